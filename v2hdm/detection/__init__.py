@@ -1,0 +1,1 @@
+"""What runs on the vehicle: onnxruntime, opencv and numpy; never torch."""

@@ -1,0 +1,30 @@
+"""What can go wrong, as one small family.
+
+Every error a user can cause is a :class:`V2hdmError`: its message is one line that says what is
+wrong, where, and what to do about it. The doors print that line and exit with code 2; anything
+else that is raised is a bug of ours and keeps its traceback.
+"""
+
+
+class V2hdmError(Exception):
+    """Root of all errors that a user can cause and mend."""
+
+
+class ConfigError(V2hdmError):
+    """A configuration value is unknown, missing or out of range."""
+
+
+class DriveError(V2hdmError):
+    """A drive on disk (images, poses, calibration) is missing, damaged or inconsistent."""
+
+
+class DetectorError(V2hdmError):
+    """A detector model cannot be loaded or does not fit the images it is given."""
+
+
+class MappingError(V2hdmError):
+    """A drive was read but no map can be made from it."""
+
+
+class MissingExtraError(V2hdmError):
+    """A door was opened without the optional dependencies that it needs."""

@@ -1,0 +1,235 @@
+"""The records that travel between the parts: plain frozen dataclasses over numpy arrays.
+
+Frames are those of :mod:`v2hdm.geometry.transform`: ``map`` (ENU, metres, z up, ground near
+z = 0), ``vehicle`` (x forward, y left, z up, origin on the ground under the rear axle), ``cam``
+(optical: z forward, x right, y down), ``px`` (u right, v down, the centre of the top-left pixel
+is (0, 0)). Transforms are 4 x 4 float64 matrices named ``dst_from_src``. Image points come in two
+flavours: ``_px`` are pixels of the image as recorded, ``_pinhole_px`` are the same points with the
+lens distortion removed, on the pinhole image of the same intrinsic matrix.
+
+Index letters, everywhere: ``i`` image, ``j`` marking, ``k`` corner observation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+DIAMOND = "diamond"
+LANE_DASH = "lane_dash"
+LANE_LINE = "lane_line"
+OTHER_PAINT = "other_paint"
+
+PAINT_CLASSES: tuple[str, ...] = (DIAMOND, LANE_DASH, LANE_LINE, OTHER_PAINT)
+"""What the detector tells apart, in the order of its output channels 1, 2, ...; channel 0 is
+everything that is not paint."""
+
+CORNERED_CLASSES: tuple[str, ...] = (DIAMOND, LANE_DASH)
+"""Classes mapped as quadrilaterals by their four corners."""
+
+LANE_CLASSES: tuple[str, ...] = (LANE_DASH, LANE_LINE)
+"""Classes whose centre lines make up the lanes."""
+
+DISTORTION_COEFFICIENTS: Mapping[str, int] = {
+    "plumb_bob": 5,
+    "rational_polynomial": 8,
+    "equidistant": 4,
+}
+"""Distortion models by their ROS ``camera_info`` name, with their number of coefficients."""
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """Intrinsics of one camera, as in a ROS ``camera_info``.
+
+    ``intrinsic`` is K (3 x 3, px); ``distortion`` holds the coefficients of ``distortion_model``
+    in OpenCV's order (see :data:`DISTORTION_COEFFICIENTS`).
+    """
+
+    name: str
+    width: int
+    height: int
+    intrinsic: FloatArray
+    distortion_model: str = "plumb_bob"
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class CentrePrior:
+    """Surveyed camera centre in the vehicle frame: ``centre_vehicle`` (3,) m, ``sigma_m`` (3,)."""
+
+    centre_vehicle: FloatArray
+    sigma_m: FloatArray
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One camera of a drive: its intrinsics and what is roughly known of its mounting.
+
+    ``ipm`` maps a name (``calibrated``: from a manual calibration of this vehicle; ``estimated``:
+    borrowed from another vehicle) to a coarse IPM homography ``vehicle_from_pinhole_px`` (3 x 3).
+    ``initial_ipm`` names the one that the mapping starts from. ``roi_vehicle`` (N x 2, m) is the
+    convex polygon on the ground within which the IPM is trusted. ``linear_response`` says that the
+    grey values are proportional to radiance; otherwise sRGB coding is assumed.
+    """
+
+    info: CameraInfo
+    ipm: Mapping[str, FloatArray]
+    initial_ipm: str
+    roi_vehicle: FloatArray
+    centre_prior: CentrePrior | None = None
+    linear_response: bool = False
+
+
+@dataclass(frozen=True)
+class GeodeticOrigin:
+    """Where the map frame's origin lies on the earth: degrees, metres above the ellipsoid."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    datum: str = "WGS84"
+    epoch: float | None = None
+
+
+@dataclass(frozen=True)
+class PoseNoise:
+    """Standard deviations of the recorded poses, as the receiver's data sheet states them."""
+
+    position_m: float = 0.02
+    heading_rad: float = 0.001
+    roll_pitch_rad: float = 0.003
+
+
+@dataclass(frozen=True)
+class Image:
+    """One image of a drive and the vehicle's pose (4 x 4) at its time stamp."""
+
+    camera: str
+    stamp_s: float
+    path: Path
+    map_from_vehicle: FloatArray
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Everything the mapper may know of a drive; images are sorted by time, then camera.
+
+    ``truth_dir`` only tells the report where ground truth lies, if there is any.
+    """
+
+    name: str
+    root: Path
+    cameras: Mapping[str, Camera]
+    images: Sequence[Image]
+    pose_noise: PoseNoise = field(default_factory=PoseNoise)
+    origin: GeodeticOrigin | None = None
+    truth_dir: Path | None = None
+
+
+@dataclass(frozen=True)
+class MarkingDetection:
+    """One quadrilateral marking in one image.
+
+    ``corners_px`` (4, 2) run counter-clockwise as seen from above the ground, which is also how
+    they run on the screen (in (u, v) coordinates their shoelace area is negative, since v points
+    down); which corner comes first is arbitrary.
+    ``covariance_px`` (8, 8) is that of the stacked corners (u0, v0, u1, ...), px^2.
+    ``corner_valid`` (4,) is False for corners that must not be used as points: hidden, cut off by
+    the image border or badly fitted.
+    """
+
+    kind: str
+    score: float
+    corners_px: FloatArray
+    covariance_px: FloatArray
+    corner_valid: BoolArray
+
+
+@dataclass(frozen=True)
+class LaneDetection:
+    """The centre line of one piece of lane paint in one image: ``points_px`` (N, 2), near to far.
+
+    ``kind`` is one of :data:`LANE_CLASSES`.
+    """
+
+    kind: str
+    score: float
+    points_px: FloatArray
+
+
+@dataclass(frozen=True)
+class ImageDetections:
+    """What the detector found in image ``i`` of a drive (an index into ``Drive.images``)."""
+
+    image: int
+    markings: tuple[MarkingDetection, ...]
+    lanes: tuple[LaneDetection, ...]
+
+
+@dataclass(frozen=True)
+class Marking:
+    """One mapped marking: ``corners_map`` (4, 2) m, counter-clockwise seen from above.
+
+    ``covariance_m2`` (8, 8) is that of the stacked corners, or None where the method has none.
+    """
+
+    kind: str
+    corners_map: FloatArray
+    sightings: int
+    covariance_m2: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class Lane:
+    """One mapped lane line: a polyline ``points_map`` (N, 2) m along its centre."""
+
+    kind: str
+    points_map: FloatArray
+    sightings: int
+
+
+@dataclass(frozen=True)
+class HdMap:
+    """Markings and lanes of a site in its map frame."""
+
+    markings: tuple[Marking, ...]
+    lanes: tuple[Lane, ...] = ()
+    origin: GeodeticOrigin | None = None
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Ground truth of a rendered drive. Only the report reads it; the mapper never does.
+
+    ``map_from_vehicle`` (I, 4, 4) are the true poses, one per ``Drive.images``. ``visibility`` (I, J)
+    is the fraction of marking j (an index into ``map.markings``) that image i shows, unoccluded.
+    ``lane_visible`` holds per lane a flag per vertex: seen by some camera of the drive.
+    """
+
+    map: HdMap
+    cam_from_vehicle: Mapping[str, FloatArray]
+    map_from_vehicle: FloatArray
+    visibility: FloatArray
+    lane_visible: tuple[BoolArray, ...]
+    disturbances: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Where one camera sits: ``cam_from_vehicle`` (4 x 4) and the IPM that follows from it.
+
+    ``covariance`` (6, 6) is that of the left-perturbation tangent of ``cam_from_vehicle``, in the
+    order translation (m), rotation (rad); None where the method has none.
+    """
+
+    info: CameraInfo
+    cam_from_vehicle: FloatArray
+    covariance: FloatArray | None = None
