@@ -1,0 +1,188 @@
+"""The pictures of a run: bird's-eye map against truth, growth of the error, overlay on an image."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+
+from v2hdm.detection.ground import apply_homography
+from v2hdm.detection.lens import distort_points
+from v2hdm.records import CameraInfo, FloatArray, HdMap, Truth
+from v2hdm.report import metrics, style
+
+_DETAIL_RADIUS_M = 7.0
+
+
+def save_birdseye(
+    path: Path,
+    maps: Mapping[str, HdMap],
+    best: str,
+    route_map: FloatArray,
+    truth: Truth | None = None,
+) -> None:
+    """Draw ``maps[best]`` over the truth from above, beside a close-up with all methods.
+
+    Args:
+        path: where the PNG goes.
+        maps: the map of each method, by its name.
+        best: the method shown on the whole site; its markings are coloured by their corner error.
+        route_map: vehicle positions (N, 2), m.
+        truth: ground truth, or None on a real drive.
+    """
+    with style.figure(path, 15.0, 7.6) as fig:
+        site, detail = fig.subplots(1, 2, width_ratios=[1.5, 1.0])
+        site.plot(*route_map.T, color=style.ROUTE, lw=6, zorder=0, solid_capstyle="round", label="route")
+        if truth is not None:
+            _draw_truth(site, truth)
+        _draw_best(site, maps[best], truth)
+        site.set_title(f"{best}: {len(maps[best].markings)} markings, {len(maps[best].lanes)} lane lines")
+        _close_up(detail, maps, best, truth)
+        for axes in (site, detail):
+            axes.set_aspect("equal")
+            axes.set_xlabel("east (m)")
+            axes.set_ylabel("north (m)")
+        site.legend(loc="best")
+
+
+def save_growth(path: Path, growth: Mapping[str, Sequence[tuple[int, float]]]) -> None:
+    """Draw corner RMSE (m) against the number of markings mapped so far, a line per method."""
+    with style.figure(path, 7.5, 4.2) as fig:
+        axes = fig.subplots()
+        for method, points in growth.items():
+            counts, errors = np.array(points, dtype=np.float64).reshape(-1, 2).T
+            axes.plot(counts, 100 * errors, "o-", ms=4, color=style.METHOD.get(method, "k"), label=method)
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:g}"[0] in "25" else "")
+        axes.grid(axis="y", which="both", color="#e6eaed")
+        axes.set_xlabel("markings mapped so far")
+        axes.set_ylabel("corner RMSE (cm)")
+        axes.set_title("Growth of the error with the map")
+        axes.legend(ncols=4, loc="best")
+
+
+def save_overlay(
+    path: Path,
+    image: np.ndarray,
+    info: CameraInfo,
+    map_from_vehicle: FloatArray,
+    hd_map: HdMap,
+    ipms: Mapping[str, FloatArray],
+) -> None:
+    """Draw a map into an image through several IPMs (``vehicle_from_pinhole_px``), by their names."""
+    canvas = image.copy()
+    for row, (name, ipm) in enumerate(ipms.items()):
+        colour = _bgr(style.METHOD.get(name, "#ffffff"))
+        pinhole_px_from_vehicle: FloatArray = np.linalg.inv(ipm)
+        for line, closed in _lines_of(hd_map):
+            points_px = _project_line(line, closed, info, map_from_vehicle, pinhole_px_from_vehicle)
+            for piece in points_px:
+                fixed = np.round(piece * 16).astype(np.int32)
+                cv2.polylines(canvas, [fixed], False, colour, 2, cv2.LINE_AA, shift=4)
+        cv2.putText(canvas, name, (16, 34 + 30 * row), cv2.FONT_HERSHEY_SIMPLEX, 0.9, colour, 2, cv2.LINE_AA)
+    unfinished = path.with_name(f".part-{path.name}")
+    cv2.imwrite(str(unfinished), canvas)
+    unfinished.replace(path)
+
+
+def _draw_truth(axes: Axes, truth: Truth) -> None:
+    polygons = [m.corners_map for m in truth.map.markings]
+    axes.add_collection(PolyCollection(polygons, facecolors="#dfe4e8", edgecolors=style.TRUTH, lw=0.4))
+    axes.add_collection(
+        LineCollection([lane.points_map for lane in truth.map.lanes], colors="#dfe4e8", lw=2.2)
+    )
+    axes.autoscale_view()
+
+
+def _draw_best(axes: Axes, hd_map: HdMap, truth: Truth | None) -> None:
+    solid = style.METHOD["Opt"]
+    axes.add_collection(
+        LineCollection(
+            [lane.points_map for lane in hd_map.lanes], colors=style.METHOD["ONI"], lw=0.9, label="lanes"
+        )
+    )
+    polygons = [m.corners_map for m in hd_map.markings]
+    if truth is None:
+        axes.add_collection(PolyCollection(polygons, facecolors=solid, edgecolors=solid, label="markings"))
+        axes.autoscale_view()
+        return
+    rows, columns = metrics.match_markings(hd_map.markings, truth.map.markings)
+    error_cm = np.full(len(polygons), np.nan)
+    for row, column in zip(rows, columns, strict=True):
+        errors = metrics.corner_errors([hd_map.markings[row]], [truth.map.markings[column]])
+        error_cm[row] = 100 * np.sqrt((errors**2).sum(axis=1).mean())
+    shown = PolyCollection(
+        polygons, array=error_cm, cmap="viridis_r", edgecolors="face", lw=1.2, label="markings"
+    )
+    top = np.nanpercentile(error_cm, 98) if np.isfinite(error_cm).any() else 1.0
+    shown.set_clim(0.0, max(1.0, top))
+    axes.add_collection(shown)
+    axes.figure.colorbar(shown, ax=axes, shrink=0.6, label="corner error of the marking (cm)")
+    axes.autoscale_view()
+
+
+def _close_up(axes: Axes, maps: Mapping[str, HdMap], best: str, truth: Truth | None) -> None:
+    """The neighbourhood of the marking in the middle of the drive, every method beside the truth."""
+    if not maps[best].markings:
+        axes.set_axis_off()
+        return
+    centre = maps[best].markings[len(maps[best].markings) // 2].corners_map.mean(axis=0)
+    if truth is not None:
+        _draw_truth(axes, truth)
+    for method, hd_map in maps.items():
+        colour = style.METHOD.get(method, "k")
+        width = 1.8 if method == best else 1.1
+        polygons = PolyCollection(
+            [m.corners_map for m in hd_map.markings], facecolors="none", edgecolors=colour, lw=width
+        )
+        axes.add_collection(polygons)
+        axes.plot([], [], color=colour, lw=width, label=method)
+    if truth is not None:
+        axes.fill([], [], facecolor="#dfe4e8", edgecolor=style.TRUTH, label="truth")
+    axes.set_xlim(centre[0] - _DETAIL_RADIUS_M, centre[0] + _DETAIL_RADIUS_M)
+    axes.set_ylim(centre[1] - _DETAIL_RADIUS_M, centre[1] + _DETAIL_RADIUS_M)
+    axes.set_title("Close-up: every method")
+    axes.legend(loc="upper right", frameon=True, edgecolor="none")
+
+
+def _lines_of(hd_map: HdMap) -> list[tuple[FloatArray, bool]]:
+    outlines = [(marking.corners_map, True) for marking in hd_map.markings]
+    return outlines + [(lane.points_map, False) for lane in hd_map.lanes]
+
+
+def _project_line(
+    line_map: FloatArray,
+    closed: bool,
+    info: CameraInfo,
+    map_from_vehicle: FloatArray,
+    pinhole_px_from_vehicle: FloatArray,
+) -> list[FloatArray]:
+    """The visible pieces (N, 2), recorded px, of a ground line; densified, so lenses bend it."""
+    ends = np.vstack([line_map, line_map[:1]]) if closed else line_map
+    dense = np.concatenate([np.linspace(a, b, 8) for a, b in itertools.pairwise(ends)])
+    offset = np.column_stack([dense, np.zeros(len(dense))]) - map_from_vehicle[:3, 3]
+    points_vehicle = (offset @ map_from_vehicle[:3, :3])[:, :2]
+    # The homography's sign is free: the side of the horizon that holds the image's bottom is in front.
+    bottom = np.linalg.inv(pinhole_px_from_vehicle) @ [info.width / 2, info.height - 1.0, 1.0]
+    ahead = np.sign((pinhole_px_from_vehicle @ (bottom / bottom[2]))[2])
+    depth = (
+        np.column_stack([points_vehicle, np.ones(len(points_vehicle))]) @ pinhole_px_from_vehicle[2] * ahead
+    )
+    points_pinhole_px = apply_homography(pinhole_px_from_vehicle, points_vehicle)
+    margin = np.array([info.width, info.height]) * 0.1
+    size = np.array([info.width, info.height])
+    visible = (depth > 0) & ((points_pinhole_px > -margin) & (points_pinhole_px < size + margin)).all(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], visible.astype(int), [0]])))
+    pieces = [points_pinhole_px[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
+    return [distort_points(info, piece) for piece in pieces]
+
+
+def _bgr(colour: str) -> tuple[int, int, int]:
+    value = int(colour[1:], 16)
+    return value & 255, value >> 8 & 255, value >> 16

@@ -1,0 +1,47 @@
+"""One look for all figures: colours by role, no chart junk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+TRUTH = "#9aa4ad"
+ROUTE = "#c9d3da"
+METHOD = {"CNI": "#e08a1e", "ENI": "#d0432b", "Opt": "#0b7a75", "ONI": "#3b6fb6"}
+"""Colour of each method, the same in every figure."""
+
+_RC: dict[Any, Any] = {
+    "font.family": "sans-serif",
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#59636b",
+    "axes.labelcolor": "#2d3439",
+    "axes.titlesize": 11,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "xtick.color": "#59636b",
+    "ytick.color": "#59636b",
+    "legend.frameon": False,
+}
+
+
+@contextmanager
+def figure(path: Path, width_in: float, height_in: float, dpi: int = 110) -> Iterator[Figure]:
+    """A figure that is saved to ``path`` (whole or not at all) when the block ends.
+
+    It has a canvas of its own and never touches pyplot's global state.
+    """
+    with mpl.rc_context(_RC):
+        fig = Figure(figsize=(width_in, height_in), dpi=dpi, layout="constrained", facecolor="white")
+        FigureCanvasAgg(fig)
+        yield fig
+        unfinished = path.with_name(f".{path.name}.part")
+        fig.savefig(unfinished, format="png")
+        unfinished.replace(path)

@@ -1,0 +1,58 @@
+"""The table that ends a run on the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from rich.table import Table
+
+METHODS: Mapping[str, str] = {
+    "CNI": "naive map, manually calibrated IPM",
+    "ENI": "naive map, IPM estimated from another vehicle",
+    "Opt": "joint optimisation of extrinsics and corners",
+    "ONI": "naive map, optimised IPM",
+}
+"""The methods of the paper (IROS 2023), in the order of its tables."""
+
+
+def results_table(title: str, results: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Table:
+    """Method x camera set: markings, recall and corner errors, from ``metrics.json``'s ``results``."""
+    has_truth = any("recall" in row for rows in results.values() for row in rows.values())
+    table = Table(title=title, title_justify="left", header_style="bold")
+    table.add_column("method")
+    for heading in ("cameras", "markings"):
+        table.add_column(heading, justify="right" if heading == "markings" else "left")
+    headings = ("recall", "false", "corner RMSE (cm)", "bias (cm)") if has_truth else ("reprojection (px)",)
+    for heading in headings:
+        table.add_column(heading, justify="right")
+    methods = sorted({m for rows in results.values() for m in rows}, key=lambda m: (_order(m), m))
+    for method in methods:
+        for cameras, rows in results.items():
+            if method in rows:
+                table.add_row(method, cameras, *_cells(rows[method], has_truth))
+        table.add_section()
+    return table
+
+
+def _order(method: str) -> int:
+    return list(METHODS).index(method) if method in METHODS else len(METHODS)
+
+
+def _cells(row: Mapping[str, float], has_truth: bool) -> list[str]:
+    if not has_truth:
+        return [str(row["markings"]), _number(row.get("reprojection_rmse_px"), 2)]
+    return [
+        str(row["markings"]),
+        _number(row.get("recall"), 3),
+        str(row.get("false_markings", "-")),
+        _number(_times_100(row.get("corner_rmse_m")), 1),
+        _number(_times_100(row.get("corner_bias_m")), 1),
+    ]
+
+
+def _times_100(value: float | None) -> float | None:
+    return None if value is None else 100.0 * value
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
