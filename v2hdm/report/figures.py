@@ -79,7 +79,7 @@ def save_overlay(
     canvas = image.copy()
     for row, (name, ipm) in enumerate(ipms.items()):
         colour = _bgr(style.METHOD.get(name, "#ffffff"))
-        pinhole_px_from_vehicle: FloatArray = np.linalg.inv(ipm)
+        pinhole_px_from_vehicle = np.asarray(np.linalg.inv(ipm), dtype=np.float64)
         for line, closed in _lines_of(hd_map):
             points_px = _project_line(line, closed, info, map_from_vehicle, pinhole_px_from_vehicle)
             for piece in points_px:

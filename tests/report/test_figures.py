@@ -1,0 +1,52 @@
+"""Figures are files that can be read back, with something drawn in them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from tests.report.scene import diamond_at, make_truth
+from v2hdm.detection.ground import ipm_from_extrinsic
+from v2hdm.records import HdMap
+from v2hdm.report.figures import save_birdseye, save_growth, save_overlay
+from v2hdm.report.table import results_table
+
+
+def test_the_birds_eye_view_is_drawn_with_and_without_truth(tmp_path: Path) -> None:
+    _, truth = make_truth()
+    maps = {"CNI": HdMap((diamond_at(10.1, 0),)), "Opt": HdMap((diamond_at(10, 0),), truth.map.lanes)}
+    route = truth.map_from_vehicle[:, :2, 3]
+    for name, known in (("with.png", truth), ("without.png", None)):
+        save_birdseye(tmp_path / name, maps, "Opt", route, known)
+        image = cv2.imread(str(tmp_path / name))
+        assert image is not None
+        assert image.std() > 5.0
+
+
+def test_no_unfinished_figure_stays_behind(tmp_path: Path) -> None:
+    save_growth(tmp_path / "growth.png", {"CNI": [(1, 0.2), (10, 0.1)], "Opt": [(1, 0.1), (10, 0.02)]})
+    assert [p.name for p in tmp_path.iterdir()] == ["growth.png"]
+
+
+def test_the_overlay_draws_the_marking_where_the_camera_sees_it(tmp_path: Path) -> None:
+    drive, _ = make_truth()
+    info = drive.cameras["front"].info
+    # 2 m above the ground, optical axis level and forward: ground at (10, 0) projects to v = 240 + 100.
+    cam_from_vehicle = np.array([[0.0, -1, 0, 0], [0, 0, -1, 2.0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    ipms = {"Opt": ipm_from_extrinsic(info, cam_from_vehicle)}
+    black = np.zeros((480, 640, 3), np.uint8)
+    save_overlay(tmp_path / "overlay.png", black, info, np.eye(4), HdMap((diamond_at(10, 0),)), ipms)
+    drawn = cv2.imread(str(tmp_path / "overlay.png")).any(axis=2)
+    drawn[:60] = False  # the legend
+    rows, columns = np.nonzero(drawn)
+    assert abs(columns.mean() - 320) < 2
+    assert 240 + 1000 / 10.5 - 3 <= rows.min() <= rows.max() <= 240 + 1000 / 9.5 + 3
+
+
+def test_the_table_shows_every_method_and_camera_set_once() -> None:
+    row = {"markings": 3, "recall": 1.0, "false_markings": 0, "corner_rmse_m": 0.0123, "corner_bias_m": 0.001}
+    table = results_table("t", {"front": {"Opt": row, "CNI": row}, "both": {"Opt": row}})
+    assert list(table.columns[0].cells) == ["CNI", "Opt", "Opt"]
+    assert list(table.columns[5].cells) == ["1.2", "1.2", "1.2"]
