@@ -18,6 +18,10 @@ class DriveError(V2hdmError):
     """A drive on disk (images, poses, calibration) is missing, damaged or inconsistent."""
 
 
+class MapFileError(V2hdmError):
+    """A map or calibration file is missing, damaged or not of its documented format."""
+
+
 class DetectorError(V2hdmError):
     """A detector model cannot be loaded or does not fit the images it is given."""
 

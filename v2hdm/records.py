@@ -233,3 +233,17 @@ class Calibration:
     info: CameraInfo
     cam_from_vehicle: FloatArray
     covariance: FloatArray | None = None
+
+    @property
+    def vehicle_from_pinhole_px(self) -> FloatArray:
+        """The IPM (3 x 3, unit norm): pinhole pixels to the ground plane z = 0 of the vehicle.
+
+        Its inverse has the columns K [r1 r2 t] of ``cam_from_vehicle`` (Hartley and Zisserman,
+        Multiple View Geometry, 2nd ed., eq. 8.1).
+
+        Raises:
+            numpy.linalg.LinAlgError: when the camera centre lies on the ground plane.
+        """
+        pinhole_px_from_vehicle = self.info.intrinsic @ self.cam_from_vehicle[:3][:, [0, 1, 3]]
+        ipm = np.linalg.inv(pinhole_px_from_vehicle)
+        return np.asarray(ipm / np.linalg.norm(ipm))

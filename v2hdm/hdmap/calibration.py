@@ -1,0 +1,72 @@
+"""The calibration of one camera as YAML: intrinsics, where it sits, its IPM and their sigmas."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from v2hdm.errors import MapFileError
+from v2hdm.files import check_keys, dump_yaml, load_yaml, replace_text, take_array, take_number, take_text
+from v2hdm.records import Calibration, CameraInfo
+
+_REQUIRED = (
+    "camera_name",
+    "image_width",
+    "image_height",
+    "camera_matrix",
+    "distortion_model",
+    "distortion_coefficients",
+    "cam_from_vehicle",
+)
+_OPTIONAL = ("vehicle_from_pinhole_px", "translation_sigma_m", "rotation_sigma_deg", "covariance")
+
+
+def write_calibration(calibration: Calibration, path: Path) -> None:
+    """Write ``calibration`` to ``path``, atomically.
+
+    The sigmas are those of the left-perturbation tangent of ``cam_from_vehicle``, so both are along
+    the camera's own axes (right, down, forward); they are left out where there is no covariance.
+    """
+    info = calibration.info
+    content: dict[str, Any] = {
+        "camera_name": info.name,
+        "image_width": info.width,
+        "image_height": info.height,
+        "camera_matrix": info.intrinsic.tolist(),
+        "distortion_model": info.distortion_model,
+        "distortion_coefficients": list(info.distortion),
+        "cam_from_vehicle": calibration.cam_from_vehicle.tolist(),
+        "vehicle_from_pinhole_px": calibration.vehicle_from_pinhole_px.tolist(),
+    }
+    if calibration.covariance is not None:
+        sigma = np.sqrt(np.diag(calibration.covariance))
+        content["translation_sigma_m"] = sigma[:3].tolist()
+        content["rotation_sigma_deg"] = np.degrees(sigma[3:]).tolist()
+        content["covariance"] = calibration.covariance.tolist()
+    replace_text(path, dump_yaml(content))
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Read what :func:`write_calibration` wrote.
+
+    Raises:
+        MapFileError: when the file is missing, damaged or not of this format.
+    """
+    content = load_yaml(path, MapFileError)
+    check_keys(content, _REQUIRED, _OPTIONAL, str(path), MapFileError)
+
+    def array(key: str, *shape: int) -> Any:
+        return take_array(content[key], shape, f"{path}: {key}", MapFileError)
+
+    info = CameraInfo(
+        name=take_text(content["camera_name"], f"{path}: camera_name", MapFileError),
+        width=int(take_number(content["image_width"], f"{path}: image_width", MapFileError)),
+        height=int(take_number(content["image_height"], f"{path}: image_height", MapFileError)),
+        intrinsic=array("camera_matrix", 3, 3),
+        distortion_model=take_text(content["distortion_model"], f"{path}: distortion_model", MapFileError),
+        distortion=tuple(array("distortion_coefficients", -1).tolist()),
+    )
+    covariance = array("covariance", 6, 6) if "covariance" in content else None
+    return Calibration(info=info, cam_from_vehicle=array("cam_from_vehicle", 4, 4), covariance=covariance)
