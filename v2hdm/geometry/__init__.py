@@ -1,0 +1,1 @@
+"""Frames, rigid motions, the pinhole camera and the ground plane: pure, batched torch functions."""
