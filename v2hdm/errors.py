@@ -32,3 +32,7 @@ class MappingError(V2hdmError):
 
 class MissingExtraError(V2hdmError):
     """A door was opened without the optional dependencies that it needs."""
+
+
+class AdjustError(V2hdmError):
+    """A bundle adjustment problem is malformed: the message names the offending item."""
