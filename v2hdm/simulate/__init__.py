@@ -1,0 +1,1 @@
+"""Rendered drives with ground truth: a scene, the cameras that look at it, the ports built from both."""

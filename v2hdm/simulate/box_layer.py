@@ -1,0 +1,122 @@
+"""What stands on the ground, drawn from far to near over it: faces of upright boxes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v2hdm.records import FloatArray
+from v2hdm.simulate.scene import Box, Light, box_footprint
+from v2hdm.simulate.textures import Float32, noise_tile, sample
+from v2hdm.simulate.view import View, Window, coverage, outline, windows
+
+_CORRUGATION_M = 0.28
+_DIRT_TILE = noise_tile(17, 6.0, 1.2)
+_FARTHEST_M = 250.0
+
+
+@dataclass(frozen=True)
+class _Face:
+    """A rectangle: its corners (4, 3), its axes from the first corner with their lengths, its normal."""
+
+    corners_map: FloatArray
+    normal: FloatArray
+    upright: bool
+
+
+def draw_boxes(
+    boxes: tuple[Box, ...], light: Light, view: View, radiance: Float32, hidden: NDArray[np.bool_]
+) -> None:
+    """Draw boxes over ``radiance`` (H, W, 3) and mark in ``hidden`` (H, W) what lies behind them."""
+    centre = view.centre_map
+
+    def distance(box: Box) -> float:
+        return float(np.hypot(*(np.array(box.centre_map) - centre[:2])))
+
+    for box in sorted(boxes, key=distance, reverse=True):
+        if distance(box) > _FARTHEST_M:
+            continue
+        for face in _faces(box):
+            if (centre - face.corners_map[0]) @ face.normal > 1e-3:
+                _draw_face(box, face, light, view, radiance, hidden)
+
+
+def _faces(box: Box) -> list[_Face]:
+    footprint = box_footprint(box)
+    low, high = box.base_m, box.base_m + box.size_m[2]
+    faces = []
+    for k in range(4):
+        a, b = footprint[k], footprint[(k + 1) % 4]
+        along = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
+        corners = np.array([[*a, low], [*b, low], [*b, high], [*a, high]])
+        faces.append(_Face(corners, np.array([along[1], -along[0], 0.0]), True))
+    for level, up in ((high, 1.0), (low, -1.0)):
+        if level > 0:
+            corners = np.column_stack([footprint, np.full(4, level)])
+            faces.append(_Face(corners, np.array([0.0, 0.0, up]), False))
+    return faces
+
+
+def _draw_face(
+    box: Box, face: _Face, light: Light, view: View, radiance: Float32, hidden: NDArray[np.bool_]
+) -> None:
+    shape = outline(view, view.homogeneous_px(face.corners_map))
+    if shape is None:
+        return
+    sun = max(float(face.normal @ np.array(light.sun_direction_map)), 0.0)
+    sky = 0.55 + 0.45 * face.normal[2]
+    colour = [
+        a * (sun * s + (sky if face.normal[2] >= 0 else 0.35) * d)
+        for a, s, d in zip(box.albedo_bgr, light.sun_bgr, light.sky_bgr, strict=True)
+    ]
+    for window in windows(view, shape):
+        covered = coverage(view, shape, window)
+        if not covered.any():
+            continue
+        tone = _tone(box, face, view, window)
+        hidden[window] |= covered > 0.5
+        target = radiance[window]
+        for channel in range(3):
+            below = target[..., channel]
+            below += covered * (tone * np.float32(colour[channel]) - below)
+
+
+def _tone(box: Box, face: _Face, view: View, window: Window) -> Float32:
+    """Relative brightness (h, w): corrugation, door seams by its shade, streaks of dirt."""
+    along_m, up_m, footprint = _face_coordinates(face, view, window)
+    offset = (float(box.seed % 101) * 0.37, float(box.seed % 71) * 0.29)
+    tone = np.float32(1.0) + np.float32(0.1) * sample(_DIRT_TILE, along_m, up_m * np.float32(0.35), offset)
+    if box.corrugated and face.upright:
+        wave = np.sin(along_m * np.float32(2 * np.pi / _CORRUGATION_M))
+        tone += (
+            np.float32(0.16)
+            * np.clip(wave * np.float32(2.5), -1, 1)
+            / (np.float32(1.0) + (footprint * 20) ** 2)
+        )
+    if face.upright:
+        tone *= np.float32(0.8) + np.float32(0.2) * np.clip(up_m * np.float32(1.2), 0, 1)
+    return np.asarray(np.clip(tone * np.float32(1.0), 0.2, 1.8))
+
+
+def _face_coordinates(face: _Face, view: View, window: Window) -> tuple[Float32, Float32, Float32]:
+    """Metres along the face's first and last edge, and the size of a pixel on it, for each pixel of a window."""
+    origin, first, last = face.corners_map[0], face.corners_map[1], face.corners_map[3]
+    axes = np.column_stack([_unit(first - origin), _unit(last - origin)])
+    pinhole_from_face = view.rays.info.intrinsic @ np.column_stack(
+        [
+            view.cam_from_map[:3, :3] @ axes,
+            view.cam_from_map[:3, :3] @ origin + view.cam_from_map[:3, 3],
+        ]
+    )
+    face_from_pinhole = np.linalg.inv(pinhole_from_face).astype(np.float32)
+    u, v = view.rays.u_pinhole_px[window], view.rays.v_pinhole_px[window]
+    a, b, w = (m[0] * u + m[1] * v + m[2] for m in face_from_pinhole)
+    depth = np.float32(1.0) / np.where(np.abs(w) < 1e-6, np.float32(1e-6), w)
+    footprint = np.abs(depth) * np.float32(1.0 / view.rays.info.intrinsic[0, 0])
+    return np.clip(a * depth, -50, 50), np.clip(b * depth, -50, 50), footprint
+
+
+def _unit(vector: FloatArray) -> FloatArray:
+    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-9))

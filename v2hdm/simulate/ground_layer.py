@@ -1,0 +1,204 @@
+"""The bare ground as a camera sees it: where every pixel meets it, its reflectance, its light."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from v2hdm.simulate.scene import Dapple, Ground, GroundMarks, Shadow
+from v2hdm.simulate.textures import Float32, Tile, fade, noise_tile, photo_tile, sample, smoothstep
+from v2hdm.simulate.view import View, outline, windows
+
+_FARTHEST_M = 400.0
+
+
+@dataclass(frozen=True)
+class GroundField:
+    """Ground seen by the image rows from ``first_row`` down, all arrays (H - first_row, W).
+
+    ``x_m``, ``y_m`` are map coordinates, ``depth_m`` runs along the optical axis, ``footprint_m`` is the ground
+    length of a pixel along the ray. Pixels above the horizon have ``below`` False and far, finite values.
+    """
+
+    first_row: int
+    x_m: Float32
+    y_m: Float32
+    depth_m: Float32
+    footprint_m: Float32
+    below: NDArray[np.bool_]
+
+    def rows(self, window: tuple[slice, slice]) -> tuple[slice, slice]:
+        """A window of the image as a window of these arrays."""
+        vertical, horizontal = window
+        return slice(vertical.start - self.first_row, vertical.stop - self.first_row), horizontal
+
+
+def intersect_ground(view: View) -> GroundField | None:
+    """Where the pixels' rays meet the plane z = 0, or None when no pixel looks down."""
+    info = view.rays.info
+    map_from_ray = view.cam_from_map[:3, :3].T @ np.linalg.inv(info.intrinsic)
+    centre = view.centre_map
+    down = -map_from_ray[2] / centre[2]
+    inverse_depth = _plane(view, down, slice(0, None))
+    below = inverse_depth > np.float32(1.0 / _FARTHEST_M)
+    ground_rows = np.flatnonzero(below.any(axis=1))
+    if len(ground_rows) == 0:
+        return None
+    first = int(ground_rows[0])
+    rows = slice(first, None)
+    depth = np.float32(1.0) / np.maximum(inverse_depth[rows], np.float32(1.0 / _FARTHEST_M))
+    x = _plane(view, map_from_ray[0], rows) * depth + np.float32(centre[0])
+    y = _plane(view, map_from_ray[1], rows) * depth + np.float32(centre[1])
+    footprint = depth * depth * np.float32(1.0 / (info.intrinsic[1, 1] * centre[2]))
+    return GroundField(first, x, y, depth, footprint, below[rows])
+
+
+def _plane(view: View, row: NDArray[np.float64], rows: slice) -> Float32:
+    out = view.rays.u_pinhole_px[rows] * np.float32(row[0])
+    out += view.rays.v_pinhole_px[rows] * np.float32(row[1])
+    out += np.float32(row[2])
+    return out
+
+
+def fine_tile(texture: str) -> Tile:
+    """The millimetre to decimetre grain of a ground texture."""
+    if texture == "concrete":
+        return noise_tile(11, 4.0, 0.6, finest_px=0.8)
+    if texture == "asphalt":
+        return noise_tile(12, 4.0, 0.1, finest_px=0.7, skew=0.5)
+    return photo_tile(texture, 3.0)
+
+
+MEDIUM_TILE = noise_tile(13, 19.0, 1.0)
+COARSE_TILE = noise_tile(14, 83.0, 1.5)
+
+
+def tone(ground: Ground, field: GroundField) -> Float32:
+    """Relative reflectance (H, W) of the bare, dry ground, about 1."""
+    shift = _shift(ground.seed)
+    fine = fine_tile(ground.texture)
+    out = sample(fine, field.x_m, field.y_m, shift)
+    out *= fade(fine, field.footprint_m) * np.float32(ground.contrast)
+    medium = sample(MEDIUM_TILE, field.x_m, field.y_m, shift)
+    medium *= fade(MEDIUM_TILE, field.footprint_m) * np.float32(0.6 * ground.stains)
+    out += medium
+    out += sample(COARSE_TILE, field.x_m, field.y_m, shift) * np.float32(0.8 * ground.stains)
+    out += np.float32(1.0)
+    np.clip(out, 0.25, 2.5, out=out)
+    if ground.slab_m is not None:
+        _slabs(ground, ground.slab_m, field, out)
+    if ground.marks is not None:
+        _marks(ground.marks, field, out)
+    return out
+
+
+def _slabs(ground: Ground, slab_m: tuple[float, float], field: GroundField, out: Float32) -> None:
+    """Multiply joints and the slightly different tones of the slabs into ``out``."""
+    cos, sin = np.float32(np.cos(ground.slab_yaw_rad)), np.float32(np.sin(ground.slab_yaw_rad))
+    index = []
+    for pitch, along in (
+        (slab_m[0], field.x_m * cos + field.y_m * sin),
+        (slab_m[1], field.y_m * cos - field.x_m * sin),
+    ):
+        along *= np.float32(1.0 / pitch)
+        cell = np.floor(along)
+        along -= cell
+        distance = np.minimum(along, np.float32(1.0) - along) * np.float32(pitch)
+        width = np.maximum(field.footprint_m, np.float32(0.004))
+        line = np.clip((np.float32(ground.joint_width_m / 2) - distance) / width + np.float32(0.5), 0, 1)
+        line *= np.minimum(np.float32(ground.joint_width_m) / width, 1)
+        out *= np.float32(1.0) - line * np.float32(1.0 - ground.joint_factor)
+        index.append(cell.astype(np.int32))
+    tones = np.random.default_rng([ground.seed, 5]).normal(1.0, 0.035, 1024).astype(np.float32)
+    out *= tones[(index[0] * 31 + index[1] * 57) & 1023]
+
+
+def _marks(marks: GroundMarks, field: GroundField, out: Float32) -> None:
+    scale = np.float32(1.0 / marks.resolution_m)
+    columns = (field.x_m - np.float32(marks.origin_map[0])) * scale
+    rows = (field.y_m - np.float32(marks.origin_map[1])) * scale
+    factor = cv2.remap(
+        marks.factor, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=128
+    )
+    out *= factor.astype(np.float32) * np.float32(1.0 / 128.0)
+
+
+def wetness(ground: Ground, field: GroundField) -> Float32 | None:
+    """How wet (H, W) the ground is, 0 dry to 1 standing water, or None when it is dry everywhere."""
+    if ground.wet_fraction <= 0:
+        return None
+    level = float(np.quantile(MEDIUM_TILE.values[::8, ::8], 1.0 - ground.wet_fraction))
+    values = sample(MEDIUM_TILE, field.x_m, field.y_m, _shift(ground.seed + 1))
+    return smoothstep(values, level - 0.15, level + 0.25)
+
+
+def sun_visibility(
+    shadows: tuple[Shadow, ...], dapples: tuple[Dapple, ...], view: View, field: GroundField
+) -> Float32:
+    """Fraction (H, W) of the sun's light that reaches the ground."""
+    out = np.ones_like(field.x_m)
+    for shadow in shadows:
+        _cast(shadow, view, field, out)
+    for dapple in dapples:
+        _dapple(dapple, view, field, out)
+    return out
+
+
+def _cast(shadow: Shadow, view: View, field: GroundField, out: Float32) -> None:
+    polygon = np.asarray(shadow.polygon_map, dtype=np.float64)
+    grown = polygon + 0.5 * shadow.softness_m * _outward(polygon)
+    shape = outline(view, view.homogeneous_px(np.column_stack([grown, np.zeros(len(grown))])))
+    if shape is None:
+        return
+    for window in windows(view, shape, field.first_row):
+        part = field.rows(window)
+        soft = np.float32(1.0) / (np.float32(shadow.softness_m) + field.footprint_m[part])
+        dark = _ground_coverage(polygon, field.x_m[part], field.y_m[part], soft)
+        out[part] = np.minimum(out[part], np.float32(1.0) - dark * np.float32(1.0 - shadow.transmission))
+
+
+def _outward(polygon: NDArray[np.float64]) -> NDArray[np.float64]:
+    away = polygon - polygon.mean(axis=0)
+    return np.asarray(away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9))
+
+
+def _ground_coverage(polygon: NDArray[np.float64], x: Float32, y: Float32, sharpness: Float32) -> Float32:
+    """Coverage of ground points by a convex polygon whose border is 1 / sharpness metres wide."""
+    following = np.roll(polygon, -1, axis=0)
+    edge = following - polygon
+    area2 = float((polygon[:, 0] * following[:, 1] - following[:, 0] * polygon[:, 1]).sum())
+    normal = np.column_stack([-edge[:, 1], edge[:, 0]]) * np.sign(area2)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    least = np.full_like(x, np.inf)
+    for n, p in zip(normal, polygon, strict=True):
+        np.minimum(least, x * np.float32(n[0]) + y * np.float32(n[1]) - np.float32(n @ p), out=least)
+    return np.asarray(np.clip(least * sharpness + np.float32(0.5), 0, 1))
+
+
+def _dapple(dapple: Dapple, view: View, field: GroundField, out: Float32) -> None:
+    tile = noise_tile(15, 40.0 * dapple.scale_m, 1.1, finest_px=3.0)
+    level = float(np.quantile(tile.values[::8, ::8], dapple.shaded))
+    if dapple.region_map is None:
+        parts = [(slice(None), slice(None))]
+        region = None
+    else:
+        region = np.asarray(dapple.region_map, dtype=np.float64)
+        shape = outline(view, view.homogeneous_px(np.column_stack([region, np.zeros(len(region))])))
+        parts = [] if shape is None else [field.rows(w) for w in windows(view, shape, field.first_row)]
+    for part in parts:
+        x, y, footprint = field.x_m[part], field.y_m[part], field.footprint_m[part]
+        lit = smoothstep(sample(tile, x, y, _shift(dapple.seed)), level - 0.12, level + 0.12)
+        amplitude = fade(tile, footprint, 8.0)
+        lit = lit * amplitude + (np.float32(1.0) - amplitude) * np.float32(1.0 - dapple.shaded)
+        dark = (np.float32(1.0) - lit) * np.float32(1.0 - dapple.transmission)
+        if region is not None:
+            dark *= _ground_coverage(region, x, y, np.full_like(x, 2.0))
+        out[part] *= np.float32(1.0) - dark
+
+
+def _shift(seed: int) -> tuple[float, float]:
+    x, y = np.random.default_rng([seed, 3]).uniform(0.0, 80.0, 2)
+    return float(x), float(y)

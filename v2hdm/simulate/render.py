@@ -1,0 +1,157 @@
+"""The renderer: a scene, a camera and its place in; an image and its class labels out.
+
+Everything is computed per pixel in linear light: the ray meets the ground, textures and paint are looked
+up there, sun and shadow multiply them, boxes are drawn over it, then lens and sensor do their work. Shapes
+are anti-aliased by their exact signed distance, so that the 50 % point of an edge is where truth puts it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from v2hdm.records import CameraInfo, FloatArray
+from v2hdm.simulate.box_layer import draw_boxes
+from v2hdm.simulate.ground_layer import GroundField, intersect_ground, sun_visibility, tone, wetness
+from v2hdm.simulate.optics import Motion, Optics, expose
+from v2hdm.simulate.paint_layer import PaintLayer
+from v2hdm.simulate.scene import Box, Light, Scene, box_shadow
+from v2hdm.simulate.sky_layer import draw_background
+from v2hdm.simulate.textures import Float32
+from v2hdm.simulate.view import View, camera_rays
+
+RENDERER_VERSION = 1
+"""Raised whenever the same scene comes out as a different picture, so that cached drives are made afresh."""
+
+_SHADOW_REACH_M = 120.0
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """One picture: ``image`` (H, W, 3) uint8 BGR sRGB, ``labels`` (H, W) uint8 with 0 for no paint and
+    1 + the index into :data:`v2hdm.records.PAINT_CLASSES` otherwise (the painted shape, worn or not, where
+    nothing stands in front of it), ``hidden`` (H, W) bool where a box is in front of the ground.
+    """
+
+    image: NDArray[np.uint8]
+    labels: NDArray[np.uint8]
+    hidden: NDArray[np.bool_]
+
+
+@dataclass
+class Renderer:
+    """Draws one scene from any number of places."""
+
+    scene: Scene
+    _paint: PaintLayer = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._paint = PaintLayer(self.scene.paints)
+
+    def render(
+        self,
+        info: CameraInfo,
+        cam_from_map: FloatArray,
+        rng: np.random.Generator,
+        optics: Optics | None = None,
+        motion: Motion | None = None,
+        moving_boxes: tuple[Box, ...] = (),
+    ) -> Rendered:
+        """Render one image.
+
+        Args:
+            info: The camera, lens distortion included; any size.
+            cam_from_map: Where it is, at the middle of the exposure.
+            rng: Source of the sensor noise; the picture is a function of its state.
+            optics: Lens and sensor.
+            motion: Motion during the exposure.
+            moving_boxes: What stands in the scene for this image only.
+        """
+        view = View(camera_rays(info), np.asarray(cam_from_map, dtype=np.float64))
+        labels = np.zeros((info.height, info.width), dtype=np.uint8)
+        hidden = np.zeros((info.height, info.width), dtype=np.bool_)
+        boxes = self.scene.boxes + moving_boxes
+        radiance = self._surroundings(view, boxes, labels)
+        draw_boxes(boxes, self.scene.light, view, radiance, hidden)
+        labels[hidden] = 0
+        image = expose(radiance, view, optics or Optics(), motion or Motion(), rng)
+        return Rendered(image, labels, hidden)
+
+    def _surroundings(self, view: View, boxes: tuple[Box, ...], labels: NDArray[np.uint8]) -> Float32:
+        """Radiance (H, W, 3) of sky and ground."""
+        scene = self.scene
+        height, width = labels.shape
+        ground = intersect_ground(view)
+        if ground is None:
+            return draw_background(view, scene.light, scene.backdrop, height)
+        sky_rows = np.flatnonzero(~ground.below.all(axis=1))
+        last_row = ground.first_row + (int(sky_rows[-1]) + 1 if len(sky_rows) else 0)
+        radiance = np.empty((height, width, 3), dtype=np.float32)
+        radiance[ground.first_row :] = self._ground(view, ground, boxes, labels)
+        if last_row:
+            background = draw_background(view, scene.light, scene.backdrop, last_row)
+            radiance[: ground.first_row] = background[: ground.first_row]
+            _haze(radiance, background, ground, last_row, scene.backdrop.haze_m)
+        return radiance
+
+    def _ground(
+        self, view: View, ground: GroundField, boxes: tuple[Box, ...], labels: NDArray[np.uint8]
+    ) -> Float32:
+        scene = self.scene
+        bare = tone(scene.ground, ground)
+        albedo = cv2.merge([bare * np.float32(c) for c in scene.ground.albedo_bgr])
+        self._paint.draw(view, ground, albedo, labels)
+        near = tuple(b for b in boxes if _distance(b, view) < _SHADOW_REACH_M)
+        shadows = scene.shadows + tuple(box_shadow(b, scene.light) for b in near)
+        sun = sun_visibility(shadows, scene.dapples, view, ground)
+        return _lit(albedo, sun, wetness(scene.ground, ground), ground, view, scene.light)
+
+
+def render(
+    scene: Scene,
+    info: CameraInfo,
+    cam_from_map: FloatArray,
+    rng: np.random.Generator,
+    optics: Optics | None = None,
+    motion: Motion | None = None,
+) -> Rendered:
+    """Render one image of a scene; see :meth:`Renderer.render`."""
+    return Renderer(scene).render(info, cam_from_map, rng, optics, motion)
+
+
+def _distance(box: Box, view: View) -> float:
+    return float(np.hypot(*(np.array(box.centre_map) - view.centre_map[:2])))
+
+
+def _lit(
+    albedo: Float32, sun: Float32, wet: Float32 | None, ground: GroundField, view: View, light: Light
+) -> Float32:
+    """Ground radiance (H', W, 3): Lambert's law under sun and sky; water darkens and mirrors the sky."""
+    height = max(light.sun_direction_map[2], 0.0)
+    channels = [
+        sun * np.float32(s * height) + np.float32(d)
+        for s, d in zip(light.sun_bgr, light.sky_bgr, strict=True)
+    ]
+    out = albedo * cv2.merge(channels)
+    if wet is None:
+        return np.asarray(out)
+    grazing = np.float32(view.centre_map[2]) / np.hypot(
+        np.hypot(ground.x_m - np.float32(view.centre_map[0]), ground.y_m - np.float32(view.centre_map[1])),
+        np.float32(view.centre_map[2]),
+    )
+    fresnel = np.float32(0.02) + np.float32(0.98) * (np.float32(1.0) - grazing) ** 5
+    out *= (np.float32(1.0) - np.float32(0.45) * wet)[..., None]
+    mirrored = cv2.merge([fresnel * wet * np.float32(c) for c in light.horizon_bgr])
+    return np.asarray(out + mirrored)
+
+
+def _haze(radiance: Float32, background: Float32, ground: GroundField, last_row: int, haze_m: float) -> None:
+    """Let the ground's far rows fade into the background of the same pixels."""
+    rows = slice(ground.first_row, last_row)
+    part = slice(0, last_row - ground.first_row)
+    clear = np.exp(ground.depth_m[part] * np.float32(-1.0 / haze_m))
+    clear = np.where(ground.below[part], clear, 0)[..., None]
+    radiance[rows] = background[rows] + clear * (radiance[rows] - background[rows])

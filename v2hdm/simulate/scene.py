@@ -1,0 +1,188 @@
+"""What there is to be seen: the ground, the paint on it, what stands on it, and the light.
+
+Everything lies in the ``map`` frame of :mod:`v2hdm.records` (metres, z up, ground at z = 0).
+Colours are linear reflectances or radiances in blue, green, red order, as OpenCV stores them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v2hdm.records import FloatArray
+
+Bgr = tuple[float, float, float]
+
+WHITE_PAINT: Bgr = (0.70, 0.74, 0.75)
+YELLOW_PAINT: Bgr = (0.07, 0.42, 0.62)
+
+GROUND_TEXTURES: tuple[str, ...] = ("concrete", "asphalt", "gravel", "grass", "brick")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroundMarks:
+    """Tyre marks, patches and kerbs that are too soft or too many for polygons, as a raster.
+
+    ``factor`` (H, W) uint8 multiplies the reflectance, 128 standing for 1; the centre of its element
+    (row, column) lies at ``origin_map + resolution_m * (column, row)``. Outside, the factor is 1.
+    """
+
+    factor: NDArray[np.uint8]
+    origin_map: tuple[float, float]
+    resolution_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ground:
+    """The bare surface: a texture, large stains, slab joints, wet areas, and marks drawn upon it.
+
+    ``contrast`` and ``stains`` are relative standard deviations of the fine grain and of the
+    metre-sized tone. ``slab_m`` is the length and width of concrete slabs, or None. ``wet_fraction``
+    is the part of the ground under a film of water.
+    """
+
+    albedo_bgr: Bgr = (0.29, 0.30, 0.31)
+    texture: str = "concrete"
+    contrast: float = 0.12
+    stains: float = 0.12
+    slab_m: tuple[float, float] | None = None
+    slab_yaw_rad: float = 0.0
+    joint_width_m: float = 0.015
+    joint_factor: float = 0.35
+    wet_fraction: float = 0.0
+    marks: GroundMarks | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Paint:
+    """One convex painted polygon.
+
+    ``kind`` is one of :data:`v2hdm.records.PAINT_CLASSES`; ``polygon_map`` (N, 2). ``wear`` from 0 (fresh)
+    to 1 (gone) is the fraction of paint worn off down to the ground, ``dirt`` the fraction of the
+    remaining contrast lost under dirt. Pieces of one marking share a ``seed``.
+    """
+
+    kind: str
+    polygon_map: FloatArray
+    albedo_bgr: Bgr = WHITE_PAINT
+    wear: float = 0.1
+    dirt: float = 0.15
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box:
+    """An upright cuboid that hides what lies behind it and casts a shadow: container, truck, wall, pole.
+
+    ``centre_map`` is the centre of its footprint, ``size_m`` its length, width and height,
+    ``base_m`` the height of its lower side.
+    """
+
+    centre_map: tuple[float, float]
+    size_m: tuple[float, float, float]
+    yaw_rad: float = 0.0
+    albedo_bgr: Bgr = (0.3, 0.3, 0.3)
+    base_m: float = 0.0
+    corrugated: bool = False
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shadow:
+    """A convex shadow on the ground: ``transmission`` of the sun's light, penumbra ``softness_m`` wide."""
+
+    polygon_map: FloatArray
+    transmission: float = 0.0
+    softness_m: float = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dapple:
+    """The broken shade of foliage: ``shaded`` fraction of the ground, flecks of about ``scale_m``.
+
+    ``region_map`` (N, 2) bounds it to a convex polygon; None means everywhere.
+    """
+
+    shaded: float = 0.6
+    scale_m: float = 1.0
+    transmission: float = 0.1
+    region_map: FloatArray | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Light:
+    """Sun and sky: ``sun_direction_map`` points to the sun, irradiances are relative."""
+
+    sun_direction_map: tuple[float, float, float] = (0.4, 0.5, 0.77)
+    sun_bgr: Bgr = (0.92, 1.0, 1.06)
+    sky_bgr: Bgr = (0.38, 0.33, 0.30)
+    zenith_bgr: Bgr = (0.75, 0.50, 0.34)
+    horizon_bgr: Bgr = (0.92, 0.90, 0.86)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Backdrop:
+    """What closes the view beyond the boxes: a skyline of blocks up to ``height_rad`` high, and haze.
+
+    ``haze_m`` is the distance at which the ground has lost 63 % of its contrast.
+    """
+
+    height_rad: float = 0.06
+    block_rad: float = 0.08
+    albedo_bgr: Bgr = (0.22, 0.21, 0.20)
+    haze_m: float = 400.0
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """Everything that the renderer draws; paint later in the list lies upon paint before it."""
+
+    ground: Ground = field(default_factory=Ground)
+    paints: tuple[Paint, ...] = ()
+    boxes: tuple[Box, ...] = ()
+    shadows: tuple[Shadow, ...] = ()
+    dapples: tuple[Dapple, ...] = ()
+    light: Light = field(default_factory=Light)
+    backdrop: Backdrop = field(default_factory=Backdrop)
+
+
+def convex_hull(points: FloatArray) -> FloatArray:
+    """Convex hull (M, 2) of points (N, 2), counter-clockwise, in float64 (Andrew's monotone chain)."""
+    ordered = sorted(map(tuple, np.asarray(points, dtype=np.float64)))
+
+    def chain(sequence: list[tuple[float, ...]]) -> list[tuple[float, ...]]:
+        hull: list[tuple[float, ...]] = []
+        for p in sequence:
+            while len(hull) > 1 and _turn(hull[-2], hull[-1], p) <= 0:
+                hull.pop()
+            hull.append(p)
+        return hull[:-1]
+
+    return np.array(chain(ordered) + chain(ordered[::-1]))
+
+
+def _turn(a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]) -> float:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+
+def box_footprint(box: Box) -> FloatArray:
+    """The four corners (4, 2) of a box's base in the map, counter-clockwise."""
+    length, width, _ = box.size_m
+    half = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (length / 2, width / 2)
+    cos, sin = np.cos(box.yaw_rad), np.sin(box.yaw_rad)
+    return np.asarray(half @ np.array([[cos, sin], [-sin, cos]]) + box.centre_map)
+
+
+def box_shadow(box: Box, light: Light, softness_m: float = 0.08) -> Shadow:
+    """The shadow that a box throws on the ground: hull of its lower and upper face along the sun's rays."""
+    sun = np.array(light.sun_direction_map)
+    per_metre = -sun[:2] / max(sun[2], 0.1)
+    footprint = box_footprint(box)
+    lower = footprint + box.base_m * per_metre
+    upper = footprint + (box.base_m + box.size_m[2]) * per_metre
+    return Shadow(polygon_map=convex_hull(np.vstack([lower, upper])), softness_m=softness_m)

@@ -1,0 +1,85 @@
+"""Endless textures: seamless tiles of noise, sampled in metres and faded out where they would alias.
+
+A tile is band-limited, so a pixel that covers more ground than the tile's finest wavelength would
+turn it into shimmer; its amplitude therefore fades with the pixel's footprint (frequency clamping,
+Norton, Rockwood and Skolmoski 1982).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+
+_TILE_PX = 512
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A seamless square texture of mean 0 and standard deviation 1, ``side_m`` wide on the ground."""
+
+    values: Float32
+    side_m: float
+
+
+@cache
+def noise_tile(seed: int, side_m: float, slope: float, finest_px: float = 2.0, skew: float = 0.0) -> Tile:
+    """Noise of spectral amplitude 1 / frequency^slope, wavelengths from ``finest_px`` tile pixels upwards.
+
+    ``skew`` > 0 gives bright specks on a dark ground, as of aggregate in asphalt.
+    """
+    rng = np.random.default_rng([seed, 77])
+    frequency = np.hypot(np.fft.fftfreq(_TILE_PX)[:, None], np.fft.rfftfreq(_TILE_PX)[None])
+    frequency[0, 0] = np.inf
+    spectrum = np.fft.rfft2(rng.standard_normal((_TILE_PX, _TILE_PX)))
+    spectrum *= frequency**-slope * np.exp(-0.5 * (frequency * finest_px) ** 2)
+    values = np.fft.irfft2(spectrum, s=(_TILE_PX, _TILE_PX))
+    values /= values.std()
+    if skew:
+        values = np.exp(skew * values)
+        values = (values - values.mean()) / values.std()
+    return Tile(np.ascontiguousarray(values, dtype=np.float32), side_m)
+
+
+@cache
+def photo_tile(name: str, side_m: float) -> Tile:
+    """A photographed surface of scikit-image (``gravel``, ``grass``, ``brick``), mirrored to be seamless."""
+    import skimage.data
+
+    photo = cv2.resize(
+        getattr(skimage.data, name)(), (_TILE_PX // 2, _TILE_PX // 2), interpolation=cv2.INTER_AREA
+    )
+    values = photo.astype(np.float32)
+    values = (values - values.mean()) / values.std()
+    mirrored = np.vstack([np.hstack([values, values[:, ::-1]]), np.hstack([values, values[:, ::-1]])[::-1]])
+    return Tile(np.ascontiguousarray(mirrored), side_m)
+
+
+def sample(tile: Tile, x_m: Float32, y_m: Float32, offset_m: tuple[float, float] = (0.0, 0.0)) -> Float32:
+    """The tile's values at ground points (H, W), bilinear, repeated endlessly.
+
+    OpenCV saturates map coordinates at 32767, which is why they are first brought near the origin.
+    """
+    scale = np.float32(tile.values.shape[0] / tile.side_m)
+    base_x = np.floor((float(x_m.flat[0]) + offset_m[0]) / tile.side_m) * tile.side_m - offset_m[0]
+    base_y = np.floor((float(y_m.flat[0]) + offset_m[1]) / tile.side_m) * tile.side_m - offset_m[1]
+    columns = (x_m - np.float32(base_x)) * scale
+    rows = (y_m - np.float32(base_y)) * scale
+    return np.asarray(cv2.remap(tile.values, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
+
+
+def fade(tile: Tile, footprint_m: Float32, finest_px: float = 4.0) -> Float32:
+    """Amplitude (H, W) left to a tile whose finest wavelength is ``finest_px`` tile pixels."""
+    finest_m = finest_px * tile.side_m / tile.values.shape[0]
+    return np.asarray(np.float32(1.0) / (np.float32(1.0) + (footprint_m * np.float32(1.0 / finest_m)) ** 2))
+
+
+def smoothstep(values: Float32, low: float, high: float) -> Float32:
+    """Cubic step from 0 at ``low`` to 1 at ``high``."""
+    t = np.clip((values - np.float32(low)) * np.float32(1.0 / (high - low)), 0, 1)
+    return np.asarray(t * t * (np.float32(3.0) - np.float32(2.0) * t))

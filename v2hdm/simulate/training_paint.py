@@ -1,0 +1,260 @@
+"""Random road paint for training: lanes along a gently bent street, fields of diamonds, everything else.
+
+Layouts run along +x from the origin, where the camera is; a :class:`Bend` turns them into the map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from v2hdm.records import DIAMOND, LANE_DASH, LANE_LINE, OTHER_PAINT, FloatArray
+from v2hdm.simulate.scene import WHITE_PAINT, YELLOW_PAINT, Bgr, Paint
+
+FAR_M = 65.0
+_NEAR_M = -4.0
+
+
+@dataclass(frozen=True)
+class Bend:
+    """A circular arc through the origin along +x, ``curvature`` in 1/m, positive to the left."""
+
+    curvature: float
+
+    def to_map(self, points: FloatArray) -> FloatArray:
+        """Points (..., 2) as (distance along the arc, offset to the left of it) in the map."""
+        along, left = points[..., 0], points[..., 1]
+        angle = along * self.curvature
+        x = along * np.sinc(angle / np.pi) - left * np.sin(angle)
+        y = along * np.sinc(angle / (2 * np.pi)) * np.sin(angle / 2) + left * np.cos(angle)
+        return np.stack([x, y], axis=-1)
+
+
+@dataclass(frozen=True)
+class Brush:
+    """The paint of one scene: its colour and the state it is in."""
+
+    albedo_bgr: Bgr
+    wear: float
+    dirt: float
+
+    def paint(self, rng: np.random.Generator, kind: str, polygon_map: FloatArray) -> Paint:
+        """One piece; wear differs from piece to piece."""
+        wear = float(np.clip(self.wear * np.exp(rng.normal(0, 0.35)), 0, 0.62))
+        dirt = float(np.clip(self.dirt * np.exp(rng.normal(0, 0.3)), 0, 0.6))
+        return Paint(
+            kind=kind,
+            polygon_map=polygon_map,
+            albedo_bgr=self.albedo_bgr,
+            wear=wear,
+            dirt=dirt,
+            seed=int(rng.integers(1 << 30)),
+        )
+
+
+def random_brush(rng: np.random.Generator, difficulty: float) -> Brush:
+    """White or yellow paint, the more worn and dirty the higher ``difficulty`` (0 to 1) is."""
+    colour = np.array(WHITE_PAINT if rng.random() < 0.82 else YELLOW_PAINT)
+    colour = colour * rng.uniform(0.65, 1.15) * np.exp(rng.normal(0, 0.03, 3))
+    worn = difficulty * rng.beta(1.2, 3.0)
+    return Brush(tuple(float(c) for c in colour), float(0.6 * worn), float(rng.uniform(0, 0.45) * difficulty))  # type: ignore[arg-type]
+
+
+def rectangle(centre: FloatArray, length: float, width: float, yaw_rad: float = 0.0) -> FloatArray:
+    """Corners (4, 2) of a rectangle, counter-clockwise."""
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (length / 2, width / 2)
+    return _turned(corners, yaw_rad) + centre
+
+
+def rhombus(centre: FloatArray, length: float, width: float, yaw_rad: float = 0.0) -> FloatArray:
+    """Corners (4, 2) of a diamond with the diagonals ``length`` and ``width``, counter-clockwise."""
+    return (
+        _turned(np.array([[-length / 2, 0], [0, -width / 2], [length / 2, 0], [0, width / 2]]), yaw_rad)
+        + centre
+    )
+
+
+def _turned(points: FloatArray, yaw_rad: float) -> FloatArray:
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    return np.asarray(points @ np.array([[cos, sin], [-sin, cos]]))
+
+
+def street_paint(rng: np.random.Generator, brush: Brush, bend: Bend) -> list[Paint]:
+    """Lane lines of all kinds about the camera, and now and then a junction's markings."""
+    lane_m = rng.uniform(2.5, 3.9)
+    first = rng.integers(-3, 0)
+    here = rng.uniform(-0.25, 0.25) * lane_m
+    width_m = rng.uniform(0.09, 0.22)
+    dash = _dash_pattern(rng)
+    paints: list[Paint] = []
+    lines = range(first, first + int(rng.integers(2, 6)))
+    for line in lines:
+        left = (line + 0.5) * lane_m + here
+        outer = line in (lines[0], lines[-1])
+        style = rng.choice(4, p=[0.4, 0.5, 0.05, 0.05] if outer else [0.74, 0.16, 0.05, 0.05])
+        paints += _lane_line(rng, brush, bend, int(style), float(left), width_m, dash)
+    for lane in lines[:-1]:
+        if rng.random() < 0.3:
+            paints += _lane_symbols(rng, brush, bend, (lane + 1) * lane_m + here, lane_m)
+    if rng.random() < 0.2:
+        paints += _junction(rng, brush, bend, lane_m)
+    return paints
+
+
+def port_paint(rng: np.random.Generator, brush: Brush, bend: Bend) -> list[Paint]:
+    """Columns of diamonds along the way, with lane lines between some of them."""
+    length_m = rng.uniform(0.45, 1.9)
+    width_m = length_m / rng.uniform(0.9, 3.0)
+    yaw = rng.choice([0.0, np.pi / 2, rng.normal(0, 0.3)], p=[0.6, 0.2, 0.2])
+    pitch_m = rng.uniform(length_m + 0.6, 7.0)
+    columns = int(rng.integers(1, 6))
+    across_m = rng.uniform(max(1.0, width_m + 0.5), 5.0)
+    jitter = rng.uniform(0, 0.4)
+    paints: list[Paint] = []
+    for column in range(columns):
+        left = (column - (columns - 1) / 2) * across_m + rng.normal(0, 0.4)
+        for along in np.arange(_NEAR_M + rng.uniform(0, pitch_m), 45.0, pitch_m):
+            centre = bend.to_map(np.array([along, left]) + rng.normal(0, jitter, 2))
+            shape = rhombus(centre, length_m, width_m, yaw + along * bend.curvature)
+            paints.append(brush.paint(rng, DIAMOND, shape))
+    dash = _dash_pattern(rng)
+    for _ in range(int(rng.integers(0, 4))):
+        style = int(rng.choice(4, p=[0.4, 0.5, 0.05, 0.05]))
+        paints = (
+            _lane_line(rng, brush, bend, style, rng.uniform(-6, 6), rng.uniform(0.09, 0.25), dash) + paints
+        )
+    if rng.random() < 0.35:
+        paints = _lane_symbols(rng, brush, bend, rng.uniform(-4, 4), 3.2) + paints
+    if rng.random() < 0.15:
+        paints = _junction(rng, brush, bend, 3.2) + paints
+    return paints
+
+
+def _dash_pattern(rng: np.random.Generator) -> tuple[float, float]:
+    """Length of a dash and of the cycle, m."""
+    length = rng.uniform(2.0, 6.0) if rng.random() < 0.85 else rng.uniform(0.9, 2.0)
+    return float(length), float(length * rng.uniform(1.6, 3.2))
+
+
+def _lane_line(
+    rng: np.random.Generator,
+    brush: Brush,
+    bend: Bend,
+    style: int,
+    left: float,
+    width_m: float,
+    dash: tuple[float, float],
+) -> list[Paint]:
+    """Style 0: dashes, 1: solid, 2: double solid, 3: dashes beside a solid line."""
+    beside = width_m * rng.uniform(1.8, 3.0)
+    out: list[Paint] = []
+    if style in (0, 3):
+        for start in np.arange(_NEAR_M - rng.uniform(0, dash[1]), FAR_M, dash[1]):
+            out.append(brush.paint(rng, LANE_DASH, _strip(bend, start, start + dash[0], left, width_m)))
+    for offset in {1: (0.0,), 2: (-beside / 2, beside / 2), 3: (beside,)}.get(style, ()):
+        out += _solid(rng, brush, bend, left + offset, width_m)
+    return out
+
+
+def _solid(rng: np.random.Generator, brush: Brush, bend: Bend, left: float, width_m: float) -> list[Paint]:
+    """A solid line, in short pieces where the way bends; some begin or end in view."""
+    start = _NEAR_M if rng.random() < 0.75 else rng.uniform(_NEAR_M, 15)
+    end = FAR_M if rng.random() < 0.75 else start + rng.uniform(9, 30)
+    piece = 2.5 if bend.curvature else end - start
+    edges = np.arange(start, end - 0.1, piece)
+    seed = int(rng.integers(1 << 30))
+    first = brush.paint(rng, LANE_LINE, _strip(bend, start, end, left, width_m))
+    return [
+        Paint(
+            kind=LANE_LINE,
+            polygon_map=_strip(bend, a, min(a + piece + 0.02, end), left, width_m),
+            albedo_bgr=first.albedo_bgr,
+            wear=first.wear,
+            dirt=first.dirt,
+            seed=seed,
+        )
+        for a in edges
+    ]
+
+
+def _strip(bend: Bend, start: float, end: float, left: float, width_m: float) -> FloatArray:
+    half = width_m / 2
+    return bend.to_map(
+        np.array([[start, left - half], [end, left - half], [end, left + half], [start, left + half]])
+    )
+
+
+def _lane_symbols(
+    rng: np.random.Generator, brush: Brush, bend: Bend, left: float, lane_m: float
+) -> list[Paint]:
+    """An arrow or a line of writing in a lane, perhaps repeated."""
+    draw = _arrow if rng.random() < 0.6 else _writing
+    out: list[Paint] = []
+    for along in np.arange(rng.uniform(1, 14), 40, rng.uniform(9, 30)):
+        for polygon in draw(rng, lane_m):
+            placed = bend.to_map(polygon + (along, left))
+            out.append(brush.paint(rng, OTHER_PAINT, placed))
+    return out
+
+
+def _arrow(rng: np.random.Generator, lane_m: float) -> Iterator[FloatArray]:
+    """Convex parts of a lane arrow: straight on, a turn, or both."""
+    length, shaft = rng.uniform(2.0, 6.0), rng.uniform(0.12, 0.3)
+    head_length, head = rng.uniform(0.25, 0.45) * length, rng.uniform(2.5, 4.5) * shaft
+    turn, straight = rng.choice([-1, 0, 1]), rng.random() < 0.6
+    if turn == 0 or straight:
+        yield rectangle(np.array([(length - head_length) / 2, 0.0]), length - head_length, shaft)
+        tip = np.array([[length - head_length, -head / 2], [length, 0.0], [length - head_length, head / 2]])
+        yield tip
+    if turn:
+        root, side = rng.uniform(0.1, 0.45) * length, turn * rng.uniform(0.5, 0.9)
+        if not straight:
+            yield rectangle(np.array([root / 2, 0.0]), root, shaft)
+        end = np.array([root + rng.uniform(0.1, 0.3) * length, side])
+        width = np.array([shaft * 1.5, 0.0])
+        start = np.array([root, 0.0])
+        bar = np.array([start - width / 2, start + width / 2, end + width / 2, end - width / 2])
+        yield bar if turn < 0 else bar[::-1]
+        yield np.array([end - (0.6, 0), end + (0, turn * 0.7), end + (0.6, 0)])[::-turn]
+
+
+def _writing(rng: np.random.Generator, lane_m: float) -> Iterator[FloatArray]:
+    """Strokes of letters or digits, drawn out along the lane as road writing is."""
+    letters, tall = int(rng.integers(1, 6)), rng.uniform(1.0, 4.0)
+    wide = min(0.75, 0.8 * lane_m / letters)
+    stroke = rng.uniform(0.12, 0.2) * wide + 0.03
+    for letter in range(letters):
+        right = (letter - (letters - 1) / 2) * wide
+        for _ in range(int(rng.integers(2, 5))):
+            if rng.random() < 0.5:
+                at = np.array([tall / 2, -right + rng.choice([-0.35, 0.0, 0.35]) * wide])
+                yield rectangle(at, tall * rng.choice([0.5, 1.0]), stroke, rng.choice([0.0, 0.08, -0.08]))
+            else:
+                at = np.array([rng.choice([0.04, 0.5, 0.96]) * tall, -right])
+                yield rectangle(at, stroke * 2.2, wide * 0.8)
+
+
+def _junction(rng: np.random.Generator, brush: Brush, bend: Bend, lane_m: float) -> list[Paint]:
+    """A stop line, a crosswalk, teeth or hatching across the way."""
+    along, left = rng.uniform(3, 25), rng.uniform(-5, 2)
+    extent, kind = lane_m * rng.integers(1, 4), rng.integers(4)
+    shapes: list[FloatArray] = []
+    if kind == 0:
+        thick = rng.uniform(0.25, 0.6)
+        shapes = [rectangle(np.array([along, left + extent / 2]), thick, extent)]
+    elif kind == 1:
+        bar, long = rng.uniform(0.35, 0.6), rng.uniform(2, 4.5)
+        shapes = [rectangle(np.array([along, y]), long, bar) for y in np.arange(left, left + extent, 2 * bar)]
+    elif kind == 2:
+        size = rng.uniform(0.4, 0.7)
+        tooth = np.array([[0.0, -0.5], [1.4, 0.0], [0.0, 0.5]]) * size
+        shapes = [tooth + (along, y) for y in np.arange(left, left + extent, 1.6 * size)]
+    else:
+        slope = rng.uniform(0.5, 1.1) * rng.choice([-1, 1])
+        shapes = [
+            rectangle(np.array([x, left]), rng.uniform(1.2, 3.0), rng.uniform(0.15, 0.4), slope)
+            for x in np.arange(along, along + 12, rng.uniform(1.0, 2.0))
+        ]
+    return [brush.paint(rng, OTHER_PAINT, bend.to_map(shape)) for shape in shapes]

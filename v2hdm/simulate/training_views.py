@@ -1,0 +1,110 @@
+"""Random cameras for training: any lens and mounting a vehicle may carry, seen through a small window.
+
+A network reads local detail, so it is trained on small crops at full resolution. A crop is itself a
+pinhole camera, one whose principal point lies anywhere, even outside: no large image is rendered.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from v2hdm.records import CameraInfo, FloatArray
+from v2hdm.simulate.optics import Motion, Optics
+
+
+@dataclass(frozen=True)
+class TrainingView:
+    """A camera, its place (``cam_from_map``, 4 x 4) and what its sensor does."""
+
+    info: CameraInfo
+    cam_from_map: FloatArray
+    optics: Optics
+    motion: Motion
+
+
+def random_view(rng: np.random.Generator, width: int, height: int) -> TrainingView:
+    """A camera near the map's origin, looking roughly along x, whose image is ``width`` x ``height``.
+
+    Focal lengths from 400 to 1500 px, heights from 1.1 to 3.6 m, pitch from level to 28 degrees down, with
+    one in three like the usual camera of a car (level, low, 600 to 1000 px).
+    """
+    car = rng.random() < 0.4
+    focal_px = float(
+        np.exp(rng.uniform(np.log(600), np.log(1000)) if car else rng.uniform(np.log(400), np.log(1500)))
+    )
+    height_m = float(rng.uniform(1.2, 1.9) if car else rng.uniform(1.1, 3.6))
+    pitch = np.deg2rad(
+        rng.uniform(-1.5, 3) if car else rng.uniform(0, 28) if rng.random() < 0.6 else rng.uniform(0, 8)
+    )
+    yaw = np.deg2rad(rng.normal(0, 4) if rng.random() < 0.75 else rng.uniform(-60, 60))
+    roll = np.deg2rad(rng.normal(0, 1.2))
+    info = _crop_camera(rng, width, height, focal_px, pitch)
+    cam_from_map = looking(np.array([0.0, rng.normal(0, 0.6), height_m]), yaw, float(pitch), roll)
+    return TrainingView(info, cam_from_map, _random_optics(rng), _random_motion(rng))
+
+
+def looking(centre_map: FloatArray, yaw_rad: float, pitch_rad: float, roll_rad: float) -> FloatArray:
+    """``cam_from_map`` (4 x 4) of a camera at ``centre_map`` that looks along +x, turned left by yaw,
+    then tilted down by pitch, then rolled about its axis.
+    """
+    cos, sin = np.cos, np.sin
+    forward = np.array([cos(yaw_rad) * cos(pitch_rad), sin(yaw_rad) * cos(pitch_rad), -sin(pitch_rad)])
+    right = np.array([sin(yaw_rad), -cos(yaw_rad), 0.0])
+    down = np.cross(forward, right)
+    rotation = np.stack(
+        [cos(roll_rad) * right + sin(roll_rad) * down, cos(roll_rad) * down - sin(roll_rad) * right, forward]
+    )
+    cam_from_map = np.eye(4)
+    cam_from_map[:3, :3] = rotation
+    cam_from_map[:3, 3] = -rotation @ centre_map
+    return cam_from_map
+
+
+def _crop_camera(
+    rng: np.random.Generator, width: int, height: int, focal_px: float, pitch: float
+) -> CameraInfo:
+    """A window of a larger camera, placed so that its ground, near the horizon more often, is in it."""
+    full_width = focal_px * rng.uniform(1.3, 2.1)
+    left = rng.uniform(0, max(full_width - width, 1))
+    horizon_row = rng.uniform(-0.5, 0.45) * height
+    above_px = focal_px * np.tan(pitch)
+    intrinsic = np.array(
+        [[focal_px, 0, full_width / 2 - left], [0, focal_px, horizon_row + above_px], [0, 0, 1]]
+    )
+    kind = rng.random()
+    if kind < 0.5:
+        return CameraInfo("training", width, height, intrinsic)
+    if kind < 0.9:
+        k1 = rng.uniform(-0.16, 0.04)
+        tangential = rng.normal(0, 5e-4, 2)
+        return CameraInfo(
+            "training", width, height, intrinsic, "plumb_bob", (k1, -0.15 * k1, *tangential, 0.0)
+        )
+    return CameraInfo(
+        "training", width, height, intrinsic, "equidistant", (*rng.normal(0, 0.01, 2), 0.0, 0.0)
+    )
+
+
+def _random_optics(rng: np.random.Generator) -> Optics:
+    return Optics(
+        psf_sigma_px=float(rng.uniform(0.35, 1.1) if rng.random() < 0.85 else rng.uniform(1.1, 1.9)),
+        vignetting=float(rng.uniform(0, 0.35)),
+        mean_level=float(np.exp(rng.uniform(np.log(0.07), np.log(0.45)))),
+        full_well_electrons=float(np.exp(rng.uniform(np.log(1200), np.log(20000)))),
+        read_noise=float(np.exp(rng.uniform(np.log(0.0005), np.log(0.006)))),
+        white_balance_bgr=tuple(float(g) for g in np.exp(rng.normal(0, 0.07, 3))),  # type: ignore[arg-type]
+        grey=bool(rng.random() < 0.12),
+    )
+
+
+def _random_motion(rng: np.random.Generator) -> Motion:
+    if rng.random() < 0.5:
+        return Motion()
+    turn = tuple(float(w) for w in rng.normal(0, 0.08, 3))
+    return Motion(
+        velocity_cam=(0.0, 0.0, float(rng.uniform(1, 14))),
+        angular_velocity_cam=turn,  # type: ignore[arg-type]
+        exposure_s=float(np.exp(rng.uniform(np.log(0.001), np.log(0.015)))),
+    )
