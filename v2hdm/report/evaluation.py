@@ -1,0 +1,76 @@
+"""One run's figures, as they stand in ``metrics.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from v2hdm.records import CORNERED_CLASSES, BoolArray, FloatArray, HdMap, Truth
+from v2hdm.report.dashes import dash_spacing
+from v2hdm.report.lane_metrics import lane_metrics
+from v2hdm.report.metrics import extrinsic_metrics, marking_metrics
+
+
+def map_figures(hd_map: HdMap, truth: Truth | None, expected: BoolArray | None) -> dict[str, Any]:
+    """Figures of one map: against the truth where there is one, counts and dash spacing always."""
+    figures: dict[str, Any] = {"markings": len(hd_map.markings)}
+    if truth is not None and expected is not None:
+        figures |= asdict(marking_metrics(hd_map, truth, expected))
+        figures["by_class"] = {
+            kind: asdict(marking_metrics(hd_map, truth, expected, kind)) for kind in CORNERED_CLASSES
+        }
+    figures["lanes"] = _lane_figures(hd_map, truth)
+    figures["dash_spacing"] = asdict(dash_spacing(hd_map))
+    return figures
+
+
+def extrinsic_figures(estimate: FloatArray, initial: FloatArray, true: FloatArray | None) -> dict[str, float]:
+    """How far an extrinsic (4 x 4) moved from its start and, where known, how far it is from truth.
+
+    The turns are those of the camera about the vehicle's axes (deg): yaw to the left, pitch nose
+    down, roll to the right.
+    """
+    turn_vehicle = estimate[:3, :3].T @ initial[:3, :3]
+    yaw, pitch, roll = Rotation.from_matrix(turn_vehicle).as_euler("ZYX", degrees=True)
+    centres = [-t[:3, :3].T @ t[:3, 3] for t in (estimate, initial)]
+    shift_m = centres[0] - centres[1]
+    figures = {"yaw_change_deg": yaw, "pitch_change_deg": pitch, "roll_change_deg": roll}
+    figures |= {f"{axis}_change_m": float(value) for axis, value in zip("xyz", shift_m, strict=True)}
+    if true is not None:
+        figures |= asdict(extrinsic_metrics(estimate, true))
+    return figures
+
+
+def growth_figures(maps: Sequence[HdMap], truth: Truth) -> list[tuple[int, float]]:
+    """Number of markings and corner RMSE (m) of each of a sequence of growing maps."""
+    nothing = np.zeros(len(truth.map.markings), dtype=bool)
+    found = [(len(m.markings), marking_metrics(m, truth, nothing).corner_rmse_m) for m in maps]
+    return [(count, rmse) for count, rmse in found if np.isfinite(rmse)]
+
+
+def headline(cameras: str, results: Mapping[str, Mapping[str, Any]]) -> str:
+    """What one camera set reached, in one sentence."""
+    best = results.get("Opt", {})
+    start = next((results[m] for m in ("ENI", "CNI") if m in results), {})
+    if "corner_rmse_m" not in best or "corner_rmse_m" not in start:
+        lanes = best.get("lanes", {}).get("lanes", 0)
+        return f"{cameras}: {best.get('markings', 0)} markings, {lanes} lane lines"
+    return (
+        f"{cameras}: corners {100 * start['corner_rmse_m']:.1f} cm off before, "
+        f"{100 * best['corner_rmse_m']:.1f} cm after the optimisation"
+    )
+
+
+def _lane_figures(hd_map: HdMap, truth: Truth | None) -> dict[str, Any]:
+    if truth is not None:
+        return asdict(lane_metrics(hd_map.lanes, truth))
+    return {
+        "lanes": len(hd_map.lanes),
+        "length_m": float(
+            sum(np.linalg.norm(np.diff(lane.points_map, axis=0), axis=1).sum() for lane in hd_map.lanes)
+        ),
+    }
