@@ -1,0 +1,57 @@
+"""A drive on disk to records: one reader a format, one registry of readers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from v2hdm.drive.folder import is_folder_drive, read_folder_drive, write_drive
+from v2hdm.drive.options import KittiOptions, ReadOptions
+from v2hdm.drive.trajectory import Trajectory
+from v2hdm.errors import DriveError
+from v2hdm.records import Drive
+
+__all__ = ["READERS", "KittiOptions", "ReadOptions", "Reader", "Trajectory", "read_drive", "write_drive"]
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One format: ``accepts`` a path by a look at the folder, ``read`` makes a drive of it."""
+
+    accepts: Callable[[Path], bool]
+    read: Callable[[Path, ReadOptions], Drive]
+
+
+READERS: Mapping[str, Reader] = {
+    "folder": Reader(accepts=is_folder_drive, read=read_folder_drive),
+}
+
+
+def read_drive(path: Path, options: ReadOptions | None = None) -> Drive:
+    """Read the drive at ``path`` in whatever format it is.
+
+    Every image gets the vehicle's pose at its time: position linear, rotation slerp, never
+    extrapolated, not across a gap longer than ``options.max_gap_s``; images without a pose are
+    dropped with a logged count. All image files are checked for presence, completeness and size.
+
+    Raises:
+        DriveError: naming what is wrong, where, and what to do about it.
+    """
+    options = options or ReadOptions()
+    if not path.is_dir():
+        raise DriveError(f"{path}: no such drive folder; check drive.path")
+    if options.max_gap_s <= 0:
+        raise DriveError(f"max_gap_s is {options.max_gap_s:g}; give a positive number of seconds")
+    if options.format != "auto":
+        if options.format not in READERS:
+            raise DriveError(
+                f"unknown drive format '{options.format}'; choose from: auto, {', '.join(READERS)}"
+            )
+        return READERS[options.format].read(path, options)
+    for reader in READERS.values():
+        if reader.accepts(path):
+            return reader.read(path, options)
+    raise DriveError(
+        f"{path}: not a drive in any known format ({', '.join(READERS)}); see docs/drive-format.md"
+    )

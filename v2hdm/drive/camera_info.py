@@ -1,0 +1,113 @@
+"""Intrinsics as a ROS ``camera_info`` calibration file (``camera_calibration_parsers``' YAML)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from v2hdm.errors import DriveError
+from v2hdm.files import (
+    check_keys,
+    dump_yaml,
+    load_yaml,
+    replace_text,
+    take_array,
+    take_mapping,
+    take_number,
+    take_text,
+)
+from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo, FloatArray
+
+_REQUIRED = (
+    "image_width",
+    "image_height",
+    "camera_name",
+    "camera_matrix",
+    "distortion_model",
+    "distortion_coefficients",
+)
+# Stereo rectification, which does not concern images as recorded.
+_IGNORED = ("rectification_matrix", "projection_matrix")
+
+
+def read_camera_info(path: Path) -> CameraInfo:
+    """Read the intrinsics at ``path``.
+
+    Raises:
+        DriveError: when the file is missing or damaged, the distortion model is unknown or has
+            another number of coefficients, or the camera matrix is none.
+    """
+    content = load_yaml(path, DriveError)
+    check_keys(content, _REQUIRED, _IGNORED, str(path), DriveError)
+    model = take_text(content["distortion_model"], f"{path}: distortion_model", DriveError)
+    if model not in DISTORTION_COEFFICIENTS:
+        raise DriveError(
+            f"{path}: unknown distortion_model '{model}'; "
+            f"convert the calibration to one of: {', '.join(DISTORTION_COEFFICIENTS)}"
+        )
+    distortion = _take_matrix(content["distortion_coefficients"], f"{path}: distortion_coefficients").ravel()
+    expected = DISTORTION_COEFFICIENTS[model]
+    if len(distortion) != expected:
+        raise DriveError(
+            f"{path}: distortion_coefficients: {model} has {expected} coefficients, got {len(distortion)}; "
+            "complete them (zeros where unused) or name the right model"
+        )
+    return CameraInfo(
+        name=take_text(content["camera_name"], f"{path}: camera_name", DriveError),
+        width=_take_size(content["image_width"], f"{path}: image_width"),
+        height=_take_size(content["image_height"], f"{path}: image_height"),
+        intrinsic=_take_intrinsic(content["camera_matrix"], f"{path}: camera_matrix"),
+        distortion_model=model,
+        distortion=tuple(distortion.tolist()),
+    )
+
+
+def write_camera_info(info: CameraInfo, path: Path) -> None:
+    """Write ``info`` to ``path``, atomically, with the identity as rectification for ROS' sake."""
+    projection = np.column_stack([info.intrinsic, np.zeros(3)])
+    content = {
+        "image_width": info.width,
+        "image_height": info.height,
+        "camera_name": info.name,
+        "camera_matrix": _matrix(info.intrinsic),
+        "distortion_model": info.distortion_model,
+        "distortion_coefficients": _matrix(np.array([info.distortion])),
+        "rectification_matrix": _matrix(np.eye(3)),
+        "projection_matrix": _matrix(projection),
+    }
+    replace_text(path, dump_yaml(content))
+
+
+def _matrix(values: FloatArray) -> dict[str, Any]:
+    return {"rows": values.shape[0], "cols": values.shape[1], "data": values.ravel().tolist()}
+
+
+def _take_matrix(content: object, where: str) -> FloatArray:
+    entry = take_mapping(content, where, DriveError)
+    check_keys(entry, ("rows", "cols", "data"), (), where, DriveError)
+    rows, cols = (_take_size(entry[key], f"{where}, {key}") for key in ("rows", "cols"))
+    data = take_array(entry["data"], (-1,), f"{where}, data", DriveError)
+    if len(data) != rows * cols:
+        raise DriveError(
+            f"{where}: {rows} x {cols} does not fit its {len(data)} numbers; mend rows, cols or data"
+        )
+    return data.reshape(rows, cols)
+
+
+def _take_size(content: object, where: str) -> int:
+    value = take_number(content, where, DriveError)
+    if value != int(value) or value < 1:
+        raise DriveError(f"{where}: expected a positive whole number, got {value:g}; mend it")
+    return int(value)
+
+
+def _take_intrinsic(content: object, where: str) -> FloatArray:
+    intrinsic = _take_matrix(content, where)
+    if intrinsic.shape != (3, 3):
+        raise DriveError(f"{where}: expected 3 x 3, got {intrinsic.shape[0]} x {intrinsic.shape[1]}; mend it")
+    zeros = intrinsic[[0, 1, 2, 2], [1, 0, 0, 1]]
+    if intrinsic[0, 0] <= 0 or intrinsic[1, 1] <= 0 or zeros.any() or intrinsic[2, 2] != 1:
+        raise DriveError(f"{where}: not of the form fx 0 cx, 0 fy cy, 0 0 1 with positive fx, fy; mend it")
+    return intrinsic

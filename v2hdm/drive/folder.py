@@ -1,0 +1,202 @@
+"""The project's own drive folder: TUM poses, ROS camera_info, image lists, one ``drive.yaml``.
+
+docs/drive-format.md describes it for those who want to make one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from v2hdm.drive.camera_info import read_camera_info, write_camera_info
+from v2hdm.drive.images import ImageFiles, check_image_files, pose_images, select_cameras
+from v2hdm.drive.mounting import (
+    IPM_NAMES,
+    choose_initial,
+    describe_prior,
+    ipm_from_guess,
+    take_centre_prior,
+    take_ipm,
+    take_roi,
+)
+from v2hdm.drive.options import ReadOptions
+from v2hdm.drive.trajectory import Trajectory
+from v2hdm.drive.tum import read_image_list, read_tum, write_image_list, write_tum
+from v2hdm.errors import DriveError
+from v2hdm.files import check_keys, dump_yaml, load_yaml, replace_text, take_mapping, take_number, take_text
+from v2hdm.records import Camera, Drive, GeodeticOrigin, PoseNoise
+
+DRIVE_FILE = "drive.yaml"
+POSES_FILE = "poses.tum"
+TRUTH_FOLDER = "truth"
+
+_DRIVE_KEYS = (("cameras",), ("name", "poses", "pose_noise", "origin", "truth"))
+_CAMERA_KEYS = (
+    ("camera_info", "images", "roi_vehicle"),
+    ("linear_response", "initial_ipm", "ipm", "cam_from_vehicle", "centre_prior"),
+)
+
+
+def is_folder_drive(path: Path) -> bool:
+    """Whether ``path`` looks like a drive in this format."""
+    return (path / DRIVE_FILE).is_file()
+
+
+def read_folder_drive(path: Path, options: ReadOptions) -> Drive:
+    """Read the drive at ``path``; see :func:`v2hdm.drive.read_drive`."""
+    where = path / DRIVE_FILE
+    content = load_yaml(where, DriveError)
+    check_keys(content, *_DRIVE_KEYS, str(where), DriveError)
+    entries = take_mapping(content["cameras"], f"{where}: cameras", DriveError)
+    if not entries:
+        raise DriveError(f"{where}: names no camera; add one under 'cameras'")
+    cameras: dict[str, Camera] = {}
+    files: list[ImageFiles] = []
+    for name in select_cameras([str(name) for name in entries], options.cameras, where):
+        place = f"{where}: camera '{name}'"
+        entry = take_mapping(entries[name], place, DriveError)
+        check_keys(entry, *_CAMERA_KEYS, place, DriveError)
+        cameras[name] = _read_camera(entry, path, place)
+        files.append(_list_images(name, path / take_text(entry["images"], f"{place}, images", DriveError)))
+    trajectory = read_tum(path / take_text(content.get("poses", POSES_FILE), f"{where}: poses", DriveError))
+    images = pose_images(files, trajectory, options.max_gap_s, path)
+    check_image_files(images, cameras)
+    return Drive(
+        name=take_text(content.get("name", path.resolve().name), f"{where}: name", DriveError),
+        root=path,
+        cameras=cameras,
+        images=images,
+        pose_noise=_read_pose_noise(content.get("pose_noise"), f"{where}: pose_noise"),
+        origin=_read_origin(content.get("origin"), f"{where}: origin"),
+        truth_dir=_find_truth(content.get("truth"), path, f"{where}: truth"),
+    )
+
+
+def write_drive(folder: Path, drive: Drive, trajectory: Trajectory) -> None:
+    """Write all of a drive but its images, which must lie in ``folder`` already, and its truth.
+
+    ``drive.yaml`` comes last: a folder without it is not a drive yet. Poses come from
+    ``trajectory``, as recorded; those of ``drive.images`` are what a reader will interpolate.
+
+    Args:
+        folder: where to write; image ``<camera>/...`` paths are written relative to its camera.
+        drive: cameras, image paths and times, noise, origin; ``truth_dir``, if any, names a folder
+            within ``folder`` (:func:`v2hdm.drive.truth.write_truth` fills it).
+        trajectory: the recorded poses, at any rate.
+    """
+    entries: dict[str, Any] = {}
+    for name, camera in drive.cameras.items():
+        write_camera_info(camera.info, folder / name / "camera_info.yaml")
+        mine = [image for image in drive.images if image.camera == name]
+        names = [image.path.relative_to(folder / name).as_posix() for image in mine]
+        write_image_list(np.array([image.stamp_s for image in mine]), names, folder / name / "images.txt")
+        entries[name] = _describe_camera(name, camera)
+    write_tum(trajectory, folder / POSES_FILE)
+    content: dict[str, Any] = {
+        "name": drive.name,
+        "poses": POSES_FILE,
+        "pose_noise": asdict(drive.pose_noise),
+    }
+    if drive.origin is not None:
+        content["origin"] = asdict(drive.origin)
+    if drive.truth_dir is not None:
+        content["truth"] = drive.truth_dir.relative_to(folder).as_posix()
+    content["cameras"] = entries
+    replace_text(folder / DRIVE_FILE, dump_yaml(content))
+
+
+def _read_camera(entry: dict[str, Any], root: Path, where: str) -> Camera:
+    info = read_camera_info(root / take_text(entry["camera_info"], f"{where}, camera_info", DriveError))
+    if ("ipm" in entry) == ("cam_from_vehicle" in entry):
+        raise DriveError(f"{where}: give either 'ipm' or 'cam_from_vehicle', one of the two")
+    if "ipm" in entry:
+        matrices = take_mapping(entry["ipm"], f"{where}, ipm", DriveError)
+        check_keys(matrices, (), IPM_NAMES, f"{where}, ipm", DriveError)
+        ipm = {name: take_ipm(matrix, f"{where}, ipm, {name}") for name, matrix in matrices.items()}
+        if not ipm:
+            raise DriveError(f"{where}, ipm: no matrix; give one of: {', '.join(IPM_NAMES)}")
+    else:
+        ipm = {"estimated": ipm_from_guess(info, entry["cam_from_vehicle"], f"{where}, cam_from_vehicle")}
+    linear = entry.get("linear_response", False)
+    if not isinstance(linear, bool):
+        raise DriveError(f"{where}, linear_response: expected true or false, got {linear!r}")
+    prior = entry.get("centre_prior")
+    if prior is not None:
+        prior_where = f"{where}, centre_prior"
+        check_keys(
+            take_mapping(prior, prior_where, DriveError), ("xyz", "sigma_m"), (), prior_where, DriveError
+        )
+    return Camera(
+        info=info,
+        ipm=ipm,
+        initial_ipm=choose_initial(entry.get("initial_ipm"), ipm, where),
+        roi_vehicle=take_roi(entry["roi_vehicle"], f"{where}, roi_vehicle"),
+        centre_prior=None if prior is None else take_centre_prior(prior, f"{where}, centre_prior"),
+        linear_response=linear,
+    )
+
+
+def _list_images(camera: str, path: Path) -> ImageFiles:
+    stamp_s, names = read_image_list(path)
+    return ImageFiles(camera=camera, stamp_s=stamp_s, paths=[path.parent / name for name in names])
+
+
+def _read_pose_noise(content: object, where: str) -> PoseNoise:
+    if content is None:
+        return PoseNoise()
+    entry = take_mapping(content, where, DriveError)
+    check_keys(entry, (), [field.name for field in fields(PoseNoise)], where, DriveError)
+    values = {key: take_number(value, f"{where}, {key}", DriveError) for key, value in entry.items()}
+    for key, value in values.items():
+        if value < 0:
+            raise DriveError(f"{where}, {key}: a standard deviation cannot be negative; mend it")
+    return PoseNoise(**values)
+
+
+def _read_origin(content: object, where: str) -> GeodeticOrigin | None:
+    if content is None:
+        return None
+    entry = take_mapping(content, where, DriveError)
+    check_keys(entry, ("latitude_deg", "longitude_deg", "altitude_m"), ("datum", "epoch"), where, DriveError)
+
+    def number(key: str) -> float:
+        return take_number(entry[key], f"{where}, {key}", DriveError)
+
+    latitude_deg, longitude_deg = number("latitude_deg"), number("longitude_deg")
+    if abs(latitude_deg) > 90 or abs(longitude_deg) > 180:
+        raise DriveError(
+            f"{where}: latitude must lie within +-90 and longitude within +-180 degrees; mend them"
+        )
+    return GeodeticOrigin(
+        latitude_deg=latitude_deg,
+        longitude_deg=longitude_deg,
+        altitude_m=number("altitude_m"),
+        datum=take_text(entry.get("datum", "WGS84"), f"{where}, datum", DriveError),
+        epoch=None if entry.get("epoch") is None else number("epoch"),
+    )
+
+
+def _find_truth(content: object, root: Path, where: str) -> Path | None:
+    if content is None:
+        return None
+    truth_dir = root / take_text(content, where, DriveError)
+    if not truth_dir.is_dir():
+        raise DriveError(f"{where}: no such folder {truth_dir}; restore it or drop the key")
+    return truth_dir
+
+
+def _describe_camera(name: str, camera: Camera) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "camera_info": f"{name}/camera_info.yaml",
+        "images": f"{name}/images.txt",
+        "linear_response": camera.linear_response,
+        "initial_ipm": camera.initial_ipm,
+        "ipm": {key: matrix.tolist() for key, matrix in camera.ipm.items()},
+        "roi_vehicle": camera.roi_vehicle.tolist(),
+    }
+    if camera.centre_prior is not None:
+        entry["centre_prior"] = describe_prior(camera.centre_prior)
+    return entry
