@@ -72,7 +72,7 @@ def _draw_face(
         for a, s, d in zip(box.albedo_bgr, light.sun_bgr, light.sky_bgr, strict=True)
     ]
     for window in windows(view, shape):
-        covered = coverage(view, shape, window)
+        covered = coverage(view, shape, window, grown_px=0.5)
         if not covered.any():
             continue
         tone = _tone(box, face, view, window)
@@ -101,7 +101,7 @@ def _tone(box: Box, face: _Face, view: View, window: Window) -> Float32:
 
 
 def _face_coordinates(face: _Face, view: View, window: Window) -> tuple[Float32, Float32, Float32]:
-    """Metres along the face's first and last edge, and the size of a pixel on it, for each pixel of a window."""
+    """Metres along the face's first and last edge for each pixel of a window, and the size of a pixel."""
     origin, first, last = face.corners_map[0], face.corners_map[1], face.corners_map[3]
     axes = np.column_stack([_unit(first - origin), _unit(last - origin)])
     pinhole_from_face = view.rays.info.intrinsic @ np.column_stack(

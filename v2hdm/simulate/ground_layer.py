@@ -19,8 +19,8 @@ _FARTHEST_M = 400.0
 class GroundField:
     """Ground seen by the image rows from ``first_row`` down, all arrays (H - first_row, W).
 
-    ``x_m``, ``y_m`` are map coordinates, ``depth_m`` runs along the optical axis, ``footprint_m`` is the ground
-    length of a pixel along the ray. Pixels above the horizon have ``below`` False and far, finite values.
+    ``x_m``, ``y_m`` are map coordinates, ``depth_m`` runs along the optical axis, ``footprint_m`` is the
+    ground length of a pixel along the ray. Pixels above the horizon have ``below`` False and are far away.
     """
 
     first_row: int
@@ -49,7 +49,7 @@ def intersect_ground(view: View) -> GroundField | None:
         return None
     first = int(ground_rows[0])
     rows = slice(first, None)
-    depth = np.float32(1.0) / np.maximum(inverse_depth[rows], np.float32(1.0 / _FARTHEST_M))
+    depth = np.reciprocal(np.maximum(inverse_depth[rows], np.float32(1.0 / _FARTHEST_M)))
     x = _plane(view, map_from_ray[0], rows) * depth + np.float32(centre[0])
     y = _plane(view, map_from_ray[1], rows) * depth + np.float32(centre[1])
     footprint = depth * depth * np.float32(1.0 / (info.intrinsic[1, 1] * centre[2]))
@@ -74,6 +74,7 @@ def fine_tile(texture: str) -> Tile:
 
 MEDIUM_TILE = noise_tile(13, 19.0, 1.0)
 COARSE_TILE = noise_tile(14, 83.0, 1.5)
+WET_TILE = noise_tile(19, 47.0, 1.9, finest_px=3.0)
 
 
 def tone(ground: Ground, field: GroundField) -> Float32:
@@ -85,7 +86,7 @@ def tone(ground: Ground, field: GroundField) -> Float32:
     medium = sample(MEDIUM_TILE, field.x_m, field.y_m, shift)
     medium *= fade(MEDIUM_TILE, field.footprint_m) * np.float32(0.6 * ground.stains)
     out += medium
-    out += sample(COARSE_TILE, field.x_m, field.y_m, shift) * np.float32(0.8 * ground.stains)
+    out += _sample_smooth(COARSE_TILE, field, shift) * np.float32(0.8 * ground.stains)
     out += np.float32(1.0)
     np.clip(out, 0.25, 2.5, out=out)
     if ground.slab_m is not None:
@@ -93,6 +94,14 @@ def tone(ground: Ground, field: GroundField) -> Float32:
     if ground.marks is not None:
         _marks(ground.marks, field, out)
     return out
+
+
+def _sample_smooth(tile: Tile, field: GroundField, shift: tuple[float, float]) -> Float32:
+    """A tile of metre-sized features at a quarter of the resolution, enlarged."""
+    small = sample(tile, field.x_m[::4, ::4], field.y_m[::4, ::4], shift)
+    height, width = field.x_m.shape
+    full = cv2.resize(small, (small.shape[1] * 4, small.shape[0] * 4), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(full[:height, :width], dtype=np.float32)
 
 
 def _slabs(ground: Ground, slab_m: tuple[float, float], field: GroundField, out: Float32) -> None:
@@ -130,9 +139,9 @@ def wetness(ground: Ground, field: GroundField) -> Float32 | None:
     """How wet (H, W) the ground is, 0 dry to 1 standing water, or None when it is dry everywhere."""
     if ground.wet_fraction <= 0:
         return None
-    level = float(np.quantile(MEDIUM_TILE.values[::8, ::8], 1.0 - ground.wet_fraction))
-    values = sample(MEDIUM_TILE, field.x_m, field.y_m, _shift(ground.seed + 1))
-    return smoothstep(values, level - 0.15, level + 0.25)
+    level = float(np.quantile(WET_TILE.values[::8, ::8], 1.0 - ground.wet_fraction))
+    values = _sample_smooth(WET_TILE, field, _shift(ground.seed + 1))
+    return smoothstep(values, level - 0.1, level + 0.3)
 
 
 def sun_visibility(

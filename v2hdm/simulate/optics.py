@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from v2hdm.simulate.view import View
 
 _CODE_STEPS = 16384
 _FLOW_STEP_PX = 16
-_NOISE_PX = 1024
+_NOISE_SHIFT_PX = 256
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,16 +54,22 @@ def expose(
     """The recorded image (H, W, 3) uint8 of a scene's radiance (H, W, 3)."""
     image = _motion_blur(radiance, view, motion)
     if optics.psf_sigma_px > 0:
-        image = cv2.GaussianBlur(image, (0, 0), optics.psf_sigma_px)
+        image = _float32(cv2.GaussianBlur(image, (0, 0), optics.psf_sigma_px))
     height, width = image.shape[:2]
     gain = optics.mean_level / max(float(image[height // 3 :: 4, ::4].mean()), 1e-6)
-    vignette = _vignette(height, width, optics.vignetting) * np.float32(gain)
-    image *= vignette[..., None] * np.array(optics.white_balance_bgr, dtype=np.float32)
+    balance = np.diag(gain * np.array(optics.white_balance_bgr)).astype(np.float32)
+    image = _float32(cv2.multiply(cv2.transform(image, balance), _vignette(height, width, optics.vignetting)))
     if optics.grey:
         image = np.repeat(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)[..., None], 3, axis=2)
     image += _noise(image, optics, rng)
-    index = np.clip(image * np.float32(_CODE_STEPS - 1), 0, _CODE_STEPS - 1).astype(np.uint16)
-    return np.asarray(_srgb_codes()[index])
+    image *= np.float32(_CODE_STEPS - 1)
+    np.clip(image, 0, _CODE_STEPS - 1, out=image)
+    return np.asarray(np.take(_srgb_codes(), image.astype(np.uint16)))
+
+
+def _float32(array: NDArray[Any]) -> Float32:
+    """OpenCV's result under the type it has."""
+    return np.asarray(array, dtype=np.float32)
 
 
 def _motion_blur(radiance: Float32, view: View, motion: Motion) -> Float32:
@@ -109,25 +116,24 @@ def _flow(view: View, motion: Motion) -> Float32:
 def _noise(image: Float32, optics: Optics, rng: np.random.Generator) -> Float32:
     """Shot and read noise of an image: a window of a fixed field of normal numbers, placed at random."""
     height, width = image.shape[:2]
-    field = _normal_field()
-    row, column = (int(n) for n in rng.integers(0, _NOISE_PX, 2))
-    rows = (np.arange(height) + row) % _NOISE_PX
-    columns = (np.arange(width) + column) % _NOISE_PX
+    row, column = (int(n) for n in rng.integers(0, _NOISE_SHIFT_PX, 2))
+    field = _normal_field(height + _NOISE_SHIFT_PX, width + _NOISE_SHIFT_PX)
     variance = np.maximum(image, 0)
     variance *= np.float32(1.0 / optics.full_well_electrons)
     variance += np.float32(optics.read_noise**2)
-    return np.asarray(cv2.sqrt(variance) * field[rows[:, None], columns[None]])
+    return np.asarray(cv2.multiply(cv2.sqrt(variance), field[row : row + height, column : column + width]))
 
 
-@cache
-def _normal_field() -> Float32:
-    return np.random.default_rng(20).standard_normal((_NOISE_PX, _NOISE_PX, 3), dtype=np.float32)
+@lru_cache(maxsize=4)
+def _normal_field(height: int, width: int) -> Float32:
+    return np.random.default_rng(20).standard_normal((height, width, 3), dtype=np.float32)
 
 
-@cache
+@lru_cache(maxsize=4)
 def _vignette(height: int, width: int, loss: float) -> Float32:
     v, u = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
-    return np.asarray((1.0 - loss * 0.5 * (u * u + v * v)).astype(np.float32))
+    falloff = (1.0 - loss * 0.5 * (u * u + v * v)).astype(np.float32)
+    return np.ascontiguousarray(np.repeat(falloff[..., None], 3, axis=2))
 
 
 @cache

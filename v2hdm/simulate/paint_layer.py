@@ -14,7 +14,7 @@ from v2hdm.simulate.view import View, coverage, outline, windows
 Labels = NDArray[np.uint8]
 
 _WEAR_TILE = noise_tile(16, 5.0, 0.8, finest_px=0.8)
-_FARTHEST_M = 80.0
+_FARTHEST_M = 70.0
 
 
 class PaintLayer:
@@ -29,8 +29,8 @@ class PaintLayer:
             row[: len(polygon), :2] = polygon
             row[len(polygon) :, :2] = polygon[-1]
 
-    def draw(self, view: View, field: GroundField, albedo: Float32, labels: Labels) -> None:
-        """Paint onto ``albedo`` (H', W, 3) of the ground field; write class indices into ``labels`` (H, W)."""
+    def draw(self, view: View, field: GroundField, albedo: list[Float32], labels: Labels) -> None:
+        """Paint onto the ground field's three planes of ``albedo`` (H', W) and into ``labels`` (H, W)."""
         homogeneous = view.homogeneous_px(self._vertices)
         for index in self._in_view(view, homogeneous):
             paint = self._paints[index]
@@ -45,10 +45,9 @@ class PaintLayer:
                     continue
                 labels[window][covered > 0.5] = label
                 opacity, tone = _opacity(paint, covered, field, part)
-                target = albedo[part]
-                for channel in range(3):
-                    below = target[..., channel]
-                    below += opacity * (tone * np.float32(paint.albedo_bgr[channel]) - below)
+                for plane, reflectance in zip(albedo, paint.albedo_bgr, strict=True):
+                    below = plane[part]
+                    below += opacity * (tone * np.float32(reflectance) - below)
 
     def _in_view(self, view: View, homogeneous: NDArray[np.float64]) -> NDArray[np.intp]:
         depth = homogeneous[..., 2]

@@ -31,9 +31,11 @@ _SHADOW_REACH_M = 120.0
 
 @dataclass(frozen=True)
 class Rendered:
-    """One picture: ``image`` (H, W, 3) uint8 BGR sRGB, ``labels`` (H, W) uint8 with 0 for no paint and
-    1 + the index into :data:`v2hdm.records.PAINT_CLASSES` otherwise (the painted shape, worn or not, where
-    nothing stands in front of it), ``hidden`` (H, W) bool where a box is in front of the ground.
+    """One picture and what it shows.
+
+    ``image`` (H, W, 3) uint8 BGR sRGB; ``labels`` (H, W) uint8, 0 for no paint and otherwise 1 + the index
+    into :data:`v2hdm.records.PAINT_CLASSES` (the painted shape, worn or not, where nothing stands in front
+    of it); ``hidden`` (H, W) bool where a box is in front of the ground.
     """
 
     image: NDArray[np.uint8]
@@ -102,7 +104,7 @@ class Renderer:
     ) -> Float32:
         scene = self.scene
         bare = tone(scene.ground, ground)
-        albedo = cv2.merge([bare * np.float32(c) for c in scene.ground.albedo_bgr])
+        albedo = [bare * np.float32(c) for c in scene.ground.albedo_bgr]
         self._paint.draw(view, ground, albedo, labels)
         near = tuple(b for b in boxes if _distance(b, view) < _SHADOW_REACH_M)
         shadows = scene.shadows + tuple(box_shadow(b, scene.light) for b in near)
@@ -127,25 +129,27 @@ def _distance(box: Box, view: View) -> float:
 
 
 def _lit(
-    albedo: Float32, sun: Float32, wet: Float32 | None, ground: GroundField, view: View, light: Light
+    albedo: list[Float32], sun: Float32, wet: Float32 | None, ground: GroundField, view: View, light: Light
 ) -> Float32:
     """Ground radiance (H', W, 3): Lambert's law under sun and sky; water darkens and mirrors the sky."""
     height = max(light.sun_direction_map[2], 0.0)
-    channels = [
-        sun * np.float32(s * height) + np.float32(d)
-        for s, d in zip(light.sun_bgr, light.sky_bgr, strict=True)
-    ]
-    out = albedo * cv2.merge(channels)
-    if wet is None:
-        return np.asarray(out)
-    grazing = np.float32(view.centre_map[2]) / np.hypot(
-        np.hypot(ground.x_m - np.float32(view.centre_map[0]), ground.y_m - np.float32(view.centre_map[1])),
-        np.float32(view.centre_map[2]),
-    )
-    fresnel = np.float32(0.02) + np.float32(0.98) * (np.float32(1.0) - grazing) ** 5
-    out *= (np.float32(1.0) - np.float32(0.45) * wet)[..., None]
-    mirrored = cv2.merge([fresnel * wet * np.float32(c) for c in light.horizon_bgr])
-    return np.asarray(out + mirrored)
+    mirror = None if wet is None else wet * _fresnel(ground, view)
+    for plane, s, d, horizon in zip(albedo, light.sun_bgr, light.sky_bgr, light.horizon_bgr, strict=True):
+        plane *= sun * np.float32(s * height) + np.float32(d)
+        if wet is not None and mirror is not None:
+            plane *= np.float32(1.0) - np.float32(0.45) * wet
+            plane += mirror * np.float32(horizon)
+    return np.asarray(cv2.merge(albedo), dtype=np.float32)
+
+
+def _fresnel(ground: GroundField, view: View) -> Float32:
+    """Part (H', W) of the sky's light that a rough film of water mirrors (after Schlick 1994)."""
+    centre = view.centre_map.astype(np.float32)
+    range_squared = (ground.x_m - centre[0]) ** 2 + (ground.y_m - centre[1]) ** 2
+    sine = centre[2] / np.sqrt(range_squared + centre[2] ** 2)
+    grazing = np.float32(1.0) - np.maximum(sine, np.float32(0.12))
+    squared = grazing * grazing
+    return np.asarray(np.float32(0.02) + np.float32(0.6) * squared * squared * grazing)
 
 
 def _haze(radiance: Float32, background: Float32, ground: GroundField, last_row: int, haze_m: float) -> None:

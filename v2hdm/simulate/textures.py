@@ -8,7 +8,7 @@ Norton, Rockwood and Skolmoski 1982).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
@@ -25,6 +25,11 @@ class Tile:
 
     values: Float32
     side_m: float
+
+    @cached_property
+    def padded(self) -> Float32:
+        """The values with their first rows and columns repeated behind the last, for interpolation."""
+        return np.pad(self.values, ((0, 2), (0, 2)), mode="wrap")
 
 
 @cache
@@ -63,14 +68,19 @@ def photo_tile(name: str, side_m: float) -> Tile:
 def sample(tile: Tile, x_m: Float32, y_m: Float32, offset_m: tuple[float, float] = (0.0, 0.0)) -> Float32:
     """The tile's values at ground points (H, W), bilinear, repeated endlessly.
 
-    OpenCV saturates map coordinates at 32767, which is why they are first brought near the origin.
+    Coordinates are wrapped here: OpenCV's own wrapping border is four times slower and saturates at 32767.
     """
-    scale = np.float32(tile.values.shape[0] / tile.side_m)
-    base_x = np.floor((float(x_m.flat[0]) + offset_m[0]) / tile.side_m) * tile.side_m - offset_m[0]
-    base_y = np.floor((float(y_m.flat[0]) + offset_m[1]) / tile.side_m) * tile.side_m - offset_m[1]
-    columns = (x_m - np.float32(base_x)) * scale
-    rows = (y_m - np.float32(base_y)) * scale
-    return np.asarray(cv2.remap(tile.values, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
+    columns = _wrapped(x_m, tile.side_m, offset_m[0])
+    rows = _wrapped(y_m, tile.side_m, offset_m[1])
+    return np.asarray(cv2.remap(tile.padded, columns, rows, cv2.INTER_LINEAR), dtype=np.float32)
+
+
+def _wrapped(metres: Float32, side_m: float, offset_m: float) -> Float32:
+    turns = metres * np.float32(1.0 / side_m)
+    turns += np.float32(offset_m / side_m)
+    turns -= np.floor(turns)
+    turns *= np.float32(_TILE_PX)
+    return turns
 
 
 def fade(tile: Tile, footprint_m: Float32, finest_px: float = 4.0) -> Float32:

@@ -20,6 +20,7 @@ from v2hdm.simulate.textures import Float32
 
 _GRID_STEP_PX = 8
 _BAND_ROWS = 32
+_BAND_AREA_PX = 4000
 _NEAR_M = 0.05
 _MARGIN_PX = 4.0
 
@@ -45,8 +46,10 @@ def _rays(width: int, height: int, intrinsic: bytes, model: str, distortion: tup
     grid = np.stack(np.meshgrid(columns, rows), axis=-1)
     shift = (undistort_points(info, grid.reshape(-1, 2)).reshape(grid.shape) - grid).astype(np.float32)
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    shift = cv2.remap(shift, u / _GRID_STEP_PX, v / _GRID_STEP_PX, cv2.INTER_LINEAR)
-    u, v = u + shift[..., 0], v + shift[..., 1]
+    dense = np.asarray(
+        cv2.remap(shift, u / _GRID_STEP_PX, v / _GRID_STEP_PX, cv2.INTER_LINEAR), dtype=np.float32
+    )
+    u, v = u + dense[..., 0], v + dense[..., 1]
     bounds = (float(u.min()), float(v.min()), float(u.max()), float(v.max()))
     return Rays(info, u, v, bounds)
 
@@ -80,8 +83,10 @@ class View:
 
 @dataclass(frozen=True)
 class Outline:
-    """A convex planar polygon as seen: its edges as unit lines (N, 3) positive inside, in pinhole pixels,
-    and its boundary (M, 2) in recorded pixels, clipped to the neighbourhood of the image.
+    """A convex planar polygon as seen.
+
+    ``edges`` (N, 3) are unit lines in pinhole pixels, positive inside; ``boundary_px`` (M, 2) is its
+    boundary in recorded pixels, clipped to the neighbourhood of the image.
     """
 
     edges: FloatArray
@@ -89,19 +94,12 @@ class Outline:
 
 
 def outline(view: View, homogeneous_px: FloatArray) -> Outline | None:
-    """The outline of a polygon given by homogeneous pinhole pixels (N, 3), or None where it is out of view."""
-    clipped = _clip(homogeneous_px, np.array([0.0, 0.0, 1.0]), _NEAR_M)
-    u0, v0, u1, v1 = view.rays.bounds
-    for line in (
-        (1.0, 0.0, _MARGIN_PX - u0),
-        (-1.0, 0.0, u1 + _MARGIN_PX),
-        (0.0, 1.0, _MARGIN_PX - v0),
-        (0.0, -1.0, v1 + _MARGIN_PX),
-    ):
-        clipped = _clip(clipped, np.array(line), 0.0)
-        if len(clipped) < 3:
-            return None
-    edges = np.cross(homogeneous_px, np.roll(homogeneous_px, -1, axis=0))
+    """The outline of a polygon of homogeneous pinhole pixels (N, 3), or None where it is out of view."""
+    clipped = _visible_part(view, homogeneous_px)
+    if len(clipped) < 3:
+        return None
+    following = homogeneous_px[np.arange(1, len(homogeneous_px) + 1) % len(homogeneous_px)]
+    edges = np.cross(homogeneous_px, following)
     norms = np.hypot(edges[:, 0], edges[:, 1])
     edges = edges[norms > 1e-12] / norms[norms > 1e-12, None]
     if len(edges) < 3:
@@ -109,10 +107,31 @@ def outline(view: View, homogeneous_px: FloatArray) -> Outline | None:
     if (edges @ homogeneous_px.mean(axis=0)).sum() < 0:
         edges = -edges
     corners = clipped[:, :2] / clipped[:, 2:]
-    steps = np.linspace(0.0, 1.0, 9)[:-1, None, None]
+    span = float(np.ptp(corners, axis=0).max())
+    steps = np.linspace(0.0, 1.0, 2 + int(min(span / 40.0, 8.0)))[:-1, None, None]
     dense = corners + steps * (np.roll(corners, -1, axis=0) - corners)
     ordered = dense.transpose(1, 0, 2).reshape(-1, 2)
     return Outline(edges, distort_points(view.rays.info, ordered))
+
+
+def _visible_part(view: View, polygon: FloatArray) -> FloatArray:
+    """What is left (M, 3) of a homogeneous polygon in front of the camera and near the image."""
+    u0, v0, u1, v1 = view.rays.bounds
+    limits = np.array(
+        [
+            [0.0, 0.0, 1.0],
+            [1.0, 0.0, _MARGIN_PX - u0],
+            [-1.0, 0.0, u1 + _MARGIN_PX],
+            [0.0, 1.0, _MARGIN_PX - v0],
+            [0.0, -1.0, v1 + _MARGIN_PX],
+        ]
+    )
+    least = (_NEAR_M, 0.0, 0.0, 0.0, 0.0)
+    if (polygon @ limits.T >= least).all():
+        return polygon
+    for line, level in zip(limits, least, strict=True):
+        polygon = _clip(polygon, line, level)
+    return polygon
 
 
 def _clip(polygon: FloatArray, line: FloatArray, least: float) -> FloatArray:
@@ -139,8 +158,10 @@ def windows(view: View, shape: Outline, first_row: int = 0) -> Iterator[Window]:
     following = np.roll(boundary, -1, axis=0)
     top = max(int(np.floor(boundary[:, 1].min())) - 2, first_row)
     bottom = min(int(np.ceil(boundary[:, 1].max())) + 3, height)
-    for row in range(top, bottom, _BAND_ROWS):
-        end = min(row + _BAND_ROWS, bottom)
+    left, right = boundary[:, 0].min(), boundary[:, 0].max()
+    band = _BAND_ROWS if (bottom - top) * (right - left) > _BAND_AREA_PX else max(bottom - top, 1)
+    for row in range(top, bottom, band):
+        end = min(row + band, bottom)
         rise = following[:, 1] - boundary[:, 1]
         with np.errstate(divide="ignore", invalid="ignore"):
             at = np.clip((np.array([[row - 2.0], [end + 2.0]]) - boundary[:, 1]) / rise, 0.0, 1.0)
@@ -149,21 +170,22 @@ def windows(view: View, shape: Outline, first_row: int = 0) -> Iterator[Window]:
         points = points[(points[:, 1] >= row - 2.01) & (points[:, 1] <= end + 2.01)]
         if len(points) == 0:
             continue
-        left = max(int(np.floor(points[:, 0].min())) - 2, 0)
-        right = min(int(np.ceil(points[:, 0].max())) + 3, width)
-        if left < right:
-            yield slice(row, end), slice(left, right)
+        first = max(int(np.floor(points[:, 0].min())) - 2, 0)
+        last = min(int(np.ceil(points[:, 0].max())) + 3, width)
+        if first < last:
+            yield slice(row, end), slice(first, last)
 
 
-def coverage(view: View, shape: Outline, window: Window) -> Float32:
+def coverage(view: View, shape: Outline, window: Window, grown_px: float = 0.0) -> Float32:
     """Fraction (h, w) of every pixel of a window that the outline covers.
 
     An edge covers ``clip(1/2 + d)`` of a pixel at signed distance d. Opposite edges of a quadrilateral add up
     (so a strip narrower than a pixel keeps its area), neighbouring ones multiply; with other numbers of
-    edges what each cuts off is added.
+    edges what each cuts off is added. ``grown_px`` pushes every edge outwards, which closes the seam between
+    faces that share one.
     """
     u, v = view.rays.u_pinhole_px[window], view.rays.v_pinhole_px[window]
-    parts = [_edge_coverage(u, v, edge) for edge in shape.edges]
+    parts = [_edge_coverage(u, v, edge, grown_px) for edge in shape.edges]
     if len(parts) == 4:
         across = np.maximum(parts[0] + parts[2] - np.float32(1.0), 0)
         return np.asarray(across * np.maximum(parts[1] + parts[3] - np.float32(1.0), 0))
@@ -173,9 +195,9 @@ def coverage(view: View, shape: Outline, window: Window) -> Float32:
     return np.asarray(np.maximum(total, 0))
 
 
-def _edge_coverage(u: Float32, v: Float32, edge: FloatArray) -> Float32:
-    a, b, c = (np.float32(x) for x in edge)
+def _edge_coverage(u: Float32, v: Float32, edge: FloatArray, grown_px: float) -> Float32:
+    a, b = np.float32(edge[0]), np.float32(edge[1])
     distance = u * a
     distance += v * b
-    distance += c + np.float32(0.5)
+    distance += np.float32(edge[2] + 0.5 + grown_px)
     return np.asarray(np.clip(distance, 0, 1, out=distance))
