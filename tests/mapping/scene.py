@@ -1,0 +1,247 @@
+"""A made-up yard: diamonds and dashes along a route with turns, and what two cameras see of them.
+
+Everything is drawn from one generator, so a seed names a scene. The truth stays here; the mapping
+gets a :class:`v2hdm.records.Drive` and detections.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from v2hdm.detection.ground import ipm_from_extrinsic
+from v2hdm.detection.lens import distort_points
+from v2hdm.records import (
+    Camera,
+    CameraInfo,
+    CentrePrior,
+    Drive,
+    FloatArray,
+    Image,
+    ImageDetections,
+    LaneDetection,
+    Marking,
+    MarkingDetection,
+    PoseNoise,
+)
+
+OPTICAL_FROM_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+
+@dataclass(kw_only=True)
+class SceneOptions:
+    """What is in the yard and how badly it is seen."""
+
+    seed: int = 0
+    length_m: float = 200.0
+    turns: bool = True
+    step_m: float = 0.9
+    cameras: tuple[str, ...] = ("front", "rear")
+    pixel_sigma: float = 0.25
+    detection_rate: float = 0.92
+    hidden_corner_rate: float = 0.05
+    false_rate: float = 0.01
+    wild_rate: float = 0.01
+    ipm_error_deg: float = 1.5
+    ipm_error_m: float = 0.3
+    jitter_deg: float = 0.1
+    rtk_m: float = 0.01
+    heading_deg: float = 0.05
+    max_range_m: float = 20.0
+    dashes_only: bool = False
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A drive, its detections, and the truth that the mapping must not see."""
+
+    drive: Drive
+    detections: list[ImageDetections]
+    markings: list[Marking]
+    lanes: list[FloatArray]
+    cam_from_vehicle: dict[str, FloatArray]
+
+
+def extrinsic(
+    yaw_deg: float, pitch_deg: float, roll_deg: float, centre: tuple[float, float, float]
+) -> FloatArray:
+    """``cam_from_vehicle`` of a camera at ``centre`` looking along yaw, pitched down."""
+    vehicle_from_body = Rotation.from_euler("ZYX", [yaw_deg, pitch_deg, roll_deg], degrees=True).as_matrix()
+    rotation = OPTICAL_FROM_BODY @ vehicle_from_body.T
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = rotation, -rotation @ np.asarray(centre)
+    return out
+
+
+MOUNTS = {
+    "front": (1.0, 16.0, 0.5, (3.6, 0.1, 2.4)),
+    "rear": (181.0, 18.0, -0.4, (-0.9, -0.1, 2.6)),
+}
+
+
+def make_scene(options: SceneOptions) -> Scene:
+    """Build the yard, drive through it and detect."""
+    rng = np.random.default_rng(options.seed)
+    route = _route(options)
+    markings, lanes = _paint(route, options)
+    truth = {name: extrinsic(*MOUNTS[name]) for name in options.cameras}
+    cameras = {name: _camera(name, truth[name], options, rng) for name in options.cameras}
+    true_poses, recorded = _poses(route, options, rng)
+    images, detections = [], []
+    for j in range(len(recorded)):
+        for name in sorted(options.cameras):
+            images.append(Image(name, 0.2 * j, Path(f"{name}/{j:06d}.jpg"), recorded[j]))
+            seen = _look(cameras[name].info, truth[name], true_poses[j], markings, lanes, options, rng)
+            detections.append(ImageDetections(len(images) - 1, *seen))
+    noise = PoseNoise(
+        max(options.rtk_m, 0.005),
+        max(np.deg2rad(options.heading_deg), 2e-4),
+        max(np.deg2rad(options.jitter_deg), 2e-4),
+    )
+    drive = Drive("yard", Path(), cameras, images, noise)
+    return Scene(drive, detections, markings, lanes, truth)
+
+
+def _route(options: SceneOptions) -> FloatArray:
+    """Poses (J, 3) x, y, heading: straight, a left and a right quarter turn of 12 m radius."""
+    poses, x, y, heading = [], 0.0, 0.0, 0.3
+    for travelled in np.arange(0.0, options.length_m, options.step_m):
+        poses.append((x, y, heading))
+        share = travelled / options.length_m
+        if options.turns and 0.3 < share < 0.3 + 19.0 / options.length_m:
+            heading += options.step_m / 12.0
+        if options.turns and 0.65 < share < 0.65 + 19.0 / options.length_m:
+            heading -= options.step_m / 12.0
+        x += options.step_m * np.cos(heading)
+        y += options.step_m * np.sin(heading)
+    return np.array(poses)
+
+
+def _beside(route: FloatArray, spacing_m: float, lateral_m: float) -> FloatArray:
+    """Poses (N, 3) every ``spacing_m`` along the route, ``lateral_m`` to its left."""
+    step = np.linalg.norm(np.diff(route[:, :2], axis=0), axis=1)
+    at = np.concatenate([[0.0], np.cumsum(step)])
+    s = np.arange(0.0, at[-1], spacing_m)
+    x, y, heading = (np.interp(s, at, route[:, i]) for i in range(3))
+    return np.column_stack([x - lateral_m * np.sin(heading), y + lateral_m * np.cos(heading), heading])
+
+
+def _placed(shape: FloatArray, pose: FloatArray) -> FloatArray:
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return shape @ np.array([[c, s], [-s, c]]) + pose[:2]
+
+
+def _paint(route: FloatArray, options: SceneOptions) -> tuple[list[Marking], list[FloatArray]]:
+    diamond = np.array([[0.6, 0.0], [0.0, 0.3], [-0.6, 0.0], [0.0, -0.3]])
+    dash = np.array([[1.5, -0.075], [1.5, 0.075], [-1.5, 0.075], [-1.5, -0.075]])
+    markings = (
+        []
+        if options.dashes_only
+        else [
+            Marking("diamond", _placed(diamond, pose), 0)
+            for lateral in (1.5, -1.2)
+            for pose in _beside(route, 5.0, lateral)[1:]
+        ]
+    )
+    sides = (1.8, -1.8) if options.dashes_only else (3.2,)
+    markings += [Marking("lane_dash", _placed(dash, p), 0) for d in sides for p in _beside(route, 6.0, d)[1:]]
+    return markings, [_beside(route, 0.5, -3.2)[:, :2]]
+
+
+def _camera(name: str, truth: FloatArray, options: SceneOptions, rng: np.random.Generator) -> Camera:
+    intrinsic = np.array([[900.0, 0, 640], [0, 900, 350], [0, 0, 1]])
+    info = CameraInfo(name, 1280, 720, intrinsic, "plumb_bob", (-0.1, 0.02, 1e-4, -2e-4, 0.0))
+    axis = rng.normal(size=3)
+    turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * np.deg2rad(options.ipm_error_deg)).as_matrix()
+    shift = rng.normal(size=3)
+    centre = -truth[:3, :3].T @ truth[:3, 3]
+    guess = np.eye(4)
+    guess[:3, :3] = turn @ truth[:3, :3]
+    guess[:3, 3] = -guess[:3, :3] @ (centre + shift / np.linalg.norm(shift) * options.ipm_error_m)
+    sign = 1.0 if centre[0] > 1 else -1.0
+    x = centre[0] + sign * np.array([4.5, 13.0, 13.0, 4.5])
+    roi = np.column_stack([x, [-2.0, -4.0, 4.0, 2.0]])
+    prior = CentrePrior(centre + rng.normal(size=3) * 0.02, np.full(3, 0.02))
+    ipms = {"estimated": ipm_from_extrinsic(info, guess), "calibrated": ipm_from_extrinsic(info, truth)}
+    return Camera(info, ipms, "estimated", roi, prior)
+
+
+def _poses(
+    route: FloatArray, options: SceneOptions, rng: np.random.Generator
+) -> tuple[list[FloatArray], list[FloatArray]]:
+    true, recorded = [], []
+    for x, y, heading in route:
+        tilt = rng.normal(size=2) * np.deg2rad(options.jitter_deg)
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_euler("ZYX", [heading, *tilt]).as_matrix()
+        pose[:3, 3] = x, y, rng.normal() * 0.003
+        true.append(pose)
+        noisy = np.eye(4)
+        measured = heading + rng.normal() * np.deg2rad(options.heading_deg)
+        noisy[:3, :3] = Rotation.from_euler("Z", measured).as_matrix()
+        noisy[:2, 3] = np.array([x, y]) + rng.normal(size=2) * options.rtk_m
+        recorded.append(noisy)
+    return true, recorded
+
+
+def _project(info: CameraInfo, cam_from_map: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Recorded pixels (N, 2) and depths (N,) of ground points (N, 2)."""
+    cam = np.column_stack([points, np.zeros(len(points)), np.ones(len(points))]) @ cam_from_map[:3].T
+    depth = np.maximum(cam[:, 2], 1e-3)
+    pinhole = cam[:, :2] / depth[:, None] * [900.0, 900.0] + [640.0, 350.0]
+    seen = (cam[:, 2] > 1) & (np.abs(pinhole - [640, 350]) < [900, 600]).all(axis=1)
+    return distort_points(info, np.where(seen[:, None], pinhole, 0.0)), np.where(seen, cam[:, 2], -1.0)
+
+
+def _inside(px: FloatArray, depth: FloatArray, options: SceneOptions, margin: float = 5.0) -> np.ndarray:
+    inside = (px > margin).all(axis=1) & (px < np.array([1280, 720]) - margin).all(axis=1)
+    return inside & (depth > 0) & (depth < options.max_range_m)
+
+
+def _look(
+    info: CameraInfo,
+    cam_from_vehicle: FloatArray,
+    map_from_vehicle: FloatArray,
+    markings: list[Marking],
+    lanes: list[FloatArray],
+    options: SceneOptions,
+    rng: np.random.Generator,
+) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
+    cam_from_map = cam_from_vehicle @ np.linalg.inv(map_from_vehicle)
+    found = []
+    for marking in markings:
+        if np.linalg.norm(marking.corners_map[0] - map_from_vehicle[:2, 3]) > options.max_range_m + 5:
+            continue
+        px, depth = _project(info, cam_from_map, marking.corners_map)
+        inside = _inside(px, depth, options)
+        if inside.sum() < 2 or rng.random() > options.detection_rate:
+            continue
+        found.append(_detection(marking.kind, px, inside, options, rng))
+    if rng.random() < options.false_rate * 6:
+        px = np.array([640.0, 450.0]) + rng.uniform(-200, 200, 2)
+        quad = np.array([[30.0, 0], [0, -15], [-30, 0], [0, 15]]) * rng.uniform(0.5, 2) + px
+        found.append(_detection("diamond", quad, np.ones(4, bool), options, rng))
+    rows = []
+    for lane in lanes:
+        px, depth = _project(info, cam_from_map, lane)
+        keep = _inside(px, depth, options)
+        if keep.sum() >= 3:
+            noise = rng.normal(size=(int(keep.sum()), 2)) * 2 * options.pixel_sigma
+            near_to_far = np.argsort(depth[keep])
+            rows.append(LaneDetection("lane_line", 0.9, (px[keep] + noise)[near_to_far]))
+    return tuple(found), tuple(rows)
+
+
+def _detection(
+    kind: str, px: FloatArray, inside: np.ndarray, options: SceneOptions, rng: np.random.Generator
+) -> MarkingDetection:
+    noisy = px + rng.normal(size=(4, 2)) * options.pixel_sigma
+    valid = inside & (rng.random(4) > options.hidden_corner_rate)
+    if rng.random() < options.wild_rate:
+        noisy[rng.integers(4)] += rng.normal(size=2) * 8
+    shift = int(rng.integers(4))
+    covariance = np.eye(8) * options.pixel_sigma**2
+    return MarkingDetection(kind, 0.9, np.roll(noisy, shift, axis=0), covariance, np.roll(valid, shift))

@@ -1,0 +1,1 @@
+"""From detections to a map: association, the naive strategy, the joint optimisation, the lanes."""

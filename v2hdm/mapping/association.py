@@ -1,0 +1,99 @@
+"""Which sightings belong together, and where the groups lie."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v2hdm.mapping.location import Located
+from v2hdm.records import BoolArray, FloatArray
+
+IntArray = NDArray[np.int64]
+_Scalar = TypeVar("_Scalar", bound=np.generic)
+
+
+@dataclass(frozen=True)
+class Association:
+    """Groups of sightings: tracks of one camera, or markings of the map.
+
+    ``group`` (S,) numbers groups from 0, -1 for sightings that belong to none; ``shift`` (S,) turns
+    a sighting's corners into its group's order: corner c of the group is corner (c + shift) mod 4
+    of the sighting. ``count`` is the number of groups.
+    """
+
+    group: IntArray
+    shift: IntArray
+    count: int
+
+    def corner_order(self) -> IntArray:
+        """Which of each sighting's corners is corner c of its group (S, 4)."""
+        return np.asarray((np.arange(4) + self.shift[:, None]) % 4)
+
+    def in_group_order(self, per_corner: NDArray[_Scalar]) -> NDArray[_Scalar]:
+        """Reorder the second axis of ``per_corner`` (S, 4, ...) into the order of the groups."""
+        return per_corner[np.arange(len(per_corner))[:, None], self.corner_order()]
+
+
+def keep_rows(association: Association, rows: BoolArray) -> Association:
+    """The association restricted to the sightings marked in ``rows`` (S,), groups renumbered."""
+    kept = rows & (association.group >= 0)
+    numbers, group = np.unique(association.group[kept], return_inverse=True)
+    full = np.full(len(association.group), -1, dtype=np.int64)
+    full[kept] = group
+    return Association(full, association.shift, len(numbers))
+
+
+@dataclass(frozen=True)
+class FusedGroups:
+    """Where G groups lie: ``corners_map`` (G, 4, 2) m with ``covariance_m2`` (G, 4, 2, 2).
+
+    ``seen`` (G, 4) counts the sightings of each corner; where it is 0 the corner is nan.
+    """
+
+    corners_map: FloatArray
+    covariance_m2: FloatArray
+    seen: IntArray
+
+    @property
+    def valid(self) -> BoolArray:
+        """Which corners (G, 4) were seen at all."""
+        return np.asarray(self.seen > 0)
+
+
+def fuse_groups(association: Association, located: Located, jitter_rad: float) -> FusedGroups:
+    """Information-weighted mean of each group's corners, with Huber weights from its own median.
+
+    A sighting's covariance is that of its pixels plus what ``jitter_rad`` of viewing direction
+    makes of it at its range, so that one far sighting cannot ruin the mean of near ones.
+    """
+    corners = association.in_group_order(located.corners_map)
+    valid = association.in_group_order(located.valid) & (association.group >= 0)[:, None]
+    noise = located.covariance_m2 + located.direction_covariance_m2(jitter_rad)
+    covariance = association.in_group_order(noise) + 1e-6 * np.eye(2)
+    information = np.linalg.inv(np.where(valid[..., None, None], covariance, np.eye(2)))
+    corner = np.where(valid, association.group[:, None] * 4 + np.arange(4), association.count * 4)
+    points = np.where(valid[..., None], corners, 0.0)
+    size = association.count * 4 + 1
+    weight = valid.astype(float)
+    for _ in range(3):
+        total = np.zeros((size, 2, 2))
+        vector = np.zeros((size, 2))
+        weighted = information * weight[..., None, None]
+        np.add.at(total, corner, weighted)
+        np.add.at(vector, corner, (weighted @ points[..., None])[..., 0])
+        solvable = np.linalg.det(total) > 0
+        spread = np.linalg.inv(np.where(solvable[:, None, None], total, np.eye(2)))
+        mean = (spread @ vector[..., None])[..., 0]
+        miss = points - mean[corner]
+        distance = np.sqrt(np.maximum(np.einsum("sci,scij,scj->sc", miss, information, miss), 1e-12))
+        weight = valid * np.minimum(1.0, 2.0 / distance)
+    seen = np.bincount(corner.ravel(), minlength=size)[:-1]
+    mean[~solvable] = np.nan
+    return FusedGroups(
+        corners_map=mean[:-1].reshape(-1, 4, 2),
+        covariance_m2=spread[:-1].reshape(-1, 4, 2, 2),
+        seen=seen.reshape(-1, 4).astype(np.int64),
+    )

@@ -1,0 +1,106 @@
+"""Where sightings lie on the ground under given extrinsics and poses, and how certainly."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v2hdm.mapping.backprojection import (
+    apply_homographies,
+    camera_centres,
+    direction_covariance,
+    homography_jacobians,
+    posed_homographies,
+)
+from v2hdm.mapping.sightings import Sightings
+from v2hdm.records import CameraInfo, FloatArray
+
+IntArray = NDArray[np.int64]
+
+# Half the trace of a ground covariance beyond which a point is as good as on the horizon, m^2.
+_HORIZON_M2 = 1e4
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Cameras and frames as the mapping currently believes them to be.
+
+    ``intrinsic`` (C, 3, 3), ``cam_from_vehicle`` (C, 4, 4), ``map_from_vehicle`` (F, 4, 4).
+    """
+
+    intrinsic: FloatArray
+    cam_from_vehicle: FloatArray
+    map_from_vehicle: FloatArray
+
+    @property
+    def height_m(self) -> FloatArray:
+        """Heights (C,) of the camera centres above the ground of the vehicle."""
+        return np.asarray(np.maximum(camera_centres(self.cam_from_vehicle)[:, 2], 0.1))
+
+
+@dataclass(frozen=True)
+class Located:
+    """Ground positions of S sightings.
+
+    ``corners_map`` (S, 4, 2) m with the covariance ``covariance_m2`` (S, 4, 2, 2) that the pixel
+    noise alone gives them; ``ray_map`` (S, 4, 2) from below the camera to the corner; ``height_m``
+    (S,) of the camera. ``valid`` (S, 4) excludes corners that miss the ground.
+    """
+
+    corners_map: FloatArray
+    covariance_m2: FloatArray
+    ray_map: FloatArray
+    height_m: FloatArray
+    valid: NDArray[np.bool_]
+
+    @property
+    def range_m(self) -> FloatArray:
+        """Horizontal distance (S, 4) of each corner from its camera."""
+        return np.asarray(np.linalg.norm(self.ray_map, axis=-1))
+
+    @property
+    def sine_depression(self) -> FloatArray:
+        """Sine (S, 4) of the angle by which each corner's ray points below the horizon."""
+        return np.asarray(self.height_m[:, None] / np.hypot(self.range_m, self.height_m[:, None]))
+
+    def direction_covariance_m2(self, sigma_rad: float) -> FloatArray:
+        """What an uncertain viewing direction adds to ``covariance_m2``: (S, 4, 2, 2)."""
+        return direction_covariance(self.ray_map, self.height_m[:, None], sigma_rad)
+
+
+def build_rig(
+    infos: Mapping[str, CameraInfo], cam_from_vehicle: Mapping[str, FloatArray], map_from_vehicle: FloatArray
+) -> Rig:
+    """Stack cameras in the order of ``infos`` with the frames' poses (F, 4, 4)."""
+    return Rig(
+        intrinsic=np.stack([info.intrinsic for info in infos.values()]),
+        cam_from_vehicle=np.stack([cam_from_vehicle[name] for name in infos]),
+        map_from_vehicle=map_from_vehicle,
+    )
+
+
+def locate(sightings: Sightings, rig: Rig) -> Located:
+    """Back-project every corner of ``sightings`` to z = 0 of the map under ``rig``."""
+    camera, frame = sightings.camera, sightings.frame
+    homographies = posed_homographies(
+        rig.intrinsic[camera], rig.cam_from_vehicle[camera], rig.map_from_vehicle[frame]
+    )
+    corners_map = apply_homographies(homographies, sightings.corners_pinhole_px)
+    jacobian = homography_jacobians(homographies, sightings.corners_pinhole_px)
+    covariance = jacobian @ sightings.covariance_px @ np.swapaxes(jacobian, -1, -2)
+    centre_vehicle = camera_centres(rig.cam_from_vehicle)[camera]
+    poses = rig.map_from_vehicle[frame]
+    centre_map = (poses[:, :3, :3] @ centre_vehicle[..., None])[..., 0] + poses[:, :3, 3]
+    with np.errstate(invalid="ignore"):
+        near = np.trace(covariance, axis1=-2, axis2=-1) < _HORIZON_M2
+    valid = sightings.valid & np.isfinite(corners_map).all(axis=-1) & near
+    return Located(
+        corners_map=corners_map,
+        covariance_m2=covariance,
+        ray_map=corners_map - centre_map[:, None, :2],
+        height_m=np.maximum(centre_map[:, 2], 0.1),
+        valid=valid,
+    )

@@ -1,0 +1,115 @@
+"""What a user may set about the mapping; every default suits a port and a city street alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from v2hdm.errors import ConfigError
+
+
+@dataclass(kw_only=True)
+class AssociationOptions:
+    """How sightings of one marking find each other.
+
+    ``ipm_sigma_rad`` is how wrong the direction of a camera's initial IPM may be (one sigma): it
+    sets how far a marking may seem to move between two images. ``refined_sigma_rad`` is the same
+    once the extrinsic has been optimised. ``gate_sigmas`` is the size of every gate in sigmas and
+    ``max_gate_m`` its limit. A track survives images without a sighting for ``max_gap_m`` of
+    travel. ``shape_tolerance`` is how far corners may deviate from another sighting of the same
+    shape, as a fraction of the marking's diameter. ``naive_merge_m`` is how far apart the naive
+    methods, which know of no uncertainty, may put two tracks of one marking.
+    """
+
+    ipm_sigma_rad: float = 0.015
+    refined_sigma_rad: float = 0.002
+    gate_sigmas: float = 4.0
+    max_gate_m: float = 1.5
+    max_gap_m: float = 4.0
+    shape_tolerance: float = 0.25
+    naive_merge_m: float = 1.0
+
+
+@dataclass(kw_only=True)
+class AcceptanceOptions:
+    """What a marking must show to enter the map.
+
+    ``min_sightings`` images with accepted corners; ``min_inlier_share`` of its corner observations
+    agreeing with the solution; ``min_detection_share`` of the images that had it in easy view, as
+    a share of what is usual for its class; ``max_sigma_m`` for its worst corner; and, where the
+    class has a consensus on its shape (at least ``consensus_count`` markings), sides and diagonals
+    within ``shape_tolerance`` of it or five times the usual scatter, whichever is larger.
+    """
+
+    min_sightings: int = 3
+    min_inlier_share: float = 0.5
+    min_detection_share: float = 0.2
+    max_sigma_m: float = 0.15
+    consensus_count: int = 8
+    shape_tolerance: float = 0.15
+
+
+@dataclass(kw_only=True)
+class LaneOptions:
+    """How lane paint becomes polylines.
+
+    ``max_range_m`` from the camera; ``node_spacing_m`` between the vertices of a polyline;
+    ``half_width_m`` across and ``half_length_m`` along bound the neighbourhood that is averaged;
+    ``max_dash_gap_m`` is the longest gap between two dashes of one line and ``max_break_m`` the
+    longest break in solid paint that is bridged. A piece needs ``min_length_m`` and, at each
+    vertex, ``min_images``.
+    """
+
+    max_range_m: float = 12.0
+    node_spacing_m: float = 0.5
+    half_width_m: float = 0.3
+    half_length_m: float = 0.8
+    max_dash_gap_m: float = 9.0
+    max_break_m: float = 3.0
+    min_length_m: float = 2.0
+    min_images: int = 3
+
+
+@dataclass(kw_only=True)
+class MappingOptions:
+    """Everything about the mapping but the solver's own settings.
+
+    Observations farther than ``max_range_m`` from the camera are left out. ``model_floor_px`` is
+    added to every corner's covariance for what no corner fit knows of: lens, shutter, flatness.
+    ``pose_states`` are the components of each frame's pose that are estimated along with the map
+    (all of ``roll pitch heading x y height``; empty is the paper's model, which trusts the
+    recorded poses). ``loss`` and ``loss_scale`` are the robust loss of the solver.
+    ``rounds`` counts association under the optimised extrinsic followed by a joint solve.
+    """
+
+    max_range_m: float = 16.0
+    model_floor_px: float = 0.15
+    pose_states: list[str] = field(default_factory=lambda: ["roll", "pitch", "heading", "x", "y", "height"])
+    loss: str = "cauchy"
+    loss_scale: float = 2.0
+    rounds: int = 2
+    association: AssociationOptions = field(default_factory=AssociationOptions)
+    acceptance: AcceptanceOptions = field(default_factory=AcceptanceOptions)
+    lanes: LaneOptions = field(default_factory=LaneOptions)
+
+
+def check_options(options: MappingOptions) -> None:
+    """Refuse values that no mapping can work with.
+
+    Raises:
+        ConfigError: A value is out of range; the message names the key.
+    """
+    positive = {
+        "max_range_m": options.max_range_m,
+        "rounds": options.rounds,
+        "association.ipm_sigma_rad": options.association.ipm_sigma_rad,
+        "association.refined_sigma_rad": options.association.refined_sigma_rad,
+        "association.gate_sigmas": options.association.gate_sigmas,
+        "association.max_gate_m": options.association.max_gate_m,
+        "acceptance.min_sightings": options.acceptance.min_sightings,
+        "lanes.node_spacing_m": options.lanes.node_spacing_m,
+        "lanes.half_width_m": options.lanes.half_width_m,
+        "lanes.half_length_m": options.lanes.half_length_m,
+    }
+    for key, value in positive.items():
+        if not value > 0:
+            raise ConfigError(f"mapping.{key} is {value}; it must be greater than zero.")

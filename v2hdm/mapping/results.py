@@ -1,0 +1,38 @@
+"""What a mapping method hands back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from v2hdm.records import Calibration, FloatArray, HdMap
+
+
+@dataclass(frozen=True)
+class Exclusion:
+    """One candidate marking that did not enter the map: what, where (2,) in the map, and why."""
+
+    kind: str
+    position_map: FloatArray
+    sightings: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """The outcome of one method on one set of cameras.
+
+    ``calibrations`` are per camera, empty where the method only has an IPM. ``reprojection_rmse_px``
+    (and ``initial_reprojection_rmse_px``, under the extrinsic the optimisation started from) are
+    over the same accepted corner observations; None for methods that do not reproject.
+    ``diagnostics`` are named figures for the log and the report.
+    """
+
+    name: str
+    cameras: tuple[str, ...]
+    hd_map: HdMap
+    calibrations: Mapping[str, Calibration] = field(default_factory=dict)
+    excluded: tuple[Exclusion, ...] = ()
+    reprojection_rmse_px: float | None = None
+    initial_reprojection_rmse_px: float | None = None
+    diagnostics: Mapping[str, float] = field(default_factory=dict)

@@ -1,0 +1,166 @@
+"""Detections as one table of arrays: what every later step of the mapping works on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v2hdm.detection.lens import has_distortion, undistort_points
+from v2hdm.errors import MappingError
+from v2hdm.records import (
+    CORNERED_CLASSES,
+    BoolArray,
+    Camera,
+    CameraInfo,
+    Drive,
+    FloatArray,
+    ImageDetections,
+)
+
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """S quadrilateral detections of a drive, in the order of its images.
+
+    ``image`` indexes ``Drive.images``, ``camera`` indexes ``cameras``, ``frame`` indexes the
+    F distinct time stamps whose recorded poses are ``map_from_vehicle`` (F, 4, 4), so that images
+    taken together share a frame. ``kind`` indexes :data:`v2hdm.records.CORNERED_CLASSES`.
+    ``corners_pinhole_px`` (S, 4, 2) have covariances ``covariance_px`` (S, 4, 2, 2), px^2;
+    ``valid`` (S, 4) says which of them may be used.
+    """
+
+    cameras: tuple[str, ...]
+    map_from_vehicle: FloatArray
+    image: IntArray
+    camera: IntArray
+    frame: IntArray
+    kind: IntArray
+    corners_pinhole_px: FloatArray
+    covariance_px: FloatArray
+    valid: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.image)
+
+    def subset(self, rows: IntArray | BoolArray) -> Sightings:
+        """The sightings at ``rows`` (indices or a mask), over the same cameras and frames."""
+        return Sightings(
+            cameras=self.cameras,
+            map_from_vehicle=self.map_from_vehicle,
+            image=self.image[rows],
+            camera=self.camera[rows],
+            frame=self.frame[rows],
+            kind=self.kind[rows],
+            corners_pinhole_px=self.corners_pinhole_px[rows],
+            covariance_px=self.covariance_px[rows],
+            valid=self.valid[rows],
+        )
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The distinct time stamps of a drive.
+
+    ``frame_of_image`` (I,) indexes ``map_from_vehicle`` (F, 4, 4), the recorded poses.
+    """
+
+    frame_of_image: IntArray
+    map_from_vehicle: FloatArray
+
+
+def frames_of(drive: Drive) -> Frames:
+    """Number the distinct time stamps of ``drive``; images of one stamp share a frame."""
+    stamps_s = np.array([image.stamp_s for image in drive.images])
+    _, first, inverse = np.unique(stamps_s, return_index=True, return_inverse=True)
+    poses = np.stack([drive.images[i].map_from_vehicle for i in first])
+    return Frames(frame_of_image=inverse.astype(np.int64), map_from_vehicle=poses.astype(np.float64))
+
+
+def collect_sightings(
+    drive: Drive, detections: Sequence[ImageDetections], cameras: Sequence[str]
+) -> Sightings:
+    """Put the quadrilateral detections of ``cameras`` into one table, lens distortion removed.
+
+    Raises:
+        MappingError: The drive has no such camera, or its images hold no usable marking.
+    """
+    camera_index = _camera_index(drive, cameras)
+    frames = frames_of(drive)
+    rows = [
+        (found.image, marking)
+        for found in sorted(detections, key=lambda one: one.image)
+        if drive.images[found.image].camera in camera_index
+        for marking in found.markings
+        if marking.kind in CORNERED_CLASSES and np.count_nonzero(marking.corner_valid) >= 2
+    ]
+    if not rows:
+        raise MappingError(
+            f"no marking was found in the images of {', '.join(cameras)} of drive {drive.name}; check "
+            "that the detector knows this kind of paint and that the images show it within range."
+        )
+    image = np.array([i for i, _ in rows], dtype=np.int64)
+    camera = np.array([camera_index[drive.images[i].camera] for i in image], dtype=np.int64)
+    corners = np.stack([marking.corners_px for _, marking in rows]).astype(np.float64)
+    covariance = np.stack([_corner_blocks(marking.covariance_px) for _, marking in rows])
+    for name, c in camera_index.items():
+        own = camera == c
+        corners[own], covariance[own] = _undistort(drive.cameras[name].info, corners[own], covariance[own])
+    valid = np.stack([marking.corner_valid for _, marking in rows]).astype(bool)
+    valid &= np.isfinite(corners).all(axis=2) & np.isfinite(covariance).all(axis=(2, 3))
+    return Sightings(
+        cameras=tuple(cameras),
+        map_from_vehicle=frames.map_from_vehicle,
+        image=image,
+        camera=camera,
+        frame=frames.frame_of_image[image],
+        kind=np.array([CORNERED_CLASSES.index(m.kind) for _, m in rows], dtype=np.int64),
+        corners_pinhole_px=corners,
+        covariance_px=covariance,
+        valid=valid,
+    )
+
+
+def camera_of(drive: Drive, name: str) -> Camera:
+    """The camera ``name`` of ``drive``.
+
+    Raises:
+        MappingError: The drive has no such camera.
+    """
+    if name not in drive.cameras:
+        known = ", ".join(drive.cameras)
+        raise MappingError(f"drive {drive.name} has no camera {name!r}; choose among {known}.")
+    return drive.cameras[name]
+
+
+def _camera_index(drive: Drive, cameras: Sequence[str]) -> dict[str, int]:
+    for name in cameras:
+        camera_of(drive, name)
+    return {name: c for c, name in enumerate(cameras)}
+
+
+def _corner_blocks(covariance_px: FloatArray) -> FloatArray:
+    """The four 2 x 2 diagonal blocks of an 8 x 8 corner covariance."""
+    blocks = np.asarray(covariance_px, dtype=np.float64).reshape(4, 2, 4, 2)
+    return blocks[range(4), :, range(4), :]
+
+
+def _undistort(
+    info: CameraInfo, corners_px: FloatArray, covariance_px: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Corners (S, 4, 2) and covariances (S, 4, 2, 2) moved from recorded to pinhole pixels."""
+    if not has_distortion(info):
+        return corners_px, covariance_px
+    step_px = 0.5
+    flat = corners_px.reshape(-1, 2)
+    columns = [
+        undistort_points(info, flat + step) - undistort_points(info, flat - step)
+        for step in (np.array([step_px, 0.0]), np.array([0.0, step_px]))
+    ]
+    jacobian = np.stack(columns, axis=2).reshape(*corners_px.shape, 2) / (2 * step_px)
+    moved = jacobian @ covariance_px @ np.swapaxes(jacobian, -1, -2)
+    return undistort_points(info, flat).reshape(corners_px.shape), moved

@@ -1,0 +1,198 @@
+"""Sightings of one marking, linked from image to image of one camera.
+
+A wrong IPM puts every marking in the wrong place, metres off at range, but in nearly the same wrong
+place in two consecutive images. So sightings are first linked along the drive, with a gate that
+grows with the motion between the images, and only later compared across gaps, laps and cameras.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from v2hdm.mapping.association import Association
+from v2hdm.mapping.location import Located, Rig
+from v2hdm.mapping.options import AssociationOptions
+from v2hdm.mapping.shapes import align, diameters
+from v2hdm.mapping.sightings import Sightings
+from v2hdm.records import BoolArray, FloatArray
+
+IntArray = NDArray[np.int64]
+
+_REFUSED = 1e9
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """What the gates allow for.
+
+    ``direction_rad`` is how wrong an extrinsic's direction may be, ``jitter_rad`` how far roll and
+    pitch stray from their poses from frame to frame, ``position_m`` the noise of the positions.
+    """
+
+    direction_rad: float
+    jitter_rad: float
+    position_m: float
+
+
+@dataclass
+class _Track:
+    """The latest state of one track: ``row`` of its last sighting, corners in the track's order."""
+
+    number: int
+    row: int
+    corners_map: FloatArray
+    valid: BoolArray
+
+    def extend(self, row: int, shift: int, located: Located) -> None:
+        """Take in the sighting at ``row``, whose corners are ``shift`` behind the track's."""
+        corners = np.roll(located.corners_map[row], -shift, axis=0)
+        valid = np.roll(located.valid[row], -shift)
+        self.corners_map[valid] = corners[valid]
+        self.valid |= valid
+        self.row = row
+
+
+def build_tracks(
+    sightings: Sightings, located: Located, rig: Rig, uncertainty: Uncertainty, options: AssociationOptions
+) -> Association:
+    """Link the ``sightings``, in image order and ``located`` under ``rig``, camera by camera.
+
+    A sighting continues at most one track and a track takes at most one sighting of an image. A
+    sighting that continues none starts its own. Sightings with fewer than two valid corners on the
+    ground belong to no track.
+    """
+    group = np.full(len(sightings), -1, dtype=np.int64)
+    shift = np.zeros(len(sightings), dtype=np.int64)
+    linker = _Linker(sightings, located, rig, uncertainty, options)
+    count = 0
+    for camera in range(len(sightings.cameras)):
+        rows_of_camera = np.flatnonzero((sightings.camera == camera) & (located.valid.sum(axis=1) >= 2))
+        images = np.flatnonzero(np.diff(sightings.image[rows_of_camera], prepend=-1) != 0)
+        active: list[_Track] = []
+        for rows in np.split(rows_of_camera, images[1:]):
+            if not len(rows):
+                continue
+            active = [track for track in active if linker.is_alive(track, rows[0])]
+            continued = linker.match(active, rows)
+            for row in rows.tolist():
+                if row in continued:
+                    track, shift[row] = continued[row]
+                    track.extend(row, int(shift[row]), located)
+                else:
+                    track = _Track(count, row, located.corners_map[row].copy(), located.valid[row].copy())
+                    active.append(track)
+                    count += 1
+                group[row] = track.number
+    return Association(group, shift, count)
+
+
+class _Linker:
+    """Matches the sightings of one image with the tracks that are alive."""
+
+    def __init__(
+        self,
+        sightings: Sightings,
+        located: Located,
+        rig: Rig,
+        uncertainty: Uncertainty,
+        options: AssociationOptions,
+    ) -> None:
+        self._sightings = sightings
+        self._located = located
+        self._uncertainty = uncertainty
+        self._options = options
+        pose = rig.map_from_vehicle
+        steps_m = np.linalg.norm(np.diff(pose[:, :2, 3], axis=0), axis=1)
+        self._odometer_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+        self._heading_rad = np.unwrap(np.arctan2(pose[:, 1, 0], pose[:, 0, 0]))
+        self._noise_m2 = _noise_covariances(located, uncertainty)
+        self._ray_map, self._range_m = _mean_rays(located)
+
+    def is_alive(self, track: _Track, row: int) -> bool:
+        """Whether ``track`` may still be continued by the sighting at ``row``."""
+        now, last = self._sightings.frame[[row, track.row]]
+        return bool(self._odometer_m[now] - self._odometer_m[last] <= self._options.max_gap_m)
+
+    def match(self, tracks: list[_Track], rows: IntArray) -> dict[int, tuple[_Track, int]]:
+        """For each row that continues a track: the track and the shift of the row's corners."""
+        if not tracks:
+            return {}
+        last = np.array([track.row for track in tracks])
+        corners = np.stack([track.corners_map for track in tracks])
+        valid = np.stack([track.valid for track in tracks])
+        found = align(
+            corners[:, None], valid[:, None], self._located.corners_map[rows], self._located.valid[rows]
+        )
+        cost = self._mahalanobis2(found.offset, last, rows)
+        shape = found.deformation_m / self._shape_tolerance_m(corners, valid)
+        gate = self._options.gate_sigmas**2
+        refused = (
+            (self._sightings.kind[last][:, None] != self._sightings.kind[rows])
+            | (cost > gate)
+            | (np.linalg.norm(found.offset, axis=-1) > self._options.max_gate_m)
+            | (shape > 1.0)
+        )
+        cost = np.where(refused, _REFUSED, cost + shape**2)
+        picked = zip(*linear_sum_assignment(cost), strict=True)
+        return {int(rows[d]): (tracks[t], int(found.shift[t, d])) for t, d in picked if cost[t, d] < _REFUSED}
+
+    def _shape_tolerance_m(self, corners: FloatArray, valid: BoolArray) -> FloatArray:
+        size_m = diameters(corners, valid)[:, None]
+        return np.asarray(np.maximum(self._options.shape_tolerance * size_m, 0.05))
+
+    def _mahalanobis2(self, offset: FloatArray, last: IntArray, rows: IntArray) -> FloatArray:
+        """Squared normalised displacements (T, D) between tracks' last sightings and ``rows``."""
+        noise = self._noise_m2[last][:, None] + self._noise_m2[rows][None]
+        covariance = noise + self._drift_covariance(last, rows)
+        solved = np.linalg.solve(covariance, offset[..., None])[..., 0]
+        return np.asarray(np.sum(offset * solved, axis=-1))
+
+    def _drift_covariance(self, last: IntArray, rows: IntArray) -> FloatArray:
+        """What a wrong extrinsic adds between two images (T, D, 2, 2).
+
+        The error along the ray is r^2 / h * d and one across it r * d; between the images both
+        change by their derivative times the motion, and the turn of the vehicle swings the first.
+        """
+        frame = self._sightings.frame
+        moved_m = np.abs(self._odometer_m[frame[rows]][None] - self._odometer_m[frame[last]][:, None])
+        turned = np.abs(self._heading_rad[frame[rows]][None] - self._heading_rad[frame[last]][:, None])
+        height_m = self._located.height_m[rows][None]
+        range_m = self._range_m[rows][None]
+        direction = self._uncertainty.direction_rad
+        along_m = direction * (1.0 + 2.0 * range_m / height_m) * (moved_m + range_m * turned)
+        across_m = direction * (moved_m + range_m * turned + range_m**2 / height_m * turned)
+        return _ray_covariance(self._ray_map[rows][None], along_m, across_m)
+
+
+def _mean_rays(located: Located) -> tuple[FloatArray, FloatArray]:
+    """Mean ray (S, 2) and its length (S,) over each sighting's valid corners."""
+    weight = located.valid / np.maximum(located.valid.sum(axis=1, keepdims=True), 1)
+    ray = np.sum(np.where(located.valid[..., None], located.ray_map, 0.0) * weight[..., None], axis=1)
+    return ray, np.linalg.norm(ray, axis=1)
+
+
+def _noise_covariances(located: Located, uncertainty: Uncertainty) -> FloatArray:
+    """Covariance (S, 2, 2) of a sighting's mean position: pixels, jitter and position noise."""
+    ray, range_m = _mean_rays(located)
+    height_m = located.height_m
+    jitter_m = uncertainty.jitter_rad * (range_m**2 + height_m**2) / height_m
+    weight = located.valid / np.maximum(located.valid.sum(axis=1, keepdims=True), 1)
+    pixels = np.sum(
+        np.where(located.valid[..., None, None], located.covariance_m2, 0.0) * weight[..., None, None], axis=1
+    )
+    spread = _ray_covariance(ray, jitter_m, uncertainty.jitter_rad * range_m)
+    # A floor of 2 cm keeps the gate from collapsing where the stated noise is nil.
+    return np.asarray(pixels + spread + (uncertainty.position_m**2 + 0.02**2) * np.eye(2))
+
+
+def _ray_covariance(ray: FloatArray, along_m: FloatArray, across_m: FloatArray) -> FloatArray:
+    """Covariances (..., 2, 2) with the given sigmas along and across ``ray`` (..., 2)."""
+    along = ray / np.maximum(np.linalg.norm(ray, axis=-1, keepdims=True), 1e-9)
+    outer = along[..., :, None] * along[..., None, :]
+    return np.asarray(
+        along_m[..., None, None] ** 2 * outer + across_m[..., None, None] ** 2 * (np.eye(2) - outer)
+    )
