@@ -13,7 +13,8 @@ import numpy as np
 from v2hdm.records import DIAMOND, LANE_DASH, LANE_LINE, OTHER_PAINT, FloatArray
 from v2hdm.simulate.scene import WHITE_PAINT, YELLOW_PAINT, Bgr, Paint
 
-FAR_M = 65.0
+FAR_M = 50.0
+_DIAMONDS_FAR_M = 32.0
 _NEAR_M = -4.0
 
 
@@ -57,7 +58,7 @@ class Brush:
 def random_brush(rng: np.random.Generator, difficulty: float) -> Brush:
     """White or yellow paint, the more worn and dirty the higher ``difficulty`` (0 to 1) is."""
     colour = np.array(WHITE_PAINT if rng.random() < 0.82 else YELLOW_PAINT)
-    colour = colour * rng.uniform(0.65, 1.15) * np.exp(rng.normal(0, 0.03, 3))
+    colour = colour * rng.uniform(0.78, 1.15) * np.exp(rng.normal(0, 0.03, 3))
     worn = difficulty * rng.beta(1.2, 3.0)
     return Brush(tuple(float(c) for c in colour), float(0.6 * worn), float(rng.uniform(0, 0.45) * difficulty))  # type: ignore[arg-type]
 
@@ -115,7 +116,7 @@ def port_paint(rng: np.random.Generator, brush: Brush, bend: Bend) -> list[Paint
     paints: list[Paint] = []
     for column in range(columns):
         left = (column - (columns - 1) / 2) * across_m + rng.normal(0, 0.4)
-        for along in np.arange(_NEAR_M + rng.uniform(0, pitch_m), 45.0, pitch_m):
+        for along in np.arange(_NEAR_M + rng.uniform(0, pitch_m), _DIAMONDS_FAR_M, pitch_m):
             centre = bend.to_map(np.array([along, left]) + rng.normal(0, jitter, 2))
             shape = rhombus(centre, length_m, width_m, yaw + along * bend.curvature)
             paints.append(brush.paint(rng, DIAMOND, shape))
@@ -192,9 +193,9 @@ def _lane_symbols(
     """An arrow or a line of writing in a lane, perhaps repeated."""
     draw = _arrow if rng.random() < 0.6 else _writing
     out: list[Paint] = []
-    for along in np.arange(rng.uniform(1, 14), 40, rng.uniform(9, 30)):
+    for along in np.arange(rng.uniform(1, 12), 32, rng.uniform(9, 30)):
         for polygon in draw(rng, lane_m):
-            placed = bend.to_map(polygon + (along, left))
+            placed = bend.to_map(polygon + np.array([along, left]))
             out.append(brush.paint(rng, OTHER_PAINT, placed))
     return out
 
@@ -217,7 +218,7 @@ def _arrow(rng: np.random.Generator, lane_m: float) -> Iterator[FloatArray]:
         start = np.array([root, 0.0])
         bar = np.array([start - width / 2, start + width / 2, end + width / 2, end - width / 2])
         yield bar if turn < 0 else bar[::-1]
-        yield np.array([end - (0.6, 0), end + (0, turn * 0.7), end + (0.6, 0)])[::-turn]
+        yield end + np.array([[-0.6, 0.0], [0.0, turn * 0.7], [0.6, 0.0]])[::-turn]
 
 
 def _writing(rng: np.random.Generator, lane_m: float) -> Iterator[FloatArray]:
@@ -250,7 +251,7 @@ def _junction(rng: np.random.Generator, brush: Brush, bend: Bend, lane_m: float)
     elif kind == 2:
         size = rng.uniform(0.4, 0.7)
         tooth = np.array([[0.0, -0.5], [1.4, 0.0], [0.0, 0.5]]) * size
-        shapes = [tooth + (along, y) for y in np.arange(left, left + extent, 1.6 * size)]
+        shapes = [tooth + np.array([along, y]) for y in np.arange(left, left + extent, 1.6 * size)]
     else:
         slope = rng.uniform(0.5, 1.1) * rng.choice([-1, 1])
         shapes = [

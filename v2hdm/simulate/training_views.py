@@ -46,8 +46,9 @@ def random_view(rng: np.random.Generator, width: int, height: int) -> TrainingVi
 
 
 def looking(centre_map: FloatArray, yaw_rad: float, pitch_rad: float, roll_rad: float) -> FloatArray:
-    """``cam_from_map`` (4 x 4) of a camera at ``centre_map`` that looks along +x, turned left by yaw,
-    then tilted down by pitch, then rolled about its axis.
+    """``cam_from_map`` (4 x 4) of a camera at ``centre_map`` (3,).
+
+    It looks along +x, turned left by yaw, then tilted down by pitch, then rolled about its axis.
     """
     cos, sin = np.cos, np.sin
     forward = np.array([cos(yaw_rad) * cos(pitch_rad), sin(yaw_rad) * cos(pitch_rad), -sin(pitch_rad)])
@@ -68,7 +69,7 @@ def _crop_camera(
     """A window of a larger camera, placed so that its ground, near the horizon more often, is in it."""
     full_width = focal_px * rng.uniform(1.3, 2.1)
     left = rng.uniform(0, max(full_width - width, 1))
-    horizon_row = rng.uniform(-0.5, 0.45) * height
+    horizon_row = rng.uniform(-0.35, 0.45) * height
     above_px = focal_px * np.tan(pitch)
     intrinsic = np.array(
         [[focal_px, 0, full_width / 2 - left], [0, focal_px, horizon_row + above_px], [0, 0, 1]]
@@ -91,7 +92,7 @@ def _random_optics(rng: np.random.Generator) -> Optics:
     return Optics(
         psf_sigma_px=float(rng.uniform(0.35, 1.1) if rng.random() < 0.85 else rng.uniform(1.1, 1.9)),
         vignetting=float(rng.uniform(0, 0.35)),
-        mean_level=float(np.exp(rng.uniform(np.log(0.07), np.log(0.45)))),
+        mean_level=float(np.exp(rng.uniform(np.log(0.1), np.log(0.36)))),
         full_well_electrons=float(np.exp(rng.uniform(np.log(1200), np.log(20000)))),
         read_noise=float(np.exp(rng.uniform(np.log(0.0005), np.log(0.006)))),
         white_balance_bgr=tuple(float(g) for g in np.exp(rng.normal(0, 0.07, 3))),  # type: ignore[arg-type]

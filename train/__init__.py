@@ -1,0 +1,1 @@
+"""`python -m train`: renders in, checkpoint out; see train/README.md."""

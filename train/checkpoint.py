@@ -1,0 +1,90 @@
+"""Checkpoints: one file that a training resumes from and an export starts from."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from models import MarkingNet, NetConfig
+from train.config import TrainConfig
+from v2hdm.errors import ConfigError
+
+# What may differ between the parts of a resumed run without making it another experiment.
+_FREE_TO_CHANGE = (
+    "output",
+    "device",
+    "minutes",
+    "steps",
+    "threads",
+    "checkpoint_minutes",
+    "resume",
+    "validation",
+)
+
+
+@dataclass
+class Checkpoint:
+    """State of a training. ``averaged`` are the weights to use, ``metrics`` what they scored last.
+
+    ``config`` is the :class:`TrainConfig` as a dict. Everything is plain data and tensors, so that a file is
+    read without running code from it.
+    """
+
+    config: dict[str, Any]
+    step: int = 0
+    renders: int = 0
+    elapsed_s: float = 0.0
+    model: dict[str, Tensor] = field(default_factory=dict)
+    averaged: dict[str, Tensor] = field(default_factory=dict)
+    optimizer: dict[str, Any] = field(default_factory=dict)
+    metrics: dict[str, float] = field(default_factory=dict)
+    best_iou: float = 0.0
+
+    def network(self) -> MarkingNet:
+        """The network with the averaged weights, in eval mode."""
+        net = MarkingNet(NetConfig(**self.config["net"]))
+        net.load_state_dict(self.averaged)
+        return net.eval()
+
+
+def save_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
+    """Write a checkpoint; a kill leaves the one before it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial")
+    torch.save(vars(checkpoint), partial)
+    partial.replace(path)
+
+
+def load_checkpoint(path: Path) -> Checkpoint:
+    """Read a checkpoint onto the CPU.
+
+    Raises:
+        ConfigError: There is none at ``path`` or it is damaged.
+    """
+    if not path.is_file():
+        raise ConfigError(f"no checkpoint at {path}: train one with `python -m train`, or name another")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        return Checkpoint(**content)
+    except Exception as error:
+        raise ConfigError(
+            f"{path} is no checkpoint of `python -m train`: {error!s:.120}".replace("\n", " ")
+        ) from error
+
+
+def check_same_experiment(checkpoint: Checkpoint, config: TrainConfig, path: Path) -> None:
+    """Refuse to go on with a run under settings that would make it another one.
+
+    Raises:
+        ConfigError: Naming the settings that differ.
+    """
+    then, now = checkpoint.config, asdict(config)
+    changed = [key for key in now if key not in _FREE_TO_CHANGE and then.get(key) != now[key]]
+    if changed:
+        raise ConfigError(
+            f"{path} was trained with another {', '.join(changed)}: set it back, or choose a new `output`"
+        )

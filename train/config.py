@@ -1,0 +1,70 @@
+"""What can be set about a training; `conf/train.yaml` holds the values that are used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from models import NetConfig
+
+
+@dataclass(kw_only=True)
+class DataConfig:
+    """The stream of renders.
+
+    Each render of ``render_width`` x ``render_height`` px is shown ``views_per_render`` times, each time
+    another crop of ``width`` x ``height`` px with other photometric changes, mixed with the
+    ``reservoir`` last ones. ``easy_samples`` renders pass until scenes are as hard as they get.
+    """
+
+    width: int = 448
+    height: int = 256
+    render_width: int = 512
+    render_height: int = 288
+    views_per_render: int = 4
+    reservoir: int = 192
+    easy_samples: int = 3000
+    workers: int = 1
+
+
+@dataclass(kw_only=True)
+class LossConfig:
+    """Weights of the classes (background first) in the cross entropy, and of the Dice term."""
+
+    class_weights: list[float] = field(default_factory=lambda: [1.0, 2.0, 2.0, 2.0, 2.0])
+    dice: float = 0.5
+
+
+@dataclass(kw_only=True)
+class ValidationConfig:
+    """A fixed set of renders of full difficulty, scored every so many minutes."""
+
+    images: int = 64
+    every_minutes: float = 5.0
+
+
+@dataclass(kw_only=True)
+class TrainConfig:
+    """One training run. It ends after ``minutes`` of training or ``steps`` updates, whichever comes first.
+
+    The learning rate rises to ``learning_rate`` over the first ``warmup`` of the run, then falls to
+    nothing as a half cosine, by the share of the run that has passed. ``ema_updates`` is the memory, in updates, of the
+    averaged weights that are validated, kept and exported. ``resume`` continues what ``output`` holds.
+    """
+
+    output: str = "runs/train"
+    seed: int = 1
+    device: str = "auto"
+    minutes: float | None = None
+    steps: int | None = None
+    batch: int = 4
+    learning_rate: float = 3e-3
+    weight_decay: float = 0.01
+    warmup: float = 0.03
+    ema_updates: int = 300
+    threads: int = 1
+    checkpoint_minutes: float = 2.0
+    resume: bool = True
+    net: NetConfig = field(default_factory=NetConfig)
+    data: DataConfig = field(default_factory=DataConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    validation: ValidationConfig = field(default_factory=ValidationConfig)

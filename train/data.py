@@ -1,0 +1,84 @@
+"""Training images without end, rendered by worker processes while the network learns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, IterableDataset, get_worker_info
+
+from train.augment import half_resolution, random_crop, random_photometry
+from train.config import DataConfig
+from v2hdm.simulate.training_scenes import TrainingSample, training_sample
+
+_VALIDATION_SEED_OFFSET = 1_000_003
+
+Pair = tuple[Tensor, Tensor]
+
+
+class RenderStream(IterableDataset[Pair]):
+    """Pairs of image (H, W, 3) uint8 and labels (H/2, W/2) uint8, the same for the same seed and workers.
+
+    Args:
+        config: Sizes and how often a render is shown.
+        seed: Names the sequence.
+        first_render: Where in it to begin, so that a resumed run sees other renders.
+    """
+
+    def __init__(self, config: DataConfig, seed: int, first_render: int = 0) -> None:
+        self.config = config
+        self.seed = seed
+        self.first_render = first_render
+
+    def __iter__(self) -> Iterator[Pair]:
+        worker = get_worker_info()
+        number, workers = (worker.id, worker.num_workers) if worker else (0, 1)
+        rng = np.random.default_rng([self.seed, self.first_render, number, 9])
+        recent: list[TrainingSample] = []
+        index = self.first_render + number
+        while True:
+            difficulty = min(1.0, index / max(self.config.easy_samples, 1))
+            recent.append(
+                training_sample(
+                    self.seed, index, self.config.render_width, self.config.render_height, difficulty
+                )
+            )
+            index += workers
+            yield self._view(rng, recent[-1])
+            for _ in range(self.config.views_per_render - 1):
+                yield self._view(rng, recent[int(rng.integers(len(recent)))])
+            if len(recent) >= self.config.reservoir:
+                recent.pop(int(rng.integers(len(recent))))
+
+    def _view(self, rng: np.random.Generator, sample: TrainingSample) -> Pair:
+        image, labels = random_crop(rng, sample.image, sample.labels, self.config.width, self.config.height)
+        return torch.from_numpy(random_photometry(rng, image)), torch.from_numpy(half_resolution(labels))
+
+
+def training_batches(config: DataConfig, seed: int, batch: int, first_render: int) -> Iterator[Pair]:
+    """Batches without end, from worker processes (or this one if ``workers`` is 0)."""
+    stream = RenderStream(config, seed, first_render)
+    loader = DataLoader(
+        stream,
+        batch_size=batch,
+        num_workers=config.workers,
+        prefetch_factor=6 if config.workers else None,
+        worker_init_fn=_single_thread if config.workers else None,
+        multiprocessing_context="spawn" if config.workers else None,
+    )
+    return iter(loader)
+
+
+def validation_pairs(config: DataConfig, seed: int, images: int) -> Iterator[Pair]:
+    """A fixed set of renders of full difficulty that no training seed of the same run shows."""
+    for index in range(images):
+        sample = training_sample(seed + _VALIDATION_SEED_OFFSET, index, config.width, config.height)
+        yield torch.from_numpy(sample.image), torch.from_numpy(half_resolution(sample.labels))
+
+
+def _single_thread(_worker: int) -> None:
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)

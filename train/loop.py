@@ -1,0 +1,185 @@
+"""The training loop: update, average, validate, save, until time or steps are used up."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.utils.tensorboard import SummaryWriter
+
+from models import MarkingNet
+from train.checkpoint import Checkpoint, check_same_experiment, load_checkpoint, save_checkpoint
+from train.config import TrainConfig
+from train.data import Pair, training_batches, validation_pairs
+from train.losses import segmentation_loss
+from train.metrics import Confusion, Score
+from v2hdm.errors import ConfigError
+
+_LOG = logging.getLogger(__name__)
+
+Progress = Callable[[float, str], None]
+"""Told the share of the run that has passed and a line of figures."""
+
+
+@dataclass
+class Trainer:
+    """A training run in the folder ``config.output``: last.pt, best.pt and TensorBoard's log."""
+
+    config: TrainConfig
+    progress: Progress
+
+    def __post_init__(self) -> None:
+        config = self.config
+        if config.minutes is None and config.steps is None:
+            raise ConfigError("the training has no end: set minutes= or steps=")
+        torch.manual_seed(config.seed)
+        torch.set_num_threads(config.threads)
+        self.device = _device(config.device)
+        self.output = Path(config.output)
+        self.state = self._open()
+        self.net = MarkingNet(config.net).to(self.device, memory_format=torch.channels_last)
+        self.averaged = AveragedModel(
+            self.net, multi_avg_fn=get_ema_multi_avg_fn(1.0 - 1.0 / config.ema_updates), use_buffers=True
+        )
+        self.optimizer = torch.optim.AdamW(self.net.parameters(), weight_decay=config.weight_decay)
+        self.class_weights = torch.tensor(config.loss.class_weights, device=self.device)
+        if self.state.step:
+            self._restore()
+
+    def run(self) -> Checkpoint:
+        """Train to the end; returns the last state, which is also in last.pt."""
+        config, state = self.config, self.state
+        validation = list(validation_pairs(config.data, config.seed, config.validation.images))
+        batches = training_batches(config.data, config.seed, config.batch, state.renders)
+        begun = time.monotonic() - state.elapsed_s
+        saved = validated = state.elapsed_s
+        with SummaryWriter(str(self.output)) as board:
+            while self._share() < 1:
+                loss = self._update(next(batches))
+                state.elapsed_s = time.monotonic() - begun
+                if state.step % 20 == 0:
+                    self._report(loss, board)
+                if state.elapsed_s - validated > 60 * config.validation.every_minutes:
+                    self._validate(validation, board)
+                    validated = state.elapsed_s
+                if state.elapsed_s - saved > 60 * config.checkpoint_minutes:
+                    self._save("last.pt")
+                    saved = state.elapsed_s
+            self._validate(validation, board)
+        self._save("last.pt")
+        return state
+
+    def _open(self) -> Checkpoint:
+        """The state to go on from: the last of this folder, or a fresh one."""
+        path = self.output / "last.pt"
+        if not (self.config.resume and path.is_file()):
+            return Checkpoint(config=asdict(self.config))
+        state = load_checkpoint(path)
+        check_same_experiment(state, self.config, path)
+        state.config = asdict(self.config)
+        _LOG.info("resuming at step %d after %.1f minutes", state.step, state.elapsed_s / 60)
+        return state
+
+    def _restore(self) -> None:
+        self.net.load_state_dict(self.state.model)
+        self.averaged.module.load_state_dict(self.state.averaged)
+        self.averaged.n_averaged.fill_(self.state.step)
+        self.optimizer.load_state_dict(self.state.optimizer)
+
+    def _share(self) -> float:
+        """How much of the run has passed, 0 to 1."""
+        config = self.config
+        by_time = self.state.elapsed_s / (60 * config.minutes) if config.minutes else 0.0
+        by_step = self.state.step / config.steps if config.steps else 0.0
+        return max(by_time, by_step)
+
+    def _learning_rate(self) -> float:
+        share, warmup = min(self._share(), 1.0), self.config.warmup
+        if share < warmup:
+            return self.config.learning_rate * (0.05 + 0.95 * share / warmup)
+        return self.config.learning_rate * 0.5 * (1 + math.cos(math.pi * (share - warmup) / (1 - warmup)))
+
+    def _update(self, batch: Pair) -> float:
+        """One step of the optimiser."""
+        image, labels = (t.to(self.device, non_blocking=True) for t in batch)
+        for group in self.optimizer.param_groups:
+            group["lr"] = self._learning_rate()
+        self.net.train()
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
+            logits = self.net(image)
+        loss = segmentation_loss(logits.float(), labels.long(), self.class_weights, self.config.loss.dice)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
+        self.optimizer.step()
+        self.averaged.update_parameters(self.net)
+        self.state.step += 1
+        self.state.renders = -(-self.state.step * self.config.batch // self.config.data.views_per_render)
+        return float(loss.detach())
+
+    @torch.inference_mode()
+    def _validate(self, pairs: list[Pair], board: SummaryWriter) -> None:
+        """Score the averaged weights and keep them if they are the best yet."""
+        if not pairs:
+            return
+        self.averaged.eval()
+        confusion = Confusion()
+        for image, labels in pairs:
+            logits = self.averaged(image[None].to(self.device))
+            confusion.add(logits, labels[None].to(self.device).long())
+        score = confusion.score()
+        self.state.metrics = metrics(score)
+        for name, value in self.state.metrics.items():
+            board.add_scalar(f"validation/{name}", value, self.state.step)
+        _LOG.info("step %d, %.1f min: %s", self.state.step, self.state.elapsed_s / 60, summary(score))
+        if score.mean_iou >= self.state.best_iou:
+            self.state.best_iou = score.mean_iou
+            self._save("best.pt")
+
+    def _report(self, loss: float, board: SummaryWriter) -> None:
+        board.add_scalar("train/loss", loss, self.state.step)
+        board.add_scalar("train/learning_rate", self._learning_rate(), self.state.step)
+        rate = self.state.step * self.config.batch / max(self.state.elapsed_s, 1e-9)
+        figures = (
+            f"step {self.state.step}, {rate:.1f} images/s, loss {loss:.3f}, IoU {self.state.best_iou:.3f}"
+        )
+        self.progress(min(self._share(), 1.0), figures)
+
+    def _save(self, name: str) -> None:
+        self.state.model = _on_cpu(self.net.state_dict())
+        self.state.averaged = _on_cpu(self.averaged.module.state_dict())
+        self.state.optimizer = self.optimizer.state_dict()
+        save_checkpoint(self.state, self.output / name)
+
+
+def metrics(score: Score) -> dict[str, float]:
+    """A score as flat figures."""
+    return {"mean_iou": score.mean_iou, "paint_iou": score.paint_iou} | {
+        f"{name}_iou": value for name, value in score.iou.items()
+    }
+
+
+def summary(score: Score) -> str:
+    """A score as one line."""
+    return ", ".join(f"{name} {value:.3f}" for name, value in metrics(score).items())
+
+
+def _on_cpu(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name: value.detach().cpu().clone() for name, value in state.items()}
+
+
+def _device(name: str) -> torch.device:
+    """The device of a name; ``auto`` is a GPU where there is one."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        return torch.device(name)
+    except RuntimeError as error:
+        raise ConfigError(f"device={name} is unknown: use auto, cpu or cuda") from error

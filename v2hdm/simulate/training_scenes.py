@@ -1,0 +1,183 @@
+"""Random scenes for training the detector: ports, streets and bare ground in every light and state.
+
+Nothing here is modelled on a particular place. Whatever may differ on a road or in a yard that nobody has
+seen yet is drawn at random, far wider than the ports that :mod:`v2hdm.simulate` renders as drives.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v2hdm.simulate.render import Renderer
+from v2hdm.simulate.scene import Backdrop, Bgr, Dapple, Ground, Light, Scene, Shadow
+from v2hdm.simulate.training_clutter import ground_marks, port_boxes, street_boxes
+from v2hdm.simulate.training_paint import Bend, port_paint, random_brush, rectangle, street_paint
+from v2hdm.simulate.training_views import TrainingView, random_view
+
+# The renderer keeps one tile per fleck size, so sizes come from a short list.
+_FLECK_SIZES_M = tuple(float(s) for s in np.geomspace(0.12, 2.5, 10))
+
+
+@dataclass(frozen=True)
+class TrainingSample:
+    """One rendered image with its labels.
+
+    ``image`` (H, W, 3) uint8 BGR and ``labels`` (H, W) uint8 are those of
+    :class:`v2hdm.simulate.render.Rendered`.
+    """
+
+    image: NDArray[np.uint8]
+    labels: NDArray[np.uint8]
+
+
+def training_sample(
+    seed: int, index: int, width: int, height: int, difficulty: float = 1.0
+) -> TrainingSample:
+    """Sample ``index`` of the endless, reproducible sequence that ``seed`` stands for.
+
+    Args:
+        seed: Names the sequence; training and validation use different ones.
+        index: Position in it.
+        width: Image width, px.
+        height: Image height, px.
+        difficulty: 0 for fresh paint in plain light, 1 for everything at its worst now and then.
+    """
+    rng = np.random.default_rng([seed, index])
+    scene = random_scene(rng, difficulty)
+    view = random_view(rng, width, height)
+    scene = _without_hidden_boxes(scene, view)
+    rendered = Renderer(scene).render(view.info, view.cam_from_map, rng, view.optics, view.motion)
+    return TrainingSample(rendered.image, rendered.labels)
+
+
+def random_scene(rng: np.random.Generator, difficulty: float = 1.0) -> Scene:
+    """A port (two in five), a street (half) or unpainted ground, seen from the map's origin along +x."""
+    place = rng.choice(["port", "street", "bare"], p=[0.41, 0.53, 0.06])
+    bend = Bend(float(rng.normal(0, 0.006)) if rng.random() < 0.4 else 0.0)
+    brush = random_brush(rng, difficulty)
+    road_half_m = float(rng.uniform(2, 9))
+    if place == "port":
+        paints, boxes = port_paint(rng, brush, bend), port_boxes(rng)
+    elif place == "street":
+        paints, boxes = street_paint(rng, brush, bend), street_boxes(rng, road_half_m)
+    else:
+        paints, boxes = [], street_boxes(rng, road_half_m) if rng.random() < 0.7 else port_boxes(rng)
+    return Scene(
+        ground=_ground(rng, place == "port", difficulty),
+        paints=tuple(paints),
+        boxes=boxes,
+        shadows=_shadows(rng, difficulty),
+        dapples=_dapples(rng, difficulty),
+        light=_light(rng),
+        backdrop=_backdrop(rng),
+    )
+
+
+def _without_hidden_boxes(scene: Scene, view: TrainingView) -> Scene:
+    """The scene less the boxes whose bounding sphere is outside the image: most of a street's, and costly."""
+    if not scene.boxes:
+        return scene
+    size = np.array([box.size_m for box in scene.boxes])
+    height = np.array([box.base_m for box in scene.boxes]) + size[:, 2] / 2
+    centre = np.column_stack([[box.centre_map for box in scene.boxes], height])
+    cam = centre @ view.cam_from_map[:3, :3].T + view.cam_from_map[:3, 3]
+    radius = np.linalg.norm(size, axis=1) / 2
+    k, info = view.info.intrinsic, view.info
+    seen = cam[:, 2] > -radius
+    for axis, pixels in ((0, info.width), (1, info.height)):
+        low, high = (-k[axis, 2]) / k[axis, axis] - 0.1, (pixels - k[axis, 2]) / k[axis, axis] + 0.1
+        for slope, sign in ((low, 1), (high, -1)):
+            seen &= sign * (cam[:, axis] - slope * cam[:, 2]) / np.hypot(1, slope) > -radius
+    return replace(scene, boxes=tuple(box for box, s in zip(scene.boxes, seen, strict=True) if s))
+
+
+def _ground(rng: np.random.Generator, port: bool, difficulty: float) -> Ground:
+    concrete = rng.random() < (0.55 if port else 0.15)
+    grey = rng.uniform(0.14, 0.36) if concrete else rng.uniform(0.05, 0.24)
+    tint = np.exp(rng.normal(0, 0.05, 3)) * (0.97, 1.0, 1.03)
+    blue, green, red = (float(c) for c in grey * tint)
+    texture = "concrete" if concrete else "asphalt"
+    if rng.random() < 0.12:
+        texture = str(rng.choice(["gravel", "grass", "brick"]))
+    slabs = (concrete and rng.random() < 0.75) or rng.random() < 0.08
+    return Ground(
+        albedo_bgr=(blue, green, red),
+        texture=texture,
+        contrast=float(rng.uniform(0.04, 0.32)),
+        stains=float(rng.uniform(0.03, 0.1 + 0.22 * difficulty)),
+        slab_m=(float(rng.uniform(2, 9)), float(rng.uniform(2, 9))) if slabs else None,
+        slab_yaw_rad=float(rng.normal(0, 0.05) if rng.random() < 0.6 else rng.uniform(0, 1.6)),
+        joint_width_m=float(rng.uniform(0.006, 0.07)),
+        joint_factor=float(rng.uniform(0.3, 0.8) if rng.random() < 0.65 else rng.uniform(1.2, 1.9)),
+        wet_fraction=float(rng.uniform(0.05, 0.5)) if rng.random() < 0.16 * difficulty else 0.0,
+        marks=ground_marks(rng) if rng.random() < 0.75 else None,
+        seed=int(rng.integers(1 << 20)),
+    )
+
+
+def _light(rng: np.random.Generator) -> Light:
+    """From deep overcast to hard, low sun; ratios of sun to skylight up to 15."""
+    elevation, azimuth = np.deg2rad(rng.uniform(12, 78)), rng.uniform(0, 2 * np.pi)
+    direction = (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation))
+    overcast = rng.random() < 0.25
+    sun = rng.uniform(0.0, 0.4) if overcast else rng.uniform(0.8, 1.3)
+    sky = rng.uniform(0.3, 0.7) if overcast else rng.uniform(0.09, 0.4)
+    warm = rng.uniform(0.0, 0.25) * (1.0 - np.sin(elevation))
+    blue = rng.uniform(0.0, 0.0 if overcast else 0.35)
+    brightness = rng.uniform(0.4, 1.4)
+    return Light(
+        sun_direction_map=tuple(float(c) for c in direction),  # type: ignore[arg-type]
+        sun_bgr=_tinted(sun, warm),
+        sky_bgr=_tinted(sky, -blue),
+        zenith_bgr=_tinted(0.55 * brightness, 0.0 if overcast else -0.4),
+        horizon_bgr=_tinted(0.9 * brightness, 0.05),
+    )
+
+
+def _tinted(grey: float, warmth: float) -> Bgr:
+    return float(grey * (1 - warmth)), float(grey), float(grey * (1 + warmth))
+
+
+def _shadows(rng: np.random.Generator, difficulty: float) -> tuple[Shadow, ...]:
+    """Shadows of what is out of view: buildings (wide) and poles, wires and gantries (narrow)."""
+    out = []
+    for _ in range(int(rng.poisson(1.2 * difficulty))):
+        wide = rng.uniform(0.1, 0.7) if rng.random() < 0.55 else rng.uniform(1, 14)
+        centre = np.array([rng.uniform(2, 40), rng.uniform(-8, 8)])
+        polygon = rectangle(centre, rng.uniform(4, 60), wide, rng.uniform(0, np.pi))
+        softness = float(np.exp(rng.uniform(np.log(0.02), np.log(0.6))))
+        out.append(Shadow(polygon_map=polygon, transmission=float(rng.beta(1, 5)), softness_m=softness))
+    return tuple(out)
+
+
+def _dapples(rng: np.random.Generator, difficulty: float) -> tuple[Dapple, ...]:
+    """The shade of trees, over all the ground or a part of it, perhaps of leaves and of boughs."""
+    if rng.random() > 0.2 + 0.25 * difficulty:
+        return ()
+    region = None
+    if rng.random() < 0.6:
+        centre = np.array([rng.uniform(3, 40), rng.uniform(-6, 6)])
+        region = rectangle(centre, rng.uniform(6, 40), rng.uniform(3, 20), rng.uniform(-0.4, 0.4))
+    return tuple(
+        Dapple(
+            shaded=float(rng.uniform(0.25, 0.92)),
+            scale_m=float(rng.choice(_FLECK_SIZES_M)),
+            transmission=float(rng.uniform(0.0, 0.3)),
+            region_map=region,
+            seed=int(rng.integers(1 << 20)),
+        )
+        for _ in range(int(rng.integers(1, 3)))
+    )
+
+
+def _backdrop(rng: np.random.Generator) -> Backdrop:
+    return Backdrop(
+        height_rad=float(rng.uniform(0.0, 0.3)),
+        block_rad=float(rng.uniform(0.02, 0.2)),
+        albedo_bgr=tuple(float(c) for c in rng.uniform(0.04, 0.5) * np.exp(rng.normal(0, 0.15, 3))),  # type: ignore[arg-type]
+        haze_m=float(np.exp(rng.uniform(np.log(120), np.log(1500)))),
+        seed=int(rng.integers(1 << 20)),
+    )
