@@ -24,8 +24,9 @@ def ipm_from_extrinsic(intrinsic: Tensor, cam_from_vehicle: Tensor) -> Tensor:
         cam_from_vehicle: (*batch, 4, 4).
     """
     pinhole_px_from_vehicle = intrinsic @ cam_from_vehicle[..., :3, [0, 1, 3]]
-    ipm = torch.linalg.inv(pinhole_px_from_vehicle)
-    return ipm / torch.linalg.matrix_norm(ipm, keepdim=True)
+    ipm: Tensor = torch.linalg.inv(pinhole_px_from_vehicle)
+    norm: Tensor = torch.linalg.matrix_norm(ipm, keepdim=True)
+    return ipm / norm
 
 
 def apply_homography(dst_from_src: Tensor, points_src: Tensor) -> Tensor:

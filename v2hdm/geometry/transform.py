@@ -57,7 +57,7 @@ def hat(vector: Tensor) -> Tensor:
     """Skew matrix (*batch, 3, 3) of a vector (*batch, 3): ``hat(a) @ b == cross(a, b)``."""
     x, y, z = vector.unbind(-1)
     o = torch.zeros_like(x)
-    return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).unflatten(-1, (3, 3))
+    return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).reshape(*vector.shape[:-1], 3, 3)
 
 
 def make_transform(rotation: Tensor, translation: Tensor) -> Tensor:
@@ -93,14 +93,15 @@ def exp(tangent: Tensor) -> Tensor:
     omega_squared = omega @ omega
     eye = torch.eye(3, dtype=tangent.dtype, device=tangent.device)
     sine, cosine, third = (_even_series(theta_squared, _reciprocal_factorials(n)) for n in (1, 2, 3))
-    jacobian = eye + cosine * omega + third * omega_squared
-    return make_transform(eye + sine * omega + cosine * omega_squared, (jacobian @ translation[..., None])[..., 0])
+    moved = (eye + cosine * omega + third * omega_squared) @ translation[..., None]
+    return make_transform(eye + sine * omega + cosine * omega_squared, moved[..., 0])
 
 
 def log(dst_from_src: Tensor) -> Tensor:
     """The tangent (*batch, 6) of a rigid motion, with a rotation of at most pi."""
     matrices = dst_from_src.reshape(-1, 4, 4)
-    return Se3.from_matrix(matrices).log().reshape(*dst_from_src.shape[:-2], 6)
+    tangent: Tensor = Se3.from_matrix(matrices).log()
+    return tangent.reshape(*dst_from_src.shape[:-2], 6)
 
 
 def adjoint(dst_from_src: Tensor) -> Tensor:

@@ -1,0 +1,168 @@
+"""A synthetic street: diamonds beside a route, seen by one or two cameras with known truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from v2hdm.adjust import Observations, PoseSigma, Problem
+from v2hdm.geometry import transform
+
+WIDTH, HEIGHT, FOCAL = 1280, 720, 900.0
+PIXEL_SIGMA = 0.7
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A problem and its truth."""
+
+    problem: Problem
+    cam_from_vehicle: np.ndarray
+    map_from_vehicle: np.ndarray
+    corners_map: np.ndarray
+
+    def corner_rmse_m(self, corners_map: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(np.sum((corners_map - self.corners_map) ** 2, axis=1))))
+
+    def rotation_error_deg(self, cam_from_vehicle: np.ndarray) -> np.ndarray:
+        off = cam_from_vehicle[:, :3, :3] @ self.cam_from_vehicle[:, :3, :3].transpose(0, 2, 1)
+        return np.rad2deg(transform.rotation_angle(torch.as_tensor(off)).numpy())
+
+
+def exp(tangent: np.ndarray) -> np.ndarray:
+    return transform.exp(torch.as_tensor(tangent, dtype=torch.float64)).numpy()
+
+
+def mounted(x: float, height: float, pitch_deg: float, *, rear: bool = False, y: float = 0.0) -> np.ndarray:
+    """``cam_from_vehicle`` of a camera looking forward (or back) and down by ``pitch_deg``."""
+    forward = np.array([-1.0 if rear else 1.0, 0, 0])
+    pitch = np.deg2rad(pitch_deg)
+    ahead = np.cos(pitch) * forward - np.sin(pitch) * np.array([0, 0, 1])
+    right = np.cross(forward, [0, 0, 1.0])
+    rotation = np.stack([right, np.cross(ahead, right), ahead])
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = rotation, -rotation @ [x, y, height]
+    return out
+
+
+def route(frames: int, step_m: float, turn_deg_per_m: float, straight_m: float = 20.0) -> np.ndarray:
+    """``map_from_vehicle``: straights and, if wanted, alternating turns in between."""
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    heading, position = 0.3, np.array([5.0, -3.0])
+    for j in range(frames):
+        phase, which = (j * step_m) % straight_m / straight_m, int(j * step_m // straight_m)
+        if phase > 0.5:
+            heading += np.deg2rad(turn_deg_per_m) * step_m * (1 if which % 2 == 0 else -1)
+        c, s = np.cos(heading), np.sin(heading)
+        position = position + step_m * np.array([c, s])
+        poses[j, :2, :2], poses[j, :2, 3] = [[c, -s], [s, c]], position
+    return poses
+
+
+def diamonds(map_from_vehicle: np.ndarray, every_m: float, rng: np.random.Generator) -> np.ndarray:
+    """Corners (N, 2) of diamonds scattered left and right of the route."""
+    path = map_from_vehicle[:, :2, 3]
+    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    corners = []
+    for s in np.arange(0, along[-1] + 12, every_m):
+        j = min(int(np.searchsorted(along, s)), len(path) - 1)
+        local = [s - along[j] + rng.uniform(-1, 1), rng.uniform(-4, 4)]
+        centre = map_from_vehicle[j, :2, :2] @ local + path[j]
+        angle = rng.uniform(0, np.pi)
+        for quarter in range(4):
+            a = angle + quarter * np.pi / 2
+            corners.append(centre + 0.35 * np.array([np.cos(a), np.sin(a)]))
+    return np.array(corners)
+
+
+def correlated(rng: np.random.Generator, count: int, width: int, memory: float) -> np.ndarray:
+    """A unit-variance Gauss-Markov sequence (count, width)."""
+    out = rng.standard_normal((count, width))
+    for j in range(1, count):
+        out[j] = memory * out[j - 1] + np.sqrt(1 - memory**2) * out[j]
+    return out
+
+
+def make_scene(
+    seed: int = 0,
+    *,
+    frames: int = 120,
+    step_m: float = 0.5,
+    turn_deg_per_m: float = 4.0,
+    every_m: float = 2.0,
+    cameras: int = 2,
+    start_error_deg: float = 3.0,
+    start_error_m: float = 0.1,
+    jitter: PoseSigma | None = None,
+    outliers: float = 0.0,
+    pixel_sigma: float = PIXEL_SIGMA,
+    prior_sigma_m: float = 0.03,
+    max_range_m: float = 15.0,
+    correlation_m: float = 0.0,
+) -> Scene:
+    """A street whose recorded poses are off by ``jitter`` and whose start is off as stated."""
+    rng = np.random.default_rng(seed)
+    truth = np.stack([mounted(1.5, 2.4, 18), mounted(-1.0, 2.6, 22, rear=True, y=0.2)])[:cameras]
+    truth = exp(np.concatenate([np.zeros((cameras, 3)), rng.normal(0, 0.02, (cameras, 3))], 1)) @ truth
+    recorded = route(frames, step_m, turn_deg_per_m)
+    state = np.zeros((frames, 6))
+    if jitter is not None:
+        memory = np.exp(-step_m / correlation_m) if correlation_m > 0 else 0.0
+        unit = rng.standard_normal((frames, 6))
+        unit[:, [0, 1]] = correlated(rng, frames, 2, memory)
+        state = unit * jitter.by_state()
+    map_from_vehicle = recorded @ exp(state)
+    corners = diamonds(recorded, every_m, rng)
+    seen = observe(truth, map_from_vehicle, corners, max_range_m)
+    camera, frame, corner, pixel = seen
+    twice = np.bincount(corner, minlength=len(corners)) >= 2
+    keep = twice[corner]
+    rank = np.cumsum(twice) - 1
+    camera, frame, corner, pixel = camera[keep], frame[keep], rank[corner[keep]], pixel[keep]
+    corners = corners[twice]
+    pixel = pixel + pixel_sigma * rng.standard_normal(pixel.shape)
+    wrong = rng.random(len(pixel)) < outliers
+    pixel[wrong] += rng.uniform(-60, 60, (int(wrong.sum()), 2))
+    axis = rng.standard_normal((cameras, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    start = exp(np.concatenate([np.zeros((cameras, 3)), np.deg2rad(start_error_deg) * axis], 1)) @ truth
+    start[:, :3, 3] += rng.uniform(-start_error_m, start_error_m, (cameras, 3))
+    centre = -np.einsum("cji,cj->ci", truth[:, :3, :3], truth[:, :3, 3])
+    problem = Problem(
+        intrinsic=np.tile([FOCAL, FOCAL, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5], (cameras, 1)),
+        cam_from_vehicle=start,
+        map_from_vehicle=recorded,
+        observations=Observations(
+            camera, frame, corner, pixel, np.tile(max(pixel_sigma, 0.1) ** 2 * np.eye(2), (len(pixel), 1, 1))
+        ),
+        corner_count=len(corners),
+        centre_vehicle=centre + prior_sigma_m * rng.standard_normal((cameras, 3)),
+        centre_sigma_m=np.full((cameras, 3), prior_sigma_m),
+        pose_sigma=jitter or PoseSigma(),
+    )
+    return Scene(problem, truth, map_from_vehicle, corners)
+
+
+def observe(
+    cam_from_vehicle: np.ndarray, map_from_vehicle: np.ndarray, corners: np.ndarray, max_range_m: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Camera, frame, corner (K,) and pixel (K, 2) of all corners in view."""
+    ground = np.column_stack([corners, np.zeros(len(corners)), np.ones(len(corners))])
+    parts = []
+    for c, mount in enumerate(cam_from_vehicle):
+        points = ground @ (mount @ np.linalg.inv(map_from_vehicle)).transpose(0, 2, 1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = FOCAL * points[..., 0] / points[..., 2] + WIDTH / 2 - 0.5
+            v = FOCAL * points[..., 1] / points[..., 2] + HEIGHT / 2 - 0.5
+        inside = (u > 0) & (u < WIDTH - 1) & (v > 0) & (v < HEIGHT - 1)
+        visible = (points[..., 2] > 0.5) & (points[..., 2] < max_range_m) & inside
+        j, n = np.nonzero(visible)
+        parts.append((np.full(len(j), c), j, n, np.column_stack([u[j, n], v[j, n]])))
+    camera, frame, corner, pixel = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return camera, frame, corner, pixel
+
+
+def without_states(problem: Problem) -> Problem:
+    return replace(problem, pose_sigma=PoseSigma())

@@ -1,0 +1,11 @@
+"""Bundle adjustment of marking corners, camera extrinsics and vehicle poses on the ground plane.
+
+``solve(problem, options) -> solution``: numpy in, numpy out; torch's LBFGS on whitened variables
+inside. :mod:`v2hdm.adjust.problem` states the model.
+"""
+
+from v2hdm.adjust.problem import Observations, PoseSigma, Problem, SolveOptions
+from v2hdm.adjust.solution import Solution, Status
+from v2hdm.adjust.solve import solve
+
+__all__ = ["Observations", "PoseSigma", "Problem", "Solution", "SolveOptions", "Status", "solve"]

@@ -1,0 +1,149 @@
+"""A problem as tensors, laid out for speed: sorted by corner, corners in route order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from v2hdm.adjust.problem import POSE_STATES, Problem
+from v2hdm.geometry.transform import inverse
+from v2hdm.records import FloatArray
+
+
+@dataclass(frozen=True)
+class Arrays:
+    """The constants of a solve; K observations of N corners from P = C * J (camera, frame) pairs.
+
+    Everything that an extrinsic and a frame do to an observation, they do through its pair. So the
+    big arrays know only pairs and corners, and sums over pairs are carried on to extrinsics and
+    frames on small tables (pair = camera * J + frame).
+
+    Attributes:
+        order: (K,) where each sorted observation stood in the problem.
+        corner_order: (N,) which corner of the problem each one here is.
+        pair: (K,) index of the (camera, frame) pair.
+        corner: (K,) index of the corner, ascending.
+        measured: (2, K) where it was seen, on the plane at depth 1.
+        root_information: (3, K) a, b, c with whitened residual (a dx, b dx + c dy), dx at depth 1.
+        vehicle_from_map: (J, 4, 4) as recorded.
+        states: columns of the frame tangent that are estimated.
+        centre, centre_information_root: (C, 3) prior on the camera centres, and 1 / sigma.
+        state_memory: (J, S) share of a state's error carried over from the previous frame.
+        state_information_root: (J, S) 1 / sigma of what is new in it.
+    """
+
+    order: Tensor
+    corner_order: Tensor
+    pair: Tensor
+    corner: Tensor
+    measured: Tensor
+    root_information: Tensor
+    vehicle_from_map: Tensor
+    states: tuple[int, ...]
+    centre: Tensor
+    centre_information_root: Tensor
+    state_memory: Tensor
+    state_information_root: Tensor
+
+    @property
+    def frame_count(self) -> int:
+        """J."""
+        return len(self.vehicle_from_map)
+
+    @property
+    def camera_count(self) -> int:
+        """C."""
+        return len(self.centre)
+
+    @property
+    def corner_count(self) -> int:
+        """N."""
+        return len(self.corner_order)
+
+    @property
+    def pair_count(self) -> int:
+        """P."""
+        return self.camera_count * self.frame_count
+
+    def take(self, keep: Tensor) -> tuple[Arrays, Tensor]:
+        """The problem restricted to the observations ``keep`` (K,) and to the corners they touch.
+
+        Returns it with the indices here of the corners that are left.
+        """
+        corners, corner = torch.unique(self.corner[keep], return_inverse=True)
+        part = replace(
+            self,
+            order=self.order[keep],
+            corner_order=self.corner_order[corners],
+            pair=self.pair[keep],
+            corner=corner,
+            measured=self.measured[:, keep],
+            root_information=self.root_information[:, keep],
+        )
+        return part, corners
+
+
+def make_arrays(problem: Problem, pose_states: tuple[str, ...], device: str) -> Arrays:
+    """Lay a checked problem out for the solver."""
+    seen = problem.observations
+    first_frame = np.full(problem.corner_count, len(problem.map_from_vehicle))
+    np.minimum.at(first_frame, seen.corner, seen.frame)
+    corner_order = np.argsort(first_frame, kind="stable")
+    rank = np.empty_like(corner_order)
+    rank[corner_order] = np.arange(len(corner_order))
+    order = np.lexsort((seen.frame, seen.camera, rank[seen.corner]))
+    focal, principal = problem.intrinsic[seen.camera, :2], problem.intrinsic[seen.camera, 2:]
+    measured = (seen.pinhole_px - principal) / focal
+    root = np.linalg.inv(np.linalg.cholesky(seen.covariance_px)) * focal[:, None, :]
+    states = tuple(k for k, name in enumerate(POSE_STATES) if name in pose_states)
+    memory, information_root = _state_prior(problem, states)
+    centre, centre_root = _centre_prior(problem)
+
+    def real(values: FloatArray) -> Tensor:
+        return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float64, device=device)
+
+    def index(values: FloatArray) -> Tensor:
+        return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.int64, device=device)
+
+    return Arrays(
+        order=index(order),
+        corner_order=index(corner_order),
+        pair=index((seen.camera * len(problem.map_from_vehicle) + seen.frame)[order]),
+        corner=index(rank[seen.corner][order]),
+        measured=real(measured[order].T),
+        root_information=real(np.stack([root[order, 0, 0], root[order, 1, 0], root[order, 1, 1]])),
+        vehicle_from_map=inverse(real(problem.map_from_vehicle)),
+        states=states,
+        centre=real(centre),
+        centre_information_root=real(centre_root),
+        state_memory=real(memory),
+        state_information_root=real(information_root),
+    )
+
+
+def _centre_prior(problem: Problem) -> tuple[FloatArray, FloatArray]:
+    """Prior centres and inverse sigmas (C, 3); without a survey the latter are 0."""
+    if problem.centre_vehicle is None or problem.centre_sigma_m is None:
+        nothing = np.zeros((len(problem.intrinsic), 3))
+        return nothing, nothing
+    return problem.centre_vehicle, 1 / problem.centre_sigma_m
+
+
+def _state_prior(problem: Problem, states: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
+    """Memory and inverse sigma of the innovation (J, S) of each frame's states.
+
+    A first-order Gauss-Markov process along the driven distance d: memory exp(-d / correlation_m),
+    innovation variance sigma^2 (1 - memory^2) (Gelb, Applied Optimal Estimation, section 3.8).
+    """
+    sigma = problem.pose_sigma.by_state()[list(states)]
+    memory = np.zeros((len(problem.map_from_vehicle), len(states)))
+    if problem.pose_sigma.correlation_m > 0:
+        correlated = [k for k, s in enumerate(states) if POSE_STATES[s] in ("x", "y", "height", "heading")]
+        step_m = np.linalg.norm(np.diff(problem.map_from_vehicle[:, :3, 3], axis=0), axis=1)
+        # A vehicle at rest repeats its error; a floor on the step keeps the innovation's sigma above 0.
+        fraction = np.maximum(step_m / problem.pose_sigma.correlation_m, 1e-4)
+        memory[1:, correlated] = np.exp(-fraction)[:, None]
+    return memory, 1 / (sigma * np.sqrt(1 - memory**2))

@@ -1,0 +1,130 @@
+"""Refuses malformed problems, naming the offending item, before they can turn into NaN."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from v2hdm.adjust.problem import LOSSES, POSE_STATES, SOLVERS, Problem, SolveOptions
+from v2hdm.errors import AdjustError
+from v2hdm.records import FloatArray
+
+
+def check_problem(problem: Problem) -> None:
+    """Raise :class:`AdjustError` for the first thing in ``problem`` that cannot be solved with."""
+    _check_shapes(problem)
+    _check_finite(problem)
+    _check_rigid("cam_from_vehicle", problem.cam_from_vehicle)
+    _check_rigid("map_from_vehicle", problem.map_from_vehicle)
+    _check_observations(problem)
+    _check_priors(problem)
+
+
+def check_options(options: SolveOptions) -> None:
+    """Raise :class:`AdjustError` for an option out of range."""
+    unknown = [name for name in options.pose_states if name not in POSE_STATES]
+    if unknown:
+        raise AdjustError(f"unknown pose state {unknown[0]!r}: choose from {', '.join(POSE_STATES)}")
+    if options.loss not in LOSSES:
+        raise AdjustError(f"unknown loss {options.loss!r}: choose from {', '.join(LOSSES)}")
+    if options.solver not in SOLVERS:
+        raise AdjustError(f"unknown solver {options.solver!r}: choose from {', '.join(SOLVERS)}")
+    if not options.loss_scale > 0:
+        raise AdjustError(f"loss_scale is {options.loss_scale}: give a number of standard deviations above 0")
+
+
+def _check_shapes(problem: Problem) -> None:
+    cameras, frames = len(problem.intrinsic), len(problem.map_from_vehicle)
+    seen = problem.observations
+    count = len(seen.camera)
+    expected: list[tuple[str, FloatArray | None, tuple[int, ...]]] = [
+        ("intrinsic", problem.intrinsic, (cameras, 4)),
+        ("cam_from_vehicle", problem.cam_from_vehicle, (cameras, 4, 4)),
+        ("map_from_vehicle", problem.map_from_vehicle, (frames, 4, 4)),
+        ("centre_vehicle", problem.centre_vehicle, (cameras, 3)),
+        ("centre_sigma_m", problem.centre_sigma_m, (cameras, 3)),
+        ("corners_start", problem.corners_start, (problem.corner_count, 2)),
+        ("observations.frame", seen.frame, (count,)),
+        ("observations.corner", seen.corner, (count,)),
+        ("observations.pinhole_px", seen.pinhole_px, (count, 2)),
+        ("observations.covariance_px", seen.covariance_px, (count, 2, 2)),
+    ]
+    for name, values, shape in expected:
+        if values is not None and np.shape(values) != shape:
+            raise AdjustError(f"{name} has shape {np.shape(values)}, expected {shape}")
+    if count == 0:
+        raise AdjustError("there is no observation to adjust: detect and associate markings first")
+    for name, index, size in (
+        ("camera", seen.camera, cameras),
+        ("frame", seen.frame, frames),
+        ("corner", seen.corner, problem.corner_count),
+    ):
+        wrong = np.flatnonzero((index < 0) | (index >= size))
+        if len(wrong):
+            raise AdjustError(
+                f"observation {wrong[0]} names {name} {index[wrong[0]]}, but there are only {size}"
+            )
+
+
+def _check_finite(problem: Problem) -> None:
+    seen = problem.observations
+    named = {
+        "intrinsic of camera": problem.intrinsic,
+        "cam_from_vehicle of camera": problem.cam_from_vehicle,
+        "map_from_vehicle of frame": problem.map_from_vehicle,
+        "pinhole_px of observation": seen.pinhole_px,
+        "covariance_px of observation": seen.covariance_px,
+        "centre_vehicle of camera": problem.centre_vehicle,
+        "corners_start of corner": problem.corners_start,
+    }
+    for name, values in named.items():
+        if values is None:
+            continue
+        wrong = np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(1))
+        if len(wrong):
+            raise AdjustError(f"{name} {wrong[0]} is not finite: remove it or correct its source")
+    if np.any(problem.intrinsic[:, :2] <= 0):
+        camera = int(np.flatnonzero((problem.intrinsic[:, :2] <= 0).any(1))[0])
+        raise AdjustError(f"intrinsic of camera {camera} has a focal length that is not positive")
+
+
+def _check_rigid(name: str, transforms: FloatArray) -> None:
+    rotation = transforms[:, :3, :3]
+    off = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
+    wrong = np.flatnonzero((off > 1e-6) | (np.linalg.det(rotation) < 0))
+    if len(wrong):
+        raise AdjustError(f"{name} {wrong[0]} is no rigid transform: its rotation is not orthonormal")
+
+
+def _check_observations(problem: Problem) -> None:
+    seen = problem.observations
+    key = np.stack([seen.corner, seen.camera, seen.frame])
+    order = np.lexsort(key)
+    same = np.flatnonzero((np.diff(key[:, order], axis=1) == 0).all(0))
+    if len(same):
+        first, second = sorted(order[same[0] : same[0] + 2])
+        raise AdjustError(
+            f"observations {first} and {second} are the same corner {seen.corner[first]} in frame "
+            f"{seen.frame[first]} of camera {seen.camera[first]}: keep one of them"
+        )
+    for name, index, size in (
+        ("corner", seen.corner, problem.corner_count),
+        ("camera", seen.camera, len(problem.intrinsic)),
+    ):
+        unseen = np.flatnonzero(np.bincount(index, minlength=size) == 0)
+        if len(unseen):
+            raise AdjustError(f"{name} {unseen[0]} has no observation: leave it out of the problem")
+    variance = np.linalg.eigvalsh(seen.covariance_px)[:, 0]
+    wrong = np.flatnonzero(~(variance > 0))
+    if len(wrong):
+        raise AdjustError(f"covariance_px of observation {wrong[0]} is not positive definite")
+
+
+def _check_priors(problem: Problem) -> None:
+    if (problem.centre_vehicle is None) != (problem.centre_sigma_m is None):
+        raise AdjustError("centre_vehicle and centre_sigma_m belong together: give both or neither")
+    if problem.centre_sigma_m is not None and not np.all(problem.centre_sigma_m > 0):
+        camera = int(np.flatnonzero(~(problem.centre_sigma_m > 0).all(1))[0])
+        raise AdjustError(f"centre_sigma_m of camera {camera} must be above 0 (inf where nothing is known)")
+    sigma = problem.pose_sigma.by_state()
+    if not (np.isfinite(sigma).all() and (sigma > 0).all() and problem.pose_sigma.correlation_m >= 0):
+        raise AdjustError(f"pose_sigma must be above 0 and finite: {problem.pose_sigma}")

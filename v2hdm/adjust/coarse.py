@@ -1,0 +1,70 @@
+"""A first look at steep rays of part of the route: leads home from ten degrees away."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from v2hdm.adjust.arrays import Arrays
+from v2hdm.adjust.descent import descend
+from v2hdm.adjust.residuals import Estimate, Loss
+from v2hdm.adjust.start import back_project, ground_hits
+
+# Sines of the depression below which rays are left out, in turn.
+_MIN_DEPRESSION_SINES = (0.2, 0.1)
+_CORNERS = 400
+_BLOCKS = 10
+# Below this many observations a camera's six unknowns are not worth estimating from the subset.
+_MIN_OBSERVATIONS = 24
+_GAP_TOLERANCE = 1e-4
+_MAX_REFRESHES = 10
+_MAX_EVALUATIONS = 200
+
+
+def coarse_extrinsics(arrays: Arrays, cam_from_vehicle: Tensor) -> tuple[Tensor, int]:
+    """Improved extrinsics (C, 4, 4), and the evaluations spent.
+
+    Rays near the horizon turn a small error of pitch into tens of metres; steep ones do not, and a few
+    hundred corners fix an extrinsic. The poses are taken as recorded: what they are off is small
+    here. The loss is convex, and wide enough for the residuals that are found.
+    """
+    subset = _route_blocks(arrays)
+    evaluations = 0
+    for min_sine in _MIN_DEPRESSION_SINES:
+        _, sine = ground_hits(arrays, cam_from_vehicle)
+        part = _seen_twice(arrays, subset[arrays.corner] & (sine > min_sine))
+        if part is None:
+            continue
+        corners, _ = back_project(part, cam_from_vehicle)
+        start = Estimate(cam_from_vehicle, part.state_memory, corners)
+        descent = descend(
+            part, start, Loss("huber", 1.0), "lbfgs", _GAP_TOLERANCE, _MAX_REFRESHES, _MAX_EVALUATIONS
+        )
+        cam_from_vehicle = descent.estimate.cam_from_vehicle
+        evaluations += descent.evaluations
+    return cam_from_vehicle, evaluations
+
+
+def _route_blocks(arrays: Arrays) -> Tensor:
+    """Mask (N,) of corners in contiguous blocks spread over the route."""
+    count = arrays.corner_count
+    index = torch.arange(count, device=arrays.corner.device)
+    if count <= _CORNERS:
+        return torch.ones_like(index, dtype=torch.bool)
+    block = index * _BLOCKS // count
+    first = torch.searchsorted(block, block)
+    return index - first < _CORNERS // _BLOCKS
+
+
+def _seen_twice(arrays: Arrays, keep: Tensor) -> Arrays | None:
+    """The paper's model on the corners that ``keep`` leaves at least two observations, if enough."""
+    sightings = torch.bincount(arrays.corner[keep], minlength=arrays.corner_count)
+    keep = keep & (sightings >= 2)[arrays.corner]
+    camera = arrays.pair[keep] // arrays.frame_count
+    if int(torch.bincount(camera, minlength=arrays.camera_count).min()) < _MIN_OBSERVATIONS:
+        return None
+    part, _ = arrays.take(keep)
+    nothing = arrays.state_memory[:, :0]
+    return replace(part, states=(), state_memory=nothing, state_information_root=nothing)

@@ -1,0 +1,82 @@
+"""torch's LBFGS over whitened variables, set up so that its first step is the Gauss-Newton step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+Objective = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""Cost and gradient at whitened variables y."""
+
+_HISTORY = 20
+_LINE_SEARCH_EVALUATIONS = 25
+# A relative decrease below this is rounding.
+_NO_PROGRESS = 1e-15
+
+
+def minimise(
+    objective: Objective,
+    cost: Tensor,
+    gradient: Tensor,
+    tolerance: float,
+    max_iterations: int,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Minimise from y = 0, whose cost and gradient are given.
+
+    torch's first step is ``-min(1, 1 / |g|_1) g``. On u = y / a with the objective scaled by 1 / a^2 and
+    a = |g_y(0)|_1 the gradient's 1-norm is 1 and that step is y = -g_y: the unit step that the
+    whitening was made for, with no internals touched.
+
+    Args:
+        objective: cost and gradient; the Hessian at 0 is about the identity.
+        cost: at 0.
+        gradient: at 0, (n,).
+        tolerance: stop when |g|^2 is below this fraction of the cost.
+        max_iterations: after these the whitening is better renewed.
+
+    Returns:
+        y, its cost and its gradient.
+    """
+    scale = gradient.abs().sum()
+    u = torch.zeros_like(gradient, requires_grad=True)
+
+    # Each call of step() evaluates first where the last one ended, so remember the points of one step.
+    def evaluate(point: Tensor) -> tuple[Tensor, Tensor]:
+        for known, known_cost, known_gradient in recent:
+            if torch.equal(known, point):
+                return known_cost, known_gradient
+        new_cost, new_gradient = objective(point * scale)
+        recent.append((point.clone(), new_cost, new_gradient))
+        return new_cost, new_gradient
+
+    def closure() -> Tensor:
+        new_cost, new_gradient = evaluate(u.detach())
+        u.grad = new_gradient / scale
+        # Relative to the start, small improvements of a large cost keep their digits.
+        return (new_cost - cost) / scale.square()
+
+    recent = [(torch.zeros_like(gradient), cost, gradient)]
+    optimizer = torch.optim.LBFGS(
+        [u],
+        lr=1.0,
+        max_iter=1,
+        max_eval=_LINE_SEARCH_EVALUATIONS,
+        tolerance_grad=0.0,
+        tolerance_change=0.0,
+        history_size=_HISTORY,
+        line_search_fn="strong_wolfe",
+    )
+    best, best_gradient = cost, gradient
+    for _ in range(max_iterations):
+        if float(best_gradient.square().sum()) <= tolerance * float(best):
+            break
+        optimizer.step(closure)
+        reached, reached_gradient = evaluate(u.detach())
+        recent[:] = [(u.detach().clone(), reached, reached_gradient)]
+        progress = float(best - reached)
+        best, best_gradient = reached, reached_gradient
+        if progress <= _NO_PROGRESS * float(best):
+            break
+    return u.detach() * scale, best, best_gradient

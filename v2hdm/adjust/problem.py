@@ -1,0 +1,119 @@
+r"""What is estimated from what: the model, as plain numpy records.
+
+Unknown are, in the frames of :mod:`v2hdm.geometry.transform`,
+
+- the extrinsic ``cam_from_vehicle`` of every camera,
+- the corners of the markings ``corners_map`` (x, y); the ground is z = 0,
+- optionally, for every frame, how far the vehicle was from its recorded pose: any of x, y, height,
+  roll, pitch, heading, as a tangent s in the vehicle frame, ``map_from_vehicle @ exp(s)``.
+
+The cost, in units of half a squared standard deviation, is
+
+.. math:: f = \tfrac12 \sum_k \rho(\|\Sigma_k^{-1/2} (\pi(T_c\,e^{-s_j} P_j^{-1}\, l) - u_k)\|^2)
+    + \tfrac12 \sum_c \|(o_c - \bar o_c) / \sigma_c\|^2 + \tfrac12 \sum_j \|s_j / \sigma_s\|^2
+
+over observations k (one corner in one image), camera centres o and frame states s. The prior acts on
+the camera's *centre in the vehicle frame*, which a survey measures, and not on the translation of
+``cam_from_vehicle``, which a rotation error would drag along.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v2hdm.records import FloatArray
+
+IntArray = NDArray[np.int64]
+
+POSE_STATES: tuple[str, ...] = ("x", "y", "height", "roll", "pitch", "heading")
+"""What a frame can deviate in, in the order of its tangent."""
+
+LOSSES: tuple[str, ...] = ("none", "huber", "cauchy", "geman_mcclure")
+SOLVERS: tuple[str, ...] = ("lbfgs", "lm")
+
+
+@dataclass(frozen=True)
+class Observations:
+    """K sightings: camera ``camera`` (K,) saw at frame ``frame`` (K,) the corner ``corner`` (K,).
+
+    ``pinhole_px`` (K, 2) is where, with the lens distortion removed; ``covariance_px`` (K, 2, 2) how
+    well, px^2.
+    """
+
+    camera: IntArray
+    frame: IntArray
+    corner: IntArray
+    pinhole_px: FloatArray
+    covariance_px: FloatArray
+
+
+@dataclass(frozen=True)
+class PoseSigma:
+    """How far the recorded poses are off, one standard deviation of each state of a frame.
+
+    ``correlation_m`` is the distance over which the errors of position and heading fade to 1 / e (a
+    first-order Gauss-Markov process along the route; frames must then be in driving order); 0 means
+    independent from frame to frame.
+    """
+
+    position_m: float = 0.02
+    heading_rad: float = 0.001
+    roll_pitch_rad: float = 0.003
+    height_m: float = 0.01
+    correlation_m: float = 0.0
+
+    def by_state(self) -> FloatArray:
+        """Sigmas (6,) in the order of :data:`POSE_STATES`."""
+        position, attitude = self.position_m, self.roll_pitch_rad
+        return np.array([position, position, self.height_m, attitude, attitude, self.heading_rad])
+
+
+@dataclass(frozen=True)
+class Problem:
+    """C cameras, J frames, N corners and what ties them together.
+
+    ``intrinsic`` (C, 4) is fx, fy, cx, cy in px. ``cam_from_vehicle`` (C, 4, 4) is where to start
+    from; ``map_from_vehicle`` (J, 4, 4) are the recorded poses. ``centre_vehicle`` and
+    ``centre_sigma_m`` (C, 3) are the surveyed camera centres, or None. ``corners_start`` (N, 2), if
+    given, replaces the start by weighted back-projection.
+    """
+
+    intrinsic: FloatArray
+    cam_from_vehicle: FloatArray
+    map_from_vehicle: FloatArray
+    observations: Observations
+    corner_count: int
+    centre_vehicle: FloatArray | None = None
+    centre_sigma_m: FloatArray | None = None
+    pose_sigma: PoseSigma = PoseSigma()
+    corners_start: FloatArray | None = None
+
+
+@dataclass(kw_only=True)
+class SolveOptions:
+    """How to solve.
+
+    Attributes:
+        pose_states: the states each frame is given, of :data:`POSE_STATES`; () is the paper's model.
+        loss: robust loss on the whitened residual of an observation, of :data:`LOSSES`.
+        loss_scale: residual, in standard deviations, from which the loss departs from least squares.
+        solver: ``lbfgs``, or ``lm`` (Schur-complement Levenberg-Marquardt) to cross-check.
+        coarse: first solve a subset of steep rays, which converges from ten degrees away.
+        gap_tolerance: stop when the predicted remaining decrease is this fraction of the cost.
+        max_refreshes: how often the problem is whitened anew at most.
+        max_evaluations: of cost and gradient, over all refreshes.
+        device: torch device to compute on.
+    """
+
+    pose_states: tuple[str, ...] = POSE_STATES
+    loss: str = "cauchy"
+    loss_scale: float = 3.0
+    solver: str = "lbfgs"
+    coarse: bool = True
+    gap_tolerance: float = 1e-11
+    max_refreshes: int = 20
+    max_evaluations: int = 500
+    device: str = "cpu"

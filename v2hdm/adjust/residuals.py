@@ -1,0 +1,172 @@
+"""The residuals, their derivatives and the cost: pure functions of an estimate.
+
+With ``A = [r1 r2 t]`` of a pair's ``cam_from_map`` a corner l lies at p = A (l_x, l_y, 1) in the
+camera and is seen at (p_x / p_z, p_y / p_z). Let a (2 x 3) be the whitened derivative of that with
+respect to p. Then the residual's derivative is a [r1 r2] with respect to the corner and
+[a, p x a] with respect to a left perturbation (translation, rotation) of the pair's ``cam_from_map``,
+and that is what extrinsics and frame states act through:
+
+- extrinsic c: a left perturbation of ``cam_from_vehicle`` is one of every pair of c;
+- state s of frame j: ``cam_from_vehicle exp(-s) vehicle_from_map``, so ds perturbs the pair by
+  -Ad(cam_from_vehicle) J_l(-s) ds (see :func:`pair_from_state`).
+
+A gradient of the cost with respect to p is a force, so that of a pair is its *wrench*: the sums of the
+forces and of their moments p x force.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from v2hdm.adjust.arrays import Arrays
+from v2hdm.adjust.robust import loss
+from v2hdm.geometry.camera import inverse_depth
+from v2hdm.geometry.transform import adjoint, exp, left_jacobian
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A point in the space of unknowns: extrinsics (C, 4, 4), frame states (J, S), corners (N, 2)."""
+
+    cam_from_vehicle: Tensor
+    frame_state: Tensor
+    corners_map: Tensor
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """Of a scalar: by extrinsic (left tangent, (C, 6)), frame state (J, S) and corner (N, 2)."""
+
+    extrinsic: Tensor
+    frame_state: Tensor
+    corners_map: Tensor
+
+
+@dataclass(frozen=True)
+class View:
+    """All observations under one estimate; each entry holds K columns.
+
+    ``axes``: the three columns of A, each (3, K). ``point``: p. ``inverse_depth`` and its ``slope``.
+    ``residual``: (2, K), whitened.
+    """
+
+    axes: tuple[Tensor, Tensor, Tensor]
+    point: Tensor
+    inverse_depth: Tensor
+    slope: Tensor
+    residual: Tensor
+
+    @property
+    def squared(self) -> Tensor:
+        """Squared Mahalanobis distance (K,) of each observation."""
+        return self.residual.square().sum(0)
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A robust loss by name and scale."""
+
+    name: str
+    scale: float
+
+
+def frame_tangent(arrays: Arrays, frame_state: Tensor) -> Tensor:
+    """The full tangents (J, 6) of the frames, zero where a state is not estimated."""
+    tangent = frame_state.new_zeros(arrays.frame_count, 6)
+    tangent[:, list(arrays.states)] = frame_state
+    return tangent
+
+
+def observe(arrays: Arrays, estimate: Estimate) -> View:
+    """Project every corner into every image that saw it."""
+    vehicle_from_map = arrays.vehicle_from_map
+    if arrays.states:
+        vehicle_from_map = exp(-frame_tangent(arrays, estimate.frame_state)) @ vehicle_from_map
+    cam_from_map = estimate.cam_from_vehicle[:, None] @ vehicle_from_map
+    table = cam_from_map[..., :3, [0, 1, 3]].mT.reshape(arrays.pair_count, 9)
+    first, second, origin = table.index_select(0, arrays.pair).T.contiguous().chunk(3)
+    x, y = estimate.corners_map.index_select(0, arrays.corner).T.contiguous()
+    point = torch.addcmul(torch.addcmul(origin, first, x), second, y)
+    reciprocal, slope = inverse_depth(point[2])
+    dx, dy = torch.addcmul(-arrays.measured, point[:2], reciprocal)
+    a, b, c = arrays.root_information
+    residual = torch.stack([a * dx, b * dx + c * dy])
+    return View((first, second, origin), point, reciprocal, slope, residual)
+
+
+def pull_back(arrays: Arrays, view: View, by_residual: Tensor) -> tuple[Tensor, Tensor]:
+    """Carry a gradient by the residuals (2, K) back to pairs and corners.
+
+    Returns the wrench of every pair (P, 6) and the gradient of every corner (N, 2).
+    """
+    a, b, c = arrays.root_information
+    by_dx, by_dy = a * by_residual[0] + b * by_residual[1], c * by_residual[1]
+    x, y, z = view.point
+    fx, fy = by_dx * view.inverse_depth, by_dy * view.inverse_depth
+    fz = (by_dx * x + by_dy * y) * view.slope
+    force = torch.stack([fx, fy, fz])
+    rows = torch.stack([fx, fy, fz, y * fz - z * fy, z * fx - x * fz, x * fy - y * fx])
+    wrench = rows.new_zeros(6, arrays.pair_count).index_add_(1, arrays.pair, rows).T
+    along = torch.stack([(view.axes[0] * force).sum(0), (view.axes[1] * force).sum(0)])
+    return wrench, along.new_zeros(2, arrays.corner_count).index_add_(1, arrays.corner, along).T
+
+
+def jacobians(arrays: Arrays, view: View) -> tuple[Tensor, Tensor]:
+    """Derivatives of the whitened residuals by pair (K, 2, 6) and by corner (K, 2, 2)."""
+    a, b, c = arrays.root_information
+    x, y, z = view.point
+    direct, across = view.inverse_depth, view.slope
+    o = torch.zeros_like(a)
+    top = torch.stack([a * direct, o, a * x * across])
+    low = torch.stack([b * direct, c * direct, (b * x + c * y) * across])
+    by_point = torch.stack([top, low]).permute(2, 0, 1)
+    position = view.point.T[:, None].expand_as(by_point)
+    by_pair = torch.cat([by_point, torch.linalg.cross(position, by_point)], dim=-1)
+    by_corner = by_point @ torch.stack([view.axes[0], view.axes[1]], dim=-1).permute(1, 0, 2)
+    return by_pair, by_corner
+
+
+def pair_from_state(arrays: Arrays, estimate: Estimate) -> Tensor:
+    """Derivative (C, J, 6, S) of each pair's left tangent by the states of its frame."""
+    by_tangent = left_jacobian(-frame_tangent(arrays, estimate.frame_state))[..., list(arrays.states)]
+    return -adjoint(estimate.cam_from_vehicle)[:, None] @ by_tangent
+
+
+def centre_residual(arrays: Arrays, estimate: Estimate) -> Tensor:
+    """Whitened residual (C, 3) of the prior on the camera centres, o = -R' t."""
+    rotation, translation = estimate.cam_from_vehicle[:, :3, :3], estimate.cam_from_vehicle[:, :3, 3:]
+    centre_vehicle = -(rotation.mT @ translation)[..., 0]
+    return (centre_vehicle - arrays.centre) * arrays.centre_information_root
+
+
+def state_residual(arrays: Arrays, frame_state: Tensor) -> Tensor:
+    """Whitened innovations (J, S) of the frame states."""
+    before = torch.cat([torch.zeros_like(frame_state[:1]), frame_state[:-1]])
+    return (frame_state - arrays.state_memory * before) * arrays.state_information_root
+
+
+def cost_and_gradient(arrays: Arrays, estimate: Estimate, robust: Loss) -> tuple[dict[str, Tensor], Gradient]:
+    """The named terms of the cost, and the gradient of their sum."""
+    view = observe(arrays, estimate)
+    rho, weight = loss(robust.name, view.squared, robust.scale)
+    wrench, by_corner = pull_back(arrays, view, view.residual * weight)
+    wrench = wrench.reshape(arrays.camera_count, arrays.frame_count, 6)
+    centre = centre_residual(arrays, estimate)
+    state = state_residual(arrays, estimate.frame_state)
+    terms = {
+        "observations": rho.sum() / 2,
+        "camera_centre": centre.square().sum() / 2,
+        "frame_states": state.square().sum() / 2,
+    }
+    by_extrinsic = wrench.sum(1)
+    # A left perturbation moves the centre by minus its translation part, turned into the vehicle.
+    rotation = estimate.cam_from_vehicle[:, :3, :3]
+    by_extrinsic[:, :3] -= (rotation @ (centre * arrays.centre_information_root)[..., None])[..., 0]
+    by_state = (pair_from_state(arrays, estimate).mT @ wrench[..., None])[..., 0].sum(0)
+    innovation = state * arrays.state_information_root
+    by_state += innovation
+    by_state[:-1] -= (arrays.state_memory * innovation)[1:]
+    return terms, Gradient(by_extrinsic, by_state, by_corner)

@@ -1,0 +1,87 @@
+"""What a solve returns: the estimate, how it went, and how sure it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+
+from v2hdm.adjust.covariance import Covariance
+from v2hdm.records import FloatArray
+
+
+class Status(Enum):
+    """How a solve ended; :attr:`advice` says what to do about it."""
+
+    CONVERGED = "converged"
+    STALLED = "stalled"
+    EVALUATIONS_EXHAUSTED = "evaluations exhausted"
+    UNDETERMINED = "undetermined"
+    BEHIND_CAMERA = "corners behind the camera"
+
+    @property
+    def advice(self) -> str:
+        """One sentence: what the status means and what to try."""
+        return _ADVICE[self]
+
+
+_ADVICE = {
+    Status.CONVERGED: "The optimum is reached; nothing needs to be done.",
+    Status.STALLED: "No step lowers the cost further although its gradient is not zero: check the "
+    "starting extrinsic and the observation covariances for values that are orders of magnitude off.",
+    Status.EVALUATIONS_EXHAUSTED: "The optimum was not reached in time: start closer or raise max_evaluations.",
+    Status.UNDETERMINED: "The observations leave a direction free: add a prior on the camera centre, "
+    "drive a turn, or estimate fewer pose states.",
+    Status.BEHIND_CAMERA: "At the solution some corners lie behind the camera that saw them: their "
+    "observations are wrong associations or the starting extrinsic points the wrong way.",
+}
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The adjusted extrinsics, poses and corners, and the evidence that they are the optimum.
+
+    Attributes:
+        status: how it ended.
+        cam_from_vehicle: adjusted extrinsics (C, 4, 4).
+        map_from_vehicle: adjusted poses (J, 4, 4); the recorded ones where no state is estimated.
+        corners_map: (N, 2) m.
+        residual_px: projected minus observed, (K, 2).
+        mahalanobis2: squared residual in standard deviations (K,), chi-square with 2 degrees of
+            freedom where model and covariances are right.
+        weight: what the robust loss left of each observation (K,), 0 to 1.
+        cost_terms: the parts of the cost by name; they add up to :attr:`cost`.
+        evaluations: of cost and gradient, all stages together.
+        gap: predicted decrease still possible, as a fraction of the cost (the certificate).
+        chi2_per_dof: about 1 where the noise model is right; outliers are left out.
+        time_s: wall time.
+        covariance: of everything estimated, on demand.
+    """
+
+    status: Status
+    cam_from_vehicle: FloatArray
+    map_from_vehicle: FloatArray
+    corners_map: FloatArray
+    residual_px: FloatArray
+    mahalanobis2: FloatArray
+    weight: FloatArray
+    cost_terms: Mapping[str, float]
+    evaluations: int
+    gap: float
+    chi2_per_dof: float
+    time_s: float
+    covariance: Covariance
+
+    @property
+    def cost(self) -> float:
+        """Half the squared, robustified residuals plus priors."""
+        return sum(self.cost_terms.values())
+
+    @property
+    def extrinsic_covariance(self) -> FloatArray:
+        """Covariance (C, 6, 6) of each extrinsic's left tangent: translation m, rotation rad."""
+        return self.covariance.extrinsic()
+
+    def corner_covariance(self, indices: FloatArray) -> FloatArray:
+        """Joint covariance (2n, 2n), m^2, of the corners ``indices`` (n,), stacked x0, y0, x1, ..."""
+        return self.covariance.corners(indices)

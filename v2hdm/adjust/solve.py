@@ -1,0 +1,129 @@
+"""``solve(problem, options) -> Solution``: check, lay out, start, descend, report."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from v2hdm.adjust.arrays import Arrays, make_arrays
+from v2hdm.adjust.checks import check_options, check_problem
+from v2hdm.adjust.coarse import coarse_extrinsics
+from v2hdm.adjust.covariance import Covariance
+from v2hdm.adjust.descent import Descent, descend
+from v2hdm.adjust.problem import Problem, SolveOptions
+from v2hdm.adjust.residuals import Estimate, Loss, cost_and_gradient, frame_tangent, observe
+from v2hdm.adjust.robust import loss
+from v2hdm.adjust.solution import Solution, Status
+from v2hdm.adjust.start import back_project
+from v2hdm.errors import AdjustError
+from v2hdm.geometry.camera import NEAR_M
+from v2hdm.geometry.transform import exp, inverse
+from v2hdm.records import FloatArray
+
+# Squared residual that one good observation in a thousand exceeds: chi-square, 2 degrees of freedom.
+_OUTLIER_SQUARED = 13.8
+
+
+def solve(problem: Problem, options: SolveOptions | None = None) -> Solution:
+    """Adjust extrinsics, poses and corners together.
+
+    Args:
+        problem: what was seen, and from where.
+        options: how to solve; the defaults suit a port vehicle.
+
+    Raises:
+        AdjustError: the problem is malformed; the message names the offending item.
+    """
+    began = time.perf_counter()
+    options = options or SolveOptions()
+    check_options(options)
+    check_problem(problem)
+    arrays = make_arrays(problem, tuple(options.pose_states), options.device)
+    start, spent = _start(problem, arrays, options)
+    robust = Loss(options.loss, options.loss_scale)
+    descent = descend(
+        arrays,
+        start,
+        robust,
+        options.solver,
+        options.gap_tolerance,
+        options.max_refreshes,
+        options.max_evaluations,
+    )
+    return _report(problem, arrays, options, descent, spent, began)
+
+
+def _start(problem: Problem, arrays: Arrays, options: SolveOptions) -> tuple[Estimate, int]:
+    """Where the descent starts, and the evaluations spent on finding it."""
+    cam_from_vehicle = torch.as_tensor(problem.cam_from_vehicle, dtype=torch.float64, device=options.device)
+    spent = 0
+    if options.coarse:
+        cam_from_vehicle, spent = coarse_extrinsics(arrays, cam_from_vehicle)
+    state = torch.zeros_like(arrays.state_memory)
+    if problem.corners_start is not None:
+        given = torch.as_tensor(problem.corners_start, dtype=torch.float64, device=options.device)
+        return Estimate(cam_from_vehicle, state, given[arrays.corner_order]), spent
+    corners, fixed = back_project(arrays, cam_from_vehicle)
+    if not bool(fixed.all()):
+        corner = int(arrays.corner_order[~fixed].min())
+        raise AdjustError(
+            f"no ray of corner {corner} meets the ground under the starting extrinsics: its observations "
+            "lie above the horizon; leave it out or give corners_start"
+        )
+    return Estimate(cam_from_vehicle, state, corners), spent
+
+
+def _report(
+    problem: Problem, arrays: Arrays, options: SolveOptions, descent: Descent, spent: int, began: float
+) -> Solution:
+    estimate = descent.estimate
+    view = observe(arrays, estimate)
+    terms, _ = cost_and_gradient(arrays, estimate, Loss(options.loss, options.loss_scale))
+    squared = view.squared
+    depth_one = view.point[:2] * view.inverse_depth - arrays.measured
+    camera = (arrays.pair // arrays.frame_count).cpu().numpy()
+    residual_px = depth_one.T.cpu().numpy() * problem.intrinsic[camera, :2]
+    map_from_vehicle = inverse(arrays.vehicle_from_map) @ exp(frame_tangent(arrays, estimate.frame_state))
+
+    def unsorted(values: Tensor | FloatArray, order: Tensor) -> FloatArray:
+        out = np.empty(values.shape)
+        out[order.cpu().numpy()] = values.cpu().numpy() if isinstance(values, Tensor) else values
+        return out
+
+    return Solution(
+        status=_status(descent, options, bool((view.point[2] <= NEAR_M).any())),
+        cam_from_vehicle=estimate.cam_from_vehicle.cpu().numpy(),
+        map_from_vehicle=map_from_vehicle.cpu().numpy(),
+        corners_map=unsorted(estimate.corners_map, arrays.corner_order),
+        residual_px=unsorted(residual_px, arrays.order),
+        mahalanobis2=unsorted(squared, arrays.order),
+        weight=unsorted(loss(options.loss, squared, options.loss_scale)[1], arrays.order),
+        cost_terms={name: float(value) for name, value in terms.items()},
+        evaluations=descent.evaluations + spent,
+        gap=descent.gap,
+        chi2_per_dof=_chi2_per_dof(arrays, terms, squared),
+        time_s=time.perf_counter() - began,
+        covariance=Covariance(descent.whitening),
+    )
+
+
+def _status(descent: Descent, options: SolveOptions, behind: bool) -> Status:
+    if behind:
+        return Status.BEHIND_CAMERA
+    if descent.whitening.is_singular:
+        return Status.UNDETERMINED
+    if descent.gap <= options.gap_tolerance:
+        return Status.CONVERGED
+    return Status.EVALUATIONS_EXHAUSTED if descent.progressing else Status.STALLED
+
+
+def _chi2_per_dof(arrays: Arrays, terms: dict[str, Tensor], squared: Tensor) -> float:
+    """Chi-square of good observations and priors per degree of freedom."""
+    good = squared[squared <= _OUTLIER_SQUARED]
+    chi2 = good.sum() + 2 * (terms["camera_centre"] + terms["frame_states"])
+    centres = int((arrays.centre_information_root > 0).sum())
+    free = 2 * arrays.corner_count + 6 * arrays.camera_count - centres
+    return float(chi2) / max(2 * len(good) - free, 1)
