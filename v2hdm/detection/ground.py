@@ -32,3 +32,26 @@ def homography_jacobian(dst_from_src: FloatArray, points_src: FloatArray) -> Flo
     depth = homogeneous[:, 2][:, None, None]
     mapped = (homogeneous[:, :2] / homogeneous[:, 2:])[:, :, None]
     return np.asarray((dst_from_src[None, :2, :2] - mapped * dst_from_src[2:, :2][None]) / depth)
+
+
+def extrinsic_from_ipm(info: CameraInfo, ipm: FloatArray, seen_vehicle: FloatArray) -> FloatArray:
+    """The ``cam_from_vehicle`` (4 x 4) nearest to an IPM: the inverse of :func:`ipm_from_extrinsic`.
+
+    A homography solved from clicked points is not exactly K [r1 r2 t]; its first two columns are
+    scaled to a mean length of one and replaced by the nearest orthonormal pair (Zhang, A flexible
+    new technique for camera calibration, 2000, section 3.1 and appendix C).
+
+    Args:
+        info: the camera's intrinsics.
+        ipm: ``vehicle_from_pinhole_px`` (3 x 3), at any scale.
+        seen_vehicle: a ground point (2,) m that lies in front of the camera; it settles the sign.
+    """
+    columns = np.linalg.inv(info.intrinsic) @ np.linalg.inv(ipm)
+    columns = columns / np.mean(np.linalg.norm(columns[:, :2], axis=0))
+    if columns[2] @ np.append(seen_vehicle, 1.0) < 0:
+        columns = -columns
+    left, _, right = np.linalg.svd(np.column_stack([columns[:, :2], np.cross(columns[:, 0], columns[:, 1])]))
+    cam_from_vehicle = np.eye(4)
+    cam_from_vehicle[:3, :3] = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    cam_from_vehicle[:3, 3] = columns[:, 2]
+    return cam_from_vehicle

@@ -27,9 +27,13 @@ def undistort_points(info: CameraInfo, points_px: FloatArray) -> FloatArray:
         return points.reshape(-1, 2).copy()
     coefficients = np.asarray(info.distortion, dtype=np.float64)
     if info.distortion_model == "equidistant":
-        out = cv2.fisheye.undistortPoints(points, info.intrinsic, coefficients, P=info.intrinsic, criteria=_UNDISTORT_CRITERIA)
+        out = cv2.fisheye.undistortPoints(
+            points, info.intrinsic, coefficients, P=info.intrinsic, criteria=_UNDISTORT_CRITERIA
+        )
     else:
-        out = cv2.undistortPoints(points, info.intrinsic, coefficients, P=info.intrinsic, criteria=_UNDISTORT_CRITERIA)
+        out = cv2.undistortPoints(
+            points, info.intrinsic, coefficients, P=info.intrinsic, criteria=_UNDISTORT_CRITERIA
+        )
     return np.asarray(out, dtype=np.float64).reshape(-1, 2)
 
 

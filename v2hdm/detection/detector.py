@@ -1,0 +1,115 @@
+"""The detector: an image in, markings with sub-pixel corners and lanes out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from v2hdm.detection.blobs import Blob, find_blobs
+from v2hdm.detection.corners import QuadStart, fit_markings
+from v2hdm.detection.lanes import trace_lanes
+from v2hdm.detection.network import Network
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.detection.plausible import plausible_kind
+from v2hdm.detection.quad import is_convex, quad_from_outline
+from v2hdm.detection.view import CameraView
+from v2hdm.errors import DetectorError
+from v2hdm.records import CORNERED_CLASSES, LANE_CLASSES, Camera, FloatArray, LaneDetection, MarkingDetection
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    blob: Blob
+    index: int
+    kind: str
+    score: float
+    outline_pinhole_px: FloatArray
+
+
+class Detector:
+    """Finds markings and lanes in single images.
+
+    A detector holds an onnxruntime session and per-camera tables; use one per process.
+    """
+
+    def __init__(self, network: Network, options: DetectorOptions):
+        self.network = network
+        self.options = options
+        self._views: dict[str, CameraView] = {}
+
+    @classmethod
+    def load(cls, path: str | Path | None = None, options: DetectorOptions | None = None) -> Detector:
+        """Load a model: ``path``, else ``options.model``, else the one that is shipped.
+
+        Raises:
+            DetectorError: the model cannot be used.
+        """
+        options = options or DetectorOptions()
+        path = path if path is not None else options.model
+        return cls(Network(None if path is None else Path(path), options.threads), options)
+
+    def detect(
+        self, image_bgr: np.ndarray, camera: Camera
+    ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
+        """Find the markings and lanes of one image (H, W, 3) uint8 BGR.
+
+        Raises:
+            DetectorError: the image is not of that form or not of the camera's size.
+        """
+        view = self.view(camera)
+        _check_image(image_bgr, camera)
+        logits = self.network.logits(image_bgr[view.top : view.top + view.height])
+        blobs, owner = find_blobs(logits, self.network.info.classes, self.network.info.stride, view.top)
+        candidates = self._candidates(blobs, view)
+        lanes = [
+            lane
+            for c in candidates
+            if c.kind in LANE_CLASSES
+            for lane in trace_lanes(c.blob, c.kind, view, self.options.lane_step_m, self.options.max_range_m)
+        ]
+        starts = [start for c in candidates if (start := self._start(c, view)) is not None]
+        markings = fit_markings(image_bgr, view, starts, owner, self.network.info.stride, self.options)
+        return tuple(markings), tuple(lanes)
+
+    def view(self, camera: Camera) -> CameraView:
+        """The tables of a camera, built at its first use."""
+        view = self._views.get(camera.info.name)
+        if view is None or view.camera is not camera:
+            view = CameraView(camera, self.network.info.multiple)
+            self._views[camera.info.name] = view
+        return view
+
+    def _candidates(self, blobs: list[Blob], view: CameraView) -> list[_Candidate]:
+        if not blobs:
+            return []
+        outlines = view.undistort(np.concatenate([blob.outline_px for blob in blobs]))
+        ends = np.cumsum([len(blob.outline_px) for blob in blobs])[:-1]
+        candidates = []
+        for index, (blob, outline) in enumerate(zip(blobs, np.split(outlines, ends), strict=True)):
+            found = plausible_kind(blob, outline, view)
+            if found is not None and found[1] >= self.options.min_score:
+                candidates.append(_Candidate(blob, index, *found, outline))
+        return candidates
+
+    def _start(self, candidate: _Candidate, view: CameraView) -> QuadStart | None:
+        """The quadrilateral to start the corner fit from, if the blob is one within range."""
+        if candidate.kind not in CORNERED_CLASSES:
+            return None
+        corners = quad_from_outline(candidate.outline_pinhole_px)
+        if corners is None or not is_convex(corners):
+            return None
+        ground = view.ground(corners)
+        if not np.isfinite(ground).all() or view.range_m(ground.mean(axis=0)) > self.options.max_range_m:
+            return None
+        return QuadStart(candidate.kind, candidate.score, corners, candidate.index)
+
+
+def _check_image(image_bgr: np.ndarray, camera: Camera) -> None:
+    expected = (camera.info.height, camera.info.width, 3)
+    if image_bgr.dtype != np.uint8 or image_bgr.shape != expected:
+        raise DetectorError(
+            f"camera {camera.info.name!r}: got an image {image_bgr.shape} {image_bgr.dtype}, its camera_info says "
+            f"{expected} uint8; mend the camera_info or pick the images that belong to it"
+        )

@@ -1,0 +1,50 @@
+"""What a user may set of the detector."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from v2hdm.errors import ConfigError
+
+
+@dataclass(kw_only=True)
+class DetectorOptions:
+    """Settings of :class:`v2hdm.detection.detector.Detector`.
+
+    Attributes:
+        model: path of the ONNX file; None takes the one that is shipped.
+        threads: threads of one onnxruntime session. Throughput comes from worker processes.
+        blur_px: standard deviation of the image's point spread, pixel aperture included, in px;
+            None measures it on the near markings. It decides the far corners' bias: 0.6 to 1.2 px
+            per px of error.
+        max_range_m: markings and lane points farther from the camera on the ground are dropped.
+        min_score: least mean class probability of a blob.
+        max_corner_sigma_px: corners with a larger standard deviation are not valid.
+        border_px: corners nearer to the image border are not valid.
+        lane_step_m: spacing of lane points on the ground.
+    """
+
+    model: str | None = None
+    threads: int = 1
+    blur_px: float | None = None
+    max_range_m: float = 22.0
+    min_score: float = 0.5
+    max_corner_sigma_px: float = 1.0
+    border_px: float = 4.0
+    lane_step_m: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot work.
+
+        Raises:
+            ConfigError: a value is out of range.
+        """
+        if self.threads < 1:
+            raise ConfigError(f"detector.threads is {self.threads}: set 1 or more")
+        if self.blur_px is not None and not 0.2 <= self.blur_px <= 3.0:
+            raise ConfigError(f"detector.blur_px is {self.blur_px}: set 0.2 to 3.0 px, or none to measure it")
+        for name in ("max_range_m", "max_corner_sigma_px", "lane_step_m"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"detector.{name} is {getattr(self, name)}: set a positive number")
+        if not 0 <= self.min_score < 1:
+            raise ConfigError(f"detector.min_score is {self.min_score}: set a probability in [0, 1)")

@@ -1,0 +1,119 @@
+"""What the detector works out once per camera: the band of rows with road in it, the lens, the ground."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from v2hdm.detection.ground import apply_homography, extrinsic_from_ipm
+from v2hdm.detection.lens import distort_points, has_distortion, undistort_points
+from v2hdm.records import BoolArray, Camera, FloatArray
+
+_LUT_STEP_PX = 4
+_HORIZON_MARGIN_PX = 16
+
+
+class CameraView:
+    """One camera as the detector sees it: fast lens and ground mappings, and the rows worth looking at.
+
+    ``top`` and ``height`` are the band of image rows below the horizon of the camera's initial IPM
+    (with a margin, since that IPM is coarse); ``height`` is a multiple of ``multiple`` where the
+    image is tall enough. Points far from any lens singularity are assumed.
+    """
+
+    def __init__(self, camera: Camera, multiple: int = 16):
+        self.camera = camera
+        self.info = camera.info
+        self.vehicle_from_pinhole_px: FloatArray = camera.ipm[camera.initial_ipm]
+        self.pinhole_px_from_vehicle: FloatArray = np.asarray(np.linalg.inv(self.vehicle_from_pinhole_px))
+        self._pinhole_lut = _build_pinhole_lut(camera) if has_distortion(camera.info) else None
+        seen_vehicle = np.asarray(camera.roi_vehicle, dtype=np.float64).mean(axis=0)
+        cam_from_vehicle = extrinsic_from_ipm(self.info, self.vehicle_from_pinhole_px, seen_vehicle)
+        self.foot_vehicle = -(cam_from_vehicle[:3, :3].T @ cam_from_vehicle[:3, 3])[:2]
+        seen_px = apply_homography(self.pinhole_px_from_vehicle, seen_vehicle[None])
+        self._ground_sign = np.sign(self._ground_depth(seen_px))[0]
+        self.top, self.height = self._band_rows(multiple)
+
+    def undistort(self, points_px: FloatArray) -> FloatArray:
+        """Recorded pixels (N, 2) to pinhole pixels, from a table; within 1e-3 px of the lens model."""
+        points = np.asarray(points_px, dtype=np.float64).reshape(-1, 2)
+        if self._pinhole_lut is None or not len(points):
+            return points.copy()
+        rows, columns = self._pinhole_lut.shape[:2]
+        cell = points / _LUT_STEP_PX
+        j = np.clip(np.floor(cell[:, 0]).astype(np.intp), 0, columns - 2)
+        i = np.clip(np.floor(cell[:, 1]).astype(np.intp), 0, rows - 2)
+        a, b = (cell[:, 0] - j)[:, None], (cell[:, 1] - i)[:, None]
+        lut = self._pinhole_lut
+        upper = lut[i, j] * (1 - a) + lut[i, j + 1] * a
+        lower = lut[i + 1, j] * (1 - a) + lut[i + 1, j + 1] * a
+        return np.asarray(upper * (1 - b) + lower * b)
+
+    def distort(self, points_pinhole_px: FloatArray) -> FloatArray:
+        """Pinhole pixels (N, 2) to recorded pixels."""
+        return distort_points(self.info, points_pinhole_px)
+
+    def distort_jacobian(self, points_pinhole_px: FloatArray) -> FloatArray:
+        """Derivative (N, 2, 2) of :meth:`distort`, by central differences over one pixel."""
+        points = np.asarray(points_pinhole_px, dtype=np.float64).reshape(-1, 2)
+        if self._pinhole_lut is None:
+            return np.broadcast_to(np.eye(2), (len(points), 2, 2)).copy()
+        steps = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
+        moved = self.distort((points[:, None] + steps).reshape(-1, 2)).reshape(-1, 4, 2)
+        return np.stack([moved[:, 0] - moved[:, 1], moved[:, 2] - moved[:, 3]], axis=2)
+
+    def ground(self, points_pinhole_px: FloatArray) -> FloatArray:
+        """Where pinhole pixels (N, 2) meet the ground, vehicle frame, m; NaN at and above the horizon."""
+        points = np.asarray(points_pinhole_px, dtype=np.float64).reshape(-1, 2)
+        ground = apply_homography(self.vehicle_from_pinhole_px, points)
+        ground[self._ground_depth(points) * self._ground_sign <= 0] = np.nan
+        return ground
+
+    def range_m(self, points_vehicle: FloatArray) -> FloatArray:
+        """Distance on the ground from below the camera; NaN stays NaN."""
+        return np.asarray(np.linalg.norm(points_vehicle - self.foot_vehicle, axis=-1))
+
+    def inside(self, points_px: FloatArray, border_px: float) -> BoolArray:
+        """Which recorded points (N, 2) lie at least ``border_px`` inside the image."""
+        limit = np.array([self.info.width - 1, self.info.height - 1], dtype=np.float64)
+        return np.asarray(((points_px >= border_px) & (points_px <= limit - border_px)).all(axis=-1))
+
+    def _ground_depth(self, points_pinhole_px: FloatArray) -> FloatArray:
+        row = self.vehicle_from_pinhole_px[2]
+        return np.asarray(points_pinhole_px @ row[:2] + row[2])
+
+    def _band_rows(self, multiple: int) -> tuple[int, int]:
+        columns = np.linspace(0, self.info.width - 1, 9)
+        rows = np.arange(self.info.height, dtype=np.float64)
+        grid_px = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+        on_ground = self._ground_depth(self.undistort(grid_px)) * self._ground_sign > 0
+        first = int(np.argmax(on_ground.reshape(len(rows), -1).any(axis=1)))
+        height = self.info.height - max(0, first - _HORIZON_MARGIN_PX)
+        height = min(-(-height // multiple) * multiple, self.info.height)
+        return self.info.height - height, height
+
+
+def _build_pinhole_lut(camera: Camera) -> FloatArray:
+    """Pinhole pixel of every ``_LUT_STEP_PX``-th recorded pixel, one cell beyond the image's far border."""
+    columns = np.arange(0, camera.info.width + _LUT_STEP_PX, _LUT_STEP_PX, dtype=np.float64)
+    rows = np.arange(0, camera.info.height + _LUT_STEP_PX, _LUT_STEP_PX, dtype=np.float64)
+    grid_px = np.stack(np.meshgrid(columns, rows), axis=-1)
+    return undistort_points(camera.info, grid_px.reshape(-1, 2)).reshape(*grid_px.shape)
+
+
+def linear_grey(image_bgr: np.ndarray, linear_response: bool) -> np.ndarray:
+    """Grey values (H, W) float32 in [0, 1] that are proportional to radiance.
+
+    sRGB coding is undone unless ``linear_response``: fitting edges on coded values pushes each side
+    of a bright marking outwards by about a fifth of the blur.
+    """
+    table = np.arange(256, dtype=np.float32) / 255 if linear_response else _LINEAR_FROM_SRGB
+    weighted = [cv2.LUT(image_bgr[..., c], table * w) for c, w in enumerate(_GREY_WEIGHTS_BGR)]
+    return np.asarray(weighted[0] + weighted[1] + weighted[2])
+
+
+_GREY_WEIGHTS_BGR = (0.114, 0.587, 0.299)
+_CODED = np.arange(256) / 255
+_LINEAR_FROM_SRGB = np.where(_CODED <= 0.04045, _CODED / 12.92, ((_CODED + 0.055) / 1.055) ** 2.4).astype(
+    np.float32
+)
