@@ -1,0 +1,230 @@
+"""The markings of a port: what is painted where, as paint to render and as the true map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from v2hdm.records import (
+    DIAMOND,
+    LANE_DASH,
+    LANE_LINE,
+    OTHER_PAINT,
+    FloatArray,
+    GeodeticOrigin,
+    HdMap,
+    Lane,
+    Marking,
+)
+from v2hdm.simulate.port_config import PaintConfig
+from v2hdm.simulate.route import Route
+from v2hdm.simulate.scene import WHITE_PAINT, YELLOW_PAINT, Bgr, Paint
+
+_VERTEX_SPACING_M = 0.5
+_PIECE_TURN_RAD = 0.06
+_PIECE_LENGTH_M = 25.0
+_PIECE_OVERLAP_M = 0.1
+_LEAST_GAP_M = 1.7
+
+
+@dataclass
+class Layout:
+    """Paint, and the markings and lanes of the true map that it stands for."""
+
+    paints: list[Paint] = field(default_factory=list)
+    markings: list[Marking] = field(default_factory=list)
+    lanes: list[Lane] = field(default_factory=list)
+    blocked_map: list[FloatArray] = field(default_factory=list)
+
+    def hd_map(self, origin: GeodeticOrigin | None) -> HdMap:
+        """The true map."""
+        return HdMap(markings=tuple(self.markings), lanes=tuple(self.lanes), origin=origin)
+
+
+def build_layout(config: PaintConfig, route: Route, rng: np.random.Generator) -> Layout:
+    """Paint a port along its route."""
+    layout = Layout()
+    for offset in config.solid_offsets_m:
+        _solid_line(config, route, offset, layout, rng)
+    for offset in config.dashed_offsets_m:
+        _dashed_line(config, route, offset, layout, rng)
+    _other_paint(config, route, layout, rng)
+    for offset in config.diamond_offsets_m:
+        _diamond_row(config, route, offset, False, layout, rng)
+    for offset in config.field_offsets_m:
+        _diamond_row(config, route, offset, True, layout, rng)
+    return layout
+
+
+def _solid_line(
+    config: PaintConfig, route: Route, offset_m: float, layout: Layout, rng: np.random.Generator
+) -> None:
+    vertices = np.arange(0.0, route.length_m, _VERTEX_SPACING_M)
+    points = route.points_at(vertices, offset_m)
+    layout.lanes.append(Lane(LANE_LINE, points, 0))
+    layout.blocked_map.append(points)
+    wear, dirt = _worn(config, rng)
+    seed = int(rng.integers(1 << 30))
+    for start, end in _pieces(route, 0.0, route.length_m):
+        around = np.array([max(start - _PIECE_OVERLAP_M, 0.0), min(end + _PIECE_OVERLAP_M, route.length_m)])
+        polygon = _ribbon(route, around, offset_m, config.line_width_m)
+        layout.paints.append(Paint(kind=LANE_LINE, polygon_map=polygon, wear=wear, dirt=dirt, seed=seed))
+
+
+def _pieces(route: Route, start: float, end: float) -> list[tuple[float, float]]:
+    """Stretches of a route that are straight to within a few millimetres."""
+    edges = [start]
+    for station in np.arange(start + _VERTEX_SPACING_M, end, 0.25):
+        turned = abs(float(route.yaw_at(np.array([station]))[0] - route.yaw_at(np.array([edges[-1]]))[0]))
+        if turned > _PIECE_TURN_RAD or station - edges[-1] > _PIECE_LENGTH_M:
+            edges.append(float(station))
+    edges.append(end)
+    return list(zip(edges[:-1], edges[1:], strict=True))
+
+
+def _ribbon(route: Route, ends_m: FloatArray, offset_m: float, width_m: float) -> FloatArray:
+    """A quadrilateral (4, 2) along the route between two stations, counter-clockwise."""
+    right = route.points_at(ends_m, offset_m - width_m / 2)
+    left = route.points_at(ends_m, offset_m + width_m / 2)
+    return np.array([right[0], right[1], left[1], left[0]])
+
+
+def _dashed_line(
+    config: PaintConfig, route: Route, offset_m: float, layout: Layout, rng: np.random.Generator
+) -> None:
+    """Dashes as markings, and one lane through them all, straight within dashes and across gaps."""
+    period = config.dash_length_m + config.dash_gap_m
+    corners = []
+    for start in np.arange(rng.uniform(0.5, period), route.length_m - period, period):
+        ends = np.array([start, start + config.dash_length_m])
+        polygon = _ribbon(route, ends, offset_m, config.line_width_m)
+        wear, dirt = _worn(config, rng)
+        layout.paints.append(
+            Paint(kind=LANE_DASH, polygon_map=polygon, wear=wear, dirt=dirt, seed=int(rng.integers(1 << 30)))
+        )
+        layout.markings.append(Marking(LANE_DASH, polygon, 0))
+        corners += [polygon[[0, 3]].mean(axis=0), polygon[[1, 2]].mean(axis=0)]
+    if not corners:
+        return
+    points = _resampled(np.array(corners))
+    layout.lanes.append(Lane(LANE_DASH, points, 0))
+    layout.blocked_map.append(points)
+
+
+def _resampled(points: FloatArray) -> FloatArray:
+    """A polyline with its own vertices and more between them, at most half a metre apart."""
+    out = [points[:1]]
+    for a, b in zip(points[:-1], points[1:], strict=True):
+        count = max(int(np.ceil(np.linalg.norm(b - a) / _VERTEX_SPACING_M)), 1)
+        out.append(a + (np.arange(1, count + 1) / count)[:, None] * (b - a))
+    return np.vstack(out)
+
+
+def _diamond_row(
+    config: PaintConfig,
+    route: Route,
+    offset_m: float,
+    is_field: bool,
+    layout: Layout,
+    rng: np.random.Generator,
+) -> None:
+    half = np.array([[0.5, 0.0], [0.0, 0.5], [-0.5, 0.0], [0.0, -0.5]])
+    half *= (config.diamond_length_m, config.diamond_width_m)
+    colour = YELLOW_PAINT if config.yellow_diamonds else WHITE_PAINT
+    phase = config.diamond_spacing_m * (0.5 + 0.37 * offset_m % 1.0 * 0.5)
+    for station in np.arange(phase, route.length_m - 2.0, config.diamond_spacing_m):
+        at = np.array([station + rng.normal(0.0, config.placing_sigma_m)])
+        yaw = float(route.yaw_at(at)[0]) + np.deg2rad(rng.normal(0.0, config.placing_sigma_deg))
+        centre = route.points_at(at, offset_m + rng.normal(0.0, config.placing_sigma_m))[0]
+        wear, dirt = _worn(config, rng)
+        seed = int(rng.integers(1 << 30))
+        if is_field and not route.is_straight(at)[0]:
+            continue
+        # Rows beyond the lanes may run into another stretch of the route behind a turn.
+        if not _is_free(centre, layout) or float(route.distance_to(centre[None])[0]) < abs(offset_m) - 0.5:
+            continue
+        corners = _placed(half, centre, yaw)
+        layout.markings.append(Marking(DIAMOND, corners, 0))
+        layout.blocked_map.append(centre[None])
+        layout.paints.append(
+            Paint(kind=DIAMOND, polygon_map=corners, albedo_bgr=colour, wear=wear, dirt=dirt, seed=seed)
+        )
+
+
+def _is_free(centre: FloatArray, layout: Layout) -> bool:
+    """Whether a marking at ``centre`` (2,) keeps clear of lines and of other markings."""
+    for points in layout.blocked_map:
+        gap = 1.1 if len(points) > 40 else _LEAST_GAP_M
+        if float(((points - centre) ** 2).sum(axis=1).min()) < gap**2:
+            return False
+    return True
+
+
+def _other_paint(config: PaintConfig, route: Route, layout: Layout, rng: np.random.Generator) -> None:
+    """Arrows, stop lines and lettering: paint that is no marking of the map."""
+    for spacing, shapes in (
+        (config.arrow_spacing_m, _arrow()),
+        (config.stop_line_spacing_m, [np.array([[-0.2, -1.5], [0.2, -1.5], [0.2, 1.5], [-0.2, 1.5]])]),
+        (config.lettering_spacing_m, None),
+    ):
+        for station in np.arange(spacing * 0.6, route.length_m - 5.0, spacing):
+            at = np.array([station + rng.uniform(-2.0, 2.0)])
+            offset = 0.0 if shapes is not None else float(rng.choice([-7.2, -3.5, 3.5, 7.2]))
+            _place_shapes(
+                shapes if shapes is not None else _lettering(rng),
+                route.points_at(at, offset)[0],
+                float(route.yaw_at(at)[0]),
+                _worn(config, rng),
+                layout,
+                WHITE_PAINT if rng.random() < 0.7 else YELLOW_PAINT,
+            )
+
+
+def _place_shapes(
+    shapes: list[FloatArray],
+    centre: FloatArray,
+    yaw_rad: float,
+    worn: tuple[float, float],
+    layout: Layout,
+    colour: Bgr,
+) -> None:
+    for shape in shapes:
+        polygon = _placed(shape, centre, yaw_rad)
+        layout.blocked_map.append(polygon)
+        layout.paints.append(
+            Paint(
+                kind=OTHER_PAINT, polygon_map=polygon, albedo_bgr=colour, wear=worn[0], dirt=worn[1], seed=7
+            )
+        )
+
+
+def _arrow() -> list[FloatArray]:
+    shaft = np.array([[-1.5, -0.08], [0.55, -0.08], [0.55, 0.08], [-1.5, 0.08]])
+    return [shaft, np.array([[0.5, -0.35], [1.5, 0.0], [0.5, 0.35]])]
+
+
+def _lettering(rng: np.random.Generator) -> list[FloatArray]:
+    """Block letters of upright and level bars, as bay numbers are painted."""
+    bars = []
+    for letter in range(int(rng.integers(2, 5))):
+        left = -0.55 * letter
+        for x0, x1, y0, y1 in (
+            (-0.6, 0.6, 0.0, 0.1), (-0.6, 0.6, 0.3, 0.4), (-0.6, -0.5, 0.1, 0.3), (-0.05, 0.05, 0.1, 0.3), (0.5, 0.6, 0.1, 0.3),
+        ):  # fmt: skip
+            if rng.random() < 0.7:
+                y_left, y_right = left + y1, left + y0
+                bars.append(np.array([[x0, y_right], [x1, y_right], [x1, y_left], [x0, y_left]]))
+    return bars
+
+
+def _placed(shape: FloatArray, centre: FloatArray, yaw_rad: float) -> FloatArray:
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    return np.asarray(shape @ np.array([[cos, sin], [-sin, cos]]) + centre)
+
+
+def _worn(config: PaintConfig, rng: np.random.Generator) -> tuple[float, float]:
+    """Wear and dirt of one marking: gamma distributed about the means, never gone altogether."""
+    wear = config.wear * float(rng.gamma(2.0, 0.5))
+    dirt = config.dirt * float(rng.gamma(2.0, 0.5))
+    return min(wear, 0.45), min(dirt, 0.7)

@@ -1,0 +1,149 @@
+"""A port made from its configuration: scene, vehicle, drive, and one image of it at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v2hdm.errors import ConfigError
+from v2hdm.records import Camera, FloatArray, GeodeticOrigin, HdMap
+from v2hdm.simulate.calibration import cam_from_vehicle, survey_camera
+from v2hdm.simulate.disturbance import DrivenPoses, drive_along
+from v2hdm.simulate.layout import build_layout
+from v2hdm.simulate.optics import Motion, Optics
+from v2hdm.simulate.port_config import PortConfig
+from v2hdm.simulate.render import Renderer
+from v2hdm.simulate.route import Route, build_route
+from v2hdm.simulate.scene import Box
+from v2hdm.simulate.yard import MovingTruck, build_scene, moving_trucks
+
+ORIGIN = GeodeticOrigin(latitude_deg=29.95, longitude_deg=122.05, altitude_m=12.0, epoch=2026.0)
+
+# Independent random streams of one seed, so that a change to one part leaves the others alone.
+_LAYOUT, _YARD, _TRUCKS, _POSES, _CALIBRATION, _IMAGES = range(6)
+
+
+@dataclass(frozen=True)
+class Port:
+    """Everything of a rendered drive but the pictures."""
+
+    config: PortConfig
+    route: Route
+    renderer: Renderer
+    trucks: tuple[MovingTruck, ...]
+    hd_map: HdMap
+    cameras: dict[str, Camera]
+    cam_from_vehicle: dict[str, FloatArray]
+    driven: DrivenPoses
+
+    def cam_from_map(self, camera: str, frame: int) -> FloatArray:
+        """Where a camera (4 x 4) truly was at an image."""
+        return np.asarray(self.cam_from_vehicle[camera] @ np.linalg.inv(self.driven.map_from_vehicle[frame]))
+
+    def moving_boxes(self, frame: int) -> tuple[Box, ...]:
+        """The moving trucks at the time of an image."""
+        stamp = float(self.driven.stamp_s[frame])
+        return tuple(box for truck in self.trucks for box in truck.boxes(self.route, stamp))
+
+    def picture(self, camera: str, frame: int) -> NDArray[np.uint8]:
+        """Render one image (H, W, 3): a function of the configuration, the camera and the frame alone."""
+        number = sorted(self.cameras).index(camera)
+        rng = np.random.default_rng([self.config.seed, _IMAGES, number, frame])
+        exposure, lens = self.config.exposure, self.config.cameras[camera]
+        optics = Optics(
+            psf_sigma_px=lens.psf_sigma_px,
+            vignetting=lens.vignetting,
+            mean_level=exposure.level * float(np.exp(rng.normal(0.0, exposure.level_sigma))),
+            full_well_electrons=exposure.full_well_electrons,
+            read_noise=exposure.read_noise,
+        )
+        rendered = self.renderer.render(
+            self.cameras[camera].info,
+            self.cam_from_map(camera, frame),
+            rng,
+            optics,
+            self._motion(camera, frame),
+            self.moving_boxes(frame),
+        )
+        return rendered.image
+
+    def _motion(self, camera: str, frame: int) -> Motion:
+        """The camera's motion on its way along the route, in its own frame."""
+        stamp = self.driven.stamp_s[frame : frame + 1]
+        speed = float(self.route.speed_at(stamp)[0])
+        station = self.route.station_at(stamp)
+        yaw_rate = speed * float(np.interp(station[0], self.route.station_m, self.route.curvature))
+        extrinsic = self.cam_from_vehicle[camera]
+        centre = -extrinsic[:3, :3].T @ extrinsic[:3, 3]
+        turning = np.array([0.0, 0.0, yaw_rate])
+        velocity = extrinsic[:3, :3] @ (np.array([speed, 0.0, 0.0]) + np.cross(turning, centre))
+        return Motion(
+            velocity_cam=_triple(velocity),
+            angular_velocity_cam=_triple(extrinsic[:3, :3] @ turning),
+            exposure_s=self.config.exposure.exposure_s,
+        )
+
+
+def build_port(config: PortConfig) -> Port:
+    """Build a port; equal configurations give equal ports.
+
+    Raises:
+        ConfigError: when values are out of range or contradict each other.
+    """
+    _check(config)
+
+    def stream(part: int) -> np.random.Generator:
+        return np.random.default_rng([config.seed, part])
+
+    route = build_route(config.route)
+    layout = build_layout(config.paint, route, stream(_LAYOUT))
+    scene = build_scene(config.surface, config.yard, route, stream(_YARD), config.seed)
+    survey = stream(_CALIBRATION)
+    cameras = {
+        name: survey_camera(name, config.cameras[name], config.calibration, config.initial_ipm, survey)
+        for name in sorted(config.cameras)
+    }
+    return Port(
+        config=config,
+        route=route,
+        renderer=Renderer(replace(scene, paints=tuple(layout.paints))),
+        trucks=moving_trucks(config.yard, route, stream(_TRUCKS)),
+        hd_map=layout.hd_map(ORIGIN),
+        cameras=cameras,
+        cam_from_vehicle={name: cam_from_vehicle(config.cameras[name].mount) for name in cameras},
+        driven=drive_along(route, config.route, config.disturbance, stream(_POSES)),
+    )
+
+
+def _check(config: PortConfig) -> None:
+    """Refuse what would fail far from its cause."""
+    rules: list[tuple[Any, str]] = [
+        (config.cameras, "cameras: none given; add at least one"),
+        (
+            config.initial_ipm in ("calibrated", "estimated"),
+            "initial_ipm: choose 'calibrated' or 'estimated'",
+        ),
+        (config.route.pieces, "route.pieces: empty; give [length_m, turn_deg] pieces"),
+        (
+            all(len(p) == 2 and p[0] > 0 for p in config.route.pieces),
+            "route.pieces: each is [length_m > 0, turn_deg]",
+        ),
+        (config.route.speed_mps > 0, "route.speed_mps: must be positive"),
+        (config.route.image_spacing_m > 0, "route.image_spacing_m: must be positive"),
+        (config.route.pose_rate_hz > 0, "route.pose_rate_hz: must be positive"),
+        (len(config.surface.slab_m) == 2, "surface.slab_m: give length and width, or [0, 0]"),
+        (0 <= config.surface.wet_fraction < 1, "surface.wet_fraction: must be within 0 and 1"),
+        (config.paint.diamond_spacing_m > 1, "paint.diamond_spacing_m: must be more than 1 m"),
+        (len(config.calibration.points_ahead_m) >= 4, "calibration.points_ahead_m: give at least 4 points"),
+        (50 <= config.exposure.jpeg_quality <= 100, "exposure.jpeg_quality: must be within 50 and 100"),
+    ]
+    for holds, message in rules:
+        if not holds:
+            raise ConfigError(f"port '{config.name}', {message}")
+
+
+def _triple(vector: FloatArray) -> tuple[float, float, float]:
+    return float(vector[0]), float(vector[1]), float(vector[2])

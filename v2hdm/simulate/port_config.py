@@ -1,0 +1,205 @@
+"""Everything that makes up a rendered port, as plain values: what `conf/run/port*.yaml` fills in.
+
+Angles are in degrees here, since people write these values; the code below works in radians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(kw_only=True)
+class MountConfig:
+    """Where a camera sits on the vehicle: centre in the vehicle frame, then yaw (left), pitch (down), roll."""
+
+    x_m: float
+    y_m: float
+    z_m: float
+    yaw_deg: float
+    pitch_deg: float
+    roll_deg: float = 0.0
+
+
+@dataclass(kw_only=True)
+class CameraConfig:
+    """One camera: lens, mount, and the mount of the same camera on the other vehicle, which lends its IPM.
+
+    ``distortion`` are plumb_bob coefficients k1 k2 p1 p2 k3.
+    """
+
+    mount: MountConfig
+    borrowed_mount: MountConfig
+    width: int = 1280
+    height: int = 720
+    focal_px: float = 900.0
+    principal_offset_px: list[float] = field(default_factory=lambda: [6.0, -4.0])
+    distortion: list[float] = field(default_factory=lambda: [-0.11, 0.035, 0.0004, -0.0003, 0.0])
+    psf_sigma_px: float = 0.65
+    vignetting: float = 0.22
+
+
+@dataclass(kw_only=True)
+class CalibrationConfig:
+    """The manual calibration: surveyed ground points clicked in an image, and the survey of the camera centre.
+
+    ``points_ahead_m`` are distance along the viewing direction and offset to the left, in m from the camera.
+    """
+
+    points_ahead_m: list[list[float]] = field(
+        default_factory=lambda: [
+            [4.0, 2.2], [4.0, -2.2], [5.2, 0.0], [7.0, 4.0], [7.0, -4.0],
+            [9.5, 1.5], [9.5, -1.5], [13.0, 4.2], [13.0, -4.2], [13.0, 0.0],
+        ]
+    )  # fmt: skip
+    survey_sigma_m: float = 0.01
+    click_sigma_px: float = 0.5
+    centre_sigma_m: float = 0.02
+
+
+@dataclass(kw_only=True)
+class DisturbanceConfig:
+    """What separates the recorded poses from the true ones; standard deviations per axis.
+
+    Roll and pitch jitter have a white and a correlated part of equal power; so has the heading error. RTK's
+    position error has a white part and one that is correlated over ``rtk_correlation_m`` of driving.
+    """
+
+    roll_pitch_deg: float = 0.11
+    heave_m: float = 0.005
+    jitter_correlation_s: float = 0.25
+    rtk_white_m: float = 0.006
+    rtk_correlated_m: float = 0.009
+    rtk_correlation_m: float = 30.0
+    heading_deg: float = 0.055
+    heading_correlation_s: float = 1.0
+
+
+@dataclass(kw_only=True)
+class RouteConfig:
+    """The way: pieces of [length in m, turn to the left in degrees], driven at about ``speed_mps``."""
+
+    pieces: list[list[float]] = field(
+        default_factory=lambda: [
+            [95.0, 0.0], [24.0, 90.0], [60.0, 0.0], [24.0, 90.0], [75.0, 0.0], [24.0, -90.0], [58.0, 0.0],
+        ]
+    )  # fmt: skip
+    speed_mps: float = 5.0
+    image_spacing_m: float = 0.9
+    pose_rate_hz: float = 10.0
+
+
+@dataclass(kw_only=True)
+class PaintConfig:
+    """The markings: diamonds in rows beside and on the route, lane lines, arrows, stop lines, lettering.
+
+    Offsets are to the left of the route, in m; ``field_offsets_m`` are rows further out, on straights
+    only. ``wear`` and ``dirt`` are the means of what varies from marking to marking.
+    """
+
+    diamond_length_m: float = 1.2
+    diamond_width_m: float = 0.6
+    diamond_spacing_m: float = 5.0
+    diamond_offsets_m: list[float] = field(default_factory=lambda: [-3.4, 0.0, 3.4])
+    field_offsets_m: list[float] = field(default_factory=lambda: [-11.0, -7.4, 7.4, 11.0])
+    placing_sigma_m: float = 0.08
+    placing_sigma_deg: float = 1.5
+    solid_offsets_m: list[float] = field(default_factory=lambda: [1.8, -5.3, 5.3])
+    dashed_offsets_m: list[float] = field(default_factory=lambda: [-1.8])
+    line_width_m: float = 0.15
+    dash_length_m: float = 3.0
+    dash_gap_m: float = 3.0
+    arrow_spacing_m: float = 47.0
+    stop_line_spacing_m: float = 83.0
+    lettering_spacing_m: float = 31.0
+    wear: float = 0.14
+    dirt: float = 0.2
+    yellow_diamonds: bool = False
+
+
+@dataclass(kw_only=True)
+class SurfaceConfig:
+    """The ground; see :class:`v2hdm.simulate.scene.Ground`. Lengths of 0 for ``slab_m`` mean no joints."""
+
+    texture: str = "concrete"
+    albedo: float = 0.3
+    contrast: float = 0.11
+    stains: float = 0.13
+    slab_m: list[float] = field(default_factory=lambda: [5.0, 4.5])
+    joint_width_m: float = 0.015
+    wet_fraction: float = 0.05
+    tyre_marks: float = 0.5
+    patches: int = 25
+    oil_stains: int = 160
+
+
+@dataclass(kw_only=True)
+class YardConfig:
+    """What stands and drives in the port, and the light.
+
+    ``stack_fill`` is the fraction of the places beside the route with container stacks; parked trucks
+    and barriers stand closer; moving trucks come the other way. Strips are shadows of cranes and beams.
+    """
+
+    stack_fill: float = 0.55
+    stack_clearance_m: float = 8.5
+    parked_trucks: int = 7
+    barriers: int = 12
+    lamp_posts: int = 14
+    moving_trucks: int = 4
+    moving_offset_m: float = 4.6
+    shadow_strips: int = 16
+    sun_azimuth_deg: float = 120.0
+    sun_elevation_deg: float = 42.0
+    sun_strength: float = 1.0
+    haze_m: float = 400.0
+
+
+@dataclass(kw_only=True)
+class ExposureConfig:
+    """The shutter and what it lets in: ``level`` is the mean the exposure aims at, varying by ``level_sigma``."""
+
+    exposure_s: float = 0.002
+    level: float = 0.25
+    level_sigma: float = 0.08
+    full_well_electrons: float = 9000.0
+    read_noise: float = 0.0015
+    jpeg_quality: int = 95
+
+
+def _front() -> CameraConfig:
+    return CameraConfig(
+        mount=MountConfig(x_m=3.60, y_m=0.05, z_m=2.45, yaw_deg=0.6, pitch_deg=16.0, roll_deg=0.3),
+        borrowed_mount=MountConfig(
+            x_m=3.42, y_m=-0.07, z_m=2.58, yaw_deg=-0.7, pitch_deg=17.1, roll_deg=-0.6
+        ),
+    )
+
+
+def _rear() -> CameraConfig:
+    return CameraConfig(
+        mount=MountConfig(x_m=-1.10, y_m=-0.04, z_m=2.60, yaw_deg=179.5, pitch_deg=17.5, roll_deg=-0.4),
+        borrowed_mount=MountConfig(
+            x_m=-0.92, y_m=0.10, z_m=2.47, yaw_deg=180.9, pitch_deg=16.3, roll_deg=0.7
+        ),
+    )
+
+
+@dataclass(kw_only=True)
+class PortConfig:
+    """A port, a vehicle with its cameras, and one drive through it.
+
+    ``initial_ipm`` is ``calibrated`` when the drive starts from this vehicle's own manual calibration,
+    ``estimated`` when it starts from the other vehicle's. Equal values give equal files, byte for byte.
+    """
+
+    name: str = "port1"
+    seed: int = 1
+    initial_ipm: str = "calibrated"
+    cameras: dict[str, CameraConfig] = field(default_factory=lambda: {"front": _front(), "rear": _rear()})
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    disturbance: DisturbanceConfig = field(default_factory=DisturbanceConfig)
+    route: RouteConfig = field(default_factory=RouteConfig)
+    paint: PaintConfig = field(default_factory=PaintConfig)
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
+    yard: YardConfig = field(default_factory=YardConfig)
+    exposure: ExposureConfig = field(default_factory=ExposureConfig)

@@ -1,0 +1,187 @@
+"""A port's drive on disk: rendered once, in parallel, resumable, then read like any other drive.
+
+Images are written one by one under their final names, each at once; `drive.yaml` is written last, so a
+folder is a drive exactly when it is complete. A render that was stopped goes on where it was.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from v2hdm.drive import write_drive
+from v2hdm.drive.folder import DRIVE_FILE, TRUTH_FOLDER
+from v2hdm.drive.truth import write_truth
+from v2hdm.errors import DriveError
+from v2hdm.records import BoolArray, Drive, FloatArray, Image, Truth
+from v2hdm.simulate.disturbance import measured_disturbances, pose_noise
+from v2hdm.simulate.port import Port, build_port
+from v2hdm.simulate.port_config import PortConfig
+from v2hdm.simulate.render import RENDERER_VERSION
+from v2hdm.simulate.visibility import points_seen, quad_samples
+
+Progress = Callable[[int, int], None]
+_Job = tuple[str, int, str]
+
+_LANE_SIGHTINGS = 2
+_worker_port: Port | None = None
+
+
+def rendered_drive(config: PortConfig, cache: Path, workers: int, progress: Progress) -> Path:
+    """The folder of a port's drive in a cache, rendered now unless it was rendered before.
+
+    Args:
+        config: The port.
+        cache: Folder of all rendered drives; a drive's own folder is named by the port and a hash of its
+            configuration and of the renderer's version.
+        workers: Processes to render with; 1 renders in this one.
+        progress: Called with the number of finished images and of all.
+
+    Raises:
+        ConfigError: when the configuration makes no port.
+        DriveError: when the cache cannot be written.
+    """
+    text = json.dumps([RENDERER_VERSION, asdict(config)], sort_keys=True)
+    folder = cache / f"{config.name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
+    if not (folder / DRIVE_FILE).is_file():
+        render_drive(config, folder, workers, progress)
+    return folder
+
+
+def render_drive(config: PortConfig, folder: Path, workers: int, progress: Progress) -> None:
+    """Render a port's drive into ``folder`` with its truth; see :func:`rendered_drive`."""
+    port = build_port(config)
+    images = _images(port, folder)
+    try:
+        for name in port.cameras:
+            (folder / name / "images").mkdir(parents=True, exist_ok=True)
+        _render_all(port, images, workers, progress)
+        drive = Drive(
+            name=config.name, root=folder, cameras=port.cameras, images=images,
+            pose_noise=pose_noise(config.disturbance), origin=port.hd_map.origin, truth_dir=folder / TRUTH_FOLDER,
+        )  # fmt: skip
+        write_truth(folder / TRUTH_FOLDER, _truth(port, images), images)
+        write_drive(folder, drive, port.driven.recorded)
+    except OSError as failure:
+        raise DriveError(
+            f"{folder}: cannot write the rendered drive ({failure.strerror}); free space or choose another cache"
+        ) from None
+
+
+def _images(port: Port, folder: Path) -> list[Image]:
+    return [
+        Image(
+            name,
+            float(stamp),
+            folder / name / "images" / f"{frame:06d}.jpg",
+            port.driven.map_from_vehicle[frame],
+        )
+        for frame, stamp in enumerate(port.driven.stamp_s)
+        for name in port.cameras
+    ]
+
+
+def _render_all(port: Port, images: list[Image], workers: int, progress: Progress) -> None:
+    jobs = [
+        (image.camera, k // len(port.cameras), str(image.path))
+        for k, image in enumerate(images)
+        if not image.path.is_file()
+    ]
+    done = len(images) - len(jobs)
+    progress(done, len(images))
+    with _renderers(port, workers, len(jobs)) as finished:
+        for _ in finished(jobs):
+            done += 1
+            progress(done, len(images))
+
+
+@contextmanager
+def _renderers(port: Port, workers: int, jobs: int) -> Iterator[Callable[[list[_Job]], Iterator[None]]]:
+    """A function that renders jobs and yields as each one ends, in this process or in several.
+
+    Processes are spawned: a fork would inherit the locks of other libraries' threads.
+    """
+    if workers <= 1 or jobs < 2 * workers:
+        yield lambda batch: (_write_picture(port, job) for job in batch)
+        return
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(workers, _start_worker, (port.config,)) as pool:
+        yield lambda batch: pool.imap_unordered(_work, batch, chunksize=4)
+
+
+def _start_worker(config: PortConfig) -> None:
+    global _worker_port
+    cv2.setNumThreads(1)
+    _worker_port = build_port(config)
+
+
+def _work(job: _Job) -> None:
+    assert _worker_port is not None
+    _write_picture(_worker_port, job)
+
+
+def _write_picture(port: Port, job: _Job) -> None:
+    camera, frame, target = job
+    quality = [cv2.IMWRITE_JPEG_QUALITY, port.config.exposure.jpeg_quality]
+    encoded, data = cv2.imencode(".jpg", port.picture(camera, frame), quality)
+    if not encoded:
+        raise DriveError(f"{target}: the image could not be coded as JPEG; check the OpenCV installation")
+    path = Path(target)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        partial.write_bytes(data.tobytes())
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _truth(port: Port, images: list[Image]) -> Truth:
+    """Ground truth for the report: what each image shows of each marking, which lane vertices were passed.
+
+    A lane vertex counts as seen when two images show it within their camera's region of interest.
+    """
+    corners = np.array([m.corners_map for m in port.hd_map.markings]).reshape(-1, 4, 2)
+    samples = quad_samples(corners)
+    per_marking = samples.shape[1]
+    vertices = [lane.points_map for lane in port.hd_map.lanes]
+    points = np.vstack([samples.reshape(-1, 2), *vertices])
+    visibility = np.zeros((len(images), len(corners)))
+    passed = np.zeros(len(points) - samples.size // 2, dtype=int)
+    for i, image in enumerate(images):
+        frame = i // len(port.cameras)
+        camera = port.cameras[image.camera]
+        boxes = port.renderer.scene.boxes + port.moving_boxes(frame)
+        seen = points_seen(camera.info, port.cam_from_map(image.camera, frame), points, boxes)
+        visibility[i] = seen[: samples.size // 2].reshape(-1, per_marking).mean(axis=1)
+        on_lanes = seen[samples.size // 2 :]
+        on_lanes[on_lanes] = _inside_roi(
+            camera.roi_vehicle, image.map_from_vehicle, points[samples.size // 2 :][on_lanes]
+        )
+        passed += on_lanes
+    flags = np.split(passed >= _LANE_SIGHTINGS, np.cumsum([len(v) for v in vertices])[:-1])
+    return Truth(
+        map=port.hd_map,
+        cam_from_vehicle=port.cam_from_vehicle,
+        map_from_vehicle=np.array([image.map_from_vehicle for image in images]),
+        visibility=visibility,
+        lane_visible=tuple(flags),
+        disturbances=measured_disturbances(port.config.disturbance, port.driven),
+    )
+
+
+def _inside_roi(roi_vehicle: FloatArray, map_from_vehicle: FloatArray, points_map: FloatArray) -> BoolArray:
+    """Which ground points (N, 2) lie in a convex counter-clockwise region (M, 2) of the vehicle."""
+    turn, shift = map_from_vehicle[:2, :2], map_from_vehicle[:2, 3]
+    points = (points_map - shift) @ turn
+    edges = np.roll(roi_vehicle, -1, axis=0) - roi_vehicle
+    offset = points[:, None] - roi_vehicle[None]
+    return np.asarray((edges[:, 0] * offset[..., 1] - edges[:, 1] * offset[..., 0] >= 0).all(axis=1))

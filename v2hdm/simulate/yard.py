@@ -1,0 +1,264 @@
+"""What surrounds the markings of a port: containers, trucks, posts, shadows, and dirt on the ground."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from v2hdm.records import FloatArray
+from v2hdm.simulate.port_config import SurfaceConfig, YardConfig
+from v2hdm.simulate.route import Route
+from v2hdm.simulate.scene import (
+    Backdrop,
+    Bgr,
+    Box,
+    Ground,
+    GroundMarks,
+    Light,
+    Scene,
+    Shadow,
+    box_footprint,
+)
+
+_CONTAINER_M = (12.19, 2.44, 2.59)
+_CONTAINER_COLOURS: tuple[Bgr, ...] = (
+    (0.06, 0.07, 0.27), (0.30, 0.13, 0.04), (0.07, 0.20, 0.38), (0.11, 0.22, 0.08),
+    (0.45, 0.46, 0.46), (0.04, 0.12, 0.33), (0.19, 0.17, 0.16), (0.27, 0.26, 0.05),
+)  # fmt: skip
+_PATH_CLEARANCE_M = 3.0
+_RASTER_M = 0.05
+_RASTER_BORDER_M = 18.0
+
+
+@dataclass(frozen=True)
+class MovingTruck:
+    """A truck that comes along the route from its far end, on the left of the vehicle's way."""
+
+    start_m: float
+    speed_mps: float
+    offset_m: float
+    colour: Bgr
+    seed: int
+
+    def boxes(self, route: Route, stamp_s: float) -> tuple[Box, ...]:
+        """Its container and cab at a time, or nothing once it has left the route."""
+        station = self.start_m - self.speed_mps * stamp_s
+        if not 15.0 < station < route.length_m - 15.0:
+            return ()
+        yaw = float(route.yaw_at(np.array([station]))[0]) + np.pi
+        centre = route.points_at(np.array([station]), self.offset_m)[0]
+        return _truck((float(centre[0]), float(centre[1])), yaw, self.colour, self.seed)
+
+
+def _truck(centre_map: tuple[float, float], yaw_rad: float, colour: Bgr, seed: int) -> tuple[Box, ...]:
+    """A container on a chassis with a cab before it, heading along ``yaw_rad``."""
+    ahead = np.array([np.cos(yaw_rad), np.sin(yaw_rad)])
+
+    def part(along: float, size: tuple[float, float, float], base: float, paint: Bgr, ribbed: bool) -> Box:
+        x, y = np.array(centre_map) + along * ahead
+        return Box(
+            centre_map=(float(x), float(y)), size_m=size, yaw_rad=yaw_rad, albedo_bgr=paint, base_m=base,
+            corrugated=ribbed, seed=seed,
+        )  # fmt: skip
+
+    black: Bgr = (0.03, 0.03, 0.03)
+    return (
+        part(-1.2, (6.06, 2.44, 2.59), 1.2, colour, True),
+        part(-1.2, (6.3, 0.9, 0.25), 0.95, black, False),
+        part(-3.0, (2.4, 2.3, 0.95), 0.0, black, False),
+        part(3.2, (1.9, 2.4, 2.6), 0.45, (0.55, 0.56, 0.57), False),
+        part(3.2, (1.2, 2.3, 0.9), 0.0, black, False),
+    )
+
+
+def build_scene(
+    surface: SurfaceConfig, yard: YardConfig, route: Route, rng: np.random.Generator, seed: int
+) -> Scene:
+    """A port without its paint."""
+    azimuth, elevation = np.deg2rad(yard.sun_azimuth_deg), np.deg2rad(yard.sun_elevation_deg)
+    sun = (np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation))
+    plain = Light()
+    light = Light(
+        sun_direction_map=(float(sun[0]), float(sun[1]), float(sun[2])),
+        sun_bgr=_scaled(plain.sun_bgr, yard.sun_strength),
+    )
+    a = surface.albedo
+    ground = Ground(
+        albedo_bgr=(0.95 * a, a, 1.03 * a),
+        texture=surface.texture,
+        contrast=surface.contrast,
+        stains=surface.stains,
+        slab_m=(surface.slab_m[0], surface.slab_m[1]) if min(surface.slab_m) > 0 else None,
+        slab_yaw_rad=0.02,
+        joint_width_m=surface.joint_width_m,
+        wet_fraction=surface.wet_fraction,
+        marks=_ground_marks(surface, route, rng),
+        seed=seed,
+    )
+    boxes = _stacks(yard, route, rng) + _occluders(yard, route, rng)
+    return Scene(
+        ground=ground,
+        boxes=tuple(boxes),
+        shadows=tuple(_strips(yard, route, rng)),
+        light=light,
+        backdrop=Backdrop(seed=seed, haze_m=yard.haze_m),
+    )
+
+
+def moving_trucks(yard: YardConfig, route: Route, rng: np.random.Generator) -> tuple[MovingTruck, ...]:
+    """The trucks that the vehicle will meet, spread evenly over the drive."""
+    trucks = []
+    for k in range(yard.moving_trucks):
+        speed = float(rng.uniform(3.0, 6.0))
+        meeting_m = route.length_m * (k + rng.uniform(0.3, 0.9)) / yard.moving_trucks
+        start = meeting_m * (1 + speed / route.speed_mps)
+        colour = _CONTAINER_COLOURS[int(rng.integers(len(_CONTAINER_COLOURS)))]
+        trucks.append(
+            MovingTruck(float(start), speed, yard.moving_offset_m, colour, int(rng.integers(1 << 20)))
+        )
+    return tuple(trucks)
+
+
+def _scaled(colour: Bgr, factor: float) -> Bgr:
+    return colour[0] * factor, colour[1] * factor, colour[2] * factor
+
+
+def _stacks(yard: YardConfig, route: Route, rng: np.random.Generator) -> list[Box]:
+    """Rows of container stacks beside the route, wherever they keep clear of all of it."""
+    boxes: list[Box] = []
+    length, width, height = _CONTAINER_M
+    for side in (-1.0, 1.0):
+        for row in range(2):
+            offset = side * (yard.stack_clearance_m + width / 2 + row * (width + 0.4) + rng.uniform(0, 1.5))
+            for station in np.arange(4.0, route.length_m, length + 0.6):
+                filled, tall = rng.random() < yard.stack_fill, int(rng.integers(1, 4))
+                colours = rng.integers(len(_CONTAINER_COLOURS), size=3)
+                at = np.array([station])
+                x, y = route.points_at(at, offset)[0]
+                yaw = float(route.yaw_at(at)[0])
+                base = Box(centre_map=(float(x), float(y)), size_m=_CONTAINER_M, yaw_rad=yaw)
+                if not filled or not _keeps_clear(base, route, boxes, yard.stack_clearance_m - 0.5):
+                    continue
+                for level in range(tall):
+                    boxes.append(
+                        Box(
+                            centre_map=base.centre_map,
+                            size_m=_CONTAINER_M,
+                            yaw_rad=yaw,
+                            base_m=level * height,
+                            albedo_bgr=_CONTAINER_COLOURS[int(colours[level])],
+                            corrugated=True,
+                            seed=int(station * 10) + level,
+                        )  # fmt: skip
+                    )
+    return boxes
+
+
+def _keeps_clear(box: Box, route: Route, others: list[Box], clearance_m: float) -> bool:
+    corners = box_footprint(box)
+    outline = np.vstack(
+        [corners + t * (np.roll(corners, -1, axis=0) - corners) for t in (0.0, 0.25, 0.5, 0.75)]
+    )
+    if float(route.distance_to(outline).min()) < clearance_m:
+        return False
+    reach = np.hypot(box.size_m[0], box.size_m[1]) / 2
+    for other in others:
+        gap = np.hypot(*(np.array(other.centre_map) - box.centre_map))
+        along = abs(np.cos(other.yaw_rad - box.yaw_rad)) > 0.99
+        needed = min(other.size_m[1], box.size_m[1]) if along else reach
+        if gap < needed:
+            return False
+    return True
+
+
+def _occluders(yard: YardConfig, route: Route, rng: np.random.Generator) -> list[Box]:
+    """Parked trucks, barriers and lamp posts nearer to the route than the stacks."""
+    boxes: list[Box] = []
+    for _ in range(yard.parked_trucks):
+        at = np.array([rng.uniform(12.0, route.length_m - 12.0)])
+        side = float(rng.choice([-1.0, 1.0]))
+        x, y = route.points_at(at, side * rng.uniform(6.3, 7.4))[0]
+        colour = _CONTAINER_COLOURS[int(rng.integers(len(_CONTAINER_COLOURS)))]
+        boxes += _truck((float(x), float(y)), float(route.yaw_at(at)[0]), colour, int(rng.integers(1 << 20)))
+    for count, size, offsets, colour in (
+        (yard.barriers, (1.3, 0.5, 0.85), (2.6, 5.0), (0.5, 0.5, 0.5)),
+        (yard.lamp_posts, (0.22, 0.22, 11.0), (5.9, 8.0), (0.3, 0.3, 0.3)),
+    ):
+        for _ in range(count):
+            at = np.array([rng.uniform(8.0, route.length_m - 8.0)])
+            side = float(rng.choice([-1.0, 1.0]))
+            x, y = route.points_at(at, side * rng.uniform(*offsets))[0]
+            yaw = float(route.yaw_at(at)[0] + rng.normal(0.0, 0.3))
+            boxes.append(Box(centre_map=(float(x), float(y)), size_m=size, yaw_rad=yaw, albedo_bgr=colour))
+    return [box for box in boxes if float(route.distance_to(box_footprint(box)).min()) > 1.9]
+
+
+def _strips(yard: YardConfig, route: Route, rng: np.random.Generator) -> list[Shadow]:
+    """Hard shadows of cranes, gantries and cables across the route."""
+    strips = []
+    for _ in range(yard.shadow_strips):
+        at = np.array([rng.uniform(0.0, route.length_m)])
+        centre = route.points_at(at, rng.uniform(-4.0, 4.0))[0]
+        yaw = float(route.yaw_at(at)[0] + rng.uniform(0.3, 2.8))
+        axis = np.array([np.cos(yaw), np.sin(yaw)])
+        across = np.array([-axis[1], axis[0]])
+        length, width = rng.uniform(8.0, 30.0), rng.choice([0.15, 0.4, 0.9, 2.5])
+        corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (length / 2, width / 2)
+        polygon = centre + corners[:, :1] * axis + corners[:, 1:] * across
+        strips.append(Shadow(polygon_map=polygon, softness_m=float(rng.uniform(0.03, 0.2))))
+    return strips
+
+
+def _ground_marks(surface: SurfaceConfig, route: Route, rng: np.random.Generator) -> GroundMarks:
+    """Tyre marks along the route, repaired patches and oil stains, as a raster of factors."""
+    low = route.points_map.min(axis=0) - _RASTER_BORDER_M
+    high = route.points_map.max(axis=0) + _RASTER_BORDER_M
+    columns, rows = (int(n) for n in np.ceil((high - low) / _RASTER_M))
+    dark = np.zeros((rows, columns), dtype=np.uint8)
+
+    def pixels(points_map: FloatArray) -> np.ndarray[tuple[int, ...], np.dtype[np.int32]]:
+        return np.asarray(np.round((points_map - low) / _RASTER_M * 8), dtype=np.int32)
+
+    for _ in range(surface.patches):
+        _patch(dark, pixels, route, rng)
+    for _ in range(surface.oil_stains):
+        at = np.array([rng.uniform(0.0, route.length_m)])
+        x, y = pixels(route.points_at(at, rng.normal(0.0, 3.5)))[0]
+        axes = (int(rng.uniform(6, 90)), int(rng.uniform(6, 60)))
+        shade = int(rng.uniform(15, 60))
+        cv2.ellipse(
+            dark, (int(x), int(y)), axes, float(rng.uniform(0, 180)), 0, 360, shade, -1, cv2.LINE_AA, 3
+        )
+    tracks = np.zeros_like(dark)
+    for _ in range(int(40 * surface.tyre_marks)):
+        _tyre_marks(tracks, pixels, route, rng)
+    soft = cv2.GaussianBlur(cv2.add(dark, tracks), (0, 0), 1.2)
+    factor = np.asarray(np.clip(128 - soft.astype(np.int16), 40, 128), dtype=np.uint8)
+    return GroundMarks(factor=factor, origin_map=(float(low[0]), float(low[1])), resolution_m=_RASTER_M)
+
+
+def _patch(dark: np.ndarray, pixels: object, route: Route, rng: np.random.Generator) -> None:
+    at = np.array([rng.uniform(0.0, route.length_m)])
+    centre = route.points_at(at, rng.uniform(-5.0, 5.0))[0]
+    yaw = float(route.yaw_at(at)[0])
+    size = rng.uniform(0.6, 3.0, 2)
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * size
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    polygon = corners @ np.array([[cos, sin], [-sin, cos]]) + centre
+    cv2.fillPoly(dark, [pixels(polygon)], int(rng.uniform(6, 26)), cv2.LINE_AA, 3)  # type: ignore[operator]
+
+
+def _tyre_marks(dark: np.ndarray, pixels: object, route: Route, rng: np.random.Generator) -> None:
+    start, length = rng.uniform(0.0, route.length_m), rng.gamma(2.0, 12.0)
+    station = np.arange(start, min(start + length, route.length_m), 0.5)
+    if len(station) < 2:
+        return
+    drift = rng.normal(0.0, 1.2) + rng.normal(0.0, 0.02) * (station - start)
+    shade, width = int(rng.uniform(6, 24)), int(rng.integers(4, 8))
+    layer = np.zeros_like(dark)
+    for wheel in (-0.9, 0.9):
+        points = route.points_at(station, drift + wheel)
+        cv2.polylines(layer, [pixels(points)], False, shade, width, cv2.LINE_AA, 3)  # type: ignore[operator]
+    cv2.add(dark, layer, dst=dark)
