@@ -11,9 +11,9 @@ from models import NetConfig
 class DataConfig:
     """The stream of renders.
 
-    Each render of ``render_width`` x ``render_height`` px is shown ``views_per_render`` times, each time
-    another crop of ``width`` x ``height`` px with other photometric changes, mixed with the
-    ``reservoir`` last ones. ``easy_samples`` renders pass until scenes are as hard as they get.
+    A render of ``render_width`` x ``render_height`` px is shown ``views_per_render`` times on average, the
+    oftener the more paint it shows, each time another crop of ``width`` x ``height`` px in other light. Past
+    renders to show again are kept in a ``reservoir``. ``easy_samples`` renders pass until scenes are as hard as they get.
     """
 
     width: int = 448
@@ -47,8 +47,8 @@ class TrainConfig:
     """One training run. It ends after ``minutes`` of training or ``steps`` updates, whichever comes first.
 
     The learning rate rises to ``learning_rate`` over the first ``warmup`` of the run, then falls to
-    nothing as a half cosine, by the share of the run that has passed. ``ema_updates`` is the memory, in updates, of the
-    averaged weights that are validated, kept and exported. ``resume`` continues what ``output`` holds.
+    nothing as a half cosine, by the share of the run that has passed. The weights that are validated, kept
+    and exported are averages over about ``ema_updates`` updates. ``resume`` goes on with what ``output`` holds.
     """
 
     output: str = "runs/train"

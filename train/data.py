@@ -38,20 +38,25 @@ class RenderStream(IterableDataset[Pair]):
         number, workers = (worker.id, worker.num_workers) if worker else (0, 1)
         rng = np.random.default_rng([self.seed, self.first_render, number, 9])
         recent: list[TrainingSample] = []
+        appeal: list[float] = []
         index = self.first_render + number
         while True:
-            difficulty = min(1.0, index / max(self.config.easy_samples, 1))
-            recent.append(
-                training_sample(
-                    self.seed, index, self.config.render_width, self.config.render_height, difficulty
-                )
-            )
+            sample = self._render(index)
+            recent.append(sample)
+            appeal.append(_appeal(sample))
             index += workers
-            yield self._view(rng, recent[-1])
+            yield self._view(rng, sample)
             for _ in range(self.config.views_per_render - 1):
-                yield self._view(rng, recent[int(rng.integers(len(recent)))])
+                again = rng.choice(len(recent), p=np.array(appeal) / sum(appeal))
+                yield self._view(rng, recent[int(again)])
             if len(recent) >= self.config.reservoir:
-                recent.pop(int(rng.integers(len(recent))))
+                dropped = int(rng.integers(len(recent)))
+                del recent[dropped], appeal[dropped]
+
+    def _render(self, index: int) -> TrainingSample:
+        config = self.config
+        difficulty = min(1.0, index / max(config.easy_samples, 1))
+        return training_sample(self.seed, index, config.render_width, config.render_height, difficulty)
 
     def _view(self, rng: np.random.Generator, sample: TrainingSample) -> Pair:
         image, labels = random_crop(rng, sample.image, sample.labels, self.config.width, self.config.height)
@@ -77,6 +82,11 @@ def validation_pairs(config: DataConfig, seed: int, images: int) -> Iterator[Pai
     for index in range(images):
         sample = training_sample(seed + _VALIDATION_SEED_OFFSET, index, config.width, config.height)
         yield torch.from_numpy(sample.image), torch.from_numpy(half_resolution(sample.labels))
+
+
+def _appeal(sample: TrainingSample) -> float:
+    """How often to show a render again, relatively: up to ten times oftener if there is paint to learn from."""
+    return 0.1 + min(float((sample.labels > 0).mean()) / 0.015, 1.0)
 
 
 def _single_thread(_worker: int) -> None:

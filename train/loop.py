@@ -44,10 +44,10 @@ class Trainer:
         self.device = _device(config.device)
         self.output = Path(config.output)
         self.state = self._open()
-        self.net = MarkingNet(config.net).to(self.device, memory_format=torch.channels_last)
-        self.averaged = AveragedModel(
-            self.net, multi_avg_fn=get_ema_multi_avg_fn(1.0 - 1.0 / config.ema_updates), use_buffers=True
-        )
+        self.net = MarkingNet(config.net).to(self.device)
+        self.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        average = get_ema_multi_avg_fn(1.0 - 1.0 / config.ema_updates)  # type: ignore[no-untyped-call]
+        self.averaged = AveragedModel(self.net, multi_avg_fn=average, use_buffers=True)
         self.optimizer = torch.optim.AdamW(self.net.parameters(), weight_decay=config.weight_decay)
         self.class_weights = torch.tensor(config.loss.class_weights, device=self.device)
         if self.state.step:
@@ -116,7 +116,7 @@ class Trainer:
             logits = self.net(image)
         loss = segmentation_loss(logits.float(), labels.long(), self.class_weights, self.config.loss.dice)
         self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
         self.optimizer.step()
         self.averaged.update_parameters(self.net)

@@ -1,0 +1,139 @@
+"""The network as an ONNX file: any size, weights inside, checked against torch, labelled."""
+
+from __future__ import annotations
+
+import json
+import logging
+import subprocess
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+
+from models.marking_net import MULTIPLE, STRIDE, MarkingNet
+from train.checkpoint import Checkpoint
+from v2hdm.errors import DetectorError
+from v2hdm.records import PAINT_CLASSES
+
+METADATA_KEY = "v2hdm"
+"""Under which key of the file's ``metadata_props`` its label is, as JSON."""
+
+PARITY_SIZES = ((16, 16), (48, 112), (256, 448), (192, 1248), (544, 960))
+"""Image heights and widths at which file and network are compared."""
+
+
+def export_checkpoint(checkpoint: Checkpoint, path: Path, opset: int, tolerance: float) -> float:
+    """Write the averaged weights of a checkpoint to an ONNX file.
+
+    The graph takes ``image`` (1, H, W, 3) uint8 BGR, H and W multiples of 16, and gives ``logits``
+    (1, C, H/2, W/2) float32. The file appears whole and checked, or not at all.
+
+    Returns:
+        The largest difference of a logit between file and network over :data:`PARITY_SIZES`.
+
+    Raises:
+        DetectorError: The difference exceeds ``tolerance``.
+    """
+    net = checkpoint.network()
+    model = to_onnx(checkpoint.network().fold(), opset)
+    onnx.helper.set_model_props(model, {METADATA_KEY: json.dumps(label(checkpoint))})
+    content = model.SerializeToString()
+    difference = parity(net, content)
+    if not difference <= tolerance:
+        raise DetectorError(
+            f"{path} was not written: its logits would differ from the network's by {difference:.2g}, "
+            f"more than tolerance={tolerance:g}; try another opset"
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial")
+    partial.write_bytes(content)
+    partial.replace(path)
+    return difference
+
+
+def to_onnx(net: MarkingNet, opset: int) -> onnx.ModelProto:
+    """The graph of a network, its height and width left open."""
+    rows, columns = torch.export.Dim("rows", min=1, max=512), torch.export.Dim("columns", min=1, max=512)
+    image = torch.zeros((1, 5 * MULTIPLE, 7 * MULTIPLE, 3), dtype=torch.uint8)
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            net,
+            (image,),
+            dynamo=True,
+            opset_version=opset,
+            input_names=["image"],
+            output_names=["logits"],
+            dynamic_shapes=({1: MULTIPLE * rows, 2: MULTIPLE * columns},),
+            external_data=False,
+            verbose=False,
+        )
+    assert program is not None
+    model = program.model_proto
+    _name_sizes(model)
+    onnx.checker.check_model(model)
+    return model
+
+
+def label(checkpoint: Checkpoint) -> dict[str, Any]:
+    """What a reader of the file needs to know to run it, and where it comes from."""
+    return {
+        "classes": list(PAINT_CLASSES),
+        "multiple": MULTIPLE,
+        "stride": STRIDE,
+        "input": "uint8 BGR, NHWC",
+        "commit": _commit(),
+        "steps": checkpoint.step,
+        "training_minutes": round(checkpoint.elapsed_s / 60, 1),
+        "metrics": {name: round(value, 4) for name, value in checkpoint.metrics.items()},
+        "training": _without_paths(checkpoint.config),
+    }
+
+
+def parity(net: MarkingNet, content: bytes) -> float:
+    """Largest difference of any logit between a network and the ONNX file made of it."""
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    generator = np.random.default_rng(0)
+    worst = 0.0
+    for height, width in PARITY_SIZES:
+        image = generator.integers(0, 256, (1, height, width, 3), dtype=np.uint8)
+        with torch.inference_mode():
+            expected = net(torch.from_numpy(image)).numpy()
+        (logits,) = session.run(["logits"], {"image": image})
+        if logits.shape != expected.shape:
+            return float("inf")
+        worst = max(worst, float(np.abs(logits - expected).max()))
+    return worst
+
+
+def _name_sizes(model: onnx.ModelProto) -> None:
+    """Call the open sizes of input and output what they are, where the exporter leaves formulas."""
+    names = {"image": {1: "height", 2: "width"}, "logits": {2: "height / 2", 3: "width / 2"}}
+    for value in (*model.graph.input, *model.graph.output):
+        for axis, name in names[value.name].items():
+            value.type.tensor_type.shape.dim[axis].dim_param = name
+
+
+def _without_paths(config: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in config.items() if key not in ("output", "device", "resume")}
+
+
+def _commit() -> str:
+    """The commit of this checkout, or ``unknown`` outside of one."""
+    try:
+        answer = subprocess.run(
+            ["git", "rev-parse", "HEAD"],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return answer.stdout.strip()
