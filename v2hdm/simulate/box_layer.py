@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from v2hdm.records import FloatArray
 from v2hdm.simulate.scene import Box, Light, box_footprint
 from v2hdm.simulate.textures import Float32, noise_tile, sample
-from v2hdm.simulate.view import View, Window, coverage, outline, windows
+from v2hdm.simulate.view import View, Window, coverage, in_view, outline, windows
 
 _CORRUGATION_M = 0.28
 _DIRT_TILE = noise_tile(17, 6.0, 1.2)
@@ -31,16 +31,26 @@ def draw_boxes(
 ) -> None:
     """Draw boxes over ``radiance`` (H, W, 3) and mark in ``hidden`` (H, W) what lies behind them."""
     centre = view.centre_map
+    if not boxes:
+        return
+    corners = np.array([_corners(box) for box in boxes])
+    visible = [boxes[k] for k in in_view(view, view.homogeneous_px(corners), _FARTHEST_M)]
 
     def distance(box: Box) -> float:
         return float(np.hypot(*(np.array(box.centre_map) - centre[:2])))
 
-    for box in sorted(boxes, key=distance, reverse=True):
-        if distance(box) > _FARTHEST_M:
-            continue
+    # Of stacked boxes the upper comes first: its underside lies behind the one below.
+    for box in sorted(visible, key=lambda b: (distance(b), b.base_m), reverse=True):
         for face in _faces(box):
             if (centre - face.corners_map[0]) @ face.normal > 1e-3:
                 _draw_face(box, face, light, view, radiance, hidden)
+
+
+def _corners(box: Box) -> FloatArray:
+    """The eight corners (8, 3), lower ones first."""
+    footprint = box_footprint(box)
+    low, high = np.full((4, 1), box.base_m), np.full((4, 1), box.base_m + box.size_m[2])
+    return np.vstack([np.hstack([footprint, low]), np.hstack([footprint, high])])
 
 
 def _faces(box: Box) -> list[_Face]:

@@ -74,7 +74,8 @@ def calibrate(
     if outside.any():
         ahead, left = config.points_ahead_m[int(np.argmax(outside))]
         raise ConfigError(
-            f"calibration.points_ahead_m: [{ahead:g}, {left:g}] is outside camera '{info.name}'; move it or the mount"
+            f"calibration.points_ahead_m: [{ahead:g}, {left:g}] is outside camera "
+            f"'{info.name}'; move it or the mount"
         )
     # Solved towards pixels, where the larger and equal errors are.
     pinhole_from_vehicle, _ = cv2.findHomography(surveyed, undistort_points(info, clicked_px), 0)

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from v2hdm.simulate.scene import Dapple, Ground, GroundMarks, Shadow
 from v2hdm.simulate.textures import Float32, Tile, fade, noise_tile, photo_tile, sample, smoothstep
-from v2hdm.simulate.view import View, outline, windows
+from v2hdm.simulate.view import View, following_row, outline, windows
 
 _FARTHEST_M = 400.0
+_SHADOWS_TO_M = 150.0
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,8 @@ def sun_visibility(
     """Fraction (H, W) of the sun's light that reaches the ground."""
     out = np.ones_like(field.x_m)
     for shadow in shadows:
-        _cast(shadow, view, field, out)
+        if float(np.hypot(*(shadow.polygon_map[0] - view.centre_map[:2]))) < _SHADOWS_TO_M:
+            _cast(shadow, view, field, out)
     for dapple in dapples:
         _dapple(dapple, view, field, out)
     return out
@@ -176,7 +178,7 @@ def _outward(polygon: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _ground_coverage(polygon: NDArray[np.float64], x: Float32, y: Float32, sharpness: Float32) -> Float32:
     """Coverage of ground points by a convex polygon whose border is 1 / sharpness metres wide."""
-    following = np.roll(polygon, -1, axis=0)
+    following = following_row(polygon)
     edge = following - polygon
     area2 = float((polygon[:, 0] * following[:, 1] - following[:, 0] * polygon[:, 1]).sum())
     normal = np.column_stack([-edge[:, 1], edge[:, 0]]) * np.sign(area2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
@@ -26,6 +27,14 @@ _PIECE_TURN_RAD = 0.06
 _PIECE_LENGTH_M = 25.0
 _PIECE_OVERLAP_M = 0.1
 _LEAST_GAP_M = 1.7
+# The bars (x0, x1, y0, y1) of a letter like an eight on a pocket calculator.
+_LETTER_BARS_M = (
+    (-0.6, 0.6, 0.0, 0.1),
+    (-0.6, 0.6, 0.3, 0.4),
+    (-0.6, -0.5, 0.1, 0.3),
+    (-0.05, 0.05, 0.1, 0.3),
+    (0.5, 0.6, 0.1, 0.3),
+)
 
 
 @dataclass
@@ -80,7 +89,7 @@ def _pieces(route: Route, start: float, end: float) -> list[tuple[float, float]]
         if turned > _PIECE_TURN_RAD or station - edges[-1] > _PIECE_LENGTH_M:
             edges.append(float(station))
     edges.append(end)
-    return list(zip(edges[:-1], edges[1:], strict=True))
+    return list(pairwise(edges))
 
 
 def _ribbon(route: Route, ends_m: FloatArray, offset_m: float, width_m: float) -> FloatArray:
@@ -115,7 +124,7 @@ def _dashed_line(
 def _resampled(points: FloatArray) -> FloatArray:
     """A polyline with its own vertices and more between them, at most half a metre apart."""
     out = [points[:1]]
-    for a, b in zip(points[:-1], points[1:], strict=True):
+    for a, b in pairwise(points):
         count = max(int(np.ceil(np.linalg.norm(b - a) / _VERTEX_SPACING_M)), 1)
         out.append(a + (np.arange(1, count + 1) / count)[:, None] * (b - a))
     return np.vstack(out)
@@ -209,12 +218,9 @@ def _lettering(rng: np.random.Generator) -> list[FloatArray]:
     bars = []
     for letter in range(int(rng.integers(2, 5))):
         left = -0.55 * letter
-        for x0, x1, y0, y1 in (
-            (-0.6, 0.6, 0.0, 0.1), (-0.6, 0.6, 0.3, 0.4), (-0.6, -0.5, 0.1, 0.3), (-0.05, 0.05, 0.1, 0.3), (0.5, 0.6, 0.1, 0.3),
-        ):  # fmt: skip
+        for x0, x1, y0, y1 in _LETTER_BARS_M:
             if rng.random() < 0.7:
-                y_left, y_right = left + y1, left + y0
-                bars.append(np.array([[x0, y_right], [x1, y_right], [x1, y_left], [x0, y_left]]))
+                bars.append(np.array([[x0, left + y0], [x1, left + y0], [x1, left + y1], [x0, left + y1]]))
     return bars
 
 

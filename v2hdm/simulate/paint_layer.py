@@ -9,7 +9,7 @@ from v2hdm.records import PAINT_CLASSES
 from v2hdm.simulate.ground_layer import MEDIUM_TILE, GroundField, fine_tile
 from v2hdm.simulate.scene import Paint
 from v2hdm.simulate.textures import Float32, Tile, fade, noise_tile, sample
-from v2hdm.simulate.view import View, coverage, outline, windows
+from v2hdm.simulate.view import View, coverage, in_view, outline, windows
 
 Labels = NDArray[np.uint8]
 
@@ -32,7 +32,7 @@ class PaintLayer:
     def draw(self, view: View, field: GroundField, albedo: list[Float32], labels: Labels) -> None:
         """Paint onto the ground field's three planes of ``albedo`` (H', W) and into ``labels`` (H, W)."""
         homogeneous = view.homogeneous_px(self._vertices)
-        for index in self._in_view(view, homogeneous):
+        for index in in_view(view, homogeneous, _FARTHEST_M):
             paint = self._paints[index]
             shape = outline(view, homogeneous[index, : len(paint.polygon_map)])
             if shape is None:
@@ -48,15 +48,6 @@ class PaintLayer:
                 for plane, reflectance in zip(albedo, paint.albedo_bgr, strict=True):
                     below = plane[part]
                     below += opacity * (tone * np.float32(reflectance) - below)
-
-    def _in_view(self, view: View, homogeneous: NDArray[np.float64]) -> NDArray[np.intp]:
-        depth = homogeneous[..., 2]
-        u0, v0, u1, v1 = view.rays.bounds
-        outside = (depth < 0.05).all(axis=1) | (depth.min(axis=1) > _FARTHEST_M)
-        for axis, low, high in ((0, u0 - 2, u1 + 2), (1, v0 - 2, v1 + 2)):
-            value = homogeneous[..., axis]
-            outside |= (value < low * depth).all(axis=1) | (value > high * depth).all(axis=1)
-        return np.flatnonzero(~outside)
 
 
 def _opacity(

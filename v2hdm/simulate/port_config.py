@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 @dataclass(kw_only=True)
 class MountConfig:
-    """Where a camera sits on the vehicle: centre in the vehicle frame, then yaw (left), pitch (down), roll."""
+    """Where a camera sits on the vehicle: its centre, then yaw (left), pitch (down) and roll."""
 
     x_m: float
     y_m: float
@@ -40,7 +40,7 @@ class CameraConfig:
 
 @dataclass(kw_only=True)
 class CalibrationConfig:
-    """The manual calibration: surveyed ground points clicked in an image, and the survey of the camera centre.
+    """The manual calibration: ground points surveyed and clicked in an image, and a survey of the camera.
 
     ``points_ahead_m`` are distance along the viewing direction and offset to the left, in m from the camera.
     """
@@ -156,7 +156,7 @@ class YardConfig:
 
 @dataclass(kw_only=True)
 class ExposureConfig:
-    """The shutter and what it lets in: ``level`` is the mean the exposure aims at, varying by ``level_sigma``."""
+    """The shutter and the sensor: the exposure aims at a mean of ``level``, varying by ``level_sigma``."""
 
     exposure_s: float = 0.002
     level: float = 0.25

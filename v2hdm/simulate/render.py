@@ -18,15 +18,13 @@ from v2hdm.simulate.box_layer import draw_boxes
 from v2hdm.simulate.ground_layer import GroundField, intersect_ground, sun_visibility, tone, wetness
 from v2hdm.simulate.optics import Motion, Optics, expose
 from v2hdm.simulate.paint_layer import PaintLayer
-from v2hdm.simulate.scene import Box, Light, Scene, box_shadow
+from v2hdm.simulate.scene import Box, Light, Scene, Shadow, box_shadow
 from v2hdm.simulate.sky_layer import draw_background
 from v2hdm.simulate.textures import Float32
 from v2hdm.simulate.view import View, camera_rays
 
 RENDERER_VERSION = 1
 """Raised whenever the same scene comes out as a different picture, so that cached drives are made afresh."""
-
-_SHADOW_REACH_M = 120.0
 
 
 @dataclass(frozen=True)
@@ -49,9 +47,12 @@ class Renderer:
 
     scene: Scene
     _paint: PaintLayer = field(init=False)
+    _shadows: tuple[Shadow, ...] = field(init=False)
 
     def __post_init__(self) -> None:
         self._paint = PaintLayer(self.scene.paints)
+        cast = tuple(box_shadow(box, self.scene.light) for box in self.scene.boxes)
+        self._shadows = self.scene.shadows + cast
 
     def render(
         self,
@@ -76,13 +77,14 @@ class Renderer:
         labels = np.zeros((info.height, info.width), dtype=np.uint8)
         hidden = np.zeros((info.height, info.width), dtype=np.bool_)
         boxes = self.scene.boxes + moving_boxes
-        radiance = self._surroundings(view, boxes, labels)
+        shadows = self._shadows + tuple(box_shadow(box, self.scene.light) for box in moving_boxes)
+        radiance = self._surroundings(view, shadows, labels)
         draw_boxes(boxes, self.scene.light, view, radiance, hidden)
         labels[hidden] = 0
         image = expose(radiance, view, optics or Optics(), motion or Motion(), rng)
         return Rendered(image, labels, hidden)
 
-    def _surroundings(self, view: View, boxes: tuple[Box, ...], labels: NDArray[np.uint8]) -> Float32:
+    def _surroundings(self, view: View, shadows: tuple[Shadow, ...], labels: NDArray[np.uint8]) -> Float32:
         """Radiance (H, W, 3) of sky and ground."""
         scene = self.scene
         height, width = labels.shape
@@ -92,7 +94,7 @@ class Renderer:
         sky_rows = np.flatnonzero(~ground.below.all(axis=1))
         last_row = ground.first_row + (int(sky_rows[-1]) + 1 if len(sky_rows) else 0)
         radiance = np.empty((height, width, 3), dtype=np.float32)
-        radiance[ground.first_row :] = self._ground(view, ground, boxes, labels)
+        radiance[ground.first_row :] = self._ground(view, ground, shadows, labels)
         if last_row:
             background = draw_background(view, scene.light, scene.backdrop, last_row)
             radiance[: ground.first_row] = background[: ground.first_row]
@@ -100,14 +102,12 @@ class Renderer:
         return radiance
 
     def _ground(
-        self, view: View, ground: GroundField, boxes: tuple[Box, ...], labels: NDArray[np.uint8]
+        self, view: View, ground: GroundField, shadows: tuple[Shadow, ...], labels: NDArray[np.uint8]
     ) -> Float32:
         scene = self.scene
         bare = tone(scene.ground, ground)
         albedo = [bare * np.float32(c) for c in scene.ground.albedo_bgr]
         self._paint.draw(view, ground, albedo, labels)
-        near = tuple(b for b in boxes if _distance(b, view) < _SHADOW_REACH_M)
-        shadows = scene.shadows + tuple(box_shadow(b, scene.light) for b in near)
         sun = sun_visibility(shadows, scene.dapples, view, ground)
         return _lit(albedo, sun, wetness(scene.ground, ground), ground, view, scene.light)
 
@@ -122,10 +122,6 @@ def render(
 ) -> Rendered:
     """Render one image of a scene; see :meth:`Renderer.render`."""
     return Renderer(scene).render(info, cam_from_map, rng, optics, motion)
-
-
-def _distance(box: Box, view: View) -> float:
-    return float(np.hypot(*(np.array(box.centre_map) - view.centre_map[:2])))
 
 
 def _lit(

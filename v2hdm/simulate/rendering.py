@@ -13,6 +13,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -66,14 +67,20 @@ def render_drive(config: PortConfig, folder: Path, workers: int, progress: Progr
             (folder / name / "images").mkdir(parents=True, exist_ok=True)
         _render_all(port, images, workers, progress)
         drive = Drive(
-            name=config.name, root=folder, cameras=port.cameras, images=images,
-            pose_noise=pose_noise(config.disturbance), origin=port.hd_map.origin, truth_dir=folder / TRUTH_FOLDER,
-        )  # fmt: skip
+            name=config.name,
+            root=folder,
+            cameras=port.cameras,
+            images=images,
+            pose_noise=pose_noise(config.disturbance),
+            origin=port.hd_map.origin,
+            truth_dir=folder / TRUTH_FOLDER,
+        )
         write_truth(folder / TRUTH_FOLDER, _truth(port, images), images)
         write_drive(folder, drive, port.driven.recorded)
     except OSError as failure:
         raise DriveError(
-            f"{folder}: cannot write the rendered drive ({failure.strerror}); free space or choose another cache"
+            f"{folder}: cannot write the rendered drive ({failure.strerror}); "
+            "free space or choose another cache"
         ) from None
 
 
@@ -111,7 +118,7 @@ def _renderers(port: Port, workers: int, jobs: int) -> Iterator[Callable[[list[_
     Processes are spawned: a fork would inherit the locks of other libraries' threads.
     """
     if workers <= 1 or jobs < 2 * workers:
-        yield lambda batch: (_write_picture(port, job) for job in batch)
+        yield lambda batch: map(partial(_write_picture, port), batch)
         return
     context = multiprocessing.get_context("spawn")
     with context.Pool(workers, _start_worker, (port.config,)) as pool:
@@ -136,12 +143,12 @@ def _write_picture(port: Port, job: _Job) -> None:
     if not encoded:
         raise DriveError(f"{target}: the image could not be coded as JPEG; check the OpenCV installation")
     path = Path(target)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        partial.write_bytes(data.tobytes())
-        partial.replace(path)
+        unfinished.write_bytes(data.tobytes())
+        unfinished.replace(path)
     finally:
-        partial.unlink(missing_ok=True)
+        unfinished.unlink(missing_ok=True)
 
 
 def _truth(port: Port, images: list[Image]) -> Truth:

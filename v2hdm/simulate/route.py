@@ -17,7 +17,7 @@ _SPEED_PERIOD_S = 23.0
 
 @dataclass(frozen=True)
 class Route:
-    """A path by its length: ``station_m`` (N,), ``points_map`` (N, 2), ``yaw_rad`` (N,), ``curvature`` (N,) 1/m."""
+    """A path by its length: ``station_m``, ``yaw_rad``, ``curvature`` (1/m), (N,); ``points_map`` (N, 2)."""
 
     station_m: FloatArray
     points_map: FloatArray
@@ -66,7 +66,7 @@ def build_route(config: RouteConfig) -> Route:
     """
     curvature = np.concatenate(
         [
-            np.full(max(int(round(length / _STEP_M)), 1), np.deg2rad(turn) / length)
+            np.full(max(round(length / _STEP_M), 1), np.deg2rad(turn) / length)
             for length, turn in config.pieces
         ]
     )
@@ -77,5 +77,10 @@ def build_route(config: RouteConfig) -> Route:
     middle = 0.5 * (yaw[1:] + yaw[:-1])
     steps = _STEP_M * np.column_stack([np.cos(middle), np.sin(middle)])
     points = np.vstack([[0.0, 0.0], np.cumsum(steps, axis=0)])
-    station = np.arange(len(yaw)) * _STEP_M
-    return Route(station, points, yaw, np.append(curvature, curvature[-1]), config.speed_mps)
+    return Route(
+        station_m=np.linspace(0.0, len(curvature) * _STEP_M, len(yaw)),
+        points_map=points,
+        yaw_rad=yaw,
+        curvature=np.append(curvature, curvature[-1]),
+        speed_mps=config.speed_mps,
+    )

@@ -13,6 +13,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from v2hdm.detection.lens import distort_points, undistort_points
 from v2hdm.records import CameraInfo, FloatArray
@@ -98,8 +99,7 @@ def outline(view: View, homogeneous_px: FloatArray) -> Outline | None:
     clipped = _visible_part(view, homogeneous_px)
     if len(clipped) < 3:
         return None
-    following = homogeneous_px[np.arange(1, len(homogeneous_px) + 1) % len(homogeneous_px)]
-    edges = np.cross(homogeneous_px, following)
+    edges = np.cross(homogeneous_px, following_row(homogeneous_px))
     norms = np.hypot(edges[:, 0], edges[:, 1])
     edges = edges[norms > 1e-12] / norms[norms > 1e-12, None]
     if len(edges) < 3:
@@ -109,9 +109,29 @@ def outline(view: View, homogeneous_px: FloatArray) -> Outline | None:
     corners = clipped[:, :2] / clipped[:, 2:]
     span = float(np.ptp(corners, axis=0).max())
     steps = np.linspace(0.0, 1.0, 2 + int(min(span / 40.0, 8.0)))[:-1, None, None]
-    dense = corners + steps * (np.roll(corners, -1, axis=0) - corners)
+    dense = corners + steps * (following_row(corners) - corners)
     ordered = dense.transpose(1, 0, 2).reshape(-1, 2)
     return Outline(edges, distort_points(view.rays.info, ordered))
+
+
+def in_view(view: View, homogeneous_px: FloatArray, farthest_m: float) -> NDArray[np.intp]:
+    """Which of several point sets (M, N, 3), as homogeneous pinhole pixels, may reach into the image.
+
+    A set is left out when all its points lie on the outer side of one border, or beyond ``farthest_m``.
+    """
+    depth = homogeneous_px[..., 2]
+    u0, v0, u1, v1 = view.rays.bounds
+    outside = (depth < _NEAR_M).all(axis=1) | (depth.min(axis=1, initial=np.inf) > farthest_m)
+    for axis, low, high in ((0, u0, u1), (1, v0, v1)):
+        value = homogeneous_px[..., axis]
+        outside |= (value < (low - _MARGIN_PX) * depth).all(axis=1)
+        outside |= (value > (high + _MARGIN_PX) * depth).all(axis=1)
+    return np.flatnonzero(~outside)
+
+
+def following_row(array: FloatArray) -> FloatArray:
+    """Each row's successor, the first row following the last; what numpy's roll does, five times as fast."""
+    return np.concatenate([array[1:], array[:1]])
 
 
 def _visible_part(view: View, polygon: FloatArray) -> FloatArray:
@@ -127,8 +147,11 @@ def _visible_part(view: View, polygon: FloatArray) -> FloatArray:
         ]
     )
     least = (_NEAR_M, 0.0, 0.0, 0.0, 0.0)
-    if (polygon @ limits.T >= least).all():
+    inside = polygon @ limits.T >= least
+    if inside.all():
         return polygon
+    if not inside.any(axis=0).all():
+        return polygon[:0]
     for line, level in zip(limits, least, strict=True):
         polygon = _clip(polygon, line, level)
     return polygon
@@ -141,7 +164,7 @@ def _clip(polygon: FloatArray, line: FloatArray, least: float) -> FloatArray:
     inside = polygon @ line - least
     if (inside >= 0).all():
         return polygon
-    following, inside_next = np.roll(polygon, -1, axis=0), np.roll(inside, -1)
+    following, inside_next = following_row(polygon), following_row(inside)
     out: list[FloatArray] = []
     for p, q, a, b in zip(polygon, following, inside, inside_next, strict=True):
         if a >= 0:
@@ -155,7 +178,7 @@ def windows(view: View, shape: Outline, first_row: int = 0) -> Iterator[Window]:
     """Image windows that cover an outline closely: bands of rows, each as wide as the outline is there."""
     height, width = view.rays.u_pinhole_px.shape
     boundary = shape.boundary_px
-    following = np.roll(boundary, -1, axis=0)
+    following = following_row(boundary)
     top = max(int(np.floor(boundary[:, 1].min())) - 2, first_row)
     bottom = min(int(np.ceil(boundary[:, 1].max())) + 3, height)
     left, right = boundary[:, 0].min(), boundary[:, 0].max()

@@ -44,7 +44,7 @@ def inside_image(info: CameraInfo, cam_from_map: FloatArray, points_map: FloatAr
     pinhole[inside] = (cam[inside] @ info.intrinsic.T)[:, :2] / cam[inside, 2:]
     # Far outside the image the lens polynomial folds back; only near it are its values meaningful.
     margin = np.array([info.width, info.height]) * 0.25
-    inside &= ((pinhole > -margin) & (pinhole < (info.width, info.height) + margin)).all(axis=1)
+    inside &= ((pinhole > -margin) & (pinhole < 5.0 * margin)).all(axis=1)
     recorded = distort_points(info, pinhole[inside])
     inside[inside] = ((recorded >= 0) & (recorded <= (info.width - 1, info.height - 1))).all(axis=1)
     return np.asarray(inside)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -142,16 +142,15 @@ def _stacks(yard: YardConfig, route: Route, rng: np.random.Generator) -> list[Bo
                 if not filled or not _keeps_clear(base, route, boxes, yard.stack_clearance_m - 0.5):
                     continue
                 for level in range(tall):
+                    colour = _CONTAINER_COLOURS[int(colours[level])]
                     boxes.append(
-                        Box(
-                            centre_map=base.centre_map,
-                            size_m=_CONTAINER_M,
-                            yaw_rad=yaw,
+                        replace(
+                            base,
                             base_m=level * height,
-                            albedo_bgr=_CONTAINER_COLOURS[int(colours[level])],
+                            albedo_bgr=colour,
                             corrugated=True,
                             seed=int(station * 10) + level,
-                        )  # fmt: skip
+                        )
                     )
     return boxes
 
@@ -256,7 +255,7 @@ def _tyre_marks(dark: np.ndarray, pixels: object, route: Route, rng: np.random.G
     if len(station) < 2:
         return
     drift = rng.normal(0.0, 1.2) + rng.normal(0.0, 0.02) * (station - start)
-    shade, width = int(rng.uniform(6, 24)), int(rng.integers(4, 8))
+    shade, width = int(rng.uniform(8, 38)), int(rng.integers(4, 8))
     layer = np.zeros_like(dark)
     for wheel in (-0.9, 0.9):
         points = route.points_at(station, drift + wheel)
