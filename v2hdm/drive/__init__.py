@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from v2hdm.drive.folder import is_folder_drive, read_folder_drive, write_drive
+from v2hdm.drive.kitti import is_kitti_drive, read_kitti_drive
 from v2hdm.drive.options import KittiOptions, ReadOptions
 from v2hdm.drive.trajectory import Trajectory
 from v2hdm.errors import DriveError
@@ -25,6 +26,7 @@ class Reader:
 
 READERS: Mapping[str, Reader] = {
     "folder": Reader(accepts=is_folder_drive, read=read_folder_drive),
+    "kitti": Reader(accepts=is_kitti_drive, read=read_kitti_drive),
 }
 
 

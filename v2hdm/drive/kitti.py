@@ -1,0 +1,182 @@
+"""A KITTI raw drive: ``<date>/<date>_drive_<number>_sync`` with its calibration in ``<date>``.
+
+The vehicle frame has its origin on the road under the IMU, which sits near the rear axle. The map
+is the local tangent plane at the first pose, with the road laid flat into z = 0. docs/kitti.md
+gives the reasons for what the format leaves open.
+"""
+
+from __future__ import annotations
+
+import logging
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from v2hdm.drive.images import ImageFiles, check_image_files, pose_images, select_cameras
+from v2hdm.drive.kitti_calibration import KittiCamera, read_kitti_camera
+from v2hdm.drive.options import KittiOptions, ReadOptions
+from v2hdm.drive.road import RoadAttitude, attitude_to_road
+from v2hdm.drive.rotation import rotation_from_euler
+from v2hdm.drive.trajectory import Trajectory
+from v2hdm.errors import DriveError
+from v2hdm.files import read_text
+from v2hdm.hdmap.geodetic import enu_from_geodetic, geodetic_from_enu
+from v2hdm.records import Calibration, Camera, CentrePrior, Drive, FloatArray, GeodeticOrigin, PoseNoise
+
+_log = logging.getLogger(__name__)
+
+_CAMERAS = ("image_00", "image_01", "image_02", "image_03")
+_SUFFIXES = (".png", ".jpg", ".jpeg")
+_OXTS_COLUMNS = 30
+# Of the data sheet's 0.1 m and 0.1 deg most is drift that a stretch of road in view shares.
+_POSE_NOISE = PoseNoise(position_m=0.02, heading_rad=0.001, roll_pitch_rad=0.002)
+
+
+def is_kitti_drive(path: Path) -> bool:
+    """Whether ``path`` looks like the folder of one KITTI raw drive."""
+    return (path / "oxts").is_dir() and any((path / name).is_dir() for name in _CAMERAS)
+
+
+def read_kitti_drive(path: Path, options: ReadOptions) -> Drive:
+    """Read the KITTI raw drive at ``path``; see :func:`v2hdm.drive.read_drive`."""
+    path = path.resolve()
+    available = [name for name in _CAMERAS if (path / name).is_dir()]
+    if not available:
+        raise DriveError(f"{path}: no folder image_00 to image_03; give the folder of one drive, ..._sync")
+    names = select_cameras(available, options.cameras, path)
+    files = [_list_images(path, name) for name in names]
+    calibrations = {name: read_kitti_camera(path.parent, name) for name in names}
+    stamp_s, oxts = _read_oxts(path, names[0])
+
+    origin_imu = GeodeticOrigin(float(oxts[0, 0]), float(oxts[0, 1]), float(oxts[0, 2]))
+    position_enu = enu_from_geodetic(origin_imu, oxts[:, :3])
+    road = attitude_to_road(position_enu, oxts[:, 3], oxts[:, 4], options.kitti.road_smoothing_m)
+    vehicle_from_imu = _level_mount(calibrations[names[0]], road, options.kitti.camera_height_m)
+    poses = _lay_flat(position_enu, oxts[:, 3:6], road, vehicle_from_imu)
+    cameras = {
+        name: _mount(calibration, vehicle_from_imu, options.kitti)
+        for name, calibration in calibrations.items()
+    }
+    images = pose_images(files, Trajectory(stamp_s, poses), options.max_gap_s, path)
+    check_image_files(images, cameras)
+    return Drive(
+        name=path.name,
+        root=path,
+        cameras=cameras,
+        images=images,
+        pose_noise=_POSE_NOISE,
+        origin=_lower(origin_imu, float(vehicle_from_imu[2, 3])),
+    )
+
+
+def _list_images(path: Path, camera: str) -> ImageFiles:
+    """The images of one camera; the file number k is the line number of its time stamp."""
+    folder = path / camera
+    paths = sorted(
+        p for p in (folder / "data").glob("*") if p.suffix.lower() in _SUFFIXES and p.stem.isdecimal()
+    )
+    if not paths:
+        raise DriveError(f"{folder / 'data'}: no PNG or JPEG image; restore KITTI's images")
+    stamps = _read_stamps(folder / "timestamps.txt")
+    last = int(paths[-1].stem)
+    if last >= len(stamps):
+        raise DriveError(
+            f"{folder / 'timestamps.txt'}: {len(stamps)} lines, but image {last} exists; restore the file"
+        )
+    stamp_s = stamps[[int(p.stem) for p in paths]]
+    if (np.diff(stamp_s) <= 0).any():
+        raise DriveError(f"{folder / 'timestamps.txt'}: times are not strictly rising; restore the file")
+    return ImageFiles(camera=camera, stamp_s=stamp_s, paths=paths)
+
+
+def _read_oxts(path: Path, camera: str) -> tuple[FloatArray, FloatArray]:
+    """Stamps (P,) and OXTS rows (P, 30); without stamps of its own, line k has those of image k."""
+    folder = path / "oxts"
+    paths = sorted(p for p in (folder / "data").glob("*.txt") if p.stem.isdecimal())
+    if not paths:
+        raise DriveError(f"{folder / 'data'}: no OXTS file; restore KITTI's oxts folder")
+    stamps_path = folder / "timestamps.txt"
+    if not stamps_path.is_file():
+        stamps_path = path / camera / "timestamps.txt"
+    stamps = _read_stamps(stamps_path)
+    last = int(paths[-1].stem)
+    if last >= len(stamps):
+        raise DriveError(f"{stamps_path}: {len(stamps)} lines, but OXTS file {last} exists; restore the file")
+    stamp_s = stamps[[int(p.stem) for p in paths]]
+    oxts = np.array([_read_oxts_row(p) for p in paths])
+    rising = np.concatenate([[True], stamp_s[1:] > np.maximum.accumulate(stamp_s)[:-1]])
+    if not rising.all():
+        _log.warning("%s: dropped %d poses whose time does not rise", stamps_path, int((~rising).sum()))
+    return stamp_s[rising], oxts[rising]
+
+
+def _read_oxts_row(path: Path) -> FloatArray:
+    try:
+        row = np.array(read_text(path, DriveError).split(), dtype=np.float64)
+    except ValueError:
+        raise DriveError(f"{path}: holds something that is not a number; restore KITTI's own file") from None
+    if len(row) != _OXTS_COLUMNS or not np.isfinite(row[:6]).all():
+        raise DriveError(
+            f"{path}: expected {_OXTS_COLUMNS} finite numbers, got {len(row)}; restore KITTI's own file"
+        )
+    return row
+
+
+def _read_stamps(path: Path) -> FloatArray:
+    """Seconds since 1970 of ``YYYY-MM-DD hh:mm:ss.fraction`` lines, the clock taken for UTC."""
+    stamps = []
+    for number, line in enumerate(read_text(path, DriveError).splitlines(), start=1):
+        # datetime stops at microseconds; KITTI writes nanoseconds.
+        whole, _, fraction = line.strip().partition(".")
+        try:
+            seconds = datetime.fromisoformat(whole).replace(tzinfo=UTC).timestamp()
+            stamps.append(seconds + float(f"0.{fraction or 0}"))
+        except ValueError:
+            raise DriveError(
+                f"{path}: line {number}: expected 'YYYY-MM-DD hh:mm:ss.fraction', got '{line}'; mend that line"
+            ) from None
+    return np.array(stamps)
+
+
+def _level_mount(calibration: KittiCamera, road: RoadAttitude, camera_height_m: float) -> FloatArray:
+    """``vehicle_from_imu``: the IMU's pitch on the vehicle, and its height from that of the camera."""
+    vehicle_from_imu = np.eye(4)
+    zero = np.zeros(1)
+    vehicle_from_imu[:3, :3] = rotation_from_euler(zero, np.array([road.mount_pitch_rad]), zero)[0]
+    camera_imu = np.linalg.inv(calibration.cam_from_imu)[:3, 3]
+    vehicle_from_imu[2, 3] = camera_height_m - (vehicle_from_imu[:3, :3] @ camera_imu)[2]
+    return vehicle_from_imu
+
+
+def _lay_flat(
+    position_enu: FloatArray, attitude_rad: FloatArray, road: RoadAttitude, vehicle_from_imu: FloatArray
+) -> FloatArray:
+    """``map_from_vehicle`` (P, 4, 4): the ground point under the IMU at z = 0, attitude to the road."""
+    enu_from_imu = rotation_from_euler(*attitude_rad.T)
+    down_imu = -(vehicle_from_imu[:3, :3].T @ vehicle_from_imu[:3, 3])
+    ground_enu = position_enu + enu_from_imu @ down_imu
+    poses = np.tile(np.eye(4), (len(position_enu), 1, 1))
+    poses[:, :3, :3] = rotation_from_euler(road.roll_rad, road.pitch_rad, attitude_rad[:, 2])
+    poses[:, :2, 3] = ground_enu[:, :2]
+    return poses
+
+
+def _mount(calibration: KittiCamera, vehicle_from_imu: FloatArray, options: KittiOptions) -> Camera:
+    cam_from_vehicle = calibration.cam_from_imu @ np.linalg.inv(vehicle_from_imu)
+    centre_vehicle = np.linalg.inv(cam_from_vehicle)[:3, 3]
+    near, far, half = options.roi_near_m, options.roi_far_m, options.roi_half_width_m
+    roi = np.array([[near, -half], [far, -half], [far, half], [near, half]]) + centre_vehicle[:2]
+    return Camera(
+        info=calibration.info,
+        ipm={"estimated": Calibration(calibration.info, cam_from_vehicle).vehicle_from_pinhole_px},
+        initial_ipm="estimated",
+        roi_vehicle=roi,
+        centre_prior=CentrePrior(centre_vehicle, np.full(3, options.centre_sigma_m)),
+    )
+
+
+def _lower(origin: GeodeticOrigin, height_m: float) -> GeodeticOrigin:
+    """``origin`` moved down to the road."""
+    latitude, longitude, altitude = geodetic_from_enu(origin, np.array([[0.0, 0.0, -height_m]]))[0]
+    return GeodeticOrigin(float(latitude), float(longitude), float(altitude))
