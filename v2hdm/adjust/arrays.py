@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from v2hdm.adjust.problem import POSE_STATES, Problem
@@ -105,7 +107,7 @@ def make_arrays(problem: Problem, pose_states: tuple[str, ...], device: str) -> 
     def real(values: FloatArray) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float64, device=device)
 
-    def index(values: FloatArray) -> Tensor:
+    def index(values: NDArray[np.integer[Any]]) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.int64, device=device)
 
     return Arrays(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.adjust.problem import LOSSES, POSE_STATES, SOLVERS, Problem, SolveOptions
+from v2hdm.adjust.problem import LOSSES, POSE_STATES, SOLVERS, IntArray, Problem, SolveOptions
 from v2hdm.errors import AdjustError
 from v2hdm.records import FloatArray
 
@@ -36,7 +36,7 @@ def _check_shapes(problem: Problem) -> None:
     cameras, frames = len(problem.intrinsic), len(problem.map_from_vehicle)
     seen = problem.observations
     count = len(seen.camera)
-    expected: list[tuple[str, FloatArray | None, tuple[int, ...]]] = [
+    expected: list[tuple[str, FloatArray | IntArray | None, tuple[int, ...]]] = [
         ("intrinsic", problem.intrinsic, (cameras, 4)),
         ("cam_from_vehicle", problem.cam_from_vehicle, (cameras, 4, 4)),
         ("map_from_vehicle", problem.map_from_vehicle, (frames, 4, 4)),

@@ -9,8 +9,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from v2hdm.adjust.reduced import to_tiles
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.records import FloatArray
+
+# Right-hand sides solved for together: enough for fast products, few enough to stay small.
+_CORNERS_AT_ONCE = 256
 
 
 @dataclass(frozen=True)
@@ -25,36 +29,42 @@ class Covariance:
 
     def extrinsic(self) -> FloatArray:
         """Of each camera's left tangent (C, 6, 6): translation m, rotation rad."""
-        size = 6 * self.whitening.arrays.camera_count
         # The extrinsics come last, so the tip of L_S is the factor of their marginal information.
-        tip = self.whitening.reduced_factor[-size:, -size:]
-        joint = torch.cholesky_inverse(tip).reshape(-1, 6, self.whitening.arrays.camera_count, 6)
+        joint = torch.cholesky_inverse(self.whitening.reduced_factor.tip).reshape(
+            -1, 6, self.whitening.arrays.camera_count, 6
+        )
         return np.stack([joint[c, :, c].cpu().numpy() for c in range(len(joint))])
 
-    def corners(self, indices: NDArray[np.int64]) -> FloatArray:
-        """Joint covariance (2 n, 2 n), m^2, of corners (n,) by their index in the problem."""
+    def corners(self, groups: NDArray[np.int64]) -> FloatArray:
+        """Joint covariance (M, 2 n, 2 n), m^2, within each of M groups (M, n) of corners of the problem."""
+        parts = np.array_split(groups, max(-(-groups.size // _CORNERS_AT_ONCE), 1))
+        return np.concatenate([self._corners(part) for part in parts])
+
+    def _corners(self, groups: NDArray[np.int64]) -> FloatArray:
+        count, each = groups.shape
         rank = torch.argsort(self.whitening.arrays.corner_order)
-        chosen = rank[torch.as_tensor(indices, device=rank.device)]
-        factor = self.whitening.corner_factor[chosen]
-        root = _reduced_root(self.whitening, chosen)
-        middle = root.T @ root + torch.eye(2 * len(chosen), dtype=root.dtype, device=root.device)
-        blocks = torch.block_diag(*torch.linalg.inv(factor))
-        return np.asarray((blocks.T @ middle @ blocks).cpu().numpy())
+        chosen = rank[torch.as_tensor(groups.flatten(), device=rank.device)]
+        root = _reduced_root(self.whitening, chosen).reshape(-1, count, 2 * each).transpose(0, 1)
+        middle = root.mT @ root + torch.eye(2 * each, dtype=root.dtype, device=root.device)
+        blocks = middle.new_zeros(count, each, 2, each, 2)
+        index = torch.arange(each, device=rank.device)
+        inverse = torch.linalg.inv(self.whitening.corner_factor[chosen]).reshape(count, each, 2, 2)
+        blocks[:, index, :, index, :] = inverse.transpose(0, 1)
+        spread = blocks.reshape(count, 2 * each, 2 * each)
+        return np.asarray((spread.mT @ middle @ spread).cpu().numpy())
 
 
 def _reduced_root(whitening: Whitening, chosen: Tensor) -> Tensor:
-    """L_S^-1 [B_i' ...] (D, 2 n) for chosen corners."""
-    arrays = whitening.arrays
-    frames, states = arrays.frame_count, len(arrays.states)
-    size = frames * states
-    right = whitening.coupling.new_zeros(len(chosen), 2, size + 6 * arrays.camera_count)
+    """L_S^-1 [B_1' B_2' ...] (D, 2 n) for n chosen corners."""
+    arrays, plan = whitening.arrays, whitening.plan
+    frames, states, columns = arrays.frame_count, len(arrays.states), 2 * len(chosen)
+    by_frame = whitening.coupling.new_zeros(frames, states, len(chosen), 2)
+    by_camera = whitening.coupling.new_zeros(arrays.camera_count, 6, len(chosen), 2)
     spread = whitening.pair_from_state.reshape(arrays.pair_count, 6, states)
     bounds = torch.searchsorted(arrays.corner, torch.stack([chosen, chosen + 1]))
-    for row, (begin, end) in enumerate(bounds.T.tolist()):
+    for n, (begin, end) in enumerate(bounds.T.tolist()):
         pair, part = arrays.pair[begin:end], whitening.coupling[begin:end]
-        by_frame = right[row, :, :size].view(2, frames, states)
-        by_frame.index_add_(1, pair % frames, (part @ spread[pair]).transpose(0, 1))
-        by_camera = right[row, :, size:].view(2, arrays.camera_count, 6)
-        by_camera.index_add_(1, pair // frames, part.transpose(0, 1))
-    flat = right.reshape(-1, right.shape[-1]).T
-    return torch.linalg.solve_triangular(whitening.reduced_factor, flat, upper=False)
+        by_frame[:, :, n].index_add_(0, pair % frames, (part @ spread[pair]).mT)
+        by_camera[:, :, n].index_add_(0, pair // frames, part.mT)
+    top = to_tiles(plan, by_frame.reshape(frames, states, columns))
+    return whitening.reduced_factor.solve(torch.cat([top, by_camera.reshape(-1, columns)]))

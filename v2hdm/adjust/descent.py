@@ -9,6 +9,7 @@ from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.lbfgs import minimise
+from v2hdm.adjust.reduced import make_plan
 from v2hdm.adjust.residuals import Estimate, Gradient, Loss, cost_and_gradient, observe
 from v2hdm.adjust.robust import annealed_scale, loss
 from v2hdm.adjust.whitening import Whitening, factorise
@@ -82,13 +83,14 @@ def descend(
 ) -> Descent:
     """Minimise the cost from ``estimate``, narrowing the robust loss on the way."""
     evaluations, refreshes, damping, scale, progressing = 0, 0, 0.0, float("inf"), True
+    plan = make_plan(arrays)
     while True:
         squared = observe(arrays, estimate).squared
         narrowed = annealed_scale(squared, robust.scale) if robust.name != "none" else robust.scale
         scale = max(robust.scale, min(narrowed, scale / _ANNEALING_STEP))
         current = Loss(robust.name, scale)
         final = scale <= robust.scale
-        whitening = factorise(arrays, estimate, loss(current.name, squared, scale)[1], damping)
+        whitening = factorise(arrays, plan, estimate, loss(current.name, squared, scale)[1], damping)
         objective = Objective(whitening, estimate, current)
         cost, gradient = objective(squared.new_zeros(whitening.size))
         gap = float(gradient.square().sum() / cost.clamp(min=_TINY))

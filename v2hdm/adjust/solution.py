@@ -6,7 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
+import numpy as np
+
 from v2hdm.adjust.covariance import Covariance
+from v2hdm.adjust.problem import IntArray
 from v2hdm.records import FloatArray
 
 
@@ -82,6 +85,11 @@ class Solution:
         """Covariance (C, 6, 6) of each extrinsic's left tangent: translation m, rotation rad."""
         return self.covariance.extrinsic()
 
-    def corner_covariance(self, indices: FloatArray) -> FloatArray:
-        """Joint covariance (2n, 2n), m^2, of the corners ``indices`` (n,), stacked x0, y0, x1, ..."""
-        return self.covariance.corners(indices)
+    def corner_covariance(self, indices: IntArray) -> FloatArray:
+        """Joint covariance (2n, 2n), m^2, of the corners ``indices`` (n,), stacked x0, y0, x1, ...
+
+        For groups (M, n), such as the corners of all markings, one each: (M, 2n, 2n).
+        """
+        groups = np.atleast_2d(indices)
+        covariance = self.covariance.corners(groups)
+        return covariance if np.ndim(indices) == 2 else covariance[0]

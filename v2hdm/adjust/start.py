@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -58,7 +60,5 @@ def back_project(arrays: Arrays, cam_from_vehicle: Tensor) -> tuple[Tensor, Tens
 
 def _one_corner_each(arrays: Arrays) -> Arrays:
     """The same observations, each of a corner of its own."""
-    from dataclasses import replace
-
     own = torch.arange(len(arrays.corner), device=arrays.corner.device)
     return replace(arrays, corner=own, corner_order=own)

@@ -1,0 +1,193 @@
+"""The reduced system of frame states and extrinsics, corners eliminated, in tiles along the route.
+
+S = U - sum_i B_i' B_i (see :mod:`v2hdm.adjust.whitening`). Vectors of the reduced unknowns hold the
+frame states, tile by tile in elimination order and padded to whole tiles, then the extrinsics.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from v2hdm.adjust.arrays import Arrays
+from v2hdm.adjust.residuals import Estimate
+from v2hdm.adjust.tiles import TIP, Pattern, Tiles, find_pattern
+
+# Rows of a tile, about: large enough for fast products, small against a corner's span of frames.
+_TILE_ROWS = 96
+# Corners whose part of the Schur complement is one dense product: neighbours share their frames.
+_BLOCK_CORNERS = 32
+
+
+@dataclass(frozen=True)
+class Block:
+    """A run of corners: their observations [begin, end), the tiles they touch, and its place there.
+
+    ``row`` is each observation's corner, counted within the block; ``slot`` its frame, counted
+    over the touched tiles.
+    """
+
+    begin: int
+    end: int
+    tiles: tuple[int, ...]
+    row: Tensor
+    slot: Tensor
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a problem's reduced system is cut into tiles; depends on who saw what, not on numbers."""
+
+    frames_per_tile: int
+    pattern: Pattern
+    blocks: tuple[Block, ...]
+
+    @property
+    def tile_count(self) -> int:
+        """G."""
+        return len(self.pattern.below)
+
+
+def make_plan(arrays: Arrays) -> Plan:
+    """Cut the frames into tiles and the corners into blocks, and find the factor's pattern."""
+    states = len(arrays.states)
+    per_tile = max(_TILE_ROWS // states, 1) if states else arrays.frame_count
+    count = -(-arrays.frame_count // per_tile) if states else 0
+    frame = arrays.pair % arrays.frame_count
+    starts = torch.arange(0, arrays.corner_count, _BLOCK_CORNERS, device=frame.device)
+    bounds = [*torch.searchsorted(arrays.corner, starts).tolist(), len(frame)]
+    blocks = []
+    for begin, end in pairwise(bounds):
+        touched = torch.unique(frame[begin:end] // per_tile)
+        slot = torch.searchsorted(touched, frame[begin:end] // per_tile) * per_tile
+        blocks.append(
+            Block(
+                begin,
+                end,
+                tuple(touched.tolist()) if states else (),
+                arrays.corner[begin:end] - arrays.corner[begin],
+                slot + frame[begin:end] % per_tile,
+            )
+        )
+    cliques = [list(block.tiles) for block in blocks]
+    if bool((arrays.state_memory > 0).any()):
+        cliques += [[tile, tile + 1] for tile in range(count - 1)]
+    return Plan(per_tile, find_pattern(count, cliques), tuple(blocks))
+
+
+def to_tiles(plan: Plan, by_frame: Tensor) -> Tensor:
+    """Values by frame (J, S, ...) as rows of the reduced vector (G F S, ...), padded with zeros."""
+    states = by_frame.shape[1]
+    if not states:
+        return by_frame.new_zeros(0, *by_frame.shape[2:])
+    shape = (plan.tile_count, plan.frames_per_tile, *by_frame.shape[1:])
+    padded = by_frame.new_zeros(shape)
+    padded.flatten(0, 1)[: len(by_frame)] = by_frame
+    ordered = torch.empty_like(padded)
+    ordered[list(plan.pattern.position)] = padded
+    return ordered.flatten(0, 2)
+
+
+def from_tiles(plan: Plan, rows: Tensor, frame_count: int, states: int) -> Tensor:
+    """Inverse of :func:`to_tiles` for vectors: (G F S,) to (J, S)."""
+    if not states:
+        return rows.new_zeros(frame_count, 0)
+    ordered = rows.reshape(plan.tile_count, plan.frames_per_tile, states)
+    return ordered[list(plan.pattern.position)].flatten(0, 1)[:frame_count]
+
+
+def held_hessian(arrays: Arrays, plan: Plan, estimate: Estimate, by_pair: Tensor, spread: Tensor) -> Tiles:
+    """U: the Hessian of frame states and extrinsics, priors included, with the corners held.
+
+    Args:
+        arrays: the problem.
+        plan: its tiles.
+        estimate: where.
+        by_pair: derivatives of the weighted residuals by pair, (K, 2, 6).
+        spread: derivatives of the pairs by the states, (C, J, 6, S).
+    """
+    cameras, states = arrays.camera_count, len(arrays.states)
+    blocks = by_pair.new_zeros(arrays.pair_count, 6, 6).index_add_(0, arrays.pair, by_pair.mT @ by_pair)
+    blocks = blocks.reshape(cameras, arrays.frame_count, 6, 6)
+    tiles = _empty_tiles(plan, states, cameras, by_pair)
+    if states:
+        _add_frames(arrays, plan, (spread.mT @ blocks @ spread).sum(0), tiles)
+        border = to_tiles(plan, (spread.mT @ blocks).permute(1, 2, 0, 3).flatten(2))
+        for column, part in enumerate(border.chunk(plan.tile_count)):
+            tiles[TIP, column] = part.mT.contiguous()
+    tip = tiles[TIP, TIP].view(cameras, 6, cameras, 6)
+    rotation, root = estimate.cam_from_vehicle[:, :3, :3], arrays.centre_information_root
+    information = rotation * root.square()[:, None] @ rotation.mT
+    for camera in range(cameras):
+        tip[camera, :, camera] = blocks[camera].sum(0)
+        tip[camera, :3, camera, :3] += information[camera]
+    return tiles
+
+
+def _empty_tiles(plan: Plan, states: int, cameras: int, like: Tensor) -> Tiles:
+    size, tip = plan.frames_per_tile * states, 6 * cameras
+    tiles = {(TIP, TIP): like.new_zeros(tip, tip)}
+    for column, below in enumerate(plan.pattern.below):
+        tiles[TIP, column] = like.new_zeros(tip, size)
+        for row in (column, *below):
+            tiles[row, column] = like.new_zeros(size, size)
+    return tiles
+
+
+def _add_frames(arrays: Arrays, plan: Plan, by_frame: Tensor, tiles: Tiles) -> None:
+    """Each frame's own information and prior, and the prior's coupling to the frame before."""
+    root, memory = arrays.state_information_root, arrays.state_memory
+    own = root.square()
+    own[:-1] += (memory * root)[1:].square()
+    across = -(memory * root.square())
+    per_tile, position, states = plan.frames_per_tile, plan.pattern.position, root.shape[1]
+    by_frame = by_frame + torch.diag_embed(own)
+    for tile, begin in enumerate(range(0, arrays.frame_count, per_tile)):
+        part, coupling = by_frame[begin : begin + per_tile], across[begin : begin + per_tile]
+        count = len(part)
+        view = tiles[position[tile], position[tile]].view(per_tile, states, per_tile, states)
+        index = torch.arange(per_tile, device=root.device)
+        # Frames that only fill up the last tile are fixed at 0.
+        view[index, :, index, :] = torch.eye(states, dtype=root.dtype, device=root.device)
+        view[index[:count], :, index[:count], :] = part
+        inner = torch.diag_embed(coupling[1:])
+        view[index[1:count], :, index[: count - 1], :] = inner
+        view[index[: count - 1], :, index[1:count], :] = inner
+        if tile and bool(coupling[0].any()):
+            _add_between(tiles, position[tile], position[tile - 1], torch.diag(coupling[0]))
+
+
+def _add_between(tiles: Tiles, later: int, earlier: int, coupling: Tensor) -> None:
+    """Couple the first frame of one tile with the last of the one before it on the route."""
+    states = len(coupling)
+    if later > earlier:
+        tiles[later, earlier][:states, -states:] += coupling
+    else:
+        tiles[earlier, later][-states:, :states] += coupling
+
+
+def subtract_corners(arrays: Arrays, plan: Plan, coupling: Tensor, spread: Tensor, tiles: Tiles) -> None:
+    """Take sum_i B_i' B_i off, block by block; ``coupling`` (K, 2, 6) holds B_i by observation."""
+    states, cameras = len(arrays.states), arrays.camera_count
+    size = plan.frames_per_tile * states
+    camera = arrays.pair // arrays.frame_count
+    by_frame = coupling @ spread.reshape(arrays.pair_count, 6, states)[arrays.pair]
+    for block in plan.blocks:
+        part, rows = slice(block.begin, block.end), int(block.row[-1]) + 1
+        by_camera = coupling.new_zeros(rows, cameras, 2, 6)
+        by_camera.index_put_((block.row, camera[part]), coupling[part], accumulate=True)
+        tip = by_camera.permute(0, 2, 1, 3).reshape(2 * rows, -1)
+        tiles[TIP, TIP].addmm_(tip.mT, tip, alpha=-1)
+        if not states:
+            continue
+        frames = coupling.new_zeros(rows, len(block.tiles) * plan.frames_per_tile, 2, states)
+        frames.index_put_((block.row, block.slot), by_frame[part], accumulate=True)
+        columns = frames.permute(0, 2, 1, 3).reshape(2 * rows, -1).split(size, dim=1)
+        placed = sorted((plan.pattern.position[tile], k) for k, tile in enumerate(block.tiles))
+        for n, (column, first) in enumerate(placed):
+            tiles[TIP, column].addmm_(tip.mT, columns[first], alpha=-1)
+            for row, second in placed[n:]:
+                tiles[row, column].addmm_(columns[second].mT, columns[first], alpha=-1)

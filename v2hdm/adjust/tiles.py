@@ -1,0 +1,160 @@
+"""Sparse Cholesky factorisation in dense tiles, for a matrix with an arrow's shape.
+
+The frames of a drive, cut into tiles along the route, couple to their neighbours and, where the
+route is driven again, to the tiles of earlier laps; the extrinsics couple to everything and come last,
+as the *tip*. Tiles are ordered by reverse Cuthill-McKee and their fill is found beforehand (the
+elimination tree: George and Liu, Computer Solution of Large Sparse Positive Definite Systems, 1981),
+so time and memory grow with the length of the route. Everything inside a tile is a dense product.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+from torch import Tensor
+
+Tiles = dict[tuple[int, int], Tensor]
+"""Lower tiles by (row, column) in elimination order; row :data:`TIP` holds the border."""
+
+TIP = -1
+
+_DAMPING_STEPS = (0.0, 1e-12, 1e-9, 1e-6, 1e-3)
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """Which tiles are not zero.
+
+    Attributes:
+        position: where each tile along the route stands in the elimination order.
+        below: for each column in that order, the rows below its diagonal, fill included, ascending.
+    """
+
+    position: tuple[int, ...]
+    below: tuple[tuple[int, ...], ...]
+
+
+def find_pattern(tile_count: int, cliques: Iterable[list[int]]) -> Pattern:
+    """The pattern of a factor whose matrix couples all tiles of each clique with one another."""
+    edges = {pair for clique in cliques for pair in combinations(sorted(clique), 2)}
+    position = np.arange(tile_count)
+    if edges:
+        first, second = np.array(sorted(edges)).T
+        graph = coo_matrix((np.ones(len(first)), (first, second)), shape=(tile_count, tile_count)).tocsr()
+        order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
+        position[order] = np.arange(tile_count)
+    below: list[set[int]] = [set() for _ in range(tile_count)]
+    for first_tile, second_tile in edges:
+        low, high = sorted((int(position[first_tile]), int(position[second_tile])))
+        below[low].add(high)
+    for rows in below:
+        if rows:
+            parent = min(rows)
+            below[parent] |= rows - {parent}
+    return Pattern(tuple(position.tolist()), tuple(tuple(sorted(rows)) for rows in below))
+
+
+@dataclass(frozen=True)
+class TiledCholesky:
+    """L of a positive definite matrix in tiles of ``size``, the tip last.
+
+    Attributes:
+        diagonal: lower factors of the diagonal tiles (G, size, size).
+        panels: what stands below each, stacked, the tip's rows last.
+        rows: which rows of the vector each panel acts on.
+        tip: lower factor of the tip.
+        damping: relative diagonal that had to be added; above 0 the matrix was singular.
+    """
+
+    diagonal: tuple[Tensor, ...]
+    panels: tuple[Tensor, ...]
+    rows: tuple[Tensor, ...]
+    tip: Tensor
+    damping: float
+
+    @property
+    def size(self) -> int:
+        """Number of rows."""
+        return sum(len(tile) for tile in self.diagonal) + len(self.tip)
+
+    def pivots(self) -> Tensor:
+        """Squares of L's diagonal."""
+        return torch.cat([tile.diagonal() for tile in (*self.diagonal, self.tip)]).square()
+
+    def solve(self, right: Tensor) -> Tensor:
+        """L^-1 b for b (size, n)."""
+        out, begin = right.clone(), 0
+        for tile, panel, rows in zip(self.diagonal, self.panels, self.rows, strict=True):
+            part = out[begin : begin + len(tile)]
+            part.copy_(torch.linalg.solve_triangular(tile, part, upper=False))
+            out.index_add_(0, rows, panel @ part, alpha=-1)
+            begin += len(tile)
+        out[begin:] = torch.linalg.solve_triangular(self.tip, out[begin:], upper=False)
+        return out
+
+    def solve_transposed(self, right: Tensor) -> Tensor:
+        """L^-T b for b (size, n)."""
+        out, end = right.clone(), self.size - len(self.tip)
+        out[end:] = torch.linalg.solve_triangular(self.tip.mT, out[end:], upper=True)
+        for tile, panel, rows in zip(
+            reversed(self.diagonal), reversed(self.panels), reversed(self.rows), strict=True
+        ):
+            begin = end - len(tile)
+            rest = out[begin:end] - panel.mT @ out.index_select(0, rows)
+            out[begin:end] = torch.linalg.solve_triangular(tile.mT, rest, upper=True)
+            end = begin
+        return out
+
+
+def factorise_tiles(tiles: Tiles, pattern: Pattern) -> TiledCholesky:
+    """Factorise, with the least damping that makes it possible."""
+    for damping in _DAMPING_STEPS:
+        factor = _factorise(tiles, pattern, damping)
+        if factor is not None:
+            return factor
+    raise ValueError("the reduced matrix is not finite or far from positive definite")
+
+
+def _factorise(tiles: Tiles, pattern: Pattern, damping: float) -> TiledCholesky | None:
+    """Right-looking: each column, once factorised, is subtracted from those it couples to."""
+    rest = {key: tile.clone() for key, tile in tiles.items()}
+    diagonal, panels, rows = [], [], []
+    for column, below in enumerate(pattern.below):
+        factor = _factorise_tile(rest.pop((column, column)), damping)
+        if factor is None:
+            return None
+        keys = (*below, TIP)
+        stacked = torch.cat([rest.pop((row, column)) for row in keys])
+        panel = torch.linalg.solve_triangular(factor, stacked.mT, upper=False).mT
+        parts = dict(zip(keys, panel.split([len(factor)] * len(below) + [len(rest[TIP, TIP])]), strict=True))
+        for first, second in _lower_pairs(keys):
+            rest[second, first].addmm_(parts[second], parts[first].mT, alpha=-1)
+        diagonal.append(factor)
+        panels.append(panel)
+        rows.append(_row_index(below, len(factor), len(pattern.below), len(rest[TIP, TIP]), panel))
+    tip = _factorise_tile(rest.pop((TIP, TIP)), damping)
+    return None if tip is None else TiledCholesky(tuple(diagonal), tuple(panels), tuple(rows), tip, damping)
+
+
+def _lower_pairs(keys: tuple[int, ...]) -> Iterable[tuple[int, int]]:
+    """Pairs (column, row) of the tiles that a panel over ``keys`` updates."""
+    return ((keys[a], keys[b]) for a in range(len(keys)) for b in range(a, len(keys)))
+
+
+def _factorise_tile(tile: Tensor, damping: float) -> Tensor | None:
+    if damping:
+        tile = tile + torch.diag(damping * tile.diagonal().abs())
+    factor, info = torch.linalg.cholesky_ex(tile)
+    return factor if int(info) == 0 else None
+
+
+def _row_index(below: tuple[int, ...], size: int, count: int, tip: int, like: Tensor) -> Tensor:
+    starts = torch.tensor(below, dtype=torch.int64, device=like.device)[:, None] * size
+    tiles = (starts + torch.arange(size, device=like.device)).flatten()
+    return torch.cat([tiles, torch.arange(count * size, count * size + tip, device=like.device)])
