@@ -1,0 +1,73 @@
+"""Every shipped run composes; a typo is one line that names the key."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+from v2hdm import config
+from v2hdm.errors import ConfigError
+from v2hdm.pipeline import RunConfig
+
+RUNS = sorted(path.stem for path in (config.conf_dir() / "run").glob("*.yaml"))
+
+
+def composed(*overrides: str) -> RunConfig:
+    config.register_schemas()
+    with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
+        return config.to_run_config(compose("map", overrides=list(overrides)))
+
+
+def test_the_runs_that_the_readme_names_are_shipped() -> None:
+    assert set(RUNS) >= {"port1", "port2", "kitti"}
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_every_shipped_run_composes_into_dataclasses(run: str) -> None:
+    assert composed(f"+run={run}", "drive.path=x" if run == "kitti" else "workers=1").name == run
+
+
+def test_no_run_is_an_error_that_lists_the_runs() -> None:
+    with pytest.raises(ConfigError, match=r"\+run=port2"):
+        composed()
+
+
+def run_door(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "v2hdm.map", *arguments]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("+run=port2", "maping.max_range_m=3"), "maping"),
+        (("+run=port2", "mapping.max_rnge_m=3"), "max_range_m"),
+        (("+run=port9",), "port9"),
+        (("+run=port2", "workers=many"), "workers"),
+        (("+run=kitti",), "drive.path"),
+        (("+run=kitti", "drive.path=nowhere"), "nowhere"),
+    ],
+)
+def test_a_wrong_argument_is_one_line_that_names_it(
+    arguments: tuple[str, ...], named: str, tmp_path: Path
+) -> None:
+    done = run_door(*arguments, folder=tmp_path)
+    assert done.returncode == 2
+    lines = done.stderr.strip().splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("error: ")
+    assert named in lines[0]
+    assert not list(tmp_path.rglob("metrics.json"))
+
+
+def test_a_users_own_runs_join_the_shipped_ones(tmp_path: Path) -> None:
+    own = tmp_path / "conf" / "run"
+    own.mkdir(parents=True)
+    (own / "mysite.yaml").write_text("# @package _global_\nname: mysite\ndrive:\n  path: nowhere_at_all\n")
+    done = run_door("--config-dir", str(tmp_path / "conf"), "+run=mysite", folder=tmp_path)
+    assert done.returncode == 2
+    assert "nowhere_at_all" in done.stderr

@@ -1,0 +1,58 @@
+"""A run on the terminal: progress bars, the log, and the table that ends it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from v2hdm import pipeline
+from v2hdm.report.table import results_table
+
+
+def run_on_terminal(config: pipeline.RunConfig, config_yaml: str) -> None:
+    """Run the pipeline and show what it does and found."""
+    console = Console()
+    with _logging_to(console), _bars(console) as progress:
+        result = pipeline.run(config, config_yaml, progress)
+    console.print()
+    for line in result.headlines:
+        console.print(line, highlight=False)
+    console.print(results_table(f"{config.name}: corners against truth", result.metrics["results"]))
+    console.print(f"results in {result.folder}", highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def _logging_to(console: Console) -> Iterator[None]:
+    handler = RichHandler(console=console, show_path=False, show_level=False, log_time_format="%H:%M:%S")
+    logger = logging.getLogger("v2hdm")
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+
+
+@contextmanager
+def _bars(console: Console) -> Iterator[pipeline.Progress]:
+    """A progress bar per task, made the first time that a task reports."""
+    columns = (
+        TextColumn("{task.description:<28}"),
+        BarColumn(40),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as bars:
+        tasks = {}
+
+        def advance(task: str, done: int, total: int) -> None:
+            if task not in tasks:
+                tasks[task] = bars.add_task(task, total=total)
+            bars.update(tasks[task], completed=done, total=total)
+
+        yield advance

@@ -1,0 +1,5 @@
+"""The whole job as one call: :func:`run` maps a drive and writes its results."""
+
+from v2hdm.pipeline.run import DriveConfig, Progress, RunConfig, RunResult, run, silent
+
+__all__ = ["DriveConfig", "Progress", "RunConfig", "RunResult", "run", "silent"]

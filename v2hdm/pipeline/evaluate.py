@@ -1,0 +1,128 @@
+"""Judging a run: the only step that may read ground truth, after everything has been mapped."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from v2hdm.detection.ground import ipm_from_extrinsic
+from v2hdm.drive.truth import read_truth
+from v2hdm.mapping.growth import growing_maps
+from v2hdm.mapping.methods import MethodResult, naive_method
+from v2hdm.mapping.options import MappingOptions
+from v2hdm.records import Drive, ImageDetections, Truth
+from v2hdm.report.evaluation import extrinsic_figures, growth_figures, headline, map_figures
+from v2hdm.report.metrics import driven_past
+
+CameraSets = Mapping[str, Mapping[str, MethodResult]]
+"""Results by camera set (``front``, ``rear``, ``both``), then by method."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The figures of a run.
+
+    ``metrics`` goes into ``metrics.json``; ``headlines`` are sentences for a reader; ``growth``
+    holds per method the corner RMSE (m) after so many markings; ``truth`` is None on a real drive.
+    """
+
+    metrics: Mapping[str, Any]
+    headlines: Sequence[str]
+    growth: Mapping[str, Sequence[tuple[int, float]]]
+    truth: Truth | None
+
+
+def evaluate(
+    drive: Drive,
+    detections: Sequence[ImageDetections],
+    methods: CameraSets,
+    options: MappingOptions,
+    progress: Callable[[int, int], None],
+) -> Judgement:
+    """Compare every method on every camera set with the truth, where the drive has one."""
+    truth = read_truth(drive) if drive.truth_dir is not None else None
+    results: dict[str, dict[str, Any]] = {}
+    reference: dict[str, Any] = {}
+    growth: dict[str, list[tuple[int, float]]] = {}
+    for done, (name, by_method) in enumerate(methods.items()):
+        progress(done, len(methods) + 1)
+        cameras = next(iter(by_method.values())).cameras
+        expected = driven_past(drive, truth, cameras) if truth else None
+        results[name] = {
+            method: map_figures(result.hd_map, truth, expected) | _own_figures(result)
+            for method, result in by_method.items()
+        }
+        if truth is not None:
+            ideal = _naive_under_true_extrinsic(drive, detections, cameras, truth, options)
+            reference[name] = {"naive_true_extrinsic": map_figures(ideal.hd_map, truth, expected)}
+    progress(len(methods), len(methods) + 1)
+    if truth is not None:
+        whole_rig = list(methods.values())[-1]
+        growth = {
+            method: growth_figures(maps, truth)
+            for method, maps in growing_maps(drive, detections, whole_rig, options).items()
+        }
+    progress(len(methods) + 1, len(methods) + 1)
+    metrics: dict[str, Any] = {"results": results, "extrinsics": _extrinsics(drive, methods, truth)}
+    if truth is not None:
+        metrics |= {"reference": reference, "disturbances": truth.disturbances, "growth": growth}
+    headlines = [headline(name, by_method) for name, by_method in results.items()]
+    return Judgement(metrics, [*_disturbances(truth), *headlines], growth, truth)
+
+
+def _own_figures(result: MethodResult) -> dict[str, Any]:
+    """What a method says of itself, without truth."""
+    figures: dict[str, Any] = {"excluded": len(result.excluded)}
+    if result.reprojection_rmse_px is not None:
+        figures["reprojection_rmse_px"] = result.reprojection_rmse_px
+        figures["initial_reprojection_rmse_px"] = result.initial_reprojection_rmse_px
+    if result.diagnostics:
+        figures["diagnostics"] = dict(result.diagnostics)
+    return figures
+
+
+def _naive_under_true_extrinsic(
+    drive: Drive,
+    detections: Sequence[ImageDetections],
+    cameras: Sequence[str],
+    truth: Truth,
+    options: MappingOptions,
+) -> MethodResult:
+    """The best that any calibration could make of the naive strategy."""
+    ipms = {
+        name: ipm_from_extrinsic(drive.cameras[name].info, truth.cam_from_vehicle[name]) for name in cameras
+    }
+    return naive_method("true extrinsic", drive, detections, cameras, ipms, options)
+
+
+def _extrinsics(drive: Drive, methods: CameraSets, truth: Truth | None) -> dict[str, Any]:
+    """Per camera the extrinsic found with all cameras together, and under ``alone`` by itself."""
+    figures: dict[str, Any] = {}
+    for by_method in reversed(list(methods.values())):
+        optimised = by_method.get("Opt")
+        if optimised is None:
+            continue
+        for name, calibration in optimised.calibrations.items():
+            found = extrinsic_figures(
+                calibration.cam_from_vehicle,
+                optimised.initial_cam_from_vehicle[name],
+                truth.cam_from_vehicle[name] if truth else None,
+            )
+            if calibration.covariance is not None:
+                sigma = np.sqrt(np.diag(calibration.covariance))
+                found["translation_sigma_m"] = float(np.linalg.norm(sigma[:3]))
+                found["rotation_sigma_deg"] = float(np.rad2deg(np.linalg.norm(sigma[3:])))
+            if name in figures:
+                figures[name]["alone"] = found
+            else:
+                figures[name] = found
+    return figures
+
+
+def _disturbances(truth: Truth | None) -> list[str]:
+    if truth is None or not truth.disturbances:
+        return []
+    return ["disturbances: " + ", ".join(f"{name} {value:g}" for name, value in truth.disturbances.items())]

@@ -1,0 +1,187 @@
+"""From a drive to a map and a calibration: read, detect, associate, adjust, judge, write.
+
+:func:`run` is the whole product as one call; it needs no terminal and knows nothing of Hydra.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+from v2hdm import __version__
+from v2hdm.detection.batch import detect_all
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.drive import ReadOptions, read_drive
+from v2hdm.errors import ConfigError
+from v2hdm.mapping.methods import run_methods
+from v2hdm.mapping.options import MappingOptions
+from v2hdm.pipeline.evaluate import CameraSets, evaluate
+from v2hdm.pipeline.write import write_results
+from v2hdm.records import Drive, ImageDetections
+from v2hdm.report.outputs import result_folder
+from v2hdm.simulate import PortConfig, rendered_drive
+
+log = logging.getLogger(__name__)
+
+
+class Progress(Protocol):
+    """Told how far a named piece of long work is."""
+
+    def __call__(self, task: str, done: int, total: int) -> None:
+        """``done`` of ``total`` steps of ``task`` are finished."""
+
+
+def silent(task: str, done: int, total: int) -> None:
+    """A :class:`Progress` that shows nothing."""
+
+
+@dataclass(kw_only=True)
+class DriveConfig(ReadOptions):
+    """Where the drive is, and how to read it: ``path`` is its folder, None where it is rendered."""
+
+    path: str | None = None
+
+
+@dataclass(kw_only=True)
+class RunConfig:
+    """Everything about one run.
+
+    Attributes:
+        name: names the results, ``<output>/<name>/``.
+        drive: the drive to map.
+        simulate: renders the drive into the cache first, instead of reading ``drive.path``.
+        detector: settings of the detector.
+        mapping: settings of association, optimisation and lanes.
+        output: folder that takes the results.
+        cache: folder that keeps rendered drives.
+        workers: processes for rendering and detection; 0 takes one per core.
+        device: where the optimisation runs, ``cpu`` or ``cuda``.
+    """
+
+    name: str
+    drive: DriveConfig = field(default_factory=DriveConfig)
+    simulate: PortConfig | None = None
+    detector: DetectorOptions = field(default_factory=DetectorOptions)
+    mapping: MappingOptions = field(default_factory=MappingOptions)
+    output: str = "outputs"
+    cache: str = "cache"
+    workers: int = 0
+    device: str = "cpu"
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run leaves behind: its folder, ``metrics.json``'s content, and sentences for a reader."""
+
+    folder: Path
+    metrics: Mapping[str, Any]
+    headlines: Sequence[str]
+
+
+def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -> RunResult:
+    """Map one drive and write the results to ``<output>/<name>/``, whole or not at all.
+
+    Args:
+        config: what to do.
+        config_yaml: the configuration as text, kept beside the results.
+        progress: told how far the long steps are.
+
+    Raises:
+        V2hdmError: The configuration, the drive or the detector is at fault, or no map can be made.
+    """
+    seconds: dict[str, float] = {}
+    with result_folder(Path(config.output) / config.name) as folder, _log_file(folder / "run.log"):
+        log.info("v2hdm %s, run %s", __version__, config.name)
+        (folder / "config.yaml").write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
+        with _timed(seconds, "render"):
+            drive_folder = _drive_folder(config, progress)
+        drive = read_drive(drive_folder, config.drive)
+        log.info("drive %s: %d images of cameras %s", drive.name, len(drive.images), ", ".join(drive.cameras))
+        with _timed(seconds, "detect"):
+            detections = _detect(config, drive, progress)
+        with _timed(seconds, "map"):
+            methods = _map_camera_sets(config, drive, detections, progress)
+        with _timed(seconds, "evaluate"):
+            judgement = evaluate(drive, detections, methods, config.mapping, partial(progress, "evaluate"))
+        metrics = {"name": config.name, "version": __version__, **judgement.metrics, "seconds": seconds}
+        write_results(folder, drive, list(methods.values())[-1], judgement, metrics)
+    return RunResult(Path(config.output) / config.name, metrics, judgement.headlines)
+
+
+def camera_sets(drive: Drive) -> dict[str, tuple[str, ...]]:
+    """Each camera alone and all together: named ``both`` for two cameras, ``all`` for more."""
+    names = tuple(drive.cameras)
+    sets = {name: (name,) for name in names}
+    if len(names) > 1:
+        sets["both" if len(names) == 2 else "all"] = names
+    return sets
+
+
+def _drive_folder(config: RunConfig, progress: Progress) -> Path:
+    if config.simulate is None:
+        if not config.drive.path:
+            raise ConfigError("drive.path is not set: name the folder of the drive, e.g. drive.path=my_drive")
+        return Path(config.drive.path)
+    if config.drive.path:
+        raise ConfigError(
+            "both simulate and drive.path are set: a run renders a drive or reads one, remove one of them"
+        )
+    return rendered_drive(config.simulate, Path(config.cache), _workers(config), partial(progress, "render"))
+
+
+def _detect(config: RunConfig, drive: Drive, progress: Progress) -> list[ImageDetections]:
+    detections = detect_all(drive, config.detector, _workers(config), partial(progress, "detect"))
+    markings = sum(len(found.markings) for found in detections)
+    lanes = sum(len(found.lanes) for found in detections)
+    log.info(
+        "detected %d markings and %d pieces of lane paint in %d images", markings, lanes, len(detections)
+    )
+    return detections
+
+
+def _map_camera_sets(
+    config: RunConfig, drive: Drive, detections: Sequence[ImageDetections], progress: Progress
+) -> CameraSets:
+    sets = camera_sets(drive)
+    found = {}
+    for done, (name, cameras) in enumerate(sets.items()):
+        progress("map", done, len(sets))
+        found[name] = run_methods(drive, detections, cameras, config.mapping, device=config.device)
+    progress("map", len(sets), len(sets))
+    return found
+
+
+def _workers(config: RunConfig) -> int:
+    if config.workers < 0:
+        raise ConfigError(f"workers is {config.workers}: set 0 for one per core, or a positive number")
+    return config.workers or os.cpu_count() or 1
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], step: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    seconds[step] = round(time.perf_counter() - start, 2)
+    log.info("%s: %.1f s", step, seconds[step])
+
+
+@contextmanager
+def _log_file(path: Path) -> Iterator[None]:
+    """Send this library's log to a file as well, for as long as the block runs."""
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    logger = logging.getLogger("v2hdm")
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        handler.close()
