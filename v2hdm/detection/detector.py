@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.detection.blobs import Blob, find_blobs
-from v2hdm.detection.corners import QuadStart, fit_markings
+from v2hdm.detection.corners import Foreground, QuadStart, fit_markings
 from v2hdm.detection.lanes import trace_lanes
 from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
@@ -70,7 +70,8 @@ class Detector:
             for lane in trace_lanes(c.blob, c.kind, view, self.options.lane_step_m, self.options.max_range_m)
         ]
         starts = [start for c in candidates if (start := self._start(c, view)) is not None]
-        markings = fit_markings(image_bgr, view, starts, owner, self.network.info.stride, self.options)
+        foreground = Foreground(owner, self.network.info.stride, view.top)
+        markings = fit_markings(image_bgr, view, starts, foreground, self.options)
         return tuple(markings), tuple(lanes)
 
     def view(self, camera: Camera) -> CameraView:
@@ -110,6 +111,6 @@ def _check_image(image_bgr: np.ndarray, camera: Camera) -> None:
     expected = (camera.info.height, camera.info.width, 3)
     if image_bgr.dtype != np.uint8 or image_bgr.shape != expected:
         raise DetectorError(
-            f"camera {camera.info.name!r}: got an image {image_bgr.shape} {image_bgr.dtype}, its camera_info says "
-            f"{expected} uint8; mend the camera_info or pick the images that belong to it"
+            f"camera {camera.info.name!r}: got an image {image_bgr.shape} {image_bgr.dtype}, its camera_info "
+            f"says {expected} uint8; mend the camera_info or pick the images that belong to it"
         )

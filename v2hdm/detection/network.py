@@ -111,7 +111,7 @@ def _read_info(session: Any, path: Path) -> NetworkInfo:
     unknown = [name for name in info.classes if name not in PAINT_CLASSES]
     if unknown or not info.classes:
         raise DetectorError(
-            f"{path}: unknown classes {unknown}, known are {', '.join(PAINT_CLASSES)}; use a model of this version"
+            f"{path}: unknown classes {unknown}, known are {', '.join(PAINT_CLASSES)}; use another model"
         )
     if info.stride < 1 or info.multiple < 1 or info.multiple % info.stride:
         raise DetectorError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from v2hdm.detection.ground import apply_homography, extrinsic_from_ipm
@@ -99,21 +98,3 @@ def _build_pinhole_lut(camera: Camera) -> FloatArray:
     rows = np.arange(0, camera.info.height + _LUT_STEP_PX, _LUT_STEP_PX, dtype=np.float64)
     grid_px = np.stack(np.meshgrid(columns, rows), axis=-1)
     return undistort_points(camera.info, grid_px.reshape(-1, 2)).reshape(*grid_px.shape)
-
-
-def linear_grey(image_bgr: np.ndarray, linear_response: bool) -> np.ndarray:
-    """Grey values (H, W) float32 in [0, 1] that are proportional to radiance.
-
-    sRGB coding is undone unless ``linear_response``: fitting edges on coded values pushes each side
-    of a bright marking outwards by about a fifth of the blur.
-    """
-    table = np.arange(256, dtype=np.float32) / 255 if linear_response else _LINEAR_FROM_SRGB
-    weighted = [cv2.LUT(image_bgr[..., c], table * w) for c, w in enumerate(_GREY_WEIGHTS_BGR)]
-    return np.asarray(weighted[0] + weighted[1] + weighted[2])
-
-
-_GREY_WEIGHTS_BGR = (0.114, 0.587, 0.299)
-_CODED = np.arange(256) / 255
-_LINEAR_FROM_SRGB = np.where(_CODED <= 0.04045, _CODED / 12.92, ((_CODED + 0.055) / 1.055) ** 2.4).astype(
-    np.float32
-)
