@@ -13,7 +13,8 @@ class DataConfig:
 
     A render of ``render_width`` x ``render_height`` px is shown ``views_per_render`` times on average, the
     oftener the more paint it shows, each time another crop of ``width`` x ``height`` px in other light. Past
-    renders to show again are kept in a ``reservoir``. ``easy_samples`` renders pass until scenes are as hard as they get.
+    renders to show again are kept in a ``reservoir``. ``easy_samples`` renders pass until scenes are as hard
+    as they get.
     """
 
     width: int = 448
@@ -48,7 +49,8 @@ class TrainConfig:
 
     The learning rate rises to ``learning_rate`` over the first ``warmup`` of the run, then falls to
     nothing as a half cosine, by the share of the run that has passed. The weights that are validated, kept
-    and exported are averages over about ``ema_updates`` updates. ``resume`` goes on with what ``output`` holds.
+    and exported are averages over about ``ema_updates`` updates. ``resume`` goes on with what ``output``
+    holds.
     """
 
     output: str = "runs/train"

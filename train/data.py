@@ -85,7 +85,7 @@ def validation_pairs(config: DataConfig, seed: int, images: int) -> Iterator[Pai
 
 
 def _appeal(sample: TrainingSample) -> float:
-    """How often to show a render again, relatively: up to ten times oftener if there is paint to learn from."""
+    """How often to show a render again, relatively: up to eleven times oftener for paint in it."""
     return 0.1 + min(float((sample.labels > 0).mean()) / 0.015, 1.0)
 
 

@@ -54,6 +54,9 @@ def ground_marks(rng: np.random.Generator) -> GroundMarks:
     """Tyre marks, cracks, repairs, rails, covers and spills: unlabelled, dark and up to twice as bright."""
     columns, rows = (int(m / _MARKS_RESOLUTION_M) for m in _MARKS_M)
     factor = np.full((rows, columns), 128, dtype=np.uint8)
+    for side in (-1, 1):
+        if rng.random() < 0.3:
+            _verge(rng, factor, side)
     for _ in range(int(rng.poisson(1.5))):
         _patch(rng, factor)
     for _ in range(int(rng.poisson(2.0))):
@@ -248,6 +251,26 @@ Factor = np.ndarray[tuple[int, ...], np.dtype[np.uint8]]
 
 def _point(rng: np.random.Generator, factor: Factor) -> tuple[int, int]:
     return int(rng.integers(factor.shape[1])), int(rng.integers(factor.shape[0]))
+
+
+def _verge(rng: np.random.Generator, factor: Factor, side: int) -> None:
+    """Rough ground from a line beside the road outwards, as of grass, leaves or gravel: specks in clumps."""
+    rows, columns = factor.shape
+    specks = cv2.GaussianBlur(
+        rng.standard_normal((rows, columns), np.float32), (0, 0), float(rng.uniform(0.5, 2.0))
+    )
+    clumps = cv2.resize(rng.standard_normal((rows // 12, columns // 12), np.float32), (columns, rows))
+    contrast = rng.uniform(0.15, 0.5)
+    rough = np.exp(
+        contrast * (specks / specks.std() + rng.uniform(0.2, 0.8) * clumps) + rng.uniform(-0.2, 0.3)
+    )
+    near, far = (rows / 2 + side * rng.uniform(1.5, 9, 2) / _MARKS_RESOLUTION_M).astype(int)
+    edge = 0 if side < 0 else rows
+    outline = np.array(
+        [[0, edge], [0, near], [columns, near if rng.random() < 0.6 else far], [columns, edge]]
+    )
+    beyond = cv2.fillPoly(np.zeros_like(factor), [outline.astype(np.int32)], 1) > 0
+    factor[beyond] = np.clip(128 * rough, 0, 255).astype(np.uint8)[beyond]
 
 
 def _patch(rng: np.random.Generator, factor: Factor) -> None:
