@@ -30,10 +30,9 @@ class Covariance:
     def extrinsic(self) -> FloatArray:
         """Of each camera's left tangent (C, 6, 6): translation m, rotation rad."""
         # The extrinsics come last, so the tip of L_S is the factor of their marginal information.
-        joint = torch.cholesky_inverse(self.whitening.reduced_factor.tip).reshape(
-            -1, 6, self.whitening.arrays.camera_count, 6
-        )
-        return np.stack([joint[c, :, c].cpu().numpy() for c in range(len(joint))])
+        joint = torch.cholesky_inverse(self.whitening.reduced_factor.tip)
+        cameras = range(self.whitening.arrays.camera_count)
+        return np.stack([joint[6 * c : 6 * c + 6, 6 * c : 6 * c + 6].cpu().numpy() for c in cameras])
 
     def corners(self, groups: NDArray[np.int64]) -> FloatArray:
         """Joint covariance (M, 2 n, 2 n), m^2, within each of M groups (M, n) of corners of the problem."""

@@ -72,7 +72,7 @@ def minimise(
     for _ in range(max_iterations):
         if float(best_gradient.square().sum()) <= tolerance * float(best):
             break
-        optimizer.step(closure)
+        optimizer.step(closure)  # type: ignore[no-untyped-call]
         reached, reached_gradient = evaluate(u.detach())
         recent[:] = [(u.detach().clone(), reached, reached_gradient)]
         progress = float(best - reached)

@@ -172,7 +172,6 @@ def _add_between(tiles: Tiles, later: int, earlier: int, coupling: Tensor) -> No
 def subtract_corners(arrays: Arrays, plan: Plan, coupling: Tensor, spread: Tensor, tiles: Tiles) -> None:
     """Take sum_i B_i' B_i off, block by block; ``coupling`` (K, 2, 6) holds B_i by observation."""
     states, cameras = len(arrays.states), arrays.camera_count
-    size = plan.frames_per_tile * states
     camera = arrays.pair // arrays.frame_count
     by_frame = coupling @ spread.reshape(arrays.pair_count, 6, states)[arrays.pair]
     for block in plan.blocks:
@@ -185,7 +184,7 @@ def subtract_corners(arrays: Arrays, plan: Plan, coupling: Tensor, spread: Tenso
             continue
         frames = coupling.new_zeros(rows, len(block.tiles) * plan.frames_per_tile, 2, states)
         frames.index_put_((block.row, block.slot), by_frame[part], accumulate=True)
-        columns = frames.permute(0, 2, 1, 3).reshape(2 * rows, -1).split(size, dim=1)
+        columns = frames.permute(0, 2, 1, 3).reshape(2 * rows, -1).chunk(len(block.tiles), dim=1)
         placed = sorted((plan.pattern.position[tile], k) for k, tile in enumerate(block.tiles))
         for n, (column, first) in enumerate(placed):
             tiles[TIP, column].addmm_(tip.mT, columns[first], alpha=-1)

@@ -117,7 +117,7 @@ def pull_back(arrays: Arrays, view: View, by_residual: Tensor) -> tuple[Tensor, 
 def jacobians(arrays: Arrays, view: View) -> tuple[Tensor, Tensor]:
     """Derivatives of the whitened residuals by pair (K, 2, 6) and by corner (K, 2, 2)."""
     a, b, c = arrays.root_information
-    x, y, z = view.point
+    x, y = view.point[:2]
     direct, across = view.inverse_depth, view.slope
     o = torch.zeros_like(a)
     top = torch.stack([a * direct, o, a * x * across])

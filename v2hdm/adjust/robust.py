@@ -32,5 +32,5 @@ def loss(name: str, squared: Tensor, scale: float) -> tuple[Tensor, Tensor]:
 
 
 def annealed_scale(squared: Tensor, scale: float) -> float:
-    """A scale that leaves most residuals in the convex part: while the fit is still poor, all look like outliers."""
+    """A scale with most residuals in the convex part: while the fit is poor, all look like outliers."""
     return max(scale, 2.0 * float(squared.median().sqrt()))

@@ -32,7 +32,8 @@ _ADVICE = {
     Status.CONVERGED: "The optimum is reached; nothing needs to be done.",
     Status.STALLED: "No step lowers the cost further although its gradient is not zero: check the "
     "starting extrinsic and the observation covariances for values that are orders of magnitude off.",
-    Status.EVALUATIONS_EXHAUSTED: "The optimum was not reached in time: start closer or raise max_evaluations.",
+    Status.EVALUATIONS_EXHAUSTED: "The optimum was not reached in time: start closer, or raise "
+    "max_evaluations.",
     Status.UNDETERMINED: "The observations leave a direction free: add a prior on the camera centre, "
     "drive a turn, or estimate fewer pose states.",
     Status.BEHIND_CAMERA: "At the solution some corners lie behind the camera that saw them: their "
