@@ -145,7 +145,7 @@ def _fresnel(ground: GroundField, view: View) -> Float32:
     sine = centre[2] / np.sqrt(range_squared + centre[2] ** 2)
     grazing = np.float32(1.0) - np.maximum(sine, np.float32(0.12))
     squared = grazing * grazing
-    return np.asarray(np.float32(0.02) + np.float32(0.6) * squared * squared * grazing)
+    return np.asarray(np.float32(0.02) + np.float32(0.45) * squared * squared * grazing)
 
 
 def _haze(radiance: Float32, background: Float32, ground: GroundField, last_row: int, haze_m: float) -> None:

@@ -1,0 +1,166 @@
+import numpy as np
+import pytest
+
+from tests.simulate.conftest import FRONT, tiny_port
+from v2hdm.detection.ground import apply_homography, ipm_from_extrinsic
+from v2hdm.drive.trajectory import interpolate
+from v2hdm.errors import ConfigError
+from v2hdm.records import DIAMOND, LANE_DASH, CameraInfo
+from v2hdm.simulate.calibration import calibrate, cam_from_vehicle, camera_info, project_ground
+from v2hdm.simulate.disturbance import correlated_noise, drive_along
+from v2hdm.simulate.layout import build_layout
+from v2hdm.simulate.port import build_port
+from v2hdm.simulate.port_config import (
+    CalibrationConfig,
+    DisturbanceConfig,
+    PaintConfig,
+    PortConfig,
+    RouteConfig,
+)
+from v2hdm.simulate.render import Renderer
+from v2hdm.simulate.route import build_route
+from v2hdm.simulate.scene import Box, Ground, Scene
+from v2hdm.simulate.visibility import hidden_by, inside_image, points_seen
+
+
+@pytest.fixture(scope="module")
+def full() -> PortConfig:
+    return PortConfig()
+
+
+def info_of(config: PortConfig, name: str) -> CameraInfo:
+    return camera_info(name, config.cameras[name])
+
+
+@pytest.mark.parametrize("name", ["front", "rear"])
+def test_exact_points_give_the_homography_of_the_extrinsic(full: PortConfig, name: str) -> None:
+    exact = CalibrationConfig(survey_sigma_m=0.0, click_sigma_px=0.0)
+    mount = full.cameras[name].mount
+    ipm, _ = calibrate(info_of(full, name), mount, exact, np.random.default_rng(0))
+    expected = ipm_from_extrinsic(info_of(full, name), cam_from_vehicle(mount))
+    assert np.allclose(ipm / ipm[2, 2], expected / expected[2, 2], rtol=1e-5, atol=1e-7)
+
+
+def test_a_camera_pitched_down_looks_at_the_ground_ahead() -> None:
+    """From 2.45 m up, 16 degrees down, the axis meets the ground 8.54 m ahead of the camera."""
+    extrinsic = cam_from_vehicle(FRONT)
+    centre = -extrinsic[:3, :3].T @ extrinsic[:3, 3]
+    assert np.allclose(centre, (FRONT.x_m, FRONT.y_m, FRONT.z_m))
+    axis = extrinsic[2, :3]
+    hit = centre - axis * centre[2] / axis[2]
+    assert hit[0] == pytest.approx(3.6 + 8.54 * np.cos(np.deg2rad(0.6)), abs=0.01)
+
+
+@pytest.mark.parametrize("name", ["front", "rear"])
+def test_the_borrowed_ipm_is_decimetres_wrong_and_the_own_one_is_not(full: PortConfig, name: str) -> None:
+    port = build_port(full)
+    camera = port.cameras[name]
+    inner = camera.roi_vehicle.mean(axis=0) + 0.95 * (camera.roi_vehicle - camera.roi_vehicle.mean(axis=0))
+    pinhole = project_ground(camera.info, port.cam_from_vehicle[name], inner)
+    error = {k: np.linalg.norm(apply_homography(m, pinhole) - inner, axis=1) for k, m in camera.ipm.items()}
+    assert np.sqrt((error["estimated"] ** 2).mean()) > 0.2
+    assert np.sqrt((error["calibrated"] ** 2).mean()) < 0.06
+
+
+@pytest.mark.parametrize("name", ["front", "rear"])
+def test_the_region_of_interest_is_in_view(full: PortConfig, name: str) -> None:
+    port = build_port(full)
+    cam_from_map = port.cam_from_vehicle[name]
+    assert inside_image(port.cameras[name].info, cam_from_map, port.cameras[name].roi_vehicle).all()
+
+
+def test_a_port_has_hundreds_of_markings_and_scores_along_the_route(full: PortConfig) -> None:
+    port = build_port(full)
+    diamonds = np.array([m.corners_map for m in port.hd_map.markings if m.kind == DIAMOND])
+    assert len(diamonds) >= 250
+    assert (port.route.distance_to(diamonds.mean(axis=1)) < 3.8).sum() >= 120
+    turned = np.rad2deg(np.ptp(port.route.yaw_rad))
+    assert turned >= 170
+    assert 350 <= port.route.length_m <= 450
+
+
+def test_markings_run_counter_clockwise_and_keep_apart() -> None:
+    route = build_route(RouteConfig())
+    layout = build_layout(PaintConfig(), route, np.random.default_rng(1))
+    corners = np.array([m.corners_map for m in layout.markings])
+    following = np.roll(corners, -1, axis=1)
+    area = 0.5 * (corners[..., 0] * following[..., 1] - following[..., 0] * corners[..., 1]).sum(axis=1)
+    assert (area > 0).all()
+    diamonds = np.array([m.corners_map.mean(axis=0) for m in layout.markings if m.kind == DIAMOND])
+    gaps = np.linalg.norm(diamonds[:, None] - diamonds[None], axis=2) + 99 * np.eye(len(diamonds))
+    assert gaps.min() > 1.6
+
+
+def test_a_dashed_lane_runs_through_the_middle_of_its_dashes() -> None:
+    route = build_route(RouteConfig())
+    layout = build_layout(PaintConfig(), route, np.random.default_rng(1))
+    lane = next(lane.points_map for lane in layout.lanes if lane.kind == LANE_DASH)
+    middles = np.array([m.corners_map.mean(axis=0) for m in layout.markings if m.kind == LANE_DASH])
+    assert np.linalg.norm(np.diff(lane, axis=0), axis=1).max() <= 0.5 + 1e-9
+    assert np.linalg.norm(middles[:, None] - lane[None], axis=2).min(axis=1).max() < 0.26
+
+
+def test_the_route_turns_by_what_its_pieces_say() -> None:
+    route = build_route(RouteConfig(pieces=[[30.0, 0.0], [20.0, 90.0], [30.0, 0.0]]))
+    assert route.length_m == pytest.approx(80.0)
+    assert np.rad2deg(route.yaw_rad[-1]) == pytest.approx(90.0, abs=0.5)
+    assert route.points_map[-1][0] == pytest.approx(30 + 20 / (np.pi / 2), abs=0.1)
+
+
+def test_correlated_noise_keeps_its_sigma_and_its_length() -> None:
+    at = np.arange(0.0, 40000.0, 1.0)
+    noise = correlated_noise(at, 2.0, 30.0, np.random.default_rng(0))[:, 0]
+    assert noise.std() == pytest.approx(2.0, rel=0.1)
+    assert np.corrcoef(noise[:-30], noise[30:])[0, 1] == pytest.approx(np.exp(-1), abs=0.08)
+
+
+def test_disturbances_are_as_large_as_configured() -> None:
+    config = RouteConfig(pieces=[[6000.0, 0.0]])
+    wanted = DisturbanceConfig()
+    driven = drive_along(build_route(config), config, wanted, np.random.default_rng(2))
+    recorded, inside = interpolate(driven.recorded, driven.stamp_s, 0.5)
+    assert inside.all()
+    tilt = np.rad2deg(driven.map_from_vehicle[:, 2, :2])
+    assert tilt.std(axis=0) == pytest.approx([wanted.roll_pitch_deg] * 2, rel=0.06)
+    error = (recorded - driven.map_from_vehicle)[:, :2, 3]
+    assert np.sqrt((error**2).mean()) > 0.009
+    assert not np.isin(driven.stamp_s, driven.recorded.stamp_s).any()
+
+
+def test_hidden_points_are_those_the_picture_hides() -> None:
+    """The slab test against the renderer: a box 1.5 m high, 8 m ahead of a camera 2.4 m up."""
+    box = Box(centre_map=(8.0, 0.4), size_m=(1.0, 2.0, 1.5), yaw_rad=0.4)
+    mount = FRONT
+    cam_from_map = cam_from_vehicle(mount)
+    info = info_of(PortConfig(), "front")
+    rendered = Renderer(Scene(ground=Ground(), boxes=(box,))).render(
+        info, cam_from_map, np.random.default_rng(0)
+    )
+    points = np.random.default_rng(1).uniform((5, -4), (25, 4), (800, 2))
+    points = points[inside_image(info, cam_from_map, points)]
+    centre = np.array([mount.x_m, mount.y_m, mount.z_m])
+    from v2hdm.detection.lens import distort_points
+
+    px = distort_points(info, project_ground(info, cam_from_map, points)).round().astype(int)
+    agree = rendered.hidden[px[:, 1], px[:, 0]] == hidden_by([box], centre, points)
+    assert agree.mean() > 0.985
+    assert not hidden_by([box], centre, points).all()
+    assert points_seen(info, cam_from_map, points, [box]).sum() == (~hidden_by([box], centre, points)).sum()
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"cameras": {}}, "cameras"),
+        ({"initial_ipm": "guess"}, "initial_ipm"),
+        ({"route": RouteConfig(pieces=[])}, "route.pieces"),
+        ({"calibration": CalibrationConfig(points_ahead_m=[[4, 0], [6, 0], [8, 0]])}, "points_ahead_m"),
+        (
+            {"calibration": CalibrationConfig(points_ahead_m=[[1, 9], [4, 1], [8, 1], [9, -2]])},
+            "outside camera",
+        ),
+    ],
+)
+def test_a_port_that_cannot_be_is_refused_by_name(changes: dict, word: str) -> None:
+    with pytest.raises(ConfigError, match=word):
+        build_port(tiny_port(**changes))
