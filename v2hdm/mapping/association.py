@@ -46,6 +46,13 @@ def keep_rows(association: Association, rows: BoolArray) -> Association:
     return Association(full, association.shift, len(numbers))
 
 
+def same_groups(a: Association, b: Association) -> bool:
+    """Whether ``a`` and ``b`` divide the sightings that both of them group in the same way."""
+    common = (a.group >= 0) & (b.group >= 0)
+    pairs = len(np.unique(np.stack([a.group[common], b.group[common]]), axis=1).T)
+    return pairs == len(np.unique(a.group[common])) == len(np.unique(b.group[common]))
+
+
 @dataclass(frozen=True)
 class FusedGroups:
     """Where G groups lie: ``corners_map`` (G, 4, 2) m with ``covariance_m2`` (G, 4, 2, 2).

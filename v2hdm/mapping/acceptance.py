@@ -1,0 +1,145 @@
+"""Which of the solved groups are markings, and why the others are not.
+
+Every rule compares a group with what a marking on the ground would have shown: seen as often as its
+place in the drive allows, agreeing with the joint solution, known to a stated sigma, shaped like
+its class, and not lying on top of another marking.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from v2hdm.mapping.options import AcceptanceOptions
+from v2hdm.mapping.shapes import is_convex, signed_area
+from v2hdm.records import BoolArray, FloatArray
+
+IntArray = NDArray[np.int64]
+
+MIN_EASY_VIEWS = 5
+"""Easy views below which a share of detections says nothing."""
+
+MAX_OVERLAP = 0.2
+"""Share of the smaller marking's area that may lie on another marking: paint does not overlap."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """What is known of G groups before the verdict.
+
+    ``kind`` (G,) indexes the cornered classes; ``corners_map`` (G, 4, 2), nan where a corner is
+    missing; ``sigma_m`` (G,) of the worst corner; ``sightings`` (G,) images with accepted
+    observations; ``inlier_share`` (G,) of the observations; ``easy_views`` (G,) images that had the
+    whole marking in easy view and ``easy_detections`` (G,) those among them that it was found in.
+    """
+
+    kind: IntArray
+    corners_map: FloatArray
+    sigma_m: FloatArray
+    sightings: IntArray
+    inlier_share: FloatArray
+    easy_views: IntArray
+    easy_detections: IntArray
+
+
+def judge(candidates: Candidates, options: AcceptanceOptions) -> list[str | None]:
+    """For each candidate the reason why it is no marking of the map, or None where it is one."""
+    verdict: list[str | None] = [None] * len(candidates.kind)
+    incomplete: NDArray[np.bool_] = np.isnan(candidates.corners_map).any(axis=(1, 2))
+    _refuse(verdict, incomplete, "a corner was never seen twice")
+    _refuse(
+        verdict,
+        candidates.sightings < options.min_sightings,
+        f"seen in fewer than {options.min_sightings} images",
+    )
+    _refuse(
+        verdict,
+        candidates.inlier_share < options.min_inlier_share,
+        "its sightings contradict each other",
+    )
+    _refuse(verdict, _seldom_detected(candidates, verdict, options), "found in too few of its images")
+    _refuse(verdict, ~is_convex(candidates.corners_map), "not a convex quadrilateral")
+    _refuse(verdict, ~(candidates.sigma_m <= options.max_sigma_m), "its position is too uncertain")
+    _refuse(verdict, _odd_shapes(candidates, verdict, options), "not shaped like the others of its class")
+    _refuse(verdict, _covered(candidates, verdict), "lies on a better supported marking")
+    return verdict
+
+
+def _refuse(verdict: list[str | None], refused: NDArray[np.bool_], reason: str) -> None:
+    for group in np.flatnonzero(refused):
+        verdict[group] = verdict[group] or reason
+
+
+def _standing(verdict: list[str | None]) -> BoolArray:
+    return np.array([reason is None for reason in verdict], dtype=bool)
+
+
+def _seldom_detected(
+    candidates: Candidates, verdict: list[str | None], options: AcceptanceOptions
+) -> BoolArray:
+    """Groups found far less often, for the chances that they had, than is usual for their class."""
+    share = candidates.easy_detections / np.maximum(candidates.easy_views, 1)
+    telling = candidates.easy_views >= MIN_EASY_VIEWS
+    seldom = np.zeros(len(share), dtype=bool)
+    for kind in np.unique(candidates.kind):
+        own = (candidates.kind == kind) & telling
+        usual = share[own & _standing(verdict)]
+        if len(usual):
+            seldom |= own & (share < options.min_detection_share * np.median(usual))
+    return seldom
+
+
+def _odd_shapes(candidates: Candidates, verdict: list[str | None], options: AcceptanceOptions) -> BoolArray:
+    """Groups whose sides or diagonals stray from their class, where the class agrees on them."""
+    lengths = _lengths(candidates.corners_map)
+    odd = np.zeros(len(lengths), dtype=bool)
+    for kind in np.unique(candidates.kind):
+        own = candidates.kind == kind
+        model = lengths[own & _standing(verdict)]
+        if len(model) < options.consensus_count:
+            continue
+        median = np.median(model, axis=0)
+        scatter = 1.4826 * np.median(np.abs(model - median), axis=0)
+        tolerance = np.maximum(np.maximum(options.shape_tolerance * median, 5 * scatter), 0.05)
+        odd |= own & ~(np.abs(lengths - median) <= tolerance).all(axis=1)
+    return odd
+
+
+def _lengths(corners: FloatArray) -> FloatArray:
+    """Mean lengths of the two pairs of opposite sides, and the diagonals (G, 4), each pair sorted.
+
+    They do not depend on which corner comes first.
+    """
+    side = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+    pairs = np.sort(0.5 * (side[:, :2] + side[:, 2:]), axis=1)
+    diagonals = np.sort(np.linalg.norm(corners[:, 2:] - corners[:, :2], axis=2), axis=1)
+    return np.asarray(np.concatenate([pairs, diagonals], axis=1))
+
+
+def _covered(candidates: Candidates, verdict: list[str | None]) -> BoolArray:
+    """Groups that overlap another one with more sightings (of equals, the later one)."""
+    covered = np.zeros(len(candidates.kind), dtype=bool)
+    standing = np.flatnonzero(_standing(verdict))
+    if len(standing) < 2:
+        return covered
+    corners = candidates.corners_map
+    centres = corners[standing].mean(axis=1)
+    reach_m = 2 * float(np.max(np.linalg.norm(corners[standing] - centres[:, None], axis=2)))
+    pairs = standing[cKDTree(centres).query_pairs(reach_m, output_type="ndarray")].reshape(-1, 2)
+    support = candidates.sightings
+    for a, b in sorted(pairs.tolist(), key=lambda pair: (-max(support[pair[0]], support[pair[1]]), pair)):
+        if covered[a] or covered[b] or _overlap(corners[a], corners[b]) <= MAX_OVERLAP:
+            continue
+        covered[b if support[a] >= support[b] else a] = True
+    return covered
+
+
+def _overlap(a: FloatArray, b: FloatArray) -> float:
+    """Common area of two convex quadrilaterals as a share of the smaller one's."""
+    origin = a.mean(axis=0)
+    common, _ = cv2.intersectConvexConvex((a - origin).astype(np.float32), (b - origin).astype(np.float32))
+    return float(common) / max(float(min(signed_area(a), signed_area(b))), 1e-9)

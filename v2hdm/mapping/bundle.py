@@ -1,0 +1,206 @@
+"""One joint solve over groups of sightings: to :mod:`v2hdm.adjust` and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v2hdm.adjust import Observations, PoseSigma, Problem, Solution, SolveOptions, solve
+from v2hdm.errors import MappingError
+from v2hdm.mapping.association import Association
+from v2hdm.mapping.backprojection import camera_centres
+from v2hdm.mapping.location import Rig
+from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.sightings import Sightings
+from v2hdm.records import BoolArray, Camera, FloatArray, PoseNoise
+
+IntArray = NDArray[np.int64]
+
+UNSURVEYED_CENTRE_SIGMA_M = 0.3
+"""How well a camera centre is known that nobody has surveyed, but a coarse IPM implies."""
+
+HEAVE_SIGMA_M = 0.01
+"""How far a vehicle's body moves up and down on its suspension on paved ground."""
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A solved bundle and what its arrays refer to.
+
+    ``rig`` holds the adjusted extrinsics and poses. Observation k is corner ``corner`` (K,) of group
+    ``group`` (K,), seen at ``row`` (K,) of the sightings. ``corner_index`` (G, 4) finds a corner in
+    the solution, -1 where it had fewer than two observations. ``camera_index`` maps camera names to
+    rows of the solution's extrinsics.
+    """
+
+    rig: Rig
+    solution: Solution
+    association: Association
+    row: IntArray
+    group: IntArray
+    corner: IntArray
+    corner_index: IntArray
+    camera_index: Mapping[str, int]
+
+    @property
+    def corners_map(self) -> FloatArray:
+        """Adjusted corners (G, 4, 2), nan where a corner is not part of the solution."""
+        out = np.full((*self.corner_index.shape, 2), np.nan)
+        known = self.corner_index >= 0
+        out[known] = self.solution.corners_map[self.corner_index[known]]
+        return out
+
+    def inliers(self, gate2: float) -> BoolArray:
+        """Which observations (K,) have a squared Mahalanobis distance within ``gate2``.
+
+        Where the stated covariances are too small overall, the gate widens with the median.
+        """
+        mahalanobis2 = self.solution.mahalanobis2
+        # The median of a chi-square distribution with two degrees of freedom is 2 ln 2.
+        scale = max(1.0, float(np.median(mahalanobis2)) / (2 * np.log(2)))
+        return np.asarray(mahalanobis2 <= gate2 * scale)
+
+
+@dataclass(frozen=True)
+class Model:
+    """What a solve estimates and how much noise it reckons with beyond that of the corners.
+
+    ``floor_px`` is added to every corner in quadrature, px.
+    """
+
+    pose_sigma: PoseSigma
+    floor_px: float
+    solver: SolveOptions
+
+
+def full_model(pose_noise: PoseNoise, options: MappingOptions) -> Model:
+    """Every frame has its own deviation from its recorded pose, as ``options`` say."""
+    pose_sigma = PoseSigma(
+        position_m=pose_noise.position_m,
+        heading_rad=pose_noise.heading_rad,
+        roll_pitch_rad=pose_noise.roll_pitch_rad,
+        height_m=HEAVE_SIGMA_M,
+    )
+    solver = SolveOptions(
+        pose_states=tuple(options.pose_states),
+        loss=options.loss,
+        loss_scale=options.loss_scale,
+        coarse=False,
+    )
+    return Model(pose_sigma, options.model_floor_px, solver)
+
+
+def coarse_model(rig: Rig, pose_noise: PoseNoise, options: MappingOptions) -> Model:
+    """The recorded poses taken at their word, and their errors as so much noise in the image.
+
+    Only the extrinsics and corners are left to estimate, which takes a fraction of the time and
+    is amply exact for telling markings apart.
+    """
+    focal_px = float(np.mean(rig.intrinsic[:, 0, 0]))
+    jitter_px = focal_px * float(np.hypot(pose_noise.roll_pitch_rad, pose_noise.heading_rad))
+    solver = SolveOptions(pose_states=(), loss=options.loss, loss_scale=options.loss_scale)
+    return Model(PoseSigma(), float(np.hypot(options.model_floor_px, jitter_px)), solver)
+
+
+def solve_bundle(
+    sightings: Sightings,
+    association: Association,
+    usable: BoolArray,
+    rig: Rig,
+    cameras: Mapping[str, Camera],
+    model: Model,
+) -> Bundle:
+    """Estimate extrinsics, poses and the corners of all groups together.
+
+    Args:
+        sightings: The table of sightings.
+        association: Groups to estimate.
+        usable: Which corners (S, 4), in the sightings' own order, may be used.
+        rig: Extrinsics to start from; the poses are always the recorded ones.
+        cameras: Cameras by name, for the priors on their centres.
+        model: Noise and what is estimated.
+
+    Raises:
+        MappingError: No corner was seen twice.
+    """
+    row, group, corner, corner_index = _observed_corners(association, usable)
+    if not len(row):
+        raise MappingError(
+            "no marking was seen in two images, so nothing can be optimised; drive past the markings "
+            "at a lower speed or raise the image rate."
+        )
+    used_cameras, camera = np.unique(sightings.camera[row], return_inverse=True)
+    used_frames, frame = np.unique(sightings.frame[row], return_inverse=True)
+    own_corner = association.corner_order()[row, corner]
+    names = [sightings.cameras[c] for c in used_cameras]
+    centre, sigma = _centre_priors(names, cameras, rig.cam_from_vehicle[used_cameras])
+    intrinsic = rig.intrinsic[used_cameras]
+    problem = Problem(
+        intrinsic=np.column_stack([intrinsic[:, 0, 0], intrinsic[:, 1, 1], intrinsic[:, :2, 2]]),
+        cam_from_vehicle=rig.cam_from_vehicle[used_cameras],
+        map_from_vehicle=sightings.map_from_vehicle[used_frames],
+        observations=Observations(
+            camera=camera.astype(np.int64),
+            frame=frame.astype(np.int64),
+            corner=corner_index[group, corner],
+            pinhole_px=sightings.corners_pinhole_px[row, own_corner],
+            covariance_px=sightings.covariance_px[row, own_corner] + model.floor_px**2 * np.eye(2),
+        ),
+        corner_count=int(corner_index.max()) + 1,
+        centre_vehicle=centre,
+        centre_sigma_m=sigma,
+        pose_sigma=model.pose_sigma,
+    )
+    solution = solve(problem, model.solver)
+    return Bundle(
+        rig=_adjusted_rig(rig, sightings, used_cameras, used_frames, solution),
+        solution=solution,
+        association=association,
+        row=row,
+        group=group,
+        corner=corner,
+        corner_index=corner_index,
+        camera_index={name: c for c, name in enumerate(names)},
+    )
+
+
+def _observed_corners(
+    association: Association, usable: BoolArray
+) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """Observations (row, group, corner; K each) of corners seen at least twice, and their numbers."""
+    in_order = association.in_group_order(usable) & (association.group >= 0)[:, None]
+    row, corner = np.nonzero(in_order)
+    group = association.group[row]
+    flat = group * 4 + corner
+    seen = np.bincount(flat, minlength=4 * association.count)
+    number = np.full(4 * association.count, -1, dtype=np.int64)
+    kept = seen >= 2
+    number[kept] = np.arange(np.count_nonzero(kept))
+    known = kept[flat]
+    return row[known], group[known], corner[known], number.reshape(-1, 4)
+
+
+def _centre_priors(
+    names: list[str], cameras: Mapping[str, Camera], cam_from_vehicle: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Prior camera centres and sigmas (C, 3): surveyed, or else implied by the starting extrinsic."""
+    centre = camera_centres(cam_from_vehicle)
+    sigma = np.full_like(centre, UNSURVEYED_CENTRE_SIGMA_M)
+    for c, name in enumerate(names):
+        prior = cameras[name].centre_prior
+        if prior is not None:
+            centre[c], sigma[c] = prior.centre_vehicle, prior.sigma_m
+    return centre, sigma
+
+
+def _adjusted_rig(
+    rig: Rig, sightings: Sightings, used_cameras: IntArray, used_frames: IntArray, solution: Solution
+) -> Rig:
+    cam_from_vehicle = rig.cam_from_vehicle.copy()
+    cam_from_vehicle[used_cameras] = solution.cam_from_vehicle
+    map_from_vehicle = sightings.map_from_vehicle.copy()
+    map_from_vehicle[used_frames] = solution.map_from_vehicle
+    return Rig(rig.intrinsic, cam_from_vehicle, map_from_vehicle)

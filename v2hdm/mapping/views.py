@@ -1,0 +1,98 @@
+"""Which images should have seen a marking."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from v2hdm.mapping.backprojection import inside_polygon
+from v2hdm.mapping.location import Rig
+from v2hdm.mapping.sightings import frames_of
+from v2hdm.records import Camera, Drive, FloatArray
+
+IntArray = NDArray[np.int64]
+
+_BORDER_PX = 10.0
+
+
+@dataclass(frozen=True)
+class Views:
+    """The images of the mapped cameras: ``image`` (V,), ``camera`` (V,) and ``frame`` (V,)."""
+
+    image: IntArray
+    camera: IntArray
+    frame: IntArray
+
+
+def views_of(drive: Drive, cameras: Sequence[str]) -> Views:
+    """All images that ``cameras`` took, whether anything was detected in them or not."""
+    index = {name: c for c, name in enumerate(cameras)}
+    rows = [i for i, image in enumerate(drive.images) if image.camera in index]
+    return Views(
+        image=np.array(rows, dtype=np.int64),
+        camera=np.array([index[drive.images[i].camera] for i in rows], dtype=np.int64),
+        frame=frames_of(drive).frame_of_image[rows],
+    )
+
+
+def easy_views(
+    views: Views, rig: Rig, cameras: Sequence[Camera], corners_map: FloatArray
+) -> tuple[IntArray, IntArray]:
+    """Pairs (group, image) in which a whole marking lies inside the region of interest and the image.
+
+    Args:
+        views: The images to consider.
+        rig: Extrinsics and poses.
+        cameras: The rig's cameras, for image sizes and regions of interest.
+        corners_map: Markings (G, 4, 2), m; those with nan corners are in no view.
+    """
+    whole = np.flatnonzero(np.isfinite(corners_map).all(axis=(1, 2)))
+    groups, images = [], []
+    for c, camera in enumerate(cameras):
+        own = views.camera == c
+        if not own.any() or not len(whole):
+            continue
+        reach_m = float(np.max(np.linalg.norm(camera.roi_vehicle, axis=1)))
+        positions = rig.map_from_vehicle[views.frame[own]][:, :2, 3]
+        near = cKDTree(positions).query_ball_point(corners_map[whole].mean(axis=1), reach_m)
+        group = np.repeat(whole, [len(n) for n in near])
+        view = np.flatnonzero(own)[np.concatenate([np.asarray(n, dtype=np.int64) for n in near])]
+        vehicle_from_map = np.linalg.inv(rig.map_from_vehicle[views.frame[view]])
+        seen = _sees(camera, rig.cam_from_vehicle[c], vehicle_from_map, corners_map[group])
+        groups.append(group[seen])
+        images.append(views.image[view[seen]])
+    empty = [np.zeros(0, dtype=np.int64)]
+    return np.concatenate(groups or empty), np.concatenate(images or empty)
+
+
+def project_ground(
+    intrinsic: FloatArray, cam_from_map: FloatArray, points_map: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Pinhole pixels (S, N, 2) and depths (S, N) of ground points (S, N, 2) by cameras (S, ...)."""
+    points = np.concatenate([points_map, np.ones_like(points_map[..., :1])], axis=-1)
+    pinhole_px_from_map = (intrinsic @ cam_from_map[:, :3])[..., [0, 1, 3]]
+    homogeneous = points @ np.swapaxes(pinhole_px_from_map, -1, -2)
+    depth = homogeneous[..., 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(homogeneous[..., :2] / depth[..., None]), np.asarray(depth)
+
+
+def _sees(
+    camera: Camera, cam_from_vehicle: FloatArray, vehicle_from_map: FloatArray, corners_map: FloatArray
+) -> NDArray[np.bool_]:
+    """Whether views (P, ...) hold the whole quadrilaterals (P, 4, 2), away from the image border."""
+    flat = np.zeros((len(corners_map), 3, 3))
+    flat[:, :2] = vehicle_from_map[:, :2][:, :, [0, 1, 3]]
+    flat[:, 2, 2] = 1.0
+    ones = np.ones((len(corners_map), 4, 1))
+    corners_vehicle = (np.concatenate([corners_map, ones], axis=-1) @ np.swapaxes(flat, 1, 2))[..., :2]
+    inside = inside_polygon(corners_vehicle, camera.roi_vehicle).all(axis=1)
+    pixel, depth = project_ground(camera.info.intrinsic, cam_from_vehicle @ vehicle_from_map, corners_map)
+    limit = np.array([camera.info.width, camera.info.height]) - _BORDER_PX
+    with np.errstate(invalid="ignore"):
+        on_image = ((pixel > _BORDER_PX) & (pixel < limit)).all(axis=(1, 2)) & (depth > 0).all(axis=1)
+    return np.asarray(inside & on_image)
