@@ -134,7 +134,7 @@ def _read_stamps(path: Path) -> FloatArray:
             stamps.append(seconds + float(f"0.{fraction or 0}"))
         except ValueError:
             raise DriveError(
-                f"{path}: line {number}: expected 'YYYY-MM-DD hh:mm:ss.fraction', got '{line}'; mend that line"
+                f"{path}: line {number}: expected 'YYYY-MM-DD hh:mm:ss.fraction', got '{line}'; mend it"
             ) from None
     return np.array(stamps)
 

@@ -1,0 +1,46 @@
+# Everything on a fresh machine with Python 3.11 or newer and make:
+#   make map     drive through a rendered port and map it
+#   make test    run the tests
+#   make check   format, lint, types, import contracts
+# Further arguments: make map ARGS="+run=port1"
+
+PYTHON ?= python3
+ARGS ?= +run=port2
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+# An empty file per set of packages: while it is newer than what it depends on, nothing is installed.
+MAP_INSTALLED := $(VENV)/.installed-map
+DEV_INSTALLED := $(VENV)/.installed-dev
+
+.PHONY: map test check clean
+
+map: $(MAP_INSTALLED)
+	$(BIN)/python -m v2hdm.map $(ARGS)
+
+# The tests run side by side; more threads in each would only get in their way.
+test: export OMP_NUM_THREADS = 1
+test: $(DEV_INSTALLED)
+	$(BIN)/python -m pytest -n 2
+
+check: $(DEV_INSTALLED)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+clean:
+	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.12 ...")'
+	$(PYTHON) -m venv $(VENV)
+
+$(MAP_INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
+	$(INSTALL) -e '.[map]'
+	@touch $@
+
+# The development packages include those for mapping.
+$(DEV_INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
+	$(INSTALL) -e '.[dev]'
+	@touch $(MAP_INSTALLED) $@
