@@ -3,13 +3,14 @@ import pytest
 
 from tests.simulate.conftest import FRONT, tiny_port
 from v2hdm.detection.ground import apply_homography, ipm_from_extrinsic
+from v2hdm.detection.lens import distort_points
 from v2hdm.drive.trajectory import interpolate
 from v2hdm.errors import ConfigError
 from v2hdm.records import DIAMOND, LANE_DASH, CameraInfo
 from v2hdm.simulate.calibration import calibrate, cam_from_vehicle, camera_info, project_ground
 from v2hdm.simulate.disturbance import correlated_noise, drive_along
 from v2hdm.simulate.layout import build_layout
-from v2hdm.simulate.port import build_port
+from v2hdm.simulate.port import Port, build_port
 from v2hdm.simulate.port_config import (
     CalibrationConfig,
     DisturbanceConfig,
@@ -26,6 +27,11 @@ from v2hdm.simulate.visibility import hidden_by, inside_image, points_seen
 @pytest.fixture(scope="module")
 def full() -> PortConfig:
     return PortConfig()
+
+
+@pytest.fixture(scope="module")
+def port(full: PortConfig) -> Port:
+    return build_port(full)
 
 
 def info_of(config: PortConfig, name: str) -> CameraInfo:
@@ -52,8 +58,7 @@ def test_a_camera_pitched_down_looks_at_the_ground_ahead() -> None:
 
 
 @pytest.mark.parametrize("name", ["front", "rear"])
-def test_the_borrowed_ipm_is_decimetres_wrong_and_the_own_one_is_not(full: PortConfig, name: str) -> None:
-    port = build_port(full)
+def test_the_borrowed_ipm_is_decimetres_wrong_and_the_own_one_is_not(port: Port, name: str) -> None:
     camera = port.cameras[name]
     inner = camera.roi_vehicle.mean(axis=0) + 0.95 * (camera.roi_vehicle - camera.roi_vehicle.mean(axis=0))
     pinhole = project_ground(camera.info, port.cam_from_vehicle[name], inner)
@@ -63,14 +68,12 @@ def test_the_borrowed_ipm_is_decimetres_wrong_and_the_own_one_is_not(full: PortC
 
 
 @pytest.mark.parametrize("name", ["front", "rear"])
-def test_the_region_of_interest_is_in_view(full: PortConfig, name: str) -> None:
-    port = build_port(full)
+def test_the_region_of_interest_is_in_view(port: Port, name: str) -> None:
     cam_from_map = port.cam_from_vehicle[name]
     assert inside_image(port.cameras[name].info, cam_from_map, port.cameras[name].roi_vehicle).all()
 
 
-def test_a_port_has_hundreds_of_markings_and_scores_along_the_route(full: PortConfig) -> None:
-    port = build_port(full)
+def test_a_port_has_hundreds_of_markings_and_scores_along_the_route(port: Port) -> None:
     diamonds = np.array([m.corners_map for m in port.hd_map.markings if m.kind == DIAMOND])
     assert len(diamonds) >= 250
     assert (port.route.distance_to(diamonds.mean(axis=1)) < 3.8).sum() >= 120
@@ -115,13 +118,13 @@ def test_correlated_noise_keeps_its_sigma_and_its_length() -> None:
 
 
 def test_disturbances_are_as_large_as_configured() -> None:
-    config = RouteConfig(pieces=[[6000.0, 0.0]])
+    config = RouteConfig(pieces=[[3000.0, 0.0]])
     wanted = DisturbanceConfig()
     driven = drive_along(build_route(config), config, wanted, np.random.default_rng(2))
     recorded, inside = interpolate(driven.recorded, driven.stamp_s, 0.5)
     assert inside.all()
     tilt = np.rad2deg(driven.map_from_vehicle[:, 2, :2])
-    assert tilt.std(axis=0) == pytest.approx([wanted.roll_pitch_deg] * 2, rel=0.06)
+    assert tilt.std(axis=0) == pytest.approx([wanted.roll_pitch_deg] * 2, rel=0.08)
     error = (recorded - driven.map_from_vehicle)[:, :2, 3]
     assert np.sqrt((error**2).mean()) > 0.009
     assert not np.isin(driven.stamp_s, driven.recorded.stamp_s).any()
@@ -139,8 +142,6 @@ def test_hidden_points_are_those_the_picture_hides() -> None:
     points = np.random.default_rng(1).uniform((5, -4), (25, 4), (800, 2))
     points = points[inside_image(info, cam_from_map, points)]
     centre = np.array([mount.x_m, mount.y_m, mount.z_m])
-    from v2hdm.detection.lens import distort_points
-
     px = distort_points(info, project_ground(info, cam_from_map, points)).round().astype(int)
     agree = rendered.hidden[px[:, 1], px[:, 0]] == hidden_by([box], centre, points)
     assert agree.mean() > 0.985

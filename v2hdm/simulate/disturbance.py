@@ -43,21 +43,21 @@ def drive_along(
     The receiver measures position and heading; roll, pitch and height are recorded as zero. Its times
     are not those of the images.
     """
-    end_s = _time_at(route, route.length_m)
-    recorded_s = np.arange(0.0, end_s, 1.0 / config.pose_rate_hz)
-    stations = np.arange(
-        route.speed_mps * _LEAD_S, route.length_m - route.speed_mps * _LEAD_S, config.image_spacing_m
-    )
-    stamp_s = np.round([_time_at(route, s) for s in stations], 6)
+    lead_m = route.speed_mps * _LEAD_S
+    stations = np.arange(lead_m, route.length_m - lead_m, config.image_spacing_m)
+    times = _times_at(route, np.append(stations, route.length_m))
+    stamp_s = np.round(times[:-1], 6)
+    recorded_s = np.arange(0.0, times[-1], 1.0 / config.pose_rate_hz)
     stamp_s = stamp_s[stamp_s < recorded_s[-1]]
     return DrivenPoses(
         stamp_s, _true_poses(route, stamp_s, disturbance, rng), _recorded(route, recorded_s, disturbance, rng)
     )
 
 
-def _time_at(route: Route, station_m: float) -> float:
-    grid = np.arange(0.0, station_m / route.speed_mps * 1.5 + 10.0, 0.05)
-    return float(np.interp(station_m, route.station_at(grid), grid))
+def _times_at(route: Route, station_m: FloatArray) -> FloatArray:
+    """Times (K,) at which the vehicle passes rising stations (K,)."""
+    grid = np.arange(0.0, station_m[-1] / route.speed_mps * 1.5 + 10.0, 0.05)
+    return np.interp(station_m, route.station_at(grid), grid)
 
 
 def _true_poses(

@@ -27,6 +27,7 @@ _PIECE_TURN_RAD = 0.06
 _PIECE_LENGTH_M = 25.0
 _PIECE_OVERLAP_M = 0.1
 _LEAST_GAP_M = 1.7
+_LINE_GAP_M = 1.1
 # The bars (x0, x1, y0, y1) of a letter like an eight on a pocket calculator.
 _LETTER_BARS_M = (
     (-0.6, 0.6, 0.0, 0.1),
@@ -44,7 +45,7 @@ class Layout:
     paints: list[Paint] = field(default_factory=list)
     markings: list[Marking] = field(default_factory=list)
     lanes: list[Lane] = field(default_factory=list)
-    blocked_map: list[FloatArray] = field(default_factory=list)
+    occupied_map: list[FloatArray] = field(default_factory=list)
 
     def hd_map(self, origin: GeodeticOrigin | None) -> HdMap:
         """The true map."""
@@ -72,7 +73,6 @@ def _solid_line(
     vertices = np.arange(0.0, route.length_m, _VERTEX_SPACING_M)
     points = route.points_at(vertices, offset_m)
     layout.lanes.append(Lane(LANE_LINE, points, 0))
-    layout.blocked_map.append(points)
     wear, dirt = _worn(config, rng)
     seed = int(rng.integers(1 << 30))
     for start, end in _pieces(route, 0.0, route.length_m):
@@ -118,7 +118,6 @@ def _dashed_line(
         return
     points = _resampled(np.array(corners))
     layout.lanes.append(Lane(LANE_DASH, points, 0))
-    layout.blocked_map.append(points)
 
 
 def _resampled(points: FloatArray) -> FloatArray:
@@ -141,6 +140,7 @@ def _diamond_row(
     half = np.array([[0.5, 0.0], [0.0, 0.5], [-0.5, 0.0], [0.0, -0.5]])
     half *= (config.diamond_length_m, config.diamond_width_m)
     colour = YELLOW_PAINT if config.yellow_diamonds else WHITE_PAINT
+    lines = np.vstack([lane.points_map for lane in layout.lanes] or [np.empty((0, 2))])
     phase = config.diamond_spacing_m * (0.5 + 0.37 * offset_m % 1.0 * 0.5)
     for station in np.arange(phase, route.length_m - 2.0, config.diamond_spacing_m):
         at = np.array([station + rng.normal(0.0, config.placing_sigma_m)])
@@ -151,21 +151,23 @@ def _diamond_row(
         if is_field and not route.is_straight(at)[0]:
             continue
         # Rows beyond the lanes may run into another stretch of the route behind a turn.
-        if not _is_free(centre, layout) or float(route.distance_to(centre[None])[0]) < abs(offset_m) - 0.5:
+        if (
+            not _is_free(centre, lines, layout)
+            or float(route.distance_to(centre[None])[0]) < abs(offset_m) - 0.5
+        ):
             continue
         corners = _placed(half, centre, yaw)
         layout.markings.append(Marking(DIAMOND, corners, 0))
-        layout.blocked_map.append(centre[None])
+        layout.occupied_map.append(centre)
         layout.paints.append(
             Paint(kind=DIAMOND, polygon_map=corners, albedo_bgr=colour, wear=wear, dirt=dirt, seed=seed)
         )
 
 
-def _is_free(centre: FloatArray, layout: Layout) -> bool:
-    """Whether a marking at ``centre`` (2,) keeps clear of lines and of other markings."""
-    for points in layout.blocked_map:
-        gap = 1.1 if len(points) > 40 else _LEAST_GAP_M
-        if float(((points - centre) ** 2).sum(axis=1).min()) < gap**2:
+def _is_free(centre: FloatArray, lines: FloatArray, layout: Layout) -> bool:
+    """Whether a marking at ``centre`` (2,) keeps clear of ``lines`` (N, 2) and of all other paint."""
+    for points, gap_m in ((lines, _LINE_GAP_M), (np.array(layout.occupied_map), _LEAST_GAP_M)):
+        if len(points) and float(((points - centre) ** 2).sum(axis=1).min()) < gap_m**2:
             return False
     return True
 
@@ -200,7 +202,7 @@ def _place_shapes(
 ) -> None:
     for shape in shapes:
         polygon = _placed(shape, centre, yaw_rad)
-        layout.blocked_map.append(polygon)
+        layout.occupied_map.extend(polygon)
         layout.paints.append(
             Paint(
                 kind=OTHER_PAINT, polygon_map=polygon, albedo_bgr=colour, wear=worn[0], dirt=worn[1], seed=7

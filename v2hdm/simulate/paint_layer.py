@@ -14,7 +14,7 @@ from v2hdm.simulate.view import View, coverage, in_view, outline, windows
 Labels = NDArray[np.uint8]
 
 _WEAR_TILE = noise_tile(16, 5.0, 0.8, finest_px=0.8)
-_FARTHEST_M = 70.0
+_FARTHEST_M = 60.0
 
 
 class PaintLayer:

@@ -11,6 +11,8 @@ import json
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
@@ -121,8 +123,16 @@ def _renderers(port: Port, workers: int, jobs: int) -> Iterator[Callable[[list[_
         yield lambda batch: map(partial(_write_picture, port), batch)
         return
     context = multiprocessing.get_context("spawn")
-    with context.Pool(workers, _start_worker, (port.config,)) as pool:
-        yield lambda batch: pool.imap_unordered(_work, batch, chunksize=4)
+    with ProcessPoolExecutor(workers, context, _start_worker, (port.config,)) as pool:
+        try:
+            yield lambda batch: pool.map(_work, batch, chunksize=4)
+        except BrokenProcessPool:
+            raise DriveError(
+                f"port '{port.config.name}': a rendering process died, perhaps for want of memory; "
+                "start again, it goes on where it was, with fewer workers"
+            ) from None
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def _start_worker(config: PortConfig) -> None:

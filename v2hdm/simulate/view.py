@@ -179,16 +179,15 @@ def windows(view: View, shape: Outline, first_row: int = 0) -> Iterator[Window]:
     height, width = view.rays.u_pinhole_px.shape
     boundary = shape.boundary_px
     following = following_row(boundary)
+    rise = following[:, 1] - boundary[:, 1]
+    rise[rise == 0] = 1e-9
     top = max(int(np.floor(boundary[:, 1].min())) - 2, first_row)
     bottom = min(int(np.ceil(boundary[:, 1].max())) + 3, height)
     left, right = boundary[:, 0].min(), boundary[:, 0].max()
     band = _BAND_ROWS if (bottom - top) * (right - left) > _BAND_AREA_PX else max(bottom - top, 1)
     for row in range(top, bottom, band):
         end = min(row + band, bottom)
-        rise = following[:, 1] - boundary[:, 1]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            at = np.clip((np.array([[row - 2.0], [end + 2.0]]) - boundary[:, 1]) / rise, 0.0, 1.0)
-        at = np.nan_to_num(at)[..., None]
+        at = np.clip((np.array([[row - 2.0], [end + 2.0]]) - boundary[:, 1]) / rise, 0.0, 1.0)[..., None]
         points = (boundary + at * (following - boundary)).reshape(-1, 2)
         points = points[(points[:, 1] >= row - 2.01) & (points[:, 1] <= end + 2.01)]
         if len(points) == 0:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from v2hdm.records import FloatArray
 from v2hdm.simulate.port_config import SurfaceConfig, YardConfig
@@ -30,6 +32,9 @@ _CONTAINER_COLOURS: tuple[Bgr, ...] = (
 _PATH_CLEARANCE_M = 3.0
 _RASTER_M = 0.05
 _RASTER_BORDER_M = 18.0
+_SUBPIXEL_BITS = 3
+
+_ToPixels = Callable[[FloatArray], NDArray[np.int32]]
 
 
 @dataclass(frozen=True)
@@ -217,8 +222,8 @@ def _ground_marks(surface: SurfaceConfig, route: Route, rng: np.random.Generator
     columns, rows = (int(n) for n in np.ceil((high - low) / _RASTER_M))
     dark = np.zeros((rows, columns), dtype=np.uint8)
 
-    def pixels(points_map: FloatArray) -> np.ndarray[tuple[int, ...], np.dtype[np.int32]]:
-        return np.asarray(np.round((points_map - low) / _RASTER_M * 8), dtype=np.int32)
+    def pixels(points_map: FloatArray) -> NDArray[np.int32]:
+        return np.asarray(np.round((points_map - low) / _RASTER_M * 2**_SUBPIXEL_BITS), dtype=np.int32)
 
     for _ in range(surface.patches):
         _patch(dark, pixels, route, rng)
@@ -238,7 +243,7 @@ def _ground_marks(surface: SurfaceConfig, route: Route, rng: np.random.Generator
     return GroundMarks(factor=factor, origin_map=(float(low[0]), float(low[1])), resolution_m=_RASTER_M)
 
 
-def _patch(dark: np.ndarray, pixels: object, route: Route, rng: np.random.Generator) -> None:
+def _patch(dark: NDArray[np.uint8], pixels: _ToPixels, route: Route, rng: np.random.Generator) -> None:
     at = np.array([rng.uniform(0.0, route.length_m)])
     centre = route.points_at(at, rng.uniform(-5.0, 5.0))[0]
     yaw = float(route.yaw_at(at)[0])
@@ -246,18 +251,16 @@ def _patch(dark: np.ndarray, pixels: object, route: Route, rng: np.random.Genera
     corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * size
     cos, sin = np.cos(yaw), np.sin(yaw)
     polygon = corners @ np.array([[cos, sin], [-sin, cos]]) + centre
-    cv2.fillPoly(dark, [pixels(polygon)], int(rng.uniform(6, 26)), cv2.LINE_AA, 3)  # type: ignore[operator]
+    cv2.fillPoly(dark, [pixels(polygon)], int(rng.uniform(6, 26)), cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
-def _tyre_marks(dark: np.ndarray, pixels: object, route: Route, rng: np.random.Generator) -> None:
+def _tyre_marks(dark: NDArray[np.uint8], pixels: _ToPixels, route: Route, rng: np.random.Generator) -> None:
     start, length = rng.uniform(0.0, route.length_m), rng.gamma(2.0, 12.0)
     station = np.arange(start, min(start + length, route.length_m), 0.5)
     if len(station) < 2:
         return
     drift = rng.normal(0.0, 1.2) + rng.normal(0.0, 0.02) * (station - start)
     shade, width = int(rng.uniform(8, 38)), int(rng.integers(4, 8))
-    layer = np.zeros_like(dark)
     for wheel in (-0.9, 0.9):
-        points = route.points_at(station, drift + wheel)
-        cv2.polylines(layer, [pixels(points)], False, shade, width, cv2.LINE_AA, 3)  # type: ignore[operator]
-    cv2.add(dark, layer, dst=dark)
+        points = pixels(route.points_at(station, drift + wheel))
+        cv2.polylines(dark, [points], False, shade, width, cv2.LINE_AA, _SUBPIXEL_BITS)
