@@ -13,7 +13,7 @@ from v2hdm.simulate.textures import Float32, Tile, fade, noise_tile, photo_tile,
 from v2hdm.simulate.view import View, following_row, outline, windows
 
 _FARTHEST_M = 400.0
-_SHADOWS_TO_M = 150.0
+_SHADOWS_TO_M = 90.0
 
 
 @dataclass(frozen=True)

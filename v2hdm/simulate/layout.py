@@ -235,4 +235,4 @@ def _worn(config: PaintConfig, rng: np.random.Generator) -> tuple[float, float]:
     """Wear and dirt of one marking: gamma distributed about the means, never gone altogether."""
     wear = config.wear * float(rng.gamma(2.0, 0.5))
     dirt = config.dirt * float(rng.gamma(2.0, 0.5))
-    return min(wear, 0.45), min(dirt, 0.7)
+    return min(wear, 0.4), min(dirt, 0.7)

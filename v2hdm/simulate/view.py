@@ -99,7 +99,10 @@ def outline(view: View, homogeneous_px: FloatArray) -> Outline | None:
     clipped = _visible_part(view, homogeneous_px)
     if len(clipped) < 3:
         return None
-    edges = np.cross(homogeneous_px, following_row(homogeneous_px))
+    following = following_row(homogeneous_px)
+    # The cross product by columns: numpy's own takes ten times as long on four rows.
+    edges = homogeneous_px[:, [1, 2, 0]] * following[:, [2, 0, 1]]
+    edges -= homogeneous_px[:, [2, 0, 1]] * following[:, [1, 2, 0]]
     norms = np.hypot(edges[:, 0], edges[:, 1])
     edges = edges[norms > 1e-12] / norms[norms > 1e-12, None]
     if len(edges) < 3:

@@ -138,7 +138,7 @@ def _stacks(yard: YardConfig, route: Route, rng: np.random.Generator) -> list[Bo
         for row in range(2):
             offset = side * (yard.stack_clearance_m + width / 2 + row * (width + 0.4) + rng.uniform(0, 1.5))
             for station in np.arange(4.0, route.length_m, length + 0.6):
-                filled, tall = rng.random() < yard.stack_fill, int(rng.integers(1, 4))
+                filled, tall = rng.random() < yard.stack_fill / (1 + row), int(rng.integers(1, 4))
                 colours = rng.integers(len(_CONTAINER_COLOURS), size=3)
                 at = np.array([station])
                 x, y = route.points_at(at, offset)[0]
