@@ -22,6 +22,7 @@ from v2hdm.records import (
     FloatArray,
     Image,
     ImageDetections,
+    Lane,
     LaneDetection,
     Marking,
     MarkingDetection,
@@ -52,6 +53,7 @@ class SceneOptions:
     heading_deg: float = 0.05
     max_range_m: float = 20.0
     dashes_only: bool = False
+    lines: tuple[float, ...] = (-3.2,)
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class Scene:
     drive: Drive
     detections: list[ImageDetections]
     markings: list[Marking]
-    lanes: list[FloatArray]
+    lanes: list[Lane]
     cam_from_vehicle: dict[str, FloatArray]
 
 
@@ -148,7 +150,8 @@ def _paint(route: FloatArray, options: SceneOptions) -> tuple[list[Marking], lis
     )
     sides = (1.8, -1.8) if options.dashes_only else (3.2,)
     markings += [Marking("lane_dash", _placed(dash, p), 0) for d in sides for p in _beside(route, 6.0, d)[1:]]
-    return markings, [_beside(route, 0.5, -3.2)[:, :2]]
+    lanes = [Lane("lane_line", _beside(route, 0.5, lateral)[:, :2], 0) for lateral in options.lines]
+    return markings, lanes + [Lane("lane_dash", _beside(route, 0.5, d)[:, :2], 0) for d in sides]
 
 
 def _camera(name: str, truth: FloatArray, options: SceneOptions, rng: np.random.Generator) -> Camera:
@@ -206,7 +209,7 @@ def _look(
     cam_from_vehicle: FloatArray,
     map_from_vehicle: FloatArray,
     markings: list[Marking],
-    lanes: list[FloatArray],
+    lanes: list[Lane],
     options: SceneOptions,
     rng: np.random.Generator,
 ) -> tuple[tuple[MarkingDetection, ...], tuple[LaneDetection, ...]]:
@@ -224,15 +227,23 @@ def _look(
         px = np.array([640.0, 450.0]) + rng.uniform(-200, 200, 2)
         quad = np.array([[30.0, 0], [0, -15], [-30, 0], [0, 15]]) * rng.uniform(0.5, 2) + px
         found.append(_detection("diamond", quad, np.ones(4, bool), options, rng))
+    strips = [("lane_line", lane.points_map) for lane in lanes if lane.kind == "lane_line"]
+    strips += [("lane_dash", _centre_line(m.corners_map)) for m in markings if m.kind == "lane_dash"]
     rows = []
-    for lane in lanes:
-        px, depth = _project(info, cam_from_map, lane)
+    for kind, points in strips:
+        px, depth = _project(info, cam_from_map, points)
         keep = _inside(px, depth, options)
         if keep.sum() >= 3:
             noise = rng.normal(size=(int(keep.sum()), 2)) * 2 * options.pixel_sigma
             near_to_far = np.argsort(depth[keep])
-            rows.append(LaneDetection("lane_line", 0.9, (px[keep] + noise)[near_to_far]))
+            rows.append(LaneDetection(kind, 0.9, (px[keep] + noise)[near_to_far]))
     return tuple(found), tuple(rows)
+
+
+def _centre_line(dash: FloatArray) -> FloatArray:
+    """Points (N, 2) every 0.3 m from end to end of a dash whose corners 1 and 2 share a long side."""
+    first, last = dash[[0, 1]].mean(axis=0), dash[[2, 3]].mean(axis=0)
+    return first + np.linspace(0.0, 1.0, 11)[:, None] * (last - first)
 
 
 def _detection(

@@ -49,7 +49,7 @@ class Candidates:
 def judge(candidates: Candidates, options: AcceptanceOptions) -> list[str | None]:
     """For each candidate the reason why it is no marking of the map, or None where it is one."""
     verdict: list[str | None] = [None] * len(candidates.kind)
-    incomplete: NDArray[np.bool_] = np.isnan(candidates.corners_map).any(axis=(1, 2))
+    incomplete = np.asarray(np.isnan(candidates.corners_map).any(axis=(1, 2)))
     _refuse(verdict, incomplete, "a corner was never seen twice")
     _refuse(
         verdict,

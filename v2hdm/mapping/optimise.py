@@ -33,6 +33,7 @@ from v2hdm.records import (
     BoolArray,
     Calibration,
     Camera,
+    CameraInfo,
     FloatArray,
     Marking,
     PoseNoise,
@@ -234,13 +235,16 @@ class Optimiser:
 def initial_rig(cameras: Mapping[str, Camera], map_from_vehicle: FloatArray) -> Rig:
     """The extrinsics nearest to each camera's initial IPM, with the recorded poses (F, 4, 4)."""
     start = {
-        name: extrinsic_from_ipm(
-            torch.from_numpy(camera.info.intrinsic),
-            torch.from_numpy(np.asarray(camera.ipm[camera.initial_ipm], dtype=np.float64)),
-        ).numpy()
+        name: nearest_extrinsic(camera.info, camera.ipm[camera.initial_ipm])
         for name, camera in cameras.items()
     }
     return build_rig({name: camera.info for name, camera in cameras.items()}, start, map_from_vehicle)
+
+
+def nearest_extrinsic(info: CameraInfo, ipm: FloatArray) -> FloatArray:
+    """The rigid ``cam_from_vehicle`` (4 x 4) that comes closest to an IPM (3 x 3)."""
+    matrix = torch.from_numpy(np.asarray(ipm, dtype=np.float64))
+    return np.asarray(extrinsic_from_ipm(torch.from_numpy(info.intrinsic), matrix).numpy())
 
 
 def corner_covariances(bundle: Bundle) -> FloatArray:

@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from v2hdm.mapping.association import Association
 from v2hdm.mapping.location import Located, Rig
 from v2hdm.mapping.options import AssociationOptions
-from v2hdm.mapping.shapes import align, diameters
+from v2hdm.mapping.shapes import SHIFTS, align, diameters
 from v2hdm.mapping.sightings import Sightings
 from v2hdm.records import BoolArray, FloatArray
 
@@ -49,9 +49,8 @@ class _Track:
 
     def extend(self, row: int, shift: int, located: Located) -> None:
         """Take in the sighting at ``row``, whose corners are ``shift`` behind the track's."""
-        corners = np.roll(located.corners_map[row], -shift, axis=0)
-        valid = np.roll(located.valid[row], -shift)
-        self.corners_map[valid] = corners[valid]
+        valid = located.valid[row][SHIFTS[shift]]
+        self.corners_map[valid] = located.corners_map[row][SHIFTS[shift]][valid]
         self.valid |= valid
         self.row = row
 

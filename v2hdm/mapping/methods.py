@@ -1,0 +1,154 @@
+"""The four methods of the paper, side by side on one set of cameras.
+
+CNI and ENI are the naive strategy under a calibrated and an estimated IPM; Opt is the joint
+optimisation; ONI is the naive strategy under the IPM that the optimisation found.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+from v2hdm.adjust import Status
+from v2hdm.detection.ground import ipm_from_extrinsic
+from v2hdm.mapping.association import Association
+from v2hdm.mapping.lane_points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
+from v2hdm.mapping.lanes import map_lanes
+from v2hdm.mapping.naive import naive_markings
+from v2hdm.mapping.optimise import Optimised, Optimiser, nearest_extrinsic
+from v2hdm.mapping.options import MappingOptions, check_options
+from v2hdm.mapping.results import MethodResult
+from v2hdm.mapping.sightings import Sightings, camera_of, collect_sightings
+from v2hdm.mapping.views import views_of
+from v2hdm.records import Drive, FloatArray, HdMap, ImageDetections, Lane
+
+Progress = Callable[[str], None]
+
+NAIVE_IPMS: Mapping[str, str] = {"CNI": "calibrated", "ENI": "estimated"}
+"""Naive methods by the name of the IPM that they use."""
+
+_log = logging.getLogger(__name__)
+
+
+def run_methods(
+    drive: Drive,
+    detections: Sequence[ImageDetections],
+    cameras: Sequence[str],
+    options: MappingOptions | None = None,
+    progress: Progress | None = None,
+) -> dict[str, MethodResult]:
+    """Map a drive with every method that its IPMs allow.
+
+    Args:
+        drive: The drive; its truth is not looked at.
+        detections: What was found in its images.
+        cameras: Which cameras to map with, together.
+        options: Settings of the mapping.
+        progress: Called with the name of each step as it begins.
+
+    Returns:
+        Results by method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``.
+
+    Raises:
+        MappingError: There is nothing to map.
+        ConfigError: An option is out of range.
+    """
+    options = options or MappingOptions()
+    check_options(options)
+    tell = progress or _silent
+    tell("linking sightings")
+    sightings = collect_sightings(drive, detections, cameras)
+    optimiser = Optimiser(sightings, views_of(drive, cameras), drive.cameras, drive.pose_noise, options)
+    tracks = optimiser.initial_tracks()
+    results: dict[str, MethodResult] = {}
+    for name, ipm_name in NAIVE_IPMS.items():
+        ipm = {c: drive.cameras[c].ipm.get(ipm_name) for c in cameras}
+        known = {c: matrix for c, matrix in ipm.items() if matrix is not None}
+        if len(known) == len(ipm):
+            tell(name)
+            results[name] = run_naive(name, drive, detections, sightings, tracks, known, options)
+    begin_s = time.perf_counter()
+    optimised = optimiser.run(tracks, tell)
+    results["Opt"] = _optimised_result(drive, detections, cameras, optimised, options, begin_s)
+    tell("ONI")
+    found = results["Opt"].calibrations
+    ipm_found = {c: ipm_from_extrinsic(found[c].info, found[c].cam_from_vehicle) for c in cameras}
+    oni = run_naive("ONI", drive, detections, sightings, tracks, ipm_found, options)
+    results["ONI"] = replace(oni, calibrations=found)
+    return results
+
+
+def run_naive(
+    name: str,
+    drive: Drive,
+    detections: Sequence[ImageDetections],
+    sightings: Sightings,
+    tracks: Association,
+    ipm: Mapping[str, FloatArray],
+    options: MappingOptions,
+) -> MethodResult:
+    """The naive strategy under one IPM per camera, for instance that of a known extrinsic."""
+    begin_s = time.perf_counter()
+    cameras = {c: camera_of(drive, c) for c in sightings.cameras}
+    markings, excluded = naive_markings(sightings, tracks, cameras, ipm, options)
+    extrinsic = {c: nearest_extrinsic(cameras[c].info, matrix) for c, matrix in ipm.items()}
+    lanes = _lanes(drive, detections, ground_by_ipm(drive, ipm, extrinsic), options)
+    return MethodResult(
+        name=name,
+        cameras=sightings.cameras,
+        hd_map=HdMap(tuple(markings), lanes, drive.origin),
+        excluded=tuple(excluded),
+        diagnostics={"time_s": time.perf_counter() - begin_s},
+    )
+
+
+def _optimised_result(
+    drive: Drive,
+    detections: Sequence[ImageDetections],
+    cameras: Sequence[str],
+    optimised: Optimised,
+    options: MappingOptions,
+    begin_s: float,
+) -> MethodResult:
+    solution = optimised.bundle.solution
+    if solution.status is not Status.CONVERGED:
+        _log.warning(
+            "the joint optimisation ended early (%s): %s", solution.status.value, solution.status.advice
+        )
+    lanes = _lanes(drive, detections, ground_by_rig(drive, cameras, optimised.bundle.rig), options)
+    return MethodResult(
+        name="Opt",
+        cameras=tuple(cameras),
+        hd_map=HdMap(optimised.markings, lanes, drive.origin),
+        calibrations=optimised.calibrations,
+        excluded=optimised.excluded,
+        reprojection_rmse_px=optimised.reprojection_rmse_px,
+        initial_reprojection_rmse_px=optimised.initial_reprojection_rmse_px,
+        diagnostics={
+            "observations": float(len(optimised.bundle.row)),
+            "candidates": float(optimised.bundle.association.count),
+            "evaluations": float(solution.evaluations),
+            "gap": solution.gap,
+            "chi2_per_dof": solution.chi2_per_dof,
+            "time_s": time.perf_counter() - begin_s,
+        },
+    )
+
+
+def _lanes(
+    drive: Drive, detections: Sequence[ImageDetections], ground: ImageGround, options: MappingOptions
+) -> tuple[Lane, ...]:
+    cloud = collect_lane_points(
+        drive,
+        detections,
+        ground,
+        max_range_m=options.lanes.max_range_m,
+        jitter_rad=drive.pose_noise.roll_pitch_rad,
+    )
+    return map_lanes(cloud, options.lanes)
+
+
+def _silent(step: str) -> None:
+    """Ignore progress."""
