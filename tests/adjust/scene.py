@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -101,12 +101,19 @@ def make_scene(
     prior_sigma_m: float = 0.03,
     max_range_m: float = 15.0,
     correlation_m: float = 0.0,
+    noise_seed: int | None = None,
 ) -> Scene:
-    """A street whose recorded poses are off by ``jitter`` and whose start is off as stated."""
+    """A street whose recorded poses are off by ``jitter`` and whose start is off as stated.
+
+    ``noise_seed`` draws other noise on the same street.
+    """
     rng = np.random.default_rng(seed)
     truth = np.stack([mounted(1.5, 2.4, 18), mounted(-1.0, 2.6, 22, rear=True, y=0.2)])[:cameras]
     truth = exp(np.concatenate([np.zeros((cameras, 3)), rng.normal(0, 0.02, (cameras, 3))], 1)) @ truth
     recorded = route(frames, step_m, turn_deg_per_m)
+    corners = diamonds(recorded, every_m, rng)
+    if noise_seed is not None:
+        rng = np.random.default_rng(noise_seed)
     state = np.zeros((frames, 6))
     if jitter is not None:
         memory = np.exp(-step_m / correlation_m) if correlation_m > 0 else 0.0
@@ -114,14 +121,13 @@ def make_scene(
         unit[:, [0, 1]] = correlated(rng, frames, 2, memory)
         state = unit * jitter.by_state()
     map_from_vehicle = recorded @ exp(state)
-    corners = diamonds(recorded, every_m, rng)
-    seen = observe(truth, map_from_vehicle, corners, max_range_m)
-    camera, frame, corner, pixel = seen
+    camera, frame, corner, _ = observe(truth, recorded, corners, max_range_m)
     twice = np.bincount(corner, minlength=len(corners)) >= 2
     keep = twice[corner]
     rank = np.cumsum(twice) - 1
-    camera, frame, corner, pixel = camera[keep], frame[keep], rank[corner[keep]], pixel[keep]
+    camera, frame, corner = camera[keep], frame[keep], rank[corner[keep]]
     corners = corners[twice]
+    pixel = project(truth[camera] @ np.linalg.inv(map_from_vehicle)[frame], corners[corner])
     pixel = pixel + pixel_sigma * rng.standard_normal(pixel.shape)
     wrong = rng.random(len(pixel)) < outliers
     pixel[wrong] += rng.uniform(-60, 60, (int(wrong.sum()), 2))
@@ -145,6 +151,13 @@ def make_scene(
     return Scene(problem, truth, map_from_vehicle, corners)
 
 
+def project(cam_from_map: np.ndarray, points_map: np.ndarray) -> np.ndarray:
+    """Pixels (K, 2) of ground points (K, 2), each by a transform of its own."""
+    ground = np.column_stack([points_map, np.zeros(len(points_map)), np.ones(len(points_map))])
+    points = (cam_from_map @ ground[..., None])[:, :3, 0]
+    return FOCAL * points[:, :2] / points[:, 2:] + np.array([WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5])
+
+
 def observe(
     cam_from_vehicle: np.ndarray, map_from_vehicle: np.ndarray, corners: np.ndarray, max_range_m: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -162,7 +175,3 @@ def observe(
         parts.append((np.full(len(j), c), j, n, np.column_stack([u[j, n], v[j, n]])))
     camera, frame, corner, pixel = (np.concatenate(part) for part in zip(*parts, strict=True))
     return camera, frame, corner, pixel
-
-
-def without_states(problem: Problem) -> Problem:
-    return replace(problem, pose_sigma=PoseSigma())

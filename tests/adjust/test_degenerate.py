@@ -1,0 +1,167 @@
+"""Bad input is refused by name or reported as a status; nothing that comes back is NaN."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.adjust.scene import make_scene, mounted
+from v2hdm.adjust import Observations, PoseSigma, Problem, SolveOptions, Status, solve
+from v2hdm.errors import AdjustError
+
+PAPER = SolveOptions(pose_states=(), loss="none")
+
+
+def street(**changes) -> Problem:
+    return make_scene(1, frames=30, **changes).problem
+
+
+def with_observations(problem: Problem, **changes) -> Problem:
+    return replace(problem, observations=replace(problem.observations, **changes))
+
+
+def changed(values: np.ndarray, index, value) -> np.ndarray:
+    out = values.copy()
+    out[index] = value
+    return out
+
+
+def bad_problems():
+    problem = street()
+    seen = problem.observations
+    twice = Observations(
+        *(np.concatenate([values, values[5:6]]) for values in (seen.camera, seen.frame, seen.corner)),
+        np.concatenate([seen.pinhole_px, seen.pinhole_px[5:6]]),
+        np.concatenate([seen.covariance_px, seen.covariance_px[5:6]]),
+    )
+    mirrored = changed(problem.cam_from_vehicle, (1, 0), -problem.cam_from_vehicle[1, 0])
+    return {
+        "observations 5 and": replace(problem, observations=twice),
+        "pinhole_px of observation 7 is not finite": with_observations(
+            problem, pinhole_px=changed(seen.pinhole_px, (7, 1), np.nan)
+        ),
+        "map_from_vehicle of frame 3 is not finite": replace(
+            problem, map_from_vehicle=changed(problem.map_from_vehicle, (3, 0, 3), np.inf)
+        ),
+        "covariance_px of observation 2 is not positive": with_observations(
+            problem, covariance_px=changed(seen.covariance_px, 2, -np.eye(2))
+        ),
+        "observation 4 names frame 999": with_observations(problem, frame=changed(seen.frame, 4, 999)),
+        "observation 4 names camera -1": with_observations(problem, camera=changed(seen.camera, 4, -1)),
+        "camera 1 has no observation": with_observations(
+            problem,
+            **{
+                name: getattr(seen, name)[seen.camera == 0]
+                for name in ("camera", "frame", "pinhole_px", "covariance_px")
+            },
+            corner=np.unique(seen.corner[seen.camera == 0], return_inverse=True)[1],
+        ),
+        f"corner {problem.corner_count} has no observation": replace(
+            problem, corner_count=problem.corner_count + 1
+        ),
+        "cam_from_vehicle 1 is no rigid transform": replace(problem, cam_from_vehicle=mirrored),
+        "intrinsic of camera 0 has a focal length": replace(
+            problem, intrinsic=changed(problem.intrinsic, (0, 1), 0.0)
+        ),
+        "centre_sigma_m of camera 1 must be above 0": replace(
+            problem, centre_sigma_m=changed(problem.centre_sigma_m, (1, 2), 0.0)
+        ),
+        "belong together": replace(problem, centre_sigma_m=None),
+        "pose_sigma must be above 0": replace(problem, pose_sigma=PoseSigma(heading_rad=0.0)),
+        "intrinsic has shape": replace(problem, intrinsic=np.eye(3)),
+        "there is no observation": with_observations(
+            problem,
+            camera=seen.camera[:0],
+            frame=seen.frame[:0],
+            corner=seen.corner[:0],
+            pinhole_px=seen.pinhole_px[:0],
+            covariance_px=seen.covariance_px[:0],
+        ),
+    }
+
+
+@pytest.mark.parametrize("message", bad_problems())
+def test_a_malformed_problem_is_refused_by_name(message):
+    problem = bad_problems()[message]
+    if message.startswith("camera 1"):
+        problem = replace(problem, corner_count=int(problem.observations.corner.max()) + 1)
+    with pytest.raises(AdjustError, match=message) as caught:
+        solve(problem)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"pose_states": ("yaw",)}, "unknown pose state 'yaw'"),
+        ({"loss": "l1"}, "unknown loss 'l1'"),
+        ({"solver": "ceres"}, "unknown solver 'ceres'"),
+        ({"loss_scale": 0.0}, "loss_scale is 0.0"),
+    ],
+)
+def test_an_unknown_option_is_refused_with_the_choices(change, message):
+    with pytest.raises(AdjustError, match=message):
+        solve(street(), SolveOptions(**change))
+
+
+def test_an_extrinsic_that_looks_at_the_sky_is_refused_with_advice():
+    problem = street(cameras=1)
+    with pytest.raises(AdjustError, match="no ray of corner 0 meets the ground"):
+        solve(replace(problem, cam_from_vehicle=mounted(1.5, 2.4, -80)[None]))
+
+
+def finite(solution) -> bool:
+    parts = (solution.cam_from_vehicle, solution.map_from_vehicle, solution.corners_map, solution.residual_px)
+    return all(
+        bool(np.isfinite(part).all()) for part in (*parts, solution.weight, solution.extrinsic_covariance)
+    )
+
+
+def test_without_a_prior_on_a_straight_road_the_solution_is_called_undetermined():
+    scene = make_scene(3, frames=40, turn_deg_per_m=0.0, start_error_deg=1.0)
+    free = replace(scene.problem, centre_vehicle=None, centre_sigma_m=None)
+    solution = solve(free, PAPER)
+    assert solution.status is Status.UNDETERMINED
+    assert "turn" in solution.status.advice
+    assert finite(solution)
+    assert solve(scene.problem, PAPER).status is Status.CONVERGED
+
+
+def test_a_corner_seen_once_is_mapped_and_says_so_by_its_covariance():
+    scene = make_scene(4, frames=40)
+    seen = scene.problem.observations
+    keep = (seen.corner != 10) | (np.arange(len(seen.corner)) == np.flatnonzero(seen.corner == 10)[-1])
+    parts = (seen.camera, seen.frame, seen.corner, seen.pinhole_px, seen.covariance_px)
+    problem = replace(scene.problem, observations=Observations(*(part[keep] for part in parts)))
+    solution = solve(problem, PAPER)
+    assert solution.status is Status.CONVERGED
+    assert finite(solution)
+    once, often = solution.corner_covariance(np.array([[10], [11]]))
+    assert np.trace(once) > 2 * np.trace(often)
+
+
+def test_an_observation_behind_the_camera_is_reported():
+    scene = make_scene(5, frames=40, cameras=1, start_error_deg=0.5)
+    seen = scene.problem.observations
+    # The corner of the last observation is claimed to be in view of a frame far beyond it.
+    last = len(scene.problem.map_from_vehicle) - 1
+    first_corner = int(seen.corner[np.argmin(seen.frame)])
+    problem = with_observations(
+        scene.problem,
+        camera=np.append(seen.camera, 0),
+        frame=np.append(seen.frame, last),
+        corner=np.append(seen.corner, first_corner),
+        pinhole_px=np.vstack([seen.pinhole_px, [640, 500]]),
+        covariance_px=np.concatenate([seen.covariance_px, seen.covariance_px[:1]]),
+    )
+    solution = solve(problem, SolveOptions(pose_states=(), loss="geman_mcclure"))
+    assert solution.status is Status.BEHIND_CAMERA
+    assert finite(solution)
+    assert solution.mahalanobis2[-1] > 1e4
+    assert solution.weight[-1] < 1e-3
+
+
+def test_too_few_evaluations_are_reported():
+    solution = solve(street(start_error_deg=5.0), replace(PAPER, coarse=False, max_refreshes=1))
+    assert solution.status is Status.EVALUATIONS_EXHAUSTED
+    assert finite(solution)

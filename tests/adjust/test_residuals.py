@@ -1,0 +1,121 @@
+"""Every derivative against autograd and finite differences, near zero rotation and near the horizon."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.adjust.scene import make_scene
+from v2hdm.adjust.arrays import make_arrays
+from v2hdm.adjust.problem import LOSSES, POSE_STATES, PoseSigma
+from v2hdm.adjust.residuals import (
+    Estimate,
+    Loss,
+    centre_residual,
+    cost_and_gradient,
+    jacobians,
+    observe,
+    pair_from_state,
+    state_residual,
+)
+from v2hdm.adjust.robust import loss
+from v2hdm.geometry.transform import exp
+
+POSES = PoseSigma(correlation_m=10.0)
+
+
+def example(pose_states=POSE_STATES, size=0.0, max_range_m=15.0, frames=14):
+    scene = make_scene(3, frames=frames, jitter=POSES, max_range_m=max_range_m)
+    arrays = make_arrays(scene.problem, pose_states, "cpu")
+    generator = torch.Generator().manual_seed(0)
+    state = size * torch.randn(arrays.state_memory.shape, generator=generator, dtype=torch.float64)
+    corners = torch.as_tensor(scene.corners_map)[arrays.corner_order]
+    return arrays, Estimate(torch.as_tensor(scene.problem.cam_from_vehicle), state, corners)
+
+
+def moved(estimate, extrinsic, state, corners):
+    return Estimate(
+        exp(extrinsic) @ estimate.cam_from_vehicle,
+        estimate.frame_state + state,
+        estimate.corners_map + corners,
+    )
+
+
+@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("size", [0.0, 1e-8, 0.05])
+@pytest.mark.parametrize("pose_states", [(), ("roll", "pitch"), POSE_STATES])
+def test_the_gradient_of_the_cost_is_that_of_autograd(name, size, pose_states):
+    arrays, estimate = example(pose_states, size)
+    zeros = [torch.zeros(len(estimate.cam_from_vehicle), 6, dtype=torch.float64)]
+    zeros += [torch.zeros_like(estimate.frame_state), torch.zeros_like(estimate.corners_map)]
+    for zero in zeros:
+        zero.requires_grad_()
+    terms, _ = cost_and_gradient(arrays, moved(estimate, *zeros), Loss(name, 3.0))
+    expected = torch.autograd.grad(sum(terms.values()), zeros)
+    _, gradient = cost_and_gradient(arrays, estimate, Loss(name, 3.0))
+    parts = (gradient.extrinsic, gradient.frame_state, gradient.corners_map)
+    for actual, wanted in zip(parts, expected, strict=True):
+        torch.testing.assert_close(actual, wanted, rtol=1e-9, atol=1e-12 * (1 + float(wanted.abs().sum())))
+
+
+@pytest.mark.parametrize(("distance_m", "pitch"), [(6.0, 0.0), (200.0, 0.0), (2000.0, 1e-3)])
+def test_gradcheck_of_the_observation_residual_holds_up_to_the_horizon(distance_m, pitch):
+    arrays, estimate = example(("roll", "pitch"), frames=2)
+    arrays, corners = arrays.take(torch.arange(len(arrays.corner)) < 6)
+    ahead = torch.tensor([distance_m, 0.0], dtype=torch.float64)
+    estimate = replace(estimate, corners_map=estimate.corners_map[corners] + ahead)
+    inputs = [torch.zeros(2, 6, dtype=torch.float64), torch.full((2, 2), pitch, dtype=torch.float64)]
+    inputs.append(torch.zeros_like(estimate.corners_map))
+    for value in inputs:
+        value.requires_grad_()
+
+    def residual(*steps):
+        return observe(arrays, moved(estimate, *steps)).residual
+
+    assert torch.autograd.gradcheck(residual, inputs, eps=1e-6, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("size", [0.0, 0.05])
+def test_jacobians_by_pair_and_corner_spread_to_the_full_derivative(size):
+    arrays, estimate = example(size=size, frames=6)
+    by_pair, by_corner = jacobians(arrays, observe(arrays, estimate))
+    spread = pair_from_state(arrays, estimate).reshape(arrays.pair_count, 6, -1)
+    k = len(arrays.corner) // 2
+    steps = [torch.zeros(arrays.camera_count, 6), torch.zeros_like(estimate.frame_state)]
+    steps = [step.to(torch.float64) for step in [*steps, torch.zeros_like(estimate.corners_map)]]
+    full = torch.autograd.functional.jacobian(
+        lambda *s: observe(arrays, moved(estimate, *s)).residual[:, k], tuple(steps)
+    )
+    camera, frame = divmod(int(arrays.pair[k]), arrays.frame_count)
+    torch.testing.assert_close(by_pair[k], full[0][:, camera])
+    torch.testing.assert_close(by_pair[k] @ spread[arrays.pair[k]], full[1][:, frame])
+    torch.testing.assert_close(by_corner[k], full[2][:, arrays.corner[k]])
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_a_loss_starts_as_least_squares_and_its_weight_is_its_slope(name):
+    squared = torch.tensor([0.0, 1e-6, 1.0, 8.9, 9.1, 400.0], dtype=torch.float64, requires_grad=True)
+    rho, weight = loss(name, squared, 3.0)
+    torch.testing.assert_close(torch.autograd.grad(rho.sum(), squared)[0], weight)
+    torch.testing.assert_close(rho[:2], squared[:2], rtol=1e-6, atol=0)
+    assert bool((weight <= 1).all())
+
+
+def test_correlated_states_have_the_covariance_of_a_gauss_markov_process():
+    arrays, _ = example(frames=12)
+    count = arrays.state_memory.numel()
+    shape = arrays.state_memory.shape
+    root = torch.autograd.functional.jacobian(
+        lambda s: state_residual(arrays, s).flatten(), torch.zeros(shape, dtype=torch.float64)
+    ).reshape(count, count)
+    covariance = torch.linalg.inv(root.T @ root).reshape(*shape, *shape)
+    apart_m = 0.5 * torch.arange(12, dtype=torch.float64)
+    torch.testing.assert_close(covariance[0, 0, :, 0], 0.02**2 * torch.exp(-apart_m / 10.0))
+    assert covariance[0, POSE_STATES.index("pitch"), 1, POSE_STATES.index("pitch")] == 0
+
+
+def test_the_centre_prior_does_not_mind_a_rotation_about_the_camera():
+    arrays, estimate = example(())
+    turn = torch.tensor([0, 0, 0, 0.1, -0.2, 0.3], dtype=torch.float64)
+    turned = replace(estimate, cam_from_vehicle=exp(turn) @ estimate.cam_from_vehicle)
+    torch.testing.assert_close(centre_residual(arrays, turned), centre_residual(arrays, estimate))

@@ -1,0 +1,199 @@
+"""Recovery of known streets, and the optimum against an independent solver."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from tests.adjust.scene import Scene, make_scene
+from v2hdm.adjust import Observations, PoseSigma, Problem, SolveOptions, Status, solve
+
+PAPER = SolveOptions(pose_states=(), loss="none")
+POSES = PoseSigma()
+REAL = PoseSigma(position_m=0.02, heading_rad=0.0017, roll_pitch_rad=0.005, height_m=0.01)
+
+
+def reference_residuals(problem: Problem, x: np.ndarray) -> np.ndarray:
+    """The model of the problem's docstring, written anew in plain numpy: all residuals, flat."""
+    cameras, frames, count = len(problem.intrinsic), len(problem.map_from_vehicle), problem.corner_count
+    extrinsic, state, corners = np.split(x, [6 * cameras, len(x) - 2 * count])
+    extrinsic, state, corners = extrinsic.reshape(-1, 6), state.reshape(frames, 6), corners.reshape(-1, 2)
+    seen = problem.observations
+    rotation = Rotation.from_rotvec(extrinsic[:, 3:]).as_matrix() @ problem.cam_from_vehicle[:, :3, :3]
+    centre = extrinsic[:, :3]
+    # exp(s) of a pose: a rotation, and the translation V s_t with V by the textbook's closed form.
+    angle = np.linalg.norm(state[:, 3:], axis=1)[:, None, None]
+    skew = np.cross(np.eye(3)[None], state[:, None, 3:])
+    half = np.sinc(angle / (2 * np.pi)) ** 2 / 2
+    sixth = (1 - np.sinc(angle / np.pi)) / np.maximum(angle, 1e-30) ** 2
+    v = np.eye(3) + half * skew + sixth * skew @ skew
+    turned = problem.map_from_vehicle[:, :3, :3] @ Rotation.from_rotvec(state[:, 3:]).as_matrix()
+    shift = np.einsum("jab,jbc,jc->ja", problem.map_from_vehicle[:, :3, :3], v, state[:, :3])
+    position = problem.map_from_vehicle[:, :3, 3] + shift
+    point_map = np.column_stack([corners, np.zeros(count)])[seen.corner] - position[seen.frame]
+    point_vehicle = np.einsum("kba,kb->ka", turned[seen.frame], point_map)
+    point = np.einsum("kab,kb->ka", rotation[seen.camera], point_vehicle - centre[seen.camera])
+    focal, principal = problem.intrinsic[seen.camera, :2], problem.intrinsic[seen.camera, 2:]
+    off = focal * point[:, :2] / point[:, 2:] + principal - seen.pinhole_px
+    whitened = np.einsum("kab,kb->ka", np.linalg.inv(np.linalg.cholesky(seen.covariance_px)), off)
+    prior = (centre - problem.centre_vehicle) / problem.centre_sigma_m
+    return np.concatenate([whitened.ravel(), prior.ravel(), (state / problem.pose_sigma.by_state()).ravel()])
+
+
+def reference_optimum(scene: Scene) -> float:
+    """The least cost that scipy finds from the truth."""
+    problem = scene.problem
+    turn = scene.cam_from_vehicle[:, :3, :3] @ problem.cam_from_vehicle[:, :3, :3].transpose(0, 2, 1)
+    extrinsic = np.column_stack([problem.centre_vehicle, Rotation.from_matrix(turn).as_rotvec()])
+    states = np.zeros(6 * len(problem.map_from_vehicle))
+    start = np.concatenate([extrinsic.ravel(), states, scene.corners_map.ravel()])
+    found = least_squares(
+        lambda x: reference_residuals(problem, x),
+        start,
+        jac="3-point",
+        x_scale="jac",
+        ftol=1e-15,
+        xtol=1e-15,
+        gtol=1e-15,
+    )
+    return float(found.cost)
+
+
+@pytest.mark.parametrize("solver", ["lbfgs", "lm"])
+def test_the_cost_is_that_of_an_independent_least_squares_solver_to_nine_digits(solver):
+    rng = np.random.default_rng(0)
+    scene = make_scene(1, frames=12, step_m=1.2, jitter=POSES, every_m=3.0)
+    root = rng.normal(0, 0.4, (len(scene.problem.observations.corner), 2, 2)) + 0.8 * np.eye(2)
+    seen = replace(scene.problem.observations, covariance_px=root @ root.transpose(0, 2, 1))
+    scene = replace(scene, problem=replace(scene.problem, observations=seen))
+    solution = solve(scene.problem, SolveOptions(loss="none", solver=solver))
+    expected = reference_optimum(scene)
+    assert solution.status is Status.CONVERGED
+    assert abs(solution.cost - expected) <= 1e-9 * expected
+
+
+@pytest.mark.parametrize("start_error_deg", [3.0, 10.0])
+@pytest.mark.parametrize("turn_deg_per_m", [0.0, 4.0])
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_the_papers_model_recovers_a_street_with_perfect_poses(start_error_deg, turn_deg_per_m, cameras):
+    scene = make_scene(
+        5,
+        start_error_deg=start_error_deg,
+        turn_deg_per_m=turn_deg_per_m,
+        cameras=cameras,
+        prior_sigma_m=0.005,
+        start_error_m=0.3,
+    )
+    solution = solve(scene.problem, PAPER)
+    assert solution.status is Status.CONVERGED
+    assert scene.corner_rmse_m(solution.corners_map) < 0.012
+    assert scene.rotation_error_deg(solution.cam_from_vehicle).max() < 0.02
+    assert solution.chi2_per_dof == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.parametrize("start_error_deg", [3.0, 10.0])
+def test_pose_states_absorb_what_the_papers_model_must_put_into_the_map(start_error_deg):
+    scene = make_scene(6, frames=120, jitter=REAL, start_error_deg=start_error_deg, prior_sigma_m=0.01)
+    states, paper = solve(scene.problem), solve(scene.problem, PAPER)
+    assert states.status is Status.CONVERGED
+    assert scene.corner_rmse_m(states.corners_map) < 0.02
+    assert scene.corner_rmse_m(states.corners_map) < 0.4 * scene.corner_rmse_m(paper.corners_map)
+    assert scene.rotation_error_deg(states.cam_from_vehicle).max() < 0.1
+    assert states.chi2_per_dof == pytest.approx(1, abs=0.05)
+    assert paper.chi2_per_dof > 1.5
+
+
+@pytest.mark.parametrize(("loss", "factor"), [("huber", 2.0), ("cauchy", 1.3), ("geman_mcclure", 1.3)])
+def test_a_robust_loss_shrugs_off_three_percent_of_wrong_associations(loss, factor):
+    clean, soiled = (make_scene(7, frames=90, jitter=POSES, outliers=share) for share in (0.0, 0.03))
+    best = clean.corner_rmse_m(solve(clean.problem).corners_map)
+    robust = solve(soiled.problem, SolveOptions(loss=loss))
+    plain = solve(soiled.problem, SolveOptions(loss="none"))
+    assert robust.status is Status.CONVERGED
+    assert soiled.corner_rmse_m(robust.corners_map) < factor * best
+    assert soiled.corner_rmse_m(plain.corners_map) > 3 * best
+    wrong = robust.mahalanobis2 > 100
+    assert 0.02 < wrong.mean() < 0.035
+    assert robust.weight[wrong].max() < robust.weight[robust.mahalanobis2 < 4].min()
+
+
+def test_both_solvers_agree_under_a_robust_loss():
+    scene = make_scene(8, frames=60, jitter=POSES, outliers=0.03)
+    lbfgs, lm = (solve(scene.problem, SolveOptions(solver=name)) for name in ("lbfgs", "lm"))
+    assert lbfgs.cost == pytest.approx(lm.cost, rel=1e-9)
+    np.testing.assert_allclose(lbfgs.corners_map, lm.corners_map, atol=1e-6)
+
+
+def test_knowing_that_rtk_errors_drift_slowly_helps():
+    poses = replace(POSES, position_m=0.04)
+    plain, correlated = [], []
+    for seed in range(3):
+        scene = make_scene(seed, frames=80, jitter=poses, correlation_m=30.0, prior_sigma_m=0.005)
+        plain.append(scene.corner_rmse_m(solve(scene.problem).corners_map))
+        aware = replace(scene.problem, pose_sigma=replace(poses, correlation_m=30.0))
+        correlated.append(scene.corner_rmse_m(solve(aware).corners_map))
+    assert np.mean(correlated) < np.mean(plain)
+
+
+def test_a_second_lap_over_the_same_markings_joins_the_first():
+    scene = make_scene(9, frames=50, step_m=0.8, jitter=POSES)
+    seen, again = scene.problem.observations, make_scene(9, frames=50, step_m=0.8, jitter=POSES)
+    noise = np.random.default_rng(1).normal(0, 0.7, seen.pinhole_px.shape)
+    both = Observations(
+        np.tile(seen.camera, 2),
+        np.concatenate([seen.frame, seen.frame + 50]),
+        np.tile(seen.corner, 2),
+        np.concatenate([seen.pinhole_px, again.problem.observations.pinhole_px + noise]),
+        np.tile(seen.covariance_px, (2, 1, 1)),
+    )
+    poses = np.tile(scene.problem.map_from_vehicle, (2, 1, 1))
+    solution = solve(replace(scene.problem, observations=both, map_from_vehicle=poses))
+    assert solution.status is Status.CONVERGED
+    assert scene.corner_rmse_m(solution.corners_map) < 0.02
+
+
+def test_the_same_problem_gives_the_same_bits_and_another_order_the_same_optimum():
+    problem = make_scene(10, frames=40, jitter=POSES, outliers=0.02).problem
+    first, second = solve(problem), solve(problem)
+    assert np.array_equal(first.corners_map, second.corners_map)
+    assert np.array_equal(first.cam_from_vehicle, second.cam_from_vehicle)
+    order = np.random.default_rng(0).permutation(len(problem.observations.corner))
+    seen = problem.observations
+    shuffled = Observations(
+        seen.camera[order],
+        seen.frame[order],
+        seen.corner[order],
+        seen.pinhole_px[order],
+        seen.covariance_px[order],
+    )
+    third = solve(replace(problem, observations=shuffled))
+    np.testing.assert_allclose(third.corners_map, first.corners_map, atol=1e-9)
+    np.testing.assert_allclose(third.mahalanobis2, first.mahalanobis2[order], atol=1e-6)
+    np.testing.assert_allclose(third.residual_px, first.residual_px[order], atol=1e-6)
+
+
+def test_the_residuals_are_projected_minus_observed_pixels():
+    scene = make_scene(11, frames=40, pixel_sigma=0.0, start_error_deg=0.5)
+    moved = scene.problem.observations.pinhole_px.copy()
+    moved[17] += [0.0, 5.0]
+    seen = replace(scene.problem.observations, pinhole_px=moved)
+    problem = replace(scene.problem, observations=seen, centre_vehicle=None, centre_sigma_m=None)
+    solution = solve(problem, SolveOptions(pose_states=(), loss="geman_mcclure"))
+    np.testing.assert_allclose(solution.residual_px[17], [0, -5], atol=0.1)
+    assert np.delete(np.abs(solution.residual_px), 17, axis=0).max() < 0.1
+
+
+def test_the_corners_may_be_given_a_start():
+    scene = make_scene(12, frames=40)
+    problem = replace(scene.problem, corners_start=scene.corners_map)
+    free, given = solve(scene.problem, PAPER), solve(problem, replace(PAPER, coarse=False))
+    assert given.cost == pytest.approx(free.cost, rel=1e-9)
+
+
+def test_the_cost_is_the_sum_of_its_named_terms():
+    solution = solve(make_scene(13, frames=40, jitter=POSES).problem)
+    assert set(solution.cost_terms) == {"observations", "camera_centre", "frame_states"}
+    assert solution.cost == pytest.approx(sum(solution.cost_terms.values()))
+    assert solution.gap <= 1e-11

@@ -1,0 +1,149 @@
+"""The whitened problem is round, its factor is the dense one, its inverse is the covariance."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.adjust.scene import make_scene
+from v2hdm.adjust import PoseSigma, SolveOptions, solve
+from v2hdm.adjust.arrays import make_arrays
+from v2hdm.adjust.descent import Objective
+from v2hdm.adjust.problem import POSE_STATES
+from v2hdm.adjust.reduced import make_plan
+from v2hdm.adjust.residuals import Estimate, Loss
+from v2hdm.adjust.tiles import TIP, factorise_tiles, find_pattern
+from v2hdm.adjust.whitening import factorise
+
+POSES = PoseSigma(correlation_m=10.0)
+
+
+@pytest.mark.parametrize("pose_states", [(), ("roll", "pitch"), POSE_STATES])
+def test_where_all_residuals_vanish_the_whitened_hessian_is_the_identity(pose_states):
+    """At a perfect fit the Gauss-Newton Hessian is the true one, so the gradient at y is y."""
+    scene = make_scene(2, frames=40, pixel_sigma=0.0, jitter=None, prior_sigma_m=0.03)
+    centre = -np.einsum("cji,cj->ci", scene.cam_from_vehicle[:, :3, :3], scene.cam_from_vehicle[:, :3, 3])
+    problem = replace(scene.problem, centre_vehicle=centre, pose_sigma=POSES)
+    arrays = make_arrays(problem, pose_states, "cpu")
+    estimate = Estimate(
+        torch.as_tensor(scene.cam_from_vehicle),
+        torch.zeros_like(arrays.state_memory),
+        torch.as_tensor(scene.corners_map)[arrays.corner_order],
+    )
+    whitening = factorise(arrays, make_plan(arrays), estimate, torch.ones_like(arrays.measured[0]))
+    objective = Objective(whitening, estimate, Loss("none", 1.0))
+    direction = torch.randn(whitening.size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    step = 1e-5 * direction
+    _, gradient = objective(step)
+    _, opposite = objective(-step)
+    # The frames that fill up the last tile are variables that nothing depends on.
+    moves = (gradient - opposite).abs() > 0
+    torch.testing.assert_close(((gradient - opposite) / 2)[moves], step[moves], rtol=1e-4, atol=1e-8)
+    assert int((~moves).sum()) < 96
+
+
+def dense(tiles, pattern, size, tip):
+    count = len(pattern.below)
+    matrix = torch.zeros(count * size + tip, count * size + tip, dtype=torch.float64)
+    for (row, column), tile in tiles.items():
+        r = count * size if row == TIP else row * size
+        c = count * size if column == TIP else column * size
+        matrix[r : r + len(tile), c : c + tile.shape[1]] = tile
+        matrix[c : c + tile.shape[1], r : r + len(tile)] = tile.T
+    return matrix
+
+
+@pytest.mark.parametrize(
+    "cliques",
+    [
+        [],
+        [[0, 1, 2], [2, 3], [3, 4], [4, 5]],
+        [[0, 1], [1, 2], [3, 4], [4, 5], [0, 4], [1, 5]],
+        [list(range(6))],
+    ],
+)
+def test_the_tiled_factor_is_that_of_the_dense_matrix(cliques):
+    size, tip, count = 5, 4, 6
+    generator = torch.Generator().manual_seed(1)
+    pattern = find_pattern(count, cliques)
+    tiles = {(TIP, TIP): 50 * torch.eye(tip, dtype=torch.float64)}
+    for column, below in enumerate(pattern.below):
+        tiles[column, column] = 50 * torch.eye(size, dtype=torch.float64)
+        for row in below:
+            tiles[row, column] = torch.zeros(size, size, dtype=torch.float64)
+        tiles[TIP, column] = torch.randn(tip, size, generator=generator, dtype=torch.float64)
+    for clique in cliques:
+        places = sorted(pattern.position[tile] for tile in clique)
+        for n, column in enumerate(places):
+            for row in places[n + 1 :]:
+                tiles[row, column] += torch.randn(size, size, generator=generator, dtype=torch.float64)
+    matrix = dense(tiles, pattern, size, tip)
+    lower = torch.linalg.cholesky(matrix)
+    factor = factorise_tiles(tiles, pattern)
+    right = torch.randn(len(matrix), 3, generator=generator, dtype=torch.float64)
+    torch.testing.assert_close(factor.solve(right), torch.linalg.solve_triangular(lower, right, upper=False))
+    torch.testing.assert_close(
+        factor.solve_transposed(right), torch.linalg.solve_triangular(lower.T, right, upper=True)
+    )
+    torch.testing.assert_close(factor.pivots(), lower.diagonal().square())
+    assert factor.damping == 0
+
+
+def test_laps_fill_in_only_where_they_meet():
+    lap = [[k, k + 1] for k in range(39)]
+    second_lap = [[k, k + 20] for k in range(20)]
+    filled = sum(len(rows) for rows in find_pattern(40, lap + second_lap).below)
+    assert filled < 40 * 39 / 2 / 4
+
+
+def test_covariances_agree_with_the_scatter_of_many_solves():
+    """Small Monte Carlo: 40 draws of noise, states and prior on one street."""
+    options = SolveOptions(loss="none", coarse=False)
+    corners, extrinsics, last = [], [], None
+    base = make_scene(20, frames=14, step_m=1.0, jitter=PoseSigma(), cameras=1, start_error_deg=0.2)
+    mark = np.arange(8)
+    for seed in range(40):
+        scene = make_scene(
+            20,
+            frames=14,
+            step_m=1.0,
+            jitter=PoseSigma(),
+            cameras=1,
+            start_error_deg=0.2,
+            noise_seed=1000 + seed,
+        )
+        assert np.array_equal(scene.corners_map, base.corners_map)
+        last = solve(scene.problem, options)
+        corners.append((last.corners_map[mark] - scene.corners_map[mark]).ravel())
+        off = last.cam_from_vehicle[0, :3, :3] @ scene.cam_from_vehicle[0, :3, :3].T
+        extrinsics.append([off[2, 1], off[0, 2], off[1, 0]])
+    assert last is not None
+    stated = np.diag(last.corner_covariance(mark))
+    found = np.mean(np.square(corners), axis=0)
+    assert np.mean(found / stated) == pytest.approx(1, abs=0.3)
+    rotation = np.diag(last.extrinsic_covariance[0])[3:]
+    np.testing.assert_allclose(np.mean(np.square(extrinsics), axis=0) / rotation, 1, atol=0.6)
+
+
+def test_the_normalised_error_of_a_marking_is_chi_square_distributed():
+    squares = []
+    for seed in range(12):
+        scene = make_scene(40 + seed, frames=24, step_m=0.8, jitter=PoseSigma(), start_error_deg=0.5)
+        solution = solve(scene.problem, SolveOptions(coarse=False))
+        groups = np.arange(scene.problem.corner_count)[:, None]
+        covariance = solution.corner_covariance(groups)
+        error = solution.corners_map - scene.corners_map
+        squares.append(np.einsum("na,nab,nb->n", error, np.linalg.inv(covariance), error).mean())
+    # Corners of one drive share the camera's error, so the mean over drives is what converges.
+    assert np.mean(squares) == pytest.approx(2, abs=0.7)
+
+
+def test_groups_of_corners_have_the_blocks_of_the_joint_covariance():
+    solution = solve(make_scene(21, frames=30, jitter=PoseSigma()).problem)
+    joint = solution.corner_covariance(np.array([3, 9, 4, 0]))
+    groups = solution.corner_covariance(np.array([[3, 9], [4, 0]]))
+    np.testing.assert_allclose(groups[0], joint[:4, :4], rtol=1e-9)
+    np.testing.assert_allclose(groups[1], joint[4:, 4:], rtol=1e-9)
+    np.testing.assert_allclose(joint, joint.T, atol=1e-15)
+    assert np.linalg.eigvalsh(joint).min() > 0

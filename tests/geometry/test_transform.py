@@ -1,0 +1,100 @@
+"""Laws of the rigid motions, then agreement with kornia's."""
+
+import pytest
+import torch
+from kornia.geometry.liegroup import Se3
+
+from v2hdm.geometry import transform as tf
+
+BATCHES = [(), (1,), (3, 2)]
+TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-12}
+
+
+def tangents(batch, dtype=torch.float64, size=1.0, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return size * torch.randn(*batch, 6, generator=generator, dtype=torch.float64).to(dtype)
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+@pytest.mark.parametrize("dtype", TOLERANCE)
+def test_a_motion_times_its_inverse_is_the_identity(batch, dtype):
+    motion = tf.exp(tangents(batch, dtype))
+    identity = torch.eye(4, dtype=dtype).expand(*batch, 4, 4)
+    torch.testing.assert_close(motion @ tf.inverse(motion), identity, atol=TOLERANCE[dtype], rtol=0)
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_composition_is_associative_on_points(batch):
+    first, second = tf.exp(tangents(batch, seed=1)), tf.exp(tangents(batch, seed=2))
+    points = torch.randn(*batch, 5, 3, dtype=torch.float64)
+    torch.testing.assert_close(tf.apply(first @ second, points), tf.apply(first, tf.apply(second, points)))
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-4, 1.0])
+@pytest.mark.parametrize("batch", BATCHES)
+def test_log_undoes_exp(batch, size):
+    tangent = tangents(batch, size=size)
+    torch.testing.assert_close(tf.log(tf.exp(tangent)), tangent, atol=1e-12, rtol=1e-9)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-8, 0.3, 3.0, 6.2])
+def test_exp_agrees_with_the_matrix_exponential_and_with_kornia(angle):
+    tangent = tangents((4,), seed=3)
+    tangent[:, 3:] *= angle / tangent[:, 3:].norm(dim=1, keepdim=True)
+    generator = torch.zeros(4, 4, 4, dtype=torch.float64)
+    generator[:, :3, :3], generator[:, :3, 3] = tf.hat(tangent[:, 3:]), tangent[:, :3]
+    torch.testing.assert_close(tf.exp(tangent), torch.linalg.matrix_exp(generator), atol=1e-12, rtol=0)
+    torch.testing.assert_close(tf.exp(tangent), Se3.exp(tangent).matrix().detach(), atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-7, 1.0])
+def test_exp_has_correct_derivatives_at_the_identity_too(size):
+    tangent = tangents((2,), size=size).requires_grad_()
+    assert torch.autograd.gradcheck(tf.exp, (tangent,), eps=1e-6)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-6, 0.1, 1.5])
+def test_the_left_jacobian_is_the_derivative_of_exp(size):
+    tangent = tangents((), size=size, seed=4)
+
+    def perturbation(other):
+        return tf.log(tf.exp(other) @ tf.inverse(tf.exp(tangent)))
+
+    step = 1e-6
+    columns = [
+        (perturbation(tangent + step * e) - perturbation(tangent - step * e)) / (2 * step)
+        for e in torch.eye(6, dtype=torch.float64)
+    ]
+    torch.testing.assert_close(tf.left_jacobian(tangent), torch.stack(columns, -1), atol=1e-8, rtol=0)
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_the_adjoint_carries_a_tangent_through_a_motion(batch):
+    motion, tangent = tf.exp(tangents(batch, seed=5)), tangents(batch, size=0.3, seed=6)
+    carried = (tf.adjoint(motion) @ tangent[..., None])[..., 0]
+    torch.testing.assert_close(motion @ tf.exp(tangent), tf.exp(carried) @ motion)
+
+
+def test_a_left_perturbation_moves_the_camera_centre_by_minus_its_translation_in_camera_axes():
+    cam_from_vehicle = tf.exp(tangents((), seed=7))
+    tangent = tangents((), size=1e-7, seed=8)
+
+    def centre(motion):
+        return tf.inverse(motion)[:3, 3]
+
+    moved = centre(tf.exp(tangent) @ cam_from_vehicle) - centre(cam_from_vehicle)
+    torch.testing.assert_close(cam_from_vehicle[:3, :3] @ moved, -tangent[:3], atol=1e-13, rtol=0)
+
+
+def test_pitch_lowers_the_nose_and_heading_turns_left():
+    nose = torch.tensor([[1.0, 0.0, 0.0]])
+    pitched = tf.apply(tf.exp(torch.tensor([0.0, 0, 0, 0, 0.1, 0])), nose)
+    turned = tf.apply(tf.exp(torch.tensor([0.0, 0, 0, 0, 0, 0.1])), nose)
+    assert pitched[0, 2] < 0
+    assert turned[0, 1] > 0
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-10, 0.5, 3.1])
+def test_the_rotation_angle_is_exact_for_small_angles_too(angle):
+    motion = tf.exp(torch.tensor([1.0, 2, 3, 0, angle, 0], dtype=torch.float64))
+    assert tf.rotation_angle(motion[:3, :3]).item() == pytest.approx(angle, rel=1e-9, abs=1e-15)
