@@ -23,7 +23,8 @@ TYPICAL_BLUR_PX = 0.75
 
 _NEAR_WIDTH_PX = 15.0
 _NEAR_SIDE_PX = 14.0
-_FAR_MAX_PX = 260.0
+_FAR_MAX_PX = 200.0
+_SMALL_PX = np.array([44.0, 18.0])
 _COVARIANCE_FACTOR = 1.4
 _COVARIANCE_FLOOR_PX = 0.03
 _MAX_MISFIT = 0.2
@@ -47,7 +48,7 @@ class QuadStart:
 
 @dataclass(frozen=True)
 class Foreground:
-    """Which blob owns each logit: ``owner`` (h, w) 1 + index or 0, ``stride`` px apart from row ``top`` on."""
+    """Which blob owns each logit: ``owner`` (h, w) 1 + index or 0, ``stride`` px apart, from row ``top``."""
 
     owner: np.ndarray
     stride: int
@@ -158,13 +159,10 @@ def _take_quads(
 
 
 def _similar_sizes(corners_px: FloatArray, mask: BoolArray) -> list[np.ndarray]:
-    """Indices under the mask, in groups whose bounding boxes are alike to a factor of 2 a side."""
-    indices = np.flatnonzero(mask)
-    if not len(indices):
-        return []
-    size = np.ceil(np.log(np.maximum(np.ptp(corners_px[indices], axis=1), 16.0)) / np.log(2.0))
-    _, group = np.unique(size, axis=0, return_inverse=True)
-    return [indices[group.reshape(-1) == g] for g in range(int(group.max()) + 1)]
+    """Indices under the mask, small and large markings apart: a batch is padded to its largest."""
+    size = np.ptp(corners_px, axis=1)
+    small = (size <= _SMALL_PX).all(axis=1)
+    return [group for half in (small, ~small) if len(group := np.flatnonzero(mask & half))]
 
 
 def _measured_blur(edges: EdgeFit) -> float | None:

@@ -21,8 +21,9 @@ from v2hdm.records import BoolArray, FloatArray
 
 _MARGIN_PX = 4
 _SMOOTHING_PX = 1.2
-_COARSE_ITERATIONS = 4
-_FINE_ITERATIONS = 5
+_MAX_PATCH = np.array([56, 48])
+_COARSE_ITERATIONS = 3
+_FINE_ITERATIONS = 4
 _MAX_STEP_PX = 1.0
 _MAX_MOVE_PX = 6.0
 _DAMPING = 1e-3
@@ -48,7 +49,10 @@ class QuadFit:
 
 @dataclass(frozen=True)
 class _Patches:
-    """Pixels around each marking: ``columns`` (M, W), ``rows`` (M, H), grey ``values`` and ``use`` (M, H, W)."""
+    """Pixels around each marking: ``columns`` (M, W), ``rows`` (M, H), grey ``values`` (M, H, W).
+
+    ``smoothed`` are the grey values after a Gaussian, ``use`` is 1 where a pixel takes part.
+    """
 
     columns: FloatArray
     rows: FloatArray
@@ -103,7 +107,7 @@ def unbow_corners(view: CameraView, corners_px: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class _System:
-    """Weighted least squares about the current corners: ``design`` (M, 12, H, W), corners first, then levels."""
+    """Least squares about the current corners: ``design`` (M, 12, H, W), eight coordinates, then levels."""
 
     design: np.ndarray
     weight: np.ndarray
@@ -117,7 +121,9 @@ def _cut_patches(
 ) -> _Patches:
     low = np.floor(corners_px.min(axis=1)).astype(np.intp) - _MARGIN_PX
     size = (np.ceil(corners_px.max(axis=1)).astype(np.intp) + _MARGIN_PX + 1 - low).max(axis=0)
-    columns, rows = low[:, :1] + np.arange(size[0]), low[:, 1:] + np.arange(size[1])
+    # A large patch has pixels to spare: neighbours say nearly the same, so every second or third does.
+    step = -(-size // _MAX_PATCH)
+    columns, rows = (low[:, axis, None] + np.arange(0, size[axis], step[axis]) for axis in (0, 1))
     height, width = grey.values.shape
     j = np.clip(columns, 0, width - 1)[:, None, :]
     i = np.clip(rows - grey.top, 0, height - 1)[:, :, None]
@@ -186,7 +192,7 @@ def _linearise(patches: _Patches, values: np.ndarray, corners: FloatArray, blur_
 
 
 def _covariance(system: _System) -> FloatArray:
-    """Corner covariance (M, 8, 8) from the residuals, inflated by their correlation along rows and columns."""
+    """Corner covariance (M, 8, 8) from the residuals, inflated by their correlation in both directions."""
     markings = len(system.weight)
     flat = system.design.reshape(markings, 12, -1).astype(np.float64)
     weight = system.weight.reshape(markings, 1, -1)
