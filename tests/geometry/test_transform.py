@@ -37,7 +37,7 @@ def test_log_undoes_exp(batch, size):
     torch.testing.assert_close(tf.log(tf.exp(tangent)), tangent, atol=1e-12, rtol=1e-9)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-8, 0.3, 3.0, 6.2])
+@pytest.mark.parametrize("angle", [0.0, 1e-8, 0.3, 3.14])
 def test_exp_agrees_with_the_matrix_exponential_and_with_kornia(angle):
     tangent = tangents((4,), seed=3)
     tangent[:, 3:] *= angle / tangent[:, 3:].norm(dim=1, keepdim=True)

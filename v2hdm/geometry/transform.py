@@ -36,21 +36,35 @@ import torch
 from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
-# Enough for machine precision up to |rotation| = 2 pi: (2 pi)^(2 * 20) / 41! is below 1e-17.
-_SERIES_TERMS = 21
+# Enough for machine precision up to |rotation| = pi: pi^(2 * 15) / 31! is below 1e-18.
+_SERIES_TERMS = 15
+
+# Coefficients (terms, series) of (-theta^2)^n in sin(theta) / theta, (1 - cos(theta)) / theta^2 and
+# (theta - sin(theta)) / theta^3.
+_EXP_SERIES = torch.tensor(
+    [[1 / factorial(2 * n + offset) for offset in (1, 2, 3)] for n in range(_SERIES_TERMS)],
+    dtype=torch.float64,
+)
+
+# The same of the powers ad, ad^2, ad^3, ad^4 in the sum of ad^n / (n + 1)!, see left_jacobian.
+_LEFT_JACOBIAN_SERIES = torch.tensor(
+    [
+        [(1 - n) / factorial(2 * n + offset) for offset in (2, 3)]
+        + [(n + 1) / factorial(2 * n + 2 + offset) for offset in (2, 3)]
+        for n in range(_SERIES_TERMS)
+    ],
+    dtype=torch.float64,
+)
 
 
-def _even_series(theta_squared: Tensor, coefficients: list[float]) -> Tensor:
-    """Sum of ``coefficients[n] * (-theta^2)^n`` by Horner's rule."""
-    x = -theta_squared
-    total = torch.full_like(x, coefficients[-1])
-    for coefficient in reversed(coefficients[:-1]):
-        total = total * x + coefficient
-    return total
-
-
-def _reciprocal_factorials(offset: int) -> list[float]:
-    return [1.0 / factorial(2 * n + offset) for n in range(_SERIES_TERMS)]
+def _even_series(rotation: Tensor, coefficients: Tensor) -> tuple[Tensor, ...]:
+    """Power series in -theta^2 by Horner's rule, theta = |rotation|, each (*batch, 1, 1)."""
+    x = -rotation.square().sum(-1)[..., None, None, None]
+    terms = coefficients.to(rotation)
+    total = terms[-1]
+    for term in reversed(terms[:-1].unbind()):
+        total = torch.addcmul(term, total, x)
+    return total.unbind(-1)
 
 
 def hat(vector: Tensor) -> Tensor:
@@ -79,7 +93,7 @@ def apply(dst_from_src: Tensor, points_src: Tensor) -> Tensor:
 
 
 def exp(tangent: Tensor) -> Tensor:
-    """The rigid motion (*batch, 4, 4) of a tangent (*batch, 6), for rotations up to 2 pi.
+    """The rigid motion (*batch, 4, 4) of a tangent (*batch, 6), for rotations up to pi.
 
     Rodrigues' formula with its coefficients as power series of theta^2: one smooth expression, hence
     exact derivatives at the identity.
@@ -88,11 +102,10 @@ def exp(tangent: Tensor) -> Tensor:
     True
     """
     translation, rotation = tangent[..., :3], tangent[..., 3:]
-    theta_squared = rotation.square().sum(-1)[..., None, None]
     omega = hat(rotation)
     omega_squared = omega @ omega
     eye = torch.eye(3, dtype=tangent.dtype, device=tangent.device)
-    sine, cosine, third = (_even_series(theta_squared, _reciprocal_factorials(n)) for n in (1, 2, 3))
+    sine, cosine, third = _even_series(rotation, _EXP_SERIES)
     moved = (eye + cosine * omega + third * omega_squared) @ translation[..., None]
     return make_transform(eye + sine * omega + cosine * omega_squared, moved[..., 0])
 
@@ -119,16 +132,12 @@ def left_jacobian(tangent: Tensor) -> Tensor:
     """Derivative (*batch, 6, 6) of :func:`exp`: ``exp(x + dx) = exp(left_jacobian(x) @ dx) @ exp(x)``.
 
     The series sum of ad^n / (n + 1)!, closed by ad^5 = -2 theta^2 ad^3 - theta^4 ad (Barfoot, State
-    Estimation for Robotics, 2nd ed., section 8.1.5), for rotations up to 2 pi.
+    Estimation for Robotics, 2nd ed., section 8.1.5), for rotations up to pi.
     """
-    theta_squared = tangent[..., 3:].square().sum(-1)[..., None, None]
     omega = hat(tangent[..., 3:])
     top = torch.cat([omega, hat(tangent[..., :3])], dim=-1)
     ad = torch.cat([top, torch.cat([torch.zeros_like(omega), omega], dim=-1)], dim=-2)
-    low = [[(1 - n) * c for n, c in enumerate(_reciprocal_factorials(offset))] for offset in (2, 3)]
-    high = [[n * c for n, c in enumerate(_reciprocal_factorials(offset))][1:] for offset in (2, 3)]
-    first, second = (_even_series(theta_squared, c) for c in low)
-    third, fourth = (_even_series(theta_squared, c) for c in high)
+    first, second, third, fourth = _even_series(tangent[..., 3:], _LEFT_JACOBIAN_SERIES)
     eye = torch.eye(6, dtype=tangent.dtype, device=tangent.device)
     return eye + ad @ (first * eye + ad @ (second * eye + ad @ (third * eye + fourth * ad)))
 
