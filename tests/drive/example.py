@@ -63,7 +63,10 @@ def make_drive(folder: Path, stamps: tuple[float, ...] = (100.05, 100.95, 101.25
         ipm = Calibration(info, looking_forward(2.0 + number)).vehicle_from_pinhole_px
         cameras[name] = Camera(
             info=info,
-            ipm={"calibrated": ipm, "estimated": Calibration(info, looking_forward(2.2)).vehicle_from_pinhole_px},
+            ipm={
+                "calibrated": ipm,
+                "estimated": Calibration(info, looking_forward(2.2)).vehicle_from_pinhole_px,
+            },
             initial_ipm="estimated",
             roi_vehicle=np.array([[3.0, -3.0], [9.0, -3.0], [9.0, 3.0], [3.0, 3.0]]),
             centre_prior=CentrePrior(np.array([0.0, 0.0, 2.0]), np.full(3, 0.02)),
@@ -93,7 +96,10 @@ def make_map() -> HdMap:
     lane = Lane("lane_line", np.array([[0.0, 2.0], [1 / 3, 2.0], [7.5, 2.25]]), sightings=4)
     rng = np.random.default_rng(3)
     half = rng.normal(size=(8, 8))
-    markings = (Marking("diamond", square + 1 / 3, 5, half @ half.T), Marking("lane_dash", square - 1e6 / 7, 3))
+    markings = (
+        Marking("diamond", square + 1 / 3, 5, half @ half.T),
+        Marking("lane_dash", square - 1e6 / 7, 3),
+    )
     return HdMap(markings, (lane,), ORIGIN)
 
 

@@ -60,7 +60,9 @@ def test_the_truth_of_one_camera_alone_has_its_own_rows_only(tmp_path: Path) -> 
     np.testing.assert_array_equal(read_truth(drive).visibility[:, 0], [0.25, 0.5, 0.0])
 
 
-def test_images_outside_the_poses_are_dropped_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_images_outside_the_poses_are_dropped_and_counted(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     make_drive(tmp_path, stamps=(99.0, 100.5, 103.0))
     with caplog.at_level(logging.WARNING):
         drive = read_drive(tmp_path)
