@@ -21,9 +21,9 @@ class DataConfig:
     height: int = 256
     render_width: int = 512
     render_height: int = 288
-    views_per_render: int = 4
-    reservoir: int = 192
-    easy_samples: int = 3000
+    views_per_render: int = 8
+    reservoir: int = 256
+    easy_samples: int = 1000
     workers: int = 1
 
 
@@ -58,11 +58,11 @@ class TrainConfig:
     device: str = "auto"
     minutes: float | None = None
     steps: int | None = None
-    batch: int = 4
-    learning_rate: float = 3e-3
+    batch: int = 2
+    learning_rate: float = 2e-3
     weight_decay: float = 0.01
     warmup: float = 0.03
-    ema_updates: int = 300
+    ema_updates: int = 400
     threads: int = 1
     checkpoint_minutes: float = 2.0
     resume: bool = True

@@ -1,0 +1,69 @@
+"""The network's shapes and the exact rearrangements inside it."""
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from models import MarkingNet, NetConfig
+from models.marking_net import _depth_to_space, _space_to_depth
+from v2hdm.records import PAINT_CLASSES
+
+
+@pytest.fixture(scope="module")
+def net() -> MarkingNet:
+    """A network whose normalisations have seen something."""
+    torch.manual_seed(0)
+    net = MarkingNet(NetConfig(widths=[16, 16, 16, 16], head_width=16))
+    for module in net.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.running_mean.normal_()
+            module.running_var.uniform_(0.5, 2.0)
+    return net.eval()
+
+
+def random_images(*shape: int) -> torch.Tensor:
+    return torch.randint(0, 256, (*shape, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
+
+
+@pytest.mark.parametrize(("batch", "height", "width"), [(1, 16, 16), (2, 48, 80), (1, 208, 1232)])
+def test_there_is_one_logit_for_every_other_pixel(net: MarkingNet, batch: int, height: int, width: int) -> None:
+    with torch.inference_mode():
+        logits = net(random_images(batch, height, width))
+    assert logits.shape == (batch, 1 + len(PAINT_CLASSES), height // 2, width // 2)
+    assert logits.dtype == torch.float32
+
+
+def test_folding_the_normalisations_leaves_the_function_as_it_is() -> None:
+    torch.manual_seed(3)
+    net = MarkingNet()
+    net.train()
+    net(random_images(2, 64, 64))
+    net.eval()
+    images = random_images(2, 48, 96)
+    with torch.inference_mode():
+        before = net(images)
+        after = net.fold()(images)
+    assert not any(isinstance(module, nn.BatchNorm2d) for module in net.modules())
+    torch.testing.assert_close(after, before, atol=1e-4, rtol=1e-4)
+
+
+def test_the_stem_keeps_every_pixel_of_a_tile_as_a_channel() -> None:
+    image = random_images(2, 8, 12)
+    channels = _space_to_depth(image) * 64.0 + 112.0
+    for row, column, colour in ((0, 0, 0), (3, 1, 2), (2, 3, 1)):
+        channel = (row * 4 + column) * 3 + colour
+        np.testing.assert_allclose(channels[:, channel], image[:, row::4, column::4, colour].float(), atol=1e-4)
+
+
+def test_depth_to_space_is_pixel_shuffle() -> None:
+    x = torch.randn(2, 12, 3, 5)
+    assert torch.equal(_depth_to_space(x), torch.pixel_shuffle(x, 2))
+
+
+def test_a_pixel_of_another_image_of_the_batch_changes_nothing(net: MarkingNet) -> None:
+    images = random_images(2, 32, 32)
+    changed = images.clone()
+    changed[1] = 255 - changed[1]
+    with torch.inference_mode():
+        torch.testing.assert_close(net(changed)[0], net(images)[0])

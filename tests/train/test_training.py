@@ -1,0 +1,122 @@
+"""A training in miniature: it learns, it resumes, it refuses what would spoil a run."""
+
+import logging
+import math
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.errors import ConfigCompositionException
+from omegaconf import OmegaConf
+
+from models import NetConfig
+from train import __main__ as door
+from train.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from train.config import DataConfig, LossConfig, TrainConfig, ValidationConfig
+from train.loop import Trainer
+from v2hdm.errors import ConfigError
+
+CONF = str(Path(__file__).resolve().parents[2] / "conf")
+
+
+def tiny(output: Path, steps: int = 3) -> TrainConfig:
+    return TrainConfig(
+        output=str(output),
+        steps=steps,
+        batch=2,
+        net=NetConfig(widths=[16, 16, 16, 16], dilations=[1]),
+        data=DataConfig(
+            width=64, height=32, render_width=80, render_height=48, views_per_render=2, reservoir=4, workers=0
+        ),
+        validation=ValidationConfig(images=2),
+    )
+
+
+def train(config: TrainConfig) -> Checkpoint:
+    return Trainer(config, lambda share, line: None).run()
+
+
+def test_a_run_leaves_checkpoints_whose_network_runs(tmp_path: Path) -> None:
+    state = train(tiny(tmp_path))
+    assert state.step == 3
+    loaded = load_checkpoint(tmp_path / "best.pt")
+    assert set(loaded.metrics) >= {"mean_iou", "paint_iou"}
+    with torch.inference_mode():
+        assert torch.isfinite(loaded.network()(torch.zeros((1, 32, 32, 3), dtype=torch.uint8))).all()
+    assert not list(tmp_path.glob("*.partial"))
+
+
+def test_the_loss_falls_on_a_batch_seen_again_and_again(tmp_path: Path) -> None:
+    trainer = Trainer(replace(tiny(tmp_path, 60), warmup=0.0), lambda share, line: None)
+    image = torch.randint(0, 60, (2, 32, 64, 3), dtype=torch.uint8)
+    labels = torch.zeros((2, 16, 32), dtype=torch.uint8)
+    image[:, 8:24, 16:40] = 230
+    labels[:, 4:12, 8:20] = 1
+    losses = [trainer._update((image, labels)) for _ in range(50)]
+    assert losses[-1] < 0.3 * losses[0]
+
+
+def test_a_run_goes_on_where_it_was_left(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    train(tiny(tmp_path, steps=2))
+    with caplog.at_level(logging.INFO):
+        state = train(tiny(tmp_path, steps=4))
+    assert state.step == 4
+    assert "resuming at step 2" in caplog.text
+
+
+def test_resumed_weights_are_those_that_were_left(tmp_path: Path) -> None:
+    left = train(tiny(tmp_path, steps=2))
+    trainer = Trainer(tiny(tmp_path, steps=9), lambda share, line: None)
+    for name, value in trainer.averaged.module.state_dict().items():
+        torch.testing.assert_close(value, left.averaged[name])
+    assert trainer.optimizer.state_dict()["state"]
+
+
+def test_going_on_under_other_settings_is_refused_by_name(tmp_path: Path) -> None:
+    train(tiny(tmp_path, steps=2))
+    with pytest.raises(ConfigError, match="another loss"):
+        train(replace(tiny(tmp_path, steps=4), loss=LossConfig(dice=0.1)))
+
+
+def test_a_run_without_an_end_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="set minutes= or steps="):
+        Trainer(replace(tiny(tmp_path), steps=None), lambda share, line: None)
+
+
+def test_the_learning_rate_warms_up_and_ends_at_nothing(tmp_path: Path) -> None:
+    trainer = Trainer(replace(tiny(tmp_path, 100), warmup=0.1), lambda share, line: None)
+    rates = []
+    for step in range(101):
+        trainer.state.step = step
+        rates.append(trainer._learning_rate())
+    assert max(rates) == rates[10] == trainer.config.learning_rate
+    assert rates[0] < 0.1 * rates[10]
+    assert math.isclose(rates[100], 0.0, abs_tol=1e-9)
+
+
+def test_a_missing_and_a_damaged_checkpoint_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no checkpoint at"):
+        load_checkpoint(tmp_path / "last.pt")
+    (tmp_path / "last.pt").write_bytes(b"no such thing")
+    with pytest.raises(ConfigError, match="is no checkpoint"):
+        load_checkpoint(tmp_path / "last.pt")
+
+
+def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path: Path) -> None:
+    saved = Checkpoint(config=asdict(TrainConfig()), step=7, averaged={"w": torch.arange(3.0)}, best_iou=0.5)
+    save_checkpoint(saved, tmp_path / "deep" / "last.pt")
+    loaded = load_checkpoint(tmp_path / "deep" / "last.pt")
+    assert (loaded.config, loaded.step, loaded.best_iou) == (saved.config, 7, 0.5)
+    assert torch.equal(loaded.averaged["w"], saved.averaged["w"])
+
+
+def test_the_shipped_settings_compose_and_typos_do_not() -> None:
+    assert door.main
+    with initialize_config_dir(CONF, version_base="1.3"):
+        config = OmegaConf.to_object(compose("train"))
+        assert isinstance(config, TrainConfig)
+        assert config.minutes is not None
+        with pytest.raises(ConfigCompositionException, match="learning_rat"):
+            compose("train", overrides=["learning_rat=1"])

@@ -1,0 +1,88 @@
+"""The random scenes: reproducible, varied, and labelled where the paint is."""
+
+import numpy as np
+import pytest
+
+from train.config import DataConfig
+from train.data import RenderStream, validation_pairs
+from v2hdm.records import PAINT_CLASSES
+from v2hdm.simulate.training_paint import Bend, rectangle, rhombus
+from v2hdm.simulate.training_scenes import random_scene, training_sample
+from v2hdm.simulate.training_views import looking, random_view
+
+TINY = DataConfig(width=64, height=32, render_width=80, render_height=48, views_per_render=2, reservoir=3)
+
+
+def test_a_seed_and_an_index_make_the_same_picture_again() -> None:
+    first, again = (training_sample(5, 3, 96, 64) for _ in range(2))
+    np.testing.assert_array_equal(first.image, again.image)
+    np.testing.assert_array_equal(first.labels, again.labels)
+    assert (training_sample(5, 4, 96, 64).image != first.image).any()
+
+
+def test_streams_of_one_seed_are_the_same() -> None:
+    one, other = iter(RenderStream(TINY, 1)), iter(RenderStream(TINY, 1))
+    for _ in range(5):
+        (image, labels), (image_again, labels_again) = next(one), next(other)
+        assert image.shape == (32, 64, 3)
+        assert labels.shape == (16, 32)
+        assert bool((image == image_again).all())
+        assert bool((labels == labels_again).all())
+
+
+def test_validation_shows_other_scenes_than_training() -> None:
+    image, _ = next(validation_pairs(TINY, 1, 1))
+    assert (image.numpy() != training_sample(1, 0, 64, 32).image).any()
+
+
+def test_all_classes_are_seen_in_a_few_dozen_samples() -> None:
+    seen = {int(c) for index in range(36) for c in np.unique(training_sample(2, index, 160, 96).labels)}
+    assert seen == set(range(1 + len(PAINT_CLASSES)))
+
+
+def test_painted_pixels_are_mostly_brighter_than_the_ground_around_them() -> None:
+    brighter = []
+    for index in range(24):
+        sample = training_sample(7, index, 192, 96, difficulty=0.0)
+        grey, paint = sample.image.mean(axis=2), sample.labels > 0
+        if 200 < paint.sum() < paint.size / 2:
+            rows = np.flatnonzero(paint.any(axis=1))
+            band = slice(rows[0], rows[-1] + 1)
+            brighter.append(grey[band][paint[band]].mean() > np.median(grey[band][~paint[band]]))
+    assert len(brighter) > 5
+    assert np.mean(brighter) > 0.75
+
+
+def test_paint_polygons_are_convex_and_have_the_size_asked_for() -> None:
+    scenes = [random_scene(np.random.default_rng(index)) for index in range(12)]
+    polygons = [paint.polygon_map for scene in scenes for paint in scene.paints]
+    assert polygons
+    for polygon in polygons:
+        edges = np.roll(polygon, -1, axis=0) - polygon
+        turns = edges[:, 0] * np.roll(edges, -1, axis=0)[:, 1] - edges[:, 1] * np.roll(edges, -1, axis=0)[:, 0]
+        assert (turns > -1e-9).all() or (turns < 1e-9).all()
+    assert np.ptp(rhombus(np.zeros(2), 1.2, 0.6)[:, 0]) == pytest.approx(1.2)
+    assert np.ptp(rectangle(np.zeros(2), 3.0, 0.15, np.pi / 2)[:, 1]) == pytest.approx(3.0)
+
+
+def test_a_bend_keeps_lengths_along_its_centre_and_turns_left_for_positive_curvature() -> None:
+    bend = Bend(0.02)
+    along = np.linspace(0, 40, 4001)
+    points = bend.to_map(np.column_stack([along, np.zeros_like(along)]))
+    assert np.linalg.norm(np.diff(points, axis=0), axis=1).sum() == pytest.approx(40, abs=1e-3)
+    np.testing.assert_allclose(points[-1], [np.sin(0.8) / 0.02, (1 - np.cos(0.8)) / 0.02], atol=1e-9)
+    np.testing.assert_allclose(Bend(0.0).to_map(np.array([[7.0, -2.0]])), [[7.0, -2.0]])
+
+
+def test_a_camera_that_looks_along_x_sees_the_road_ahead_below_its_axis() -> None:
+    cam_from_map = looking(np.array([0.0, 0.0, 2.0]), 0.0, 0.0, 0.0)
+    np.testing.assert_allclose(cam_from_map @ [10.0, 3.0, 0.0, 1.0], [-3.0, 2.0, 10.0, 1.0], atol=1e-12)
+    tilted = looking(np.array([0.0, 0.0, 2.0]), 0.0, np.arctan2(2.0, 10.0), 0.0)
+    np.testing.assert_allclose((tilted @ [10.0, 0.0, 0.0, 1.0])[:2], 0.0, atol=1e-12)
+
+
+def test_camera_rotations_are_rotations() -> None:
+    for index in range(10):
+        rotation = random_view(np.random.default_rng(index), 64, 32).cam_from_map[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(rotation) == pytest.approx(1)
