@@ -14,10 +14,12 @@ from dataclasses import replace
 from v2hdm.adjust import Status
 from v2hdm.detection.ground import ipm_from_extrinsic
 from v2hdm.mapping.association import Association
+from v2hdm.mapping.conclude import Optimised
+from v2hdm.mapping.growth import grow_map
 from v2hdm.mapping.lane_points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
 from v2hdm.mapping.lanes import map_lanes
 from v2hdm.mapping.naive import naive_markings
-from v2hdm.mapping.optimise import Optimised, Optimiser, nearest_extrinsic
+from v2hdm.mapping.optimise import Optimiser, nearest_extrinsic
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.sightings import Sightings, camera_of, collect_sightings
@@ -38,6 +40,7 @@ def run_methods(
     cameras: Sequence[str],
     options: MappingOptions | None = None,
     progress: Progress | None = None,
+    growth_steps: int = 0,
 ) -> dict[str, MethodResult]:
     """Map a drive with every method that its IPMs allow.
 
@@ -47,6 +50,7 @@ def run_methods(
         cameras: Which cameras to map with, together.
         options: Settings of the mapping.
         progress: Called with the name of each step as it begins.
+        growth_steps: At how many sizes of the growing map ``Opt`` is solved again; 0 for none.
 
     Returns:
         Results by method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``.
@@ -71,9 +75,13 @@ def run_methods(
             results[name] = run_naive(name, drive, detections, sightings, tracks, known, options)
     begin_s = time.perf_counter()
     optimised = optimiser.run(tracks, tell)
-    results["Opt"] = _optimised_result(drive, detections, cameras, optimised, options, begin_s)
+    optimal = _optimised_result(drive, detections, cameras, optimised, options, begin_s)
+    if growth_steps:
+        tell("growth of the map")
+        optimal = replace(optimal, growth=grow_map(optimiser, optimised, growth_steps))
+    results["Opt"] = optimal
     tell("ONI")
-    found = results["Opt"].calibrations
+    found = optimal.calibrations
     ipm_found = {c: ipm_from_extrinsic(found[c].info, found[c].cam_from_vehicle) for c in cameras}
     oni = run_naive("ONI", drive, detections, sightings, tracks, ipm_found, options)
     results["ONI"] = replace(oni, calibrations=found)

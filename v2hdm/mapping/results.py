@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from v2hdm.records import Calibration, FloatArray, HdMap
+from v2hdm.records import Calibration, FloatArray, HdMap, Marking
 
 
 @dataclass(frozen=True)
@@ -19,12 +19,21 @@ class Exclusion:
 
 
 @dataclass(frozen=True)
+class GrowthStep:
+    """The state after the first markings of a drive: their map and the extrinsics by camera."""
+
+    markings: tuple[Marking, ...]
+    cam_from_vehicle: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True)
 class MethodResult:
     """The outcome of one method on one set of cameras.
 
     ``calibrations`` are per camera, empty where the method only has an IPM. ``reprojection_rmse_px``
     (and ``initial_reprojection_rmse_px``, under the extrinsic the optimisation started from) are
     over the same accepted corner observations; None for methods that do not reproject.
+    ``growth`` is how the result came about, marking by marking, where that was asked for;
     ``diagnostics`` are named figures for the log and the report.
     """
 
@@ -35,4 +44,5 @@ class MethodResult:
     excluded: tuple[Exclusion, ...] = ()
     reprojection_rmse_px: float | None = None
     initial_reprojection_rmse_px: float | None = None
+    growth: tuple[GrowthStep, ...] = ()
     diagnostics: Mapping[str, float] = field(default_factory=dict)
