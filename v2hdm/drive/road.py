@@ -3,7 +3,7 @@
 The mapper's ground is the plane z = 0. A street has grade, cross-fall and slow undulation, and GNSS
 height drifts by decimetres within a minute; none of it concerns the markings' plan. What does is
 the vehicle's attitude relative to the road beneath and before it: pitch by acceleration and
-suspension moves a ground point at 15 m by about 0.5 m per degree at a car's camera height.
+suspension moves a ground point at 15 m by about 2.4 m per degree at a car's camera height of 1.65 m.
 """
 
 from __future__ import annotations

@@ -1,0 +1,154 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.drive.example import ORIGIN, camera_info, looking_forward, make_map
+from v2hdm.detection.ground import ipm_from_extrinsic
+from v2hdm.errors import MapFileError
+from v2hdm.hdmap import read_calibration, read_geojson, write_calibration, write_geojson
+from v2hdm.hdmap.geodetic import enu_from_geodetic, geodetic_from_enu
+from v2hdm.records import Calibration, GeodeticOrigin, HdMap, Marking
+
+LATITUDES, LONGITUDES = st.floats(-89.9, 89.9), st.floats(-180, 180)
+
+
+@given(LATITUDES, LONGITUDES, st.floats(-400, 4000))
+def test_enu_agrees_with_pyproj_and_returns(latitude: float, longitude: float, altitude: float) -> None:
+    origin = GeodeticOrigin(latitude, longitude, altitude)
+    points = np.random.default_rng(0).uniform(-3000, 3000, (50, 3)) * [1, 1, 0.05]
+    degrees = geodetic_from_enu(origin, points)
+    np.testing.assert_allclose(enu_from_geodetic(origin, degrees), points, atol=1e-6)
+    enu = pyproj.Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
+        f"+step +proj=topocentric +ellps=WGS84 +lat_0={latitude!r} +lon_0={longitude!r} +h_0={altitude!r}"
+    )
+    expected = np.column_stack(enu.transform(degrees[:, 1], degrees[:, 0], degrees[:, 2]))
+    np.testing.assert_allclose(expected, points, atol=1e-6)
+
+
+def assert_same(got: HdMap, expected: HdMap) -> None:
+    assert got.origin == expected.origin
+    assert len(got.markings) == len(expected.markings)
+    for a, b in zip(got.markings, expected.markings, strict=True):
+        assert (a.kind, a.sightings) == (b.kind, b.sightings)
+        np.testing.assert_array_equal(a.corners_map, b.corners_map)
+        assert (a.covariance_m2 is None) == (b.covariance_m2 is None)
+        if a.covariance_m2 is not None:
+            np.testing.assert_array_equal(a.covariance_m2, b.covariance_m2)
+    for c, d in zip(got.lanes, expected.lanes, strict=True):
+        assert (c.kind, c.sightings) == (d.kind, d.sightings)
+        np.testing.assert_array_equal(c.points_map, d.points_map)
+
+
+@pytest.mark.parametrize("origin", [None, ORIGIN])
+def test_a_map_survives_its_file_to_the_last_bit(tmp_path: Path, origin: GeodeticOrigin | None) -> None:
+    hd_map = HdMap(make_map().markings, make_map().lanes, origin)
+    write_geojson(hd_map, tmp_path / "map.geojson")
+    assert_same(read_geojson(tmp_path / "map.geojson"), hd_map)
+
+
+def test_an_empty_map_is_a_map(tmp_path: Path) -> None:
+    write_geojson(HdMap(()), tmp_path / "map.geojson")
+    assert_same(read_geojson(tmp_path / "map.geojson"), HdMap(()))
+
+
+@pytest.mark.parametrize("turn", [1, -1])
+def test_rings_are_closed_and_counter_clockwise_whatever_the_corners_do(tmp_path: Path, turn: int) -> None:
+    corners = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [0.0, 1.0]])[::turn]
+    write_geojson(HdMap((Marking("diamond", corners, 3),), (), ORIGIN), tmp_path / "map.geojson")
+    geometry = json.loads((tmp_path / "map.geojson").read_text())["features"][0]["geometry"]
+    ring = np.array(geometry["coordinates"][0])
+    assert geometry["type"] == "Polygon"
+    assert ring.shape == (5, 2)
+    np.testing.assert_array_equal(ring[0], ring[-1])
+    x, y = (ring - ring[0]).T
+    assert x[:-1] @ y[1:] - y[:-1] @ x[1:] > 0
+
+
+def test_coordinates_are_longitude_and_latitude_to_a_tenth_of_a_millimetre(tmp_path: Path) -> None:
+    write_geojson(make_map(), tmp_path / "map.geojson")
+    feature = json.loads((tmp_path / "map.geojson").read_text())["features"][-1]
+    lon, lat = np.array(feature["geometry"]["coordinates"]).T
+    metres = enu_from_geodetic(ORIGIN, np.column_stack([lat, lon, np.full(len(lat), ORIGIN.altitude_m)]))
+    np.testing.assert_allclose(metres[:, :2], make_map().lanes[0].points_map, atol=2e-4)
+
+
+def test_local_metres_say_that_they_are_not_degrees(tmp_path: Path) -> None:
+    write_geojson(HdMap(make_map().markings), tmp_path / "map.geojson")
+    assert "metres" in json.loads((tmp_path / "map.geojson").read_text())["v2hdm"]["coordinates"]
+
+
+def test_a_map_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> None:
+    path = tmp_path / "map.geojson"
+    write_geojson(make_map(), path)
+    broken = HdMap((Marking("diamond", np.full((4, 2), np.nan), 3),))
+    with pytest.raises(ValueError, match="JSON compliant"):
+        write_geojson(broken, path)
+    assert_same(read_geojson(path), make_map())
+    assert [entry.name for entry in tmp_path.iterdir()] == ["map.geojson"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "line 1 JSON syntax error"),
+        ("[]", "expected a JSON object"),
+        ('{"type": "FeatureCollection", "features": []}', "not a map written by v2hdm"),
+        ('{"v2hdm": {}, "features": [{"properties": {}}]}', "feature 0: has neither"),
+        ('{"v2hdm": {}, "features": [{"properties": {"corners_map": [[0, 0]]}}]}', "feature 0, "),
+        ('{"v2hdm": {"origin": {"lat": 1}}, "features": []}', "origin: unknown key 'lat'"),
+    ],
+)
+def test_a_damaged_map_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "map.geojson").write_text(text)
+    with pytest.raises(MapFileError, match=message):
+        read_geojson(tmp_path / "map.geojson")
+
+
+def test_a_missing_map_is_named(tmp_path: Path) -> None:
+    with pytest.raises(MapFileError, match="no such file"):
+        read_geojson(tmp_path / "map.geojson")
+
+
+@pytest.mark.parametrize("with_covariance", [True, False])
+def test_a_calibration_survives_its_file(tmp_path: Path, with_covariance: bool) -> None:
+    half = np.random.default_rng(2).normal(size=(6, 6))
+    written = Calibration(camera_info(), looking_forward(), half @ half.T if with_covariance else None)
+    write_calibration(written, tmp_path / "front.yaml")
+    got = read_calibration(tmp_path / "front.yaml")
+    np.testing.assert_array_equal(got.cam_from_vehicle, written.cam_from_vehicle)
+    np.testing.assert_array_equal(got.info.intrinsic, written.info.intrinsic)
+    assert (got.info.name, got.info.distortion) == (written.info.name, written.info.distortion)
+    assert (got.covariance is None) == (not with_covariance)
+    if got.covariance is not None:
+        np.testing.assert_array_equal(got.covariance, half @ half.T)
+
+
+def test_sigmas_are_written_in_metres_and_degrees(tmp_path: Path) -> None:
+    covariance = np.diag(np.square([0.01, 0.02, 0.03, *np.radians([0.1, 0.2, 0.3])]))
+    write_calibration(Calibration(camera_info(), looking_forward(), covariance), tmp_path / "front.yaml")
+    text = (tmp_path / "front.yaml").read_text()
+    assert "translation_sigma_m: [0.01, 0.02, 0.03]" in text
+    assert "rotation_sigma_deg: [0.1" in text
+
+
+def test_the_ipm_of_a_calibration_is_that_of_the_vehicle() -> None:
+    calibration = Calibration(camera_info(), looking_forward())
+    np.testing.assert_allclose(
+        calibration.vehicle_from_pinhole_px, ipm_from_extrinsic(camera_info(), looking_forward()), atol=1e-15
+    )
+
+
+def test_a_calibration_with_a_typo_is_refused(tmp_path: Path) -> None:
+    write_calibration(Calibration(camera_info(), looking_forward()), tmp_path / "front.yaml")
+    text = (tmp_path / "front.yaml").read_text().replace("camera_matrix", "camera_matriks")
+    (tmp_path / "front.yaml").write_text(text)
+    with pytest.raises(MapFileError, match="did you mean 'camera_matrix'"):
+        read_calibration(tmp_path / "front.yaml")
