@@ -68,9 +68,9 @@ class DisturbanceConfig:
     heave_m: float = 0.005
     jitter_correlation_s: float = 0.25
     rtk_white_m: float = 0.006
-    rtk_correlated_m: float = 0.009
+    rtk_correlated_m: float = 0.010
     rtk_correlation_m: float = 30.0
-    heading_deg: float = 0.055
+    heading_deg: float = 0.065
     heading_correlation_s: float = 1.0
 
 

@@ -10,13 +10,13 @@ from v2hdm.detection.lens import distort_points
 from v2hdm.records import BoolArray, CameraInfo, FloatArray
 from v2hdm.simulate.scene import Box
 
-_SAMPLES = 6
-_FARTHEST_M = 45.0
+_SAMPLES = 5
+_FARTHEST_M = 40.0
 _NEAR_M = 0.3
 
 
 def quad_samples(corners: FloatArray) -> FloatArray:
-    """A grid of points (J, 36, 2), each standing for an equal share of quadrilaterals (J, 4, 2)."""
+    """A grid of points (J, 25, 2), each standing for an equal share of quadrilaterals (J, 4, 2)."""
     steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
     s, t = (g.ravel()[None, :, None] for g in np.meshgrid(steps, steps))
     a, b, c, d = (corners[:, k, None, :] for k in range(4))
@@ -26,14 +26,21 @@ def quad_samples(corners: FloatArray) -> FloatArray:
 def points_seen(
     info: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray, boxes: Sequence[Box]
 ) -> BoolArray:
-    """Which ground points (N, 2) an image shows: inside its border, within 45 m, not behind a box."""
+    """Which ground points (N, 2) an image shows: inside its border, within 40 m, not behind a box."""
     centre = -cam_from_map[:3, :3].T @ cam_from_map[:3, 3]
     seen = np.hypot(*(points_map - centre[:2]).T) < _FARTHEST_M
     seen[seen] = inside_image(info, cam_from_map, points_map[seen])
-    near = [b for b in boxes if np.hypot(*(np.array(b.centre_map) - centre[:2])) < _FARTHEST_M + 10.0]
+    near = [b for b in boxes if _may_hide(b, cam_from_map, float(centre[2]))]
     if seen.any() and near:
         seen[seen] = ~hidden_by(near, centre, points_map[seen])
     return np.asarray(seen)
+
+
+def _may_hide(box: Box, cam_from_map: FloatArray, height_m: float) -> bool:
+    """Whether a box lies before the camera, near enough, and not above all its sight lines to the ground."""
+    reach = float(np.hypot(box.size_m[0], box.size_m[1])) / 2
+    depth = float(cam_from_map[2, :2] @ np.array(box.centre_map) + cam_from_map[2, 3])
+    return box.base_m < height_m and -reach < depth < _FARTHEST_M + reach
 
 
 def inside_image(info: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray) -> BoolArray:
