@@ -31,18 +31,18 @@ def random_photometry(rng: np.random.Generator, image: Bytes) -> Bytes:
     gain, lift, gamma = np.exp(rng.normal(0, 0.15)), rng.normal(0, 0.03), np.exp(rng.normal(0, 0.15))
     tint = np.exp(rng.normal(0, 0.05, 3))
     curve = np.clip(((levels**gamma - 0.4) * gain + 0.4 + lift)[:, None] * tint, 0, 1)
-    out = cv2.LUT(image, np.round(curve * 255).astype(np.uint8)[None])
+    out = _bytes(cv2.LUT(image, np.round(curve * 255).astype(np.uint8)[None]))
     if rng.random() < 0.12:
         out[:] = cv2.cvtColor(out, cv2.COLOR_BGR2GRAY)[..., None]
     if rng.random() < 0.15:
         soft = cv2.GaussianBlur(out, (0, 0), 1.0)
         amount = rng.uniform(0.3, 1.2)
-        out = cv2.addWeighted(out, 1 + amount, soft, -amount, 0)
+        out = _bytes(cv2.addWeighted(out, 1 + amount, soft, -amount, 0))
     if rng.random() < 0.3:
         quality = int(rng.integers(40, 96))
         _, packed = cv2.imencode(".jpg", out, [cv2.IMWRITE_JPEG_QUALITY, quality])
-        out = cv2.imdecode(packed, cv2.IMREAD_COLOR)
-    return np.asarray(out, dtype=np.uint8)
+        out = _bytes(cv2.imdecode(packed, cv2.IMREAD_COLOR))
+    return out
 
 
 def half_resolution(labels: Bytes) -> Bytes:
@@ -59,3 +59,8 @@ def half_resolution(labels: Bytes) -> Bytes:
     )
     counts = np.stack([(blocks == c).sum(axis=2) for c in range(1 + len(PAINT_CLASSES))], axis=2)
     return np.where(counts.max(axis=2) > 2, counts.argmax(axis=2), IGNORE).astype(np.uint8)
+
+
+def _bytes(image: object) -> Bytes:
+    """OpenCV's return types are too wide for a strict reader."""
+    return np.asarray(image, dtype=np.uint8)

@@ -1,7 +1,7 @@
 """The exported file: the network's function at any size, with a label, whole or not at all."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +9,24 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
 
+from export import __main__ as door
+from export import onnx_file
 from export.onnx_file import METADATA_KEY, PARITY_SIZES, export_checkpoint
 from models import MarkingNet, NetConfig
+from train.augment import half_resolution
 from train.checkpoint import Checkpoint
 from train.config import TrainConfig
-from v2hdm.errors import DetectorError
+from train.losses import IGNORE
+from train.metrics import Confusion
+from v2hdm.errors import ConfigError, DetectorError
 from v2hdm.records import PAINT_CLASSES
+from v2hdm.simulate.training_scenes import training_sample
+
+ROOT = Path(__file__).resolve().parents[2]
+CONF = str(ROOT / "conf")
+SHIPPED = ROOT / "v2hdm" / "detection" / "default.onnx"
 
 SMALL = NetConfig(widths=[16, 16, 16, 16], dilations=[1, 2])
 
@@ -59,7 +70,48 @@ def test_the_label_says_how_to_run_it_and_where_it_comes_from(exported: Path) ->
     assert "private" not in properties[METADATA_KEY]
 
 
-def test_a_file_that_differs_from_its_network_is_not_written(checkpoint: Checkpoint, tmp_path: Path) -> None:
+def test_a_file_that_differs_from_its_network_is_not_written(
+    checkpoint: Checkpoint, exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(onnx_file, "to_onnx", lambda net, opset: onnx.load(exported))
+    other = replace(checkpoint, averaged={k: v + 0.1 for k, v in checkpoint.averaged.items()})
     with pytest.raises(DetectorError, match="was not written"):
-        export_checkpoint(checkpoint, tmp_path / "net.onnx", opset=18, tolerance=-1.0)
+        export_checkpoint(other, tmp_path / "net.onnx", opset=18, tolerance=1e-3)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("overrides", "line"),
+    [
+        (["checkpoint=nowhere.pt", "output=net.onnx"], "no checkpoint at nowhere.pt"),
+        (["output=net.onnx"], "checkpoint= is missing"),
+    ],
+)
+def test_what_is_missing_is_named_in_one_line(overrides: list[str], line: str) -> None:
+    with initialize_config_dir(CONF, version_base="1.3"):
+        composed = compose("export", overrides=overrides)
+    with pytest.raises(ConfigError, match=line):
+        door.run(composed)
+
+
+def test_the_shipped_detector_finds_paint_where_it_is() -> None:
+    session = onnxruntime.InferenceSession(SHIPPED)
+    confusion, shifts = Confusion(), []
+    for index in range(12):
+        sample = training_sample(424242, index, 448, 256, difficulty=0.3)
+        (logits,) = session.run(None, {"image": sample.image[None]})
+        labels = half_resolution(sample.labels)
+        confusion.add(torch.from_numpy(logits), torch.from_numpy(labels)[None].long())
+        known = labels != IGNORE
+        found, painted = (logits[0].argmax(axis=0) > 0) & known, (labels > 0) & known
+        if (found & painted).sum() > 0.8 * max(painted.sum(), found.sum(), 100):
+            shifts.append(
+                [a.mean() - b.mean() for a, b in zip(found.nonzero(), painted.nonzero(), strict=True)]
+            )
+    assert confusion.score().paint_iou > 0.5
+    assert np.abs(np.median(shifts, axis=0)).max() < 0.3
+
+
+def test_the_shipped_detector_knows_the_classes_of_this_code() -> None:
+    properties = {p.key: p.value for p in onnx.load(SHIPPED).metadata_props}
+    assert json.loads(properties[METADATA_KEY])["classes"] == list(PAINT_CLASSES)

@@ -59,7 +59,9 @@ def test_paint_polygons_are_convex_and_have_the_size_asked_for() -> None:
     assert polygons
     for polygon in polygons:
         edges = np.roll(polygon, -1, axis=0) - polygon
-        turns = edges[:, 0] * np.roll(edges, -1, axis=0)[:, 1] - edges[:, 1] * np.roll(edges, -1, axis=0)[:, 0]
+        turns = (
+            edges[:, 0] * np.roll(edges, -1, axis=0)[:, 1] - edges[:, 1] * np.roll(edges, -1, axis=0)[:, 0]
+        )
         assert (turns > -1e-9).all() or (turns < 1e-9).all()
     assert np.ptp(rhombus(np.zeros(2), 1.2, 0.6)[:, 0]) == pytest.approx(1.2)
     assert np.ptp(rectangle(np.zeros(2), 3.0, 0.15, np.pi / 2)[:, 1]) == pytest.approx(3.0)
