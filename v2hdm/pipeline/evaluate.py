@@ -10,10 +10,13 @@ import numpy as np
 
 from v2hdm.detection.ground import ipm_from_extrinsic
 from v2hdm.drive.truth import read_truth
-from v2hdm.mapping.growth import growing_maps
-from v2hdm.mapping.methods import MethodResult, naive_method
+from v2hdm.mapping.methods import run_naive
+from v2hdm.mapping.optimise import Optimiser, nearest_extrinsic
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.records import Drive, ImageDetections, Truth
+from v2hdm.mapping.results import MethodResult
+from v2hdm.mapping.sightings import collect_sightings
+from v2hdm.mapping.views import views_of
+from v2hdm.records import Drive, HdMap, ImageDetections, Truth
 from v2hdm.report.evaluation import extrinsic_figures, growth_figures, headline, map_figures
 from v2hdm.report.metrics import driven_past
 
@@ -48,7 +51,7 @@ def evaluate(
     reference: dict[str, Any] = {}
     growth: dict[str, list[tuple[int, float]]] = {}
     for done, (name, by_method) in enumerate(methods.items()):
-        progress(done, len(methods) + 1)
+        progress(done, len(methods))
         cameras = next(iter(by_method.values())).cameras
         expected = driven_past(drive, truth, cameras) if truth else None
         results[name] = {
@@ -58,14 +61,9 @@ def evaluate(
         if truth is not None:
             ideal = _naive_under_true_extrinsic(drive, detections, cameras, truth, options)
             reference[name] = {"naive_true_extrinsic": map_figures(ideal.hd_map, truth, expected)}
-    progress(len(methods), len(methods) + 1)
+    progress(len(methods), len(methods))
     if truth is not None:
-        whole_rig = list(methods.values())[-1]
-        growth = {
-            method: growth_figures(maps, truth)
-            for method, maps in growing_maps(drive, detections, whole_rig, options).items()
-        }
-    progress(len(methods) + 1, len(methods) + 1)
+        growth = _growth(list(methods.values())[-1], truth)
     metrics: dict[str, Any] = {"results": results, "extrinsics": _extrinsics(drive, methods, truth)}
     if truth is not None:
         metrics |= {"reference": reference, "disturbances": truth.disturbances, "growth": growth}
@@ -95,7 +93,25 @@ def _naive_under_true_extrinsic(
     ipms = {
         name: ipm_from_extrinsic(drive.cameras[name].info, truth.cam_from_vehicle[name]) for name in cameras
     }
-    return naive_method("true extrinsic", drive, detections, cameras, ipms, options)
+    sightings = collect_sightings(drive, detections, cameras)
+    optimiser = Optimiser(sightings, views_of(drive, cameras), drive.cameras, drive.pose_noise, options)
+    return run_naive(
+        "true extrinsic", drive, detections, sightings, optimiser.initial_tracks(), ipms, options
+    )
+
+
+def _growth(methods: Mapping[str, MethodResult], truth: Truth) -> dict[str, list[tuple[int, float]]]:
+    """Corner RMSE (m) over the first n markings, per method; only Opt solves anew at each n.
+
+    The other methods keep a marking as it is once it has been passed, so their first n will do.
+    """
+    steps = methods["Opt"].growth
+    counts = [len(step.markings) for step in steps]
+    growth = {"Opt": growth_figures([HdMap(step.markings) for step in steps], truth)}
+    for name, result in methods.items():
+        if name != "Opt":
+            growth[name] = growth_figures([HdMap(result.hd_map.markings[:n]) for n in counts], truth)
+    return growth
 
 
 def _extrinsics(drive: Drive, methods: CameraSets, truth: Truth | None) -> dict[str, Any]:
@@ -108,7 +124,9 @@ def _extrinsics(drive: Drive, methods: CameraSets, truth: Truth | None) -> dict[
         for name, calibration in optimised.calibrations.items():
             found = extrinsic_figures(
                 calibration.cam_from_vehicle,
-                optimised.initial_cam_from_vehicle[name],
+                nearest_extrinsic(
+                    drive.cameras[name].info, drive.cameras[name].ipm[drive.cameras[name].initial_ipm]
+                ),
                 truth.cam_from_vehicle[name] if truth else None,
             )
             if calibration.covariance is not None:

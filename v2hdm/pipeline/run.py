@@ -30,6 +30,9 @@ from v2hdm.simulate import PortConfig, rendered_drive
 
 log = logging.getLogger(__name__)
 
+GROWTH_STEPS = 8
+"""Sizes of the growing map at which its error is drawn."""
+
 
 class Progress(Protocol):
     """Told how far a named piece of long work is."""
@@ -118,7 +121,7 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
 def camera_sets(drive: Drive) -> dict[str, tuple[str, ...]]:
     """Each camera alone and all together: named ``both`` for two cameras, ``all`` for more."""
     names = tuple(drive.cameras)
-    sets = {name: (name,) for name in names}
+    sets: dict[str, tuple[str, ...]] = {name: (name,) for name in names}
     if len(names) > 1:
         sets["both" if len(names) == 2 else "all"] = names
     return sets
@@ -153,7 +156,12 @@ def _map_camera_sets(
     found = {}
     for done, (name, cameras) in enumerate(sets.items()):
         progress("map", done, len(sets))
-        found[name] = run_methods(drive, detections, cameras, config.mapping, device=config.device)
+        # The picture of the growing map is drawn for the whole rig, which comes last, and needs truth.
+        growth_steps = GROWTH_STEPS if drive.truth_dir and done == len(sets) - 1 else 0
+        found[name] = run_methods(drive, detections, cameras, config.mapping, growth_steps=growth_steps)
+        for exclusion in found[name]["Opt"].excluded:
+            where = ", ".join(f"{value:.2f}" for value in exclusion.position_map)
+            log.info("%s: left out a %s at (%s): %s", name, exclusion.kind, where, exclusion.reason)
     progress("map", len(sets), len(sets))
     return found
 

@@ -12,7 +12,7 @@ from v2hdm.detection.batch import read_image
 from v2hdm.detection.ground import ipm_from_extrinsic
 from v2hdm.hdmap.calibration import write_calibration
 from v2hdm.hdmap.geojson import write_geojson
-from v2hdm.mapping.methods import MethodResult
+from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.evaluate import Judgement
 from v2hdm.records import Drive, FloatArray, Image
 from v2hdm.report.figures import save_birdseye, save_growth, save_overlay
