@@ -1,0 +1,90 @@
+"""Each rule of acceptance refuses what it is meant for, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from v2hdm.mapping.acceptance import Candidates, judge
+from v2hdm.mapping.options import AcceptanceOptions
+
+DIAMOND = np.array([[0.6, 0.0], [0.0, 0.3], [-0.6, 0.0], [0.0, -0.3]])
+COUNT = 12
+
+
+def row_of_diamonds() -> Candidates:
+    """Twelve sound diamonds, five metres apart."""
+    return Candidates(
+        kind=np.zeros(COUNT, dtype=np.int64),
+        corners_map=DIAMOND + np.arange(COUNT)[:, None, None] * np.array([5.0, 0.0]),
+        sigma_m=np.full(COUNT, 0.01),
+        sightings=np.full(COUNT, 10),
+        inlier_share=np.ones(COUNT),
+        easy_views=np.full(COUNT, 8),
+        easy_detections=np.full(COUNT, 8),
+    )
+
+
+def refused(candidates: Candidates) -> dict[int, str]:
+    verdict = judge(candidates, AcceptanceOptions())
+    return {group: reason for group, reason in enumerate(verdict) if reason is not None}
+
+
+def test_sound_markings_are_all_accepted() -> None:
+    assert refused(row_of_diamonds()) == {}
+
+
+def test_a_marking_seen_twice_is_refused() -> None:
+    sound = row_of_diamonds()
+    sound.sightings[3] = 2
+    assert list(refused(sound)) == [3]
+
+
+def test_a_marking_with_a_missing_corner_is_refused() -> None:
+    sound = row_of_diamonds()
+    sound.corners_map[4, 1] = np.nan
+    assert refused(sound) == {4: "a corner was never seen twice"}
+
+
+def test_contradictory_sightings_are_refused() -> None:
+    sound = row_of_diamonds()
+    sound.inlier_share[0] = 0.3
+    assert refused(sound) == {0: "its sightings contradict each other"}
+
+
+def test_what_most_of_its_images_do_not_show_is_refused() -> None:
+    sound = row_of_diamonds()
+    sound.easy_detections[7] = 1
+    assert refused(sound) == {7: "found in too few of its images"}
+
+
+def test_seldom_seen_is_no_fault_where_there_were_few_chances() -> None:
+    sound = row_of_diamonds()
+    sound.easy_views[7], sound.easy_detections[7] = 4, 0
+    assert refused(sound) == {}
+
+
+def test_a_marking_twice_as_large_as_all_others_is_refused() -> None:
+    sound = row_of_diamonds()
+    sound.corners_map[5] = sound.corners_map[5].mean(axis=0) + 2 * DIAMOND
+    assert refused(sound) == {5: "not shaped like the others of its class"}
+
+
+def test_a_class_of_mixed_shapes_has_no_consensus_to_stray_from() -> None:
+    sound = row_of_diamonds()
+    for group in range(COUNT):
+        sound.corners_map[group] = sound.corners_map[group].mean(axis=0) + (0.5 + 0.2 * group) * DIAMOND
+    assert refused(sound) == {}
+
+
+def test_of_two_markings_on_one_spot_the_better_supported_stays() -> None:
+    sound = row_of_diamonds()
+    sound.corners_map[2] = sound.corners_map[1] + [0.1, 0.0]
+    sound.sightings[2] = 4
+    assert refused(sound) == {2: "lies on a better supported marking"}
+
+
+def test_an_uncertain_marking_is_refused() -> None:
+    sound = row_of_diamonds()
+    assert list(refused(replace(sound, sigma_m=np.where(np.arange(COUNT) == 6, 0.5, 0.01)))) == [6]

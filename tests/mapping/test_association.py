@@ -1,0 +1,150 @@
+"""Tracks stay pure under a wrong IPM; merging joins what is one marking and nothing else."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.mapping.scene import Scene, SceneOptions, make_scene
+from v2hdm.mapping.association import Association, fuse_groups, keep_rows, same_groups
+from v2hdm.mapping.location import Located, Rig, locate
+from v2hdm.mapping.merge import merge_groups
+from v2hdm.mapping.optimise import initial_rig
+from v2hdm.mapping.options import AssociationOptions
+from v2hdm.mapping.shapes import align
+from v2hdm.mapping.sightings import Sightings, collect_sightings
+from v2hdm.mapping.tracks import Uncertainty, build_tracks
+
+MAX_RANGE_M = 16.0
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return make_scene(SceneOptions(length_m=80.0, seed=11, false_rate=0.0))
+
+
+@pytest.fixture(scope="module")
+def sightings(scene: Scene) -> Sightings:
+    return collect_sightings(scene.drive, scene.detections, ("front", "rear"))
+
+
+def true_rig(scene: Scene, sightings: Sightings) -> Rig:
+    rig = initial_rig(scene.drive.cameras, sightings.map_from_vehicle)
+    truth = np.stack([scene.cam_from_vehicle[name] for name in sightings.cameras])
+    return Rig(rig.intrinsic, truth, sightings.map_from_vehicle)
+
+
+def true_marking(scene: Scene, sightings: Sightings) -> np.ndarray:
+    """Index of the marking (S,) that each sighting shows, by its corners under the true extrinsic."""
+    located = locate(sightings, true_rig(scene, sightings))
+    corners = np.stack([m.corners_map for m in scene.markings])
+    distance = np.linalg.norm(located.corners_map[:, None, :, None] - corners[None, :, None, :], axis=-1)
+    distance = np.where(sightings.valid[:, None, :, None], distance, np.nan).min(axis=3)
+    return np.nanmean(distance, axis=2).argmin(axis=1)
+
+
+def tracks_under(rig: Rig, sightings: Sightings, sigma_rad: float) -> tuple[Association, Located]:
+    located = locate(sightings, rig)
+    located.valid[:] &= located.range_m <= MAX_RANGE_M
+    return build_tracks(
+        sightings, located, rig, Uncertainty(sigma_rad, 0.0017, 0.01), AssociationOptions()
+    ), located
+
+
+def test_under_an_ipm_that_is_wrong_by_decimetres_no_track_mixes_two_markings(
+    scene: Scene, sightings: Sightings
+) -> None:
+    tracks, _ = tracks_under(initial_rig(scene.drive.cameras, sightings.map_from_vehicle), sightings, 0.015)
+    marking = true_marking(scene, sightings)
+    grouped = tracks.group >= 0
+    per_track = np.unique(np.stack([tracks.group[grouped], marking[grouped]]), axis=1)
+    assert per_track.shape[1] == tracks.count
+
+
+def test_tracks_are_long_although_images_miss_markings(scene: Scene, sightings: Sightings) -> None:
+    tracks, _ = tracks_under(initial_rig(scene.drive.cameras, sightings.map_from_vehicle), sightings, 0.015)
+    assert np.median(np.bincount(tracks.group[tracks.group >= 0])) >= 8
+
+
+def test_corner_orders_agree_within_a_track(scene: Scene, sightings: Sightings) -> None:
+    tracks, _ = tracks_under(initial_rig(scene.drive.cameras, sightings.map_from_vehicle), sightings, 0.015)
+    located = locate(sightings, true_rig(scene, sightings))
+    true_corners = np.stack([m.corners_map for m in scene.markings])[true_marking(scene, sightings)]
+    whole = np.ones((len(sightings), 4), dtype=bool)
+    true_shift = align(true_corners, whole, located.corners_map, located.valid).shift
+    judged = (tracks.group >= 0) & (located.valid.sum(axis=1) >= 3)
+    turn = (tracks.shift - true_shift) % 4
+    per_track = np.unique(np.stack([tracks.group[judged], turn[judged]]), axis=1)
+    assert per_track.shape[1] == len(np.unique(tracks.group[judged]))
+
+
+def test_merging_leaves_one_group_per_marking(scene: Scene, sightings: Sightings) -> None:
+    rig = true_rig(scene, sightings)
+    tracks, located = tracks_under(rig, sightings, 0.002)
+    merged = merge_groups(
+        tracks,
+        sightings,
+        fuse_groups(tracks, located, 0.0017),
+        floor_m=0.05,
+        gate_sigmas=4.0,
+        max_distance_m=1.5,
+        shape_tolerance=0.25,
+    )
+    marking = true_marking(scene, sightings)
+    # A sighting with a grossly misplaced corner may stay alone; it never makes a marking.
+    size = np.bincount(merged.group[merged.group >= 0])
+    supported = (merged.group >= 0) & (size[merged.group] >= 3)
+    pairs = np.unique(np.stack([merged.group[supported], marking[supported]]), axis=1)
+    assert pairs.shape[1] == len(np.unique(pairs[0])) == len(np.unique(pairs[1]))
+    assert len(np.unique(pairs[1])) >= len(np.unique(marking[merged.group >= 0])) - 1
+    assert merged.count < tracks.count
+
+
+def test_two_markings_of_one_image_are_never_merged(sightings: Sightings) -> None:
+    together = sightings.subset(np.flatnonzero(sightings.image == sightings.image[0])[:2])
+    association = Association(np.array([0, 1]), np.zeros(2, int), 2)
+    rig_corners = np.tile(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), (2, 1, 1))
+    located = Located(
+        rig_corners,
+        np.tile(np.eye(2) * 1e-4, (2, 4, 1, 1)),
+        rig_corners + 5,
+        np.full(2, 2.4),
+        np.ones((2, 4), bool),
+    )
+    merged = merge_groups(
+        association,
+        together,
+        fuse_groups(association, located, 0.001),
+        floor_m=0.05,
+        gate_sigmas=4.0,
+        max_distance_m=1.5,
+        shape_tolerance=0.25,
+    )
+    assert merged.count == 2
+
+
+def test_groups_are_renumbered_when_rows_are_dropped() -> None:
+    association = Association(np.array([0, 1, 2, 1, -1]), np.arange(5) % 4, 3)
+    kept = keep_rows(association, np.array([False, True, True, True, True]))
+    assert kept.group.tolist() == [-1, 0, 1, 0, -1]
+    assert kept.count == 2
+
+
+def test_the_same_division_under_other_numbers_is_the_same() -> None:
+    a = Association(np.array([0, 0, 1, 2, -1]), np.zeros(5, int), 3)
+    b = Association(np.array([5, 5, 0, 1, 1]), np.zeros(5, int), 6)
+    c = Association(np.array([5, 0, 0, 1, 1]), np.zeros(5, int), 6)
+    assert same_groups(a, b)
+    assert not same_groups(a, c)
+
+
+def test_a_far_sighting_cannot_ruin_the_mean_of_near_ones() -> None:
+    corners = np.tile(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), (4, 1, 1))
+    corners[3] += 0.8
+    ray = np.full((4, 4, 2), 4.0)
+    ray[3] = 14.0
+    located = Located(
+        corners, np.tile(np.eye(2) * 1e-4, (4, 4, 1, 1)), ray, np.full(4, 2.4), np.ones((4, 4), bool)
+    )
+    fused = fuse_groups(Association(np.zeros(4, int), np.zeros(4, int), 1), located, 0.002)
+    assert np.abs(fused.corners_map[0] - corners[0]).max() < 0.02

@@ -1,0 +1,136 @@
+"""Lane clouds drawn by hand: what belongs together is joined, what does not is not."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from v2hdm.mapping.lane_points import LaneCloud
+from v2hdm.mapping.lanes import map_lanes
+from v2hdm.mapping.options import LaneOptions
+from v2hdm.records import FloatArray, Lane
+
+OPTIONS = LaneOptions()
+
+
+def cloud_of(
+    lines: list[FloatArray], dash: bool = False, images: int = 12, sigma_m: float = 0.03, seed: int = 0
+) -> LaneCloud:
+    """Each line (N, 2) seen by ``images`` images, every point off by ``sigma_m``."""
+    rng = np.random.default_rng(seed)
+    points, tangents, image = [], [], []
+    for line in lines:
+        direction = np.gradient(line, axis=0)
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        for i in range(images):
+            points.append(line + rng.normal(size=line.shape) * sigma_m)
+            tangents.append(direction * rng.choice([-1.0, 1.0]))
+            image.append(np.full(len(line), i))
+    count = sum(len(p) for p in points)
+    return LaneCloud(
+        np.concatenate(points),
+        np.concatenate(tangents),
+        np.full(count, 1 / sigma_m**2),
+        np.concatenate(image),
+        np.full(count, dash),
+    )
+
+
+def straight(start: float, stop: float, y: float = 0.0, step: float = 0.3) -> FloatArray:
+    x = np.arange(start, stop, step)
+    return np.column_stack([x, np.full_like(x, y)])
+
+
+def length(lane: Lane) -> float:
+    return float(np.linalg.norm(np.diff(lane.points_map, axis=0), axis=1).sum())
+
+
+def test_a_straight_line_becomes_one_polyline_on_its_centre() -> None:
+    (lane,) = map_lanes(cloud_of([straight(0, 40)]), OPTIONS)
+    assert lane.kind == "lane_line"
+    assert length(lane) > 38
+    assert np.abs(lane.points_map[:, 1]).max() < 0.03
+    steps = np.linalg.norm(np.diff(lane.points_map, axis=0), axis=1)
+    np.testing.assert_allclose(steps, OPTIONS.node_spacing_m, rtol=0.1)
+
+
+def test_a_turn_of_twelve_metres_radius_stays_one_line() -> None:
+    angle = np.arange(0, np.pi, 0.3 / 12)
+    (lane,) = map_lanes(cloud_of([12 * np.column_stack([np.cos(angle), np.sin(angle)])]), OPTIONS)
+    assert length(lane) > 0.95 * 12 * np.pi
+    assert np.abs(np.linalg.norm(lane.points_map, axis=1) - 12).max() < 0.05
+
+
+def test_dashes_of_one_line_become_one_dashed_lane_across_their_gaps() -> None:
+    dashes = [straight(s, s + 3.0) for s in np.arange(0, 36, 6.0)]
+    (lane,) = map_lanes(cloud_of(dashes, dash=True), OPTIONS)
+    assert lane.kind == "lane_dash"
+    assert length(lane) > 31
+    assert np.abs(lane.points_map[:, 1]).max() < 0.05
+
+
+def test_dashes_of_a_bend_follow_it_across_their_gaps() -> None:
+    radius = 25.0
+    dashes = []
+    for start in np.arange(0, 30, 6.0):
+        angle = np.arange(start, start + 3.0, 0.3) / radius
+        dashes.append(radius * np.column_stack([np.cos(angle), np.sin(angle)]))
+    (lane,) = map_lanes(cloud_of(dashes, dash=True), OPTIONS)
+    assert np.abs(np.linalg.norm(lane.points_map, axis=1) - radius).max() < 0.1
+
+
+def test_solid_paint_is_not_continued_across_a_wide_gap() -> None:
+    lanes = map_lanes(cloud_of([straight(0, 15), straight(22, 40)]), OPTIONS)
+    assert len(lanes) == 2
+
+
+def test_neighbouring_dashed_lines_are_never_connected() -> None:
+    left = [straight(s, s + 3.0, 1.7) for s in np.arange(0, 24, 6.0)]
+    right = [straight(s, s + 3.0, -1.7) for s in np.arange(3, 27, 6.0)]
+    lanes = map_lanes(cloud_of(left + right, dash=True), OPTIONS)
+    assert len(lanes) == 2
+    assert all(np.ptp(lane.points_map[:, 1]) < 0.1 for lane in lanes)
+
+
+def test_a_double_line_stays_double() -> None:
+    lanes = map_lanes(cloud_of([straight(0, 20, 0.0), straight(0, 20, 0.35)]), OPTIONS)
+    assert len(lanes) == 2
+    assert sorted(round(float(np.median(lane.points_map[:, 1])), 1) for lane in lanes) == [0.0, 0.3]
+
+
+def test_crossing_lines_do_not_bend_each_other() -> None:
+    across = straight(-10, 10)[:, ::-1] + [10.0, 0.0]
+    lanes = map_lanes(cloud_of([straight(0, 20), across]), OPTIONS)
+    assert sum(length(lane) for lane in lanes) > 36
+    for lane in lanes:
+        assert min(np.abs(lane.points_map[:, 1]).max(), np.abs(lane.points_map[:, 0] - 10).max()) < 0.06
+
+
+def test_what_two_images_saw_is_no_lane() -> None:
+    assert map_lanes(cloud_of([straight(0, 20)], images=2), OPTIONS) == ()
+
+
+def test_a_closed_line_is_closed() -> None:
+    angle = np.arange(0, 2 * np.pi, 0.3 / 15)
+    (lane,) = map_lanes(cloud_of([15 * np.column_stack([np.cos(angle), np.sin(angle)])]), OPTIONS)
+    assert np.linalg.norm(lane.points_map[0] - lane.points_map[-1]) < 0.6
+
+
+def test_an_empty_cloud_has_no_lanes() -> None:
+    assert (
+        map_lanes(
+            LaneCloud(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, int), np.zeros(0, bool)),
+            OPTIONS,
+        )
+        == ()
+    )
+
+
+def test_a_hundred_thousand_points_take_seconds() -> None:
+    cloud = cloud_of([straight(0, 350, y, 0.25) for y in (-3.5, 0.0, 3.5, 7.0)], images=18)
+    assert len(cloud.weight) > 100_000
+    begin = time.perf_counter()
+    lanes = map_lanes(cloud, OPTIONS)
+    assert len(lanes) == 4
+    assert time.perf_counter() - begin < 30
