@@ -4,8 +4,19 @@
 inside. :mod:`v2hdm.adjust.problem` states the model.
 """
 
+from v2hdm.adjust.observability import Observability, observability
 from v2hdm.adjust.problem import Observations, PoseSigma, Problem, SolveOptions
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
 
-__all__ = ["Observations", "PoseSigma", "Problem", "Solution", "SolveOptions", "Status", "solve"]
+__all__ = [
+    "Observability",
+    "Observations",
+    "PoseSigma",
+    "Problem",
+    "Solution",
+    "SolveOptions",
+    "Status",
+    "observability",
+    "solve",
+]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
-from v2hdm.adjust.lbfgs import minimise
+from v2hdm.adjust.lbfgs import minimise, predicted_gap
 from v2hdm.adjust.reduced import make_plan
 from v2hdm.adjust.residuals import Estimate, Gradient, Loss, cost_and_gradient, observe
 from v2hdm.adjust.robust import annealed_scale, loss
@@ -20,7 +20,7 @@ _ANNEALING_TOLERANCE = 1e-3
 _ANNEALING_STEP = 3.0
 _ITERATIONS_PER_WHITENING = 12
 _MAX_LM_DAMPING = 1e8
-_TINY = 1e-300
+_MIN_LM_DAMPING = 1e-5
 
 
 @dataclass(frozen=True)
@@ -93,9 +93,13 @@ def descend(
         whitening = factorise(arrays, plan, estimate, loss(current.name, squared, scale)[1], damping)
         objective = Objective(whitening, estimate, current)
         cost, gradient = objective(squared.new_zeros(whitening.size))
-        gap = float(gradient.square().sum() / cost.clamp(min=_TINY))
+        gap = predicted_gap(cost, gradient)
         refreshes += 1
-        done = (final and gap <= tolerance) or refreshes > max_refreshes or evaluations >= max_evaluations
+        done = (
+            (final and gap <= tolerance and damping == 0)
+            or refreshes > max_refreshes
+            or evaluations >= max_evaluations
+        )
         if done or not progressing:
             return Descent(estimate, whitening, gap, evaluations + 1, progressing)
         if solver == "lm":
@@ -116,5 +120,5 @@ def _newton_step(
     """One damped Gauss-Newton step of Levenberg-Marquardt; a rejected one raises the damping."""
     reached, _ = objective(-gradient)
     if float(reached) <= float(cost):
-        return -gradient, reached, damping / 10 if damping > 1e-9 else 0.0
-    return torch.zeros_like(gradient), cost, min(max(10 * damping, 1e-6), _MAX_LM_DAMPING)
+        return -gradient, reached, damping / 10 if damping > _MIN_LM_DAMPING else 0.0
+    return torch.zeros_like(gradient), cost, min(max(10 * damping, _MIN_LM_DAMPING), _MAX_LM_DAMPING)

@@ -16,6 +16,14 @@ _LINE_SEARCH_EVALUATIONS = 25
 _NO_PROGRESS = 1e-15
 
 
+def predicted_gap(cost: Tensor, gradient: Tensor) -> float:
+    """|g|^2 as a fraction of the cost: twice what a unit Newton step on whitened variables gains.
+
+    A cost below 1 is a fit better than one standard deviation in all; the gap is then absolute.
+    """
+    return float(gradient.square().sum() / cost.clamp(min=1.0))
+
+
 def minimise(
     objective: Objective,
     cost: Tensor,
@@ -33,7 +41,7 @@ def minimise(
         objective: cost and gradient; the Hessian at 0 is about the identity.
         cost: at 0.
         gradient: at 0, (n,).
-        tolerance: stop when |g|^2 is below this fraction of the cost.
+        tolerance: stop when :func:`predicted_gap` is below this.
         max_iterations: after these the whitening is better renewed.
 
     Returns:
@@ -70,7 +78,7 @@ def minimise(
     )
     best, best_gradient = cost, gradient
     for _ in range(max_iterations):
-        if float(best_gradient.square().sum()) <= tolerance * float(best):
+        if predicted_gap(best, best_gradient) <= tolerance:
             break
         optimizer.step(closure)  # type: ignore[no-untyped-call]
         reached, reached_gradient = evaluate(u.detach())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
@@ -74,7 +74,7 @@ class Solution:
     gap: float
     chi2_per_dof: float
     time_s: float
-    covariance: Covariance
+    covariance: Covariance = field(repr=False)
 
     @property
     def cost(self) -> float:

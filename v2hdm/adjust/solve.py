@@ -25,6 +25,7 @@ from v2hdm.records import FloatArray
 
 # Squared residual that one good observation in a thousand exceeds: chi-square, 2 degrees of freedom.
 _OUTLIER_SQUARED = 13.8
+_MEDIAN_SQUARED = 1.386
 
 
 def solve(problem: Problem, options: SolveOptions | None = None) -> Solution:
@@ -122,7 +123,9 @@ def _status(descent: Descent, options: SolveOptions, behind: bool) -> Status:
 
 def _chi2_per_dof(arrays: Arrays, terms: dict[str, Tensor], squared: Tensor) -> float:
     """Chi-square of good observations and priors per degree of freedom."""
-    good = squared[squared <= _OUTLIER_SQUARED]
+    # The median tells the noise's own scale, whatever the outliers.
+    scale = max(1.0, float(squared.median()) / _MEDIAN_SQUARED)
+    good = squared[squared <= _OUTLIER_SQUARED * scale]
     chi2 = good.sum() + 2 * (terms["camera_centre"] + terms["frame_states"])
     centres = int((arrays.centre_information_root > 0).sum())
     free = 2 * arrays.corner_count + 6 * arrays.camera_count - centres

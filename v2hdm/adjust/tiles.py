@@ -19,6 +19,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from torch import Tensor
 
+from v2hdm.errors import AdjustError
+
 Tiles = dict[tuple[int, int], Tensor]
 """Lower tiles by (row, column) in elimination order; row :data:`TIP` holds the border."""
 
@@ -118,7 +120,10 @@ def factorise_tiles(tiles: Tiles, pattern: Pattern) -> TiledCholesky:
         factor = _factorise(tiles, pattern, damping)
         if factor is not None:
             return factor
-    raise ValueError("the reduced matrix is not finite or far from positive definite")
+    raise AdjustError(
+        "the normal equations cannot be factorised even when damped: look for observations or priors "
+        "whose sigmas differ by many orders of magnitude"
+    )
 
 
 def _factorise(tiles: Tiles, pattern: Pattern, damping: float) -> TiledCholesky | None:

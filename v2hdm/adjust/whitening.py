@@ -28,6 +28,8 @@ from v2hdm.adjust.tiles import TIP, TiledCholesky, factorise_tiles
 
 # Keeps a corner factorable whose sightings a robust loss has all but switched off.
 _WEIGHT_FLOOR = 1e-6
+# Information, 1 / m^2, that keeps a corner factorable which runs off to the horizon.
+_CORNER_FLOOR = 1e-10
 # Below this a pivot is what rounding left of zero.
 _SINGULAR_PIVOT = 1e-13
 
@@ -109,7 +111,7 @@ def factorise(
     by_pair, by_corner = by_pair * root, by_corner * root
     blocks = by_corner.new_zeros(arrays.corner_count, 2, 2)
     blocks.index_add_(0, arrays.corner, by_corner.mT @ by_corner)
-    blocks.diagonal(dim1=1, dim2=2).mul_(1 + damping)
+    blocks.diagonal(dim1=1, dim2=2).mul_(1 + damping).add_(_CORNER_FLOOR)
     corner_factor = cholesky_2x2(blocks)
     coupling = solve_lower_matrix(corner_factor[arrays.corner], by_corner.mT @ by_pair)
     spread = pair_from_state(arrays, estimate)

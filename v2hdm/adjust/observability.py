@@ -1,0 +1,65 @@
+"""What the drive itself says about each extrinsic, and what rests on the survey alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from v2hdm.adjust.problem import Problem
+from v2hdm.adjust.solution import Solution
+from v2hdm.records import FloatArray
+
+AXES: tuple[str, ...] = ("forward", "left", "up", "roll", "pitch", "heading")
+
+# Share of the information from which a direction is said to rest on the survey. Two cameras that
+# share an unobservable direction halve it between them, hence below one half.
+_RESTS_ON_PRIOR = 0.25
+
+
+@dataclass(frozen=True)
+class Observability:
+    """Of one camera's extrinsic, along and about the vehicle's axes in the order of :data:`AXES`.
+
+    ``sigma`` (6,) is the standard deviation after the adjustment, m and rad. ``prior_share`` (3,) is how
+    much of what is known of the camera's centre comes from its prior: 0, the drive alone
+    determines it; 1, only the prior does. (For a normal variable the prior's share of the
+    information is the ratio of the variances after and before.)
+    """
+
+    sigma: FloatArray
+    prior_share: FloatArray
+
+    @property
+    def unobserved(self) -> tuple[str, ...]:
+        """Directions of the camera's centre that rest on its prior."""
+        return tuple(
+            axis for axis, share in zip(AXES, self.prior_share, strict=False) if share > _RESTS_ON_PRIOR
+        )
+
+    def sentence(self, camera: str) -> str:
+        """For the person who drove: what is known how well, and what would help."""
+        turns = np.rad2deg(self.sigma[3:])
+        rotation = f"rotation known to {turns.max():.3f} deg"
+        if not self.unobserved:
+            centre = f"centre known to {100 * self.sigma[:3].max():.1f} cm"
+            return f"{camera}: {centre}, {rotation}; the drive fixes both"
+        worst = 100 * max(self.sigma[AXES.index(axis)] for axis in self.unobserved)
+        level = [axis for axis in self.unobserved if axis != "up"]
+        hint = "one turn on the route would fix them" if level else "longer sightings would fix it"
+        offsets = " and ".join(self.unobserved)
+        return f"{camera}: {rotation}; the {offsets} offset ({worst:.1f} cm) rests on the survey: {hint}"
+
+
+def observability(problem: Problem, solution: Solution) -> Sequence[Observability]:
+    """How well each camera of ``problem`` is determined by the drive, one record a camera."""
+    rotation = solution.cam_from_vehicle[:, :3, :3]
+    covariance = solution.extrinsic_covariance
+    # The tangent's axes are the camera's, and its translation is minus the motion of the centre.
+    centre = rotation.transpose(0, 2, 1) @ covariance[:, :3, :3] @ rotation
+    turn = rotation.transpose(0, 2, 1) @ covariance[:, 3:, 3:] @ rotation
+    variance = np.concatenate([np.diagonal(block, axis1=1, axis2=2) for block in (centre, turn)], axis=1)
+    prior = np.full((len(rotation), 3), np.inf) if problem.centre_sigma_m is None else problem.centre_sigma_m
+    share = np.minimum(variance[:, :3] / prior**2, 1.0)
+    return [Observability(np.sqrt(v), s) for v, s in zip(variance, share, strict=True)]
