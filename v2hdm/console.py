@@ -22,16 +22,16 @@ def run_on_terminal(config: pipeline.RunConfig, config_yaml: str) -> None:
     console.print()
     for line in result.headlines:
         console.print(line, highlight=False)
-    console.print(results_table(f"{config.name}: corners against truth", result.metrics["results"]))
+    console.print(results_table(config.name, result.metrics["results"]))
     console.print(f"results in {result.folder}", highlight=False, soft_wrap=True)
 
 
 @contextmanager
 def _logging_to(console: Console) -> Iterator[None]:
-    handler = RichHandler(console=console, show_path=False, show_level=False, log_time_format="%H:%M:%S")
+    handler = RichHandler(logging.INFO, console, show_path=False, show_level=False, log_time_format="%X")
     logger = logging.getLogger("v2hdm")
     logger.addHandler(handler)
-    logger.setLevel(logging.INFO)
+    logger.setLevel(logging.DEBUG)
     try:
         yield
     finally:

@@ -161,7 +161,7 @@ def _map_camera_sets(
         found[name] = run_methods(drive, detections, cameras, config.mapping, growth_steps=growth_steps)
         for exclusion in found[name]["Opt"].excluded:
             where = ", ".join(f"{value:.2f}" for value in exclusion.position_map)
-            log.info("%s: left out a %s at (%s): %s", name, exclusion.kind, where, exclusion.reason)
+            log.debug("%s: left out a %s at (%s): %s", name, exclusion.kind, where, exclusion.reason)
     progress("map", len(sets), len(sets))
     return found
 
@@ -187,7 +187,7 @@ def _log_file(path: Path) -> Iterator[None]:
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     logger = logging.getLogger("v2hdm")
     logger.addHandler(handler)
-    logger.setLevel(logging.INFO)
+    logger.setLevel(logging.DEBUG)
     try:
         yield
     finally:
