@@ -21,7 +21,7 @@ map: $(MAP_INSTALLED)
 # The tests run side by side; more threads in each would only get in their way.
 test: export OMP_NUM_THREADS = 1
 test: $(DEV_INSTALLED)
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 check: $(DEV_INSTALLED)
 	$(BIN)/ruff format --check .

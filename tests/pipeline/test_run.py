@@ -1,0 +1,173 @@
+"""The main job on a short rendered drive: images and poses in, map and calibrations out."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from v2hdm.drive import ReadOptions, read_drive
+from v2hdm.errors import ConfigError, DriveError, MappingError, V2hdmError
+from v2hdm.hdmap.calibration import read_calibration
+from v2hdm.hdmap.geojson import read_geojson
+from v2hdm.pipeline import DriveConfig, RunConfig, run
+from v2hdm.pipeline.run import camera_sets
+from v2hdm.simulate import PortConfig, render_drive
+from v2hdm.simulate.port_config import RouteConfig
+
+
+def short_port() -> PortConfig:
+    """A straight and a turn of the default port, with another vehicle's IPM to start from."""
+    route = RouteConfig(pieces=[[20.0, 0.0], [16.0, 70.0], [10.0, 0.0]], image_spacing_m=1.2)
+    return PortConfig(name="short", seed=11, initial_ipm="estimated", route=route)
+
+
+@pytest.fixture(scope="module")
+def drive_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("drive") / "short"
+    render_drive(short_port(), folder, 1, lambda done, total: None)
+    return folder
+
+
+def run_config(drive: Path, output: Path, **changes: object) -> RunConfig:
+    drive_config = DriveConfig(path=str(drive))
+    return RunConfig(
+        **{"name": "short", "drive": drive_config, "output": str(output), "workers": 1, **changes}
+    )
+
+
+@pytest.fixture(scope="module")
+def result(drive_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("outputs")
+    return run(run_config(drive_folder, output)).folder
+
+
+def test_every_method_is_judged_on_every_camera_set(result: Path) -> None:
+    metrics = json.loads((result / "metrics.json").read_text())
+    assert set(metrics["results"]) == {"front", "rear", "both"}
+    for methods in metrics["results"].values():
+        assert set(methods) == {"CNI", "ENI", "Opt", "ONI"}
+        for figures in methods.values():
+            assert {"markings", "recall", "corner_rmse_m", "corner_bias_m"} <= set(figures)
+    assert set(metrics["extrinsics"]) == {"front", "rear"}
+    assert metrics["disturbances"]
+
+
+def test_the_optimisation_repairs_another_vehicles_calibration(result: Path) -> None:
+    metrics = json.loads((result / "metrics.json").read_text())
+    both = metrics["results"]["both"]
+    assert both["ENI"]["corner_rmse_m"] > 0.2
+    assert both["Opt"]["corner_rmse_m"] < 0.06
+    assert both["Opt"]["recall"] > 0.9
+    assert both["Opt"]["false_markings"] == 0
+    for camera in ("front", "rear"):
+        assert metrics["extrinsics"][camera]["rotation_error_deg"] < 0.2
+
+
+def test_the_files_of_a_result_can_be_read_back(result: Path) -> None:
+    hd_map = read_geojson(result / "map.geojson")
+    metrics = json.loads((result / "metrics.json").read_text())
+    assert len(hd_map.markings) == metrics["results"]["both"]["Opt"]["markings"]
+    assert all(marking.covariance_m2 is not None for marking in hd_map.markings)
+    for camera in ("front", "rear"):
+        calibration = read_calibration(result / f"calibration_{camera}.yaml")
+        assert calibration.covariance is not None
+        assert np.linalg.det(calibration.cam_from_vehicle[:3, :3]) == pytest.approx(1.0)
+    for picture in ("birdseye.png", "growth.png", "overlay_front.png", "overlay_rear.png"):
+        image = cv2.imread(str(result / picture))
+        assert image is not None, picture
+        assert image.std() > 5.0
+    assert (result / "config.yaml").stat().st_size > 0
+    assert "detected" in (result / "run.log").read_text()
+
+
+def test_the_map_is_the_same_to_the_byte_without_the_truth(
+    result: Path, drive_folder: Path, tmp_path: Path
+) -> None:
+    blind = tmp_path / "short"
+    shutil.copytree(drive_folder, blind)
+    shutil.rmtree(blind / "truth")
+    description = blind / "drive.yaml"
+    lines = description.read_text().splitlines(keepends=True)
+    description.write_text("".join(line for line in lines if not line.startswith("truth:")))
+    again = run(run_config(blind, tmp_path / "outputs")).folder
+    for name in ("map.geojson", "calibration_front.yaml", "calibration_rear.yaml"):
+        assert (again / name).read_bytes() == (result / name).read_bytes()
+
+
+def test_two_worker_processes_find_the_same_map(result: Path, drive_folder: Path, tmp_path: Path) -> None:
+    again = run(run_config(drive_folder, tmp_path, workers=2)).folder
+    assert (again / "map.geojson").read_bytes() == (result / "map.geojson").read_bytes()
+
+
+def small_copy(drive_folder: Path, target: Path) -> Path:
+    """The first three time stamps of the drive."""
+    shutil.copytree(drive_folder, target, ignore=shutil.ignore_patterns("truth", "*.jpg"))
+    for camera in ("front", "rear"):
+        listing = target / camera / "images.txt"
+        kept = [line for line in listing.read_text().splitlines() if line and not line.startswith("#")][:3]
+        listing.write_text("\n".join(kept) + "\n")
+        for line in kept:
+            name = Path(line.split()[1])
+            source = next((drive_folder / camera).rglob(name.name))
+            destination = target / source.relative_to(drive_folder)
+            destination.parent.mkdir(exist_ok=True)
+            shutil.copy(source, destination)
+    description = target / "drive.yaml"
+    lines = description.read_text().splitlines(keepends=True)
+    description.write_text("".join(line for line in lines if not line.startswith("truth:")))
+    return target
+
+
+def fails(drive: Path, output: Path, kind: type[V2hdmError]) -> str:
+    with pytest.raises(kind) as caught:
+        run(run_config(drive, output))
+    assert "\n" not in str(caught.value)
+    assert not output.exists() or not any(output.iterdir())
+    return str(caught.value)
+
+
+def test_a_missing_image_is_named_and_leaves_nothing_behind(drive_folder: Path, tmp_path: Path) -> None:
+    drive = small_copy(drive_folder, tmp_path / "drive")
+    image = sorted((drive / "rear").rglob("*.jpg"))[1]
+    image.unlink()
+    assert image.name in fails(drive, tmp_path / "out", DriveError)
+
+
+def test_a_truncated_image_is_named(drive_folder: Path, tmp_path: Path) -> None:
+    drive = small_copy(drive_folder, tmp_path / "drive")
+    image = sorted((drive / "front").rglob("*.jpg"))[2]
+    image.write_bytes(image.read_bytes()[:-2000])
+    assert image.name in fails(drive, tmp_path / "out", DriveError)
+
+
+def test_an_image_of_another_size_is_named_with_both_sizes(drive_folder: Path, tmp_path: Path) -> None:
+    drive = small_copy(drive_folder, tmp_path / "drive")
+    image = sorted((drive / "front").rglob("*.jpg"))[0]
+    cv2.imwrite(str(image), np.zeros((480, 640, 3), np.uint8))
+    message = fails(drive, tmp_path / "out", DriveError)
+    assert image.name in message
+    assert "640" in message
+    assert "1280" in message
+
+
+def test_a_drive_past_nothing_says_that_no_marking_was_found(drive_folder: Path, tmp_path: Path) -> None:
+    drive = small_copy(drive_folder, tmp_path / "drive")
+    for image in drive.rglob("*.jpg"):
+        cv2.imwrite(str(image), np.full((720, 1280, 3), 90, np.uint8))
+    assert "marking" in fails(drive, tmp_path / "out", MappingError)
+
+
+def test_a_run_that_both_renders_and_reads_is_refused(tmp_path: Path) -> None:
+    config = run_config(tmp_path, tmp_path / "out", simulate=short_port())
+    with pytest.raises(ConfigError, match=r"drive\.path"):
+        run(config)
+
+
+def test_a_single_camera_is_one_set_and_two_are_three(drive_folder: Path) -> None:
+    assert list(camera_sets(read_drive(drive_folder))) == ["front", "rear", "both"]
+    assert list(camera_sets(read_drive(drive_folder, ReadOptions(cameras=["rear"])))) == ["rear"]
