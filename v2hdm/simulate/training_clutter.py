@@ -6,10 +6,16 @@ Bright, upright and thin things matter most (trunks, signs, white vans), then br
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from v2hdm.simulate.scene import Bgr, Box, GroundMarks
+
+Factor = NDArray[np.uint8]
+Thing = Callable[[np.random.Generator, float, float], list[Box]]
 
 _MARKS_M = (56.0, 28.0)
 _MARKS_RESOLUTION_M = 0.04
@@ -102,12 +108,12 @@ def _box(
     )
 
 
-def _row(rng: np.random.Generator, left: float, thing: object) -> list[Box]:
+def _row(rng: np.random.Generator, left: float, thing: Thing) -> list[Box]:
     """Several of a thing (a function of rng, x and y) along the road."""
     out: list[Box] = []
     along = rng.uniform(2, 14)
     while along < 60 and len(out) < 24:
-        out += thing(rng, float(along), float(left + rng.normal(0, 0.3)))  # type: ignore[operator]
+        out += thing(rng, float(along), float(left + rng.normal(0, 0.3)))
         along += rng.uniform(4, 16)
     return out
 
@@ -244,9 +250,6 @@ def _container_stack(rng: np.random.Generator, left: float) -> list[Box]:
             )
         along += length + rng.choice([0.4, rng.uniform(2, 15)])
     return out
-
-
-Factor = np.ndarray[tuple[int, ...], np.dtype[np.uint8]]
 
 
 def _point(rng: np.random.Generator, factor: Factor) -> tuple[int, int]:

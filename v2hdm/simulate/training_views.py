@@ -28,16 +28,14 @@ def random_view(rng: np.random.Generator, width: int, height: int) -> TrainingVi
     """A camera near the map's origin, looking roughly along x, whose image is ``width`` x ``height``.
 
     Focal lengths from 400 to 1500 px, heights from 1.1 to 3.6 m, pitch from level to 28 degrees down, with
-    one in three like the usual camera of a car (level, low, 600 to 1000 px).
+    two in five like the usual camera of a car (level, low, 600 to 1000 px).
     """
-    car = rng.random() < 0.4
-    focal_px = float(
-        np.exp(rng.uniform(np.log(600), np.log(1000)) if car else rng.uniform(np.log(400), np.log(1500)))
-    )
-    height_m = float(rng.uniform(1.2, 1.9) if car else rng.uniform(1.1, 3.6))
-    pitch = np.deg2rad(
-        rng.uniform(-1.5, 3) if car else rng.uniform(0, 28) if rng.random() < 0.6 else rng.uniform(0, 8)
-    )
+    if rng.random() < 0.4:
+        focal_px, height_m, pitch = _log_uniform(rng, 600, 1000), rng.uniform(1.2, 1.9), rng.uniform(-1.5, 3)
+    else:
+        focal_px, height_m = _log_uniform(rng, 400, 1500), rng.uniform(1.1, 3.6)
+        pitch = rng.uniform(0, 28 if rng.random() < 0.6 else 8)
+    pitch = np.deg2rad(pitch)
     yaw = np.deg2rad(rng.normal(0, 4) if rng.random() < 0.75 else rng.uniform(-60, 60))
     roll = np.deg2rad(rng.normal(0, 1.2))
     info = _crop_camera(rng, width, height, focal_px, pitch)
@@ -92,9 +90,9 @@ def _random_optics(rng: np.random.Generator) -> Optics:
     return Optics(
         psf_sigma_px=float(rng.uniform(0.35, 1.1) if rng.random() < 0.85 else rng.uniform(1.1, 1.9)),
         vignetting=float(rng.uniform(0, 0.35)),
-        mean_level=float(np.exp(rng.uniform(np.log(0.1), np.log(0.36)))),
-        full_well_electrons=float(np.exp(rng.uniform(np.log(1200), np.log(20000)))),
-        read_noise=float(np.exp(rng.uniform(np.log(0.0005), np.log(0.006)))),
+        mean_level=_log_uniform(rng, 0.1, 0.36),
+        full_well_electrons=_log_uniform(rng, 1200, 20000),
+        read_noise=_log_uniform(rng, 0.0005, 0.006),
         white_balance_bgr=tuple(float(g) for g in np.exp(rng.normal(0, 0.07, 3))),  # type: ignore[arg-type]
         grey=bool(rng.random() < 0.12),
     )
@@ -107,5 +105,9 @@ def _random_motion(rng: np.random.Generator) -> Motion:
     return Motion(
         velocity_cam=(0.0, 0.0, float(rng.uniform(1, 14))),
         angular_velocity_cam=turn,  # type: ignore[arg-type]
-        exposure_s=float(np.exp(rng.uniform(np.log(0.001), np.log(0.015)))),
+        exposure_s=_log_uniform(rng, 0.001, 0.015),
     )
+
+
+def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
