@@ -49,7 +49,7 @@ def _is_whole(data: np.ndarray) -> bool:
 
     OpenCV decodes a truncated file to half an image without a word.
     """
-    tail = data[-64:].tobytes()
+    tail = data[-4096:].tobytes()
     if data[:2].tobytes() == b"\xff\xd8":
         return b"\xff\xd9" in tail
     if data[:4].tobytes() == b"\x89PNG":

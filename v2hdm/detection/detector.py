@@ -67,7 +67,9 @@ class Detector:
             lane
             for c in candidates
             if c.kind in LANE_CLASSES
-            for lane in trace_lanes(c.blob, c.kind, view, self.options.lane_step_m, self.options.max_range_m)
+            for lane in trace_lanes(
+                c.blob, c.kind, c.score, view, self.options.lane_step_m, self.options.max_range_m
+            )
         ]
         starts = [start for c in candidates if (start := self._start(c, view)) is not None]
         foreground = Foreground(owner, self.network.info.stride, view.top)

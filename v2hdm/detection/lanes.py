@@ -16,7 +16,7 @@ _ROWS_MIN_ASPECT = 0.35
 
 
 def trace_lanes(
-    blob: Blob, kind: str, view: CameraView, step_m: float, max_range_m: float
+    blob: Blob, kind: str, score: float, view: CameraView, step_m: float, max_range_m: float
 ) -> list[LaneDetection]:
     """The centre lines of one blob, a point every ``step_m`` on the ground, near to far.
 
@@ -35,7 +35,7 @@ def trace_lanes(
         points_vehicle = _resample(centre_vehicle, view, step_m, max_range_m)
         if len(points_vehicle) >= _MIN_POINTS:
             points_pinhole_px = apply_homography(view.pinhole_px_from_vehicle, points_vehicle)
-            lanes.append(LaneDetection(kind, blob.class_score[kind], view.distort(points_pinhole_px)))
+            lanes.append(LaneDetection(kind, score, view.distort(points_pinhole_px)))
     return lanes
 
 

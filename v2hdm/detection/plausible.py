@@ -1,4 +1,4 @@
-"""What a blob can be, judged by its size on the ground.
+"""What a blob can be, judged by its class scores and its size on the ground.
 
 The initial IPM may be decimetres wrong, so sizes only rule out what is far off.
 """
@@ -10,14 +10,21 @@ import numpy as np
 
 from v2hdm.detection.blobs import Blob
 from v2hdm.detection.view import CameraView
-from v2hdm.records import DIAMOND, LANE_DASH, LANE_LINE, FloatArray
+from v2hdm.records import DIAMOND, LANE_CLASSES, LANE_DASH, LANE_LINE, FloatArray
 
 _SIZE_LIMITS_M: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     DIAMOND: ((0.15, 5.0), (0.1, 3.0)),
     LANE_DASH: ((0.3, 12.0), (0.03, 0.8)),
-    LANE_LINE: ((0.3, np.inf), (0.03, 4.0)),
+    LANE_LINE: ((0.3, np.inf), (0.03, np.inf)),
 }
 """Least and largest length and width of each class. A line's box is wide where the line bends."""
+
+_DASH_LENGTH_M = 7.5
+_DASH_SHARE = 0.25
+"""A piece of lane paint that ends at both sides, no longer than that, is a dash even if the network
+gives only this share of its lane score to dashes: seen locally, dash and line are the same paint."""
+
+_BORDER_PX = 6.0
 
 
 def plausible_kind(blob: Blob, outline_pinhole_px: FloatArray, view: CameraView) -> tuple[str, float] | None:
@@ -29,17 +36,29 @@ def plausible_kind(blob: Blob, outline_pinhole_px: FloatArray, view: CameraView)
         view: its camera.
     """
     length_m, width_m = _ground_size(view.ground(outline_pinhole_px))
-    if not np.isfinite(length_m):
-        return None
-    kinds = sorted(blob.class_score, key=blob.class_score.__getitem__, reverse=True)
-    if kinds[0] not in _SIZE_LIMITS_M:
-        return None
-    # Runners-up are considered only between classes that look alike.
-    for kind in kinds[:2]:
-        limits = _SIZE_LIMITS_M.get(kind)
-        if limits and limits[0][0] <= length_m <= limits[0][1] and limits[1][0] <= width_m <= limits[1][1]:
-            return kind, blob.class_score[kind]
-    return None
+    whole = bool(view.inside(blob.outline_px, _BORDER_PX).all())
+    kind, score = _likeliest(blob.class_score, whole and length_m <= _DASH_LENGTH_M)
+    if kind == LANE_DASH and not _fits(LANE_DASH, length_m, width_m):
+        kind = LANE_LINE
+    return (kind, score) if _fits(kind, length_m, width_m) else None
+
+
+def _likeliest(class_score: dict[str, float], short: bool) -> tuple[str, float]:
+    """The best class, lane classes taken together first; ``short`` paint is rather a dash than a line."""
+    lane_score = sum(class_score.get(name, 0.0) for name in LANE_CLASSES)
+    others = {name: score for name, score in class_score.items() if name not in LANE_CLASSES}
+    best_other = max(others, key=others.__getitem__, default="")
+    if best_other and others[best_other] >= lane_score:
+        return best_other, others[best_other]
+    dash_share = class_score.get(LANE_DASH, 0.0) / max(lane_score, 1e-9)
+    return (LANE_DASH if dash_share > (_DASH_SHARE if short else 0.5) else LANE_LINE), lane_score
+
+
+def _fits(kind: str, length_m: float, width_m: float) -> bool:
+    if kind not in _SIZE_LIMITS_M:
+        return False
+    length, width = _SIZE_LIMITS_M[kind]
+    return bool(length[0] <= length_m <= length[1] and width[0] <= width_m <= width[1])
 
 
 def _ground_size(outline_vehicle: FloatArray) -> tuple[float, float]:

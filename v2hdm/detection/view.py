@@ -34,7 +34,7 @@ class CameraView:
         self.top, self.height = self._band_rows(multiple)
 
     def undistort(self, points_px: FloatArray) -> FloatArray:
-        """Recorded pixels (N, 2) to pinhole pixels, from a table; within 1e-3 px of the lens model."""
+        """Recorded pixels (N, 2) to pinhole pixels, from a table; within 1e-2 px of the lens model."""
         points = np.asarray(points_px, dtype=np.float64).reshape(-1, 2)
         if self._pinhole_lut is None or not len(points):
             return points.copy()

@@ -1,0 +1,61 @@
+"""Model files: what is refused, and that any image size is taken."""
+
+import numpy as np
+import pytest
+
+from tests.detection.pictures import brightness_model, make_camera, save_model
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.network import Network
+from v2hdm.errors import DetectorError
+from v2hdm.records import PAINT_CLASSES
+
+SLOPE = np.zeros(5)
+OFFSET = np.arange(5.0)
+
+
+def test_logits_cover_images_of_any_size(tmp_path):
+    network = Network(brightness_model(tmp_path))
+    for height, width in ((32, 48), (33, 47), (5, 16)):
+        logits = network.logits(np.zeros((height, width, 3), dtype=np.uint8))
+        assert logits.shape == (1 + len(PAINT_CLASSES), -(-height // 2), -(-width // 2))
+
+
+def test_a_missing_model_is_named(tmp_path):
+    with pytest.raises(DetectorError, match=r"gone\.onnx: no such detector model"):
+        Network(tmp_path / "gone.onnx")
+
+
+def test_a_damaged_model_is_refused(tmp_path):
+    path = tmp_path / "damaged.onnx"
+    path.write_bytes(brightness_model(tmp_path).read_bytes()[:200])
+    with pytest.raises(DetectorError, match="not a usable ONNX model"):
+        Network(path)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "words"),
+    [
+        ({"other": 1}, "no usable 'v2hdm' metadata"),
+        ({"classes": ["zebra"], "multiple": 16, "stride": 2}, "unknown classes"),
+        ({"classes": list(PAINT_CLASSES), "multiple": 15, "stride": 2}, "does not divide"),
+        ({"classes": list(PAINT_CLASSES), "multiple": "many", "stride": 2}, "no usable 'v2hdm' metadata"),
+    ],
+)
+def test_a_model_with_wrong_metadata_is_refused(tmp_path, metadata, words):
+    save_model(tmp_path / "m.onnx", SLOPE, OFFSET, metadata)
+    with pytest.raises(DetectorError, match=words):
+        Network(tmp_path / "m.onnx")
+
+
+def test_a_model_whose_outputs_disagree_with_its_metadata_is_refused(tmp_path):
+    save_model(tmp_path / "m.onnx", SLOPE, OFFSET, {"classes": ["diamond"], "multiple": 16, "stride": 2})
+    with pytest.raises(DetectorError, match="export it again"):
+        Network(tmp_path / "m.onnx").logits(np.zeros((32, 32, 3), dtype=np.uint8))
+
+
+@pytest.mark.parametrize(
+    "image", [np.zeros((10, 10, 3), dtype=np.uint8), np.zeros((360, 640)), np.zeros((360, 640, 3))]
+)
+def test_an_image_that_is_not_the_cameras_is_refused(tmp_path, image):
+    with pytest.raises(DetectorError, match="camera 'front'"):
+        Detector.load(brightness_model(tmp_path)).detect(image, make_camera())

@@ -1,0 +1,143 @@
+"""Quadrilaterals, their blurred coverage, and blobs of logits: what the corner fits stand on."""
+
+import cv2
+import numpy as np
+import pytest
+
+from v2hdm.detection.blobs import find_blobs, foreground_level, zero_crossings
+from v2hdm.detection.coverage import blurred_coverage
+from v2hdm.detection.normal import normal_pdf_cdf
+from v2hdm.detection.quad import (
+    interior_angles,
+    intersect_sides,
+    is_convex,
+    order_corners,
+    quad_from_outline,
+    side_frames,
+    signed_area,
+    width,
+)
+from v2hdm.records import PAINT_CLASSES
+
+KITE = order_corners(np.array([[20.3, 10.2], [40.1, 14.9], [19.4, 19.3], [3.2, 15.5]]))
+
+
+def logits_of(labels: np.ndarray) -> np.ndarray:
+    """Confident logits (C, h, w) of a label picture."""
+    return np.stack([np.where(labels == c, 5.0, -5.0) for c in range(1 + len(PAINT_CLASSES))]).astype(
+        np.float32
+    )
+
+
+def test_ordered_corners_run_counter_clockwise_on_the_screen():
+    assert signed_area(KITE) < 0
+    assert is_convex(KITE)
+    assert not is_convex(KITE[::-1])
+
+
+def test_normals_point_outwards():
+    _, normal, _ = side_frames(KITE)
+    middle = (KITE + np.roll(KITE, -1, axis=0)) / 2
+    assert (((middle - KITE.mean(axis=0)) * normal).sum(axis=1) > 0).all()
+
+
+def test_the_angles_of_a_quadrilateral_add_up_to_a_full_turn():
+    assert interior_angles(KITE).sum() == pytest.approx(2 * np.pi)
+
+
+def test_lines_through_the_sides_meet_in_the_corners():
+    _, normal, _ = side_frames(KITE)
+    middle = (KITE + np.roll(KITE, -1, axis=0)) / 2
+    np.testing.assert_allclose(intersect_sides(middle, normal), KITE, atol=1e-9)
+
+
+def test_the_width_of_a_bar_is_its_breadth():
+    assert width(order_corners(np.array([[0, 0], [30, 0], [30, 4], [0, 4.0]]))) == pytest.approx(4.0)
+
+
+def test_a_quadrilateral_is_found_again_from_points_on_its_outline():
+    along = np.linspace(0, 1, 40, endpoint=False)[:, None]
+    outline = np.concatenate([KITE[e] * (1 - along) + KITE[(e + 1) % 4] * along for e in range(4)])
+    found = quad_from_outline(outline)
+    assert found is not None
+    distance = np.linalg.norm(found[:, None] - KITE, axis=-1).min(axis=1)
+    assert distance.max() < 0.05
+
+
+@pytest.mark.parametrize("outline", [np.zeros((3, 2)), np.zeros((9, 2)), np.arange(18.0).reshape(9, 2)])
+def test_points_that_enclose_nothing_give_no_quadrilateral(outline):
+    assert quad_from_outline(outline) is None
+
+
+def test_the_normal_distribution_is_right_to_four_digits():
+    x = np.array([-2.0, -1.0, 0.0, 1.0, 1.959964])
+    pdf, cdf = normal_pdf_cdf(x)
+    np.testing.assert_allclose(cdf, [0.0227501, 0.1586553, 0.5, 0.8413447, 0.975], atol=2e-5)
+    np.testing.assert_allclose(pdf[2:4], [0.3989423, 0.2419707], atol=1e-6)
+
+
+def test_blurred_coverage_is_that_of_a_finely_drawn_and_blurred_shape():
+    columns, rows, blur_px, fine = np.arange(45.0)[None], np.arange(28.0)[None], 0.7, 15
+    u, v = np.meshgrid((np.arange(45 * fine) + 0.5) / fine - 0.5, (np.arange(28 * fine) + 0.5) / fine - 0.5)
+    _, normal, _ = side_frames(KITE)
+    offset = np.stack([u, v], axis=-1)[:, :, None] - KITE
+    drawn = ((offset * normal).sum(axis=-1) < 0).all(axis=-1).astype(np.float32)
+    drawn = cv2.GaussianBlur(drawn, (0, 0), blur_px * fine)[fine // 2 :: fine, fine // 2 :: fine]
+    coverage, _ = blurred_coverage(KITE[None], columns, rows, blur_px)
+    np.testing.assert_allclose(coverage[0], drawn, atol=4e-3)
+    assert coverage.sum() == pytest.approx(-signed_area(KITE), rel=1e-4)
+
+
+def test_the_derivative_of_coverage_is_its_slope():
+    columns, rows, step = np.arange(45.0)[None], np.arange(28.0)[None], 0.02
+    _, derivative = blurred_coverage(KITE[None], columns, rows, 0.7)
+    for corner, axis in np.ndindex(4, 2):
+        shift = np.zeros((1, 4, 2))
+        shift[0, corner, axis] = step
+        more, less = (blurred_coverage(KITE + sign * shift, columns, rows, 0.7)[0] for sign in (1, -1))
+        np.testing.assert_allclose(derivative[:, corner, axis], (more - less) / (2 * step), atol=2e-3)
+
+
+def test_zero_crossings_are_interpolated_between_neighbours():
+    level = np.array([[-1.0, 3.0, -1.0]])
+    np.testing.assert_allclose(zero_crossings(level), [[0.25, 0.0], [1.75, 0.0]])
+
+
+def test_the_foreground_counts_all_paint_together():
+    logits = np.zeros((3, 1, 1), dtype=np.float32)
+    logits[1:] = -0.2  # each class is less likely than the background, both together are not
+    assert foreground_level(logits)[0, 0] > 0
+
+
+def test_a_diamond_that_touches_a_line_is_split_from_it():
+    labels = np.zeros((40, 60), dtype=int)
+    labels[10:30, 20:40] = 1 + PAINT_CLASSES.index("diamond")
+    labels[:, 40:44] = 1 + PAINT_CLASSES.index("lane_line")
+    blobs, owner = find_blobs(logits_of(labels), PAINT_CLASSES, 2, 0)
+    assert sorted(blob.kind for blob in blobs) == ["diamond", "lane_line"]
+    square = next(blob for blob in blobs if blob.kind == "diamond")
+    assert square.outline_px[:, 0].max() == pytest.approx(2 * 39.5 + 0.5, abs=0.1)
+    assert owner[20, 30] != owner[20, 42]
+
+
+def test_a_dash_that_looks_like_a_line_here_and_there_stays_one_blob():
+    labels = np.zeros((40, 60), dtype=int)
+    labels[5:35, 20:24] = 1 + PAINT_CLASSES.index("lane_dash")
+    labels[5:14, 20:24] = 1 + PAINT_CLASSES.index("lane_line")
+    blobs, _ = find_blobs(logits_of(labels), PAINT_CLASSES, 2, 0)
+    assert [blob.kind for blob in blobs] == ["lane_dash"]
+
+
+def test_worn_holes_do_not_add_to_the_outline():
+    labels = np.zeros((40, 60), dtype=int)
+    labels[10:30, 20:40] = 1
+    labels[18:22, 28:32] = 0
+    blobs, _ = find_blobs(logits_of(labels), PAINT_CLASSES, 2, top_px=100)
+    inner = np.abs(blobs[0].outline_px - [2 * 29.5 + 0.5, 100 + 2 * 19.5 + 0.5]).max(axis=1)
+    assert inner.min() > 15
+
+
+def test_an_empty_picture_has_no_blobs():
+    blobs, owner = find_blobs(logits_of(np.zeros((8, 8), dtype=int)), PAINT_CLASSES, 2, 0)
+    assert blobs == []
+    assert not owner.any()
