@@ -74,8 +74,20 @@ def test_a_marking_twice_as_large_as_all_others_is_refused() -> None:
 def test_a_class_of_mixed_shapes_has_no_consensus_to_stray_from() -> None:
     sound = row_of_diamonds()
     for group in range(COUNT):
-        sound.corners_map[group] = sound.corners_map[group].mean(axis=0) + (0.5 + 0.2 * group) * DIAMOND
+        sound.corners_map[group] = sound.corners_map[group].mean(axis=0) + 1.3**group * DIAMOND / 8
     assert refused(sound) == {}
+
+
+def test_dashes_of_two_widths_are_two_shapes_and_not_outliers() -> None:
+    sound = row_of_diamonds()
+    for group in range(0, COUNT, 3):
+        sound.corners_map[group] = sound.corners_map[group].mean(axis=0) + [1.0, 2.0] * DIAMOND
+    assert refused(sound) == {}
+
+
+def test_a_shift_that_all_markings_share_speaks_against_none() -> None:
+    sound = row_of_diamonds()
+    assert refused(replace(sound, sigma_m=np.full(COUNT, 0.4))) == {}
 
 
 def test_of_two_markings_on_one_spot_the_better_supported_stays() -> None:

@@ -23,6 +23,16 @@ IntArray = NDArray[np.int64]
 MIN_EASY_VIEWS = 5
 """Easy views below which a share of detections says nothing."""
 
+MIN_SHAPE_TOLERANCE_M = 0.05
+"""Lengths that differ by less are the same, however short they are."""
+
+MIN_PEERS = 2
+PEER_SHARE = 0.05
+"""A shape is established by this many others, and by this share of its class."""
+
+MAX_LONELY_SHARE = 0.25
+"""Where more of a class than this have no peers, it has no shapes of its own to judge by."""
+
 MAX_OVERLAP = 0.2
 """Share of the smaller marking's area that may lie on another marking: paint does not overlap."""
 
@@ -63,7 +73,7 @@ def judge(candidates: Candidates, options: AcceptanceOptions) -> list[str | None
     )
     _refuse(verdict, _seldom_detected(candidates, verdict, options), "found in too few of its images")
     _refuse(verdict, ~is_convex(candidates.corners_map), "not a convex quadrilateral")
-    _refuse(verdict, ~(candidates.sigma_m <= options.max_sigma_m), "its position is too uncertain")
+    _refuse(verdict, _uncertain(candidates, options), "its position is too uncertain")
     _refuse(verdict, _odd_shapes(candidates, verdict, options), "not shaped like the others of its class")
     _refuse(verdict, _covered(candidates, verdict), "lies on a better supported marking")
     return verdict
@@ -93,19 +103,34 @@ def _seldom_detected(
     return seldom
 
 
+def _uncertain(candidates: Candidates, options: AcceptanceOptions) -> BoolArray:
+    """Groups less certain than the best by more than is allowed.
+
+    What even the best one has is shared by all: a shift of the whole map, which a straight drive
+    leaves to the prior on the camera's position, says nothing against a single marking.
+    """
+    sigma2 = np.where(np.isfinite(candidates.sigma_m), candidates.sigma_m, np.inf) ** 2
+    return np.asarray(sigma2 > np.min(sigma2, initial=np.inf) + options.max_sigma_m**2)
+
+
 def _odd_shapes(candidates: Candidates, verdict: list[str | None], options: AcceptanceOptions) -> BoolArray:
-    """Groups whose sides or diagonals stray from their class, where the class agrees on them."""
+    """Groups without peers in a class whose members mostly have peers.
+
+    Peers agree in sides and diagonals. A class may hold several shapes, such as the dashes of two
+    kinds of road; what is refused is a shape that hardly any other shares.
+    """
     lengths = _lengths(candidates.corners_map)
     odd = np.zeros(len(lengths), dtype=bool)
     for kind in np.unique(candidates.kind):
-        own = candidates.kind == kind
-        model = lengths[own & _standing(verdict)]
-        if len(model) < options.consensus_count:
+        own = np.flatnonzero((candidates.kind == kind) & _standing(verdict))
+        if len(own) < options.consensus_count:
             continue
-        median = np.median(model, axis=0)
-        scatter = 1.4826 * np.median(np.abs(model - median), axis=0)
-        tolerance = np.maximum(np.maximum(options.shape_tolerance * median, 5 * scatter), 0.05)
-        odd |= own & ~(np.abs(lengths - median) <= tolerance).all(axis=1)
+        tolerance = np.maximum(options.shape_tolerance * lengths[own], MIN_SHAPE_TOLERANCE_M)
+        alike = np.abs(lengths[own][:, None] - lengths[own][None]) <= tolerance[:, None]
+        peers = alike.all(axis=2).sum(axis=1) - 1
+        lonely = peers < max(MIN_PEERS, PEER_SHARE * len(own))
+        if lonely.mean() <= MAX_LONELY_SHARE:
+            odd[own[lonely]] = True
     return odd
 
 

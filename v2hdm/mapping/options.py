@@ -35,9 +35,9 @@ class AcceptanceOptions:
 
     ``min_sightings`` images with accepted corners; ``min_inlier_share`` of its corner observations
     agreeing with the solution; ``min_detection_share`` of the images that had it in easy view, as
-    a share of what is usual for its class; ``max_sigma_m`` for its worst corner; and, where the
-    class has a consensus on its shape (at least ``consensus_count`` markings), sides and diagonals
-    within ``shape_tolerance`` of it or five times the usual scatter, whichever is larger.
+    a share of what is usual for its class; a worst corner less certain than the best one of the map
+    by at most ``max_sigma_m``; and, in a class of at least ``consensus_count`` markings, sides and
+    diagonals that others have too, within ``shape_tolerance`` of their length.
     """
 
     min_sightings: int = 3
