@@ -9,7 +9,7 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.quad import signed_area
 from v2hdm.errors import ConfigError
 
-NEAR = [diamond(4.6, y, 1.2, 0.7, yaw) for y, yaw in ((-1.1, 12.0), (0.1, -7.0), (1.2, 20.0))]
+NEAR = [diamond(5.4, y, 1.2, 0.7, yaw) for y, yaw in ((-1.1, 12.0), (0.1, -7.0), (1.2, 20.0))]
 FAR = [diamond(x, y, 1.2, 0.7, 9.0 * y) for x in (8.0, 10.0, 12.5, 15.0) for y in (-2.3, -0.4, 1.6)]
 
 
@@ -42,7 +42,9 @@ def run(models, shapes, lens="plumb_bob", seeds=(0,), kind="diamond", blur_px=0.
     truth_px = [to_image(camera, shape) for shape in shapes]
     parts, found = [], 0
     for seed in seeds:
-        image = picture(camera, shapes, blur_px=blur_px, seed=seed, linear=linear)
+        image = picture(
+            camera, shapes, blur_px=blur_px, seed=seed, linear=linear, paint=0.9 if linear else 0.5
+        )
         markings, _ = detect(models, image, camera, kind, **options)
         found += len(markings)
         parts.append(errors_px(markings, truth_px))
@@ -83,10 +85,11 @@ def test_a_camera_with_linear_response_is_taken_at_its_word(models):
     assert np.median(np.linalg.norm(errors, axis=1)) < 0.12
 
 
-@pytest.mark.parametrize(("shapes", "name"), [(NEAR, "near"), (FAR, "far")])
-def test_stated_covariances_fit_the_errors(models, shapes, name):
+@pytest.mark.parametrize(("shapes", "least"), [(NEAR, 0.05), (FAR, 0.3)])
+def test_stated_covariances_fit_the_errors(models, shapes, least):
+    """On such a clean picture near errors (.01 px) stay far below the floor of .03 px that is stated."""
     errors, covariances, _ = run(models, shapes, seeds=range(3), blur_px=0.75)
-    assert 0.3 < normalised(errors, covariances).mean() < 4.0, name
+    assert least < normalised(errors, covariances).mean() < 4.0
 
 
 def test_telling_the_blur_does_as_well_as_measuring_it(models):
@@ -108,8 +111,8 @@ def test_corners_run_counter_clockwise_on_the_screen(models):
 
 def test_worn_gaps_in_the_sides_do_not_move_near_corners(models):
     camera = make_camera()
-    shape = diamond(4.8, 0.0, 1.4, 0.9)
-    gaps = [bar(5.15, 0.22, 0.10, 0.10), bar(4.45, -0.24, 0.12, 0.08), bar(5.1, -0.3, 0.08, 0.12)]
+    shape = diamond(5.4, 0.0, 1.4, 0.9)
+    gaps = [bar(5.75, 0.22, 0.10, 0.10), bar(5.05, -0.24, 0.12, 0.08), bar(5.7, -0.3, 0.08, 0.12)]
     markings, _ = detect(models, picture(camera, [shape], holes=gaps), camera)
     errors, _ = errors_px(markings, [to_image(camera, shape)])
     assert len(errors) == 4
@@ -132,9 +135,9 @@ def test_corners_cut_off_by_the_image_border_are_not_valid(models):
 def test_a_side_hidden_by_an_occluder_gives_no_valid_corners(models):
     """A dark, straight-edged thing lies over one half: its edge is sharp, and not the marking's."""
     camera = make_camera("pinhole")
-    shape = bar(4.8, 0.0, 1.0, 0.8)
+    shape = bar(5.4, 0.0, 1.0, 0.8)
     image = picture(camera, [shape])
-    middle = int(to_image(camera, np.array([[4.8, 0.0]]))[0, 0])
+    middle = int(to_image(camera, np.array([[5.4, 0.0]]))[0, 0])
     image[:, middle:] = 4
     markings, _ = detect(models, image, camera)
     for marking in markings:

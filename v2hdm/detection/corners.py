@@ -34,6 +34,7 @@ _BLUR_QUANTILE = 0.4
 _BLUR_PRIOR_SIDES = 6
 _BLUR_LIMITS_PX = (0.45, 1.5)
 _ROWS_AROUND_PX = 16
+_MIN_VALID_CORNERS = 2
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def fit_markings(
     foreground: Foreground,
     options: DetectorOptions,
 ) -> list[MarkingDetection]:
-    """Refine the corners of one image's markings; those with no usable corner are dropped."""
+    """Refine the corners of one image's markings; those with fewer than two valid ones are dropped."""
     if not starts:
         return []
     start = np.stack([s.corners_pinhole_px for s in starts])
@@ -96,7 +97,7 @@ def fit_markings(
     return [
         MarkingDetection(s.kind, s.score, found.px[m], found.covariance[m], found.valid[m])
         for m, s in enumerate(starts)
-        if found.valid[m].any()
+        if np.count_nonzero(found.valid[m]) >= _MIN_VALID_CORNERS
     ]
 
 
