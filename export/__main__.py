@@ -5,30 +5,28 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import hydra
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue
-from rich.console import Console
 
 from export.config import ExportConfig
 from export.onnx_file import export_checkpoint
 from train.checkpoint import load_checkpoint
-from v2hdm.errors import ConfigError, V2hdmError
-
-_CONF = Path(__file__).resolve().parents[1] / "conf"
+from train.door import open_door
+from v2hdm.errors import ConfigError
 
 ConfigStore.instance().store(name="export_schema", node=ExportConfig)
 
 
 def run(composed: DictConfig) -> str:
-    """Export as configured; returns what there is to say about it."""
-    try:
-        config = OmegaConf.to_object(composed)
-    except MissingMandatoryValue as error:
-        raise ConfigError(
-            f"{error.full_key}= is missing: `python -m export checkpoint=... output=...`"
-        ) from error
+    """Export as configured; returns what there is to say about it.
+
+    Raises:
+        ConfigError: A value is missing or the checkpoint cannot be read.
+    """
+    missing = sorted(OmegaConf.missing_keys(composed))
+    if missing:
+        raise ConfigError(f"{', '.join(missing)} is missing: `python -m export checkpoint=... output=...`")
+    config = OmegaConf.to_object(composed)
     assert isinstance(config, ExportConfig)
     checkpoint = load_checkpoint(Path(config.checkpoint))
     output = Path(config.output)
@@ -38,16 +36,10 @@ def run(composed: DictConfig) -> str:
     return f"{output}: {size_mb:.2f} MB, step {checkpoint.step}, mean IoU {iou:.3f}, parity {difference:.1e}"
 
 
-@hydra.main(version_base="1.3", config_path=str(_CONF), config_name="export")
 def main(composed: DictConfig) -> None:
     """Export a checkpoint to ONNX."""
-    console = Console(stderr=True, highlight=False, soft_wrap=True)
-    try:
-        console.print(run(composed))
-    except V2hdmError as error:
-        console.print(f"[red]error:[/] {error}")
-        sys.exit(2)
+    print(run(composed), file=sys.stderr)
 
 
 if __name__ == "__main__":
-    main()
+    open_door("export", main)

@@ -84,7 +84,7 @@ def test_a_file_that_differs_from_its_network_is_not_written(
     ("overrides", "line"),
     [
         (["checkpoint=nowhere.pt", "output=net.onnx"], "no checkpoint at nowhere.pt"),
-        (["output=net.onnx"], "checkpoint= is missing"),
+        (["output=net.onnx"], "checkpoint is missing"),
     ],
 )
 def test_what_is_missing_is_named_in_one_line(overrides: list[str], line: str) -> None:

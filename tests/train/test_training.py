@@ -2,6 +2,7 @@
 
 import logging
 import math
+import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from models import NetConfig
 from train import __main__ as door
 from train.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from train.config import DataConfig, LossConfig, TrainConfig, ValidationConfig
+from train.door import open_door
 from train.loop import Trainer
 from v2hdm.errors import ConfigError
 
@@ -120,3 +122,17 @@ def test_the_shipped_settings_compose_and_typos_do_not() -> None:
         assert config.minutes is not None
         with pytest.raises(ConfigCompositionException, match="learning_rat"):
             compose("train", overrides=["learning_rat=1"])
+
+
+@pytest.mark.parametrize("argument", ["learning_rat=1", "batch=many"])
+def test_a_mistyped_argument_is_one_line_and_exit_code_2(
+    argument: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["train", argument])
+    with pytest.raises(SystemExit) as exit_:
+        open_door("train", door.main)
+    assert exit_.value.code == 2
+    line = capsys.readouterr().err.strip()
+    assert line.startswith("error: configuration")
+    assert argument.split("=")[0] in line
+    assert "\n" not in line
