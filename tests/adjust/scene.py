@@ -47,7 +47,7 @@ def mounted(x: float, height: float, pitch_deg: float, *, rear: bool = False, y:
     return out
 
 
-def route(frames: int, step_m: float, turn_deg_per_m: float, straight_m: float = 20.0) -> np.ndarray:
+def route(frames: int, step_m: float, turn_deg_per_m: float, straight_m: float) -> np.ndarray:
     """``map_from_vehicle``: straights and, if wanted, alternating turns in between."""
     poses = np.tile(np.eye(4), (frames, 1, 1))
     heading, position = 0.3, np.array([5.0, -3.0])
@@ -91,6 +91,7 @@ def make_scene(
     frames: int = 120,
     step_m: float = 0.5,
     turn_deg_per_m: float = 4.0,
+    straight_m: float = 20.0,
     every_m: float = 2.0,
     cameras: int = 2,
     start_error_deg: float = 3.0,
@@ -110,7 +111,7 @@ def make_scene(
     rng = np.random.default_rng(seed)
     truth = np.stack([mounted(1.5, 2.4, 18), mounted(-1.0, 2.6, 22, rear=True, y=0.2)])[:cameras]
     truth = exp(np.concatenate([np.zeros((cameras, 3)), rng.normal(0, 0.02, (cameras, 3))], 1)) @ truth
-    recorded = route(frames, step_m, turn_deg_per_m)
+    recorded = route(frames, step_m, turn_deg_per_m, straight_m)
     corners = diamonds(recorded, every_m, rng)
     if noise_seed is not None:
         rng = np.random.default_rng(noise_seed)
@@ -118,7 +119,9 @@ def make_scene(
     if jitter is not None:
         memory = np.exp(-step_m / correlation_m) if correlation_m > 0 else 0.0
         unit = rng.standard_normal((frames, 6))
-        unit[:, [0, 1]] = correlated(rng, frames, 2, memory)
+        # The receiver's error keeps its direction in the map while the vehicle turns.
+        error_map = correlated(rng, frames, 2, memory)
+        unit[:, :2] = (recorded[:, :2, :2].transpose(0, 2, 1) @ error_map[..., None])[..., 0]
         state = unit * jitter.by_state()
     map_from_vehicle = recorded @ exp(state)
     camera, frame, corner, _ = observe(truth, recorded, corners, max_range_m)
@@ -129,8 +132,10 @@ def make_scene(
     corners = corners[twice]
     pixel = project(truth[camera] @ np.linalg.inv(map_from_vehicle)[frame], corners[corner])
     pixel = pixel + pixel_sigma * rng.standard_normal(pixel.shape)
-    wrong = rng.random(len(pixel)) < outliers
-    pixel[wrong] += rng.uniform(-60, 60, (int(wrong.sum()), 2))
+    # Of a generator of their own, so that the same street without them has the same noise.
+    wrong_rng = np.random.default_rng([seed, 1])
+    wrong = wrong_rng.random(len(pixel)) < outliers
+    pixel[wrong] += wrong_rng.uniform(-60, 60, (int(wrong.sum()), 2))
     axis = rng.standard_normal((cameras, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     start = exp(np.concatenate([np.zeros((cameras, 3)), np.deg2rad(start_error_deg) * axis], 1)) @ truth

@@ -9,7 +9,7 @@ from v2hdm.adjust import PoseSigma, observability, solve
 
 @pytest.mark.parametrize("cameras", [1, 2])
 def test_a_straight_drive_leaves_forward_and_left_to_the_survey(cameras):
-    scene = make_scene(1, frames=60, turn_deg_per_m=0.0, cameras=cameras, jitter=PoseSigma())
+    scene = make_scene(1, frames=40, turn_deg_per_m=0.0, cameras=cameras, jitter=PoseSigma())
     for camera in observability(scene.problem, solve(scene.problem)):
         assert camera.unobserved == ("forward", "left")
         # The direction is common to both cameras, so two surveys halve its variance.
@@ -18,7 +18,7 @@ def test_a_straight_drive_leaves_forward_and_left_to_the_survey(cameras):
 
 
 def test_turns_fix_all_offsets():
-    scene = make_scene(1, frames=120, turn_deg_per_m=8.0)
+    scene = make_scene(1, frames=90, turn_deg_per_m=8.0)
     for camera in observability(scene.problem, solve(scene.problem)):
         assert camera.unobserved == ()
         assert camera.sigma[:3].max() < 0.015

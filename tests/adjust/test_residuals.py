@@ -28,7 +28,7 @@ def example(pose_states=POSE_STATES, size=0.0, max_range_m=15.0, frames=14):
     scene = make_scene(3, frames=frames, jitter=POSES, max_range_m=max_range_m)
     arrays = make_arrays(scene.problem, pose_states, "cpu")
     generator = torch.Generator().manual_seed(0)
-    state = size * torch.randn(arrays.state_memory.shape, generator=generator, dtype=torch.float64)
+    state = size * torch.randn(arrays.state_information_root.shape, generator=generator, dtype=torch.float64)
     corners = torch.as_tensor(scene.corners_map)[arrays.corner_order]
     return arrays, Estimate(torch.as_tensor(scene.problem.cam_from_vehicle), state, corners)
 
@@ -101,17 +101,21 @@ def test_a_loss_starts_as_least_squares_and_its_weight_is_its_slope(name):
     assert bool((weight <= 1).all())
 
 
-def test_correlated_states_have_the_covariance_of_a_gauss_markov_process():
-    arrays, _ = example(frames=12)
-    count = arrays.state_memory.numel()
-    shape = arrays.state_memory.shape
+def test_correlated_positions_have_the_covariance_of_a_gauss_markov_process_in_the_map():
+    scene = make_scene(3, frames=12, turn_deg_per_m=8.0, straight_m=2.0, jitter=POSES)
+    arrays = make_arrays(scene.problem, POSE_STATES, "cpu")
+    shape, count = arrays.state_information_root.shape, arrays.state_information_root.numel()
     root = torch.autograd.functional.jacobian(
         lambda s: state_residual(arrays, s).flatten(), torch.zeros(shape, dtype=torch.float64)
     ).reshape(count, count)
     covariance = torch.linalg.inv(root.T @ root).reshape(*shape, *shape)
-    apart_m = 0.5 * torch.arange(12, dtype=torch.float64)
-    torch.testing.assert_close(covariance[0, 0, :, 0], 0.02**2 * torch.exp(-apart_m / 10.0))
-    assert covariance[0, POSE_STATES.index("pitch"), 1, POSE_STATES.index("pitch")] == 0
+    turned = torch.as_tensor(scene.problem.map_from_vehicle[:, :2, :2])
+    in_map = torch.einsum("jab,jbkc,kdc->jkad", turned, covariance[:, :2, :, :2], turned)
+    apart_m = 0.5 * (torch.arange(12)[:, None] - torch.arange(12)).abs().to(torch.float64)
+    expected = 0.02**2 * torch.exp(-apart_m / 10.0)[..., None, None] * torch.eye(2, dtype=torch.float64)
+    torch.testing.assert_close(in_map, expected, atol=1e-12, rtol=1e-6)
+    pitch = POSE_STATES.index("pitch")
+    assert covariance[0, pitch, 1, pitch] == 0
 
 
 def test_the_centre_prior_does_not_mind_a_rotation_about_the_camera():

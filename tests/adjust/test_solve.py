@@ -80,6 +80,7 @@ def test_the_cost_is_that_of_an_independent_least_squares_solver_to_nine_digits(
 def test_the_papers_model_recovers_a_street_with_perfect_poses(start_error_deg, turn_deg_per_m, cameras):
     scene = make_scene(
         5,
+        frames=70,
         start_error_deg=start_error_deg,
         turn_deg_per_m=turn_deg_per_m,
         cameras=cameras,
@@ -88,14 +89,14 @@ def test_the_papers_model_recovers_a_street_with_perfect_poses(start_error_deg, 
     )
     solution = solve(scene.problem, PAPER)
     assert solution.status is Status.CONVERGED
-    assert scene.corner_rmse_m(solution.corners_map) < 0.012
+    assert scene.corner_rmse_m(solution.corners_map) < 0.02
     assert scene.rotation_error_deg(solution.cam_from_vehicle).max() < 0.02
     assert solution.chi2_per_dof == pytest.approx(1, abs=0.05)
 
 
 @pytest.mark.parametrize("start_error_deg", [3.0, 10.0])
 def test_pose_states_absorb_what_the_papers_model_must_put_into_the_map(start_error_deg):
-    scene = make_scene(6, frames=120, jitter=REAL, start_error_deg=start_error_deg, prior_sigma_m=0.01)
+    scene = make_scene(6, frames=80, jitter=REAL, start_error_deg=start_error_deg, prior_sigma_m=0.01)
     states, paper = solve(scene.problem), solve(scene.problem, PAPER)
     assert states.status is Status.CONVERGED
     assert scene.corner_rmse_m(states.corners_map) < 0.02
@@ -107,7 +108,7 @@ def test_pose_states_absorb_what_the_papers_model_must_put_into_the_map(start_er
 
 @pytest.mark.parametrize(("loss", "factor"), [("huber", 2.0), ("cauchy", 1.3), ("geman_mcclure", 1.3)])
 def test_a_robust_loss_shrugs_off_three_percent_of_wrong_associations(loss, factor):
-    clean, soiled = (make_scene(7, frames=90, jitter=POSES, outliers=share) for share in (0.0, 0.03))
+    clean, soiled = (make_scene(7, frames=60, jitter=POSES, outliers=share) for share in (0.0, 0.03))
     best = clean.corner_rmse_m(solve(clean.problem).corners_map)
     robust = solve(soiled.problem, SolveOptions(loss=loss))
     plain = solve(soiled.problem, SolveOptions(loss="none"))
@@ -120,7 +121,7 @@ def test_a_robust_loss_shrugs_off_three_percent_of_wrong_associations(loss, fact
 
 
 def test_both_solvers_agree_under_a_robust_loss():
-    scene = make_scene(8, frames=60, jitter=POSES, outliers=0.03)
+    scene = make_scene(8, frames=40, jitter=POSES, outliers=0.03)
     lbfgs, lm = (solve(scene.problem, SolveOptions(solver=name)) for name in ("lbfgs", "lm"))
     assert lbfgs.cost == pytest.approx(lm.cost, rel=1e-9)
     np.testing.assert_allclose(lbfgs.corners_map, lm.corners_map, atol=1e-6)
@@ -129,8 +130,8 @@ def test_both_solvers_agree_under_a_robust_loss():
 def test_knowing_that_rtk_errors_drift_slowly_helps():
     poses = replace(POSES, position_m=0.04)
     plain, correlated = [], []
-    for seed in range(3):
-        scene = make_scene(seed, frames=80, jitter=poses, correlation_m=30.0, prior_sigma_m=0.005)
+    for seed in range(2):
+        scene = make_scene(seed, frames=60, jitter=poses, correlation_m=30.0, prior_sigma_m=0.005)
         plain.append(scene.corner_rmse_m(solve(scene.problem).corners_map))
         aware = replace(scene.problem, pose_sigma=replace(poses, correlation_m=30.0))
         correlated.append(scene.corner_rmse_m(solve(aware).corners_map))

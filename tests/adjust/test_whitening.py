@@ -28,7 +28,7 @@ def test_where_all_residuals_vanish_the_whitened_hessian_is_the_identity(pose_st
     arrays = make_arrays(problem, pose_states, "cpu")
     estimate = Estimate(
         torch.as_tensor(scene.cam_from_vehicle),
-        torch.zeros_like(arrays.state_memory),
+        torch.zeros_like(arrays.state_information_root),
         torch.as_tensor(scene.corners_map)[arrays.corner_order],
     )
     whitening = factorise(arrays, make_plan(arrays), estimate, torch.ones_like(arrays.measured[0]))
@@ -98,12 +98,12 @@ def test_laps_fill_in_only_where_they_meet():
 
 
 def test_covariances_agree_with_the_scatter_of_many_solves():
-    """Small Monte Carlo: 40 draws of noise, states and prior on one street."""
+    """Small Monte Carlo: 24 draws of noise, states and prior on one street."""
     options = SolveOptions(loss="none", coarse=False)
     corners, extrinsics, last = [], [], None
     base = make_scene(20, frames=14, step_m=1.0, jitter=PoseSigma(), cameras=1, start_error_deg=0.2)
     mark = np.arange(8)
-    for seed in range(40):
+    for seed in range(24):
         scene = make_scene(
             20,
             frames=14,
@@ -128,7 +128,7 @@ def test_covariances_agree_with_the_scatter_of_many_solves():
 
 def test_the_normalised_error_of_a_marking_is_chi_square_distributed():
     squares = []
-    for seed in range(12):
+    for seed in range(8):
         scene = make_scene(40 + seed, frames=24, step_m=0.8, jitter=PoseSigma(), start_error_deg=0.5)
         solution = solve(scene.problem, SolveOptions(coarse=False))
         groups = np.arange(scene.problem.corner_count)[:, None]

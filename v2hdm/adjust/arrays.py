@@ -14,6 +14,9 @@ from v2hdm.adjust.problem import POSE_STATES, Problem
 from v2hdm.geometry.transform import inverse
 from v2hdm.records import FloatArray
 
+# Least step between frames, as a fraction of the correlation length.
+_MIN_STEP = 1e-4
+
 
 @dataclass(frozen=True)
 class Arrays:
@@ -33,7 +36,7 @@ class Arrays:
         vehicle_from_map: (J, 4, 4) as recorded.
         states: columns of the frame tangent that are estimated.
         centre, centre_information_root: (C, 3) prior on the camera centres, and 1 / sigma.
-        state_memory: (J, S) share of a state's error carried over from the previous frame.
+        state_transition: (J, S, S) what a frame's states are expected to be, given the frame's before.
         state_information_root: (J, S) 1 / sigma of what is new in it.
     """
 
@@ -47,7 +50,7 @@ class Arrays:
     states: tuple[int, ...]
     centre: Tensor
     centre_information_root: Tensor
-    state_memory: Tensor
+    state_transition: Tensor
     state_information_root: Tensor
 
     @property
@@ -101,7 +104,7 @@ def make_arrays(problem: Problem, pose_states: tuple[str, ...], device: str) -> 
     measured = (seen.pinhole_px - principal) / focal
     root = np.linalg.inv(np.linalg.cholesky(seen.covariance_px)) * focal[:, None, :]
     states = tuple(k for k, name in enumerate(POSE_STATES) if name in pose_states)
-    memory, information_root = _state_prior(problem, states)
+    transition, information_root = _state_prior(problem, states)
     centre, centre_root = _centre_prior(problem)
 
     def real(values: FloatArray) -> Tensor:
@@ -121,7 +124,7 @@ def make_arrays(problem: Problem, pose_states: tuple[str, ...], device: str) -> 
         states=states,
         centre=real(centre),
         centre_information_root=real(centre_root),
-        state_memory=real(memory),
+        state_transition=real(transition),
         state_information_root=real(information_root),
     )
 
@@ -135,17 +138,22 @@ def _centre_prior(problem: Problem) -> tuple[FloatArray, FloatArray]:
 
 
 def _state_prior(problem: Problem, states: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
-    """Memory and inverse sigma of the innovation (J, S) of each frame's states.
+    """Transition (J, S, S) and inverse sigma (J, S) of the innovation of each frame's states.
 
-    A first-order Gauss-Markov process along the driven distance d: memory exp(-d / correlation_m),
-    innovation variance sigma^2 (1 - memory^2) (Gelb, Applied Optimal Estimation, section 3.8).
+    Position errors are a first-order Gauss-Markov process along the driven distance d: memory
+    m = exp(-d / correlation_m), innovation variance sigma^2 (1 - m^2) (Gelb, Applied Optimal Estimation,
+    section 3.8). They keep their direction in the map, and so turn in the vehicle as it turns.
     """
-    sigma = problem.pose_sigma.by_state()[list(states)]
-    memory = np.zeros((len(problem.map_from_vehicle), len(states)))
+    poses, sigma = problem.map_from_vehicle, problem.pose_sigma.by_state()
+    transition = np.zeros((len(poses), 6, 6))
+    memory = np.zeros((len(poses), 6))
     if problem.pose_sigma.correlation_m > 0:
-        correlated = [k for k, s in enumerate(states) if POSE_STATES[s] in ("x", "y", "height", "heading")]
-        step_m = np.linalg.norm(np.diff(problem.map_from_vehicle[:, :3, 3], axis=0), axis=1)
+        step_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
         # A vehicle at rest repeats its error; a floor on the step keeps the innovation's sigma above 0.
-        fraction = np.maximum(step_m / problem.pose_sigma.correlation_m, 1e-4)
-        memory[1:, correlated] = np.exp(-fraction)[:, None]
-    return memory, 1 / (sigma * np.sqrt(1 - memory**2))
+        step_m = np.maximum(step_m, _MIN_STEP * problem.pose_sigma.correlation_m)
+        memory[1:, :2] = np.exp(-step_m / problem.pose_sigma.correlation_m)[:, None]
+        turn = poses[1:, :2, :2].transpose(0, 2, 1) @ poses[:-1, :2, :2]
+        transition[1:, :2, :2] = memory[1:, :2, None] * turn
+    chosen = list(states)
+    information_root = 1 / (sigma * np.sqrt(1 - memory**2))
+    return transition[:, chosen][:, :, chosen], information_root[:, chosen]

@@ -38,7 +38,7 @@ def coarse_extrinsics(arrays: Arrays, cam_from_vehicle: Tensor) -> tuple[Tensor,
         if part is None:
             continue
         corners, _ = back_project(part, cam_from_vehicle)
-        start = Estimate(cam_from_vehicle, part.state_memory, corners)
+        start = Estimate(cam_from_vehicle, part.state_information_root, corners)
         descent = descend(
             part, start, Loss("huber", 1.0), "lbfgs", _GAP_TOLERANCE, _MAX_REFRESHES, _MAX_EVALUATIONS
         )
@@ -66,5 +66,9 @@ def _seen_twice(arrays: Arrays, keep: Tensor) -> Arrays | None:
     if int(torch.bincount(camera, minlength=arrays.camera_count).min()) < _MIN_OBSERVATIONS:
         return None
     part, _ = arrays.take(keep)
-    nothing = arrays.state_memory[:, :0]
-    return replace(part, states=(), state_memory=nothing, state_information_root=nothing)
+    return replace(
+        part,
+        states=(),
+        state_transition=arrays.state_transition[:, :0, :0],
+        state_information_root=arrays.state_information_root[:, :0],
+    )

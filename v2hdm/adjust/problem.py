@@ -54,9 +54,9 @@ class Observations:
 class PoseSigma:
     """How far the recorded poses are off, one standard deviation of each state of a frame.
 
-    ``correlation_m`` is the distance over which the errors of position and heading fade to 1 / e (a
-    first-order Gauss-Markov process along the route; frames must then be in driving order); 0 means
-    independent from frame to frame.
+    ``correlation_m`` is the distance over which the error of the position in the map fades to 1 / e
+    (a first-order Gauss-Markov process along the route, as RTK has; frames must then be in driving
+    order); 0 means independent from frame to frame. Attitude and heave are always independent.
     """
 
     position_m: float = 0.02

@@ -73,7 +73,7 @@ def make_plan(arrays: Arrays) -> Plan:
             )
         )
     cliques = [list(block.tiles) for block in blocks]
-    if bool((arrays.state_memory > 0).any()):
+    if bool(arrays.state_transition.any()):
         cliques += [[tile, tile + 1] for tile in range(count - 1)]
     return Plan(per_tile, find_pattern(count, cliques), tuple(blocks))
 
@@ -139,12 +139,13 @@ def _empty_tiles(plan: Plan, states: int, cameras: int, like: Tensor) -> Tiles:
 
 def _add_frames(arrays: Arrays, plan: Plan, by_frame: Tensor, tiles: Tiles) -> None:
     """Each frame's own information and prior, and the prior's coupling to the frame before."""
-    root, memory = arrays.state_information_root, arrays.state_memory
-    own = root.square()
-    own[:-1] += (memory * root)[1:].square()
-    across = -(memory * root.square())
+    root, transition = arrays.state_information_root, arrays.state_transition
+    carried = root[..., None] * transition
+    own = torch.diag_embed(root.square())
+    own[:-1] += (carried.mT @ carried)[1:]
+    across = -root[..., None] * carried
     per_tile, position, states = plan.frames_per_tile, plan.pattern.position, root.shape[1]
-    by_frame = by_frame + torch.diag_embed(own)
+    by_frame = by_frame + own
     for tile, begin in enumerate(range(0, arrays.frame_count, per_tile)):
         part, coupling = by_frame[begin : begin + per_tile], across[begin : begin + per_tile]
         count = len(part)
@@ -153,11 +154,10 @@ def _add_frames(arrays: Arrays, plan: Plan, by_frame: Tensor, tiles: Tiles) -> N
         # Frames that only fill up the last tile are fixed at 0.
         view[index, :, index, :] = torch.eye(states, dtype=root.dtype, device=root.device)
         view[index[:count], :, index[:count], :] = part
-        inner = torch.diag_embed(coupling[1:])
-        view[index[1:count], :, index[: count - 1], :] = inner
-        view[index[: count - 1], :, index[1:count], :] = inner
+        view[index[1:count], :, index[: count - 1], :] = coupling[1:]
+        view[index[: count - 1], :, index[1:count], :] = coupling[1:].mT
         if tile and bool(coupling[0].any()):
-            _add_between(tiles, position[tile], position[tile - 1], torch.diag(coupling[0]))
+            _add_between(tiles, position[tile], position[tile - 1], coupling[0])
 
 
 def _add_between(tiles: Tiles, later: int, earlier: int, coupling: Tensor) -> None:
@@ -166,7 +166,7 @@ def _add_between(tiles: Tiles, later: int, earlier: int, coupling: Tensor) -> No
     if later > earlier:
         tiles[later, earlier][:states, -states:] += coupling
     else:
-        tiles[earlier, later][-states:, :states] += coupling
+        tiles[earlier, later][-states:, :states] += coupling.mT
 
 
 def subtract_corners(arrays: Arrays, plan: Plan, coupling: Tensor, spread: Tensor, tiles: Tiles) -> None:

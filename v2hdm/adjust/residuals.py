@@ -145,7 +145,8 @@ def centre_residual(arrays: Arrays, estimate: Estimate) -> Tensor:
 def state_residual(arrays: Arrays, frame_state: Tensor) -> Tensor:
     """Whitened innovations (J, S) of the frame states."""
     before = torch.cat([torch.zeros_like(frame_state[:1]), frame_state[:-1]])
-    return (frame_state - arrays.state_memory * before) * arrays.state_information_root
+    expected = (arrays.state_transition @ before[..., None])[..., 0]
+    return (frame_state - expected) * arrays.state_information_root
 
 
 def cost_and_gradient(arrays: Arrays, estimate: Estimate, robust: Loss) -> tuple[dict[str, Tensor], Gradient]:
@@ -168,5 +169,5 @@ def cost_and_gradient(arrays: Arrays, estimate: Estimate, robust: Loss) -> tuple
     by_state = (pair_from_state(arrays, estimate).mT @ wrench[..., None])[..., 0].sum(0)
     innovation = state * arrays.state_information_root
     by_state += innovation
-    by_state[:-1] -= (arrays.state_memory * innovation)[1:]
+    by_state[:-1] -= (arrays.state_transition.mT @ innovation[..., None])[1:, :, 0]
     return terms, Gradient(by_extrinsic, by_state, by_corner)

@@ -63,7 +63,7 @@ def _start(problem: Problem, arrays: Arrays, options: SolveOptions) -> tuple[Est
     spent = 0
     if options.coarse:
         cam_from_vehicle, spent = coarse_extrinsics(arrays, cam_from_vehicle)
-    state = torch.zeros_like(arrays.state_memory)
+    state = torch.zeros_like(arrays.state_information_root)
     if problem.corners_start is not None:
         given = torch.as_tensor(problem.corners_start, dtype=torch.float64, device=options.device)
         return Estimate(cam_from_vehicle, state, given[arrays.corner_order]), spent

@@ -44,7 +44,7 @@ def back_project(arrays: Arrays, cam_from_vehicle: Tensor) -> tuple[Tensor, Tens
     points_map, sine = ground_hits(arrays, cam_from_vehicle)
     usable = sine > _MIN_DEPRESSION_SINE
     each = _one_corner_each(arrays)
-    state = arrays.state_memory.new_zeros(arrays.state_memory.shape)
+    state = torch.zeros_like(arrays.state_information_root)
     estimate = Estimate(cam_from_vehicle, state, points_map)
     _, by_corner = jacobians(each, observe(each, estimate))
     information = torch.where(usable[:, None, None], by_corner.mT @ by_corner, torch.zeros_like(by_corner))
