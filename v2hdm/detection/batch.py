@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import cv2
@@ -16,6 +18,7 @@ from v2hdm.records import Camera, Drive, Image, ImageDetections
 
 _worker: tuple[Detector, Drive] | None = None
 _CHUNK = 4
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def read_image(image: Image, camera: Camera) -> np.ndarray:
@@ -93,10 +96,28 @@ def detect_all(
         return results
     Detector.load(options=options)  # a bad model is refused here, once, not in every worker
     context = multiprocessing.get_context("spawn")
-    with context.Pool(min(workers, total), _start_worker, (drive, options)) as pool:
+    with (
+        _single_threaded_children(),
+        context.Pool(min(workers, total), _start_worker, (drive, options)) as pool,
+    ):
         for detections in pool.imap(_work, range(total), chunksize=_CHUNK):
             collect(detections)
     return results
+
+
+@contextmanager
+def _single_threaded_children() -> Iterator[None]:
+    """Keep numpy's linear algebra in child processes from starting a thread a core each."""
+    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def _start_worker(drive: Drive, options: DetectorOptions) -> None:
