@@ -74,6 +74,7 @@ class Trainer:
                     saved = state.elapsed_s
             self._validate(validation, board)
         self._save("last.pt")
+        self.progress(1.0, f"step {state.step}, IoU {state.best_iou:.3f}")
         return state
 
     def _open(self) -> Checkpoint:

@@ -27,7 +27,9 @@ def random_images(*shape: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(("batch", "height", "width"), [(1, 16, 16), (2, 48, 80), (1, 208, 1232)])
-def test_there_is_one_logit_for_every_other_pixel(net: MarkingNet, batch: int, height: int, width: int) -> None:
+def test_there_is_one_logit_for_every_other_pixel(
+    net: MarkingNet, batch: int, height: int, width: int
+) -> None:
     with torch.inference_mode():
         logits = net(random_images(batch, height, width))
     assert logits.shape == (batch, 1 + len(PAINT_CLASSES), height // 2, width // 2)
@@ -53,7 +55,9 @@ def test_the_stem_keeps_every_pixel_of_a_tile_as_a_channel() -> None:
     channels = _space_to_depth(image) * 64.0 + 112.0
     for row, column, colour in ((0, 0, 0), (3, 1, 2), (2, 3, 1)):
         channel = (row * 4 + column) * 3 + colour
-        np.testing.assert_allclose(channels[:, channel], image[:, row::4, column::4, colour].float(), atol=1e-4)
+        np.testing.assert_allclose(
+            channels[:, channel], image[:, row::4, column::4, colour].float(), atol=1e-4
+        )
 
 
 def test_depth_to_space_is_pixel_shuffle() -> None:
