@@ -60,6 +60,8 @@ def ground_marks(rng: np.random.Generator) -> GroundMarks:
     """Tyre marks, cracks, repairs, rails, covers and spills: unlabelled, dark and up to twice as bright."""
     columns, rows = (int(m / _MARKS_RESOLUTION_M) for m in _MARKS_M)
     factor = np.full((rows, columns), 128, dtype=np.uint8)
+    if rng.random() < 0.2:
+        _flecks(rng, factor)
     for side in (-1, 1):
         if rng.random() < 0.3:
             _verge(rng, factor, side)
@@ -254,6 +256,21 @@ def _container_stack(rng: np.random.Generator, left: float) -> list[Box]:
 
 def _point(rng: np.random.Generator, factor: Factor) -> tuple[int, int]:
     return int(rng.integers(factor.shape[1])), int(rng.integers(factor.shape[0]))
+
+
+def _flecks(rng: np.random.Generator, factor: Factor) -> None:
+    """Single spots of sun on shaded ground, all of about one size: the easiest thing to take for diamonds."""
+    size = float(np.exp(rng.uniform(np.log(1.5), np.log(9.0))))
+    noise = cv2.GaussianBlur(
+        rng.standard_normal(factor.shape, np.float32),
+        (0, 0),
+        size,
+        sigmaY=size * float(rng.uniform(0.5, 2.0)),
+    )
+    noise /= noise.std()
+    lit = np.clip((noise - rng.uniform(0.7, 2.0)) / rng.uniform(0.1, 0.8), 0, 1)
+    shade = rng.uniform(30, 90)
+    factor[:] = (shade + lit * (rng.uniform(200, 255) - shade)).astype(np.uint8)
 
 
 def _verge(rng: np.random.Generator, factor: Factor, side: int) -> None:

@@ -55,7 +55,7 @@ def training_sample(
 
 def random_scene(rng: np.random.Generator, difficulty: float = 1.0) -> Scene:
     """A port (two in five), a street (half) or unpainted ground, seen from the map's origin along +x."""
-    place = rng.choice(["port", "street", "bare"], p=[0.41, 0.53, 0.06])
+    place = rng.choice(["port", "street", "bare"], p=[0.4, 0.5, 0.1])
     bend = Bend(float(rng.normal(0, 0.006)) if rng.random() < 0.4 else 0.0)
     brush = random_brush(rng, difficulty)
     road_half_m = float(rng.uniform(2, 9))
@@ -98,15 +98,17 @@ def _ground(rng: np.random.Generator, port: bool, difficulty: float) -> Ground:
     concrete = rng.random() < (0.55 if port else 0.15)
     grey = rng.uniform(0.14, 0.36) if concrete else rng.uniform(0.05, 0.24)
     tint = np.exp(rng.normal(0, 0.05, 3)) * (0.97, 1.0, 1.03)
-    blue, green, red = (float(c) for c in grey * tint)
     texture = "concrete" if concrete else "asphalt"
-    if rng.random() < 0.12:
+    if rng.random() < 0.14:
         texture = str(rng.choice(["gravel", "grass", "brick"]))
+    if texture == "grass":
+        tint = np.array([rng.uniform(0.2, 0.7), 1.0, rng.uniform(0.6, 1.4)])
+    blue, green, red = (float(c) for c in grey * tint)
     slabs = (concrete and rng.random() < 0.75) or rng.random() < 0.08
     return Ground(
         albedo_bgr=(blue, green, red),
         texture=texture,
-        contrast=float(rng.uniform(0.04, 0.32)),
+        contrast=float(rng.uniform(0.2, 0.6) if texture == "grass" else rng.uniform(0.04, 0.32)),
         stains=float(rng.uniform(0.03, 0.1 + 0.22 * difficulty)),
         slab_m=(float(rng.uniform(2, 9)), float(rng.uniform(2, 9))) if slabs else None,
         slab_yaw_rad=float(rng.normal(0, 0.05) if rng.random() < 0.6 else rng.uniform(0, 1.6)),
@@ -155,7 +157,7 @@ def _shadows(rng: np.random.Generator, difficulty: float) -> tuple[Shadow, ...]:
 
 def _dapples(rng: np.random.Generator, difficulty: float) -> tuple[Dapple, ...]:
     """The shade of trees, over all the ground or a part of it, perhaps of leaves and of boughs."""
-    if rng.random() > 0.2 + 0.25 * difficulty:
+    if rng.random() > 0.25 + 0.3 * difficulty:
         return ()
     region = None
     if rng.random() < 0.6:
@@ -163,7 +165,7 @@ def _dapples(rng: np.random.Generator, difficulty: float) -> tuple[Dapple, ...]:
         region = rectangle(centre, rng.uniform(6, 40), rng.uniform(3, 20), rng.uniform(-0.4, 0.4))
     return tuple(
         Dapple(
-            shaded=float(rng.uniform(0.25, 0.92)),
+            shaded=float(rng.uniform(0.25, 0.85) if rng.random() < 0.5 else rng.uniform(0.8, 0.97)),
             scale_m=float(rng.choice(_FLECK_SIZES_M)),
             transmission=float(rng.uniform(0.0, 0.3)),
             region_map=region,
