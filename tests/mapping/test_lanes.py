@@ -130,7 +130,7 @@ def test_an_empty_cloud_has_no_lanes() -> None:
 def test_a_hundred_thousand_points_take_seconds() -> None:
     cloud = cloud_of([straight(0, 350, y, 0.25) for y in (-3.5, 0.0, 3.5, 7.0)], images=18)
     assert len(cloud.weight) > 100_000
-    begin = time.perf_counter()
+    begin = time.process_time()
     lanes = map_lanes(cloud, OPTIONS)
     assert len(lanes) == 4
-    assert time.perf_counter() - begin < 30
+    assert time.process_time() - begin < 15
