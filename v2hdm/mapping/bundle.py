@@ -89,6 +89,7 @@ def full_model(pose_noise: PoseNoise, options: MappingOptions) -> Model:
         loss=options.loss,
         loss_scale=options.loss_scale,
         coarse=False,
+        device=options.device,
     )
     return Model(pose_sigma, options.model_floor_px, solver)
 
@@ -101,7 +102,9 @@ def coarse_model(rig: Rig, pose_noise: PoseNoise, options: MappingOptions) -> Mo
     """
     focal_px = float(np.mean(rig.intrinsic[:, 0, 0]))
     jitter_px = focal_px * float(np.hypot(pose_noise.roll_pitch_rad, pose_noise.heading_rad))
-    solver = SolveOptions(pose_states=(), loss=options.loss, loss_scale=options.loss_scale)
+    solver = SolveOptions(
+        pose_states=(), loss=options.loss, loss_scale=options.loss_scale, device=options.device
+    )
     return Model(PoseSigma(), float(np.hypot(options.model_floor_px, jitter_px)), solver)
 
 

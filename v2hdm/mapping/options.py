@@ -79,6 +79,7 @@ class MappingOptions:
     (all of ``roll pitch heading x y height``; empty is the paper's model, which trusts the
     recorded poses). ``loss`` and ``loss_scale`` are the robust loss of the solver.
     ``rounds`` counts association under the optimised extrinsic followed by a joint solve.
+    ``device`` is the torch device that the joint solves run on, ``cpu`` or ``cuda``.
     """
 
     max_range_m: float = 16.0
@@ -87,6 +88,7 @@ class MappingOptions:
     loss: str = "cauchy"
     loss_scale: float = 2.0
     rounds: int = 2
+    device: str = "cpu"
     association: AssociationOptions = field(default_factory=AssociationOptions)
     acceptance: AcceptanceOptions = field(default_factory=AcceptanceOptions)
     lanes: LaneOptions = field(default_factory=LaneOptions)
