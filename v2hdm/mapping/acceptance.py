@@ -71,10 +71,12 @@ def judge(candidates: Candidates, options: AcceptanceOptions) -> list[str | None
         candidates.inlier_share < options.min_inlier_share,
         "its sightings contradict each other",
     )
-    _refuse(verdict, _seldom_detected(candidates, verdict, options), "found in too few of its images")
     _refuse(verdict, ~is_convex(candidates.corners_map), "not a convex quadrilateral")
     _refuse(verdict, _uncertain(candidates, options), "its position is too uncertain")
-    _refuse(verdict, _odd_shapes(candidates, verdict, options), "not shaped like the others of its class")
+    typical, odd = _judge_shapes(candidates, verdict, options)
+    _refuse(verdict, odd, "not shaped like the others of its class")
+    seldom = _seldom_detected(candidates, verdict, options) & ~typical
+    _refuse(verdict, seldom, "found in too few of its images")
     _refuse(verdict, _covered(candidates, verdict), "lies on a better supported marking")
     return verdict
 
@@ -91,7 +93,11 @@ def _standing(verdict: list[str | None]) -> BoolArray:
 def _seldom_detected(
     candidates: Candidates, verdict: list[str | None], options: AcceptanceOptions
 ) -> BoolArray:
-    """Groups found far less often, for the chances that they had, than is usual for their class."""
+    """Groups found far less often, for the chances that they had, than is usual for their class.
+
+    A chance artefact shows in a few images; but so does a worn marking, which is why this speaks only
+    against groups whose shape is not known from others.
+    """
     share = candidates.easy_detections / np.maximum(candidates.easy_views, 1)
     telling = candidates.easy_views >= MIN_EASY_VIEWS
     seldom = np.zeros(len(share), dtype=bool)
@@ -113,13 +119,16 @@ def _uncertain(candidates: Candidates, options: AcceptanceOptions) -> BoolArray:
     return np.asarray(sigma2 > np.min(sigma2, initial=np.inf) + options.max_sigma_m**2)
 
 
-def _odd_shapes(candidates: Candidates, verdict: list[str | None], options: AcceptanceOptions) -> BoolArray:
-    """Groups without peers in a class whose members mostly have peers.
+def _judge_shapes(
+    candidates: Candidates, verdict: list[str | None], options: AcceptanceOptions
+) -> tuple[BoolArray, BoolArray]:
+    """Groups with peers, and groups without, in classes whose members mostly have peers.
 
     Peers agree in sides and diagonals. A class may hold several shapes, such as the dashes of two
-    kinds of road; what is refused is a shape that hardly any other shares.
+    kinds of road; what is odd is a shape that hardly any other shares.
     """
     lengths = _lengths(candidates.corners_map)
+    typical = np.zeros(len(lengths), dtype=bool)
     odd = np.zeros(len(lengths), dtype=bool)
     for kind in np.unique(candidates.kind):
         own = np.flatnonzero((candidates.kind == kind) & _standing(verdict))
@@ -131,7 +140,8 @@ def _odd_shapes(candidates: Candidates, verdict: list[str | None], options: Acce
         lonely = peers < max(MIN_PEERS, PEER_SHARE * len(own))
         if lonely.mean() <= MAX_LONELY_SHARE:
             odd[own[lonely]] = True
-    return odd
+            typical[own[~lonely]] = True
+    return typical, odd
 
 
 def _lengths(corners: FloatArray) -> FloatArray:

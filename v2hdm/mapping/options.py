@@ -34,10 +34,11 @@ class AcceptanceOptions:
     """What a marking must show to enter the map.
 
     ``min_sightings`` images with accepted corners; ``min_inlier_share`` of its corner observations
-    agreeing with the solution; ``min_detection_share`` of the images that had it in easy view, as
-    a share of what is usual for its class; a worst corner less certain than the best one of the map
-    by at most ``max_sigma_m``; and, in a class of at least ``consensus_count`` markings, sides and
-    diagonals that others have too, within ``shape_tolerance`` of their length.
+    agreeing with the solution; a worst corner less certain than the best one of the map by at most
+    ``max_sigma_m``; in a class of at least ``consensus_count`` markings, sides and diagonals that
+    others have too, within ``shape_tolerance`` of their length; and, unless its shape is thereby
+    known, detections in ``min_detection_share`` of the images that had it in easy view, as a share
+    of what is usual for its class.
     """
 
     min_sightings: int = 3
