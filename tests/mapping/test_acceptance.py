@@ -18,6 +18,7 @@ def row_of_diamonds() -> Candidates:
     return Candidates(
         kind=np.zeros(COUNT, dtype=np.int64),
         corners_map=DIAMOND + np.arange(COUNT)[:, None, None] * np.array([5.0, 0.0]),
+        completed=np.zeros(COUNT, dtype=bool),
         sigma_m=np.full(COUNT, 0.01),
         sightings=np.full(COUNT, 10),
         inlier_share=np.ones(COUNT),
@@ -44,6 +45,20 @@ def test_a_marking_seen_twice_is_refused() -> None:
 def test_a_marking_with_a_missing_corner_is_refused() -> None:
     sound = row_of_diamonds()
     sound.corners_map[4, 1] = np.nan
+    assert refused(sound) == {4: "a corner was never seen twice"}
+
+
+def test_a_corner_may_be_implied_where_the_shape_is_known() -> None:
+    sound = row_of_diamonds()
+    sound.completed[4] = True
+    assert refused(sound) == {}
+
+
+def test_a_corner_may_not_be_implied_where_no_other_has_such_a_shape() -> None:
+    sound = row_of_diamonds()
+    for group in range(COUNT):
+        sound.corners_map[group] = sound.corners_map[group].mean(axis=0) + 1.3**group * DIAMOND / 8
+    sound.completed[4] = True
     assert refused(sound) == {4: "a corner was never seen twice"}
 
 

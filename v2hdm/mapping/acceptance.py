@@ -42,13 +42,15 @@ class Candidates:
     """What is known of G groups before the verdict.
 
     ``kind`` (G,) indexes the cornered classes; ``corners_map`` (G, 4, 2), nan where a corner is
-    missing; ``sigma_m`` (G,) of the worst corner; ``sightings`` (G,) images with accepted
-    observations; ``inlier_share`` (G,) of the observations; ``easy_views`` (G,) images that had the
-    whole marking in easy view and ``easy_detections`` (G,) those among them that it was found in.
+    missing; ``completed`` (G,) whether one corner was implied by the other three; ``sigma_m`` (G,)
+    of the worst corner; ``sightings`` (G,) images with accepted observations; ``inlier_share`` (G,)
+    of the observations; ``easy_views`` (G,) images that had the whole marking in easy view and
+    ``easy_detections`` (G,) those among them that it was found in.
     """
 
     kind: IntArray
     corners_map: FloatArray
+    completed: BoolArray
     sigma_m: FloatArray
     sightings: IntArray
     inlier_share: FloatArray
@@ -75,6 +77,7 @@ def judge(candidates: Candidates, options: AcceptanceOptions) -> list[str | None
     _refuse(verdict, _uncertain(candidates, options), "its position is too uncertain")
     typical, odd = _judge_shapes(candidates, verdict, options)
     _refuse(verdict, odd, "not shaped like the others of its class")
+    _refuse(verdict, candidates.completed & ~typical, "a corner was never seen twice")
     seldom = _seldom_detected(candidates, verdict, options) & ~typical
     _refuse(verdict, seldom, "found in too few of its images")
     _refuse(verdict, _covered(candidates, verdict), "lies on a better supported marking")

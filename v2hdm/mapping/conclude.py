@@ -12,6 +12,7 @@ from v2hdm.errors import MappingError
 from v2hdm.mapping.acceptance import Candidates, judge
 from v2hdm.mapping.association import fuse_groups
 from v2hdm.mapping.bundle import Bundle
+from v2hdm.mapping.completion import SolvedCorners, solved_corners
 from v2hdm.mapping.location import Rig, locate
 from v2hdm.mapping.merge import group_kinds
 from v2hdm.mapping.options import AcceptanceOptions
@@ -68,8 +69,8 @@ def conclude(
         MappingError: No candidate is accepted.
     """
     final = evidence.final
-    covariance = corner_covariances(final)
-    candidates = _candidates(evidence, covariance)
+    solved = solved_corners(final)
+    candidates = _candidates(evidence, solved)
     verdict = judge(candidates, options)
     accepted = np.flatnonzero([reason is None for reason in verdict])
     excluded = _exclusions(candidates, verdict)
@@ -80,7 +81,7 @@ def conclude(
             kind=CORNERED_CLASSES[candidates.kind[group]],
             corners_map=candidates.corners_map[group],
             sightings=int(candidates.sightings[group]),
-            covariance_m2=covariance[group],
+            covariance_m2=solved.covariance_m2[group],
         )
         for group in accepted
     )
@@ -97,33 +98,21 @@ def conclude(
     )
 
 
-def corner_covariances(bundle: Bundle) -> FloatArray:
-    """Covariances (G, 8, 8), m^2, of each group's stacked corners; nan where a corner is missing.
-
-    They are scaled by chi^2 per degree of freedom where that exceeds one: residuals larger than
-    their stated noise make the map less certain than the noise model claims.
-    """
-    out = np.full((len(bundle.corner_index), 8, 8), np.nan)
-    whole = np.flatnonzero((bundle.corner_index >= 0).all(axis=1))
-    if len(whole):
-        covariance = bundle.solution.corner_covariance(bundle.corner_index[whole])
-        out[whole] = max(1.0, bundle.solution.chi2_per_dof) * covariance
-    return out
-
-
-def _candidates(evidence: Evidence, covariance: FloatArray) -> Candidates:
+def _candidates(evidence: Evidence, solved: SolvedCorners) -> Candidates:
     final, ungated, sightings = evidence.final, evidence.ungated, evidence.sightings
     count = final.association.count
-    corners = final.corners_map
-    variance = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 4, 2).sum(axis=2)
+    variance = np.diagonal(solved.covariance_m2, axis1=1, axis2=2).reshape(-1, 4, 2).sum(axis=2)
     total = np.bincount(ungated.group, minlength=count)
     agreeing = np.bincount(ungated.group[evidence.inlier], minlength=count)
     seen = np.unique(np.stack([final.group, sightings.image[final.row]]), axis=1)
-    easy = np.stack(easy_views(evidence.views, final.rig, list(evidence.cameras.values()), corners))
+    easy = np.stack(
+        easy_views(evidence.views, final.rig, list(evidence.cameras.values()), solved.corners_map)
+    )
     found = np.isin(_pair_keys(easy), _pair_keys(seen))
     return Candidates(
         kind=group_kinds(final.association, sightings),
-        corners_map=corners,
+        corners_map=solved.corners_map,
+        completed=solved.completed,
         sigma_m=np.sqrt(np.max(variance, axis=1)),
         sightings=np.bincount(seen[0], minlength=count),
         inlier_share=agreeing / np.maximum(total, 1),

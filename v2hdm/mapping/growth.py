@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.mapping.bundle import Bundle
+from v2hdm.mapping.completion import complete_corners
 from v2hdm.mapping.conclude import Optimised
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.results import GrowthStep
@@ -57,7 +58,7 @@ def _order_of_sight(optimised: Optimised) -> IntArray:
 
 
 def _step(bundle: Bundle, optimised: Optimised, chosen: IntArray, names: tuple[str, ...]) -> GrowthStep:
-    corners = bundle.corners_map[optimised.groups[chosen]]
+    corners = complete_corners(bundle.corners_map[optimised.groups[chosen]])
     return GrowthStep(
         markings=tuple(
             replace(optimised.markings[m], corners_map=corners[row], covariance_m2=None)

@@ -1,0 +1,75 @@
+"""The fourth corner of a marking of which only three were seen well enough.
+
+A container's edge, a puddle or worn paint can hide one corner from every image. Diamonds and dashes
+are parallelograms on the ground, so three corners imply the fourth, p1 + p3 - p2, and with it a
+covariance. Whether the marking is accepted is then up to the shape that results.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from v2hdm.mapping.bundle import Bundle
+from v2hdm.records import BoolArray, FloatArray
+
+
+@dataclass(frozen=True)
+class SolvedCorners:
+    """Corners (G, 4, 2) m and their joint covariances (G, 8, 8) m^2, nan where not even three are known.
+
+    ``completed`` (G,) marks groups with a corner that was implied and not seen.
+    """
+
+    corners_map: FloatArray
+    covariance_m2: FloatArray
+    completed: BoolArray
+
+
+def solved_corners(bundle: Bundle) -> SolvedCorners:
+    """Corners of every group of ``bundle``, a single missing one completed.
+
+    Covariances are scaled by chi^2 per degree of freedom where that exceeds one: residuals larger
+    than their stated noise make the map less certain than the noise model claims.
+    """
+    known = bundle.corner_index >= 0
+    whole = np.flatnonzero(known.all(axis=1))
+    partial = np.flatnonzero(known.sum(axis=1) == 3)
+    covariance = np.full((len(known), 8, 8), np.nan)
+    scale = max(1.0, bundle.solution.chi2_per_dof)
+    if len(whole):
+        covariance[whole] = scale * bundle.solution.corner_covariance(bundle.corner_index[whole])
+    if len(partial):
+        # Corners in circular order after the missing one: next, opposite, previous.
+        others = (np.argmin(known[partial], axis=1)[:, None] + np.arange(1, 4)) % 4
+        indices = np.take_along_axis(bundle.corner_index[partial], others, axis=1)
+        three = scale * bundle.solution.corner_covariance(indices)
+        for group, order, block in zip(partial, others, three, strict=True):
+            spread = _spread(order)
+            covariance[group] = spread @ block @ spread.T
+    completed = np.zeros(len(known), dtype=bool)
+    completed[partial] = True
+    return SolvedCorners(complete_corners(bundle.corners_map), covariance, completed)
+
+
+def complete_corners(corners_map: FloatArray) -> FloatArray:
+    """Quadrilaterals (G, 4, 2) with a single nan corner replaced by that of the parallelogram."""
+    out = corners_map.copy()
+    missing = np.asarray(np.isnan(corners_map).any(axis=2))
+    partial = np.flatnonzero(missing.sum(axis=1) == 1)
+    corner = np.argmax(missing[partial], axis=1)
+    after, opposite, before = (corners_map[partial, (corner + step) % 4] for step in (1, 2, 3))
+    out[partial, corner] = after + before - opposite
+    return out
+
+
+def _spread(others: np.ndarray) -> FloatArray:
+    """Matrix (8, 6) from the known corners (next, opposite, previous) to all four in order."""
+    spread = np.zeros((8, 6))
+    missing = (int(others[0]) - 1) % 4
+    for k, corner in enumerate(others.tolist()):
+        spread[2 * corner : 2 * corner + 2, 2 * k : 2 * k + 2] = np.eye(2)
+    for k, sign in enumerate((1.0, -1.0, 1.0)):
+        spread[2 * missing : 2 * missing + 2, 2 * k : 2 * k + 2] = sign * np.eye(2)
+    return spread
