@@ -43,7 +43,7 @@ class Brush:
 
     def paint(self, rng: np.random.Generator, kind: str, polygon_map: FloatArray) -> Paint:
         """One piece; wear differs from piece to piece."""
-        wear = float(np.clip(self.wear * np.exp(rng.normal(0, 0.35)), 0, 0.62))
+        wear = float(np.clip(self.wear * np.exp(rng.normal(0, 0.5)), 0, 0.62))
         dirt = float(np.clip(self.dirt * np.exp(rng.normal(0, 0.3)), 0, 0.6))
         return Paint(
             kind=kind,
