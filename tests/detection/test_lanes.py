@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.detection.pictures import bar, brightness_model, make_camera, picture
+from tests.detection.pictures import bar, brightness_model, diamond, make_camera, picture
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.view import CameraView
@@ -57,3 +57,11 @@ def test_a_dash_is_a_marking_and_a_piece_of_lane(tmp_path):
 def test_paint_too_long_for_a_dash_is_a_line(tmp_path):
     ((kind, _),) = lanes_of(tmp_path, [bar(10.5, 0.5, 15.0, 0.15)], kind="lane_dash")
     assert kind == "lane_line"
+
+
+def test_a_compact_marking_is_never_lane_paint_whatever_the_network_says(tmp_path):
+    camera = make_camera()
+    detector = Detector.load(brightness_model(tmp_path, "lane_dash"))
+    markings, lanes = detector.detect(picture(camera, [diamond(8.0, 0.5)]), camera)
+    assert [m.kind for m in markings] == ["diamond"]
+    assert lanes == ()

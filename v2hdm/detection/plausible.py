@@ -24,6 +24,9 @@ _DASH_SHARE = 0.25
 """A piece of lane paint that ends at both sides, no longer than that, is a dash even if the network
 gives only this share of its lane score to dashes: seen locally, dash and line are the same paint."""
 
+_LEAST_ELONGATION = 3.0
+"""Lane paint is at least this many times as long as wide; far diamonds look like dashes, but are not."""
+
 _BORDER_PX = 6.0
 
 
@@ -37,7 +40,10 @@ def plausible_kind(blob: Blob, outline_pinhole_px: FloatArray, view: CameraView)
     """
     length_m, width_m = _ground_size(view.ground(outline_pinhole_px))
     whole = bool(view.inside(blob.outline_px, _BORDER_PX).all())
-    kind, score = _likeliest(blob.class_score, whole and length_m <= _DASH_LENGTH_M)
+    if whole and length_m < _LEAST_ELONGATION * width_m:
+        kind, score = _likeliest_compact(blob.class_score)
+    else:
+        kind, score = _likeliest(blob.class_score, whole and length_m <= _DASH_LENGTH_M)
     if kind == LANE_DASH and not _fits(LANE_DASH, length_m, width_m):
         kind = LANE_LINE
     return (kind, score) if _fits(kind, length_m, width_m) else None
@@ -52,6 +58,14 @@ def _likeliest(class_score: dict[str, float], short: bool) -> tuple[str, float]:
         return best_other, others[best_other]
     dash_share = class_score.get(LANE_DASH, 0.0) / max(lane_score, 1e-9)
     return (LANE_DASH if dash_share > (_DASH_SHARE if short else 0.5) else LANE_LINE), lane_score
+
+
+def _likeliest_compact(class_score: dict[str, float]) -> tuple[str, float]:
+    """The best class but lanes, which its shape rules out; their score is paint, so the best takes it."""
+    lane_score = sum(class_score.get(name, 0.0) for name in LANE_CLASSES)
+    others = {name: score for name, score in class_score.items() if name not in LANE_CLASSES}
+    best = max(others, key=others.__getitem__, default=LANE_LINE)
+    return best, others.get(best, 0.0) + lane_score
 
 
 def _fits(kind: str, length_m: float, width_m: float) -> bool:

@@ -15,6 +15,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
+import torch
+
 from v2hdm import __version__
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
@@ -65,7 +67,7 @@ class RunConfig:
         output: folder that takes the results.
         cache: folder that keeps rendered drives.
         workers: processes for rendering and detection; 0 takes one per core.
-        device: where the optimisation runs, ``cpu`` or ``cuda``.
+        device: what ``conf/map.yaml`` hands on as ``mapping.device``, ``cpu`` or ``cuda``.
     """
 
     name: str
@@ -99,6 +101,7 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
     Raises:
         V2hdmError: The configuration, the drive or the detector is at fault, or no map can be made.
     """
+    _check_device(config.mapping.device)
     seconds: dict[str, float] = {}
     with result_folder(Path(config.output) / config.name) as folder, _log_file(folder / "run.log"):
         log.info("v2hdm %s, run %s", __version__, config.name)
@@ -164,6 +167,20 @@ def _map_camera_sets(
             log.debug("%s: left out a %s at (%s): %s", name, exclusion.kind, where, exclusion.reason)
     progress("map", len(sets), len(sets))
     return found
+
+
+def _check_device(device: str) -> None:
+    """Refuse a device that is unknown or not there, before any long work.
+
+    Raises:
+        ConfigError: The message names the device.
+    """
+    if device not in ("cpu", "cuda"):
+        raise ConfigError(f"device is {device!r}: choose cpu or cuda")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ConfigError(
+            "device is 'cuda' but torch sees no GPU: check the driver and torch build, or set device=cpu"
+        )
 
 
 def _workers(config: RunConfig) -> int:

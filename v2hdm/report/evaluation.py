@@ -9,20 +9,25 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from v2hdm.records import CORNERED_CLASSES, BoolArray, FloatArray, HdMap, Truth
+from v2hdm.records import CORNERED_CLASSES, DIAMOND, BoolArray, FloatArray, HdMap, Truth
 from v2hdm.report.dashes import dash_spacing
 from v2hdm.report.lane_metrics import lane_metrics
 from v2hdm.report.metrics import extrinsic_metrics, marking_metrics
 
 
 def map_figures(hd_map: HdMap, truth: Truth | None, expected: BoolArray | None) -> dict[str, Any]:
-    """Figures of one map: against the truth where there is one, counts and dash spacing always."""
+    """Figures of one map: against the truth where there is one, counts and dash spacing always.
+
+    Counts and errors are of markings of all classes; ``recall`` and ``expected`` are those of the
+    diamonds, the site's landmarks, where it has any. ``by_class`` holds every figure of each class.
+    """
     figures: dict[str, Any] = {"markings": len(hd_map.markings)}
     if truth is not None and expected is not None:
         figures |= asdict(marking_metrics(hd_map, truth, expected))
-        figures["by_class"] = {
-            kind: asdict(marking_metrics(hd_map, truth, expected, kind)) for kind in CORNERED_CLASSES
-        }
+        by_class = {kind: asdict(marking_metrics(hd_map, truth, expected, kind)) for kind in CORNERED_CLASSES}
+        if by_class[DIAMOND]["expected"]:
+            figures |= {name: by_class[DIAMOND][name] for name in ("expected", "recall")}
+        figures["by_class"] = by_class
     figures["lanes"] = _lane_figures(hd_map, truth)
     figures["dash_spacing"] = asdict(dash_spacing(hd_map))
     return figures
