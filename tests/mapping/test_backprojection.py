@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.mapping.scene import MOUNTS, SceneOptions, extrinsic, make_scene
@@ -13,7 +12,6 @@ from v2hdm.mapping.backprojection import (
     direction_covariance,
     forward_ipm,
     homography_jacobians,
-    inside_polygon,
     plain_homographies,
     posed_homographies,
 )
@@ -76,10 +74,3 @@ def test_a_pitch_error_moves_a_point_along_its_ray_as_the_formula_says() -> None
     """At h = 2.4 m and r = 10 m, one milliradian of pitch is (100 + 5.76) / 2.4 mm = 44 mm."""
     covariance = direction_covariance(np.array([10.0, 0.0]), np.array(2.4), 1e-3)
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [0.04407, 0.010], rtol=1e-3)
-
-
-@pytest.mark.parametrize("order", [1, -1])
-def test_inside_a_polygon_of_either_sense(order: int) -> None:
-    square = np.array([[0.0, 0], [2, 0], [2, 2], [0, 2]])[::order]
-    points = np.array([[1.0, 1.0], [3.0, 1.0], [np.nan, 1.0]])
-    assert inside_polygon(points, square).tolist() == [True, False, False]

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tests.report.scene import diamond_at, make_truth
 from v2hdm.records import DIAMOND, LANE_DASH, HdMap, Lane, Marking
 from v2hdm.report.lane_metrics import lane_metrics
-from v2hdm.report.metrics import corner_errors, driven_past, extrinsic_metrics, inside_convex, marking_metrics
+from v2hdm.report.metrics import corner_errors, driven_past, extrinsic_metrics, marking_metrics
 
 
 def test_only_the_marking_inside_the_region_of_interest_counts_as_driven_past() -> None:
@@ -70,13 +70,6 @@ def test_extrinsic_error_is_the_angle_and_the_distance_of_the_centres() -> None:
     result = extrinsic_metrics(estimate, true)
     assert result.rotation_error_deg == pytest.approx(2.0)
     assert result.translation_error_m == pytest.approx(0.05)
-
-
-def test_both_orientations_of_a_convex_polygon_contain_their_inside() -> None:
-    square = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
-    points = np.array([[0.5, 0.5], [1.5, 0.5], [-0.1, 0.2]])
-    assert inside_convex(square, points).tolist() == [True, False, False]
-    assert inside_convex(square[::-1], points).tolist() == [True, False, False]
 
 
 def test_a_lane_five_centimetres_aside_over_the_visible_half_is_all_of_what_was_visible() -> None:

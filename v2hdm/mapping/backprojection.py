@@ -88,12 +88,3 @@ def direction_covariance(ray_ground: FloatArray, height_m: FloatArray, sigma_rad
         sigma_along[..., None, None] ** 2 * along[..., :, None] * along[..., None, :]
         + sigma_across[..., None, None] ** 2 * across[..., :, None] * across[..., None, :]
     )
-
-
-def inside_polygon(points: FloatArray, polygon: FloatArray) -> NDArray[np.bool_]:
-    """Whether points (..., 2) lie inside the convex ``polygon`` (N, 2); nan counts as outside."""
-    edges = np.roll(polygon, -1, axis=0) - polygon
-    ahead = polygon[None] - np.asarray(points).reshape(-1, 1, 2)
-    side = edges[:, 0] * -ahead[..., 1] + edges[:, 1] * ahead[..., 0]
-    inside = (side >= 0).all(axis=1) | (side <= 0).all(axis=1)
-    return np.asarray(inside.reshape(np.shape(points)[:-1]))

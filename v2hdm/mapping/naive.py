@@ -14,7 +14,6 @@ from v2hdm.mapping.association import Association, FusedGroups, keep_rows
 from v2hdm.mapping.backprojection import (
     apply_homographies,
     forward_ipm,
-    inside_polygon,
     plain_homographies,
 )
 from v2hdm.mapping.merge import group_kinds, merge_groups
@@ -22,6 +21,7 @@ from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import Exclusion
 from v2hdm.mapping.shapes import is_convex
 from v2hdm.mapping.sightings import Sightings
+from v2hdm.planar import inside_convex
 from v2hdm.records import CORNERED_CLASSES, BoolArray, Camera, FloatArray, Marking
 
 
@@ -78,7 +78,7 @@ def _inside_roi(
     inside = np.zeros(len(sightings), dtype=bool)
     for c, name in enumerate(sightings.cameras):
         own = sightings.camera == c
-        inside[own] = inside_polygon(corners_vehicle[own], cameras[name].roi_vehicle).all(axis=1)
+        inside[own] = inside_convex(cameras[name].roi_vehicle, corners_vehicle[own]).all(axis=1)
     return inside & sightings.valid.all(axis=1)
 
 

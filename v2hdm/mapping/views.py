@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from v2hdm.mapping.backprojection import inside_polygon
 from v2hdm.mapping.location import Rig
 from v2hdm.mapping.sightings import frames_of
+from v2hdm.planar import inside_convex
 from v2hdm.records import Camera, Drive, FloatArray
 
 IntArray = NDArray[np.int64]
@@ -90,7 +90,7 @@ def _sees(
     flat[:, 2, 2] = 1.0
     ones = np.ones((len(corners_map), 4, 1))
     corners_vehicle = (np.concatenate([corners_map, ones], axis=-1) @ np.swapaxes(flat, 1, 2))[..., :2]
-    inside = inside_polygon(corners_vehicle, camera.roi_vehicle).all(axis=1)
+    inside = inside_convex(camera.roi_vehicle, corners_vehicle).all(axis=1)
     pixel, depth = project_ground(camera.info.intrinsic, cam_from_vehicle @ vehicle_from_map, corners_map)
     limit = np.array([camera.info.width, camera.info.height]) - _BORDER_PX
     with np.errstate(invalid="ignore"):

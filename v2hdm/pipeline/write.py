@@ -14,7 +14,8 @@ from v2hdm.hdmap.calibration import write_calibration
 from v2hdm.hdmap.geojson import write_geojson
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.evaluate import Judgement
-from v2hdm.records import Drive, FloatArray, Image
+from v2hdm.planar import ground_in_vehicle
+from v2hdm.records import Drive, Image
 from v2hdm.report.figures import save_birdseye, save_growth, save_overlay
 from v2hdm.report.outputs import write_json
 
@@ -68,12 +69,7 @@ def _fullest_image(drive: Drive, name: str, best: MethodResult) -> Image:
     low, high = (f(drive.cameras[name].roi_vehicle, axis=0) for f in (np.min, np.max))
 
     def shown(image: Image) -> int:
-        points_vehicle = _to_vehicle(image.map_from_vehicle, centres)
+        points_vehicle = ground_in_vehicle(image.map_from_vehicle, centres)
         return int(((points_vehicle > low) & (points_vehicle < high)).all(axis=1).sum())
 
     return max(images, key=shown)
-
-
-def _to_vehicle(map_from_vehicle: FloatArray, points_map: FloatArray) -> FloatArray:
-    """Ground points (N, 2) in the vehicle frame of a level vehicle."""
-    return np.asarray((points_map - map_from_vehicle[:2, 3]) @ map_from_vehicle[:2, :2])

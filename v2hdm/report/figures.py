@@ -13,10 +13,14 @@ from matplotlib.collections import LineCollection, PolyCollection
 
 from v2hdm.detection.ground import apply_homography
 from v2hdm.detection.lens import distort_points
+from v2hdm.planar import ground_in_vehicle
 from v2hdm.records import CameraInfo, FloatArray, HdMap, Truth
 from v2hdm.report import metrics, style
 
-_DETAIL_RADIUS_M = 7.0
+_HEIGHT_IN = 7.6
+_BESIDE_ROUTE_M = 12.0
+_DETAIL_RADIUS_M = 5.0
+_OVERLAY_RANGE_M = 30.0
 
 
 def save_birdseye(
@@ -35,8 +39,10 @@ def save_birdseye(
         route_map: vehicle positions (N, 2), m.
         truth: ground truth, or None on a real drive.
     """
-    with style.figure(path, 15.0, 7.6) as fig:
-        site, detail = fig.subplots(1, 2, width_ratios=[1.5, 1.0])
+    extent_m = np.maximum(np.ptp(route_map, axis=0), 1.0) + 2 * _BESIDE_ROUTE_M
+    site_width_in = _HEIGHT_IN * float(np.clip(extent_m[0] / extent_m[1], 0.5, 2.0)) + 1.6
+    with style.figure(path, site_width_in + _HEIGHT_IN, _HEIGHT_IN) as fig:
+        site, detail = fig.subplots(1, 2, width_ratios=[site_width_in, _HEIGHT_IN])
         site.plot(*route_map.T, color=style.ROUTE, lw=6, zorder=0, solid_capstyle="round", label="route")
         if truth is not None:
             _draw_truth(site, truth)
@@ -128,11 +134,11 @@ def _draw_best(axes: Axes, hd_map: HdMap, truth: Truth | None) -> None:
 
 
 def _close_up(axes: Axes, maps: Mapping[str, HdMap], best: str, truth: Truth | None) -> None:
-    """The neighbourhood of the marking in the middle of the drive, every method beside the truth."""
+    """The neighbourhood of one marking, every method beside the truth."""
     if not maps[best].markings:
         axes.set_axis_off()
         return
-    centre = maps[best].markings[len(maps[best].markings) // 2].corners_map.mean(axis=0)
+    centre = _common_marking(maps, best)
     if truth is not None:
         _draw_truth(axes, truth)
     for method, hd_map in maps.items():
@@ -151,6 +157,18 @@ def _close_up(axes: Axes, maps: Mapping[str, HdMap], best: str, truth: Truth | N
     axes.legend(loc="upper right", frameon=True, edgecolor="none")
 
 
+def _common_marking(maps: Mapping[str, HdMap], best: str) -> FloatArray:
+    """Centre (2,) of a marking of the best map, near the middle of the drive, that all methods mapped."""
+    markings = maps[best].markings
+    known = set(range(len(markings)))
+    for hd_map in maps.values():
+        rows, _ = metrics.match_markings(markings, hd_map.markings)
+        known &= set(rows)
+    middle = len(markings) // 2
+    chosen = min(known or {middle}, key=lambda m: abs(m - middle))
+    return np.asarray(markings[chosen].corners_map.mean(axis=0))
+
+
 def _lines_of(hd_map: HdMap) -> list[tuple[FloatArray, bool]]:
     outlines = [(marking.corners_map, True) for marking in hd_map.markings]
     return outlines + [(lane.points_map, False) for lane in hd_map.lanes]
@@ -166,8 +184,7 @@ def _project_line(
     """The visible pieces (N, 2), recorded px, of a ground line; densified, so lenses bend it."""
     ends = np.vstack([line_map, line_map[:1]]) if closed else line_map
     dense = np.concatenate([np.linspace(a, b, 8) for a, b in itertools.pairwise(ends)])
-    offset = np.column_stack([dense, np.zeros(len(dense))]) - map_from_vehicle[:3, 3]
-    points_vehicle = (offset @ map_from_vehicle[:3, :3])[:, :2]
+    points_vehicle = ground_in_vehicle(map_from_vehicle, dense)
     # The homography's sign is free: the side of the horizon that holds the image's bottom is in front.
     bottom = np.linalg.inv(pinhole_px_from_vehicle) @ [info.width / 2, info.height - 1.0, 1.0]
     ahead = np.sign((pinhole_px_from_vehicle @ (bottom / bottom[2]))[2])
@@ -177,7 +194,11 @@ def _project_line(
     points_pinhole_px = apply_homography(pinhole_px_from_vehicle, points_vehicle)
     margin = np.array([info.width, info.height]) * 0.1
     size = np.array([info.width, info.height])
-    visible = (depth > 0) & ((points_pinhole_px > -margin) & (points_pinhole_px < size + margin)).all(axis=1)
+    visible = (
+        (depth > 0)
+        & (np.linalg.norm(points_vehicle, axis=1) < _OVERLAY_RANGE_M)
+        & ((points_pinhole_px > -margin) & (points_pinhole_px < size + margin)).all(axis=1)
+    )
     edges = np.flatnonzero(np.diff(np.concatenate([[0], visible.astype(int), [0]])))
     pieces = [points_pinhole_px[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
     return [distort_points(info, piece) for piece in pieces]

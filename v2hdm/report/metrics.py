@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
+from v2hdm.planar import ground_in_vehicle, inside_convex
 from v2hdm.records import BoolArray, Drive, FloatArray, HdMap, Marking, Truth
 
 MATCH_GATE_M = 2.0
@@ -65,7 +66,7 @@ def driven_past(drive: Drive, truth: Truth, cameras: Sequence[str]) -> BoolArray
         candidates = np.flatnonzero(truth.visibility[i] >= FULLY_VISIBLE)
         if candidates.size == 0:
             continue
-        corners_vehicle = _to_vehicle(truth.map_from_vehicle[i], corners_map[candidates])
+        corners_vehicle = ground_in_vehicle(truth.map_from_vehicle[i], corners_map[candidates])
         inside = inside_convex(drive.cameras[image.camera].roi_vehicle, corners_vehicle).all(axis=1)
         sightings[candidates[inside]] += 1
     return sightings >= MIN_SIGHTINGS
@@ -127,20 +128,6 @@ def extrinsic_metrics(cam_from_vehicle: FloatArray, true_cam_from_vehicle: Float
         rotation_error_deg=float(np.rad2deg(Rotation.from_matrix(difference).magnitude())),
         translation_error_m=float(np.linalg.norm(centres[0] - centres[1])),
     )
-
-
-def inside_convex(polygon: FloatArray, points: FloatArray) -> BoolArray:
-    """Whether points (..., 2) lie inside a convex polygon (N, 2) of either orientation."""
-    edges = np.roll(polygon, -1, axis=0) - polygon
-    offsets = points[..., None, :] - polygon
-    cross = edges[:, 0] * offsets[..., 1] - edges[:, 1] * offsets[..., 0]
-    return np.asarray((cross >= 0).all(axis=-1) | (cross <= 0).all(axis=-1))
-
-
-def _to_vehicle(map_from_vehicle: FloatArray, points_map: FloatArray) -> FloatArray:
-    """Ground points (..., 2) of the map as seen from the vehicle, its small tilt included."""
-    offset = np.concatenate([points_map, np.zeros((*points_map.shape[:-1], 1))], axis=-1)
-    return np.asarray(((offset - map_from_vehicle[:3, 3]) @ map_from_vehicle[:3, :3])[..., :2])
 
 
 def _rms(errors: FloatArray) -> float:

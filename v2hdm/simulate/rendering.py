@@ -25,7 +25,8 @@ from v2hdm.drive import write_drive
 from v2hdm.drive.folder import DRIVE_FILE, TRUTH_FOLDER
 from v2hdm.drive.truth import write_truth
 from v2hdm.errors import DriveError
-from v2hdm.records import BoolArray, Drive, FloatArray, Image, Truth
+from v2hdm.planar import ground_in_vehicle, inside_convex
+from v2hdm.records import Drive, Image, Truth
 from v2hdm.simulate.disturbance import measured_disturbances, pose_noise
 from v2hdm.simulate.port import Port, build_port
 from v2hdm.simulate.port_config import PortConfig
@@ -180,9 +181,8 @@ def _truth(port: Port, images: list[Image]) -> Truth:
         seen = points_seen(camera.info, port.cam_from_map(image.camera, frame), points, boxes)
         visibility[i] = seen[: samples.size // 2].reshape(-1, per_marking).mean(axis=1)
         on_lanes = seen[samples.size // 2 :]
-        on_lanes[on_lanes] = _inside_roi(
-            camera.roi_vehicle, image.map_from_vehicle, points[samples.size // 2 :][on_lanes]
-        )
+        vertices_vehicle = ground_in_vehicle(image.map_from_vehicle, points[samples.size // 2 :][on_lanes])
+        on_lanes[on_lanes] = inside_convex(camera.roi_vehicle, vertices_vehicle)
         passed += on_lanes
     flags = np.split(passed >= _LANE_SIGHTINGS, np.cumsum([len(v) for v in vertices])[:-1])
     return Truth(
@@ -193,12 +193,3 @@ def _truth(port: Port, images: list[Image]) -> Truth:
         lane_visible=tuple(flags),
         disturbances=measured_disturbances(port.config.disturbance, port.driven),
     )
-
-
-def _inside_roi(roi_vehicle: FloatArray, map_from_vehicle: FloatArray, points_map: FloatArray) -> BoolArray:
-    """Which ground points (N, 2) lie in a convex counter-clockwise region (M, 2) of the vehicle."""
-    turn, shift = map_from_vehicle[:2, :2], map_from_vehicle[:2, 3]
-    points = (points_map - shift) @ turn
-    edges = np.roll(roi_vehicle, -1, axis=0) - roi_vehicle
-    offset = points[:, None] - roi_vehicle[None]
-    return np.asarray((edges[:, 0] * offset[..., 1] - edges[:, 1] * offset[..., 0] >= 0).all(axis=1))

@@ -267,7 +267,7 @@ def _flecks(rng: np.random.Generator, factor: Factor) -> None:
         size,
         sigmaY=size * float(rng.uniform(0.5, 2.0)),
     )
-    noise /= noise.std()
+    noise = noise / noise.std()
     lit = np.clip((noise - rng.uniform(0.7, 2.0)) / rng.uniform(0.1, 0.8), 0, 1)
     shade = rng.uniform(30, 90)
     factor[:] = (shade + lit * (rng.uniform(200, 255) - shade)).astype(np.uint8)

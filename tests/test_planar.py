@@ -1,0 +1,24 @@
+"""Polygons and ground points, worked out by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from v2hdm.planar import ground_in_vehicle, inside_convex
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_inside_a_polygon_of_either_sense(order: int) -> None:
+    square = np.array([[0.0, 0], [2, 0], [2, 2], [0, 2]])[::order]
+    points = np.array([[1.0, 1.0], [3.0, 1.0], [np.nan, 1.0]])
+    assert inside_convex(square, points).tolist() == [True, False, False]
+
+
+def test_a_ground_point_ahead_is_on_the_vehicles_x_axis() -> None:
+    map_from_vehicle = np.eye(4)
+    map_from_vehicle[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    map_from_vehicle[:2, 3] = [10.0, 5.0]
+    points = ground_in_vehicle(map_from_vehicle, np.array([[10.0, 8.0], [9.0, 5.0]]))
+    assert points == pytest.approx(np.array([[3.0, 0.0], [0.0, 1.0]]), abs=1e-12)
