@@ -117,4 +117,5 @@ def test_the_vehicle_needs_no_torch_and_no_hydra():
     )
     command = f"{block}; import v2hdm.detect, v2hdm.detection.batch"
     root = Path(__file__).parents[2]
-    subprocess.run([sys.executable, "-c", command], check=True, cwd=root)
+    done = subprocess.run([sys.executable, "-c", command], cwd=root, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -66,16 +66,7 @@ def minimise(
         return (new_cost - cost) / scale.square()
 
     recent = [(torch.zeros_like(gradient), cost, gradient)]
-    optimizer = torch.optim.LBFGS(
-        [u],
-        lr=1.0,
-        max_iter=1,
-        max_eval=_LINE_SEARCH_EVALUATIONS,
-        tolerance_grad=0.0,
-        tolerance_change=0.0,
-        history_size=_HISTORY,
-        line_search_fn="strong_wolfe",
-    )
+    optimizer = _one_step_optimizer(u)
     best, best_gradient = cost, gradient
     for _ in range(max_iterations):
         if predicted_gap(best, best_gradient) <= tolerance:
@@ -88,3 +79,17 @@ def minimise(
         if progress <= _NO_PROGRESS * float(best):
             break
     return u.detach() * scale, best, best_gradient
+
+
+def _one_step_optimizer(u: Tensor) -> torch.optim.LBFGS:
+    """LBFGS that makes one iteration a step and leaves stopping to its caller."""
+    return torch.optim.LBFGS(
+        [u],
+        lr=1.0,
+        max_iter=1,
+        max_eval=_LINE_SEARCH_EVALUATIONS,
+        tolerance_grad=0.0,
+        tolerance_change=0.0,
+        history_size=_HISTORY,
+        line_search_fn="strong_wolfe",
+    )
