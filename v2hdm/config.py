@@ -59,7 +59,7 @@ def explain(error: Exception, overrides: list[str]) -> ConfigError:
     root: BaseException = error
     while root.__cause__ is not None:
         root = root.__cause__
-    lines = [line.strip() for line in f"{error}\n{root}".splitlines() if line.strip()]
+    lines = [line.strip().rstrip(".") for line in f"{error}\n{root}".splitlines() if line.strip()]
     message = "; ".join(dict.fromkeys(line for line in lines if not _NOISE.match(line)))
     unknown = re.search(r"[Kk]ey '([\w.]+)' (?:not in|is not in)", message)
     hint = ""
@@ -73,7 +73,9 @@ def explain(error: Exception, overrides: list[str]) -> ConfigError:
     return ConfigError(f"configuration{where}: {message}{hint}")
 
 
-_NOISE = re.compile(r"(full_key|reference_type|object_type|Set the environment variable|See https?:)")
+_NOISE = re.compile(
+    r"(full_key|To append to your config|reference_type|object_type|Set the environment variable|See https?:)"
+)
 
 
 def _keys(schema: type[Any], prefix: str = "") -> list[str]:

@@ -41,14 +41,22 @@ def _run_hydra() -> None:
 
     config.register_schemas()
 
+    failures: list[V2hdmError] = []
+
     @hydra.main(config_path=str(config.conf_dir()), config_name="map", version_base="1.3")
     def run_composed(composed: DictConfig) -> None:
-        console.run_on_terminal(config.to_run_config(composed), config.to_yaml(composed))
+        # Carried past Hydra, which would announce it with lines of its own.
+        try:
+            console.run_on_terminal(config.to_run_config(composed), config.to_yaml(composed))
+        except V2hdmError as error:
+            failures.append(error)
 
     try:
         run_composed()
     except (HydraException, OmegaConfBaseException) as error:
         raise config.explain(error, sys.argv[1:]) from error
+    for failure in failures:
+        raise failure
 
 
 def _fail(message: str) -> None:

@@ -106,8 +106,7 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
     with result_folder(Path(config.output) / config.name) as folder, _log_file(folder / "run.log"):
         log.info("v2hdm %s, run %s", __version__, config.name)
         (folder / "config.yaml").write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
-        with _timed(seconds, "render"):
-            drive_folder = _drive_folder(config, progress)
+        drive_folder = _drive_folder(config, seconds, progress)
         drive = read_drive(drive_folder, config.drive)
         log.info("drive %s: %d images of cameras %s", drive.name, len(drive.images), ", ".join(drive.cameras))
         with _timed(seconds, "detect"):
@@ -130,7 +129,7 @@ def camera_sets(drive: Drive) -> dict[str, tuple[str, ...]]:
     return sets
 
 
-def _drive_folder(config: RunConfig, progress: Progress) -> Path:
+def _drive_folder(config: RunConfig, seconds: dict[str, float], progress: Progress) -> Path:
     if config.simulate is None:
         if not config.drive.path:
             raise ConfigError("drive.path is not set: name the folder of the drive, e.g. drive.path=my_drive")
@@ -139,7 +138,10 @@ def _drive_folder(config: RunConfig, progress: Progress) -> Path:
         raise ConfigError(
             "both simulate and drive.path are set: a run renders a drive or reads one, remove one of them"
         )
-    return rendered_drive(config.simulate, Path(config.cache), _workers(config), partial(progress, "render"))
+    with _timed(seconds, "render"):
+        return rendered_drive(
+            config.simulate, Path(config.cache), _workers(config), partial(progress, "render")
+        )
 
 
 def _detect(config: RunConfig, drive: Drive, progress: Progress) -> list[ImageDetections]:
