@@ -17,13 +17,17 @@ from v2hdm.hdmap.geojson import read_geojson
 from v2hdm.pipeline import DriveConfig, RunConfig, run
 from v2hdm.pipeline.run import camera_sets
 from v2hdm.simulate import PortConfig, render_drive
-from v2hdm.simulate.port_config import RouteConfig
+from v2hdm.simulate.port_config import RouteConfig, YardConfig
 
 
 def short_port() -> PortConfig:
-    """A straight and a turn of the default port, with another vehicle's IPM to start from."""
-    route = RouteConfig(pieces=[[20.0, 0.0], [16.0, 70.0], [10.0, 0.0]], image_spacing_m=1.2)
-    return PortConfig(name="short", seed=11, initial_ipm="estimated", route=route)
+    """A straight and a turn of the default port, with another vehicle's IPM to start from.
+
+    What stands in the way and throws shadows comes in numbers for a whole port, so fewer do here.
+    """
+    route = RouteConfig(pieces=[[20.0, 0.0], [16.0, 70.0], [10.0, 0.0]], image_spacing_m=1.0)
+    yard = YardConfig(parked_trucks=1, barriers=2, lamp_posts=2, moving_trucks=1, shadow_strips=2)
+    return PortConfig(name="short", seed=11, initial_ipm="estimated", route=route, yard=yard)
 
 
 @pytest.fixture(scope="module")
