@@ -37,6 +37,7 @@ class Bundle:
     """
 
     rig: Rig
+    problem: Problem
     solution: Solution
     association: Association
     row: IntArray
@@ -160,6 +161,7 @@ def solve_bundle(
     solution = solve(problem, model.solver)
     return Bundle(
         rig=_adjusted_rig(rig, sightings, used_cameras, used_frames, solution),
+        problem=problem,
         solution=solution,
         association=association,
         row=row,

@@ -11,9 +11,10 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from v2hdm.adjust import Status
+from v2hdm.adjust import Status, observability
 from v2hdm.detection.ground import ipm_from_extrinsic
 from v2hdm.mapping.association import Association
+from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.conclude import Optimised
 from v2hdm.mapping.growth import grow_map
 from v2hdm.mapping.lane_points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
@@ -142,7 +143,13 @@ def _optimised_result(
             "chi2_per_dof": solution.chi2_per_dof,
             "time_s": time.perf_counter() - begin_s,
         },
+        certainty=_certainty(optimised.bundle),
     )
+
+
+def _certainty(bundle: Bundle) -> dict[str, str]:
+    known = observability(bundle.problem, bundle.solution)
+    return {name: known[index].sentence(name) for name, index in bundle.camera_index.items()}
 
 
 def _lanes(

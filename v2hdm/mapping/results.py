@@ -34,7 +34,8 @@ class MethodResult:
     (and ``initial_reprojection_rmse_px``, under the extrinsic the optimisation started from) are
     over the same accepted corner observations; None for methods that do not reproject.
     ``growth`` is how the result came about, marking by marking, where that was asked for;
-    ``diagnostics`` are named figures for the log and the report.
+    ``diagnostics`` are named figures for the log and the report; ``certainty`` says of each camera
+    in a sentence what the drive determined and what rests on the survey.
     """
 
     name: str
@@ -46,3 +47,4 @@ class MethodResult:
     initial_reprojection_rmse_px: float | None = None
     growth: tuple[GrowthStep, ...] = ()
     diagnostics: Mapping[str, float] = field(default_factory=dict)
+    certainty: Mapping[str, str] = field(default_factory=dict)

@@ -68,7 +68,8 @@ def evaluate(
     if truth is not None:
         metrics |= {"reference": reference, "disturbances": truth.disturbances, "growth": growth}
     headlines = [headline(name, by_method) for name, by_method in results.items()]
-    return Judgement(metrics, [*_disturbances(truth), *headlines], growth, truth)
+    certainty = list(methods.values())[-1]["Opt"].certainty.values()
+    return Judgement(metrics, [*_disturbances(truth), *headlines, *certainty], growth, truth)
 
 
 def _own_figures(result: MethodResult) -> dict[str, Any]:
@@ -122,13 +123,14 @@ def _extrinsics(drive: Drive, methods: CameraSets, truth: Truth | None) -> dict[
         if optimised is None:
             continue
         for name, calibration in optimised.calibrations.items():
-            found = extrinsic_figures(
+            found: dict[str, Any] = extrinsic_figures(
                 calibration.cam_from_vehicle,
                 nearest_extrinsic(
                     drive.cameras[name].info, drive.cameras[name].ipm[drive.cameras[name].initial_ipm]
                 ),
                 truth.cam_from_vehicle[name] if truth else None,
             )
+            found["certainty"] = optimised.certainty.get(name, "")
             if calibration.covariance is not None:
                 sigma = np.sqrt(np.diag(calibration.covariance))
                 found["translation_sigma_m"] = float(np.linalg.norm(sigma[:3]))
