@@ -17,8 +17,8 @@ _SIZE_LIMITS_M: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     LANE_DASH: ((0.7, 12.0), (0.03, 0.8)),
     LANE_LINE: ((0.3, np.inf), (0.03, np.inf)),
 }
-"""Least and largest length and width of each class: road codes have no dash below 1 m, and letters have strokes
-of half a metre. A line's box is wide where the line bends."""
+"""Least and largest length and width of each class: road codes have no dash below 1 m, and
+letters have strokes of half a metre. A line's box is wide where the line bends."""
 
 _DASH_LENGTH_M = 7.5
 _DASH_SHARE = 0.25
