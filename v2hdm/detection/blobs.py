@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from v2hdm.records import DIAMOND, LANE_DASH, LANE_LINE, BoolArray, FloatArray
+from v2hdm.records import DIAMOND, LANE_DASH, LANE_LINE, OTHER_PAINT, BoolArray, FloatArray
 
 _MIN_CELLS = 5
 """Blobs of fewer logits are noise: their outline is not worth four corners."""
@@ -27,7 +27,8 @@ class Blob:
     ``level`` (h, w) float32 is positive inside, its zero crossing is the soft outline; element
     (i, j) lies at recorded pixel ``origin_px + stride * (j, i)``. ``outline_px`` (N, 2) are the
     zero crossings between neighbouring elements, recorded px, in no order. ``class_score`` maps
-    each class to its mean probability over the blob.
+    each class to its mean probability over the blob. ``touches_other_paint`` says that it was split
+    off a connected piece of paint another part of which is other paint, such as the head of an arrow.
     """
 
     class_score: dict[str, float]
@@ -35,6 +36,7 @@ class Blob:
     origin_px: FloatArray
     stride: int
     outline_px: FloatArray
+    touches_other_paint: bool = False
 
     @property
     def kind(self) -> str:
@@ -78,14 +80,20 @@ def find_blobs(
         cv2.drawContours(inside, [contour], -1, 1, cv2.FILLED, offset=(-x, -y))
         box = (slice(y, y + h), slice(x, x + w))
         local_logits, local_level = logits[(slice(None), *box)], level[box]
-        for mask, part_level in _split_by_group(inside.astype(bool), local_logits, local_level, classes):
+        siblings: list[int] = []
+        parts = _split_by_group(inside.astype(bool), local_logits, local_level, classes)
+        for mask, part_level in parts:
             if np.count_nonzero(mask) < _MIN_CELLS:
                 continue
             framed = framed_level[y : y + h + 2, x : x + w + 2].copy()
             framed[1:-1, 1:-1] = part_level
             origin_px = stride * np.array([x - 1.0, y - 1.0]) + (stride - 1) / 2 + [0.0, top_px]
             blobs.append(_make_blob(mask, framed, local_logits, classes, stride, origin_px))
+            siblings.append(len(blobs) - 1)
             owner[box][mask] = len(blobs)
+        if any(blobs[s].kind == OTHER_PAINT for s in siblings):
+            for s in siblings:
+                blobs[s] = replace(blobs[s], touches_other_paint=True)
     return blobs, owner
 
 

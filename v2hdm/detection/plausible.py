@@ -45,6 +45,8 @@ def plausible_kind(blob: Blob, outline_pinhole_px: FloatArray, view: CameraView)
         kind, score = _likeliest_compact(blob.class_score)
     else:
         kind, score = _likeliest(blob.class_score, whole and length_m <= _DASH_LENGTH_M)
+    if kind == LANE_DASH and blob.touches_other_paint:
+        return None  # the shaft of an arrow, the stroke of a letter
     if kind == LANE_DASH and not _fits(LANE_DASH, length_m, width_m):
         kind = LANE_LINE
     return (kind, score) if _fits(kind, length_m, width_m) else None
