@@ -123,9 +123,7 @@ def _draw_best(axes: Axes, hd_map: HdMap, truth: Truth | None) -> None:
     for row, column in zip(rows, columns, strict=True):
         errors = metrics.corner_errors([hd_map.markings[row]], [truth.map.markings[column]])
         error_cm[row] = 100 * np.sqrt((errors**2).sum(axis=1).mean())
-    shown = PolyCollection(
-        polygons, array=error_cm, cmap="viridis_r", edgecolors="face", lw=1.2, label="markings"
-    )
+    shown = PolyCollection(polygons, array=error_cm, cmap="viridis_r", edgecolors="face", lw=1.2)
     top = np.nanpercentile(error_cm, 98) if np.isfinite(error_cm).any() else 1.0
     shown.set_clim(0.0, max(1.0, top))
     axes.add_collection(shown)
