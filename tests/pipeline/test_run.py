@@ -66,7 +66,7 @@ def test_the_optimisation_repairs_another_vehicles_calibration(result: Path) -> 
     both = metrics["results"]["both"]
     assert both["ENI"]["corner_rmse_m"] > 0.2
     assert both["Opt"]["corner_rmse_m"] < 0.06
-    assert both["Opt"]["recall"] > 0.8  # of 19; some are worn to flakes
+    assert both["Opt"]["recall"] > 0.8  # a floor against breakage: 16 of 19 are found today
     assert both["Opt"]["false_markings"] == 0
     for camera in ("front", "rear"):
         assert metrics["extrinsics"][camera]["rotation_error_deg"] < 0.2

@@ -16,9 +16,8 @@ from scipy.spatial.transform import Rotation
 from v2hdm.planar import ground_in_vehicle, inside_convex
 from v2hdm.records import BoolArray, Drive, FloatArray, HdMap, Marking, Truth
 
-MATCH_GATE_M = 1.5
-"""A mapped marking farther than this from every true one of its class is false: less than the distance
-between the rows of paint beside a lane, so that a neighbour is not taken for a badly placed one."""
+MATCH_GATE_M = 2.0
+"""A mapped marking farther than this from every true one of its class is false."""
 
 MIN_SIGHTINGS = 3
 """A marking was driven past when this many images show all of it inside the region of interest."""
