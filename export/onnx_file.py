@@ -15,13 +15,16 @@ import onnx
 import onnxruntime
 import torch
 
-from models.marking_net import MULTIPLE, STRIDE, MarkingNet
+from models import MarkingNet, Prediction
+from models.marking_net import KIND_STRIDE, LANE_STRIDE, MULTIPLE, PAINT_STRIDE
 from train.checkpoint import Checkpoint
 from v2hdm.errors import DetectorError
 from v2hdm.records import PAINT_CLASSES
 
 METADATA_KEY = "v2hdm"
 """Under which key of the file's ``metadata_props`` its label is, as JSON."""
+
+_STRIDES = dict(zip(Prediction._fields, (PAINT_STRIDE, KIND_STRIDE, LANE_STRIDE), strict=True))
 
 PARITY_SIZES = ((16, 16), (48, 112), (256, 448), (192, 1248), (544, 960))
 """Image heights and widths at which file and network are compared."""
@@ -30,23 +33,29 @@ PARITY_SIZES = ((16, 16), (48, 112), (256, 448), (192, 1248), (544, 960))
 def export_checkpoint(checkpoint: Checkpoint, path: Path, opset: int, tolerance: float) -> float:
     """Write the averaged weights of a checkpoint to an ONNX file.
 
-    The graph takes ``image`` (1, H, W, 3) uint8 BGR, H and W multiples of 16, and gives ``logits``
-    (1, C, H/2, W/2) float32. The file appears whole and checked, or not at all.
+    The graph takes ``image`` (1, H, W, 3) uint8 BGR, H and W multiples of 16, and gives the outputs of
+    :class:`models.Prediction` by their names. The file appears whole and checked, or not at all.
 
     Returns:
-        The largest difference of a logit between file and network over :data:`PARITY_SIZES`.
+        The largest difference of an output between file and network over :data:`PARITY_SIZES`.
 
     Raises:
-        DetectorError: The difference exceeds ``tolerance``.
+        DetectorError: The difference exceeds ``tolerance``, or weights are not finite.
     """
     net = checkpoint.network()
+    broken = [name for name, value in net.state_dict().items() if not torch.isfinite(value).all()]
+    if broken:
+        raise DetectorError(
+            f"{path} was not written: {broken[0]} of the checkpoint holds values that are not finite; "
+            "export an earlier checkpoint"
+        )
     model = to_onnx(checkpoint.network().fold(), opset)
     onnx.helper.set_model_props(model, {METADATA_KEY: json.dumps(label(checkpoint))})
     content = model.SerializeToString()
     difference = parity(net, content)
     if not difference <= tolerance:
         raise DetectorError(
-            f"{path} was not written: its logits would differ from the network's by {difference:.2g}, "
+            f"{path} was not written: its outputs would differ from the network's by {difference:.2g}, "
             f"more than tolerance={tolerance:g}; try another opset"
         )
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -69,7 +78,7 @@ def to_onnx(net: MarkingNet, opset: int) -> onnx.ModelProto:
             dynamo=True,
             opset_version=opset,
             input_names=["image"],
-            output_names=["logits"],
+            output_names=list(Prediction._fields),
             dynamic_shapes=({1: MULTIPLE * rows, 2: MULTIPLE * columns},),
             external_data=False,
             verbose=False,
@@ -86,7 +95,7 @@ def label(checkpoint: Checkpoint) -> dict[str, Any]:
     return {
         "classes": list(PAINT_CLASSES),
         "multiple": MULTIPLE,
-        "stride": STRIDE,
+        "strides": _STRIDES,
         "input": "uint8 BGR, NHWC",
         "commit": _commit(),
         "steps": checkpoint.step,
@@ -97,24 +106,26 @@ def label(checkpoint: Checkpoint) -> dict[str, Any]:
 
 
 def parity(net: MarkingNet, content: bytes) -> float:
-    """Largest difference of any logit between a network and the ONNX file made of it."""
+    """Largest difference of any output between a network and the ONNX file made of it."""
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     generator = np.random.default_rng(0)
     worst = 0.0
     for height, width in PARITY_SIZES:
         image = generator.integers(0, 256, (1, height, width, 3), dtype=np.uint8)
         with torch.inference_mode():
-            expected = net(torch.from_numpy(image)).numpy()
-        (logits,) = session.run(["logits"], {"image": image})
-        if logits.shape != expected.shape:
-            return float("inf")
-        worst = max(worst, float(np.abs(logits - expected).max()))
+            prediction = net(torch.from_numpy(image))
+        outputs = session.run(list(Prediction._fields), {"image": image})
+        for output, expected in zip(outputs, prediction, strict=True):
+            if output.shape != tuple(expected.shape):
+                return float("inf")
+            worst = max(worst, float(np.abs(output - expected.numpy()).max()))
     return worst
 
 
 def _name_sizes(model: onnx.ModelProto) -> None:
     """Call the open sizes of input and output what they are, where the exporter leaves formulas."""
-    names = {"image": {1: "height", 2: "width"}, "logits": {2: "height / 2", 3: "width / 2"}}
+    names = {output: {2: f"height / {stride}", 3: f"width / {stride}"} for output, stride in _STRIDES.items()}
+    names["image"] = {1: "height", 2: "width"}
     for value in (*model.graph.input, *model.graph.output):
         for axis, name in names[value.name].items():
             value.type.tensor_type.shape.dim[axis].dim_param = name

@@ -1,5 +1,5 @@
 """The networks, torch only: what `python -m train` trains and `python -m export` turns into ONNX."""
 
-from models.marking_net import MarkingNet, NetConfig
+from models.marking_net import MarkingNet, NetConfig, Prediction
 
-__all__ = ["MarkingNet", "NetConfig"]
+__all__ = ["MarkingNet", "NetConfig", "Prediction"]

@@ -6,23 +6,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from train.losses import IGNORE
-from v2hdm.records import PAINT_CLASSES
+from v2hdm.simulate.training_scenes import TrainingSample
 
 Bytes = NDArray[np.uint8]
 
 
-def random_crop(
-    rng: np.random.Generator, image: Bytes, labels: Bytes, width: int, height: int
-) -> tuple[Bytes, Bytes]:
-    """A crop of image and labels, mirrored half the time."""
-    row = int(rng.integers(image.shape[0] - height + 1))
-    column = int(rng.integers(image.shape[1] - width + 1))
+def random_crop(rng: np.random.Generator, sample: TrainingSample, width: int, height: int) -> TrainingSample:
+    """A crop of a sample, mirrored half the time."""
+    row = int(rng.integers(sample.image.shape[0] - height + 1))
+    column = int(rng.integers(sample.image.shape[1] - width + 1))
+    flip = -1 if rng.random() < 0.5 else 1
     window = slice(row, row + height), slice(column, column + width)
-    image, labels = image[window], labels[window]
-    if rng.random() < 0.5:
-        image, labels = image[:, ::-1], labels[:, ::-1]
-    return np.ascontiguousarray(image), np.ascontiguousarray(labels)
+    image = np.ascontiguousarray(sample.image[window][:, ::flip])
+    labels = np.ascontiguousarray(sample.labels[window][:, ::flip])
+    hidden = np.ascontiguousarray(sample.hidden[window][:, ::flip])
+    lanes = [lane - (column, row) for lane in sample.lanes_px]
+    if flip < 0:
+        lanes = [lane * (-1, 1) + (width - 1, 0) for lane in lanes]
+    return TrainingSample(image, labels, hidden, tuple(lanes))
 
 
 def random_photometry(rng: np.random.Generator, image: Bytes) -> Bytes:
@@ -43,22 +44,6 @@ def random_photometry(rng: np.random.Generator, image: Bytes) -> Bytes:
         _, packed = cv2.imencode(".jpg", out, [cv2.IMWRITE_JPEG_QUALITY, quality])
         out = _bytes(cv2.imdecode(packed, cv2.IMREAD_COLOR))
     return out
-
-
-def half_resolution(labels: Bytes) -> Bytes:
-    """Labels (H/2, W/2) of 2 x 2 pixel blocks: the class of three or more of the pixels, ignored at a tie.
-
-    Where paint and background halve a block neither answer is right; ignoring those keeps the learnt
-    edge at the true one instead of half a pixel outside or inside it.
-    """
-    height, width = labels.shape
-    blocks = (
-        labels.reshape(height // 2, 2, width // 2, 2)
-        .transpose(0, 2, 1, 3)
-        .reshape(height // 2, width // 2, 4)
-    )
-    counts = np.stack([(blocks == c).sum(axis=2) for c in range(1 + len(PAINT_CLASSES))], axis=2)
-    return np.where(counts.max(axis=2) > 2, counts.argmax(axis=2), IGNORE).astype(np.uint8)
 
 
 def _bytes(image: object) -> Bytes:

@@ -21,7 +21,7 @@ class DataConfig:
     height: int = 256
     render_width: int = 512
     render_height: int = 288
-    views_per_render: int = 8
+    views_per_render: int = 4
     reservoir: int = 256
     easy_samples: int = 1000
     workers: int = 1
@@ -29,10 +29,16 @@ class DataConfig:
 
 @dataclass(kw_only=True)
 class LossConfig:
-    """Weights of the classes (background first) in the cross entropy, and of the Dice term."""
+    """Weights of the terms: Dice of the paint, its class, and the lanes, beside the paint's cross entropy.
 
-    class_weights: list[float] = field(default_factory=lambda: [1.0, 2.0, 2.0, 2.0, 2.0])
+    ``paint_weight`` and ``lane_weight`` are what a cell of paint or a crossing weighs against one of nothing.
+    """
+
+    paint_weight: float = 2.0
     dice: float = 0.5
+    kinds: float = 0.4
+    lanes: float = 0.4
+    lane_weight: float = 3.0
 
 
 @dataclass(kw_only=True)
@@ -40,7 +46,7 @@ class ValidationConfig:
     """A fixed set of renders of full difficulty, scored every so many minutes."""
 
     images: int = 64
-    every_minutes: float = 5.0
+    every_minutes: float = 8.0
 
 
 @dataclass(kw_only=True)
@@ -58,7 +64,7 @@ class TrainConfig:
     device: str = "auto"
     minutes: float | None = None
     steps: int | None = None
-    batch: int = 2
+    batch: int = 4
     learning_rate: float = 2e-3
     weight_decay: float = 0.01
     warmup: float = 0.03

@@ -10,17 +10,19 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
-from train.augment import half_resolution, random_crop, random_photometry
+from train.augment import random_crop, random_photometry
 from train.config import DataConfig
+from train.targets import Targets, targets
 from v2hdm.simulate.training_scenes import TrainingSample, training_sample
 
 _VALIDATION_SEED_OFFSET = 1_000_003
 
-Pair = tuple[Tensor, Tensor]
+Pair = tuple[Tensor, Targets]
+"""Images (H, W, 3) uint8 and the answers for them."""
 
 
 class RenderStream(IterableDataset[Pair]):
-    """Pairs of image (H, W, 3) uint8 and labels (H/2, W/2) uint8, the same for the same seed and workers.
+    """Pairs of image and answers, the same for the same seed and workers.
 
     Args:
         config: Sizes and how often a render is shown.
@@ -59,8 +61,8 @@ class RenderStream(IterableDataset[Pair]):
         return training_sample(self.seed, index, config.render_width, config.render_height, difficulty)
 
     def _view(self, rng: np.random.Generator, sample: TrainingSample) -> Pair:
-        image, labels = random_crop(rng, sample.image, sample.labels, self.config.width, self.config.height)
-        return torch.from_numpy(random_photometry(rng, image)), torch.from_numpy(half_resolution(labels))
+        crop = random_crop(rng, sample, self.config.width, self.config.height)
+        return torch.from_numpy(random_photometry(rng, crop.image)), targets(crop)
 
 
 def training_batches(config: DataConfig, seed: int, batch: int, first_render: int) -> Iterator[Pair]:
@@ -81,7 +83,7 @@ def validation_pairs(config: DataConfig, seed: int, images: int) -> Iterator[Pai
     """A fixed set of renders of full difficulty that no training seed of the same run shows."""
     for index in range(images):
         sample = training_sample(seed + _VALIDATION_SEED_OFFSET, index, config.width, config.height)
-        yield torch.from_numpy(sample.image), torch.from_numpy(half_resolution(sample.labels))
+        yield torch.from_numpy(sample.image), targets(sample)
 
 
 def _appeal(sample: TrainingSample) -> float:

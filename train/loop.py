@@ -14,12 +14,13 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils.tensorboard import SummaryWriter
 
-from models import MarkingNet
+from models import MarkingNet, Prediction
 from train.checkpoint import Checkpoint, check_same_experiment, load_checkpoint, save_checkpoint
 from train.config import TrainConfig
 from train.data import Pair, training_batches, validation_pairs
-from train.losses import segmentation_loss
-from train.metrics import Confusion, Score
+from train.losses import total_loss
+from train.metrics import Score, Tally
+from train.targets import Targets
 from v2hdm.errors import ConfigError
 
 _LOG = logging.getLogger(__name__)
@@ -49,7 +50,6 @@ class Trainer:
         average = get_ema_multi_avg_fn(1.0 - 1.0 / config.ema_updates)  # type: ignore[no-untyped-call]
         self.averaged = AveragedModel(self.net, multi_avg_fn=average, use_buffers=True)
         self.optimizer = torch.optim.AdamW(self.net.parameters(), weight_decay=config.weight_decay)
-        self.class_weights = torch.tensor(config.loss.class_weights, device=self.device)
         if self.state.step:
             self._restore()
 
@@ -109,13 +109,14 @@ class Trainer:
 
     def _update(self, batch: Pair) -> float:
         """One step of the optimiser."""
-        image, labels = (t.to(self.device, non_blocking=True) for t in batch)
+        image, targets = self._to_device(batch)
         for group in self.optimizer.param_groups:
             group["lr"] = self._learning_rate()
         self.net.train()
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
-            logits = self.net(image)
-        loss = segmentation_loss(logits.float(), labels.long(), self.class_weights, self.config.loss.dice)
+            prediction = self.net(image)
+        prediction = Prediction(*(output.float() for output in prediction))
+        loss = total_loss(prediction, targets, self.config.loss)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
@@ -125,17 +126,23 @@ class Trainer:
         self.state.renders = -(-self.state.step * self.config.batch // self.config.data.views_per_render)
         return float(loss.detach())
 
+    def _to_device(self, batch: Pair) -> Pair:
+        image, targets = batch
+        move = (target.to(self.device, non_blocking=True) for target in targets)
+        return image.to(self.device, non_blocking=True), Targets(*move)
+
     @torch.inference_mode()
     def _validate(self, pairs: list[Pair], board: SummaryWriter) -> None:
         """Score the averaged weights and keep them if they are the best yet."""
         if not pairs:
             return
         self.averaged.eval()
-        confusion = Confusion()
-        for image, labels in pairs:
-            logits = self.averaged(image[None].to(self.device))
-            confusion.add(logits, labels[None].to(self.device).long())
-        score = confusion.score()
+        tally = Tally()
+        for image, targets in pairs:
+            batch = image[None], Targets(*(target[None] for target in targets))
+            image, targets = self._to_device(batch)
+            tally.add(self.averaged(image), targets)
+        score = tally.score()
         self.state.metrics = metrics(score)
         for name, value in self.state.metrics.items():
             board.add_scalar(f"validation/{name}", value, self.state.step)
@@ -162,9 +169,9 @@ class Trainer:
 
 def metrics(score: Score) -> dict[str, float]:
     """A score as flat figures."""
-    return {"mean_iou": score.mean_iou, "paint_iou": score.paint_iou} | {
-        f"{name}_iou": value for name, value in score.iou.items()
-    }
+    lanes = {"lane_recall": score.lane_recall, "lane_precision": score.lane_precision}
+    iou = {f"{name}_iou": value for name, value in score.iou.items()}
+    return {"mean_iou": score.mean_iou, "paint_iou": score.paint_iou} | iou | lanes
 
 
 def summary(score: Score) -> str:

@@ -1,39 +1,76 @@
-"""What the training minimises: weighted cross entropy plus soft Dice."""
+"""What the training minimises: one term for each output of the network."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import cross_entropy
+from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, smooth_l1_loss
 
-IGNORE = 255
-"""Label of pixels that carry no loss: those that an edge of paint halves."""
+from models import Prediction
+from train.config import LossConfig
+from train.targets import IGNORE, Targets
 
 
-def segmentation_loss(logits: Tensor, labels: Tensor, class_weights: Tensor, dice_weight: float) -> Tensor:
-    """Cross entropy plus ``dice_weight`` times the soft Dice loss, a scalar.
+def total_loss(prediction: Prediction, targets: Targets, config: LossConfig) -> Tensor:
+    """The weighted sum of the terms, a scalar."""
+    loss = paint_loss(prediction.paint[:, 0], targets.paint, config.paint_weight, config.dice)
+    loss = loss + config.kinds * kind_loss(prediction.kinds, targets.kinds)
+    if config.lanes:
+        loss = loss + config.lanes * lane_loss(prediction.lanes, targets, config.lane_weight)
+    return loss
+
+
+def paint_loss(logits: Tensor, labels: Tensor, positive_weight: float, dice_weight: float) -> Tensor:
+    """Binary cross entropy plus soft Dice of paint, logits and labels (B, H, W).
 
     Args:
-        logits: (B, C, H, W) float.
-        labels: (B, H, W) int64, class index or :data:`IGNORE`.
-        class_weights: (C,) weights of the cross entropy.
+        logits: Log odds of paint.
+        labels: 0, 1 or :data:`IGNORE`.
+        positive_weight: What an element of paint weighs, one of background weighing 1.
         dice_weight: 0 leaves the Dice term out.
     """
-    loss = cross_entropy(logits, labels, weight=class_weights, ignore_index=IGNORE)
+    loss = _balanced_cross_entropy(logits, labels, positive_weight)
     return loss + dice_weight * dice_loss(logits, labels) if dice_weight else loss
 
 
 def dice_loss(logits: Tensor, labels: Tensor) -> Tensor:
-    """One minus the soft Dice overlap, averaged over the paint classes that the batch shows.
+    """One minus the soft Dice overlap of a batch's paint.
 
-    Milletari et al., "V-Net", 2016, eq. for D with squared denominators. Background is left out, and so
-    are absent classes: their overlap is 0 however good the prediction is.
+    Milletari et al., "V-Net", 2016, eq. for D with squared denominators.
     """
-    known = (labels != IGNORE).unsqueeze(1)
-    probability = logits.softmax(dim=1) * known
-    classes = torch.arange(logits.shape[1], device=logits.device).view(1, -1, 1, 1)
-    target = (labels.unsqueeze(1) == classes).to(probability.dtype)
-    overlap = (probability * target).sum(dim=(0, 2, 3))[1:]
-    size = (probability.square() + target).sum(dim=(0, 2, 3))[1:]
-    present = (target.sum(dim=(0, 2, 3))[1:] > 0).to(probability.dtype)
-    return (present * (1 - (2 * overlap + 1) / (size + 1))).sum() / present.sum().clamp(min=1)
+    known = labels != IGNORE
+    probability = logits.sigmoid() * known
+    target = (labels == 1).to(probability.dtype)
+    return 1 - (2 * (probability * target).sum() + 1) / (probability.square().sum() + target.sum() + 1)
+
+
+def kind_loss(logits: Tensor, labels: Tensor) -> Tensor:
+    """Cross entropy of the paint's class: logits (B, K, H, W), labels (B, H, W); no paint carries no loss.
+
+    Each class has the same weight as all its cells together have in a batch, to the power of a half:
+    arrows are few, lines are many.
+    """
+    labels = labels.long()
+    counts = torch.bincount(labels[labels != IGNORE], minlength=logits.shape[1]).to(logits.dtype)
+    if not counts.sum():
+        return logits.sum() * 0
+    weight = (counts.sum() / counts.clamp(min=1)).sqrt().clamp(max=6.0)
+    return cross_entropy(logits, labels, weight=weight, ignore_index=IGNORE)
+
+
+def lane_loss(logits: Tensor, targets: Targets, positive_weight: float) -> Tensor:
+    """Whether a lane's line crosses, and where: logits (B, 2, H, W) as in :class:`models.Prediction`."""
+    loss = _balanced_cross_entropy(logits[:, 0], targets.lane_there, positive_weight)
+    crossed = targets.lane_there == 1
+    if not crossed.any():
+        return loss
+    return loss + smooth_l1_loss(logits[:, 1][crossed], targets.lane_offset[crossed], beta=0.1)
+
+
+def _balanced_cross_entropy(logits: Tensor, labels: Tensor, positive_weight: float) -> Tensor:
+    """Mean binary cross entropy of the elements that are known, positive ones weighing more."""
+    known = labels != IGNORE
+    target = (labels == 1).to(logits.dtype)
+    weight = known * (1 + (positive_weight - 1) * target)
+    total = binary_cross_entropy_with_logits(logits, target, weight, reduction="sum")
+    return total / weight.sum().clamp(min=1)

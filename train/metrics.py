@@ -1,4 +1,4 @@
-"""How good a network is on labelled images: intersection over union by class."""
+"""How good a network is on labelled images: intersection over union by class, lane crossings found."""
 
 from __future__ import annotations
 
@@ -8,17 +8,25 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
-from train.losses import IGNORE
+from models import Prediction
+from models.marking_net import KIND_STRIDE, PAINT_STRIDE
+from train.targets import IGNORE, Targets
 from v2hdm.records import PAINT_CLASSES
 
 
 @dataclass(frozen=True)
 class Score:
-    """Intersection over union of every paint class, of paint as a whole, and the mean over classes."""
+    """Intersection over union of every paint class (cells of 4 px) and of paint as such (cells of 2 px).
+
+    ``lane_recall`` and ``lane_precision`` count crossings of row anchors, right if at most one cell off.
+    """
 
     iou: dict[str, float]
     paint_iou: float
+    lane_recall: float
+    lane_precision: float
 
     @property
     def mean_iou(self) -> float:
@@ -26,24 +34,65 @@ class Score:
         return float(np.mean(list(self.iou.values()))) if self.iou else 0.0
 
 
-class Confusion:
-    """Counts of pixels by (true class, predicted class), added up image by image."""
+class Tally:
+    """Counts over images, added up one by one."""
 
     def __init__(self) -> None:
-        self.counts: NDArray[np.int64] = np.zeros((1 + len(PAINT_CLASSES),) * 2, dtype=np.int64)
+        self._kinds: NDArray[np.int64] = np.zeros((1 + len(PAINT_CLASSES),) * 2, dtype=np.int64)
+        self._paint: NDArray[np.int64] = np.zeros((2, 2), dtype=np.int64)
+        self._lanes: NDArray[np.int64] = np.zeros(4, dtype=np.int64)
 
-    def add(self, logits: Tensor, labels: Tensor) -> None:
-        """Count the pixels of logits (B, C, H, W) against labels (B, H, W), except ignored ones."""
-        classes = len(self.counts)
-        known = labels != IGNORE
-        pairs = labels[known] * classes + logits.argmax(dim=1)[known]
-        self.counts += torch.bincount(pairs, minlength=classes**2).view(classes, classes).cpu().numpy()
+    def add(self, prediction: Prediction, targets: Targets) -> None:
+        """Count a batch, except for what its targets ignore."""
+        known = targets.paint != IGNORE
+        _count(self._paint, targets.paint[known], prediction.paint[:, 0][known] > 0)
+        self._add_kinds(prediction, targets)
+        self._add_lanes(prediction.lanes[:, 0] > 0, targets.lane_there)
 
     def score(self) -> Score:
         """The scores so far; a class that was never shown is left out."""
-        hits = np.diag(self.counts)
-        union = self.counts.sum(axis=0) + self.counts.sum(axis=1) - hits
-        shown = self.counts.sum(axis=1) > 0
+        hits = np.diag(self._kinds)
+        union = self._kinds.sum(axis=0) + self._kinds.sum(axis=1) - hits
+        shown = self._kinds.sum(axis=1) > 0
         iou = {name: float(hits[c] / union[c]) for c, name in enumerate(PAINT_CLASSES, start=1) if shown[c]}
-        paint = self.counts[1:, 1:].sum()
-        return Score(iou, float(paint / max(self.counts.sum() - self.counts[0, 0], 1)))
+        paint = self._paint
+        found, true, right, given = (int(count) for count in self._lanes)
+        return Score(
+            iou,
+            float(paint[1, 1] / max(paint.sum() - paint[0, 0], 1)),
+            found / max(true, 1),
+            right / max(given, 1),
+        )
+
+    def _add_kinds(self, prediction: Prediction, targets: Targets) -> None:
+        """Cells where paint is likelier than not take the class that is likeliest there."""
+        scale = KIND_STRIDE // PAINT_STRIDE
+        painted = torch.nn.functional.avg_pool2d(prediction.paint.sigmoid(), scale)[:, 0] > 0.5
+        guess = torch.where(painted, prediction.kinds.argmax(dim=1) + 1, 0)
+        truth_paint = targets.paint.to(torch.float32)[:, None]
+        empty = max_pool2d(truth_paint, scale)[:, 0] == 0
+        truth = torch.where(targets.kinds == IGNORE, 0, targets.kinds.long() + 1)
+        known = (targets.kinds != IGNORE) | empty
+        _count(self._kinds, truth[known], guess[known])
+
+    def _add_lanes(self, given: Tensor, there: Tensor) -> None:
+        true, possible = there == 1, there != 0
+        self._lanes += np.array(
+            [
+                (true & _widened(given)).sum().item(),
+                true.sum().item(),
+                (given & _widened(possible)).sum().item(),
+                given.sum().item(),
+            ]
+        )
+
+
+def _widened(cells: Tensor) -> Tensor:
+    """Cells (B, H, W) and their neighbours along the row."""
+    return max_pool2d(cells.to(torch.float32)[:, None], (1, 3), 1, (0, 1))[:, 0] > 0
+
+
+def _count(table: NDArray[np.int64], truth: Tensor, guess: Tensor) -> None:
+    size = len(table)
+    pairs = truth.long() * size + guess.long()
+    table += torch.bincount(pairs.flatten(), minlength=size**2).view(size, size).cpu().numpy()

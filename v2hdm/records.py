@@ -25,17 +25,36 @@ BoolArray = NDArray[np.bool_]
 DIAMOND = "diamond"
 LANE_DASH = "lane_dash"
 LANE_LINE = "lane_line"
+ARROW = "arrow"
+STOP_LINE = "stop_line"
+CROSSWALK_BAR = "crosswalk_bar"
+CHEVRON = "chevron"
 OTHER_PAINT = "other_paint"
 
-PAINT_CLASSES: tuple[str, ...] = (DIAMOND, LANE_DASH, LANE_LINE, OTHER_PAINT)
-"""What the detector tells apart, in the order of its output channels 1, 2, ...; channel 0 is
-everything that is not paint."""
+PAINT_CLASSES: tuple[str, ...] = (
+    DIAMOND,
+    LANE_DASH,
+    LANE_LINE,
+    ARROW,
+    STOP_LINE,
+    CROSSWALK_BAR,
+    CHEVRON,
+    OTHER_PAINT,
+)
+"""What the detector tells apart, in the order of its class channels. Chevrons are the bars and angles
+that fill an area; other paint is writing, teeth and whatever else is no marking to map."""
 
-CORNERED_CLASSES: tuple[str, ...] = (DIAMOND, LANE_DASH)
+CORNERED_CLASSES: tuple[str, ...] = (DIAMOND, LANE_DASH, STOP_LINE, CROSSWALK_BAR)
 """Classes mapped as quadrilaterals by their four corners."""
+
+OUTLINED_CLASSES: tuple[str, ...] = (ARROW, CHEVRON)
+"""Classes detected with their outline, but not mapped: they have no four corners."""
 
 LANE_CLASSES: tuple[str, ...] = (LANE_DASH, LANE_LINE)
 """Classes whose centre lines make up the lanes."""
+
+LANE_BOUNDARY = "lane_boundary"
+"""Kind of a lane detection that is a whole line, gaps between dashes and hidden parts included."""
 
 DISTORTION_COEFFICIENTS: Mapping[str, int] = {
     "plumb_bob": 5,
@@ -144,6 +163,9 @@ class MarkingDetection:
     ``covariance_px`` (8, 8) is that of the stacked corners (u0, v0, u1, ...), px^2.
     ``corner_valid`` (4,) is False for corners that must not be used as points: hidden, cut off by
     the image border or badly fitted.
+
+    Arrows and chevrons are no quadrilaterals: of their corners, all nan, none is valid, and ``outline_px``
+    (N, 2) is their polygon; it is empty for quadrilaterals.
     """
 
     kind: str
@@ -151,18 +173,22 @@ class MarkingDetection:
     corners_px: FloatArray
     covariance_px: FloatArray
     corner_valid: BoolArray
+    outline_px: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
 
 
 @dataclass(frozen=True)
 class LaneDetection:
-    """The centre line of one piece of lane paint in one image: ``points_px`` (N, 2), near to far.
+    """A centre line in one image: ``points_px`` (N, 2), near to far.
 
-    ``kind`` is one of :data:`LANE_CLASSES`.
+    ``kind`` is one of :data:`LANE_CLASSES` for that of one piece of lane paint, or :data:`LANE_BOUNDARY` for
+    a whole line. The whole lines of an image have an ``identity``: 1, 2, ... from the vehicle to the left,
+    -1, -2, ... to the right.
     """
 
     kind: str
     score: float
     points_px: FloatArray
+    identity: int | None = None
 
 
 @dataclass(frozen=True)

@@ -133,40 +133,53 @@ def _coverage(camera: Camera, shape: np.ndarray, samples: int = 8) -> np.ndarray
     return coverage
 
 
+STRIDES = {"paint": 2, "kinds": 4, "lanes": 8}
+
+
 @lru_cache
 def brightness_model(folder: Path, kind: str = "diamond", threshold: int = 135) -> Path:
     """An ONNX model that calls everything brighter than ``threshold`` paint of class ``kind``."""
     path = folder / f"{kind}_{threshold}.onnx"
-    slope = np.zeros(1 + len(PAINT_CLASSES), dtype=np.float32)
-    offset = np.full(1 + len(PAINT_CLASSES), -40.0, dtype=np.float32)
-    channel = 1 + PAINT_CLASSES.index(kind)
-    offset[0], slope[channel], offset[channel] = 0.0, 0.1, -0.1 * threshold
-    save_model(path, slope, offset)
+    kinds = np.full(len(PAINT_CLASSES), -40.0)
+    kinds[PAINT_CLASSES.index(kind)] = 0.0
+    save_model(path, (0.1, -0.1 * threshold), kinds)
     return path
 
 
 def save_model(
-    path: Path, slope: np.ndarray, offset: np.ndarray, metadata: dict[str, object] | None = None
+    path: Path, paint: tuple[float, float], kinds: np.ndarray, metadata: dict[str, object] | None = None
 ) -> None:
-    """An ONNX model with logits = slope * mean brightness of 2 x 2 px + offset."""
-    metadata = metadata or {"classes": list(PAINT_CLASSES), "multiple": 16, "stride": 2}
-    channels = len(slope)
+    """An ONNX model: paint = slope * brightness of 2 x 2 px + offset, the same kinds all over, no lanes."""
+    metadata = metadata or {"classes": list(PAINT_CLASSES), "multiple": 16, "strides": STRIDES}
     nodes = [
         helper.make_node("Cast", ["image"], ["real"], to=TensorProto.FLOAT),
         helper.make_node("Transpose", ["real"], ["planes"], perm=[0, 3, 1, 2]),
         helper.make_node("Conv", ["planes", "mean"], ["grey"], strides=[2, 2]),
-        helper.make_node("Conv", ["grey", "slope", "offset"], ["logits"]),
+        helper.make_node("Conv", ["grey", "slope", "offset"], ["paint"]),
+        helper.make_node("AveragePool", ["grey"], ["grey4"], kernel_shape=[2, 2], strides=[2, 2]),
+        helper.make_node("Conv", ["grey4", "none4", "kind_offset"], ["kinds"]),
+        helper.make_node("AveragePool", ["grey4"], ["grey8"], kernel_shape=[2, 2], strides=[2, 2]),
+        helper.make_node("Conv", ["grey8", "none8", "lane_offset"], ["lanes"]),
+    ]
+    weights = {
+        "mean": np.full((1, 3, 2, 2), 1 / 12),
+        "slope": np.full((1, 1, 1, 1), paint[0]),
+        "offset": np.array([paint[1]]),
+        "none4": np.zeros((len(kinds), 1, 1, 1)),
+        "kind_offset": kinds,
+        "none8": np.zeros((2, 1, 1, 1)),
+        "lane_offset": np.array([-40.0, 0.0]),
+    }
+    outputs = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, channels, f"h_{name}", f"w_{name}"])
+        for name, channels in (("paint", 1), ("kinds", len(kinds)), ("lanes", 2))
     ]
     graph = helper.make_graph(
         nodes,
         "brightness",
         [helper.make_tensor_value_info("image", TensorProto.UINT8, [1, "H", "W", 3])],
-        [helper.make_tensor_value_info("logits", TensorProto.FLOAT, [1, channels, "h", "w"])],
-        [
-            numpy_helper.from_array(np.full((1, 3, 2, 2), 1 / 12, dtype=np.float32), "mean"),
-            numpy_helper.from_array(slope.reshape(-1, 1, 1, 1).astype(np.float32), "slope"),
-            numpy_helper.from_array(offset.astype(np.float32), "offset"),
-        ],
+        outputs,
+        [numpy_helper.from_array(value.astype(np.float32), name) for name, value in weights.items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
     helper.set_model_props(model, {"v2hdm": json.dumps(metadata)})

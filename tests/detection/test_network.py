@@ -3,21 +3,22 @@
 import numpy as np
 import pytest
 
-from tests.detection.pictures import brightness_model, make_camera, save_model
+from tests.detection.pictures import STRIDES, brightness_model, make_camera, save_model
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.network import Network
 from v2hdm.errors import DetectorError
 from v2hdm.records import PAINT_CLASSES
 
-SLOPE = np.zeros(5)
-OFFSET = np.arange(5.0)
+KINDS = np.zeros(len(PAINT_CLASSES))
 
 
-def test_logits_cover_images_of_any_size(tmp_path):
+def test_the_outputs_cover_images_of_any_size(tmp_path):
     network = Network(brightness_model(tmp_path))
     for height, width in ((32, 48), (33, 47), (5, 16)):
-        logits = network.logits(np.zeros((height, width, 3), dtype=np.uint8))
-        assert logits.shape == (1 + len(PAINT_CLASSES), -(-height // 2), -(-width // 2))
+        output = network.run(np.zeros((height, width, 3), dtype=np.uint8))
+        assert output.paint.shape == (-(-height // 2), -(-width // 2))
+        assert output.kinds.shape == (len(PAINT_CLASSES), -(-height // 4), -(-width // 4))
+        assert output.lanes.shape == (2, -(-height // 8), -(-width // 8))
 
 
 def test_a_missing_model_is_named(tmp_path):
@@ -36,21 +37,34 @@ def test_a_damaged_model_is_refused(tmp_path):
     ("metadata", "words"),
     [
         ({"other": 1}, "no usable 'v2hdm' metadata"),
-        ({"classes": ["zebra"], "multiple": 16, "stride": 2}, "unknown classes"),
-        ({"classes": list(PAINT_CLASSES), "multiple": 15, "stride": 2}, "does not divide"),
-        ({"classes": list(PAINT_CLASSES), "multiple": "many", "stride": 2}, "no usable 'v2hdm' metadata"),
+        ({"classes": ["zebra"], "multiple": 16, "strides": STRIDES}, "unknown classes"),
+        ({"classes": list(PAINT_CLASSES), "multiple": 15, "strides": STRIDES}, "do not divide"),
+        ({"classes": list(PAINT_CLASSES), "multiple": 16, "strides": STRIDES | {"kinds": 1}}, "no multiple"),
+        (
+            {"classes": list(PAINT_CLASSES), "multiple": "many", "strides": STRIDES},
+            "no usable 'v2hdm' metadata",
+        ),
+        ({"classes": list(PAINT_CLASSES), "multiple": 16, "stride": 2}, "no usable 'v2hdm' metadata"),
     ],
 )
 def test_a_model_with_wrong_metadata_is_refused(tmp_path, metadata, words):
-    save_model(tmp_path / "m.onnx", SLOPE, OFFSET, metadata)
+    save_model(tmp_path / "m.onnx", (0.1, 0.0), KINDS, metadata)
     with pytest.raises(DetectorError, match=words):
         Network(tmp_path / "m.onnx")
 
 
 def test_a_model_whose_outputs_disagree_with_its_metadata_is_refused(tmp_path):
-    save_model(tmp_path / "m.onnx", SLOPE, OFFSET, {"classes": ["diamond"], "multiple": 16, "stride": 2})
+    save_model(
+        tmp_path / "m.onnx", (0.1, 0.0), KINDS, {"classes": ["diamond"], "multiple": 16, "strides": STRIDES}
+    )
     with pytest.raises(DetectorError, match="export it again"):
-        Network(tmp_path / "m.onnx").logits(np.zeros((32, 32, 3), dtype=np.uint8))
+        Network(tmp_path / "m.onnx").run(np.zeros((32, 32, 3), dtype=np.uint8))
+
+
+def test_weights_that_are_no_numbers_are_noticed(tmp_path):
+    save_model(tmp_path / "m.onnx", (np.nan, 0.0), KINDS)
+    with pytest.raises(DetectorError, match="not finite"):
+        Network(tmp_path / "m.onnx").run(np.zeros((32, 32, 3), dtype=np.uint8))
 
 
 @pytest.mark.parametrize(

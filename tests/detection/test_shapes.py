@@ -4,8 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from v2hdm.detection.blobs import find_blobs, foreground_level, zero_crossings
+from v2hdm.detection.blobs import find_blobs, outline_polygon, zero_crossings
 from v2hdm.detection.coverage import blurred_coverage
+from v2hdm.detection.network import NetworkOutput
 from v2hdm.detection.normal import normal_pdf_cdf
 from v2hdm.detection.quad import (
     interior_angles,
@@ -22,11 +23,13 @@ from v2hdm.records import PAINT_CLASSES
 KITE = order_corners(np.array([[20.3, 10.2], [40.1, 14.9], [19.4, 19.3], [3.2, 15.5]]))
 
 
-def logits_of(labels: np.ndarray) -> np.ndarray:
-    """Confident logits (C, h, w) of a label picture."""
-    return np.stack([np.where(labels == c, 5.0, -5.0) for c in range(1 + len(PAINT_CLASSES))]).astype(
-        np.float32
-    )
+def output_of(labels: np.ndarray) -> NetworkOutput:
+    """What a confident network says of a label picture (h, w) at the resolution of its paint."""
+    paint = np.where(labels > 0, 5.0, -5.0).astype(np.float32)
+    kinds = np.stack([np.where(labels == 1 + c, 5.0, -5.0) for c in range(len(PAINT_CLASSES))])
+    coarse = kinds.reshape(len(kinds), labels.shape[0] // 2, 2, labels.shape[1] // 2, 2).mean(axis=(2, 4))
+    lanes = np.zeros((2, labels.shape[0] // 4, labels.shape[1] // 4), dtype=np.float32)
+    return NetworkOutput(paint, coarse.astype(np.float32), lanes)
 
 
 def test_ordered_corners_run_counter_clockwise_on_the_screen():
@@ -103,17 +106,23 @@ def test_zero_crossings_are_interpolated_between_neighbours():
     np.testing.assert_allclose(zero_crossings(level), [[0.25, 0.0], [1.75, 0.0]])
 
 
-def test_the_foreground_counts_all_paint_together():
-    logits = np.zeros((3, 1, 1), dtype=np.float32)
-    logits[1:] = -0.2  # each class is less likely than the background, both together are not
-    assert foreground_level(logits)[0, 0] > 0
+def test_the_outline_polygon_of_an_arrow_encloses_its_cells():
+    labels = np.zeros((40, 60), dtype=int)
+    labels[10:30, 20:24] = labels[10:16, 14:30] = 1 + PAINT_CLASSES.index("arrow")
+    blobs, _ = find_blobs(output_of(labels), PAINT_CLASSES, 2, 50)
+    (arrow,) = blobs
+    assert arrow.kind == "arrow"
+    polygon = outline_polygon(arrow)
+    area_px = abs(signed_area(polygon))
+    assert area_px == pytest.approx(4 * np.count_nonzero(labels), rel=0.06)
+    np.testing.assert_allclose(polygon.min(axis=0), [2 * 13.5 + 0.5, 50 + 2 * 9.5 + 0.5], atol=0.6)
 
 
 def test_a_diamond_that_touches_a_line_is_split_from_it():
     labels = np.zeros((40, 60), dtype=int)
     labels[10:30, 20:40] = 1 + PAINT_CLASSES.index("diamond")
     labels[:, 40:44] = 1 + PAINT_CLASSES.index("lane_line")
-    blobs, owner = find_blobs(logits_of(labels), PAINT_CLASSES, 2, 0)
+    blobs, owner = find_blobs(output_of(labels), PAINT_CLASSES, 2, 0)
     assert sorted(blob.kind for blob in blobs) == ["diamond", "lane_line"]
     square = next(blob for blob in blobs if blob.kind == "diamond")
     assert square.outline_px[:, 0].max() == pytest.approx(2 * 39.5 + 0.5, abs=0.1)
@@ -124,7 +133,7 @@ def test_a_dash_that_looks_like_a_line_here_and_there_stays_one_blob():
     labels = np.zeros((40, 60), dtype=int)
     labels[5:35, 20:24] = 1 + PAINT_CLASSES.index("lane_dash")
     labels[5:14, 20:24] = 1 + PAINT_CLASSES.index("lane_line")
-    blobs, _ = find_blobs(logits_of(labels), PAINT_CLASSES, 2, 0)
+    blobs, _ = find_blobs(output_of(labels), PAINT_CLASSES, 2, 0)
     assert [blob.kind for blob in blobs] == ["lane_dash"]
 
 
@@ -132,12 +141,12 @@ def test_worn_holes_do_not_add_to_the_outline():
     labels = np.zeros((40, 60), dtype=int)
     labels[10:30, 20:40] = 1
     labels[18:22, 28:32] = 0
-    blobs, _ = find_blobs(logits_of(labels), PAINT_CLASSES, 2, top_px=100)
+    blobs, _ = find_blobs(output_of(labels), PAINT_CLASSES, 2, top_px=100)
     inner = np.abs(blobs[0].outline_px - [2 * 29.5 + 0.5, 100 + 2 * 19.5 + 0.5]).max(axis=1)
     assert inner.min() > 15
 
 
 def test_an_empty_picture_has_no_blobs():
-    blobs, owner = find_blobs(logits_of(np.zeros((8, 8), dtype=int)), PAINT_CLASSES, 2, 0)
+    blobs, owner = find_blobs(output_of(np.zeros((8, 8), dtype=int)), PAINT_CLASSES, 2, 0)
     assert blobs == []
     assert not owner.any()

@@ -14,11 +14,10 @@ from hydra import compose, initialize_config_dir
 from export import __main__ as door
 from export import onnx_file
 from export.onnx_file import METADATA_KEY, PARITY_SIZES, export_checkpoint
-from models import MarkingNet, NetConfig
-from train.augment import half_resolution
+from models import MarkingNet, NetConfig, Prediction
 from train.checkpoint import Checkpoint
 from train.config import TrainConfig
-from train.losses import IGNORE
+from train.targets import IGNORE, paint_target
 from v2hdm.errors import ConfigError, DetectorError
 from v2hdm.records import PAINT_CLASSES
 from v2hdm.simulate.training_scenes import training_sample
@@ -52,18 +51,28 @@ def test_the_file_computes_what_the_network_computes(
     checkpoint: Checkpoint, exported: Path, height: int, width: int
 ) -> None:
     image = np.random.default_rng(height).integers(0, 256, (1, height, width, 3)).astype(np.uint8)
-    (logits,) = onnxruntime.InferenceSession(exported).run(None, {"image": image})
+    session = onnxruntime.InferenceSession(exported)
     with torch.inference_mode():
-        expected = checkpoint.network()(torch.from_numpy(image)).numpy()
-    assert logits.shape == (1, 1 + len(PAINT_CLASSES), height // 2, width // 2)
-    np.testing.assert_allclose(logits, expected, atol=1e-4)
+        prediction = checkpoint.network()(torch.from_numpy(image))
+    for name, expected in prediction._asdict().items():
+        (output,) = session.run([name], {"image": image})
+        np.testing.assert_allclose(output, expected.numpy(), atol=1e-4)
+
+
+def test_the_outputs_have_the_names_that_the_detector_asks_for(exported: Path) -> None:
+    names = [node.name for node in onnxruntime.InferenceSession(exported).get_outputs()]
+    assert names == list(Prediction._fields) == ["paint", "kinds", "lanes"]
 
 
 def test_the_label_says_how_to_run_it_and_where_it_comes_from(exported: Path) -> None:
     properties = {p.key: p.value for p in onnx.load(exported).metadata_props}
     label = json.loads(properties[METADATA_KEY])
     assert label["classes"] == list(PAINT_CLASSES)
-    assert (label["multiple"], label["stride"], label["steps"]) == (16, 2, 5)
+    assert (label["multiple"], label["strides"], label["steps"]) == (
+        16,
+        {"paint": 2, "kinds": 4, "lanes": 8},
+        5,
+    )
     assert label["metrics"] == {"mean_iou": 0.25}
     assert label["training"]["batch"] == TrainConfig().batch
     assert "private" not in properties[METADATA_KEY]
@@ -76,6 +85,14 @@ def test_a_file_that_differs_from_its_network_is_not_written(
     other = replace(checkpoint, averaged={k: v + 0.1 for k, v in checkpoint.averaged.items()})
     with pytest.raises(DetectorError, match="was not written"):
         export_checkpoint(other, tmp_path / "net.onnx", opset=18, tolerance=1e-3)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_weights_that_are_no_numbers_are_not_written(checkpoint: Checkpoint, tmp_path: Path) -> None:
+    name = next(iter(checkpoint.averaged))
+    broken = replace(checkpoint, averaged={**checkpoint.averaged, name: checkpoint.averaged[name] * np.nan})
+    with pytest.raises(DetectorError, match="not finite"):
+        export_checkpoint(broken, tmp_path / "net.onnx", opset=18, tolerance=1e-3)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -98,12 +115,12 @@ def test_the_shipped_detector_finds_fresh_paint_where_it_is() -> None:
     recall, precision, overlap = [], [], np.zeros((3, 3))
     for index in range(12):
         sample = training_sample(424242, index, 448, 256, difficulty=0.0)
-        (logits,) = session.run(None, {"image": sample.image[None]})
-        labels = half_resolution(sample.labels)
-        found, painted = logits[0].argmax(axis=0) > 0, (labels > 0) & (labels != IGNORE)
+        (paint,) = session.run(["paint"], {"image": sample.image[None]})
+        target = paint_target(sample.labels)
+        found, painted = paint[0, 0] > 0, target == 1
         if painted.sum() > 150:
             recall.append(found[painted].mean())
-            precision.append(painted[found & (labels != IGNORE)].mean())
+            precision.append(painted[found & (target != IGNORE)].mean())
         for row, column in np.ndindex(3, 3):
             overlap[row, column] += (np.roll(found, (row - 1, column - 1), (0, 1)) & painted).sum()
     assert np.median(recall) > 0.85

@@ -14,7 +14,7 @@ from v2hdm.records import PAINT_CLASSES
 def net() -> MarkingNet:
     """A network whose normalisations have seen something."""
     torch.manual_seed(0)
-    net = MarkingNet(NetConfig(widths=[16, 16, 16, 16], head_width=16))
+    net = MarkingNet(NetConfig(widths=[16, 16, 16, 16]))
     for module in net.modules():
         if isinstance(module, nn.BatchNorm2d):
             module.running_mean.normal_()
@@ -27,13 +27,24 @@ def random_images(*shape: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(("batch", "height", "width"), [(1, 16, 16), (2, 48, 80), (1, 208, 1232)])
-def test_there_is_one_logit_for_every_other_pixel(
+def test_every_output_covers_the_image_at_its_stride(
     net: MarkingNet, batch: int, height: int, width: int
 ) -> None:
     with torch.inference_mode():
-        logits = net(random_images(batch, height, width))
-    assert logits.shape == (batch, 1 + len(PAINT_CLASSES), height // 2, width // 2)
-    assert logits.dtype == torch.float32
+        paint, kinds, lanes = net(random_images(batch, height, width))
+    assert paint.shape == (batch, 1, height // 2, width // 2)
+    assert kinds.shape == (batch, len(PAINT_CLASSES), height // 4, width // 4)
+    assert lanes.shape == (batch, 2, height // 8, width // 8)
+    assert paint.dtype == torch.float32
+
+
+@pytest.mark.parametrize("config", [NetConfig(separable=False), NetConfig(lanes=False)])
+def test_the_switches_leave_the_outputs_as_they_are_shaped(config: NetConfig) -> None:
+    with torch.inference_mode():
+        prediction = MarkingNet(config).eval()(random_images(1, 32, 48))
+    assert prediction.lanes.shape == (1, 2, 4, 6)
+    if not config.lanes:
+        assert (prediction.lanes < 0).all(), "a network without lanes finds none"
 
 
 def test_folding_the_normalisations_leaves_the_function_as_it_is() -> None:
@@ -47,7 +58,8 @@ def test_folding_the_normalisations_leaves_the_function_as_it_is() -> None:
         before = net(images)
         after = net.fold()(images)
     assert not any(isinstance(module, nn.BatchNorm2d) for module in net.modules())
-    torch.testing.assert_close(after, before, atol=1e-4, rtol=1e-4)
+    for one, other in zip(after, before, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-4)
 
 
 def test_the_stem_keeps_every_pixel_of_a_tile_as_a_channel() -> None:
@@ -70,4 +82,5 @@ def test_a_pixel_of_another_image_of_the_batch_changes_nothing(net: MarkingNet) 
     changed = images.clone()
     changed[1] = 255 - changed[1]
     with torch.inference_mode():
-        torch.testing.assert_close(net(changed)[0], net(images)[0])
+        for one, other in zip(net(changed), net(images), strict=True):
+            torch.testing.assert_close(one[0], other[0])

@@ -2,32 +2,27 @@
 
 import numpy as np
 
-from train.augment import half_resolution, random_crop, random_photometry
-from train.losses import IGNORE
+from train.augment import random_crop, random_photometry
+from v2hdm.simulate.training_scenes import TrainingSample
 
 
-def test_a_block_takes_the_class_of_most_of_its_pixels_and_a_tie_is_ignored() -> None:
-    labels = np.array([[1, 1, 0, 2], [1, 0, 2, 0], [0, 0, 3, 3], [0, 4, 3, 3]], dtype=np.uint8)
-    assert half_resolution(labels).tolist() == [[1, IGNORE], [0, 3]]
-
-
-def test_half_resolution_moves_no_edge() -> None:
-    labels = np.zeros((64, 64), dtype=np.uint8)
-    labels[:, 21:] = 1
-    row = half_resolution(labels)[0]
-    assert row[9] == 0
-    assert row[10] == IGNORE
-    assert row[11] == 1
-
-
-def test_crops_show_the_labels_of_their_own_pixels() -> None:
+def test_crops_keep_image_labels_hidden_and_lanes_together() -> None:
     labels = np.random.default_rng(0).integers(0, 5, (40, 60)).astype(np.uint8)
     image = np.repeat(labels[..., None], 3, axis=2)
+    image[20, 30] = 250
+    whole = TrainingSample(image, labels, labels > 2, (np.array([[30.0, 20.0], [31.0, 10.0]]),))
     rng = np.random.default_rng(1)
-    for _ in range(20):
-        cropped, cropped_labels = random_crop(rng, image, labels, 32, 16)
-        assert cropped.shape == (16, 32, 3)
-        np.testing.assert_array_equal(cropped[..., 1], cropped_labels)
+    seen = 0
+    for _ in range(40):
+        crop = random_crop(rng, whole, 32, 16)
+        assert crop.image.shape == (16, 32, 3)
+        bright = crop.image[..., 1] == 250
+        np.testing.assert_array_equal(crop.image[..., 1][~bright], crop.labels[~bright])
+        np.testing.assert_array_equal(crop.hidden, crop.labels > 2)
+        for row, column in np.argwhere(bright):
+            np.testing.assert_array_equal(crop.lanes_px[0][0], [column, row])
+            seen += 1
+    assert seen > 3
 
 
 def test_photometry_changes_values_but_not_shape_or_type_or_its_input() -> None:

@@ -1,4 +1,4 @@
-"""From logits to blobs of paint: what is connected, of which class, and its soft outline."""
+"""From the network's outputs to blobs of paint: what is connected, of which class, its soft outline."""
 
 from __future__ import annotations
 
@@ -8,16 +8,41 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from v2hdm.records import DIAMOND, LANE_DASH, LANE_LINE, OTHER_PAINT, BoolArray, FloatArray
+from v2hdm.detection.network import NetworkOutput
+from v2hdm.records import (
+    ARROW,
+    CHEVRON,
+    CROSSWALK_BAR,
+    DIAMOND,
+    LANE_DASH,
+    LANE_LINE,
+    OTHER_PAINT,
+    STOP_LINE,
+    BoolArray,
+    FloatArray,
+)
 
 _MIN_CELLS = 5
-"""Blobs of fewer logits are noise: their outline is not worth four corners."""
+"""Blobs of fewer cells are noise: their outline is not worth four corners."""
 
 _SPLIT_FRACTION = 0.15
 """Where a second group of classes holds this much of a blob, two markings touch."""
 
-_GROUPS: tuple[tuple[str, ...], ...] = ((DIAMOND,), (LANE_DASH, LANE_LINE))
+_GROUPS: tuple[tuple[str, ...], ...] = (
+    (DIAMOND,),
+    (LANE_DASH, LANE_LINE),
+    (STOP_LINE,),
+    (CROSSWALK_BAR,),
+    (ARROW, CHEVRON, OTHER_PAINT),
+)
 """Classes that are never split from each other: a dash that looks like a line here and there is one blob."""
+
+_SYMBOLS = _GROUPS[-1]
+
+_OUTLINE_SCALE = 4
+
+_MAX_VOTES = 400
+"""Cells of a blob that are asked for its class; more of them say nothing new."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +52,8 @@ class Blob:
     ``level`` (h, w) float32 is positive inside, its zero crossing is the soft outline; element
     (i, j) lies at recorded pixel ``origin_px + stride * (j, i)``. ``outline_px`` (N, 2) are the
     zero crossings between neighbouring elements, recorded px, in no order. ``class_score`` maps
-    each class to its mean probability over the blob. ``touches_other_paint`` says that it was split
-    off a connected piece of paint another part of which is other paint, such as the head of an arrow.
+    each class to its mean probability over the blob. ``touches_symbol`` says that it was split
+    off a connected piece of paint another part of which is an arrow, a chevron or other paint.
     """
 
     class_score: dict[str, float]
@@ -36,7 +61,7 @@ class Blob:
     origin_px: FloatArray
     stride: int
     outline_px: FloatArray
-    touches_other_paint: bool = False
+    touches_symbol: bool = False
 
     @property
     def kind(self) -> str:
@@ -44,30 +69,22 @@ class Blob:
         return max(self.class_score, key=self.class_score.__getitem__)
 
 
-def foreground_level(logits: np.ndarray) -> np.ndarray:
-    """Log odds (h, w) of paint of any class against background, from logits (C, h, w)."""
-    odds = cv2.exp(np.minimum(logits[1] - logits[0], 30.0))
-    for logit in logits[2:]:
-        odds += cv2.exp(np.minimum(logit - logits[0], 30.0))
-    return np.asarray(cv2.log(odds))
-
-
 def find_blobs(
-    logits: np.ndarray, classes: Sequence[str], stride: int, top_px: int
+    output: NetworkOutput, classes: Sequence[str], stride: int, top_px: int
 ) -> tuple[list[Blob], np.ndarray]:
     """Split the paint of one image into blobs.
 
     Args:
-        logits: (C, h, w) float32, background first.
-        classes: names of the paint channels.
-        stride: recorded pixels per logit.
-        top_px: image row at which the logits' band starts.
+        output: what the network says of a band of the image.
+        classes: names of the channels of its ``kinds``.
+        stride: recorded pixels per element of its ``paint``.
+        top_px: image row at which the band starts.
 
     Returns:
-        The blobs, and a map (h, w) int16 with 1 + the index of the blob that covers each logit, 0
-        for none.
+        The blobs, and a map (h, w) int16 with 1 + the index of the blob that covers each element of
+        ``paint``, 0 for none.
     """
-    framed_level = np.pad(foreground_level(logits), 1, constant_values=-1.0)
+    framed_level = np.pad(output.paint, 1, constant_values=-1.0)
     level = framed_level[1:-1, 1:-1]
     contours, _ = cv2.findContours((level > 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     owner = np.zeros(level.shape, dtype=np.int16)
@@ -76,70 +93,102 @@ def find_blobs(
         if len(contour) < 4:
             continue
         x, y, w, h = cv2.boundingRect(contour)
-        inside = np.zeros((h, w), dtype=np.uint8)
-        cv2.drawContours(inside, [contour], -1, 1, cv2.FILLED, offset=(-x, -y))
+        filled = np.zeros((h, w), dtype=np.uint8)
+        cv2.drawContours(filled, [contour], -1, 1, cv2.FILLED, offset=(-x, -y))
+        inside = filled.view(np.bool_)
         box = (slice(y, y + h), slice(x, x + w))
-        local_logits, local_level = logits[(slice(None), *box)], level[box]
         siblings: list[int] = []
-        parts = _split_by_group(inside.astype(bool), local_logits, local_level, classes)
-        for mask, part_level in parts:
-            if np.count_nonzero(mask) < _MIN_CELLS:
-                continue
+        parts = _parts(inside, output, box, classes)
+        for mask, part_level, scores in parts:
             framed = framed_level[y : y + h + 2, x : x + w + 2].copy()
             framed[1:-1, 1:-1] = part_level
             origin_px = stride * np.array([x - 1.0, y - 1.0]) + (stride - 1) / 2 + [0.0, top_px]
-            blobs.append(_make_blob(mask, framed, local_logits, classes, stride, origin_px))
+            blobs.append(_make_blob(mask, framed, scores, classes, stride, origin_px))
             siblings.append(len(blobs) - 1)
             owner[box][mask] = len(blobs)
-        if any(blobs[s].kind == OTHER_PAINT for s in siblings):
+        if any(blobs[s].kind in _SYMBOLS for s in siblings):
             for s in siblings:
-                blobs[s] = replace(blobs[s], touches_other_paint=True)
+                blobs[s] = replace(blobs[s], touches_symbol=True)
     return blobs, owner
 
 
-def _split_by_group(
-    inside: BoolArray, logits: np.ndarray, level: np.ndarray, classes: Sequence[str]
-) -> list[tuple[BoolArray, np.ndarray]]:
-    """The parts of a blob that belong to different groups of classes, each with its own signed level."""
-    votes = np.bincount(logits[1:].argmax(axis=0)[inside], minlength=len(classes))
+_Part = tuple[BoolArray, np.ndarray, np.ndarray]
+"""A part's mask (h, w), its signed level (h, w), and the mean probability (K,) of each class in it."""
+
+
+def _parts(
+    inside: BoolArray, output: NetworkOutput, box: tuple[slice, slice], classes: Sequence[str]
+) -> list[_Part]:
+    """The parts of a blob that belong to different groups of classes; one where all of it is of one group."""
+    level = output.paint[box]
+    if np.count_nonzero(inside) < _MIN_CELLS:
+        return []
+    probability = _class_probability(inside, output, box)
+    certainty = _certainty(inside, level)
+    votes = np.bincount(probability.argmax(axis=0), minlength=len(classes))
     group_of = np.array([_group_index(name) for name in classes])
-    groups = np.unique(group_of)
-    share = np.array([votes[group_of == g].sum() for g in groups]) / max(1, votes.sum())
-    present = groups[share >= _SPLIT_FRACTION]
+    share = np.array([votes[group_of == g].sum() for g in range(len(_GROUPS))]) / max(1, votes.sum())
+    present = np.flatnonzero(share >= _SPLIT_FRACTION)
     if len(present) < 2:
-        return [(inside, level)]
+        return [(inside, level, certainty * probability.mean(axis=1))]
+    kinds = _kinds_at_full(output, box)
     parts = []
     for group in present:
-        mine = logits[1:][group_of == group].max(axis=0)
-        rest = logits[1:][group_of != group].max(axis=0)
+        mine = kinds[group_of == group].max(axis=0)
+        rest = kinds[group_of != group].max(axis=0)
         group_level = np.minimum(level, mine - rest)
         count, labels = cv2.connectedComponents(((group_level > 0) & inside).astype(np.uint8))
-        parts += [(labels == label, group_level) for label in range(1, count)]
+        for label in range(1, count):
+            mask = labels == label
+            if np.count_nonzero(mask) >= _MIN_CELLS:
+                own = _class_probability(mask, output, box).mean(axis=1)
+                parts.append((mask, group_level, _certainty(mask, level) * own))
     return parts
 
 
+def _class_probability(mask: BoolArray, output: NetworkOutput, box: tuple[slice, slice]) -> np.ndarray:
+    """Probability (K, n) of each class at cells of the mask (h, w) that is placed at ``box``."""
+    i, j = np.nonzero(mask)
+    step = -(-len(i) // _MAX_VOTES)
+    scale = output.paint.shape[1] / output.kinds.shape[2]
+    rows = ((i[::step] + box[0].start) / scale).astype(np.intp)
+    columns = ((j[::step] + box[1].start) / scale).astype(np.intp)
+    logits = output.kinds[:, rows, columns]
+    odds = np.exp(logits - logits.max(axis=0))
+    return np.asarray(odds / odds.sum(axis=0))
+
+
+def _certainty(mask: BoolArray, level: np.ndarray) -> float:
+    """Mean probability of paint where the mask (h, w) is."""
+    return float((1 / (1 + np.exp(-np.clip(level[mask], -30, 30)))).mean())
+
+
+def _kinds_at_full(output: NetworkOutput, box: tuple[slice, slice]) -> np.ndarray:
+    """Class logits (K, h, w), interpolated to the elements of ``paint`` in a box."""
+    rows, columns = (np.arange(part.start, part.stop, dtype=np.float32) for part in box)
+    scale = np.float32(output.paint.shape[1] / output.kinds.shape[2])
+    u, v = np.meshgrid((columns + 0.5) / scale - 0.5, (rows + 0.5) / scale - 0.5)
+    return np.stack(
+        [cv2.remap(plane, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for plane in output.kinds]
+    )
+
+
 def _group_index(name: str) -> int:
-    for index, group in enumerate(_GROUPS):
-        if name in group:
-            return index
-    return len(_GROUPS)
+    return next(index for index, group in enumerate(_GROUPS) if name in group)
 
 
 def _make_blob(
     mask: BoolArray,
     framed_level: np.ndarray,
-    logits: np.ndarray,
+    scores: np.ndarray,
     classes: Sequence[str],
     stride: int,
     origin_px: FloatArray,
 ) -> Blob:
-    cells = logits[:, mask]
-    cells = np.exp(cells - cells.max(axis=0))
-    probability = (cells / cells.sum(axis=0)).mean(axis=1)
     # Holes are filled and other blobs in the same box emptied, so that only this outline crosses zero.
     level = np.where(np.pad(mask, 1), np.maximum(framed_level, 1e-3), np.minimum(framed_level, -1e-3))
     return Blob(
-        class_score={name: float(probability[c + 1]) for c, name in enumerate(classes)},
+        class_score=dict(zip(classes, scores.tolist(), strict=True)),
         level=level,
         origin_px=origin_px,
         stride=stride,
@@ -157,3 +206,13 @@ def zero_crossings(level: np.ndarray) -> FloatArray:
         fraction = first[i, j] / (first[i, j] - second[i, j])
         points.append(np.column_stack([j, i + fraction] if axis == 0 else [j + fraction, i]))
     return np.concatenate(points).astype(np.float64)
+
+
+def outline_polygon(blob: Blob) -> FloatArray:
+    """The soft outline as a closed polygon (N, 2) in recorded px, to a fifth of an element."""
+    fine = cv2.resize(blob.level, None, fx=_OUTLINE_SCALE, fy=_OUTLINE_SCALE, interpolation=cv2.INTER_LINEAR)
+    contours, _ = cv2.findContours((fine > 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    longest = max(contours, key=len)
+    polygon = cv2.approxPolyDP(longest, 0.2 * _OUTLINE_SCALE, closed=True).reshape(-1, 2)
+    cells = (polygon + 0.5) / _OUTLINE_SCALE - 0.5
+    return np.asarray(blob.origin_px + blob.stride * cells)

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.detection.blobs import Blob, find_blobs
+from v2hdm.detection.anchors import link_anchors
+from v2hdm.detection.blobs import Blob, find_blobs, outline_polygon
 from v2hdm.detection.corners import Foreground, QuadStart, fit_markings
 from v2hdm.detection.lanes import trace_lanes
 from v2hdm.detection.network import Network
@@ -16,7 +17,15 @@ from v2hdm.detection.plausible import plausible_kind
 from v2hdm.detection.quad import is_convex, quad_from_outline
 from v2hdm.detection.view import CameraView
 from v2hdm.errors import DetectorError
-from v2hdm.records import CORNERED_CLASSES, LANE_CLASSES, Camera, FloatArray, LaneDetection, MarkingDetection
+from v2hdm.records import (
+    CORNERED_CLASSES,
+    LANE_CLASSES,
+    OUTLINED_CLASSES,
+    Camera,
+    FloatArray,
+    LaneDetection,
+    MarkingDetection,
+)
 
 
 @dataclass(frozen=True)
@@ -60,8 +69,9 @@ class Detector:
         """
         view = self.view(camera)
         _check_image(image_bgr, camera)
-        logits = self.network.logits(image_bgr[view.top : view.top + view.height])
-        blobs, owner = find_blobs(logits, self.network.info.classes, self.network.info.stride, view.top)
+        info = self.network.info
+        output = self.network.run(image_bgr[view.top : view.top + view.height])
+        blobs, owner = find_blobs(output, info.classes, info.paint_stride, view.top)
         candidates = self._candidates(blobs, view)
         lanes = [
             lane
@@ -71,9 +81,11 @@ class Detector:
                 c.blob, c.kind, c.score, view, self.options.lane_step_m, self.options.max_range_m
             )
         ]
+        lanes += link_anchors(output.lanes, info.lane_stride, view)
         starts = [start for c in candidates if (start := self._start(c, view)) is not None]
-        foreground = Foreground(owner, self.network.info.stride, view.top)
+        foreground = Foreground(owner, info.paint_stride, view.top)
         markings = fit_markings(image_bgr, view, starts, foreground, self.options)
+        markings += [symbol for c in candidates if (symbol := self._symbol(c, view)) is not None]
         return tuple(markings), tuple(lanes)
 
     def view(self, camera: Camera) -> CameraView:
@@ -107,6 +119,16 @@ class Detector:
         if not np.isfinite(ground).all() or view.range_m(ground.mean(axis=0)) > self.options.max_range_m:
             return None
         return QuadStart(candidate.kind, candidate.score, corners, candidate.index)
+
+    def _symbol(self, candidate: _Candidate, view: CameraView) -> MarkingDetection | None:
+        """A marking that has an outline but no four corners, within range."""
+        if candidate.kind not in OUTLINED_CLASSES:
+            return None
+        ground = view.ground(candidate.outline_pinhole_px)
+        if not np.isfinite(ground).all() or view.range_m(ground.mean(axis=0)) > self.options.max_range_m:
+            return None
+        nothing = np.full((4, 2), np.nan), np.full((8, 8), np.nan), np.zeros(4, dtype=np.bool_)
+        return MarkingDetection(candidate.kind, candidate.score, *nothing, outline_polygon(candidate.blob))
 
 
 def _check_image(image_bgr: np.ndarray, camera: Camera) -> None:

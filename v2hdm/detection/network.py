@@ -17,27 +17,41 @@ from v2hdm.records import PAINT_CLASSES
 DEFAULT_MODEL = Path(__file__).with_name("default.onnx")
 
 _METADATA_KEY = "v2hdm"
-_BACKGROUND = "background"
+_OUTPUTS = ["paint", "kinds", "lanes"]
 
 
 @dataclass(frozen=True)
 class NetworkInfo:
     """What a model file says of itself.
 
-    ``classes`` are those of output channels 1, 2, ...; inputs are padded to ``multiple`` px;
-    ``stride`` is the number of px per logit.
+    ``classes`` are those of the channels of ``kinds``; inputs are padded to ``multiple`` px; the strides are
+    the numbers of px per element of each output.
     """
 
     classes: tuple[str, ...]
     multiple: int
-    stride: int
+    paint_stride: int
+    kind_stride: int
+    lane_stride: int
+
+
+@dataclass(frozen=True)
+class NetworkOutput:
+    """What the network says of an image.
+
+    Element (i, j) of an output of stride s belongs to the image point (s * j + (s - 1) / 2, likewise i).
+    ``paint`` (h, w) float32: log odds of paint. ``kinds`` (K, h', w') float32: logits of its class.
+    ``lanes`` (2, h", w") float32: log odds that a lane's line crosses the row anchor in the cell, and its
+    offset from the cell's centre in cells.
+    """
+
+    paint: np.ndarray
+    kinds: np.ndarray
+    lanes: np.ndarray
 
 
 class Network:
-    """A segmentation network: uint8 BGR images in, logits of background and paint classes out.
-
-    Logit (row i, column j) belongs to image point (stride * j + (stride - 1) / 2, likewise i).
-    """
+    """The paint and lane network: uint8 BGR images in, :class:`NetworkOutput` out."""
 
     def __init__(self, path: Path | None = None, threads: int = 1):
         """Load a model file.
@@ -49,32 +63,59 @@ class Network:
         self._session = _open_session(self.path, threads)
         self.info = _read_info(self._session, self.path)
 
-    def logits(self, image_bgr: np.ndarray) -> np.ndarray:
-        """Logits (C, ceil(H / stride), ceil(W / stride)) float32 of an image (H, W, 3) uint8 of any size.
+    def run(self, image_bgr: np.ndarray) -> NetworkOutput:
+        """Look at an image (H, W, 3) uint8 of any size.
 
         Raises:
-            DetectorError: the network refused the image.
+            DetectorError: the network refused the image, or what it says is not what its label promises.
         """
         height, width = image_bgr.shape[:2]
-        multiple, stride = self.info.multiple, self.info.stride
+        multiple = self.info.multiple
         padded = image_bgr
         if height % multiple or width % multiple:
             padded = cv2.copyMakeBorder(
                 image_bgr, 0, -height % multiple, 0, -width % multiple, cv2.BORDER_REPLICATE
             )
         try:
-            (out,) = self._session.run(["logits"], {"image": np.ascontiguousarray(padded)[None]})
+            outputs = self._session.run(_OUTPUTS, {"image": np.ascontiguousarray(padded)[None]})
         except Exception as error:  # onnxruntime raises classes of its own that are not exported
             raise DetectorError(
                 f"{self.path}: the network failed on a {width}x{height} image ({_one_line(error)}); "
                 "export it again with dynamic sizes"
             ) from error
-        expected = (1, len(self.info.classes) + 1, padded.shape[0] // stride, padded.shape[1] // stride)
-        if out.shape != expected:
-            raise DetectorError(
-                f"{self.path}: logits are {out.shape} where {expected} was promised; export it again"
+        paint, kinds, lanes = (
+            self._cropped(name, output, channels, stride, padded.shape, (height, width))
+            for name, output, channels, stride in zip(
+                _OUTPUTS,
+                outputs,
+                (1, len(self.info.classes), 2),
+                (self.info.paint_stride, self.info.kind_stride, self.info.lane_stride),
+                strict=True,
             )
-        return np.asarray(out[0, :, : -(-height // stride), : -(-width // stride)])
+        )
+        # One sum meets every value: not-a-number anywhere in the weights spreads over all of the image.
+        if not np.isfinite(paint.sum()):
+            raise DetectorError(
+                f"{self.path}: the network gives values that are not finite; export an earlier checkpoint"
+            )
+        return NetworkOutput(paint[0], kinds, lanes)
+
+    def _cropped(
+        self,
+        name: str,
+        output: np.ndarray,
+        channels: int,
+        stride: int,
+        padded: tuple[int, ...],
+        size: tuple[int, int],
+    ) -> np.ndarray:
+        """One output (C, h, w) without the padding."""
+        expected = (1, channels, padded[0] // stride, padded[1] // stride)
+        if output.shape != expected:
+            raise DetectorError(
+                f"{self.path}: {name} is {output.shape} where {expected} was promised; export it again"
+            )
+        return np.asarray(output[0, :, : -(-size[0] // stride), : -(-size[1] // stride)])
 
 
 def _open_session(path: Path, threads: int) -> Any:
@@ -97,11 +138,10 @@ def _open_session(path: Path, threads: int) -> Any:
 def _read_info(session: Any, path: Path) -> NetworkInfo:
     try:
         metadata = json.loads(session.get_modelmeta().custom_metadata_map[_METADATA_KEY])
-        classes = tuple(str(name) for name in metadata["classes"])
         info = NetworkInfo(
-            classes[1:] if classes[:1] == (_BACKGROUND,) else classes,
+            tuple(str(name) for name in metadata["classes"]),
             int(metadata["multiple"]),
-            int(metadata["stride"]),
+            *(int(metadata["strides"][name]) for name in _OUTPUTS),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise DetectorError(
@@ -113,14 +153,20 @@ def _read_info(session: Any, path: Path) -> NetworkInfo:
         raise DetectorError(
             f"{path}: unknown classes {unknown}, known are {', '.join(PAINT_CLASSES)}; use another model"
         )
-    if info.stride < 1 or info.multiple < 1 or info.multiple % info.stride:
+    strides = (info.paint_stride, info.kind_stride, info.lane_stride)
+    if min(strides) < 1 or any(info.multiple % stride for stride in strides):
         raise DetectorError(
-            f"{path}: stride {info.stride} does not divide multiple {info.multiple}; export it again"
+            f"{path}: strides {strides} do not divide multiple {info.multiple}; export it again"
+        )
+    if info.kind_stride % info.paint_stride:
+        raise DetectorError(
+            f"{path}: the stride of kinds, {info.kind_stride}, is no multiple of that of paint, "
+            f"{info.paint_stride}; export it again"
         )
     names = ([node.name for node in session.get_inputs()], [node.name for node in session.get_outputs()])
-    if names != (["image"], ["logits"]):
+    if names != (["image"], _OUTPUTS):
         raise DetectorError(
-            f"{path}: inputs and outputs are {names}, not ['image'] and ['logits']; export it again"
+            f"{path}: inputs and outputs are {names}, not ['image'] and {_OUTPUTS}; export it again"
         )
     return info
 

@@ -10,15 +10,30 @@ import numpy as np
 
 from v2hdm.detection.blobs import Blob
 from v2hdm.detection.view import CameraView
-from v2hdm.records import DIAMOND, LANE_CLASSES, LANE_DASH, LANE_LINE, FloatArray
+from v2hdm.records import (
+    ARROW,
+    CHEVRON,
+    CROSSWALK_BAR,
+    DIAMOND,
+    LANE_CLASSES,
+    LANE_DASH,
+    LANE_LINE,
+    STOP_LINE,
+    FloatArray,
+)
 
 _SIZE_LIMITS_M: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     DIAMOND: ((0.15, 5.0), (0.1, 3.0)),
     LANE_DASH: ((0.7, 12.0), (0.03, 0.8)),
     LANE_LINE: ((0.3, np.inf), (0.03, np.inf)),
+    STOP_LINE: ((0.8, 25.0), (0.12, 1.2)),
+    CROSSWALK_BAR: ((0.8, 10.0), (0.15, 1.2)),
+    ARROW: ((0.6, 9.0), (0.1, 4.0)),
+    CHEVRON: ((0.5, 20.0), (0.1, 10.0)),
 }
 """Least and largest length and width of each class: road codes have no dash below 1 m, and
-letters have strokes of half a metre. A line's box is wide where the line bends."""
+letters have strokes of half a metre. A line's box is wide where the line bends. Other paint is
+not reported at all."""
 
 _DASH_LENGTH_M = 7.5
 _DASH_SHARE = 0.25
@@ -32,7 +47,7 @@ _BORDER_PX = 6.0
 
 
 def plausible_kind(blob: Blob, outline_pinhole_px: FloatArray, view: CameraView) -> tuple[str, float] | None:
-    """The likeliest class that the blob's size on the ground allows, with its score; None for other paint.
+    """The likeliest class that the blob's size on the ground allows, with its score; None for none.
 
     Args:
         blob: the blob.
@@ -45,7 +60,7 @@ def plausible_kind(blob: Blob, outline_pinhole_px: FloatArray, view: CameraView)
         kind, score = _likeliest_compact(blob.class_score)
     else:
         kind, score = _likeliest(blob.class_score, whole and length_m <= _DASH_LENGTH_M)
-    if kind == LANE_DASH and blob.touches_other_paint:
+    if kind == LANE_DASH and blob.touches_symbol:
         return None  # the shaft of an arrow, the stroke of a letter
     if kind == LANE_DASH and not _fits(LANE_DASH, length_m, width_m):
         kind = LANE_LINE

@@ -8,10 +8,13 @@ from itertools import pairwise
 import numpy as np
 
 from v2hdm.records import (
+    ARROW,
+    CORNERED_CLASSES,
     DIAMOND,
     LANE_DASH,
     LANE_LINE,
     OTHER_PAINT,
+    STOP_LINE,
     FloatArray,
     GeodeticOrigin,
     HdMap,
@@ -28,6 +31,7 @@ _PIECE_LENGTH_M = 25.0
 _PIECE_OVERLAP_M = 0.1
 _LEAST_GAP_M = 1.7
 _LINE_GAP_M = 1.1
+_STOP_LINE_M = np.array([[-0.2, -1.5], [0.2, -1.5], [0.2, 1.5], [-0.2, 1.5]])
 # The bars (x0, x1, y0, y1) of a letter like an eight on a pocket calculator.
 _LETTER_BARS_M = (
     (-0.6, 0.6, 0.0, 0.1),
@@ -173,16 +177,17 @@ def _is_free(centre: FloatArray, lines: FloatArray, layout: Layout) -> bool:
 
 
 def _other_paint(config: PaintConfig, route: Route, layout: Layout, rng: np.random.Generator) -> None:
-    """Arrows, stop lines and lettering: paint that is no marking of the map."""
-    for spacing, shapes in (
-        (config.arrow_spacing_m, _arrow()),
-        (config.stop_line_spacing_m, [np.array([[-0.2, -1.5], [0.2, -1.5], [0.2, 1.5], [-0.2, 1.5]])]),
-        (config.lettering_spacing_m, None),
+    """Arrows, stop lines and lettering; of these only the stop lines are markings of the map."""
+    for kind, spacing, shapes in (
+        (ARROW, config.arrow_spacing_m, _arrow()),
+        (STOP_LINE, config.stop_line_spacing_m, [_STOP_LINE_M]),
+        (OTHER_PAINT, config.lettering_spacing_m, None),
     ):
         for station in np.arange(spacing * 0.6, route.length_m - 5.0, spacing):
             at = np.array([station + rng.uniform(-2.0, 2.0)])
             offset = 0.0 if shapes is not None else float(rng.choice([-7.2, -3.5, 3.5, 7.2]))
             _place_shapes(
+                kind,
                 shapes if shapes is not None else _lettering(rng),
                 route.points_at(at, offset)[0],
                 float(route.yaw_at(at)[0]),
@@ -193,6 +198,7 @@ def _other_paint(config: PaintConfig, route: Route, layout: Layout, rng: np.rand
 
 
 def _place_shapes(
+    kind: str,
     shapes: list[FloatArray],
     centre: FloatArray,
     yaw_rad: float,
@@ -204,10 +210,10 @@ def _place_shapes(
         polygon = _placed(shape, centre, yaw_rad)
         layout.occupied_map.extend(polygon)
         layout.paints.append(
-            Paint(
-                kind=OTHER_PAINT, polygon_map=polygon, albedo_bgr=colour, wear=worn[0], dirt=worn[1], seed=7
-            )
+            Paint(kind=kind, polygon_map=polygon, albedo_bgr=colour, wear=worn[0], dirt=worn[1], seed=7)
         )
+        if kind in CORNERED_CLASSES:
+            layout.markings.append(Marking(kind=kind, corners_map=polygon))
 
 
 def _arrow() -> list[FloatArray]:

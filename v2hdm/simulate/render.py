@@ -23,8 +23,8 @@ from v2hdm.simulate.sky_layer import draw_background
 from v2hdm.simulate.textures import Float32
 from v2hdm.simulate.view import View, camera_rays
 
-RENDERER_VERSION = 1
-"""Raised whenever the same scene comes out as a different picture, so that cached drives are made afresh."""
+RENDERER_VERSION = 2
+"""Raised whenever a scene comes out as another picture or with another truth: cached drives are made afresh."""
 
 
 @dataclass(frozen=True)

@@ -6,16 +6,27 @@ Layouts run along +x from the origin, where the camera is; a :class:`Bend` turns
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from v2hdm.records import DIAMOND, LANE_DASH, LANE_LINE, OTHER_PAINT, FloatArray
+from v2hdm.records import (
+    ARROW,
+    CHEVRON,
+    CROSSWALK_BAR,
+    DIAMOND,
+    LANE_DASH,
+    LANE_LINE,
+    OTHER_PAINT,
+    STOP_LINE,
+    FloatArray,
+)
 from v2hdm.simulate.scene import WHITE_PAINT, YELLOW_PAINT, Bgr, Paint
 
 FAR_M = 50.0
 _DIAMONDS_FAR_M = 32.0
 _NEAR_M = -4.0
+_LANE_STEP_M = 0.5
 
 
 @dataclass(frozen=True)
@@ -82,29 +93,37 @@ def _turned(points: FloatArray, yaw_rad: float) -> FloatArray:
     return np.asarray(points @ np.array([[cos, sin], [-sin, cos]]))
 
 
-def street_paint(rng: np.random.Generator, brush: Brush, bend: Bend) -> list[Paint]:
+@dataclass
+class RoadPaint:
+    """The paint of a scene, and the centre lines (N, 2, map) of its lanes' lines, gaps of dashes included."""
+
+    paints: list[Paint] = field(default_factory=list)
+    lanes: list[FloatArray] = field(default_factory=list)
+
+
+def street_paint(rng: np.random.Generator, brush: Brush, bend: Bend) -> RoadPaint:
     """Lane lines of all kinds about the camera, and now and then a junction's markings."""
     lane_m = rng.uniform(2.5, 3.9)
     first = rng.integers(-3, 0)
     here = rng.uniform(-0.25, 0.25) * lane_m
     width_m = rng.uniform(0.09, 0.22)
     dash = _dash_pattern(rng)
-    paints: list[Paint] = []
+    road = RoadPaint()
     lines = range(first, first + int(rng.integers(2, 6)))
     for line in lines:
         left = (line + 0.5) * lane_m + here
         outer = line in (lines[0], lines[-1])
         style = rng.choice(4, p=[0.4, 0.5, 0.05, 0.05] if outer else [0.74, 0.16, 0.05, 0.05])
-        paints += _lane_line(rng, brush, bend, int(style), float(left), width_m, dash)
+        _lane_line(road, rng, brush, bend, int(style), float(left), width_m, dash)
     for lane in lines[:-1]:
         if rng.random() < 0.3:
-            paints += _lane_symbols(rng, brush, bend, (lane + 1) * lane_m + here, lane_m)
-    if rng.random() < 0.2:
-        paints += _junction(rng, brush, bend, lane_m)
-    return paints
+            road.paints += _lane_symbols(rng, brush, bend, (lane + 1) * lane_m + here, lane_m)
+    if rng.random() < 0.25:
+        road.paints += _junction(rng, brush, bend, lane_m)
+    return road
 
 
-def port_paint(rng: np.random.Generator, brush: Brush, bend: Bend) -> list[Paint]:
+def port_paint(rng: np.random.Generator, brush: Brush, bend: Bend) -> RoadPaint:
     """Columns of diamonds along the way, with lane lines between some of them."""
     length_m = rng.uniform(0.45, 1.9)
     width_m = length_m / rng.uniform(0.9, 3.0)
@@ -121,16 +140,16 @@ def port_paint(rng: np.random.Generator, brush: Brush, bend: Bend) -> list[Paint
             shape = rhombus(centre, length_m, width_m, yaw + along * bend.curvature)
             paints.append(brush.paint(rng, DIAMOND, shape))
     dash = _dash_pattern(rng)
+    road = RoadPaint()
+    if rng.random() < 0.2:
+        road.paints += _junction(rng, brush, bend, 3.2)
+    if rng.random() < 0.35:
+        road.paints += _lane_symbols(rng, brush, bend, rng.uniform(-4, 4), 3.2)
     for _ in range(int(rng.integers(0, 4))):
         style = int(rng.choice(4, p=[0.4, 0.5, 0.05, 0.05]))
-        paints = (
-            _lane_line(rng, brush, bend, style, rng.uniform(-6, 6), rng.uniform(0.09, 0.25), dash) + paints
-        )
-    if rng.random() < 0.35:
-        paints = _lane_symbols(rng, brush, bend, rng.uniform(-4, 4), 3.2) + paints
-    if rng.random() < 0.15:
-        paints = _junction(rng, brush, bend, 3.2) + paints
-    return paints
+        _lane_line(road, rng, brush, bend, style, rng.uniform(-6, 6), rng.uniform(0.09, 0.25), dash)
+    road.paints += paints
+    return road
 
 
 def _dash_pattern(rng: np.random.Generator) -> tuple[float, float]:
@@ -140,6 +159,7 @@ def _dash_pattern(rng: np.random.Generator) -> tuple[float, float]:
 
 
 def _lane_line(
+    road: RoadPaint,
     rng: np.random.Generator,
     brush: Brush,
     bend: Bend,
@@ -147,22 +167,42 @@ def _lane_line(
     left: float,
     width_m: float,
     dash: tuple[float, float],
-) -> list[Paint]:
-    """Style 0: dashes, 1: solid, 2: double solid, 3: dashes beside a solid line."""
+) -> None:
+    """Add a line to the road. Style 0: dashes, 1: solid, 2: double solid, 3: dashes beside a solid line."""
     beside = width_m * rng.uniform(1.8, 3.0)
-    out: list[Paint] = []
+    extents: list[tuple[float, float]] = []
     if style in (0, 3):
         for start in np.arange(_NEAR_M - rng.uniform(0, dash[1]), FAR_M, dash[1]):
-            out.append(brush.paint(rng, LANE_DASH, _strip(bend, start, start + dash[0], left, width_m)))
-    for offset in {1: (0.0,), 2: (-beside / 2, beside / 2), 3: (beside,)}.get(style, ()):
-        out += _solid(rng, brush, bend, left + offset, width_m)
-    return out
+            strip = _strip(bend, start, start + dash[0], left, width_m)
+            road.paints.append(brush.paint(rng, LANE_DASH, strip))
+        extents.append((_NEAR_M, FAR_M))
+    offsets = {1: (0.0,), 2: (-beside / 2, beside / 2), 3: (beside,)}.get(style, ())
+    for offset in offsets:
+        extent = _solid_extent(rng)
+        road.paints += _solid(rng, brush, bend, extent, left + offset, width_m)
+        extents.append(extent)
+    start, end = min(e[0] for e in extents), max(e[1] for e in extents)
+    centre = left + (beside / 2 if style == 3 else 0.0)
+    along = np.arange(start, end + 1e-6, _LANE_STEP_M)
+    road.lanes.append(bend.to_map(np.column_stack([along, np.full(len(along), centre)])))
 
 
-def _solid(rng: np.random.Generator, brush: Brush, bend: Bend, left: float, width_m: float) -> list[Paint]:
-    """A solid line, in short pieces where the way bends; some begin or end in view."""
+def _solid_extent(rng: np.random.Generator) -> tuple[float, float]:
+    """Where a solid line begins and ends along the way; some do so in view."""
     start = _NEAR_M if rng.random() < 0.75 else rng.uniform(_NEAR_M, 15)
-    end = FAR_M if rng.random() < 0.75 else start + rng.uniform(9, 30)
+    return float(start), float(FAR_M if rng.random() < 0.75 else start + rng.uniform(9, 30))
+
+
+def _solid(
+    rng: np.random.Generator,
+    brush: Brush,
+    bend: Bend,
+    extent: tuple[float, float],
+    left: float,
+    width_m: float,
+) -> list[Paint]:
+    """A solid line, in short pieces where the way bends."""
+    start, end = extent
     piece = 2.5 if bend.curvature else end - start
     edges = np.arange(start, end - 0.1, piece)
     seed = int(rng.integers(1 << 30))
@@ -191,12 +231,12 @@ def _lane_symbols(
     rng: np.random.Generator, brush: Brush, bend: Bend, left: float, lane_m: float
 ) -> list[Paint]:
     """An arrow or a line of writing in a lane, perhaps repeated."""
-    draw = _arrow if rng.random() < 0.6 else _writing
+    draw, kind = (_arrow, ARROW) if rng.random() < 0.6 else (_writing, OTHER_PAINT)
     out: list[Paint] = []
     for along in np.arange(rng.uniform(1, 12), 32, rng.uniform(9, 30)):
         for polygon in draw(rng, lane_m):
             placed = bend.to_map(polygon + np.array([along, left]))
-            out.append(brush.paint(rng, OTHER_PAINT, placed))
+            out.append(brush.paint(rng, kind, placed))
     return out
 
 
@@ -238,24 +278,52 @@ def _writing(rng: np.random.Generator, lane_m: float) -> Iterator[FloatArray]:
 
 
 def _junction(rng: np.random.Generator, brush: Brush, bend: Bend, lane_m: float) -> list[Paint]:
-    """A stop line, a crosswalk, teeth or hatching across the way."""
+    """A stop line, a crosswalk, teeth, or chevrons across the way."""
     along, left = rng.uniform(3, 25), rng.uniform(-5, 2)
-    extent, kind = lane_m * rng.integers(1, 4), rng.integers(4)
-    shapes: list[FloatArray] = []
-    if kind == 0:
-        thick = rng.uniform(0.25, 0.6)
-        shapes = [rectangle(np.array([along, left + extent / 2]), thick, extent)]
-    elif kind == 1:
-        bar, long = rng.uniform(0.35, 0.6), rng.uniform(2, 4.5)
-        shapes = [rectangle(np.array([along, y]), long, bar) for y in np.arange(left, left + extent, 2 * bar)]
-    elif kind == 2:
-        size = rng.uniform(0.4, 0.7)
-        tooth = np.array([[0.0, -0.5], [1.4, 0.0], [0.0, 0.5]]) * size
-        shapes = [tooth + np.array([along, y]) for y in np.arange(left, left + extent, 1.6 * size)]
-    else:
-        slope = rng.uniform(0.5, 1.1) * rng.choice([-1, 1])
-        shapes = [
-            rectangle(np.array([x, left]), rng.uniform(1.2, 3.0), rng.uniform(0.15, 0.4), slope)
-            for x in np.arange(along, along + 12, rng.uniform(1.0, 2.0))
-        ]
-    return [brush.paint(rng, OTHER_PAINT, bend.to_map(shape)) for shape in shapes]
+    extent = lane_m * rng.integers(1, 4)
+    draw, kind = [
+        (_stop_line, STOP_LINE),
+        (_crosswalk, CROSSWALK_BAR),
+        (_teeth, OTHER_PAINT),
+        (_chevrons, CHEVRON),
+    ][int(rng.choice(4, p=[0.27, 0.27, 0.13, 0.33]))]
+    return [
+        brush.paint(rng, kind, bend.to_map(shape + np.array([along, left]))) for shape in draw(rng, extent)
+    ]
+
+
+def _stop_line(rng: np.random.Generator, extent: float) -> Iterator[FloatArray]:
+    """One thick line across the way."""
+    yield rectangle(np.array([0.0, extent / 2]), rng.uniform(0.25, 0.6), extent)
+
+
+def _crosswalk(rng: np.random.Generator, extent: float) -> Iterator[FloatArray]:
+    """Bars along the way, side by side across it."""
+    bar, long = rng.uniform(0.35, 0.6), rng.uniform(2, 4.5)
+    for left in np.arange(0, extent, 2 * bar):
+        yield rectangle(np.array([0.0, left]), long, bar)
+
+
+def _teeth(rng: np.random.Generator, extent: float) -> Iterator[FloatArray]:
+    """A row of triangles: give way."""
+    size = rng.uniform(0.4, 0.7)
+    for left in np.arange(0, extent, 1.6 * size):
+        yield np.array([[0.0, -0.5], [1.4, 0.0], [0.0, 0.5]]) * size + np.array([0.0, left])
+
+
+def _chevrons(rng: np.random.Generator, extent: float) -> Iterator[FloatArray]:
+    """Parallel slanted bars, or angles made of two, one behind the other."""
+    slope = rng.uniform(0.5, 1.1) * rng.choice([-1, 1])
+    wide, thick = rng.uniform(1.0, 3.0), rng.uniform(0.15, 0.45)
+    angles = rng.random() < 0.6
+    for along in np.arange(0, 12, rng.uniform(1.0, 2.5)):
+        yield _slanted(along, 0.0, wide, thick, slope)
+        if angles:
+            yield _slanted(along, 0.0, -wide, thick, -slope)
+
+
+def _slanted(along: float, left: float, wide: float, thick: float, slope: float) -> FloatArray:
+    """A bar (4, 2) from (along, left), ``wide`` across the way and ``thick`` along it, counter-clockwise."""
+    end = along + wide * slope
+    bar = np.array([[along, left], [along + thick, left], [end + thick, left + wide], [end, left + wide]])
+    return bar if wide > 0 else bar[::-1]

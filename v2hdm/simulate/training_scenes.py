@@ -11,13 +11,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from v2hdm.detection.lens import distort_points
+from v2hdm.records import FloatArray
 from v2hdm.simulate.render import Renderer
 from v2hdm.simulate.scene import Backdrop, Bgr, Dapple, Ground, Light, Scene, Shadow
 from v2hdm.simulate.training_clutter import ground_marks, port_boxes, street_boxes
-from v2hdm.simulate.training_paint import Bend, port_paint, random_brush, rectangle, street_paint
+from v2hdm.simulate.training_paint import Bend, RoadPaint, port_paint, random_brush, rectangle, street_paint
 from v2hdm.simulate.training_views import TrainingView, random_view
 
 # The renderer keeps one tile per fleck size, so sizes come from a short list.
+_NEAR_M = 0.3
 _FLECK_SIZES_M = tuple(float(s) for s in np.geomspace(0.12, 2.5, 10))
 
 
@@ -25,12 +28,15 @@ _FLECK_SIZES_M = tuple(float(s) for s in np.geomspace(0.12, 2.5, 10))
 class TrainingSample:
     """One rendered image with its labels.
 
-    ``image`` (H, W, 3) uint8 BGR and ``labels`` (H, W) uint8 are those of
-    :class:`v2hdm.simulate.render.Rendered`.
+    ``image`` (H, W, 3) uint8 BGR, ``labels`` (H, W) uint8 and ``hidden`` (H, W) bool are those of
+    :class:`v2hdm.simulate.render.Rendered`. ``lanes_px`` are the centre lines (N, 2) of the lanes' lines in
+    recorded pixels, from near to far, whatever stands in front of them; parts may be outside the image.
     """
 
     image: NDArray[np.uint8]
     labels: NDArray[np.uint8]
+    hidden: NDArray[np.bool_]
+    lanes_px: tuple[FloatArray, ...]
 
 
 def training_sample(
@@ -46,34 +52,52 @@ def training_sample(
         difficulty: 0 for fresh paint in plain light, 1 for everything at its worst now and then.
     """
     rng = np.random.default_rng([seed, index])
-    scene = random_scene(rng, difficulty)
+    scene, lanes = random_scene(rng, difficulty)
     view = random_view(rng, width, height)
     scene = _without_hidden_boxes(scene, view)
     rendered = Renderer(scene).render(view.info, view.cam_from_map, rng, view.optics, view.motion)
-    return TrainingSample(rendered.image, rendered.labels)
+    seen = (_in_image(view, lane) for lane in lanes)
+    lanes_px = tuple(lane for lane in seen if len(lane) > 1)
+    return TrainingSample(rendered.image, rendered.labels, rendered.hidden, lanes_px)
 
 
-def random_scene(rng: np.random.Generator, difficulty: float = 1.0) -> Scene:
-    """A port (two in five), a street (half) or unpainted ground, seen from the map's origin along +x."""
+def _in_image(view: TrainingView, points_map: FloatArray) -> FloatArray:
+    """Recorded pixels (M, 2) of those ground points (N, 2) that lie before the camera."""
+    cam = points_map @ view.cam_from_map[:3, :2].T + view.cam_from_map[:3, 3]
+    cam = cam[cam[:, 2] > _NEAR_M]
+    pinhole = (cam @ view.info.intrinsic.T)[:, :2] / cam[:, 2:]
+    # Far outside the image the lens polynomial folds back.
+    reach = np.array([view.info.width, view.info.height])
+    near = ((pinhole > -0.5 * reach) & (pinhole < 1.5 * reach)).all(axis=1)
+    return distort_points(view.info, pinhole[near])
+
+
+def random_scene(rng: np.random.Generator, difficulty: float = 1.0) -> tuple[Scene, list[FloatArray]]:
+    """A port (two in five), a street (half) or unpainted ground, seen from the map's origin along +x.
+
+    Returns:
+        The scene, and the centre lines (N, 2, map) of its lanes' lines.
+    """
     place = rng.choice(["port", "street", "bare"], p=[0.4, 0.5, 0.1])
     bend = Bend(float(rng.normal(0, 0.006)) if rng.random() < 0.4 else 0.0)
     brush = random_brush(rng, difficulty)
     road_half_m = float(rng.uniform(2, 9))
     if place == "port":
-        paints, boxes = port_paint(rng, brush, bend), port_boxes(rng)
+        road, boxes = port_paint(rng, brush, bend), port_boxes(rng)
     elif place == "street":
-        paints, boxes = street_paint(rng, brush, bend), street_boxes(rng, road_half_m)
+        road, boxes = street_paint(rng, brush, bend), street_boxes(rng, road_half_m)
     else:
-        paints, boxes = [], street_boxes(rng, road_half_m) if rng.random() < 0.7 else port_boxes(rng)
-    return Scene(
+        road, boxes = RoadPaint(), street_boxes(rng, road_half_m) if rng.random() < 0.7 else port_boxes(rng)
+    scene = Scene(
         ground=_ground(rng, place == "port", difficulty),
-        paints=tuple(paints),
+        paints=tuple(road.paints),
         boxes=boxes,
         shadows=_shadows(rng, difficulty),
         dapples=_dapples(rng, difficulty),
         light=_light(rng),
         backdrop=_backdrop(rng),
     )
+    return scene, road.lanes
 
 
 def _without_hidden_boxes(scene: Scene, view: TrainingView) -> Scene:

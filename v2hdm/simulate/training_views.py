@@ -27,13 +27,13 @@ class TrainingView:
 def random_view(rng: np.random.Generator, width: int, height: int) -> TrainingView:
     """A camera near the map's origin, looking roughly along x, whose image is ``width`` x ``height``.
 
-    Focal lengths from 400 to 1500 px, heights from 1.1 to 3.6 m, pitch from level to 28 degrees down, with
+    Focal lengths from 300 to 1500 px, heights from 1.1 to 3.6 m, pitch from level to 28 degrees down, with
     two in five like the usual camera of a car (level, low, 600 to 1000 px).
     """
     if rng.random() < 0.4:
         focal_px, height_m, pitch = _log_uniform(rng, 600, 1000), rng.uniform(1.2, 1.9), rng.uniform(-1.5, 3)
     else:
-        focal_px, height_m = _log_uniform(rng, 400, 1500), rng.uniform(1.1, 3.6)
+        focal_px, height_m = _log_uniform(rng, 300, 1500), rng.uniform(1.1, 3.6)
         pitch = rng.uniform(0, 28 if rng.random() < 0.6 else 8)
     pitch = np.deg2rad(pitch)
     yaw = np.deg2rad(rng.normal(0, 4) if rng.random() < 0.75 else rng.uniform(-60, 60))

@@ -1,0 +1,112 @@
+"""What the network is to answer for a labelled image, at the resolution of each of its outputs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from models.marking_net import KIND_STRIDE, LANE_STRIDE, PAINT_STRIDE
+from v2hdm.records import PAINT_CLASSES, FloatArray
+from v2hdm.simulate.training_scenes import TrainingSample
+
+IGNORE = 255
+"""Marks elements that carry no loss."""
+
+_LEAST_PAINT = 0.4
+"""A cell shows the class of its paint where that covers at least this share of it."""
+
+_MAX_SLOPE = 4.0
+"""Lines that run flatter across the row anchors than this (px along per px down) have no clear crossing."""
+
+_NEAR_EDGE = 0.3
+"""Beyond this offset, in cells, the next cell would be nearly as good an answer."""
+
+Bytes = NDArray[np.uint8]
+
+
+class Targets(NamedTuple):
+    """The answers for images (B, H, W); the batch dimension is missing for a single one.
+
+    ``paint`` (B, H/2, W/2) uint8: 1 for paint. ``kinds`` (B, H/4, W/4) uint8: index into ``PAINT_CLASSES``.
+    ``lane_there`` (B, H/8, W/8) uint8: 1 where a lane's line crosses the row anchor in that cell, and
+    ``lane_offset`` (B, H/8, W/8) float32: where in it, in cells from its centre. :data:`IGNORE` carries no
+    loss.
+    """
+
+    paint: Tensor
+    kinds: Tensor
+    lane_there: Tensor
+    lane_offset: Tensor
+
+
+def targets(sample: TrainingSample) -> Targets:
+    """The answers for one image. Where a box stands before a lane's line, either answer will do."""
+    there, offset = lane_targets(sample.lanes_px, *sample.labels.shape)
+    there[_blocks(sample.hidden, LANE_STRIDE).any(axis=2) & (there == 1)] = IGNORE
+    answers = paint_target(sample.labels), kind_target(sample.labels), there, offset
+    return Targets(*(torch.from_numpy(answer) for answer in answers))
+
+
+def paint_target(labels: Bytes) -> Bytes:
+    """Paint (H/2, W/2) where three or more of a block's four pixels are, ignored where two are.
+
+    Where paint and background halve a block neither answer is right; ignoring those keeps the learnt
+    edge at the true one instead of half a pixel outside or inside it.
+    """
+    count = _blocks(labels, PAINT_STRIDE).astype(bool).sum(axis=2)
+    return np.where(count == PAINT_STRIDE**2 // 2, IGNORE, count > PAINT_STRIDE**2 // 2).astype(np.uint8)
+
+
+def kind_target(labels: Bytes) -> Bytes:
+    """The commonest paint class (H/4, W/4) of each block, ignored where there is little paint."""
+    blocks = _blocks(labels, KIND_STRIDE)
+    counts = np.stack([(blocks == 1 + c).sum(axis=2) for c in range(len(PAINT_CLASSES))], axis=2)
+    painted = counts.sum(axis=2) >= _LEAST_PAINT * KIND_STRIDE**2
+    return np.where(painted, counts.argmax(axis=2), IGNORE).astype(np.uint8)
+
+
+def lane_targets(
+    lanes_px: Sequence[FloatArray], height: int, width: int
+) -> tuple[Bytes, NDArray[np.float32]]:
+    """Which cells (H/8, W/8) the lines cross at the cell row's middle, and where in the cell."""
+    rows, columns = height // LANE_STRIDE, width // LANE_STRIDE
+    there = np.zeros((rows, columns), dtype=np.uint8)
+    offset = np.zeros((rows, columns), dtype=np.float32)
+    for lane in lanes_px:
+        row, u, slope = _crossings(lane, rows)
+        cell = (u + 0.5) / LANE_STRIDE
+        column = np.floor(cell).astype(np.intp)
+        within = cell - column - 0.5
+        inside = (column >= 0) & (column < columns)
+        flat = inside & (np.abs(slope) > _MAX_SLOPE)
+        there[row[flat], column[flat]] = IGNORE
+        side = column + np.sign(within).astype(np.intp)
+        unclear = (np.abs(within) > _NEAR_EDGE) & (side >= 0) & (side < columns)
+        beside = row[unclear], side[unclear]
+        there[beside] = np.where(there[beside] == 1, 1, IGNORE)
+        clear = inside & ~flat
+        there[row[clear], column[clear]] = 1
+        offset[row[clear], column[clear]] = within[clear]
+    return there, offset
+
+
+def _crossings(lane_px: FloatArray, rows: int) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
+    """Where a polyline (N, 2) crosses the row anchors: row (K,), pixel column (K,), columns per row (K,)."""
+    anchors = LANE_STRIDE * np.arange(rows) + (LANE_STRIDE - 1) / 2
+    first, second = lane_px[:-1], lane_px[1:]
+    crossed = (first[:, None, 1] > anchors) != (second[:, None, 1] > anchors)
+    segment, row = np.nonzero(crossed)
+    slope = (second[segment, 0] - first[segment, 0]) / (second[segment, 1] - first[segment, 1])
+    return row, first[segment, 0] + slope * (anchors[row] - first[segment, 1]), slope
+
+
+def _blocks(labels: NDArray[Any], size: int) -> NDArray[Any]:
+    """The pixels (H / size, W / size, size * size) of each block."""
+    height, width = labels.shape
+    split = labels.reshape(height // size, size, width // size, size).transpose(0, 2, 1, 3)
+    return split.reshape(height // size, width // size, size * size)
