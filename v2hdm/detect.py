@@ -1,7 +1,7 @@
 """The on-vehicle door: ``python -m v2hdm.detect SOURCE`` finds markings and lanes in images.
 
 It needs the base install only (numpy, opencv, onnxruntime, PyYAML): no torch, no Hydra. One JSON object
-a line and image; latency percentiles at the end on stderr.
+a line and image; latency percentiles at the end on stderr. docs/detect.md describes both.
 """
 
 from __future__ import annotations
@@ -9,29 +9,43 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import sys
-import time
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import islice
 from pathlib import Path
-from typing import Any, TextIO
+from typing import NamedTuple, TextIO
 
 import cv2
 import numpy as np
 
-from v2hdm.detection.batch import read_image
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.draw import draw_detections
-from v2hdm.detection.ground import apply_homography, ipm_from_extrinsic
+from v2hdm.detection.frames import Frame, camera_frames, image_frames, list_images, video_frames
+from v2hdm.detection.image_file import IMAGE_SUFFIXES
+from v2hdm.detection.json_line import as_record
+from v2hdm.detection.mounting import camera_from_calibration, rough_calibration
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.view import CameraView
-from v2hdm.drive import read_drive
-from v2hdm.errors import DriveError, V2hdmError
-from v2hdm.hdmap import read_calibration
-from v2hdm.records import Calibration, Camera, FloatArray, Image, LaneDetection, MarkingDetection
+from v2hdm.detection.road import Road, RoadDetector
+from v2hdm.detection.stopwatch import Stopwatch, lap
+from v2hdm.drive import READERS, read_drive
+from v2hdm.errors import ConfigError, DriveError, V2hdmError
 
 EXIT_USER_ERROR = 2
-_IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
+_ROUGH_MOUNTING = (1.6, 5.0, 60.0)
+_ROUGH_RANGE_M = 40.0
+"""Without a calibration distances may be wrong by a factor of two: nothing may be dropped for being far."""
+
+_STAGES = ("read", "net", "corners", "lanes")
+
+
+class _Job(NamedTuple):
+    """Frames to look at, and the detector for each as far as it is known before the first."""
+
+    frames: Iterator[tuple[Frame, RoadDetector | None]]
+    live: bool = False
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -47,22 +61,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def camera_from_calibration(calibration: Calibration) -> Camera:
-    """A camera whose IPM is the one of a finished calibration."""
-    ipm = ipm_from_extrinsic(calibration.info, calibration.cam_from_vehicle)
-    below = np.array([[calibration.info.intrinsic[0, 2], calibration.info.height - 1.0]])
-    seen_vehicle = apply_homography(ipm, below)
-    square = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
-    return Camera(calibration.info, {"calibrated": ipm}, "calibrated", seen_vehicle + square)
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m v2hdm.detect", description=__doc__.split("\n\n")[0])
-    parser.add_argument("source", type=Path, help="a drive folder, a folder of images, or one image")
     parser.add_argument(
-        "--camera", type=Path, help="calibration YAML of the camera, for images outside a drive"
+        "source", help="an image, a folder of images, a drive folder, a video file, or a camera's index"
+    )
+    parser.add_argument("--camera", type=Path, metavar="YAML", help="the camera's calibration: gives metres")
+    parser.add_argument(
+        "--mounting",
+        type=float,
+        nargs=3,
+        metavar=("HEIGHT_M", "PITCH_DEG", "FOV_DEG"),
+        help="without a calibration: about how high the camera is, how far it looks down, its horizontal "
+        "field of view (default: {:g} {:g} {:g})".format(*_ROUGH_MOUNTING),
+    )
+    parser.add_argument(
+        "--linear", action="store_true", help="grey values are proportional to light, not sRGB"
     )
     parser.add_argument("--model", help="ONNX file of the detector (default: the one that is shipped)")
+    parser.add_argument("--threads", type=int, default=1, help="threads of the network (default: 1)")
+    parser.add_argument("--limit", type=int, metavar="N", help="stop after N images")
     parser.add_argument("--output", type=Path, help="file for the JSON lines (default: stdout)")
     parser.add_argument(
         "--draw", type=Path, metavar="DIR", help="folder for the images with detections drawn"
@@ -72,101 +90,191 @@ def _parser() -> argparse.ArgumentParser:
 
 def _detect(parsed: argparse.Namespace) -> None:
     cv2.setNumThreads(1)
-    detector = Detector.load(options=DetectorOptions(model=parsed.model))
-    sources = list(_images(parsed.source, parsed.camera))
-    part = parsed.output and parsed.output.with_name(parsed.output.name + ".part")
-    try:
-        with part.open("w") if part else nullcontext(sys.stdout) as stream:
-            latency_s = [
-                _detect_one(detector, image, camera, stream, parsed.draw) for image, camera in sources
-            ]
-        if part:
-            part.replace(parsed.output)
-    except OSError as error:
-        if isinstance(error, BrokenPipeError):
-            raise
-        raise DriveError(
-            f"{error.filename}: cannot write there ({error.strerror}); give another place"
-        ) from error
-    finally:
-        if part:
-            part.unlink(missing_ok=True)
-    p50, p90, p99 = np.percentile(latency_s, [50, 90, 99]) * 1e3
-    print(f"{len(latency_s)} images; latency p50 {p50:.1f}, p90 {p90:.1f}, p99 {p99:.1f} ms", file=sys.stderr)
+    options = DetectorOptions(model=parsed.model, threads=parsed.threads)
+    if parsed.camera is None:
+        options.max_range_m = _ROUGH_RANGE_M
+    detector = Detector.load(options=options)
+    job = _job(parsed, detector)
+    stopwatch = Stopwatch()
+    failure = None
+    with _lines(parsed.output) as stream:
+        try:
+            for frame, road, found in _found(job, parsed, detector, stopwatch):
+                print(json.dumps(as_record(frame, road.camera.info.name, found)), file=stream)
+                if job.live:
+                    stream.flush()
+                if parsed.draw is not None:
+                    _draw(parsed.draw / f"{frame.name}.jpg", frame, found)
+        except KeyboardInterrupt:
+            pass  # the way to end a live camera; what was found is kept
+        except DriveError as error:
+            if not (job.live and stopwatch.images):
+                raise
+            failure = error  # hours of a camera that was unplugged are kept
+    _report(stopwatch)
+    if failure:
+        raise failure
 
 
-def _images(source: Path, camera_file: Path | None) -> Iterator[tuple[Image, Camera]]:
-    if not source.exists():
-        raise DriveError(f"{source}: no such image or folder; give a drive, a folder of images or an image")
-    if camera_file is None:
-        if not source.is_dir():
-            raise DriveError(
-                f"{source}: an image alone says nothing of its camera; add --camera CALIBRATION.yaml"
+def _job(parsed: argparse.Namespace, detector: Detector) -> _Job:
+    """What the source is, and which detector its frames want."""
+    road = None
+    if parsed.camera is not None:
+        if parsed.mounting is not None:
+            raise ConfigError(
+                "--camera and --mounting exclude each other: a calibration holds the mounting; drop one"
             )
-        drive = read_drive(source)
-        yield from ((image, drive.cameras[image.camera]) for image in drive.images)
+        road = RoadDetector.calibrated(detector, parsed.camera, parsed.linear)
+    if parsed.source.isdecimal():
+        info = road and road.camera.info
+        frames = camera_frames(int(parsed.source), (info.width, info.height) if info else None)
+        return _Job(((frame, road) for frame in frames), live=True)
+    path = Path(parsed.source)
+    if not path.exists():
+        raise DriveError(f"{path}: no such image, video or folder; a camera is named by its index, such as 0")
+    if path.is_dir():
+        paths = list_images(path)
+        if paths:
+            return _Job((frame, road) for frame in image_frames(paths))
+        if any(reader.accepts(path) for reader in READERS.values()):
+            return _Job(_drive_frames(path, detector, road))
+        raise DriveError(f"{path}: no images ({', '.join(IMAGE_SUFFIXES)}) and no drive in this folder")
+    frames = image_frames([path]) if path.suffix.lower() in IMAGE_SUFFIXES else video_frames(path)
+    return _Job((frame, road) for frame in frames)
+
+
+def _drive_frames(
+    path: Path, detector: Detector, road: RoadDetector | None
+) -> Iterator[tuple[Frame, RoadDetector]]:
+    """The images of a drive; if a calibration was given, those of its camera."""
+    drive = read_drive(path)
+    roads = {name: RoadDetector(detector, camera) for name, camera in drive.cameras.items()}
+    if road is not None:
+        name = road.camera.info.name
+        if name not in drive.cameras:
+            raise DriveError(
+                f"{path}: no camera {name!r}, as the calibration calls it; this drive has {', '.join(roads)}"
+            )
+        roads = {name: road}
+    for image in drive.images:
+        if image.camera in roads:
+            (frame,) = image_frames([image.path], grey=True)
+            name = f"{image.camera}_{frame.name}"
+            yield replace(frame, name=name, stamp_s=image.stamp_s), roads[image.camera]
+
+
+def _found(
+    job: _Job, parsed: argparse.Namespace, detector: Detector, stopwatch: Stopwatch
+) -> Iterator[tuple[Frame, RoadDetector, Road]]:
+    """Every frame with what it shows."""
+    frames = iter(job.frames if parsed.limit is None else islice(job.frames, parsed.limit))
+    rough: RoadDetector | None = None
+    while True:
+        with stopwatch.image():
+            with lap("read"):
+                frame, road = next(frames, (None, None))
+            if frame is None:
+                stopwatch.discard()
+                return
+            if road is None:
+                road = rough = rough or _rough_road(frame, parsed, detector)
+            _check_size(frame, road)
+            found = road.detect(frame.pixels)
+        yield frame, road, found
+
+
+def _rough_road(frame: Frame, parsed: argparse.Namespace, detector: Detector) -> RoadDetector:
+    """A detector for a camera of which only the image size is known; it says so."""
+    height_m, pitch_deg, fov_deg = parsed.mounting or _ROUGH_MOUNTING
+    if not (height_m > 0 and -45 < pitch_deg < 85 and 10 <= fov_deg <= 150):
+        raise ConfigError(
+            f"--mounting {height_m:g} {pitch_deg:g} {fov_deg:g}: give a height above 0 m, a pitch "
+            "of -45 to 85 deg (down is positive) and a field of view of 10 to 150 deg"
+        )
+    if parsed.mounting is None:
+        print(
+            f"no --camera: taking it to be {height_m:g} m up, {pitch_deg:g} deg down, {fov_deg:g} deg wide "
+            "(--mounting says otherwise); positions in px only",
+            file=sys.stderr,
+        )
+    rows, columns = frame.pixels.shape[:2]
+    calibration = rough_calibration("camera", columns, rows, height_m, pitch_deg, fov_deg)
+    return RoadDetector(detector, camera_from_calibration(calibration, parsed.linear))
+
+
+def _check_size(frame: Frame, road: RoadDetector) -> None:
+    info = road.camera.info
+    height, width = frame.pixels.shape[:2]
+    if (width, height) != (info.width, info.height):
+        where = "the calibration" if road.footprint else "what is known"
+        raise DriveError(
+            f"{frame.source}: the image is {width}x{height}, but {where} of camera {info.name!r} is for "
+            f"{info.width}x{info.height}; give images of that size, or the calibration of these"
+        )
+
+
+@contextmanager
+def _lines(output: Path | None) -> Iterator[TextIO]:
+    """Where the JSON lines go; a file appears when it is complete."""
+    if output is None:
+        yield sys.stdout
         return
-    camera = camera_from_calibration(read_calibration(camera_file))
-    paths = [source]
-    if source.is_dir():
-        paths = sorted(path for path in source.iterdir() if path.suffix.lower() in _IMAGE_SUFFIXES)
-    if not paths:
-        raise DriveError(f"{source}: no images ({', '.join(_IMAGE_SUFFIXES)}) in this folder; give another")
-    for path in paths:
-        yield Image(camera.info.name, 0.0, path, np.eye(4)), camera
+    partial = output.with_name(f".{output.name}.{os.getpid()}.part")
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        with partial.open("w", encoding="utf-8") as stream:
+            yield stream
+        partial.replace(output)
+    except OSError as error:
+        raise DriveError(f"{output}: cannot write there ({error.strerror}); give another --output") from error
+    finally:
+        partial.unlink(missing_ok=True)
 
 
-def _detect_one(detector: Detector, image: Image, camera: Camera, stream: TextIO, draw: Path | None) -> float:
-    """Detect in one image and write it out; the seconds that detection alone took."""
-    pixels = read_image(image, camera)
-    view = detector.view(camera)
-    start = time.perf_counter()
-    markings, lanes = detector.detect(pixels, camera)
-    latency_s = time.perf_counter() - start
-    print(json.dumps(_record(image, markings, lanes, view)), file=stream)
-    if draw is not None:
-        draw.mkdir(parents=True, exist_ok=True)
-        target = draw / f"{image.camera}_{image.path.stem}.jpg"
-        if not cv2.imwrite(str(target), draw_detections(pixels, markings, lanes)):
-            raise DriveError(f"{target}: cannot write this picture; give another --draw folder")
-    return latency_s
+def _draw(path: Path, frame: Frame, found: Road) -> None:
+    """Write the frame with its detections drawn, at once or not at all."""
+    drawn = draw_detections(
+        frame.pixels, [marking.image for marking in found.markings], [lane.image for lane in found.lanes]
+    )
+    _, packed = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, 92])
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_bytes(packed.tobytes())
+        partial.replace(path)
+    except OSError as error:
+        raise DriveError(f"{path}: cannot write there ({error.strerror}); give another --draw") from error
+    finally:
+        partial.unlink(missing_ok=True)
 
 
-def _record(
-    image: Image, markings: Sequence[MarkingDetection], lanes: Sequence[LaneDetection], view: CameraView
-) -> dict[str, Any]:
-    """What goes into one JSON line; ``_vehicle`` are metres on the ground by the camera's IPM."""
-    return {
-        "image": str(image.path),
-        "camera": image.camera,
-        "markings": [
-            {
-                "class": marking.kind,
-                "score": round(marking.score, 4),
-                "corners_px": marking.corners_px.round(3).tolist(),
-                "corner_valid": marking.corner_valid.tolist(),
-                "covariance_px": marking.covariance_px.round(5).tolist(),
-                "corners_vehicle": _on_ground(view, marking.corners_px),
-            }
-            for marking in markings
-        ],
-        "lanes": [
-            {
-                "class": lane.kind,
-                "score": round(lane.score, 4),
-                "points_px": lane.points_px.round(2).tolist(),
-                "points_vehicle": _on_ground(view, lane.points_px),
-            }
-            for lane in lanes
-        ],
-    }
+def _report(stopwatch: Stopwatch) -> None:
+    """How long it took, on stderr."""
+    if not stopwatch.images:
+        print("no images", file=sys.stderr)
+        return
+    print(f"{stopwatch.images} images{_peak_memory()}", file=sys.stderr)
+    print(f"{'latency, ms':12s} {'p50':>7s} {'p90':>7s} {'p99':>7s}", file=sys.stderr)
+    stages = [stage for stage in _STAGES if stage in stopwatch.stages]
+    stages += [stage for stage in stopwatch.stages if stage not in _STAGES]
+    times_s = {stage: stopwatch.times_s(stage) for stage in stages}
+    times_s["other"] = stopwatch.total_s() - sum(times_s.values())
+    times_s["all"] = stopwatch.total_s()
+    for stage, seconds in times_s.items():
+        p50, p90, p99 = np.percentile(seconds, [50, 90, 99]) * 1e3
+        print(f"{stage:12s} {p50:7.1f} {p90:7.1f} {p99:7.1f}", file=sys.stderr)
 
 
-def _on_ground(view: CameraView, points_px: FloatArray) -> list[list[float] | None]:
-    """Points on the ground, vehicle frame, m; None for those at or above the horizon."""
-    points_vehicle = view.ground(view.undistort(points_px)).round(4)
-    return [point.tolist() if np.isfinite(point).all() else None for point in points_vehicle]
+def _peak_memory() -> str:
+    """The most memory that this process ever held, where the operating system counts it."""
+    if sys.platform == "win32":
+        return ""
+    import resource
+
+    unit = 1 if sys.platform == "darwin" else 1024
+    return f", peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6:.0f} MB"
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a service manager's way to say Ctrl-C
     sys.exit(main())

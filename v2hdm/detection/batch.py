@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from v2hdm.detection.detector import Detector
+from v2hdm.detection.image_file import read_bgr
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import DriveError
 from v2hdm.records import Camera, Drive, Image, ImageDetections
@@ -22,42 +23,19 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 
 
 def read_image(image: Image, camera: Camera) -> np.ndarray:
-    """Decode an image file to (H, W, 3) uint8 BGR.
+    """Decode an image file of a drive to (H, W, 3) uint8 BGR; grey cameras are taken, too.
 
     Raises:
-        DriveError: the file is missing, truncated or not of the camera's size.
+        DriveError: the file is missing, truncated, not 8-bit or not of the camera's size.
     """
-    try:
-        data = np.fromfile(image.path, dtype=np.uint8)
-    except OSError as error:
-        raise DriveError(
-            f"{image.path}: cannot read this image ({error.strerror}); restore it or drop it from the list"
-        ) from error
-    pixels = cv2.imdecode(data, cv2.IMREAD_COLOR) if _is_whole(data) else None
-    if pixels is None:
-        raise DriveError(
-            f"{image.path}: the image is truncated or damaged; copy it again or drop it from the list"
-        )
+    pixels = read_bgr(image.path, grey=True)
     expected = (camera.info.height, camera.info.width)
     if pixels.shape[:2] != expected:
         raise DriveError(
             f"{image.path}: the image is {pixels.shape[1]}x{pixels.shape[0]} but the camera_info of camera "
             f"{image.camera!r} says {expected[1]}x{expected[0]}; mend the camera_info or the image list"
         )
-    return np.asarray(pixels)
-
-
-def _is_whole(data: np.ndarray) -> bool:
-    """Whether a JPEG or PNG has its end marker.
-
-    OpenCV decodes a truncated file to half an image without a word.
-    """
-    tail = data[-4096:].tobytes()
-    if data[:2].tobytes() == b"\xff\xd8":
-        return b"\xff\xd9" in tail
-    if data[:4].tobytes() == b"\x89PNG":
-        return b"IEND" in tail
-    return len(data) > 0
+    return pixels
 
 
 def detect_all(

@@ -1,6 +1,5 @@
-"""Whole drives, and the on-vehicle door."""
+"""Whole drives."""
 
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -9,13 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.detection.pictures import brightness_model, diamond, extrinsic, make_camera, picture
-from v2hdm.detect import main
+from tests.detection.pictures import brightness_model, diamond, make_camera, picture
 from v2hdm.detection.batch import detect_all, read_image
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import DriveError
-from v2hdm.hdmap import write_calibration
-from v2hdm.records import Calibration, Drive, Image
+from v2hdm.records import Drive, Image
 
 
 @pytest.fixture(scope="module")
@@ -69,53 +66,11 @@ def test_a_missing_image_and_one_of_another_size_are_refused_by_name(drive, tmp_
         read_image(Image("front", 0.0, tmp_path / "small.png", np.eye(4)), camera)
 
 
-def test_the_door_writes_a_line_an_image_with_corners_in_pixels_and_metres(drive, model, tmp_path, capsys):
-    calibration = tmp_path / "front.yaml"
-    write_calibration(Calibration(drive.cameras["front"].info, extrinsic()), calibration)
-    output, drawn = tmp_path / "found.jsonl", tmp_path / "drawn"
-    arguments = [str(drive.root), "--camera", str(calibration), "--model", str(model)]
-    assert main([*arguments, "--output", str(output), "--draw", str(drawn)]) == 0
-    lines = [json.loads(line) for line in output.read_text().splitlines()]
-    assert len(lines) == len(list(drawn.glob("*.jpg"))) == 10
-    near = min(lines[0]["markings"], key=lambda marking: marking["corners_vehicle"][0][0])
-    np.testing.assert_allclose(np.mean(near["corners_vehicle"], axis=0), [8.0, 0.5], atol=0.02)
-    assert np.shape(near["covariance_px"]) == (8, 8)
-    assert "10 images; latency p50" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["nowhere"], "nowhere: no such image or folder"),
-        ([__file__], "add --camera"),
-        ([".", "--model", "none.onnx"], "none.onnx: no such detector model"),
-    ],
-)
-def test_bad_input_ends_in_one_line_and_exit_code_2(arguments, words, model, capsys):
-    arguments = arguments if "--model" in arguments else [*arguments, "--model", str(model)]
-    assert main(arguments) == 2
-    error = capsys.readouterr().err
-    assert words in error
-    assert error.count("\n") == 1
-
-
-def test_nothing_half_written_is_left_when_an_image_is_damaged(drive, model, tmp_path):
-    calibration, folder = tmp_path / "front.yaml", tmp_path / "images"
-    write_calibration(Calibration(drive.cameras["front"].info, extrinsic()), calibration)
-    folder.mkdir()
-    (folder / "a.png").write_bytes(drive.images[0].path.read_bytes())
-    (folder / "b.png").write_bytes(drive.images[1].path.read_bytes()[:500])
-    output = tmp_path / "found.jsonl"
-    arguments = [str(folder), "--camera", str(calibration), "--model", str(model), "--output", str(output)]
-    assert main(arguments) == 2
-    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["front.yaml"]
-
-
 def test_the_vehicle_needs_no_torch_and_no_hydra():
     block = (
         "import sys; sys.modules.update(dict.fromkeys(['torch', 'kornia', 'hydra', 'omegaconf', 'scipy']))"
     )
-    command = f"{block}; import v2hdm.detect, v2hdm.detection.batch"
+    command = f"{block}; import v2hdm.detect, v2hdm.detection.batch, v2hdm.detection.road"
     root = Path(__file__).parents[2]
     done = subprocess.run([sys.executable, "-c", command], cwd=root, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

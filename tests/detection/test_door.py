@@ -1,0 +1,297 @@
+"""The on-vehicle door: every source, what it writes, and what it refuses."""
+
+import json
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import onnx
+import pytest
+from onnx import numpy_helper
+
+from tests.detection.pictures import HEIGHT, WIDTH, brightness_model, diamond, extrinsic, make_camera, picture
+from v2hdm.detect import main
+from v2hdm.detection import frames
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.draw import draw_detections
+from v2hdm.detection.road import RoadDetector
+from v2hdm.detection.stopwatch import Stopwatch, lap
+from v2hdm.hdmap import write_calibration
+from v2hdm.records import Calibration, LaneDetection, MarkingDetection
+
+DIAMONDS = [diamond(8.0, 0.5), diamond(11.0, -0.5)]
+COVARIANCE = np.diag([1e-4, 1e-4, 1e-4, 1e-6, 1e-6, 1e-6])
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Two pictures of two diamonds, their camera's calibration and a model that sees them."""
+
+    folder: Path
+    calibration: Path
+    model: Path
+
+    def run(self, source: object, *arguments: object, calibrated: bool = True) -> int:
+        camera = ["--camera", str(self.calibration)] if calibrated else []
+        return main([str(source), "--model", str(self.model), *camera, *map(str, arguments)])
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    root = tmp_path_factory.mktemp("door")
+    folder = root / "images"
+    folder.mkdir()
+    for n in range(2):
+        cv2.imwrite(str(folder / f"{n}.png"), picture(make_camera(), DIAMONDS, seed=n))
+    write_calibration(Calibration(make_camera().info, extrinsic(), COVARIANCE), root / "front.yaml")
+    return Bench(folder, root / "front.yaml", brightness_model(root))
+
+
+def lines(output: str) -> list[dict]:
+    return [json.loads(line, parse_constant=lambda name: pytest.fail(name)) for line in output.splitlines()]
+
+
+def near(record: dict) -> dict:
+    """The marking at 8 m."""
+    return min(record["markings"], key=lambda marking: marking["corners_vehicle"][0][0])
+
+
+def test_a_folder_gives_a_line_an_image_in_pixels_and_metres_and_pictures(bench, tmp_path, capsys):
+    output, drawn = tmp_path / "deep" / "found.jsonl", tmp_path / "drawn"
+    assert bench.run(bench.folder, "--output", output, "--draw", drawn) == 0
+    records = lines(output.read_text())
+    assert [record["source"] for record in records] == [str(bench.folder / f"{n}.png") for n in range(2)]
+    assert sorted(path.name for path in drawn.iterdir()) == ["0.jpg", "1.jpg"]
+    marking = near(records[0])
+    assert marking["class"] == "diamond"
+    np.testing.assert_allclose(np.mean(marking["corners_vehicle"], axis=0), [8.0, 0.5], atol=0.02)
+    assert np.shape(marking["covariance_px"]) == np.shape(marking["covariance_m2"]) == (8, 8)
+    assert np.linalg.eigvalsh(marking["covariance_m2"])[0] > -1e-7
+    report = capsys.readouterr().err
+    assert report.startswith("2 images, peak memory")
+    for stage in ("read", "all"):
+        assert re.search(rf"^{stage}( +\d+\.\d){{3}}$", report, re.MULTILINE)
+
+
+def test_an_uncertain_calibration_shows_in_metres_and_not_in_pixels(bench, tmp_path, capsys):
+    exact = tmp_path / "exact.yaml"
+    write_calibration(Calibration(make_camera().info, extrinsic()), exact)
+    bench.run(bench.folder / "0.png")
+    bench.run(bench.folder / "0.png", "--camera", exact)
+    unsure, sure = (near(record) for record in lines(capsys.readouterr().out))
+    assert unsure["covariance_px"] == sure["covariance_px"]
+    gap = np.diag(unsure["covariance_m2"]) - np.diag(sure["covariance_m2"])
+    assert (gap > 1e-4).all()
+
+
+def test_without_a_calibration_there_are_pixels_only_and_a_word_about_it(bench, capsys):
+    assert bench.run(bench.folder / "0.png", calibrated=False) == 0
+    out, err = capsys.readouterr()
+    assert all("corners_vehicle" not in marking for marking in lines(out)[0]["markings"])
+    assert "no --camera: taking it to be 1.6 m up" in err
+    assert bench.run(bench.folder / "0.png", "--mounting", 2.2, 14, 63, calibrated=False) == 0
+    out, err = capsys.readouterr()
+    assert ["corners_px" in marking for marking in lines(out)[0]["markings"]] == [True, True]
+    assert "no --camera" not in err
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # FFmpeg takes it at its first use: here
+    path = tmp_path_factory.mktemp("video") / "drive.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (WIDTH, HEIGHT))
+    for n in range(4):
+        writer.write(picture(make_camera(), DIAMONDS, seed=n))
+    writer.release()
+    return path
+
+
+def test_a_video_gives_a_line_a_frame_with_its_time(bench, video, tmp_path, capsys):
+    assert bench.run(video, "--draw", tmp_path) == 0
+    records = lines(capsys.readouterr().out)
+    assert [(record["frame"], record["stamp_s"]) for record in records] == [
+        (n, pytest.approx(n / 10)) for n in range(4)
+    ]
+    np.testing.assert_allclose(np.mean(near(records[3])["corners_vehicle"], axis=0), [8.0, 0.5], atol=0.03)
+    assert len(list(tmp_path.glob("drive_00000*.jpg"))) == 4
+
+
+def test_a_video_that_is_cut_off_is_told(bench, video, tmp_path, caplog):
+    cut = tmp_path / "cut.avi"
+    cut.write_bytes(video.read_bytes()[: int(video.stat().st_size * 0.7)])
+    assert bench.run(cut) == 0
+    assert re.search(r"the video ends after [12] of \d frames", caplog.text)
+
+
+def test_the_number_of_images_can_be_limited(bench, video, capsys):
+    assert bench.run(video, "--limit", 2) == 0
+    assert len(lines(capsys.readouterr().out)) == 2
+
+
+class FakeCapture:
+    """A camera that is unplugged, or interrupted, after three frames."""
+
+    end: type[BaseException] | None = None
+
+    def __init__(self, source: int) -> None:
+        self.left = 3
+
+    def isOpened(self) -> bool:
+        return True
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        self.left -= 1
+        if self.left < 0 and self.end:
+            raise self.end
+        return self.left >= 0, picture(make_camera(), DIAMONDS)
+
+    def set(self, key: int, value: float) -> None:
+        assert value in (WIDTH, HEIGHT)
+
+    def release(self) -> None: ...
+
+
+def test_a_live_camera_runs_until_it_is_interrupted(bench, tmp_path, monkeypatch):
+    monkeypatch.setattr(frames.cv2, "VideoCapture", FakeCapture)
+    monkeypatch.setattr(FakeCapture, "end", KeyboardInterrupt)
+    output = tmp_path / "found.jsonl"
+    assert bench.run(0, "--output", output) == 0
+    assert [record["source"] for record in lines(output.read_text())] == ["camera 0"] * 3
+
+
+def test_what_an_unplugged_camera_saw_is_kept(bench, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(frames.cv2, "VideoCapture", FakeCapture)
+    output = tmp_path / "found.jsonl"
+    assert bench.run(0, "--output", output) == 2
+    assert "camera 0: gives no image after 3 frames" in capsys.readouterr().err
+    assert len(lines(output.read_text())) == 3
+
+
+def not_finite(model: Path, path: Path) -> Path:
+    """A copy of the model with one weight that is not a number."""
+    content = onnx.load(model)
+    weight = next(w for w in content.graph.initializer if w.name == "slope")
+    weight.CopyFrom(numpy_helper.from_array(np.full((1, 1, 1, 1), np.nan, dtype=np.float32), "slope"))
+    onnx.save(content, path)
+    return path
+
+
+def bad_source(name: str, bench: Bench, folder: Path) -> list[object]:
+    """The arguments of one mistake."""
+    image = cv2.imread(str(bench.folder / "0.png"))
+    path = folder / f"{name}.png"
+    if name == "grey":
+        cv2.imwrite(str(path), image[..., 0])
+    elif name == "deep":
+        cv2.imwrite(str(path), image.astype(np.uint16) * 256)
+    elif name == "small":
+        cv2.imwrite(str(path), image[::2, ::2])
+    elif name == "video":
+        path = folder / "broken.mp4"
+        path.write_bytes(b"no video" * 99)
+    elif name == "empty":
+        path = folder
+    elif name == "model":
+        (folder / "bad.onnx").write_bytes(bench.model.read_bytes()[:200])
+        return [bench.folder, "--model", folder / "bad.onnx"]
+    elif name == "nan":
+        return [bench.folder, "--model", not_finite(bench.model, folder / "nan.onnx")]
+    elif name == "calibration":
+        return [bench.folder, "--camera", folder / "none.yaml"]
+    return [path]
+
+
+@pytest.mark.parametrize(
+    ("mistake", "words"),
+    [
+        ("missing", "missing.png: no such image, video or folder"),
+        ("grey", "grey.png: the image has one channel; convert it"),
+        ("deep", "deep.png: the image has 16 bits a channel; convert it to 8 bits"),
+        ("small", "the image is 320x180, but the calibration of camera 'front' is for 640x360"),
+        ("video", "broken.mp4: neither an image nor a video"),
+        ("empty", "no images (.jpg"),
+        ("model", "bad.onnx: not a usable ONNX model"),
+        ("nan", "nan.onnx: the network gives values that are not finite"),
+        ("calibration", "none.yaml: no such file"),
+    ],
+)
+def test_a_mistake_is_one_line_exit_code_2_and_nothing_half_written(bench, tmp_path, capfd, mistake, words):
+    output = tmp_path / "found.jsonl"
+    assert bench.run(*bad_source(mistake, bench, tmp_path), "--output", output) == 2
+    error = capfd.readouterr().err
+    assert words in error
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    assert not list(tmp_path.glob("*found*"))
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_a_camera_that_does_not_open_is_one_line(bench, capfd):
+    assert bench.run(97) == 2
+    assert capfd.readouterr().err.startswith("error: camera 97: does not open")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--mounting", 1, 0, 60], "exclude each other"),
+        (["--threads", 0], "detector.threads is 0"),
+    ],
+)
+def test_arguments_that_cannot_work_are_refused(bench, capsys, arguments, words):
+    assert bench.run(bench.folder, *arguments) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_a_rough_mounting_that_cannot_be_is_refused(bench, capsys):
+    assert bench.run(bench.folder, "--mounting", -1, 0, 60, calibrated=False) == 2
+    assert "give a height above 0 m" in capsys.readouterr().err
+
+
+def test_the_class_for_a_robots_loop_gives_what_the_door_writes(bench, capsys):
+    bench.run(bench.folder / "0.png")
+    (record,) = lines(capsys.readouterr().out)
+    road = RoadDetector.load(bench.calibration, bench.model)
+    found = road.detect(cv2.imread(str(bench.folder / "0.png")))
+    assert [marking.kind for marking in found.markings] == [m["class"] for m in record["markings"]]
+    for marking, written in zip(found.markings, record["markings"], strict=True):
+        np.testing.assert_allclose(marking.corners_vehicle, written["corners_vehicle"], atol=1e-4)
+        np.testing.assert_allclose(marking.covariance_m2, written["covariance_m2"], rtol=1e-3)
+
+
+def test_arrows_and_whole_lines_are_written_and_drawn_without_corners(bench, monkeypatch, capsys, tmp_path):
+    nothing = np.full((4, 2), np.nan), np.full((8, 8), np.nan), np.zeros(4, dtype=bool)
+    outline = np.array([[300.0, 200.0], [340.0, 200.0], [320.0, 300.0]])
+    arrow = MarkingDetection("arrow", 0.9, *nothing, outline)
+    line = LaneDetection("lane_boundary", 0.8, np.array([[100.0, 350.0], [200.0, 200.0]]), -1)
+    monkeypatch.setattr(Detector, "detect", lambda *_: ((arrow,), (line,)))
+    assert bench.run(bench.folder / "0.png", "--draw", tmp_path) == 0
+    (record,) = lines(capsys.readouterr().out)
+    assert set(record["markings"][0]) == {"class", "score", "outline_px", "outline_vehicle"}
+    (lane,) = record["lanes"]
+    assert (lane["identity"], np.shape(lane["covariance_m2"])) == (-1, (2, 2, 2))
+    image = np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)
+    drawn = draw_detections(image, [arrow], [line])
+    assert (drawn[198:203, 310:330] > 0).any()
+    assert not image.any()
+
+
+def test_the_stopwatch_adds_up_laps_of_an_image_and_forgets_failed_ones():
+    stopwatch = Stopwatch()
+    for stages in (["net"], ["net", "lanes", "lanes"]):
+        with stopwatch.image():
+            for stage in stages:
+                with lap(stage):
+                    pass
+    with pytest.raises(ValueError, match="spoilt"), stopwatch.image():
+        raise ValueError("spoilt")
+    with stopwatch.image():
+        stopwatch.discard()
+    with lap("net"):
+        pass  # nobody asks
+    assert (stopwatch.images, stopwatch.stages) == (2, ("net", "lanes"))
+    assert stopwatch.times_s("lanes")[0] == 0.0 < stopwatch.times_s("lanes")[1]
+    assert (stopwatch.total_s() >= stopwatch.times_s("net") + stopwatch.times_s("lanes")).all()

@@ -1,0 +1,127 @@
+"""Images one after another: from files, a video or a live camera."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from v2hdm.detection.image_file import IMAGE_SUFFIXES, read_bgr
+from v2hdm.errors import DriveError
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image (H, W, 3) uint8 BGR to look at.
+
+    ``source`` is its file, or the video or camera it comes from, ``index`` its number there. ``stamp_s`` is
+    the time within a video, Unix time for a live camera, None for a file. ``name`` is unique.
+    """
+
+    source: str
+    name: str
+    index: int
+    stamp_s: float | None
+    pixels: np.ndarray
+
+
+def image_frames(paths: Sequence[Path], grey: bool = False) -> Iterator[Frame]:
+    """Image files, each read when its turn comes.
+
+    Args:
+        paths: the files.
+        grey: take images of one channel, too.
+
+    Raises:
+        DriveError: a file is missing, damaged or not 8-bit colour.
+    """
+    names = [path.stem for path in paths]
+    unique = len(set(names)) == len(names)
+    for index, path in enumerate(paths):
+        name = path.stem if unique else path.name.replace(".", "_")
+        yield Frame(str(path), name, index, None, read_bgr(path, grey))
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The image files that lie in a folder itself, by name."""
+    try:
+        return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+    except OSError as error:
+        raise DriveError(
+            f"{folder}: cannot read this folder ({error.strerror}); check its permissions"
+        ) from error
+
+
+def video_frames(path: Path) -> Iterator[Frame]:
+    """Every frame of a video file; one that ends early is told with a warning.
+
+    Raises:
+        DriveError: OpenCV cannot read it, or it has no frame.
+    """
+    with _capture(str(path)) as capture:
+        if not capture.isOpened():
+            raise DriveError(
+                f"{path}: neither an image nor a video that OpenCV can read; convert it to JPEG, PNG or MP4"
+            )
+        promised = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        index = 0
+        while (pixels := _read(capture)) is not None:
+            stamp_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
+            yield Frame(str(path), f"{path.stem}_{index:06d}", index, stamp_s, pixels)
+            index += 1
+        if not index:
+            raise DriveError(f"{path}: the video has no frame that can be read; copy or convert it again")
+        if index < promised:
+            _log.warning("%s: the video ends after %d of %d frames; is it cut off?", path, index, promised)
+
+
+def camera_frames(number: int, size: tuple[int, int] | None = None) -> Iterator[Frame]:
+    """Frames of a live camera until it fails.
+
+    Args:
+        number: the index that the operating system gives it.
+        size: width and height to ask the camera for; it may give others.
+
+    Raises:
+        DriveError: it does not open, or gives no more frames.
+    """
+    with _capture(number) as capture:
+        if not capture.isOpened():
+            raise DriveError(f"camera {number}: does not open; is it plugged in and used by no one else?")
+        if size is not None:
+            capture.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
+            capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
+        index = 0
+        while (pixels := _read(capture)) is not None:
+            yield Frame(f"camera {number}", f"camera{number}_{index:06d}", index, time.time(), pixels)
+            index += 1
+        raise DriveError(f"camera {number}: gives no image after {index} frames; check its cable")
+
+
+@contextmanager
+def _capture(source: str | int) -> Iterator[cv2.VideoCapture]:
+    """A capture that keeps OpenCV's and FFmpeg's own complaints off the terminal; the error is ours."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        capture = cv2.VideoCapture(source)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+    try:
+        yield capture
+    finally:
+        capture.release()
+
+
+def _read(capture: cv2.VideoCapture) -> np.ndarray | None:
+    there, pixels = capture.read()
+    return np.asarray(pixels) if there else None
