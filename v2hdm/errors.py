@@ -36,3 +36,7 @@ class MissingExtraError(V2hdmError):
 
 class AdjustError(V2hdmError):
     """A bundle adjustment problem is malformed: the message names the offending item."""
+
+
+class LabelError(V2hdmError):
+    """Labels to train the detector from are missing, damaged or of a class that is not known."""
