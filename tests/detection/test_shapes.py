@@ -6,7 +6,6 @@ import pytest
 
 from v2hdm.detection.blobs import find_blobs, outline_polygon, zero_crossings
 from v2hdm.detection.coverage import blurred_coverage
-from v2hdm.detection.network import NetworkOutput
 from v2hdm.detection.normal import normal_pdf_cdf
 from v2hdm.detection.quad import (
     interior_angles,
@@ -18,18 +17,18 @@ from v2hdm.detection.quad import (
     signed_area,
     width,
 )
+from v2hdm.detection.sight import Sight
 from v2hdm.records import PAINT_CLASSES
 
 KITE = order_corners(np.array([[20.3, 10.2], [40.1, 14.9], [19.4, 19.3], [3.2, 15.5]]))
 
 
-def output_of(labels: np.ndarray) -> NetworkOutput:
+def sight_of(labels: np.ndarray) -> Sight:
     """What a confident network says of a label picture (h, w) at the resolution of its paint."""
     paint = np.where(labels > 0, 5.0, -5.0).astype(np.float32)
     kinds = np.stack([np.where(labels == 1 + c, 5.0, -5.0) for c in range(len(PAINT_CLASSES))])
     coarse = kinds.reshape(len(kinds), labels.shape[0] // 2, 2, labels.shape[1] // 2, 2).mean(axis=(2, 4))
-    lanes = np.zeros((2, labels.shape[0] // 4, labels.shape[1] // 4), dtype=np.float32)
-    return NetworkOutput(paint, coarse.astype(np.float32), lanes)
+    return Sight(paint, coarse.astype(np.float32), [])
 
 
 def test_ordered_corners_run_counter_clockwise_on_the_screen():
@@ -109,7 +108,7 @@ def test_zero_crossings_are_interpolated_between_neighbours():
 def test_the_outline_polygon_of_an_arrow_encloses_its_cells():
     labels = np.zeros((40, 60), dtype=int)
     labels[10:30, 20:24] = labels[10:16, 14:30] = 1 + PAINT_CLASSES.index("arrow")
-    blobs, _ = find_blobs(output_of(labels), PAINT_CLASSES, 2, 50)
+    blobs, _ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 50)
     (arrow,) = blobs
     assert arrow.kind == "arrow"
     polygon = outline_polygon(arrow)
@@ -122,7 +121,7 @@ def test_a_diamond_that_touches_a_line_is_split_from_it():
     labels = np.zeros((40, 60), dtype=int)
     labels[10:30, 20:40] = 1 + PAINT_CLASSES.index("diamond")
     labels[:, 40:44] = 1 + PAINT_CLASSES.index("lane_line")
-    blobs, owner = find_blobs(output_of(labels), PAINT_CLASSES, 2, 0)
+    blobs, owner = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
     assert sorted(blob.kind for blob in blobs) == ["diamond", "lane_line"]
     square = next(blob for blob in blobs if blob.kind == "diamond")
     assert square.outline_px[:, 0].max() == pytest.approx(2 * 39.5 + 0.5, abs=0.1)
@@ -133,7 +132,7 @@ def test_a_dash_that_looks_like_a_line_here_and_there_stays_one_blob():
     labels = np.zeros((40, 60), dtype=int)
     labels[5:35, 20:24] = 1 + PAINT_CLASSES.index("lane_dash")
     labels[5:14, 20:24] = 1 + PAINT_CLASSES.index("lane_line")
-    blobs, _ = find_blobs(output_of(labels), PAINT_CLASSES, 2, 0)
+    blobs, _ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
     assert [blob.kind for blob in blobs] == ["lane_dash"]
 
 
@@ -141,12 +140,12 @@ def test_worn_holes_do_not_add_to_the_outline():
     labels = np.zeros((40, 60), dtype=int)
     labels[10:30, 20:40] = 1
     labels[18:22, 28:32] = 0
-    blobs, _ = find_blobs(output_of(labels), PAINT_CLASSES, 2, top_px=100)
+    blobs, _ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, top_px=100)
     inner = np.abs(blobs[0].outline_px - [2 * 29.5 + 0.5, 100 + 2 * 19.5 + 0.5]).max(axis=1)
     assert inner.min() > 15
 
 
 def test_an_empty_picture_has_no_blobs():
-    blobs, owner = find_blobs(output_of(np.zeros((8, 8), dtype=int)), PAINT_CLASSES, 2, 0)
+    blobs, owner = find_blobs(sight_of(np.zeros((8, 8), dtype=int)), PAINT_CLASSES, 2, 0)
     assert blobs == []
     assert not owner.any()

@@ -1,4 +1,4 @@
-"""From the network's row anchors to the lines of lanes: peaks along each row, linked from row to row.
+"""From crossings of row anchors to the lines of lanes: linked from row to row.
 
 Rows are taken from near to far: near the vehicle lines are far apart, so that each is known by the time
 they run together.
@@ -6,94 +6,87 @@ they run together.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from v2hdm.detection.sight import AnchorRow
 from v2hdm.detection.view import CameraView
 from v2hdm.records import LANE_BOUNDARY, FloatArray, LaneDetection
 
-_MIN_ROWS = 6
+_MIN_POINTS = 6
 """Lines seen on fewer row anchors are chance."""
 
-_MAX_GAP_ROWS = 4
-_SLOPE_ROWS = 6
-"""Over how many of its last rows a line's direction is taken."""
+_MAX_GAP_PX = 40.0
+_SLOPE_POINTS = 6
+"""Over how many of its last points a line's direction is taken."""
 
-_MAX_SLOPE_CELLS = 4.5
-_GATE_CELLS = 1.5
+_MAX_SLOPE = 4.5
+_GATE_PX = 12.0
 
 
 @dataclass
 class _Chain:
-    """A line so far: cell rows, pixel columns in cells, and log odds, from near to far."""
+    """A line so far: image points and log odds, from near to far."""
 
-    rows: list[int] = field(default_factory=list)
-    columns: list[float] = field(default_factory=list)
+    v_px: list[float] = field(default_factory=list)
+    u_px: list[float] = field(default_factory=list)
     odds: list[float] = field(default_factory=list)
 
-    def add(self, row: int, column: float, odds: float) -> None:
-        self.rows.append(row)
-        self.columns.append(column)
+    def add(self, v_px: float, u_px: float, odds: float) -> None:
+        self.v_px.append(v_px)
+        self.u_px.append(u_px)
         self.odds.append(odds)
 
-    def distance(self, row: int, columns: np.ndarray) -> np.ndarray:
-        """How far peaks of a later row are from where this line should cross it, 1 being just near enough."""
-        ahead = self.rows[-1] - row
-        if len(self.rows) == 1:
-            return np.asarray(np.abs(columns - self.columns[-1]) / (_MAX_SLOPE_CELLS * ahead))
-        first = max(-len(self.rows), -_SLOPE_ROWS)
-        slope = (self.columns[-1] - self.columns[first]) / (self.rows[first] - self.rows[-1])
-        gate = _GATE_CELLS * (1 + 0.3 * (ahead - 1)) * (1.5 if len(self.rows) < _SLOPE_ROWS else 1.0)
-        return np.asarray(np.abs(columns - self.columns[-1] - slope * ahead) / gate)
+    def expected(self, v_px: float) -> tuple[float, float]:
+        """Where the line should cross a row farther on, px, and how far off it may be."""
+        ahead = self.v_px[-1] - v_px
+        if len(self.v_px) == 1:
+            return self.u_px[-1], _MAX_SLOPE * ahead
+        first = max(-len(self.v_px), -_SLOPE_POINTS)
+        slope = (self.u_px[-1] - self.u_px[first]) / (self.v_px[first] - self.v_px[-1])
+        young = 1.5 if len(self.v_px) < _SLOPE_POINTS else 1.0
+        return self.u_px[-1] + slope * ahead, _GATE_PX * young * (1 + 0.04 * (ahead - 8))
 
 
-def link_anchors(lanes: np.ndarray, stride: int, view: CameraView) -> list[LaneDetection]:
-    """The whole lines of one image.
-
-    Args:
-        lanes: (2, h, w) as in :class:`v2hdm.detection.network.NetworkOutput`.
-        stride: recorded px per cell.
-        view: the camera; its band of rows is what ``lanes`` covers.
-    """
+def link_anchors(rows: Sequence[AnchorRow], view: CameraView) -> list[LaneDetection]:
+    """The whole lines of one image, from its row anchors ``rows``, near to far."""
     found = []
-    for chain in _chains(lanes):
-        u = stride * (np.array(chain.columns) + 0.5) - 0.5
-        v = stride * np.array(chain.rows) + (stride - 1) / 2 + view.top
+    for chain in _chains(rows):
         score = float((1 / (1 + np.exp(-np.array(chain.odds)))).mean())
-        found.append(LaneDetection(LANE_BOUNDARY, score, np.column_stack([u, v])))
+        points_px = np.column_stack([chain.u_px, chain.v_px])
+        found.append(LaneDetection(LANE_BOUNDARY, score, points_px))
     return _identified(found, view)
 
 
-def _chains(lanes: np.ndarray) -> list[_Chain]:
-    odds, offset = lanes
-    padded = np.pad(odds, ((0, 0), (1, 1)), constant_values=-np.inf)
-    peak = (odds > 0) & (odds >= padded[:, :-2]) & (odds > padded[:, 2:])
+def _chains(rows: Sequence[AnchorRow]) -> list[_Chain]:
     open_chains: list[_Chain] = []
     done: list[_Chain] = []
-    for row in range(len(odds) - 1, -1, -1):
-        cells = np.flatnonzero(peak[row])
-        done += [chain for chain in open_chains if chain.rows[-1] - row > _MAX_GAP_ROWS]
-        open_chains = [chain for chain in open_chains if chain.rows[-1] - row <= _MAX_GAP_ROWS]
-        if not len(cells):
-            continue
-        columns = cells + np.clip(offset[row, cells], -0.5, 0.5)
-        started = _extend(open_chains, row, columns, odds[row, cells])
-        open_chains += started
-    return [chain for chain in done + open_chains if len(chain.rows) >= _MIN_ROWS]
+    for row in rows:
+        done += [chain for chain in open_chains if chain.v_px[-1] - row.v_px > _MAX_GAP_PX]
+        open_chains = [chain for chain in open_chains if chain.v_px[-1] - row.v_px <= _MAX_GAP_PX]
+        open_chains += _extend(open_chains, row)
+    return [chain for chain in done + open_chains if len(chain.v_px) >= _MIN_POINTS]
 
 
-def _extend(chains: list[_Chain], row: int, columns: np.ndarray, odds: np.ndarray) -> list[_Chain]:
-    """Give each peak of a row to the chain that it suits best, nearest pairs first; the rest start chains."""
-    free = np.ones(len(columns), dtype=np.bool_)
-    if chains:
-        distance = np.stack([chain.distance(row, columns) for chain in chains])
-        while distance.size and distance.min() <= 1:
-            c, p = (int(n) for n in np.unravel_index(np.argmin(distance), distance.shape))
-            chains[c].add(row, float(columns[p]), float(odds[p]))
-            free[p] = False
-            distance[c], distance[:, p] = np.inf, np.inf
-    return [_Chain([row], [float(columns[p])], [float(odds[p])]) for p in np.flatnonzero(free)]
+def _extend(chains: list[_Chain], row: AnchorRow) -> list[_Chain]:
+    """Give each crossing of a row to the chain that it suits best; what is left over starts chains."""
+    columns, odds = row.u_px.tolist(), row.odds.tolist()
+    pairs = []
+    for c, chain in enumerate(chains):
+        expected, gate = chain.expected(row.v_px)
+        pairs += [
+            (abs(u - expected) / gate, c, p) for p, u in enumerate(columns) if abs(u - expected) <= gate
+        ]
+    taken: set[int] = set()
+    extended: set[int] = set()
+    for _, c, p in sorted(pairs):
+        if c not in extended and p not in taken:
+            chains[c].add(row.v_px, columns[p], odds[p])
+            extended.add(c)
+            taken.add(p)
+    return [_Chain([row.v_px], [columns[p]], [odds[p]]) for p in range(len(columns)) if p not in taken]
 
 
 def _identified(lanes: list[LaneDetection], view: CameraView) -> list[LaneDetection]:

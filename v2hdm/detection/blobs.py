@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from v2hdm.detection.network import NetworkOutput
+from v2hdm.detection.sight import Sight
 from v2hdm.records import (
     ARROW,
     CHEVRON,
@@ -70,12 +70,12 @@ class Blob:
 
 
 def find_blobs(
-    output: NetworkOutput, classes: Sequence[str], stride: int, top_px: int
+    sight: Sight, classes: Sequence[str], stride: int, top_px: int
 ) -> tuple[list[Blob], np.ndarray]:
     """Split the paint of one image into blobs.
 
     Args:
-        output: what the network says of a band of the image.
+        sight: what the network says of a band of the image.
         classes: names of the channels of its ``kinds``.
         stride: recorded pixels per element of its ``paint``.
         top_px: image row at which the band starts.
@@ -84,7 +84,7 @@ def find_blobs(
         The blobs, and a map (h, w) int16 with 1 + the index of the blob that covers each element of
         ``paint``, 0 for none.
     """
-    framed_level = np.pad(output.paint, 1, constant_values=-1.0)
+    framed_level = np.pad(sight.paint, 1, constant_values=-1.0)
     level = framed_level[1:-1, 1:-1]
     contours, _ = cv2.findContours((level > 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     owner = np.zeros(level.shape, dtype=np.int16)
@@ -98,7 +98,7 @@ def find_blobs(
         inside = filled.view(np.bool_)
         box = (slice(y, y + h), slice(x, x + w))
         siblings: list[int] = []
-        parts = _parts(inside, output, box, classes)
+        parts = _parts(inside, sight, box, classes)
         for mask, part_level, scores in parts:
             framed = framed_level[y : y + h + 2, x : x + w + 2].copy()
             framed[1:-1, 1:-1] = part_level
@@ -116,14 +116,12 @@ _Part = tuple[BoolArray, np.ndarray, np.ndarray]
 """A part's mask (h, w), its signed level (h, w), and the mean probability (K,) of each class in it."""
 
 
-def _parts(
-    inside: BoolArray, output: NetworkOutput, box: tuple[slice, slice], classes: Sequence[str]
-) -> list[_Part]:
+def _parts(inside: BoolArray, sight: Sight, box: tuple[slice, slice], classes: Sequence[str]) -> list[_Part]:
     """The parts of a blob that belong to different groups of classes; one where all of it is of one group."""
-    level = output.paint[box]
+    level = sight.paint[box]
     if np.count_nonzero(inside) < _MIN_CELLS:
         return []
-    probability = _class_probability(inside, output, box)
+    probability = _class_probability(inside, sight, box)
     certainty = _certainty(inside, level)
     votes = np.bincount(probability.argmax(axis=0), minlength=len(classes))
     group_of = np.array([_group_index(name) for name in classes])
@@ -131,7 +129,7 @@ def _parts(
     present = np.flatnonzero(share >= _SPLIT_FRACTION)
     if len(present) < 2:
         return [(inside, level, certainty * probability.mean(axis=1))]
-    kinds = _kinds_at_full(output, box)
+    kinds = _kinds_at_full(sight, box)
     parts = []
     for group in present:
         mine = kinds[group_of == group].max(axis=0)
@@ -141,19 +139,19 @@ def _parts(
         for label in range(1, count):
             mask = labels == label
             if np.count_nonzero(mask) >= _MIN_CELLS:
-                own = _class_probability(mask, output, box).mean(axis=1)
+                own = _class_probability(mask, sight, box).mean(axis=1)
                 parts.append((mask, group_level, _certainty(mask, level) * own))
     return parts
 
 
-def _class_probability(mask: BoolArray, output: NetworkOutput, box: tuple[slice, slice]) -> np.ndarray:
+def _class_probability(mask: BoolArray, sight: Sight, box: tuple[slice, slice]) -> np.ndarray:
     """Probability (K, n) of each class at cells of the mask (h, w) that is placed at ``box``."""
     i, j = np.nonzero(mask)
     step = -(-len(i) // _MAX_VOTES)
-    scale = output.paint.shape[1] / output.kinds.shape[2]
+    scale = sight.kind_scale
     rows = ((i[::step] + box[0].start) / scale).astype(np.intp)
     columns = ((j[::step] + box[1].start) / scale).astype(np.intp)
-    logits = output.kinds[:, rows, columns]
+    logits = sight.kinds[:, rows, columns]
     odds = np.exp(logits - logits.max(axis=0))
     return np.asarray(odds / odds.sum(axis=0))
 
@@ -163,13 +161,13 @@ def _certainty(mask: BoolArray, level: np.ndarray) -> float:
     return float((1 / (1 + np.exp(-np.clip(level[mask], -30, 30)))).mean())
 
 
-def _kinds_at_full(output: NetworkOutput, box: tuple[slice, slice]) -> np.ndarray:
+def _kinds_at_full(sight: Sight, box: tuple[slice, slice]) -> np.ndarray:
     """Class logits (K, h, w), interpolated to the elements of ``paint`` in a box."""
     rows, columns = (np.arange(part.start, part.stop, dtype=np.float32) for part in box)
-    scale = np.float32(output.paint.shape[1] / output.kinds.shape[2])
+    scale = np.float32(sight.kind_scale)
     u, v = np.meshgrid((columns + 0.5) / scale - 0.5, (rows + 0.5) / scale - 0.5)
     return np.stack(
-        [cv2.remap(plane, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for plane in output.kinds]
+        [cv2.remap(plane, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for plane in sight.kinds]
     )
 
 

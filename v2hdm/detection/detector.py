@@ -15,6 +15,7 @@ from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.plausible import plausible_kind
 from v2hdm.detection.quad import is_convex, quad_from_outline
+from v2hdm.detection.sight import look
 from v2hdm.detection.view import CameraView
 from v2hdm.errors import DetectorError
 from v2hdm.records import (
@@ -70,8 +71,8 @@ class Detector:
         view = self.view(camera)
         _check_image(image_bgr, camera)
         info = self.network.info
-        output = self.network.run(image_bgr[view.top : view.top + view.height])
-        blobs, owner = find_blobs(output, info.classes, info.paint_stride, view.top)
+        sight = look(self.network, image_bgr, view)
+        blobs, owner = find_blobs(sight, info.classes, info.paint_stride, view.top)
         candidates = self._candidates(blobs, view)
         lanes = [
             lane
@@ -81,7 +82,7 @@ class Detector:
                 c.blob, c.kind, c.score, view, self.options.lane_step_m, self.options.max_range_m
             )
         ]
-        lanes += link_anchors(output.lanes, info.lane_stride, view)
+        lanes += link_anchors(sight.anchors, view)
         starts = [start for c in candidates if (start := self._start(c, view)) is not None]
         foreground = Foreground(owner, info.paint_stride, view.top)
         markings = fit_markings(image_bgr, view, starts, foreground, self.options)

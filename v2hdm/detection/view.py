@@ -11,13 +11,17 @@ from v2hdm.records import BoolArray, Camera, FloatArray
 _LUT_STEP_PX = 4
 _HORIZON_MARGIN_PX = 16
 
+FINE_ENOUGH_M = 0.007
+"""Ground per pixel, across the view, of which half the resolution shows enough: a dash stays 10 px wide."""
+
 
 class CameraView:
     """One camera as the detector sees it: fast lens and ground mappings, and the rows worth looking at.
 
     ``top`` and ``height`` are the band of image rows below the horizon of the camera's initial IPM
     (with a margin, since that IPM is coarse); ``height`` is a multiple of ``multiple`` where the
-    image is tall enough. Points far from any lens singularity are assumed.
+    image is tall enough. From ``fine_row`` on (None if there is no such row) a pixel is less than
+    :data:`FINE_ENOUGH_M` of ground wide. Points far from any lens singularity are assumed.
     """
 
     def __init__(self, camera: Camera, multiple: int = 16):
@@ -32,6 +36,7 @@ class CameraView:
         seen_px = apply_homography(self.pinhole_px_from_vehicle, seen_vehicle[None])
         self._ground_sign = np.sign(self._ground_depth(seen_px))[0]
         self.top, self.height = self._band_rows(multiple)
+        self.fine_row = self._fine_row()
 
     def undistort(self, points_px: FloatArray) -> FloatArray:
         """Recorded pixels (N, 2) to pinhole pixels, from a table; within 1e-2 px of the lens model."""
@@ -90,6 +95,17 @@ class CameraView:
         height = self.info.height - max(0, first - _HORIZON_MARGIN_PX)
         height = min(-(-height // multiple) * multiple, self.info.height)
         return self.info.height - height, height
+
+    def _fine_row(self) -> int | None:
+        middle = (self.info.width - 1) / 2
+        rows = np.arange(self.top, self.info.height, dtype=np.float64)
+        left, right = (
+            self.ground(self.undistort(np.column_stack([np.full_like(rows, middle + side), rows])))
+            for side in (-0.5, 0.5)
+        )
+        coarse = ~(np.linalg.norm(right - left, axis=1) <= FINE_ENOUGH_M)
+        first = int(np.flatnonzero(coarse)[-1]) + 1 if coarse.any() else 0
+        return self.top + first if first < len(rows) else None
 
 
 def _build_pinhole_lut(camera: Camera) -> FloatArray:

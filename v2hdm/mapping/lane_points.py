@@ -20,7 +20,7 @@ from v2hdm.mapping.backprojection import (
 )
 from v2hdm.mapping.location import Rig
 from v2hdm.mapping.sightings import frames_of
-from v2hdm.records import LANE_DASH, BoolArray, Drive, FloatArray, ImageDetections
+from v2hdm.records import LANE_CLASSES, LANE_DASH, BoolArray, Drive, FloatArray, ImageDetections
 
 IntArray = NDArray[np.int64]
 
@@ -99,7 +99,7 @@ def collect_lane_points(
         for found in detections
         if covered[found.image]
         for lane in found.lanes
-        if len(lane.points_px) >= 2
+        if lane.kind in LANE_CLASSES and len(lane.points_px) >= 2
     ]
     if not pieces:
         return LaneCloud(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, int), np.zeros(0, bool))

@@ -95,12 +95,20 @@ def _poses(
     return poses
 
 
-def pose_noise(config: DisturbanceConfig) -> PoseNoise:
-    """What the receiver's data sheet would state."""
+def pose_noise(config: DisturbanceConfig, speed_mps: float) -> PoseNoise:
+    """What the receiver's data sheet would state, and a test drive of the suspension at ``speed_mps``."""
+    heading_rad = float(np.deg2rad(config.heading_deg))
+    roll_pitch_rad = float(np.deg2rad(config.roll_pitch_deg))
     return PoseNoise(
         position_m=float(np.hypot(config.rtk_white_m, config.rtk_correlated_m)),
-        heading_rad=float(np.deg2rad(config.heading_deg)),
-        roll_pitch_rad=float(np.deg2rad(config.roll_pitch_deg)),
+        heading_rad=heading_rad,
+        roll_pitch_rad=roll_pitch_rad,
+        position_drift_m=config.rtk_correlated_m,
+        position_drift_over_m=config.rtk_correlation_m,
+        heading_drift_rad=heading_rad / float(np.sqrt(2.0)),
+        heading_drift_over_m=config.heading_correlation_s * speed_mps,
+        roll_pitch_drift_rad=roll_pitch_rad / float(np.sqrt(2.0)),
+        roll_pitch_drift_over_m=config.jitter_correlation_s * speed_mps,
     )
 
 

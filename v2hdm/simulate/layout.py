@@ -213,7 +213,7 @@ def _place_shapes(
             Paint(kind=kind, polygon_map=polygon, albedo_bgr=colour, wear=worn[0], dirt=worn[1], seed=7)
         )
         if kind in CORNERED_CLASSES:
-            layout.markings.append(Marking(kind=kind, corners_map=polygon))
+            layout.markings.append(Marking(kind, polygon, 0))
 
 
 def _arrow() -> list[FloatArray]:

@@ -24,7 +24,7 @@ from v2hdm.simulate.textures import Float32
 from v2hdm.simulate.view import View, camera_rays
 
 RENDERER_VERSION = 2
-"""Raised whenever a scene comes out as another picture or with another truth: cached drives are made afresh."""
+"""Raised whenever a scene comes out as another picture or truth: cached drives are made afresh then."""
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,7 @@ def render_drive(config: PortConfig, folder: Path, workers: int, progress: Progr
             root=folder,
             cameras=port.cameras,
             images=images,
-            pose_noise=pose_noise(config.disturbance),
+            pose_noise=pose_noise(config.disturbance, config.route.speed_mps),
             origin=port.hd_map.origin,
             truth_dir=folder / TRUTH_FOLDER,
         )

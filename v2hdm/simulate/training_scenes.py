@@ -56,13 +56,13 @@ def training_sample(
     view = random_view(rng, width, height)
     scene = _without_hidden_boxes(scene, view)
     rendered = Renderer(scene).render(view.info, view.cam_from_map, rng, view.optics, view.motion)
-    seen = (_in_image(view, lane) for lane in lanes)
+    seen = (image_points(view, lane) for lane in lanes)
     lanes_px = tuple(lane for lane in seen if len(lane) > 1)
     return TrainingSample(rendered.image, rendered.labels, rendered.hidden, lanes_px)
 
 
-def _in_image(view: TrainingView, points_map: FloatArray) -> FloatArray:
-    """Recorded pixels (M, 2) of those ground points (N, 2) that lie before the camera."""
+def image_points(view: TrainingView, points_map: FloatArray) -> FloatArray:
+    """Recorded pixels (M, 2), in order, of those ground points (N, 2, map) that lie before the camera."""
     cam = points_map @ view.cam_from_map[:3, :2].T + view.cam_from_map[:3, 3]
     cam = cam[cam[:, 2] > _NEAR_M]
     pinhole = (cam @ view.info.intrinsic.T)[:, :2] / cam[:, 2:]

@@ -1,0 +1,77 @@
+"""Looking at near ground at half the resolution moves nothing."""
+
+import numpy as np
+import pytest
+
+from tests.detection.pictures import brightness_model, diamond, extrinsic, picture
+from v2hdm.detection import sight as sight_module
+from v2hdm.detection.ground import ipm_from_extrinsic
+from v2hdm.detection.network import Network, NetworkOutput
+from v2hdm.detection.sight import look
+from v2hdm.detection.view import CameraView
+from v2hdm.records import Camera, CameraInfo
+
+
+def large_camera(width: int = 1280, height: int = 720) -> Camera:
+    """A camera with much near ground in it."""
+    intrinsic = np.array([[900.0, 0.0, width / 2], [0.0, 900.0, height / 2], [0.0, 0.0, 1.0]])
+    info = CameraInfo("front", width, height, intrinsic)
+    roi = np.array([[3.0, -2.0], [9.0, -2.0], [9.0, 2.0], [3.0, 2.0]])
+    return Camera(info, {"calibrated": ipm_from_extrinsic(info, extrinsic(pitch_deg=18))}, "calibrated", roi)
+
+
+class LineNetwork(Network):
+    """Finds, on every row anchor, the columns where an image's red channel turns from 0 to 255."""
+
+    def run(self, image_bgr: np.ndarray) -> NetworkOutput:
+        output = super().run(image_bgr)
+        stride = self.info.lane_stride
+        lanes = output.lanes.copy()
+        red = image_bgr[..., 2].astype(float)
+        for row in range(lanes.shape[1]):
+            above, below = stride * row + stride // 2 - 1, stride * row + stride // 2
+            edge = 0.5 * sum(float((255 - red[line]).sum() / 255) for line in (above, below))
+            cell = edge / stride
+            if 0 < cell < lanes.shape[2]:
+                lanes[:, row, int(cell)] = 5.0, cell - int(cell) - 0.5
+        return NetworkOutput(output.paint, output.kinds, lanes)
+
+
+def test_both_resolutions_say_the_same_of_the_same_place(tmp_path):
+    camera = large_camera()
+    view = CameraView(camera)
+    network = Network(brightness_model(tmp_path))
+    image = picture(camera, [diamond(5.0, 0.0)])
+    twice = look(network, image, view)
+    assert sight_module._seam_row(network, view) is not None
+    view.fine_row = None
+    assert sight_module._seam_row(network, view) is None
+    once = look(network, image, view)
+    assert twice.paint.shape == once.paint.shape
+    assert twice.kinds.shape == once.kinds.shape
+    both, either = ((once.paint > 0) & (twice.paint > 0)).sum(), ((once.paint > 0) | (twice.paint > 0)).sum()
+    assert both / either > 0.97
+    centres = [np.argwhere(sight.paint > 0).mean(axis=0) for sight in (once, twice)]
+    np.testing.assert_allclose(*centres, atol=0.1)
+
+
+def test_row_anchors_of_the_two_resolutions_lie_on_one_line(tmp_path):
+    camera = large_camera()
+    image = np.zeros((camera.info.height, camera.info.width, 3), dtype=np.uint8)
+    for v in range(camera.info.height):
+        image[v, int(200 + 0.5 * v) :, 2] = 255
+    rows = look(LineNetwork(brightness_model(tmp_path)), image, CameraView(camera)).anchors
+    v = np.array([row.v_px for row in rows])
+    u = np.array([row.u_px[0] for row in rows])
+    assert (np.diff(v) < 0).all()
+    assert set(np.round(-np.diff(v))) >= {8, 16}, "both resolutions took part"
+    assert np.abs(u - (199.5 + 0.5 * v)).max() < 1.2
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 720), (1242, 375), (1288, 722), (640, 480)])
+def test_the_parts_cover_the_band_whatever_the_image_size(tmp_path, width, height):
+    camera = large_camera(width, height)
+    view = CameraView(camera)
+    sight = look(Network(brightness_model(tmp_path)), np.zeros((height, width, 3), dtype=np.uint8), view)
+    assert sight.paint.shape == (-(-view.height // 2), -(-width // 2))
+    assert sight.kinds.shape[1:] == (-(-view.height // 4), -(-width // 4))

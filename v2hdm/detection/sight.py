@@ -1,0 +1,108 @@
+"""One image through the network: far ground at full resolution, near ground at half of it.
+
+A metre of ground near the vehicle fills so many pixels that half of them, in each direction, show all that
+the network needs; corners are refined on the image itself afterwards. Looking twice costs half as much.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from v2hdm.detection.network import Network
+from v2hdm.detection.view import CameraView
+from v2hdm.records import FloatArray
+
+_OVERLAP_PX = 64
+"""By how much the two parts overlap, so that either has its surroundings where they are joined."""
+
+_GRID_PX = 16
+"""Where the parts are joined is on the grid of all outputs; the network's own multiple may be larger."""
+
+
+@dataclass(frozen=True)
+class AnchorRow:
+    """The crossings of lanes' lines on one image row ``v_px``: columns (N,) px and log odds (N,)."""
+
+    v_px: float
+    u_px: FloatArray
+    odds: FloatArray
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What the network says of the camera's band of rows.
+
+    ``paint`` (h, w) and ``kinds`` (K, h', w') are as in :class:`NetworkOutput`; ``anchors`` from near to far.
+    """
+
+    paint: np.ndarray
+    kinds: np.ndarray
+    anchors: list[AnchorRow]
+
+    @cached_property
+    def kind_scale(self) -> float:
+        """Elements of ``paint`` per element of ``kinds``, in each direction."""
+        return float(self.paint.shape[1] / self.kinds.shape[2])
+
+
+def look(network: Network, image_bgr: np.ndarray, view: CameraView) -> Sight:
+    """Run the network on the rows of an image (H, W, 3) that show ground in reach."""
+    band = image_bgr[view.top : view.top + view.height]
+    seam = _seam_row(network, view)
+    if seam is None:
+        output = network.run(band)
+        return Sight(output.paint, output.kinds, _anchor_rows(output.lanes, network, view.top, 1))
+    far = network.run(band[: seam + _OVERLAP_PX])
+    near_top = seam - _OVERLAP_PX
+    half = cv2.resize(band[near_top:], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    near = network.run(half)
+    far_rows = [row for row in _anchor_rows(far.lanes, network, view.top, 1) if row.v_px < view.top + seam]
+    near_rows = _anchor_rows(near.lanes, network, view.top + near_top, 2)
+    near_rows = [row for row in near_rows if row.v_px >= view.top + seam]
+    paint, kinds = (
+        _joined(getattr(far, name), getattr(near, name), seam // stride, near_top // stride)
+        for name, stride in (("paint", network.info.paint_stride), ("kinds", network.info.kind_stride))
+    )
+    return Sight(paint, kinds, near_rows + far_rows)
+
+
+def _seam_row(network: Network, view: CameraView) -> int | None:
+    """Row of the band from which half the resolution will do; None if that saves nothing."""
+    grid = max(_GRID_PX, network.info.multiple)
+    if view.fine_row is None or view.info.width % (2 * grid) or view.height % grid:
+        return None
+    seam = -(-(view.fine_row - view.top) // grid) * grid
+    seam += (view.height - seam) % (2 * grid)
+    worth = view.height - seam >= 3 * _OVERLAP_PX
+    return max(seam, _OVERLAP_PX) if worth and seam >= _OVERLAP_PX else None
+
+
+def _joined(far: np.ndarray, near: np.ndarray, seam: int, near_top: int) -> np.ndarray:
+    """Far rows above the seam, near ones, doubled, below it; planes (h, w) or stacks of them (K, h, w)."""
+    if far.ndim == 3:
+        return np.stack([_joined(f, n, seam, near_top) for f, n in zip(far, near, strict=True)])
+    doubled = cv2.resize(near, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
+    return np.concatenate([far[:seam], doubled[seam - near_top :]])
+
+
+def _anchor_rows(lanes: np.ndarray, network: Network, top_px: int, scale: int) -> list[AnchorRow]:
+    """Peaks along each row of ``lanes`` (2, h, w), near to far, of an image reduced by ``scale``."""
+    odds, offset = lanes
+    padded = np.pad(odds, ((0, 0), (1, 1)), constant_values=-np.inf)
+    i, j = np.nonzero((odds > 0) & (odds >= padded[:, :-2]) & (odds > padded[:, 2:]))
+    stride = network.info.lane_stride
+    u = stride * (j + np.clip(offset[i, j], -0.5, 0.5) + 0.5) - 0.5
+    v = stride * np.arange(len(odds)) + (stride - 1) / 2
+    # Pixel p of the reduced image is centred on scale * p + (scale - 1) / 2 of the image.
+    u, v = scale * u + (scale - 1) / 2, scale * v + (scale - 1) / 2 + top_px
+    found = odds[i, j].astype(np.float64)
+    bounds = np.searchsorted(i, np.arange(len(odds) + 1))
+    return [
+        AnchorRow(float(v[row]), u[part], found[part])
+        for row in range(len(odds) - 1, -1, -1)
+        if (part := slice(bounds[row], bounds[row + 1])).stop > part.start
+    ]
