@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -82,9 +83,19 @@ def check_same_experiment(checkpoint: Checkpoint, config: TrainConfig, path: Pat
     Raises:
         ConfigError: Naming the settings that differ.
     """
-    then, now = checkpoint.config, asdict(config)
+    then, now = _completed(checkpoint.config, asdict(TrainConfig())), asdict(config)
     changed = [key for key in now if key not in _FREE_TO_CHANGE and then.get(key) != now[key]]
     if changed:
         raise ConfigError(
             f"{path} was trained with another {', '.join(changed)}: set it back, or choose a new `output`"
         )
+
+
+def _completed(config: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration with the settings that there were not yet when it was saved."""
+    return {
+        key: _completed(config[key], default)
+        if isinstance(config.get(key), dict) and default
+        else config.get(key, default)
+        for key, default in defaults.items()
+    }

@@ -15,6 +15,11 @@ class DataConfig:
     oftener the more paint it shows, each time another crop of ``width`` x ``height`` px in other light. Past
     renders to show again are kept in a ``reservoir``. ``easy_samples`` renders pass until scenes are as hard
     as they get.
+
+    ``coco`` and ``tusimple`` are files of users' own labels: polygons of markings in COCO's format, lanes in
+    TuSimple's. The images' names in them start from ``coco_images`` and ``tusimple_images``, or else from the
+    folder of the file. ``coco_classes`` says what categories mean that are not called like a class: a class,
+    or "none" for what is no marking. ``labelled_share`` of all views are then of these images.
     """
 
     width: int = 448
@@ -25,6 +30,12 @@ class DataConfig:
     reservoir: int = 256
     easy_samples: int = 1000
     workers: int = 1
+    coco: str | None = None
+    coco_images: str | None = None
+    coco_classes: dict[str, str] = field(default_factory=dict)
+    tusimple: str | None = None
+    tusimple_images: str | None = None
+    labelled_share: float = 0.3
 
 
 @dataclass(kw_only=True)

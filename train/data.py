@@ -1,4 +1,4 @@
-"""Training images without end, rendered by worker processes while the network learns."""
+"""Training images without end, rendered by worker processes while the network learns, and users' own."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from train.augment import random_crop, random_photometry
 from train.config import DataConfig
+from train.labels import LabelledImages, read_labels
 from train.targets import Targets, targets
 from v2hdm.simulate.training_scenes import TrainingSample, training_sample
 
@@ -22,23 +23,43 @@ Pair = tuple[Tensor, Targets]
 
 
 class RenderStream(IterableDataset[Pair]):
-    """Pairs of image and answers, the same for the same seed and workers.
+    """Pairs of image and answers, the same for the same seed, workers and part.
 
     Args:
         config: Sizes and how often a render is shown.
         seed: Names the sequence.
         first_render: Where in it to begin, so that a resumed run sees other renders.
+        part: Which of how many trainings in step this stream feeds: no two see the same render.
+        labels: Labelled images to mix in, ``config.labelled_share`` of all.
     """
 
-    def __init__(self, config: DataConfig, seed: int, first_render: int = 0) -> None:
+    def __init__(
+        self,
+        config: DataConfig,
+        seed: int,
+        first_render: int = 0,
+        part: tuple[int, int] = (0, 1),
+        labels: LabelledImages | None = None,
+    ) -> None:
         self.config = config
         self.seed = seed
         self.first_render = first_render
+        self.part = part
+        self.labels = labels
 
     def __iter__(self) -> Iterator[Pair]:
         worker = get_worker_info()
         number, workers = (worker.id, worker.num_workers) if worker else (0, 1)
+        rank, size = self.part
+        number, workers = rank * workers + number, size * workers
         rng = np.random.default_rng([self.seed, self.first_render, number, 9])
+        for pair in self._renders(rng, number, workers):
+            while self.labels is not None and rng.random() < self.config.labelled_share:
+                yield self.labels.view(rng)
+            yield pair
+
+    def _renders(self, rng: np.random.Generator, number: int, workers: int) -> Iterator[Pair]:
+        """Views of the renders ``number``, ``number + workers``, ..."""
         recent: list[TrainingSample] = []
         appeal: list[float] = []
         index = self.first_render + number
@@ -65,9 +86,15 @@ class RenderStream(IterableDataset[Pair]):
         return torch.from_numpy(random_photometry(rng, crop.image)), targets(crop)
 
 
-def training_batches(config: DataConfig, seed: int, batch: int, first_render: int) -> Iterator[Pair]:
-    """Batches without end, from worker processes (or this one if ``workers`` is 0)."""
-    stream = RenderStream(config, seed, first_render)
+def training_batches(
+    config: DataConfig, seed: int, batch: int, first_render: int, part: tuple[int, int] = (0, 1)
+) -> Iterator[Pair]:
+    """Batches without end, from worker processes (or this one if ``workers`` is 0).
+
+    Raises:
+        LabelError: The users' own labels cannot be used.
+    """
+    stream = RenderStream(config, seed, first_render, part, read_labels(config))
     loader = DataLoader(
         stream,
         batch_size=batch,

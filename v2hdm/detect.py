@@ -38,7 +38,7 @@ _ROUGH_MOUNTING = (1.6, 5.0, 60.0)
 _ROUGH_RANGE_M = 40.0
 """Without a calibration distances may be wrong by a factor of two: nothing may be dropped for being far."""
 
-_STAGES = ("read", "net", "corners", "lanes")
+_STAGES = ("read", "net", "blobs", "corners", "lanes")
 
 
 class _Job(NamedTuple):

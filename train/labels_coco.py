@@ -1,0 +1,126 @@
+"""Markings labelled as polygons in COCO's format (Lin et al., "Microsoft COCO", 2014; instances JSON)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from train.labels_image import LabelledImage, Shape
+from v2hdm.errors import LabelError
+from v2hdm.files import load_json
+from v2hdm.records import PAINT_CLASSES, FloatArray
+
+NOT_PAINT = "none"
+"""What a category maps to if its annotations are no markings."""
+
+_HALF_PX = 0.5
+"""COCO counts from the top-left pixel's corner, this project from its centre."""
+
+
+def read_coco(path: Path, images: Path, classes: Mapping[str, str]) -> list[LabelledImage]:
+    """Every image of a COCO file; those without annotations are images without markings.
+
+    Args:
+        path: the JSON file.
+        images: the folder that its ``file_name`` entries start from.
+        classes: what categories mean, by name: one of PAINT_CLASSES or "none"; those that are called like a
+            class need not be in it.
+
+    Raises:
+        LabelError: the file is missing or damaged, or uses a category that is not known.
+    """
+    content = load_json(path, LabelError)
+    names = {
+        entry["id"]: str(entry["name"]) for entry in _entries(content, "categories", ("id", "name"), path)
+    }
+    shapes: dict[Any, list[Shape]] = {}
+    entries = _entries(content, "images", ("id", "file_name"), path)
+    for entry in entries:
+        if entry["id"] in shapes:
+            raise LabelError(f"{path}: two images have the id {entry['id']}; give each its own")
+        shapes[entry["id"]] = []
+    kinds = _kinds(names, classes, path)
+    for number, entry in enumerate(
+        _entries(content, "annotations", ("image_id", "category_id", "segmentation"), path)
+    ):
+        where = f"{path}: annotation {entry.get('id', number)}"
+        if entry["category_id"] not in names:
+            raise LabelError(f"{where}: its category {entry['category_id']!r} is not in the file; add it")
+        if entry["image_id"] not in shapes:
+            raise LabelError(f"{where}: its image {entry['image_id']!r} is not in the file; add it")
+        kind = _kind(names[entry["category_id"]], kinds, where)
+        if kind != NOT_PAINT:
+            shapes[entry["image_id"]].append(Shape(kind, _rings(entry["segmentation"], where)))
+    if not entries:
+        raise LabelError(f"{path}: has no images; give another file")
+    return [
+        LabelledImage(
+            f"{path}: image {entry['id']}",
+            images / str(entry["file_name"]),
+            _size(entry),
+            shapes=tuple(shapes[entry["id"]]),
+        )
+        for entry in entries
+    ]
+
+
+def _kinds(names: Mapping[Any, str], classes: Mapping[str, str], path: Path) -> dict[str, str]:
+    """The class map, complete with the names that are classes."""
+    for name, kind in classes.items():
+        if name not in names.values():
+            raise LabelError(
+                f"data.coco_classes: {path} has no category {name!r} but {', '.join(names.values())}; mend it"
+            )
+        if kind not in (*PAINT_CLASSES, NOT_PAINT):
+            raise LabelError(
+                f"data.coco_classes: {name!r} is to be {kind!r}; choose from: "
+                f"{', '.join(PAINT_CLASSES)}, {NOT_PAINT}"
+            )
+    alike = {name: name.strip().lower().replace(" ", "_").replace("-", "_") for name in names.values()}
+    return {name: kind for name, kind in alike.items() if kind in PAINT_CLASSES} | dict(classes)
+
+
+def _kind(name: str, kinds: Mapping[str, str], where: str) -> str:
+    if name not in kinds:
+        raise LabelError(
+            f"{where}: category {name!r} is no class of the detector; say which it is with "
+            f"'data.coco_classes={{{name}: CLASS}}', CLASS one of: {', '.join(PAINT_CLASSES)}, {NOT_PAINT}"
+        )
+    return kinds[name]
+
+
+def _rings(segmentation: object, where: str) -> tuple[FloatArray, ...]:
+    if not isinstance(segmentation, list) or not segmentation:
+        raise LabelError(f"{where}: its segmentation is no list of polygons (masks are not); export polygons")
+    rings = []
+    for polygon in segmentation:
+        try:
+            ring = np.array(polygon, dtype=np.float64).reshape(-1, 2) - _HALF_PX
+        except (TypeError, ValueError):
+            raise LabelError(f"{where}: a polygon is not x, y, x, y, ...; mend it") from None
+        if len(ring) < 3 or not np.isfinite(ring).all():
+            raise LabelError(f"{where}: a polygon has under three points, or one not finite; mend it")
+        rings.append(ring)
+    return tuple(rings)
+
+
+def _size(entry: Mapping[str, Any]) -> tuple[int, int] | None:
+    width, height = entry.get("width"), entry.get("height")
+    return (width, height) if isinstance(width, int) and isinstance(height, int) else None
+
+
+def _entries(
+    content: Mapping[str, Any], key: str, needed: tuple[str, ...], path: Path
+) -> list[dict[str, Any]]:
+    """The list of objects under a key, each with the keys that are needed."""
+    entries = content.get(key)
+    if not isinstance(entries, list):
+        raise LabelError(f"{path}: has no list {key!r}; is it a COCO instances file?")
+    for number, entry in enumerate(entries):
+        missing = [name for name in needed if not isinstance(entry, dict) or name not in entry]
+        if missing:
+            raise LabelError(f"{path}: {key}[{number}] has no {missing[0]!r}; add it")
+    return entries
