@@ -120,11 +120,22 @@ class GeodeticOrigin:
 
 @dataclass(frozen=True)
 class PoseNoise:
-    """Standard deviations of the recorded poses, as the receiver's data sheet states them."""
+    """Standard deviations of the recorded poses, as the receiver's data sheet states them.
+
+    Of each, ``..._drift_...`` is the part that changes only slowly, as RTK's errors do: a first-order
+    Gauss-Markov process that fades to 1 / e over ``..._drift_over_m`` of driving. The rest, in quadrature, is
+    drawn anew at every image; without a drift all of it is.
+    """
 
     position_m: float = 0.02
     heading_rad: float = 0.001
     roll_pitch_rad: float = 0.003
+    position_drift_m: float = 0.0
+    position_drift_over_m: float = 30.0
+    heading_drift_rad: float = 0.0
+    heading_drift_over_m: float = 5.0
+    roll_pitch_drift_rad: float = 0.0
+    roll_pitch_drift_over_m: float = 1.0
 
 
 @dataclass(frozen=True)

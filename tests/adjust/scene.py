@@ -85,6 +85,22 @@ def correlated(rng: np.random.Generator, count: int, width: int, memory: float) 
     return out
 
 
+def pose_errors(
+    map_from_vehicle: np.ndarray, sigma: PoseSigma, step_m: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Tangents (J, 6) of the errors that ``sigma`` describes: white noise and drifts."""
+    count = len(map_from_vehicle)
+    drift_sigma = np.array([drift.sigma for drift in sigma.drift_by_state()])
+    memory = np.exp([-step_m / drift.over_m for drift in sigma.drift_by_state()])
+    out = rng.standard_normal((count, 6)) * np.sqrt(sigma.by_state() ** 2 - drift_sigma**2)
+    if drift_sigma.any():
+        drift = np.column_stack([correlated(rng, count, 1, one) for one in memory])
+        out += drift * drift_sigma
+    # The receiver's error keeps its direction in the map while the vehicle turns.
+    out[:, :2] = (map_from_vehicle[:, :2, :2].transpose(0, 2, 1) @ out[:, :2, None])[..., 0]
+    return out
+
+
 def make_scene(
     seed: int = 0,
     *,
@@ -101,7 +117,6 @@ def make_scene(
     pixel_sigma: float = PIXEL_SIGMA,
     prior_sigma_m: float = 0.03,
     max_range_m: float = 15.0,
-    correlation_m: float = 0.0,
     noise_seed: int | None = None,
 ) -> Scene:
     """A street whose recorded poses are off by ``jitter`` and whose start is off as stated.
@@ -115,14 +130,7 @@ def make_scene(
     corners = diamonds(recorded, every_m, rng)
     if noise_seed is not None:
         rng = np.random.default_rng(noise_seed)
-    state = np.zeros((frames, 6))
-    if jitter is not None:
-        memory = np.exp(-step_m / correlation_m) if correlation_m > 0 else 0.0
-        unit = rng.standard_normal((frames, 6))
-        # The receiver's error keeps its direction in the map while the vehicle turns.
-        error_map = correlated(rng, frames, 2, memory)
-        unit[:, :2] = (recorded[:, :2, :2].transpose(0, 2, 1) @ error_map[..., None])[..., 0]
-        state = unit * jitter.by_state()
+    state = np.zeros((frames, 6)) if jitter is None else pose_errors(recorded, jitter, step_m, rng)
     map_from_vehicle = recorded @ exp(state)
     camera, frame, corner, _ = observe(truth, recorded, corners, max_range_m)
     twice = np.bincount(corner, minlength=len(corners)) >= 2

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.adjust.scene import make_scene, mounted
-from v2hdm.adjust import Observations, PoseSigma, Problem, SolveOptions, Status, solve
+from v2hdm.adjust import Drift, Observations, PoseSigma, Problem, SolveOptions, Status, solve
 from v2hdm.errors import AdjustError
 
 PAPER = SolveOptions(pose_states=(), loss="none")
@@ -68,6 +68,9 @@ def bad_problems():
         ),
         "belong together": replace(problem, centre_sigma_m=None),
         "pose_sigma must be above 0": replace(problem, pose_sigma=PoseSigma(heading_rad=0.0)),
+        "must be part of its pose_sigma 0.02": replace(
+            problem, pose_sigma=PoseSigma(position_drift=Drift(0.03, 10.0))
+        ),
         "intrinsic has shape": replace(problem, intrinsic=np.eye(3)),
         "there is no observation": with_observations(
             problem,

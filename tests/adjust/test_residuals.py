@@ -2,12 +2,13 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from tests.adjust.scene import make_scene
 from v2hdm.adjust.arrays import make_arrays
-from v2hdm.adjust.problem import LOSSES, POSE_STATES, PoseSigma
+from v2hdm.adjust.problem import LOSSES, POSE_STATES, Drift, PoseSigma
 from v2hdm.adjust.residuals import (
     Estimate,
     Loss,
@@ -21,7 +22,7 @@ from v2hdm.adjust.residuals import (
 from v2hdm.adjust.robust import loss
 from v2hdm.geometry.transform import exp
 
-POSES = PoseSigma(correlation_m=10.0)
+POSES = PoseSigma(position_drift=Drift(0.016, 10.0), heading_drift=Drift(0.0006, 5.0))
 
 
 def example(pose_states=POSE_STATES, size=0.0, max_range_m=15.0, frames=14):
@@ -101,21 +102,27 @@ def test_a_loss_starts_as_least_squares_and_its_weight_is_its_slope(name):
     assert bool((weight <= 1).all())
 
 
-def test_correlated_positions_have_the_covariance_of_a_gauss_markov_process_in_the_map():
+def test_a_position_error_has_the_covariance_of_white_noise_and_a_gauss_markov_process_in_the_map():
     scene = make_scene(3, frames=12, turn_deg_per_m=8.0, straight_m=2.0, jitter=POSES)
     arrays = make_arrays(scene.problem, POSE_STATES, "cpu")
     shape, count = arrays.state_information_root.shape, arrays.state_information_root.numel()
     root = torch.autograd.functional.jacobian(
         lambda s: state_residual(arrays, s).flatten(), torch.zeros(shape, dtype=torch.float64)
     ).reshape(count, count)
-    covariance = torch.linalg.inv(root.T @ root).reshape(*shape, *shape)
+    states = torch.linalg.inv(root.T @ root).reshape(*shape, *shape)
+    # Which state acts on which column of the tangent, (6, S).
+    onto = torch.eye(6, dtype=torch.float64)[:, list(arrays.states)]
+    covariance = torch.einsum("as,jskt,bt->jakb", onto, states, onto)
     turned = torch.as_tensor(scene.problem.map_from_vehicle[:, :2, :2])
     in_map = torch.einsum("jab,jbkc,kdc->jkad", turned, covariance[:, :2, :, :2], turned)
     apart_m = 0.5 * (torch.arange(12)[:, None] - torch.arange(12)).abs().to(torch.float64)
-    expected = 0.02**2 * torch.exp(-apart_m / 10.0)[..., None, None] * torch.eye(2, dtype=torch.float64)
+    white, drift = 0.012**2 * torch.eye(12, dtype=torch.float64), 0.016**2 * torch.exp(-apart_m / 10.0)
+    expected = (white + drift)[..., None, None] * torch.eye(2, dtype=torch.float64)
     torch.testing.assert_close(in_map, expected, atol=1e-12, rtol=1e-6)
-    pitch = POSE_STATES.index("pitch")
+    pitch, heading = POSE_STATES.index("pitch"), POSE_STATES.index("heading")
     assert covariance[0, pitch, 1, pitch] == 0
+    assert float(covariance[0, heading, 1, heading]) == pytest.approx(0.0006**2 * np.exp(-0.1))
+    assert float(covariance[5, heading, 5, heading]) == pytest.approx(0.001**2)
 
 
 def test_the_centre_prior_does_not_mind_a_rotation_about_the_camera():

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.adjust.scene import make_scene
-from v2hdm.adjust import PoseSigma, SolveOptions, solve
+from v2hdm.adjust import Drift, PoseSigma, SolveOptions, solve
 from v2hdm.adjust.arrays import make_arrays
 from v2hdm.adjust.descent import Objective
 from v2hdm.adjust.problem import POSE_STATES
@@ -16,7 +16,7 @@ from v2hdm.adjust.residuals import Estimate, Loss
 from v2hdm.adjust.tiles import TIP, factorise_tiles, find_pattern
 from v2hdm.adjust.whitening import factorise
 
-POSES = PoseSigma(correlation_m=10.0)
+POSES = PoseSigma(position_drift=Drift(0.01, 10.0), roll_pitch_drift=Drift(0.003, 2.0))
 
 
 @pytest.mark.parametrize("pose_states", [(), ("roll", "pitch"), POSE_STATES])
@@ -126,11 +126,16 @@ def test_covariances_agree_with_the_scatter_of_many_solves():
     np.testing.assert_allclose(np.mean(np.square(extrinsics), axis=0) / rotation, 1, atol=0.6)
 
 
-def test_the_normalised_error_of_a_marking_is_chi_square_distributed():
+DRIFTING = PoseSigma(
+    position_drift=Drift(0.018, 30.0), heading_drift=Drift(0.0007, 5.0), roll_pitch_drift=Drift(0.002, 1.2)
+)
+
+
+@pytest.mark.parametrize(("jitter", "drives"), [(PoseSigma(), 32), (DRIFTING, 16)])
+def test_the_normalised_error_of_a_marking_is_chi_square_distributed(jitter, drives):
     squares = []
-    drives = 32
     for seed in range(drives):
-        scene = make_scene(40 + seed, frames=24, step_m=0.8, jitter=PoseSigma(), start_error_deg=0.5)
+        scene = make_scene(40 + seed, frames=24, step_m=0.8, jitter=jitter, start_error_deg=0.5)
         solution = solve(scene.problem, SolveOptions(coarse=False))
         groups = np.arange(scene.problem.corner_count)[:, None]
         covariance = solution.corner_covariance(groups)

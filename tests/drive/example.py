@@ -81,7 +81,7 @@ def make_drive(folder: Path, stamps: tuple[float, ...] = (100.05, 100.95, 101.25
         root=folder,
         cameras=cameras,
         images=sorted(images, key=lambda image: (image.stamp_s, image.camera)),
-        pose_noise=PoseNoise(0.01, 0.0009, 0.002),
+        pose_noise=PoseNoise(0.01, 0.0009, 0.002, position_drift_m=0.008, position_drift_over_m=25.0),
         origin=ORIGIN,
         truth_dir=folder / "truth",
     )

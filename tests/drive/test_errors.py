@@ -89,6 +89,14 @@ CASES: dict[str, tuple[Damage, str]] = {
     ),
     "no cameras": (edit("drive.yaml", r"^cameras:(.|\n)*", "cameras: {}"), r"names no camera"),
     "bad noise": (edit("drive.yaml", r"position_m: 0\.01", "position_m: -1.0"), r"position_m: .*negative"),
+    "more drift than error": (
+        edit("drive.yaml", r"position_drift_m: 0\.008", "position_drift_m: 0.02"),
+        r"position_drift_m: is part of position_m and cannot be above it",
+    ),
+    "drift over nothing": (
+        edit("drive.yaml", r"position_drift_over_m: 25\.0", "position_drift_over_m: 0"),
+        r"position_drift_over_m: an error that fades over no distance",
+    ),
     "bad latitude": (
         edit("drive.yaml", r"latitude_deg: 53.5", "latitude_deg: 99"),
         r"latitude must lie within",

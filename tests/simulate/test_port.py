@@ -8,7 +8,7 @@ from v2hdm.drive.trajectory import interpolate
 from v2hdm.errors import ConfigError
 from v2hdm.records import DIAMOND, LANE_DASH, CameraInfo
 from v2hdm.simulate.calibration import calibrate, cam_from_vehicle, camera_info, project_ground
-from v2hdm.simulate.disturbance import correlated_noise, drive_along
+from v2hdm.simulate.disturbance import correlated_noise, drive_along, pose_noise
 from v2hdm.simulate.layout import build_layout
 from v2hdm.simulate.port import Port, build_port
 from v2hdm.simulate.port_config import (
@@ -165,3 +165,24 @@ def test_hidden_points_are_those_the_picture_hides() -> None:
 def test_a_port_that_cannot_be_is_refused_by_name(changes: dict, word: str) -> None:
     with pytest.raises(ConfigError, match=word):
         build_port(tiny_port(**changes))
+
+
+def test_the_stated_drift_is_that_of_the_recorded_positions() -> None:
+    """Over many short drives, errors 5 m apart covary as the drift alone and errors at one place as all."""
+    config = RouteConfig(pieces=[[12.0, 0.0]], pose_rate_hz=20.0)
+    disturbance = DisturbanceConfig(rtk_white_m=0.006, rtk_correlated_m=0.01, rtk_correlation_m=10.0)
+    stated = pose_noise(disturbance, config.speed_mps)
+    route = build_route(config)
+    errors = []
+    for seed in range(400):
+        driven = drive_along(route, config, disturbance, np.random.default_rng(seed))
+        station = route.station_at(driven.recorded.stamp_s)
+        errors.append(driven.recorded.map_from_vehicle[:, :2, 3] - route.points_at(station))
+    error = np.stack(errors)
+    later = int(np.searchsorted(station, station[0] + 5.0))
+    apart_m = station[later] - station[0]
+    same, across = np.mean(error[:, 0] ** 2), np.mean(error[:, 0] * error[:, later])
+    fade = np.exp(-apart_m / stated.position_drift_over_m)
+    assert same == pytest.approx(stated.position_m**2, rel=0.2)
+    assert across == pytest.approx(stated.position_drift_m**2 * fade, rel=0.3)
+    assert stated.heading_drift_over_m == config.speed_mps * disturbance.heading_correlation_s

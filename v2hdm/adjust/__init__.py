@@ -5,11 +5,12 @@ inside. :mod:`v2hdm.adjust.problem` states the model.
 """
 
 from v2hdm.adjust.observability import Observability, observability
-from v2hdm.adjust.problem import Observations, PoseSigma, Problem, SolveOptions
+from v2hdm.adjust.problem import Drift, Observations, PoseSigma, Problem, SolveOptions
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
 
 __all__ = [
+    "Drift",
     "Observability",
     "Observations",
     "PoseSigma",

@@ -16,6 +16,8 @@ from v2hdm.records import FloatArray
 
 # Least step between frames, as a fraction of the correlation length.
 _MIN_STEP = 1e-4
+# Below this share of an error its white part is rounding left over from the drift.
+_MIN_WHITE_SHARE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,8 @@ class Arrays:
         measured: (2, K) where it was seen, on the plane at depth 1.
         root_information: (3, K) a, b, c with whitened residual (a dx, b dx + c dy), dx at depth 1.
         vehicle_from_map: (J, 4, 4) as recorded.
-        states: columns of the frame tangent that are estimated.
+        states: the column of the frame tangent that each state of a frame acts on. Where an error has a
+            drift beside its white part, two states act on one column.
         centre, centre_information_root: (C, 3) prior on the camera centres, and 1 / sigma.
         state_transition: (J, S, S) what a frame's states are expected to be, given the frame's before.
         state_information_root: (J, S) 1 / sigma of what is new in it.
@@ -103,8 +106,8 @@ def make_arrays(problem: Problem, pose_states: tuple[str, ...], device: str) -> 
     focal, principal = problem.intrinsic[seen.camera, :2], problem.intrinsic[seen.camera, 2:]
     measured = (seen.pinhole_px - principal) / focal
     root = np.linalg.inv(np.linalg.cholesky(seen.covariance_px)) * focal[:, None, :]
-    states = tuple(k for k, name in enumerate(POSE_STATES) if name in pose_states)
-    transition, information_root = _state_prior(problem, states)
+    components = _components(problem, pose_states)
+    transition, information_root = _state_prior(problem, components)
     centre, centre_root = _centre_prior(problem)
 
     def real(values: FloatArray) -> Tensor:
@@ -121,7 +124,7 @@ def make_arrays(problem: Problem, pose_states: tuple[str, ...], device: str) -> 
         measured=real(measured[order].T),
         root_information=real(np.stack([root[order, 0, 0], root[order, 1, 0], root[order, 1, 1]])),
         vehicle_from_map=inverse(real(problem.map_from_vehicle)),
-        states=states,
+        states=tuple(component.column for component in components),
         centre=real(centre),
         centre_information_root=real(centre_root),
         state_transition=real(transition),
@@ -137,23 +140,43 @@ def _centre_prior(problem: Problem) -> tuple[FloatArray, FloatArray]:
     return problem.centre_vehicle, 1 / problem.centre_sigma_m
 
 
-def _state_prior(problem: Problem, states: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
+@dataclass(frozen=True)
+class _Component:
+    """One state of a frame: the tangent's column, its sigma, and how far it fades (0: white)."""
+
+    column: int
+    sigma: float
+    over_m: float
+
+
+def _components(problem: Problem, pose_states: tuple[str, ...]) -> list[_Component]:
+    """The states of a frame: for each error its white part, then its drift, where there are any."""
+    total, drifts = problem.pose_sigma.by_state(), problem.pose_sigma.drift_by_state()
+    chosen = [k for k, name in enumerate(POSE_STATES) if name in pose_states]
+    white = {k: float(np.sqrt(max(total[k] ** 2 - drifts[k].sigma ** 2, 0.0))) for k in chosen}
+    components = [_Component(k, white[k], 0.0) for k in chosen if white[k] > _MIN_WHITE_SHARE * total[k]]
+    return components + [_Component(k, drifts[k].sigma, drifts[k].over_m) for k in chosen if drifts[k].sigma]
+
+
+def _state_prior(problem: Problem, components: list[_Component]) -> tuple[FloatArray, FloatArray]:
     """Transition (J, S, S) and inverse sigma (J, S) of the innovation of each frame's states.
 
-    Position errors are a first-order Gauss-Markov process along the driven distance d: memory
-    m = exp(-d / correlation_m), innovation variance sigma^2 (1 - m^2) (Gelb, Applied Optimal Estimation,
-    section 3.8). They keep their direction in the map, and so turn in the vehicle as it turns.
+    A drift is a first-order Gauss-Markov process along the driven distance d: memory m = exp(-d / over_m),
+    innovation variance sigma^2 (1 - m^2) (Gelb, Applied Optimal Estimation, section 3.8).
     """
-    poses, sigma = problem.map_from_vehicle, problem.pose_sigma.by_state()
-    transition = np.zeros((len(poses), 6, 6))
-    memory = np.zeros((len(poses), 6))
-    if problem.pose_sigma.correlation_m > 0:
-        step_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-        # A vehicle at rest repeats its error; a floor on the step keeps the innovation's sigma above 0.
-        step_m = np.maximum(step_m, _MIN_STEP * problem.pose_sigma.correlation_m)
-        memory[1:, :2] = np.exp(-step_m / problem.pose_sigma.correlation_m)[:, None]
-        turn = poses[1:, :2, :2].transpose(0, 2, 1) @ poses[:-1, :2, :2]
-        transition[1:, :2, :2] = memory[1:, :2, None] * turn
-    chosen = list(states)
-    information_root = 1 / (sigma * np.sqrt(1 - memory**2))
-    return transition[:, chosen][:, :, chosen], information_root[:, chosen]
+    poses = problem.map_from_vehicle
+    step_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    turn = np.tile(np.eye(6), (max(len(poses) - 1, 0), 1, 1))
+    turn[:, :2, :2] = poses[1:, :2, :2].transpose(0, 2, 1) @ poses[:-1, :2, :2]
+    transition = np.zeros((len(poses), len(components), len(components)))
+    information_root = np.empty((len(poses), len(components)))
+    for a, state in enumerate(components):
+        memory = np.zeros(len(poses))
+        if state.over_m:
+            # A vehicle at rest repeats its error; a floor on the step keeps the innovation's sigma above 0.
+            memory[1:] = np.exp(-np.maximum(step_m / state.over_m, _MIN_STEP))
+            for b, before in enumerate(components):
+                if before.over_m:
+                    transition[1:, a, b] = memory[1:] * turn[:, state.column, before.column]
+        information_root[:, a] = 1 / (state.sigma * np.sqrt(1 - memory**2))
+    return transition, information_root

@@ -126,5 +126,8 @@ def _check_priors(problem: Problem) -> None:
         camera = int(np.flatnonzero(~(problem.centre_sigma_m > 0).all(1))[0])
         raise AdjustError(f"centre_sigma_m of camera {camera} must be above 0 (inf where nothing is known)")
     sigma = problem.pose_sigma.by_state()
-    if not (np.isfinite(sigma).all() and (sigma > 0).all() and problem.pose_sigma.correlation_m >= 0):
+    if not (np.isfinite(sigma).all() and (sigma > 0).all()):
         raise AdjustError(f"pose_sigma must be above 0 and finite: {problem.pose_sigma}")
+    for total, drift in zip(sigma, problem.pose_sigma.drift_by_state(), strict=True):
+        if not (0 <= drift.sigma <= total and drift.over_m > 0):
+            raise AdjustError(f"{drift} must be part of its pose_sigma {total:g} and fade over a distance")

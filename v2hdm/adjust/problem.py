@@ -51,24 +51,43 @@ class Observations:
 
 
 @dataclass(frozen=True)
+class Drift:
+    """The slow part of a pose error: a first-order Gauss-Markov process along the route.
+
+    ``sigma`` is its standard deviation, in the unit of the error; ``over_m`` the driven distance over which
+    it fades to 1 / e. A sigma of 0 means that there is none.
+    """
+
+    sigma: float = 0.0
+    over_m: float = 30.0
+
+
+@dataclass(frozen=True)
 class PoseSigma:
     """How far the recorded poses are off, one standard deviation of each state of a frame.
 
-    ``correlation_m`` is the distance over which the error of the position in the map fades to 1 / e
-    (a first-order Gauss-Markov process along the route, as RTK has; frames must then be in driving
-    order); 0 means independent from frame to frame. Attitude and heave are always independent.
+    Of each, the ``..._drift`` is the part that fades along the route; frames must then be in driving
+    order. The rest, in quadrature, is independent from frame to frame. A drift of the position keeps its
+    direction in the map, and so turns in the vehicle as it turns.
     """
 
     position_m: float = 0.02
     heading_rad: float = 0.001
     roll_pitch_rad: float = 0.003
     height_m: float = 0.01
-    correlation_m: float = 0.0
+    position_drift: Drift = Drift()
+    heading_drift: Drift = Drift()
+    roll_pitch_drift: Drift = Drift()
 
     def by_state(self) -> FloatArray:
         """Sigmas (6,) in the order of :data:`POSE_STATES`."""
         position, attitude = self.position_m, self.roll_pitch_rad
         return np.array([position, position, self.height_m, attitude, attitude, self.heading_rad])
+
+    def drift_by_state(self) -> tuple[Drift, ...]:
+        """The six drifts in the order of :data:`POSE_STATES`."""
+        position, attitude = self.position_drift, self.roll_pitch_drift
+        return (position, position, Drift(), attitude, attitude, self.heading_drift)
 
 
 @dataclass(frozen=True)

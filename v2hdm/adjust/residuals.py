@@ -74,10 +74,10 @@ class Loss:
 
 
 def frame_tangent(arrays: Arrays, frame_state: Tensor) -> Tensor:
-    """The full tangents (J, 6) of the frames, zero where a state is not estimated."""
+    """The full tangents (J, 6) of the frames, zero where nothing is estimated."""
     tangent = frame_state.new_zeros(arrays.frame_count, 6)
-    tangent[:, list(arrays.states)] = frame_state
-    return tangent
+    columns = torch.tensor(arrays.states, dtype=torch.int64, device=tangent.device)
+    return tangent.index_add(1, columns, frame_state)
 
 
 def observe(arrays: Arrays, estimate: Estimate) -> View:

@@ -153,7 +153,19 @@ def _read_pose_noise(content: object, where: str) -> PoseNoise:
     for key, value in values.items():
         if value < 0:
             raise DriveError(f"{where}, {key}: a standard deviation cannot be negative; mend it")
-    return PoseNoise(**values)
+        if key.endswith("_over_m") and value == 0:
+            raise DriveError(
+                f"{where}, {key}: an error that fades over no distance is no drift; leave it out"
+            )
+    noise = PoseNoise(**values)
+    for total, drift in (
+        ("position_m", "position_drift_m"),
+        ("heading_rad", "heading_drift_rad"),
+        ("roll_pitch_rad", "roll_pitch_drift_rad"),
+    ):
+        if getattr(noise, drift) > getattr(noise, total):
+            raise DriveError(f"{where}, {drift}: is part of {total} and cannot be above it; mend one of them")
+    return noise
 
 
 def _read_origin(content: object, where: str) -> GeodeticOrigin | None:

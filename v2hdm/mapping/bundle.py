@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.adjust import Observations, PoseSigma, Problem, Solution, SolveOptions, solve
+from v2hdm.adjust import Drift, Observations, PoseSigma, Problem, Solution, SolveOptions, solve
 from v2hdm.errors import MappingError
 from v2hdm.mapping.association import Association
 from v2hdm.mapping.backprojection import camera_centres
@@ -84,6 +84,9 @@ def full_model(pose_noise: PoseNoise, options: MappingOptions) -> Model:
         heading_rad=pose_noise.heading_rad,
         roll_pitch_rad=pose_noise.roll_pitch_rad,
         height_m=HEAVE_SIGMA_M,
+        position_drift=Drift(pose_noise.position_drift_m, pose_noise.position_drift_over_m),
+        heading_drift=Drift(pose_noise.heading_drift_rad, pose_noise.heading_drift_over_m),
+        roll_pitch_drift=Drift(pose_noise.roll_pitch_drift_rad, pose_noise.roll_pitch_drift_over_m),
     )
     solver = SolveOptions(
         pose_states=tuple(options.pose_states),
@@ -136,31 +139,23 @@ def solve_bundle(
             "no marking was seen in two images, so nothing can be optimised; drive past the markings "
             "at a lower speed or raise the image rate."
         )
-    used_cameras, camera = np.unique(sightings.camera[row], return_inverse=True)
-    used_frames, frame = np.unique(sightings.frame[row], return_inverse=True)
-    own_corner = association.corner_order()[row, corner]
-    names = [sightings.cameras[c] for c in used_cameras]
-    centre, sigma = _centre_priors(names, cameras, rig.cam_from_vehicle[used_cameras])
-    intrinsic = rig.intrinsic[used_cameras]
-    problem = Problem(
-        intrinsic=np.column_stack([intrinsic[:, 0, 0], intrinsic[:, 1, 1], intrinsic[:, :2, 2]]),
-        cam_from_vehicle=rig.cam_from_vehicle[used_cameras],
-        map_from_vehicle=sightings.map_from_vehicle[used_frames],
-        observations=Observations(
-            camera=camera.astype(np.int64),
-            frame=frame.astype(np.int64),
-            corner=corner_index[group, corner],
-            pinhole_px=sightings.corners_pinhole_px[row, own_corner],
-            covariance_px=sightings.covariance_px[row, own_corner] + model.floor_px**2 * np.eye(2),
-        ),
-        corner_count=int(corner_index.max()) + 1,
-        centre_vehicle=centre,
-        centre_sigma_m=sigma,
-        pose_sigma=model.pose_sigma,
+    used = _Used(
+        *np.unique(sightings.camera[row], return_inverse=True),
+        *np.unique(sightings.frame[row], return_inverse=True),
     )
+    own_corner = association.corner_order()[row, corner]
+    observations = Observations(
+        camera=used.camera.astype(np.int64),
+        frame=used.frame.astype(np.int64),
+        corner=corner_index[group, corner],
+        pinhole_px=sightings.corners_pinhole_px[row, own_corner],
+        covariance_px=sightings.covariance_px[row, own_corner] + model.floor_px**2 * np.eye(2),
+    )
+    names = [sightings.cameras[c] for c in used.cameras]
+    problem = _problem(sightings, rig, used, [cameras[name] for name in names], observations, model)
     solution = solve(problem, model.solver)
     return Bundle(
-        rig=_adjusted_rig(rig, sightings, used_cameras, used_frames, solution),
+        rig=_adjusted_rig(rig, sightings, used, solution),
         problem=problem,
         solution=solution,
         association=association,
@@ -169,6 +164,39 @@ def solve_bundle(
         corner=corner,
         corner_index=corner_index,
         camera_index={name: c for c, name in enumerate(names)},
+    )
+
+
+@dataclass(frozen=True)
+class _Used:
+    """The cameras (C,) and frames (J,) of a problem, and which of them each observation (K,) has."""
+
+    cameras: IntArray
+    camera: IntArray
+    frames: IntArray
+    frame: IntArray
+
+
+def _problem(
+    sightings: Sightings,
+    rig: Rig,
+    used: _Used,
+    cameras: Sequence[Camera],
+    observations: Observations,
+    model: Model,
+) -> Problem:
+    """The adjustment of ``observations``, whose ``cameras`` are those of ``used``."""
+    centre, sigma = _centre_priors(cameras, rig.cam_from_vehicle[used.cameras])
+    intrinsic = rig.intrinsic[used.cameras]
+    return Problem(
+        intrinsic=np.column_stack([intrinsic[:, 0, 0], intrinsic[:, 1, 1], intrinsic[:, :2, 2]]),
+        cam_from_vehicle=rig.cam_from_vehicle[used.cameras],
+        map_from_vehicle=sightings.map_from_vehicle[used.frames],
+        observations=observations,
+        corner_count=int(observations.corner.max()) + 1,
+        centre_vehicle=centre,
+        centre_sigma_m=sigma,
+        pose_sigma=model.pose_sigma,
     )
 
 
@@ -188,24 +216,20 @@ def _observed_corners(
     return row[known], group[known], corner[known], number.reshape(-1, 4)
 
 
-def _centre_priors(
-    names: list[str], cameras: Mapping[str, Camera], cam_from_vehicle: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def _centre_priors(cameras: Sequence[Camera], cam_from_vehicle: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Prior camera centres and sigmas (C, 3): surveyed, or else implied by the starting extrinsic."""
     centre = camera_centres(cam_from_vehicle)
     sigma = np.full_like(centre, UNSURVEYED_CENTRE_SIGMA_M)
-    for c, name in enumerate(names):
-        prior = cameras[name].centre_prior
+    for c, camera in enumerate(cameras):
+        prior = camera.centre_prior
         if prior is not None:
             centre[c], sigma[c] = prior.centre_vehicle, prior.sigma_m
     return centre, sigma
 
 
-def _adjusted_rig(
-    rig: Rig, sightings: Sightings, used_cameras: IntArray, used_frames: IntArray, solution: Solution
-) -> Rig:
+def _adjusted_rig(rig: Rig, sightings: Sightings, used: _Used, solution: Solution) -> Rig:
     cam_from_vehicle = rig.cam_from_vehicle.copy()
-    cam_from_vehicle[used_cameras] = solution.cam_from_vehicle
+    cam_from_vehicle[used.cameras] = solution.cam_from_vehicle
     map_from_vehicle = sightings.map_from_vehicle.copy()
-    map_from_vehicle[used_frames] = solution.map_from_vehicle
+    map_from_vehicle[used.frames] = solution.map_from_vehicle
     return Rig(rig.intrinsic, cam_from_vehicle, map_from_vehicle)
