@@ -276,7 +276,7 @@ def _corner_line(tally: Tally) -> str:
     size = np.linalg.norm(error, axis=1)
     normalised = np.sort(tally.normalised)
     return (
-        f"corners within {CORNER_RANGE_M:g} m: {len(error)}, median {np.median(size):.3f} px, 95th percentile "
+        f"corners within {CORNER_RANGE_M:g} m: {len(error)}, median {np.median(size):.3f} px, 95 % below "
         f"{np.quantile(size, 0.95):.3f} px, bias ({error[:, 0].mean():+.3f}, {error[:, 1].mean():+.3f}) px; "
         f"normalised squared error median {np.median(normalised):.2f} (honest: 1.39), mean of the inner 95 % "
         f"{normalised[: int(0.95 * len(error))].mean():.2f} (honest: 1.60)"

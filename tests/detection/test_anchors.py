@@ -67,3 +67,24 @@ def test_a_few_missing_rows_do_not_break_a_line(view):
 def test_single_peaks_are_no_lines(view):
     alone = [AnchorRow(v, np.array([40.0]), np.array([3.0])) for v in (700.0, 600.0, 500.0, 400.0)]
     assert link_anchors(alone, view) == []
+
+
+def test_the_gap_between_two_dashes_does_not_break_a_line(view):
+    line = straight(view, 1.6)
+    rows = anchors_of(view, [line])
+    ground = view.ground(view.undistort(np.array([[row.u_px[0], row.v_px] for row in rows])))
+    dashed = [row for row, x in zip(rows, ground[:, 0], strict=True) if not 6.0 < x < 9.0]
+    assert len(rows) - len(dashed) > 5
+    (lane,) = link_anchors(dashed, view)
+    assert len(lane.points_px) == len(dashed)
+
+
+def test_lines_that_run_side_by_side_are_not_joined_across_a_gap(view):
+    near, far = straight(view, 1.6), straight(view, 3.2)
+    rows = [
+        row
+        for line, part in ((near, lambda v: v > 230), (far, lambda v: v < 215))
+        for row in anchors_of(view, [line])
+        if part(row.v_px)
+    ]
+    assert len(link_anchors(rows, view)) == 2

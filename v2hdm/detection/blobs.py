@@ -70,7 +70,7 @@ class Blob:
 
 
 def find_blobs(
-    sight: Sight, classes: Sequence[str], stride: int, top_px: int
+    sight: Sight, classes: Sequence[str], stride: int, top_px: int, reach_px: int = 0
 ) -> tuple[list[Blob], np.ndarray]:
     """Split the paint of one image into blobs.
 
@@ -79,6 +79,7 @@ def find_blobs(
         classes: names of the channels of its ``kinds``.
         stride: recorded pixels per element of its ``paint``.
         top_px: image row at which the band starts.
+        reach_px: image row; blobs that lie above it as a whole are too far away to be of use.
 
     Returns:
         The blobs, and a map (h, w) int16 with 1 + the index of the blob that covers each element of
@@ -93,6 +94,8 @@ def find_blobs(
         if len(contour) < 4:
             continue
         x, y, w, h = cv2.boundingRect(contour)
+        if stride * (y + h) + top_px < reach_px:
+            continue
         filled = np.zeros((h, w), dtype=np.uint8)
         cv2.drawContours(filled, [contour], -1, 1, cv2.FILLED, offset=(-x, -y))
         inside = filled.view(np.bool_)

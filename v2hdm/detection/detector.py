@@ -10,7 +10,7 @@ import numpy as np
 from v2hdm.detection.anchors import link_anchors
 from v2hdm.detection.blobs import Blob, find_blobs, outline_polygon
 from v2hdm.detection.corners import Foreground, QuadStart, fit_markings
-from v2hdm.detection.lanes import trace_lanes
+from v2hdm.detection.lanes import LanePaint, trace_lanes
 from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.plausible import plausible_kind
@@ -48,6 +48,7 @@ class Detector:
         self.network = network
         self.options = options
         self._views: dict[str, CameraView] = {}
+        self._reach_px: dict[str, int] = {}
 
     @classmethod
     def load(cls, path: str | Path | None = None, options: DetectorOptions | None = None) -> Detector:
@@ -72,16 +73,11 @@ class Detector:
         _check_image(image_bgr, camera)
         info = self.network.info
         sight = look(self.network, image_bgr, view)
-        blobs, owner = find_blobs(sight, info.classes, info.paint_stride, view.top)
+        reach_px = self._reach_px[camera.info.name]
+        blobs, owner = find_blobs(sight, info.classes, info.paint_stride, view.top, reach_px)
         candidates = self._candidates(blobs, view)
-        lanes = [
-            lane
-            for c in candidates
-            if c.kind in LANE_CLASSES
-            for lane in trace_lanes(
-                c.blob, c.kind, c.score, view, self.options.lane_step_m, self.options.max_range_m
-            )
-        ]
+        paint = [LanePaint(c.blob, c.kind, c.score) for c in candidates if c.kind in LANE_CLASSES]
+        lanes = trace_lanes(paint, view, self.options.lane_step_m, self.options.max_range_m)
         lanes += link_anchors(sight.anchors, view)
         starts = [start for c in candidates if (start := self._start(c, view)) is not None]
         foreground = Foreground(owner, info.paint_stride, view.top)
@@ -95,6 +91,7 @@ class Detector:
         if view is None or view.camera is not camera:
             view = CameraView(camera, self.network.info.multiple)
             self._views[camera.info.name] = view
+            self._reach_px[camera.info.name] = view.first_row_within(self.options.max_range_m)
         return view
 
     def _candidates(self, blobs: list[Blob], view: CameraView) -> list[_Candidate]:

@@ -1,6 +1,9 @@
-"""From a blob of lane paint to its centre line as a row of points."""
+"""From blobs of lane paint to their centre lines as rows of points."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -9,47 +12,84 @@ from v2hdm.detection.ground import apply_homography
 from v2hdm.detection.view import CameraView
 from v2hdm.records import FloatArray, LaneDetection
 
-_MAX_WIDTH_M = 0.7
 _CAP_WIDTH_RATIO = 0.7
 _MIN_POINTS = 2
 _ROWS_MIN_ASPECT = 0.35
 
 
-def trace_lanes(
-    blob: Blob, kind: str, score: float, view: CameraView, step_m: float, max_range_m: float
-) -> list[LaneDetection]:
-    """The centre lines of one blob, a point every ``step_m`` on the ground, near to far.
+@dataclass(frozen=True)
+class LanePaint:
+    """A blob that is lane paint of class ``kind``."""
 
-    The blob is cut by image rows (by columns where it lies flat); each cut's two edge points are
+    blob: Blob
+    kind: str
+    score: float
+
+
+def trace_lanes(
+    paints: Sequence[LanePaint], view: CameraView, step_m: float, max_range_m: float
+) -> list[LaneDetection]:
+    """The centre lines of one image's lane paint, a point every ``step_m`` on the ground, near to far.
+
+    A blob is cut by image rows (by columns where it lies flat); each cut's two edge points are
     taken to the ground by the camera's initial IPM and averaged there, so perspective does not pull
     the centre. Cuts through the slanted ends, narrower than the rest, are left out. A blob of two
     lines that touch gives one row of points for each branch.
     """
+    branches = [(paint, edges) for paint in paints for edges in _branches(paint.blob)]
+    if not branches:
+        return []
+    edges_px = np.concatenate([edges for _, edges in branches])
+    edges_vehicle = view.ground(view.undistort(edges_px.reshape(-1, 2))).reshape(-1, 2, 2)
+    ends = np.cumsum([len(edges) for _, edges in branches])[:-1]
+    traced = [
+        (paint, points)
+        for (paint, _), edges in zip(branches, np.split(edges_vehicle, ends), strict=True)
+        if len(points := _resample(_centre(edges), view, step_m, max_range_m)) >= _MIN_POINTS
+    ]
+    if not traced:
+        return []
+    points_vehicle = np.concatenate([points for _, points in traced])
+    points_px = view.distort(apply_homography(view.pinhole_px_from_vehicle, points_vehicle))
+    ends = np.cumsum([len(points) for _, points in traced])[:-1]
+    return [
+        LaneDetection(paint.kind, paint.score, points)
+        for (paint, _), points in zip(traced, np.split(points_px, ends), strict=True)
+    ]
+
+
+def _branches(blob: Blob) -> list[FloatArray]:
+    """The two edges (n, 2, 2), recorded px, of each branch of a blob, cut by cut."""
     height, width = blob.level.shape
     by_rows = height >= _ROWS_MIN_ASPECT * width
     order = [1, 0] if by_rows else [0, 1]
-    lanes = []
-    for chain in _chains(_cuts(blob.level if by_rows else blob.level.T)):
-        first, second = chain[:, [0, 1]][:, order], chain[:, [0, 2]][:, order]
-        centre_vehicle = _centre_on_ground(blob, view, first, second)
-        points_vehicle = _resample(centre_vehicle, view, step_m, max_range_m)
-        if len(points_vehicle) >= _MIN_POINTS:
-            points_pinhole_px = apply_homography(view.pinhole_px_from_vehicle, points_vehicle)
-            lanes.append(LaneDetection(kind, score, view.distort(points_pinhole_px)))
-    return lanes
+    return [
+        blob.origin_px + blob.stride * np.stack([chain[:, [0, 1]], chain[:, [0, 2]]], axis=1)[..., order]
+        for chain in _chains(_cuts(blob.level if by_rows else blob.level.T))
+    ]
 
 
-def _cuts(level: np.ndarray) -> list[FloatArray]:
-    """Per row of a field (h, w): runs (R, 3) of row, start and end column of where it is positive."""
+def _cuts(level: np.ndarray) -> FloatArray:
+    """Runs (R, 3) of row, start and end column of where a field (h, w) is positive, in order."""
     i, j = np.nonzero((level[:, :-1] > 0) != (level[:, 1:] > 0))
     crossing = j + level[i, j] / (level[i, j] - level[i, j + 1])
-    runs = np.column_stack([i[::2], crossing[::2], crossing[1::2]]).astype(np.float64)
+    return np.column_stack([i[::2], crossing[::2], crossing[1::2]]).astype(np.float64)
+
+
+def _chains(runs: FloatArray) -> list[FloatArray]:
+    """Runs linked from row to row where they overlap (n, 3), each chain one branch of the blob."""
+    if len(runs) < _MIN_POINTS:
+        return []
+    above, below = runs[:-1], runs[1:]
+    linked = (below[:, 0] == above[:, 0] + 1) & (above[:, 1] < below[:, 2]) & (below[:, 1] < above[:, 2])
+    if linked.all():
+        return [runs]
     breaks = np.flatnonzero(np.diff(runs[:, 0])) + 1
-    return np.split(runs, breaks)
+    return _branching_chains(np.split(runs, breaks))
 
 
-def _chains(cuts: list[FloatArray]) -> list[FloatArray]:
-    """Runs (n, 3) linked from row to row where they overlap, each chain one branch of the blob."""
+def _branching_chains(cuts: list[FloatArray]) -> list[FloatArray]:
+    """The chains of a blob some rows of which hold several runs; ``cuts`` has the runs row by row."""
     open_chains: list[list[FloatArray]] = []
     closed: list[list[FloatArray]] = []
     for runs in cuts:
@@ -74,17 +114,15 @@ def _chains(cuts: list[FloatArray]) -> list[FloatArray]:
     return [np.array(chain) for chain in closed + open_chains if len(chain) >= _MIN_POINTS]
 
 
-def _centre_on_ground(blob: Blob, view: CameraView, first: FloatArray, second: FloatArray) -> FloatArray:
-    """Centres (n, 2) on the ground, vehicle frame, of cuts between two edge points given in blob cells."""
-    cells = np.concatenate([first, second])
-    edge_vehicle = view.ground(view.undistort(blob.origin_px + blob.stride * cells)).reshape(2, -1, 2)
-    width_m = np.linalg.norm(edge_vehicle[1] - edge_vehicle[0], axis=1)
+def _centre(edges_vehicle: FloatArray) -> FloatArray:
+    """Centres (n, 2) of cuts between two edge points on the ground (n, 2, 2), caps left out."""
+    width_m = np.linalg.norm(edges_vehicle[:, 1] - edges_vehicle[:, 0], axis=1)
     finite = np.isfinite(width_m)
     if not finite.any():
         return np.empty((0, 2))
     typical_m = float(np.median(width_m[finite]))
     whole = finite & (width_m > _CAP_WIDTH_RATIO * typical_m) & (width_m < typical_m / _CAP_WIDTH_RATIO)
-    return np.asarray(edge_vehicle.mean(axis=0)[whole])
+    return np.asarray(edges_vehicle.mean(axis=1)[whole])
 
 
 def _resample(centre_vehicle: FloatArray, view: CameraView, step_m: float, max_range_m: float) -> FloatArray:

@@ -86,12 +86,21 @@ class CameraView:
         row = self.vehicle_from_pinhole_px[2]
         return np.asarray(points_pinhole_px @ row[:2] + row[2])
 
-    def _band_rows(self, multiple: int) -> tuple[int, int]:
+    def first_row_within(self, range_m: float) -> int:
+        """The uppermost row of the band that shows ground within ``range_m`` of the camera's foot."""
+        near = self.range_m(self._row_grid_vehicle()) <= range_m
+        return max(self.top, int(np.argmax(near.any(axis=1)))) if near.any() else self.info.height
+
+    def _row_grid_vehicle(self) -> FloatArray:
+        """Ground points (H, 9, 2) of every row at nine columns, vehicle frame; nan above the horizon."""
         columns = np.linspace(0, self.info.width - 1, 9)
         rows = np.arange(self.info.height, dtype=np.float64)
-        grid_px = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-        on_ground = self._ground_depth(self.undistort(grid_px)) * self._ground_sign > 0
-        first = int(np.argmax(on_ground.reshape(len(rows), -1).any(axis=1)))
+        grid_px = np.stack(np.meshgrid(columns, rows), axis=-1)
+        return self.ground(self.undistort(grid_px.reshape(-1, 2))).reshape(grid_px.shape)
+
+    def _band_rows(self, multiple: int) -> tuple[int, int]:
+        on_ground = np.isfinite(self._row_grid_vehicle()).all(axis=2).any(axis=1)
+        first = int(np.argmax(on_ground))
         height = self.info.height - max(0, first - _HORIZON_MARGIN_PX)
         height = min(-(-height // multiple) * multiple, self.info.height)
         return self.info.height - height, height
