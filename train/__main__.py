@@ -12,6 +12,7 @@ from rich.logging import RichHandler
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from train.config import TrainConfig
+from train.distributed import Team, joined_team
 from train.door import open_door
 from train.loop import Trainer
 
@@ -22,7 +23,12 @@ def main(composed: DictConfig) -> None:
     """Train the detector's network."""
     config = OmegaConf.to_object(composed)
     assert isinstance(config, TrainConfig)
-    console = Console(stderr=True)
+    with joined_team(config.device) as team:
+        _train(config, team)
+
+
+def _train(config: TrainConfig, team: Team) -> None:
+    console = Console(stderr=True, quiet=not team.leads)
     handler = RichHandler(console=console, show_path=False)
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[handler], force=True)
     columns = (
@@ -33,7 +39,9 @@ def main(composed: DictConfig) -> None:
     )
     with Progress(*columns, console=console) as bar:
         task = bar.add_task("rendering the validation set", total=1.0)
-        trainer = Trainer(config, lambda share, line: bar.update(task, completed=share, description=line))
+        trainer = Trainer(
+            config, lambda share, line: bar.update(task, completed=share, description=line), team
+        )
         state = trainer.run()
     console.print(
         f"trained {state.step} steps, mean IoU {state.best_iou:.3f}: {Path(config.output) / 'best.pt'}"

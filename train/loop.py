@@ -6,6 +6,7 @@ import logging
 import math
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from models import MarkingNet, Prediction
 from train.checkpoint import Checkpoint, check_same_experiment, load_checkpoint, save_checkpoint
 from train.config import TrainConfig
 from train.data import Pair, training_batches, validation_pairs
+from train.distributed import Team, choose_device
 from train.losses import total_loss
 from train.metrics import Score, Tally
 from train.targets import Targets
@@ -31,10 +33,14 @@ Progress = Callable[[float, str], None]
 
 @dataclass
 class Trainer:
-    """A training run in the folder ``config.output``: last.pt, best.pt and TensorBoard's log."""
+    """A training run in the folder ``config.output``: last.pt, best.pt and TensorBoard's log.
+
+    Of a ``team`` each member has its trainer; ``config.batch`` images a member make up an update.
+    """
 
     config: TrainConfig
     progress: Progress
+    team: Team | None = None
 
     def __post_init__(self) -> None:
         config = self.config
@@ -42,9 +48,11 @@ class Trainer:
             raise ConfigError("the training has no end: set minutes= or steps=")
         torch.manual_seed(config.seed)
         torch.set_num_threads(config.threads)
-        self.device = _device(config.device)
+        self._team = self.team or Team(choose_device(config.device))
+        self.device = self._team.device
         self.output = Path(config.output)
-        self.state = self._open()
+        self.state = self._team.from_leader(self._open)
+        self._resumed_at = self.state.step, self.state.renders
         self.net = MarkingNet(config.net).to(self.device)
         self.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         average = get_ema_multi_avg_fn(1.0 - 1.0 / config.ema_updates)  # type: ignore[no-untyped-call]
@@ -52,18 +60,21 @@ class Trainer:
         self.optimizer = torch.optim.AdamW(self.net.parameters(), weight_decay=config.weight_decay)
         if self.state.step:
             self._restore()
+        self._team.follow([*self.net.state_dict().values(), *self.averaged.module.state_dict().values()])
 
     def run(self) -> Checkpoint:
         """Train to the end; returns the last state, which is also in last.pt."""
-        config, state = self.config, self.state
-        validation = list(validation_pairs(config.data, config.seed, config.validation.images))
-        batches = training_batches(config.data, config.seed, config.batch, state.renders)
+        config, state, team = self.config, self.state, self._team
+        part = team.rank, team.size
+        batches = training_batches(config.data, config.seed, config.batch, state.renders, part)
+        images = config.validation.images if team.leads else 0
+        validation = list(validation_pairs(config.data, config.seed, images))
         begun = time.monotonic() - state.elapsed_s
         saved = validated = state.elapsed_s
-        with SummaryWriter(str(self.output)) as board:
+        with SummaryWriter(str(self.output)) if team.leads else nullcontext() as board:
             while self._share() < 1:
                 loss = self._update(next(batches))
-                state.elapsed_s = time.monotonic() - begun
+                state.elapsed_s = team.agree(time.monotonic() - begun)
                 if state.step % 20 == 0:
                     self._report(loss, board)
                 if state.elapsed_s - validated > 60 * config.validation.every_minutes:
@@ -119,12 +130,19 @@ class Trainer:
         loss = total_loss(prediction, targets, self.config.loss)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
+        # Statistics of the normalisations are averaged, too: each member has seen its own images only.
+        gradients = [p.grad for p in self.net.parameters() if p.grad is not None]
+        statistics = [buffer for buffer in self.net.buffers() if buffer.is_floating_point()]
+        loss = loss.detach()
+        self._team.average([*gradients, *statistics, loss])
         nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
         self.optimizer.step()
         self.averaged.update_parameters(self.net)
         self.state.step += 1
-        self.state.renders = -(-self.state.step * self.config.batch // self.config.data.views_per_render)
-        return float(loss.detach())
+        step, renders = self._resumed_at
+        views = (self.state.step - step) * self.config.batch * self._team.size
+        self.state.renders = renders - (-views // self.config.data.views_per_render)
+        return float(loss)
 
     def _to_device(self, batch: Pair) -> Pair:
         image, targets = batch
@@ -132,9 +150,9 @@ class Trainer:
         return image.to(self.device, non_blocking=True), Targets(*move)
 
     @torch.inference_mode()
-    def _validate(self, pairs: list[Pair], board: SummaryWriter) -> None:
+    def _validate(self, pairs: list[Pair], board: SummaryWriter | None) -> None:
         """Score the averaged weights and keep them if they are the best yet."""
-        if not pairs:
+        if not pairs or board is None:
             return
         self.averaged.eval()
         tally = Tally()
@@ -151,7 +169,9 @@ class Trainer:
             self.state.best_iou = score.mean_iou
             self._save("best.pt")
 
-    def _report(self, loss: float, board: SummaryWriter) -> None:
+    def _report(self, loss: float, board: SummaryWriter | None) -> None:
+        if board is None:
+            return
         board.add_scalar("train/loss", loss, self.state.step)
         board.add_scalar("train/learning_rate", self._learning_rate(), self.state.step)
         rate = self.state.step * self.config.batch / max(self.state.elapsed_s, 1e-9)
@@ -161,6 +181,8 @@ class Trainer:
         self.progress(min(self._share(), 1.0), figures)
 
     def _save(self, name: str) -> None:
+        if not self._team.leads:
+            return
         self.state.model = _on_cpu(self.net.state_dict())
         self.state.averaged = _on_cpu(self.averaged.module.state_dict())
         self.state.optimizer = self.optimizer.state_dict()
@@ -181,13 +203,3 @@ def summary(score: Score) -> str:
 
 def _on_cpu(state: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name: value.detach().cpu().clone() for name, value in state.items()}
-
-
-def _device(name: str) -> torch.device:
-    """The device of a name; ``auto`` is a GPU where there is one."""
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        return torch.device(name)
-    except RuntimeError as error:
-        raise ConfigError(f"device={name} is unknown: use auto, cpu or cuda") from error

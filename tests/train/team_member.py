@@ -1,0 +1,44 @@
+"""One of the processes that test_distributed.py starts with torchrun: trains, goes on, leaves its weights."""
+
+import sys
+from pathlib import Path
+
+import torch
+
+from models import NetConfig
+from train.config import DataConfig, TrainConfig, ValidationConfig
+from train.data import RenderStream
+from train.distributed import joined_team
+from train.loop import Trainer
+
+
+def tiny(output: Path, steps: int) -> TrainConfig:
+    return TrainConfig(
+        output=str(output),
+        device="cpu",
+        steps=steps,
+        batch=2,
+        net=NetConfig(widths=[16, 16, 16, 16], dilations=[1]),
+        data=DataConfig(
+            width=64, height=32, render_width=80, render_height=48, views_per_render=2, reservoir=4, workers=0
+        ),
+        validation=ValidationConfig(images=1),
+    )
+
+
+def main(folder: Path) -> None:
+    seen: list[int] = []
+    render = RenderStream._render
+    RenderStream._render = lambda self, index: (seen.append(index), render(self, index))[1]
+    with joined_team("cpu") as team:
+        for steps in (2, 4):
+            trainer = Trainer(tiny(folder / "run", steps), lambda share, line: None, team)
+            left = trainer.state.step
+            state = trainer.run()
+        members = {"net": trainer.net.state_dict(), "averaged": trainer.averaged.module.state_dict()}
+        plain = {"left": left, "step": state.step, "renders": state.renders, "seen": seen}
+        torch.save(members | plain, folder / f"member{team.rank}.pt")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
