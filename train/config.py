@@ -26,7 +26,7 @@ class DataConfig:
     height: int = 256
     render_width: int = 512
     render_height: int = 288
-    views_per_render: int = 4
+    views_per_render: int = 6
     reservoir: int = 256
     easy_samples: int = 1000
     workers: int = 1
@@ -47,7 +47,7 @@ class LossConfig:
 
     paint_weight: float = 2.0
     dice: float = 0.5
-    kinds: float = 0.4
+    kinds: float = 1.0
     lanes: float = 0.4
     lane_weight: float = 3.0
 
