@@ -118,7 +118,7 @@ def street_paint(rng: np.random.Generator, brush: Brush, bend: Bend) -> RoadPain
     for lane in lines[:-1]:
         if rng.random() < 0.3:
             road.paints += _lane_symbols(rng, brush, bend, (lane + 1) * lane_m + here, lane_m)
-    if rng.random() < 0.25:
+    if rng.random() < 0.45:
         road.paints += _junction(rng, brush, bend, lane_m)
     return road
 
@@ -141,7 +141,7 @@ def port_paint(rng: np.random.Generator, brush: Brush, bend: Bend) -> RoadPaint:
             paints.append(brush.paint(rng, DIAMOND, shape))
     dash = _dash_pattern(rng)
     road = RoadPaint()
-    if rng.random() < 0.2:
+    if rng.random() < 0.4:
         road.paints += _junction(rng, brush, bend, 3.2)
     if rng.random() < 0.35:
         road.paints += _lane_symbols(rng, brush, bend, rng.uniform(-4, 4), 3.2)
