@@ -80,13 +80,12 @@ def _draw_marking(canvas: np.ndarray, marking: MarkingDetection) -> None:
 
 
 def _write(canvas: np.ndarray, text: str, at_px: FloatArray, colour: tuple[int, int, int]) -> None:
-    """Text to the right of a point, with a dark rim so that it shows on paint."""
+    """Text to the right of a point, with a shadow so that it shows on paint."""
     scale = max(_LEAST_TEXT_SCALE, _TEXT_SCALE * min(1.0, canvas.shape[1] / _FULL_WIDTH_PX))
     u, v = (int(c) for c in np.clip(np.nan_to_num(at_px), -_FAR_PX, _FAR_PX))
-    for thickness, tone in ((3, (0, 0, 0)), (1, colour)):
-        cv2.putText(
-            canvas, text, (u + 6, v + 4), cv2.FONT_HERSHEY_SIMPLEX, scale, tone, thickness, cv2.LINE_AA
-        )
+    for shift, tone in ((1, (0, 0, 0)), (0, colour)):
+        at = (u + 6 + shift, v + 4 + shift)
+        cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, tone, 1, cv2.LINE_AA)
 
 
 def _fixed(points_px: FloatArray) -> np.ndarray:

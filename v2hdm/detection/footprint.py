@@ -2,10 +2,53 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from v2hdm.detection.view import CameraView
 from v2hdm.records import Calibration, FloatArray
+
+
+@dataclass(frozen=True)
+class GroundPoints:
+    """Points on the ground plane: ``points_vehicle`` (N, 2), m, nan where a pixel shows no ground.
+
+    ``by_px`` (N, 2, 2) and ``by_mounting`` (N, 2, 6) are their derivatives by the recorded pixel and by the
+    tangent of ``cam_from_vehicle``, whose covariance is ``mounting_covariance`` (6, 6).
+    """
+
+    points_vehicle: FloatArray
+    by_px: FloatArray
+    by_mounting: FloatArray
+    mounting_covariance: FloatArray
+
+    def __getitem__(self, part: slice) -> GroundPoints:
+        """Some of the points."""
+        return GroundPoints(
+            self.points_vehicle[part], self.by_px[part], self.by_mounting[part], self.mounting_covariance
+        )
+
+    def joint_covariance(self, covariance_px: FloatArray) -> FloatArray:
+        """Covariance (2N, 2N), m^2, of the stacked points (x0, y0, x1, ...).
+
+        ``covariance_px`` (2N, 2N) is that of their pixels (u0, v0, u1, ...). The rows and columns of points that are not on the ground are nan.
+        """
+        count = len(self.points_vehicle)
+        blocks = np.zeros((count, 2, count, 2))
+        blocks[range(count), :, range(count)] = self.by_px
+        jacobian = blocks.reshape(2 * count, 2 * count)
+        stacked = self.by_mounting.reshape(2 * count, 6)
+        return np.asarray(
+            jacobian @ covariance_px @ jacobian.T + stacked @ self.mounting_covariance @ stacked.T
+        )
+
+    def single_covariances(self, sigma_px: float) -> FloatArray:
+        """Covariance (N, 2, 2), m^2, of each point, its pixel being off by ``sigma_px`` in u and v alike."""
+        covariance = sigma_px**2 * self.by_px @ np.swapaxes(self.by_px, 1, 2)
+        return np.asarray(
+            covariance + self.by_mounting @ self.mounting_covariance @ np.swapaxes(self.by_mounting, 1, 2)
+        )
 
 
 class Footprint:
@@ -29,35 +72,10 @@ class Footprint:
         self._cam_from_vehicle = calibration.cam_from_vehicle
         self._covariance = np.zeros((6, 6)) if calibration.covariance is None else calibration.covariance
 
-    def polygon(self, points_px: FloatArray, covariance_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Points whose errors hang together.
-
-        Args:
-            points_px: (N, 2).
-            covariance_px: (2N, 2N) of the stacked points (u0, v0, u1, ...).
-
-        Returns:
-            The points (N, 2), m, vehicle frame, and their covariance (2N, 2N), m^2, likewise stacked; nan
-            where a point is not on the ground.
-        """
+    def of(self, points_px: FloatArray) -> GroundPoints:
+        """Recorded pixels (N, 2) on the ground; best called once for all points of an image."""
         points_vehicle, by_px, by_mounting = self._linearised(points_px)
-        count = len(points_vehicle)
-        blocks = np.zeros((count, 2, count, 2))
-        blocks[range(count), :, range(count)] = by_px
-        jacobian = blocks.reshape(2 * count, 2 * count)
-        stacked = by_mounting.reshape(2 * count, 6)
-        return points_vehicle, jacobian @ covariance_px @ jacobian.T + stacked @ self._covariance @ stacked.T
-
-    def points(self, points_px: FloatArray, sigma_px: float) -> tuple[FloatArray, FloatArray]:
-        """Points (N, 2) on the ground, each with its own covariance (N, 2, 2), m^2.
-
-        Args:
-            points_px: (N, 2).
-            sigma_px: standard deviation of either coordinate.
-        """
-        points_vehicle, by_px, by_mounting = self._linearised(points_px)
-        covariance = sigma_px**2 * by_px @ np.swapaxes(by_px, 1, 2)
-        return points_vehicle, covariance + by_mounting @ self._covariance @ np.swapaxes(by_mounting, 1, 2)
+        return GroundPoints(points_vehicle, by_px, by_mounting, self._covariance)
 
     def _linearised(self, points_px: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Points (N, 2) and their derivatives by recorded pixel (N, 2, 2) and by the mounting (N, 2, 6)."""

@@ -10,13 +10,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.footprint import Footprint
+from v2hdm.detection.footprint import Footprint, GroundPoints
 from v2hdm.detection.mounting import camera_from_calibration
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.stopwatch import lap
@@ -123,22 +125,29 @@ class RoadDetector:
         """
         markings, lanes = self.detector.detect(image_bgr, self.camera)
         with lap("metres"):
-            return Road(
-                tuple(self._on_ground(marking) for marking in markings),
-                tuple(self._line_on_ground(lane) for lane in lanes),
-            )
+            return self._on_ground(markings, lanes)
 
-    def _on_ground(self, marking: MarkingDetection) -> RoadMarking:
+    def _on_ground(self, markings: Sequence[MarkingDetection], lanes: Sequence[LaneDetection]) -> Road:
         none = np.empty((0, 2))
         if self.footprint is None:
-            return RoadMarking(marking, none, np.empty((0, 0)), none)
-        if len(marking.outline_px):
-            outline, _ = self.footprint.points(marking.outline_px, 0.0)
-            return RoadMarking(marking, none, np.empty((0, 0)), outline)
-        corners, covariance = self.footprint.polygon(marking.corners_px, marking.covariance_px)
-        return RoadMarking(marking, corners, covariance, none)
+            return Road(
+                tuple(RoadMarking(marking, none, np.empty((0, 0)), none) for marking in markings),
+                tuple(RoadLane(lane, none, np.empty((0, 2, 2))) for lane in lanes),
+            )
+        shapes_px = [m.outline_px if len(m.outline_px) else m.corners_px for m in markings]
+        shapes_px += [lane.points_px for lane in lanes]
+        ground = self.footprint.of(np.concatenate([none, *shapes_px]))
+        ends = np.cumsum([0, *map(len, shapes_px)])
+        parts = [ground[begin:end] for begin, end in pairwise(ends.tolist())]
+        return Road(tuple(map(_marking, markings, parts)), tuple(map(_lane, lanes, parts[len(markings) :])))
 
-    def _line_on_ground(self, lane: LaneDetection) -> RoadLane:
-        if self.footprint is None:
-            return RoadLane(lane, np.empty((0, 2)), np.empty((0, 2, 2)))
-        return RoadLane(lane, *self.footprint.points(lane.points_px, LANE_SIGMA_PX))
+
+def _marking(image: MarkingDetection, ground: GroundPoints) -> RoadMarking:
+    none = np.empty((0, 2))
+    if len(image.outline_px):
+        return RoadMarking(image, none, np.empty((0, 0)), ground.points_vehicle)
+    return RoadMarking(image, ground.points_vehicle, ground.joint_covariance(image.covariance_px), none)
+
+
+def _lane(image: LaneDetection, ground: GroundPoints) -> RoadLane:
+    return RoadLane(image, ground.points_vehicle, ground.single_covariances(LANE_SIGMA_PX))
