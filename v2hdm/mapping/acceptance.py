@@ -20,6 +20,9 @@ from v2hdm.records import BoolArray, FloatArray
 
 IntArray = NDArray[np.int64]
 
+ODD_SHAPE = "not shaped like the others of its class"
+"""The reason of a refusal that a single misplaced corner may have brought about."""
+
 MIN_EASY_VIEWS = 5
 """Easy views below which a share of detections says nothing."""
 
@@ -76,7 +79,7 @@ def judge(candidates: Candidates, options: AcceptanceOptions) -> list[str | None
     _refuse(verdict, ~is_convex(candidates.corners_map), "not a convex quadrilateral")
     _refuse(verdict, _uncertain(candidates, options), "its position is too uncertain")
     typical, odd = _judge_shapes(candidates, verdict, options)
-    _refuse(verdict, odd, "not shaped like the others of its class")
+    _refuse(verdict, odd, ODD_SHAPE)
     _refuse(verdict, candidates.completed & ~typical, "a corner was never seen twice")
     seldom = _seldom_detected(candidates, verdict, options) & ~typical
     _refuse(verdict, seldom, "found in too few of its images")
@@ -130,24 +133,34 @@ def _judge_shapes(
     Peers agree in sides and diagonals. A class may hold several shapes, such as the dashes of two
     kinds of road; what is odd is a shape that hardly any other shares.
     """
-    lengths = _lengths(candidates.corners_map)
+    lengths = characteristic_lengths(candidates.corners_map)
     typical = np.zeros(len(lengths), dtype=bool)
     odd = np.zeros(len(lengths), dtype=bool)
     for kind in np.unique(candidates.kind):
         own = np.flatnonzero((candidates.kind == kind) & _standing(verdict))
         if len(own) < options.consensus_count:
             continue
-        tolerance = np.maximum(options.shape_tolerance * lengths[own], MIN_SHAPE_TOLERANCE_M)
-        alike = np.abs(lengths[own][:, None] - lengths[own][None]) <= tolerance[:, None]
-        peers = alike.all(axis=2).sum(axis=1) - 1
-        lonely = peers < max(MIN_PEERS, PEER_SHARE * len(own))
+        peers = count_peers(lengths[own], lengths[own], options) - 1
+        lonely = peers < least_peers(len(own))
         if lonely.mean() <= MAX_LONELY_SHARE:
             odd[own[lonely]] = True
             typical[own[~lonely]] = True
     return typical, odd
 
 
-def _lengths(corners: FloatArray) -> FloatArray:
+def count_peers(lengths: FloatArray, others: FloatArray, options: AcceptanceOptions) -> IntArray:
+    """How many of the shapes ``others`` (P, 4) each of the shapes ``lengths`` (G, 4) agrees with."""
+    tolerance = np.maximum(options.shape_tolerance * lengths, MIN_SHAPE_TOLERANCE_M)
+    alike = np.abs(lengths[:, None] - others[None]) <= tolerance[:, None]
+    return np.asarray(alike.all(axis=2).sum(axis=1))
+
+
+def least_peers(members: int) -> float:
+    """Peers that establish a shape in a class of so many members."""
+    return max(MIN_PEERS, PEER_SHARE * members)
+
+
+def characteristic_lengths(corners: FloatArray) -> FloatArray:
     """Mean lengths of the two pairs of opposite sides, and the diagonals (G, 4), each pair sorted.
 
     They do not depend on which corner comes first.

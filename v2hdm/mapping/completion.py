@@ -1,8 +1,9 @@
 """The fourth corner of a marking of which only three were seen well enough.
 
-A container's edge, a puddle or worn paint can hide one corner from every image. Diamonds and dashes
-are parallelograms on the ground, so three corners imply the fourth, p1 + p3 - p2, and with it a
-covariance. Whether the marking is accepted is then up to the shape that results.
+A container's edge, a puddle or worn paint can hide one corner from every image, and where a shadow's
+edge crosses it, the corner of the sunlit part may be taken for that of the marking in every image.
+Diamonds and dashes are parallelograms on the ground, so three corners imply the fourth, p1 + p3 - p2,
+and with it a covariance. Whether the marking is accepted is then up to the shape that results.
 """
 
 from __future__ import annotations
@@ -10,9 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from v2hdm.mapping.acceptance import characteristic_lengths, count_peers, least_peers
 from v2hdm.mapping.bundle import Bundle
+from v2hdm.mapping.options import AcceptanceOptions
 from v2hdm.records import BoolArray, FloatArray
+
+IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -51,6 +57,46 @@ def solved_corners(bundle: Bundle) -> SolvedCorners:
     completed = np.zeros(len(known), dtype=bool)
     completed[partial] = True
     return SolvedCorners(complete_corners(bundle.corners_map), covariance, completed)
+
+
+def without_misplaced_corners(
+    solved: SolvedCorners, odd: IntArray, kind: IntArray, accepted: IntArray, options: AcceptanceOptions
+) -> SolvedCorners:
+    """Replace the one corner of each group ``odd`` that keeps it from having its class's shape.
+
+    Args:
+        solved: The groups' corners.
+        odd: (O,) groups of an odd shape.
+        kind: (G,) class of every group.
+        accepted: (A,) groups that were accepted, which give their classes their shapes.
+        options: When shapes agree.
+
+    Returns:
+        The corners with those of odd groups replaced where that gives them an established shape; of the
+        four ways to do it, the one with the most peers, and the nearest to what was seen if several do.
+    """
+    corners, covariance = solved.corners_map.copy(), solved.covariance_m2.copy()
+    completed = solved.completed.copy()
+    known = characteristic_lengths(solved.corners_map[accepted])
+    for group in odd:
+        peers = known[kind[accepted] == kind[group]]
+        if completed[group] or not len(peers):
+            continue
+        ways = np.repeat(corners[group][None], 4, axis=0)
+        ways[range(4), range(4)] = np.nan
+        ways = complete_corners(ways)
+        agreeing = count_peers(characteristic_lengths(ways), peers, options)
+        moved_m = np.linalg.norm(ways - corners[group], axis=2).max(axis=1)
+        best = int(np.lexsort((moved_m, -agreeing))[0])
+        if agreeing[best] < least_peers(len(peers)):
+            continue
+        others = (best + np.arange(1, 4)) % 4
+        columns = (2 * others[:, None] + np.arange(2)).ravel()
+        spread = _spread(others)
+        corners[group] = ways[best]
+        covariance[group] = spread @ covariance[group][np.ix_(columns, columns)] @ spread.T
+        completed[group] = True
+    return SolvedCorners(corners, covariance, completed)
 
 
 def complete_corners(corners_map: FloatArray) -> FloatArray:

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.errors import MappingError
-from v2hdm.mapping.acceptance import Candidates, judge
+from v2hdm.mapping.acceptance import ODD_SHAPE, Candidates, judge
 from v2hdm.mapping.association import fuse_groups
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.mapping.completion import SolvedCorners, solved_corners
+from v2hdm.mapping.completion import SolvedCorners, solved_corners, without_misplaced_corners
 from v2hdm.mapping.location import Rig, locate
 from v2hdm.mapping.merge import group_kinds
 from v2hdm.mapping.options import AcceptanceOptions
@@ -72,6 +72,12 @@ def conclude(
     solved = solved_corners(final)
     candidates = _candidates(evidence, solved)
     verdict = judge(candidates, options)
+    odd = np.flatnonzero([reason == ODD_SHAPE for reason in verdict])
+    if len(odd):
+        accepted = np.flatnonzero([reason is None for reason in verdict])
+        solved = without_misplaced_corners(solved, odd, candidates.kind, accepted, options)
+        candidates = _candidates(evidence, solved)
+        verdict = judge(candidates, options)
     accepted = np.flatnonzero([reason is None for reason in verdict])
     excluded = _exclusions(candidates, verdict)
     if not len(accepted):
