@@ -117,11 +117,13 @@ def make_scene(
     pixel_sigma: float = PIXEL_SIGMA,
     prior_sigma_m: float = 0.03,
     max_range_m: float = 15.0,
+    min_views: int = 2,
     noise_seed: int | None = None,
 ) -> Scene:
     """A street whose recorded poses are off by ``jitter`` and whose start is off as stated.
 
-    ``noise_seed`` draws other noise on the same street.
+    Corners seen fewer than ``min_views`` times are left out. ``noise_seed`` draws other noise on the same
+    street.
     """
     rng = np.random.default_rng(seed)
     truth = np.stack([mounted(1.5, 2.4, 18), mounted(-1.0, 2.6, 22, rear=True, y=0.2)])[:cameras]
@@ -133,11 +135,11 @@ def make_scene(
     state = np.zeros((frames, 6)) if jitter is None else pose_errors(recorded, jitter, step_m, rng)
     map_from_vehicle = recorded @ exp(state)
     camera, frame, corner, _ = observe(truth, recorded, corners, max_range_m)
-    twice = np.bincount(corner, minlength=len(corners)) >= 2
-    keep = twice[corner]
-    rank = np.cumsum(twice) - 1
+    often = np.bincount(corner, minlength=len(corners)) >= min_views
+    keep = often[corner]
+    rank = np.cumsum(often) - 1
     camera, frame, corner = camera[keep], frame[keep], rank[corner[keep]]
-    corners = corners[twice]
+    corners = corners[often]
     pixel = project(truth[camera] @ np.linalg.inv(map_from_vehicle)[frame], corners[corner])
     pixel = pixel + pixel_sigma * rng.standard_normal(pixel.shape)
     # Of a generator of their own, so that the same street without them has the same noise.

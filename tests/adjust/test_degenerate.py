@@ -72,6 +72,7 @@ def bad_problems():
             problem, pose_sigma=PoseSigma(position_drift=Drift(0.03, 10.0))
         ),
         "intrinsic has shape": replace(problem, intrinsic=np.eye(3)),
+        "twist_vehicle has shape": replace(problem, twist_vehicle=np.zeros((3, 6))),
         "there is no observation": with_observations(
             problem,
             camera=seen.camera[:0],
@@ -100,6 +101,8 @@ def test_a_malformed_problem_is_refused_by_name(message):
         ({"loss": "l1"}, "unknown loss 'l1'"),
         ({"solver": "ceres"}, "unknown solver 'ceres'"),
         ({"loss_scale": 0.0}, "loss_scale is 0.0"),
+        ({"gate_probability": 1.0}, "gate_probability is 1.0"),
+        ({"clock_offset": True}, "a clock offset needs twist_vehicle"),
     ],
 )
 def test_an_unknown_option_is_refused_with_the_choices(change, message):

@@ -16,6 +16,7 @@ from v2hdm.adjust.residuals import (
     cost_and_gradient,
     jacobians,
     observe,
+    pair_from_clock,
     pair_from_state,
     state_residual,
 )
@@ -25,36 +26,43 @@ from v2hdm.geometry.transform import exp
 POSES = PoseSigma(position_drift=Drift(0.016, 10.0), heading_drift=Drift(0.0006, 5.0))
 
 
-def example(pose_states=POSE_STATES, size=0.0, max_range_m=15.0, frames=14):
+def example(pose_states=POSE_STATES, size=0.0, max_range_m=15.0, frames=14, clock=False):
     scene = make_scene(3, frames=frames, jitter=POSES, max_range_m=max_range_m)
-    arrays = make_arrays(scene.problem, pose_states, "cpu")
+    twist = np.tile([5.0, 0.1, 0.0, 0.0, 0.0, 0.4], (frames, 1)) * np.linspace(0.8, 1.2, frames)[:, None]
+    problem = replace(scene.problem, twist_vehicle=twist)
+    arrays = make_arrays(problem, pose_states, "cpu", clock)
     generator = torch.Generator().manual_seed(0)
     state = size * torch.randn(arrays.state_information_root.shape, generator=generator, dtype=torch.float64)
     corners = torch.as_tensor(scene.corners_map)[arrays.corner_order]
-    return arrays, Estimate(torch.as_tensor(scene.problem.cam_from_vehicle), state, corners)
+    clock_s = arrays.no_clock() + 0.3 * size
+    return arrays, Estimate(torch.as_tensor(scene.problem.cam_from_vehicle), state, corners, clock_s)
 
 
-def moved(estimate, extrinsic, state, corners):
+def moved(estimate, extrinsic, state, corners, clock=None):
     return Estimate(
         exp(extrinsic) @ estimate.cam_from_vehicle,
         estimate.frame_state + state,
         estimate.corners_map + corners,
+        estimate.clock_s if clock is None else estimate.clock_s + clock,
     )
 
 
 @pytest.mark.parametrize("name", LOSSES)
 @pytest.mark.parametrize("size", [0.0, 1e-8, 0.05])
-@pytest.mark.parametrize("pose_states", [(), ("roll", "pitch"), POSE_STATES])
-def test_the_gradient_of_the_cost_is_that_of_autograd(name, size, pose_states):
-    arrays, estimate = example(pose_states, size)
+@pytest.mark.parametrize(
+    ("pose_states", "clock"), [((), False), (("roll", "pitch"), False), (POSE_STATES, True)]
+)
+def test_the_gradient_of_the_cost_is_that_of_autograd(name, size, pose_states, clock):
+    arrays, estimate = example(pose_states, size, clock=clock)
     zeros = [torch.zeros(len(estimate.cam_from_vehicle), 6, dtype=torch.float64)]
     zeros += [torch.zeros_like(estimate.frame_state), torch.zeros_like(estimate.corners_map)]
+    zeros += [torch.zeros_like(estimate.clock_s)]
     for zero in zeros:
         zero.requires_grad_()
     terms, _ = cost_and_gradient(arrays, moved(estimate, *zeros), Loss(name, 3.0))
-    expected = torch.autograd.grad(sum(terms.values()), zeros)
+    expected = torch.autograd.grad(sum(terms.values()), zeros, materialize_grads=True)
     _, gradient = cost_and_gradient(arrays, estimate, Loss(name, 3.0))
-    parts = (gradient.extrinsic, gradient.frame_state, gradient.corners_map)
+    parts = (gradient.extrinsic, gradient.frame_state, gradient.corners_map, gradient.clock_s)
     for actual, wanted in zip(parts, expected, strict=True):
         torch.testing.assert_close(actual, wanted, rtol=1e-9, atol=1e-12 * (1 + float(wanted.abs().sum())))
 
@@ -78,12 +86,14 @@ def test_gradcheck_of_the_observation_residual_holds_up_to_the_horizon(distance_
 
 @pytest.mark.parametrize("size", [0.0, 0.05])
 def test_jacobians_by_pair_and_corner_spread_to_the_full_derivative(size):
-    arrays, estimate = example(size=size, frames=6)
+    arrays, estimate = example(size=size, frames=6, clock=True)
     by_pair, by_corner = jacobians(arrays, observe(arrays, estimate))
     spread = pair_from_state(arrays, estimate).reshape(arrays.pair_count, 6, -1)
+    by_clock = pair_from_clock(arrays, estimate).reshape(arrays.pair_count, 6, 1)
     k = len(arrays.corner) // 2
     steps = [torch.zeros(arrays.camera_count, 6), torch.zeros_like(estimate.frame_state)]
     steps = [step.to(torch.float64) for step in [*steps, torch.zeros_like(estimate.corners_map)]]
+    steps += [torch.zeros_like(estimate.clock_s)]
     full = torch.autograd.functional.jacobian(
         lambda *s: observe(arrays, moved(estimate, *s)).residual[:, k], tuple(steps)
     )
@@ -91,6 +101,7 @@ def test_jacobians_by_pair_and_corner_spread_to_the_full_derivative(size):
     torch.testing.assert_close(by_pair[k], full[0][:, camera])
     torch.testing.assert_close(by_pair[k] @ spread[arrays.pair[k]], full[1][:, frame])
     torch.testing.assert_close(by_corner[k], full[2][:, arrays.corner[k]])
+    torch.testing.assert_close(by_pair[k] @ by_clock[arrays.pair[k]], full[3][:, camera])
 
 
 @pytest.mark.parametrize("name", LOSSES)

@@ -19,17 +19,22 @@ from v2hdm.adjust.whitening import factorise
 POSES = PoseSigma(position_drift=Drift(0.01, 10.0), roll_pitch_drift=Drift(0.003, 2.0))
 
 
-@pytest.mark.parametrize("pose_states", [(), ("roll", "pitch"), POSE_STATES])
-def test_where_all_residuals_vanish_the_whitened_hessian_is_the_identity(pose_states):
+@pytest.mark.parametrize(
+    ("pose_states", "clock"),
+    [((), False), (("roll", "pitch"), True), (POSE_STATES, False), (POSE_STATES, True)],
+)
+def test_where_all_residuals_vanish_the_whitened_hessian_is_the_identity(pose_states, clock):
     """At a perfect fit the Gauss-Newton Hessian is the true one, so the gradient at y is y."""
     scene = make_scene(2, frames=40, pixel_sigma=0.0, jitter=None, prior_sigma_m=0.03)
     centre = -np.einsum("cji,cj->ci", scene.cam_from_vehicle[:, :3, :3], scene.cam_from_vehicle[:, :3, 3])
-    problem = replace(scene.problem, centre_vehicle=centre, pose_sigma=POSES)
-    arrays = make_arrays(problem, pose_states, "cpu")
+    twist = np.tile([5.0, 0.0, 0.0, 0.0, 0.0, 0.3], (40, 1))
+    problem = replace(scene.problem, centre_vehicle=centre, pose_sigma=POSES, twist_vehicle=twist)
+    arrays = make_arrays(problem, pose_states, "cpu", clock)
     estimate = Estimate(
         torch.as_tensor(scene.cam_from_vehicle),
         torch.zeros_like(arrays.state_information_root),
         torch.as_tensor(scene.corners_map)[arrays.corner_order],
+        arrays.no_clock(),
     )
     whitening = factorise(arrays, make_plan(arrays), estimate, torch.ones_like(arrays.measured[0]))
     objective = Objective(whitening, estimate, Loss("none", 1.0))

@@ -41,6 +41,9 @@ class Arrays:
         centre, centre_information_root: (C, 3) prior on the camera centres, and 1 / sigma.
         state_transition: (J, S, S) what a frame's states are expected to be, given the frame's before.
         state_information_root: (J, S) 1 / sigma of what is new in it.
+        clock_twist: (J, 6, Q) how the vehicle moves with a camera's clock offset; Q is 1, or 0 where no
+            offset is estimated.
+        clock_information_root: 1 / sigma of a clock offset.
     """
 
     order: Tensor
@@ -55,6 +58,8 @@ class Arrays:
     centre_information_root: Tensor
     state_transition: Tensor
     state_information_root: Tensor
+    clock_twist: Tensor
+    clock_information_root: float
 
     @property
     def frame_count(self) -> int:
@@ -72,9 +77,18 @@ class Arrays:
         return len(self.corner_order)
 
     @property
+    def camera_unknowns(self) -> int:
+        """6 + Q: a camera's extrinsic and, where it is estimated, its clock offset."""
+        return 6 + self.clock_twist.shape[-1]
+
+    @property
     def pair_count(self) -> int:
         """P."""
         return self.camera_count * self.frame_count
+
+    def no_clock(self) -> Tensor:
+        """Clock offsets (C, Q) of zero."""
+        return self.centre.new_zeros(self.camera_count, self.clock_twist.shape[-1])
 
     def take(self, keep: Tensor) -> tuple[Arrays, Tensor]:
         """The problem restricted to the observations ``keep`` (K,) and to the corners they touch.
@@ -94,7 +108,9 @@ class Arrays:
         return part, corners
 
 
-def make_arrays(problem: Problem, pose_states: tuple[str, ...], device: str) -> Arrays:
+def make_arrays(
+    problem: Problem, pose_states: tuple[str, ...], device: str, clock_offset: bool = False
+) -> Arrays:
     """Lay a checked problem out for the solver."""
     seen = problem.observations
     first_frame = np.full(problem.corner_count, len(problem.map_from_vehicle))
@@ -129,7 +145,16 @@ def make_arrays(problem: Problem, pose_states: tuple[str, ...], device: str) -> 
         centre_information_root=real(centre_root),
         state_transition=real(transition),
         state_information_root=real(information_root),
+        clock_twist=real(_clock_twist(problem, clock_offset)),
+        clock_information_root=1 / problem.clock_sigma_s,
     )
+
+
+def _clock_twist(problem: Problem, clock_offset: bool) -> FloatArray:
+    """(J, 6, Q), Q = 1 if clock offsets are estimated."""
+    if not clock_offset or problem.twist_vehicle is None:
+        return np.zeros((len(problem.map_from_vehicle), 6, 0))
+    return problem.twist_vehicle[:, :, None]
 
 
 def _centre_prior(problem: Problem) -> tuple[FloatArray, FloatArray]:

@@ -19,6 +19,12 @@ def check_problem(problem: Problem) -> None:
     _check_priors(problem)
 
 
+def check_model(problem: Problem, options: SolveOptions) -> None:
+    """Raise :class:`AdjustError` where ``options`` ask for more than ``problem`` says."""
+    if options.clock_offset and problem.twist_vehicle is None:
+        raise AdjustError("a clock offset needs twist_vehicle: say how the vehicle moves at each frame")
+
+
 def check_options(options: SolveOptions) -> None:
     """Raise :class:`AdjustError` for an option out of range."""
     unknown = [name for name in options.pose_states if name not in POSE_STATES]
@@ -28,6 +34,8 @@ def check_options(options: SolveOptions) -> None:
         raise AdjustError(f"unknown loss {options.loss!r}: choose from {', '.join(LOSSES)}")
     if options.solver not in SOLVERS:
         raise AdjustError(f"unknown solver {options.solver!r}: choose from {', '.join(SOLVERS)}")
+    if not 0 < options.gate_probability < 1:
+        raise AdjustError(f"gate_probability is {options.gate_probability}: give a share between 0 and 1")
     if not options.loss_scale > 0:
         raise AdjustError(f"loss_scale is {options.loss_scale}: give a number of standard deviations above 0")
 
@@ -43,6 +51,7 @@ def _check_shapes(problem: Problem) -> None:
         ("centre_vehicle", problem.centre_vehicle, (cameras, 3)),
         ("centre_sigma_m", problem.centre_sigma_m, (cameras, 3)),
         ("corners_start", problem.corners_start, (problem.corner_count, 2)),
+        ("twist_vehicle", problem.twist_vehicle, (frames, 6)),
         ("observations.frame", seen.frame, (count,)),
         ("observations.corner", seen.corner, (count,)),
         ("observations.pinhole_px", seen.pinhole_px, (count, 2)),
@@ -75,6 +84,7 @@ def _check_finite(problem: Problem) -> None:
         "covariance_px of observation": seen.covariance_px,
         "centre_vehicle of camera": problem.centre_vehicle,
         "corners_start of corner": problem.corners_start,
+        "twist_vehicle of frame": problem.twist_vehicle,
     }
     for name, values in named.items():
         if values is None:
@@ -125,6 +135,8 @@ def _check_priors(problem: Problem) -> None:
     if problem.centre_sigma_m is not None and not np.all(problem.centre_sigma_m > 0):
         camera = int(np.flatnonzero(~(problem.centre_sigma_m > 0).all(1))[0])
         raise AdjustError(f"centre_sigma_m of camera {camera} must be above 0 (inf where nothing is known)")
+    if not problem.clock_sigma_s > 0:
+        raise AdjustError(f"clock_sigma_s is {problem.clock_sigma_s}: give a number of seconds above 0")
     sigma = problem.pose_sigma.by_state()
     if not (np.isfinite(sigma).all() and (sigma > 0).all()):
         raise AdjustError(f"pose_sigma must be above 0 and finite: {problem.pose_sigma}")

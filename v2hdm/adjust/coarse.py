@@ -38,7 +38,7 @@ def coarse_extrinsics(arrays: Arrays, cam_from_vehicle: Tensor) -> tuple[Tensor,
         if part is None:
             continue
         corners, _ = back_project(part, cam_from_vehicle)
-        start = Estimate(cam_from_vehicle, part.state_information_root, corners)
+        start = Estimate(cam_from_vehicle, part.state_information_root, corners, part.no_clock())
         descent = descend(
             part, start, Loss("huber", 1.0), "lbfgs", _GAP_TOLERANCE, _MAX_REFRESHES, _MAX_EVALUATIONS
         )
@@ -71,4 +71,5 @@ def _seen_twice(arrays: Arrays, keep: Tensor) -> Arrays | None:
         states=(),
         state_transition=arrays.state_transition[:, :0, :0],
         state_information_root=arrays.state_information_root[:, :0],
+        clock_twist=arrays.clock_twist[..., :0],
     )

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v2hdm.adjust.reduced import to_tiles
+from v2hdm.adjust.reduced import spread_to_cameras, to_tiles
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.records import FloatArray
 
@@ -31,8 +31,16 @@ class Covariance:
         """Of each camera's left tangent (C, 6, 6): translation m, rotation rad."""
         # The extrinsics come last, so the tip of L_S is the factor of their marginal information.
         joint = torch.cholesky_inverse(self.whitening.reduced_factor.tip)
-        cameras = range(self.whitening.arrays.camera_count)
-        return np.stack([joint[6 * c : 6 * c + 6, 6 * c : 6 * c + 6].cpu().numpy() for c in cameras])
+        each = self.whitening.arrays.camera_unknowns
+        starts = range(0, len(joint), each)
+        return np.stack([joint[k : k + 6, k : k + 6].cpu().numpy() for k in starts])
+
+    def clock_s2(self) -> FloatArray:
+        """Variance (C,) of each camera's clock offset, s^2; 0 where it is not estimated."""
+        arrays = self.whitening.arrays
+        joint = torch.cholesky_inverse(self.whitening.reduced_factor.tip)
+        variance = joint.diagonal().reshape(arrays.camera_count, -1)[:, 6:]
+        return np.asarray(variance.sum(1).cpu().numpy())
 
     def corners(self, groups: NDArray[np.int64]) -> FloatArray:
         """Joint covariance (M, 2 n, 2 n), m^2, within each of M groups (M, n) of corners of the problem."""
@@ -58,12 +66,13 @@ def _reduced_root(whitening: Whitening, chosen: Tensor) -> Tensor:
     arrays, plan = whitening.arrays, whitening.plan
     frames, states, columns = arrays.frame_count, len(arrays.states), 2 * len(chosen)
     by_frame = whitening.coupling.new_zeros(frames, states, len(chosen), 2)
-    by_camera = whitening.coupling.new_zeros(arrays.camera_count, 6, len(chosen), 2)
-    spread = whitening.pair_from_state.reshape(arrays.pair_count, 6, states)
+    by_camera = whitening.coupling.new_zeros(arrays.camera_count, arrays.camera_unknowns, len(chosen), 2)
+    spread = whitening.spread.state.reshape(arrays.pair_count, 6, states)
     bounds = torch.searchsorted(arrays.corner, torch.stack([chosen, chosen + 1]))
     for n, (begin, end) in enumerate(bounds.T.tolist()):
         pair, part = arrays.pair[begin:end], whitening.coupling[begin:end]
         by_frame[:, :, n].index_add_(0, pair % frames, (part @ spread[pair]).mT)
-        by_camera[:, :, n].index_add_(0, pair // frames, part.mT)
+        of_camera = spread_to_cameras(arrays, whitening.spread, part, pair)
+        by_camera[:, :, n].index_add_(0, pair // frames, of_camera.mT)
     top = to_tiles(plan, by_frame.reshape(frames, states, columns))
     return whitening.reduced_factor.solve(torch.cat([top, by_camera.reshape(-1, columns)]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -10,7 +10,7 @@ from torch import Tensor
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.lbfgs import minimise, predicted_gap
 from v2hdm.adjust.reduced import make_plan
-from v2hdm.adjust.residuals import Estimate, Gradient, Loss, cost_and_gradient, observe
+from v2hdm.adjust.residuals import Estimate, Loss, cost_and_gradient, observe
 from v2hdm.adjust.robust import annealed_scale, loss
 from v2hdm.adjust.whitening import Whitening, factorise
 from v2hdm.geometry.transform import exp, left_jacobian
@@ -54,6 +54,7 @@ class Objective:
             exp(step.extrinsic) @ self.base.cam_from_vehicle,
             self.base.frame_state + step.frame_state,
             self.base.corners_map + step.corners_map,
+            self.base.clock_s + step.clock_s,
         )
         return estimate, step.extrinsic
 
@@ -63,8 +64,7 @@ class Objective:
         estimate, tangent = self.moved(whitened)
         terms, gradient = cost_and_gradient(self.whitening.arrays, estimate, self.robust)
         by_tangent = (left_jacobian(tangent).mT @ gradient.extrinsic[..., None])[..., 0]
-        gradient = Gradient(by_tangent, gradient.frame_state, gradient.corners_map)
-        return total(terms), self.whitening.whiten(gradient)
+        return total(terms), self.whitening.whiten(replace(gradient, extrinsic=by_tangent))
 
 
 def total(terms: dict[str, Tensor]) -> Tensor:

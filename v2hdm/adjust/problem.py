@@ -5,7 +5,8 @@ Unknown are, in the frames of :mod:`v2hdm.geometry.transform`,
 - the extrinsic ``cam_from_vehicle`` of every camera,
 - the corners of the markings ``corners_map`` (x, y); the ground is z = 0,
 - optionally, for every frame, how far the vehicle was from its recorded pose: any of x, y, height,
-  roll, pitch, heading, as a tangent s in the vehicle frame, ``map_from_vehicle @ exp(s)``.
+  roll, pitch, heading, as a tangent s in the vehicle frame, ``map_from_vehicle @ exp(s)``,
+- optionally, for every camera, a clock offset: its images were taken that much later than they say.
 
 The cost, in units of half a squared standard deviation, is
 
@@ -97,7 +98,9 @@ class Problem:
     ``intrinsic`` (C, 4) is fx, fy, cx, cy in px. ``cam_from_vehicle`` (C, 4, 4) is where to start
     from; ``map_from_vehicle`` (J, 4, 4) are the recorded poses. ``centre_vehicle`` and
     ``centre_sigma_m`` (C, 3) are the surveyed camera centres, or None. ``corners_start`` (N, 2), if
-    given, replaces the start by weighted back-projection.
+    given, replaces the start by weighted back-projection. ``twist_vehicle`` (J, 6) is how the vehicle
+    moves at each frame, per second and in its own frame (m/s, then rad/s); a clock offset needs it, and
+    is held near zero by ``clock_sigma_s``.
     """
 
     intrinsic: FloatArray
@@ -109,6 +112,8 @@ class Problem:
     centre_sigma_m: FloatArray | None = None
     pose_sigma: PoseSigma = PoseSigma()
     corners_start: FloatArray | None = None
+    twist_vehicle: FloatArray | None = None
+    clock_sigma_s: float = 0.02
 
 
 @dataclass(kw_only=True)
@@ -117,8 +122,10 @@ class SolveOptions:
 
     Attributes:
         pose_states: the states each frame is given, of :data:`POSE_STATES`; () is the paper's model.
+        clock_offset: whether each camera's clock offset is estimated.
         loss: robust loss on the whitened residual of an observation, of :data:`LOSSES`.
         loss_scale: residual, in standard deviations, from which the loss departs from least squares.
+        gate_probability: share of sound observations that the verdict on outliers may cost.
         solver: ``lbfgs``, or ``lm`` (Schur-complement Levenberg-Marquardt) to cross-check.
         coarse: first solve a subset of steep rays, which converges from ten degrees away.
         gap_tolerance: stop when the predicted remaining decrease is this fraction of the cost.
@@ -128,8 +135,10 @@ class SolveOptions:
     """
 
     pose_states: tuple[str, ...] = POSE_STATES
+    clock_offset: bool = False
     loss: str = "cauchy"
     loss_scale: float = 3.0
+    gate_probability: float = 1e-4
     solver: str = "lbfgs"
     coarse: bool = True
     gap_tolerance: float = 1e-11

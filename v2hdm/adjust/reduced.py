@@ -99,7 +99,25 @@ def from_tiles(plan: Plan, rows: Tensor, frame_count: int, states: int) -> Tenso
     return ordered[list(plan.pattern.position)].flatten(0, 1)[:frame_count]
 
 
-def held_hessian(arrays: Arrays, plan: Plan, estimate: Estimate, by_pair: Tensor, spread: Tensor) -> Tiles:
+@dataclass(frozen=True)
+class Spread:
+    """How pairs move with what they belong to: derivatives of their left tangents.
+
+    ``state`` (C, J, 6, S) by the states of the frame; ``clock`` (C, J, 6, Q) by the camera's clock offset. By
+    the camera's extrinsic it is the identity.
+    """
+
+    state: Tensor
+    clock: Tensor
+
+    @property
+    def camera(self) -> Tensor:
+        """(C, J, 6, 6 + Q): by all unknowns of the camera."""
+        identity = torch.eye(6, dtype=self.clock.dtype, device=self.clock.device)
+        return torch.cat([identity.expand(*self.clock.shape[:2], 6, 6), self.clock], dim=-1)
+
+
+def held_hessian(arrays: Arrays, plan: Plan, estimate: Estimate, by_pair: Tensor, spread: Spread) -> Tiles:
     """U: the Hessian of frame states and extrinsics, priors included, with the corners held.
 
     Args:
@@ -107,28 +125,31 @@ def held_hessian(arrays: Arrays, plan: Plan, estimate: Estimate, by_pair: Tensor
         plan: its tiles.
         estimate: where.
         by_pair: derivatives of the weighted residuals by pair, (K, 2, 6).
-        spread: derivatives of the pairs by the states, (C, J, 6, S).
+        spread: how the pairs move with frames and cameras.
     """
-    cameras, states = arrays.camera_count, len(arrays.states)
+    cameras, states, each = arrays.camera_count, len(arrays.states), arrays.camera_unknowns
     blocks = by_pair.new_zeros(arrays.pair_count, 6, 6).index_add_(0, arrays.pair, by_pair.mT @ by_pair)
     blocks = blocks.reshape(cameras, arrays.frame_count, 6, 6)
-    tiles = _empty_tiles(plan, states, cameras, by_pair)
+    of_camera = spread.camera
+    by_camera = blocks @ of_camera
+    tiles = _empty_tiles(plan, states, cameras * each, by_pair)
     if states:
-        _add_frames(arrays, plan, (spread.mT @ blocks @ spread).sum(0), tiles)
-        border = to_tiles(plan, (spread.mT @ blocks).permute(1, 2, 0, 3).flatten(2))
+        _add_frames(arrays, plan, (spread.state.mT @ blocks @ spread.state).sum(0), tiles)
+        border = to_tiles(plan, (spread.state.mT @ by_camera).permute(1, 2, 0, 3).flatten(2))
         for column, part in enumerate(border.chunk(plan.tile_count)):
             tiles[TIP, column] = part.mT.contiguous()
-    tip = tiles[TIP, TIP].view(cameras, 6, cameras, 6)
+    tip = tiles[TIP, TIP].view(cameras, each, cameras, each)
     rotation, root = estimate.cam_from_vehicle[:, :3, :3], arrays.centre_information_root
     information = rotation * root.square()[:, None] @ rotation.mT
     for camera in range(cameras):
-        tip[camera, :, camera] = blocks[camera].sum(0)
+        tip[camera, :, camera] = (of_camera[camera].mT @ by_camera[camera]).sum(0)
         tip[camera, :3, camera, :3] += information[camera]
+        tip[camera, :, camera].diagonal()[6:] += arrays.clock_information_root**2
     return tiles
 
 
-def _empty_tiles(plan: Plan, states: int, cameras: int, like: Tensor) -> Tiles:
-    size, tip = plan.frames_per_tile * states, 6 * cameras
+def _empty_tiles(plan: Plan, states: int, tip: int, like: Tensor) -> Tiles:
+    size = plan.frames_per_tile * states
     tiles = {(TIP, TIP): like.new_zeros(tip, tip)}
     for column, below in enumerate(plan.pattern.below):
         tiles[TIP, column] = like.new_zeros(tip, size)
@@ -169,15 +190,16 @@ def _add_between(tiles: Tiles, later: int, earlier: int, coupling: Tensor) -> No
         tiles[earlier, later][-states:, :states] += coupling.mT
 
 
-def subtract_corners(arrays: Arrays, plan: Plan, coupling: Tensor, spread: Tensor, tiles: Tiles) -> None:
+def subtract_corners(arrays: Arrays, plan: Plan, coupling: Tensor, spread: Spread, tiles: Tiles) -> None:
     """Take sum_i B_i' B_i off, block by block; ``coupling`` (K, 2, 6) holds B_i by observation."""
-    states, cameras = len(arrays.states), arrays.camera_count
+    states, cameras, each = len(arrays.states), arrays.camera_count, arrays.camera_unknowns
     camera = arrays.pair // arrays.frame_count
-    by_frame = coupling @ spread.reshape(arrays.pair_count, 6, states)[arrays.pair]
+    by_frame = coupling @ spread.state.reshape(arrays.pair_count, 6, states)[arrays.pair]
     for block in plan.blocks:
         part, rows = slice(block.begin, block.end), int(block.row[-1]) + 1
-        by_camera = coupling.new_zeros(rows, cameras, 2, 6)
-        by_camera.index_put_((block.row, camera[part]), coupling[part], accumulate=True)
+        by_camera = coupling.new_zeros(rows, cameras, 2, each)
+        of_camera = spread_to_cameras(arrays, spread, coupling[part], arrays.pair[part])
+        by_camera.index_put_((block.row, camera[part]), of_camera, accumulate=True)
         tip = by_camera.permute(0, 2, 1, 3).reshape(2 * rows, -1)
         tiles[TIP, TIP].addmm_(tip.mT, tip, alpha=-1)
         if not states:
@@ -190,3 +212,11 @@ def subtract_corners(arrays: Arrays, plan: Plan, coupling: Tensor, spread: Tenso
             tiles[TIP, column].addmm_(tip.mT, columns[first], alpha=-1)
             for row, second in placed[n:]:
                 tiles[row, column].addmm_(columns[second].mT, columns[first], alpha=-1)
+
+
+def spread_to_cameras(arrays: Arrays, spread: Spread, by_pair: Tensor, pair: Tensor) -> Tensor:
+    """Derivatives (M, 2, 6 + Q) by the unknowns of the cameras, from those (M, 2, 6) by ``pair`` (M,)."""
+    if arrays.camera_unknowns == 6:
+        return by_pair
+    clock = spread.clock.reshape(arrays.pair_count, 6, -1)
+    return torch.cat([by_pair, by_pair @ clock[pair]], dim=-1)

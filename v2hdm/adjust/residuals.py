@@ -8,7 +8,9 @@ and that is what extrinsics and frame states act through:
 
 - extrinsic c: a left perturbation of ``cam_from_vehicle`` is one of every pair of c;
 - state s of frame j: ``cam_from_vehicle exp(-s) vehicle_from_map``, so ds perturbs the pair by
-  -Ad(cam_from_vehicle) J_l(-s) ds (see :func:`pair_from_state`).
+  -Ad(cam_from_vehicle) J_l(-s) ds (see :func:`pair_from_state`);
+- clock offset q of camera c: ``cam_from_vehicle exp(-q v_j) exp(-s) vehicle_from_map`` with the vehicle's
+  twist v_j, so dq perturbs the pair by -Ad(cam_from_vehicle) v_j dq (see :func:`pair_from_clock`).
 
 A gradient of the cost with respect to p is a force, so that of a pair is its *wrench*: the sums of the
 forces and of their moments p x force.
@@ -29,20 +31,25 @@ from v2hdm.geometry.transform import adjoint, exp, left_jacobian
 
 @dataclass(frozen=True)
 class Estimate:
-    """A point in the space of unknowns: extrinsics (C, 4, 4), frame states (J, S), corners (N, 2)."""
+    """A point in the space of unknowns.
+
+    Extrinsics (C, 4, 4), frame states (J, S), corners (N, 2), clock offsets (C, Q) in s.
+    """
 
     cam_from_vehicle: Tensor
     frame_state: Tensor
     corners_map: Tensor
+    clock_s: Tensor
 
 
 @dataclass(frozen=True)
 class Gradient:
-    """Of a scalar: by extrinsic (left tangent, (C, 6)), frame state (J, S) and corner (N, 2)."""
+    """Of a scalar: by extrinsic (left tangent, (C, 6)), frame state (J, S), corner (N, 2), clock (C, Q)."""
 
     extrinsic: Tensor
     frame_state: Tensor
     corners_map: Tensor
+    clock_s: Tensor
 
 
 @dataclass(frozen=True)
@@ -85,7 +92,7 @@ def observe(arrays: Arrays, estimate: Estimate) -> View:
     vehicle_from_map = arrays.vehicle_from_map
     if arrays.states:
         vehicle_from_map = exp(-frame_tangent(arrays, estimate.frame_state)) @ vehicle_from_map
-    cam_from_map = estimate.cam_from_vehicle[:, None] @ vehicle_from_map
+    cam_from_map = _cam_from_vehicle_then(arrays, estimate) @ vehicle_from_map
     table = cam_from_map[..., :3, [0, 1, 3]].mT.reshape(arrays.pair_count, 9)
     first, second, origin = table.index_select(0, arrays.pair).T.contiguous().chunk(3)
     x, y = estimate.corners_map.index_select(0, arrays.corner).T.contiguous()
@@ -95,6 +102,15 @@ def observe(arrays: Arrays, estimate: Estimate) -> View:
     a, b, c = arrays.root_information
     residual = torch.stack([a * dx, b * dx + c * dy])
     return View((first, second, origin), point, reciprocal, slope, residual)
+
+
+def _cam_from_vehicle_then(arrays: Arrays, estimate: Estimate) -> Tensor:
+    """Cameras from where the vehicle is at each frame's stated time, (C, J or 1, 4, 4)."""
+    cam_from_vehicle = estimate.cam_from_vehicle[:, None]
+    if not arrays.clock_twist.shape[-1]:
+        return cam_from_vehicle
+    moved = (arrays.clock_twist @ estimate.clock_s[:, None, :, None])[..., 0]
+    return cam_from_vehicle @ exp(-moved)
 
 
 def pull_back(arrays: Arrays, view: View, by_residual: Tensor) -> tuple[Tensor, Tensor]:
@@ -132,7 +148,12 @@ def jacobians(arrays: Arrays, view: View) -> tuple[Tensor, Tensor]:
 def pair_from_state(arrays: Arrays, estimate: Estimate) -> Tensor:
     """Derivative (C, J, 6, S) of each pair's left tangent by the states of its frame."""
     by_tangent = left_jacobian(-frame_tangent(arrays, estimate.frame_state))[..., list(arrays.states)]
-    return -adjoint(estimate.cam_from_vehicle)[:, None] @ by_tangent
+    return -adjoint(_cam_from_vehicle_then(arrays, estimate)) @ by_tangent
+
+
+def pair_from_clock(arrays: Arrays, estimate: Estimate) -> Tensor:
+    """Derivative (C, J, 6, Q) of each pair's left tangent by the clock offset of its camera."""
+    return -adjoint(estimate.cam_from_vehicle)[:, None] @ arrays.clock_twist
 
 
 def centre_residual(arrays: Arrays, estimate: Estimate) -> Tensor:
@@ -157,10 +178,12 @@ def cost_and_gradient(arrays: Arrays, estimate: Estimate, robust: Loss) -> tuple
     wrench = wrench.reshape(arrays.camera_count, arrays.frame_count, 6)
     centre = centre_residual(arrays, estimate)
     state = state_residual(arrays, estimate.frame_state)
+    clock = estimate.clock_s * arrays.clock_information_root
     terms = {
         "observations": rho.sum() / 2,
         "camera_centre": centre.square().sum() / 2,
         "frame_states": state.square().sum() / 2,
+        "clock_offsets": clock.square().sum() / 2,
     }
     by_extrinsic = wrench.sum(1)
     # A left perturbation moves the centre by minus its translation part, turned into the vehicle.
@@ -170,4 +193,6 @@ def cost_and_gradient(arrays: Arrays, estimate: Estimate, robust: Loss) -> tuple
     innovation = state * arrays.state_information_root
     by_state += innovation
     by_state[:-1] -= (arrays.state_transition.mT @ innovation[..., None])[1:, :, 0]
-    return terms, Gradient(by_extrinsic, by_state, by_corner)
+    by_clock = (pair_from_clock(arrays, estimate).mT @ wrench[..., None])[..., 0].sum(1)
+    by_clock += clock * arrays.clock_information_root
+    return terms, Gradient(by_extrinsic, by_state, by_corner, by_clock)

@@ -9,8 +9,9 @@ from enum import Enum
 import numpy as np
 
 from v2hdm.adjust.covariance import Covariance
-from v2hdm.adjust.problem import IntArray
-from v2hdm.records import FloatArray
+from v2hdm.adjust.gating import Excluded, Verdict, VerdictArray, excluded
+from v2hdm.adjust.problem import IntArray, Observations
+from v2hdm.records import BoolArray, FloatArray
 
 
 class Status(Enum):
@@ -41,6 +42,10 @@ _ADVICE = {
 }
 
 
+# Noise that is off by less than this factor cannot be told from what a drive's geometry does to it.
+_NOISE_FACTOR = 1.25
+
+
 @dataclass(frozen=True)
 class Solution:
     """The adjusted extrinsics, poses and corners, and the evidence that they are the optimum.
@@ -54,6 +59,9 @@ class Solution:
         mahalanobis2: squared residual in standard deviations (K,), chi-square with 2 degrees of
             freedom where model and covariances are right.
         weight: what the robust loss left of each observation (K,), 0 to 1.
+        verdict: a :class:`v2hdm.adjust.Verdict` on each observation (K,).
+        clock_offset_s: (C,) how much later than stated each camera's images were taken; 0 where that is
+            not estimated.
         cost_terms: the parts of the cost by name; they add up to :attr:`cost`.
         evaluations: of cost and gradient, all stages together.
         gap: predicted decrease still possible, as a fraction of the cost (the certificate).
@@ -69,6 +77,8 @@ class Solution:
     residual_px: FloatArray
     mahalanobis2: FloatArray
     weight: FloatArray
+    verdict: VerdictArray
+    clock_offset_s: FloatArray
     cost_terms: Mapping[str, float]
     evaluations: int
     gap: float
@@ -80,6 +90,31 @@ class Solution:
     def cost(self) -> float:
         """Half the squared, robustified residuals plus priors."""
         return sum(self.cost_terms.values())
+
+    @property
+    def accepted(self) -> BoolArray:
+        """Which observations (K,) the verdict is for."""
+        return np.asarray(self.verdict == Verdict.ACCEPTED)
+
+    def excluded(self, observations: Observations) -> tuple[Excluded, ...]:
+        """What was left out of ``observations``, those of the problem, and why; worst first."""
+        return excluded(observations, self.mahalanobis2, self.verdict)
+
+    @property
+    def noise_advice(self) -> str:
+        """One sentence on whether the residuals are as large as the stated noise says."""
+        ratio = float(np.sqrt(self.chi2_per_dof))
+        if ratio > _NOISE_FACTOR:
+            return (
+                f"The residuals are {ratio:.1f} times what the stated noise allows: the observation "
+                "covariances or pose sigmas are too small, or the poses err in a way that is not estimated."
+            )
+        if ratio < 1 / _NOISE_FACTOR:
+            return (
+                f"The residuals are {1 / ratio:.1f} times smaller than the stated noise: the map is better "
+                "than its covariances say; state smaller sigmas."
+            )
+        return "The residuals are as large as the stated noise says."
 
     @property
     def extrinsic_covariance(self) -> FloatArray:

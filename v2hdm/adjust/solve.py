@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays, make_arrays
-from v2hdm.adjust.checks import check_options, check_problem
+from v2hdm.adjust.checks import check_model, check_options, check_problem
 from v2hdm.adjust.coarse import coarse_extrinsics
 from v2hdm.adjust.covariance import Covariance
 from v2hdm.adjust.descent import Descent, descend
+from v2hdm.adjust.gating import MEDIAN_SQUARED, judge
 from v2hdm.adjust.problem import Problem, SolveOptions
 from v2hdm.adjust.residuals import Estimate, Loss, cost_and_gradient, frame_tangent, observe
 from v2hdm.adjust.robust import loss
@@ -25,7 +26,6 @@ from v2hdm.records import FloatArray
 
 # Squared residual that one good observation in a thousand exceeds: chi-square, 2 degrees of freedom.
 _OUTLIER_SQUARED = 13.8
-_MEDIAN_SQUARED = 1.386
 
 
 def solve(problem: Problem, options: SolveOptions | None = None) -> Solution:
@@ -42,7 +42,8 @@ def solve(problem: Problem, options: SolveOptions | None = None) -> Solution:
     options = options or SolveOptions()
     check_options(options)
     check_problem(problem)
-    arrays = make_arrays(problem, tuple(options.pose_states), options.device)
+    check_model(problem, options)
+    arrays = make_arrays(problem, tuple(options.pose_states), options.device, options.clock_offset)
     start, spent = _start(problem, arrays, options)
     robust = Loss(options.loss, options.loss_scale)
     descent = descend(
@@ -66,7 +67,7 @@ def _start(problem: Problem, arrays: Arrays, options: SolveOptions) -> tuple[Est
     state = torch.zeros_like(arrays.state_information_root)
     if problem.corners_start is not None:
         given = torch.as_tensor(problem.corners_start, dtype=torch.float64, device=options.device)
-        return Estimate(cam_from_vehicle, state, given[arrays.corner_order]), spent
+        return Estimate(cam_from_vehicle, state, given[arrays.corner_order], arrays.no_clock()), spent
     corners, fixed = back_project(arrays, cam_from_vehicle)
     if not bool(fixed.all()):
         corner = int(arrays.corner_order[~fixed].min())
@@ -74,7 +75,7 @@ def _start(problem: Problem, arrays: Arrays, options: SolveOptions) -> tuple[Est
             f"no ray of corner {corner} meets the ground under the starting extrinsics: its observations "
             "lie above the horizon; leave it out or give corners_start"
         )
-    return Estimate(cam_from_vehicle, state, corners), spent
+    return Estimate(cam_from_vehicle, state, corners, arrays.no_clock()), spent
 
 
 def _report(
@@ -89,19 +90,18 @@ def _report(
     residual_px = depth_one.T.cpu().numpy() * problem.intrinsic[camera, :2]
     map_from_vehicle = inverse(arrays.vehicle_from_map) @ exp(frame_tangent(arrays, estimate.frame_state))
 
-    def unsorted(values: Tensor | FloatArray, order: Tensor) -> FloatArray:
-        out = np.empty(values.shape)
-        out[order.cpu().numpy()] = values.cpu().numpy() if isinstance(values, Tensor) else values
-        return out
-
+    behind = _unsorted((view.point[2] <= NEAR_M).double(), arrays.order) > 0
+    mahalanobis2 = _unsorted(squared, arrays.order)
     return Solution(
-        status=_status(descent, options, bool((view.point[2] <= NEAR_M).any())),
+        status=_status(descent, options, bool(behind.any())),
         cam_from_vehicle=estimate.cam_from_vehicle.cpu().numpy(),
         map_from_vehicle=map_from_vehicle.cpu().numpy(),
-        corners_map=unsorted(estimate.corners_map, arrays.corner_order),
-        residual_px=unsorted(residual_px, arrays.order),
-        mahalanobis2=unsorted(squared, arrays.order),
-        weight=unsorted(loss(options.loss, squared, options.loss_scale)[1], arrays.order),
+        corners_map=_unsorted(estimate.corners_map, arrays.corner_order),
+        residual_px=_unsorted(residual_px, arrays.order),
+        mahalanobis2=mahalanobis2,
+        verdict=judge(problem.observations, mahalanobis2, behind, options.gate_probability),
+        weight=_unsorted(loss(options.loss, squared, options.loss_scale)[1], arrays.order),
+        clock_offset_s=_clock_offset_s(estimate),
         cost_terms={name: float(value) for name, value in terms.items()},
         evaluations=descent.evaluations + spent,
         gap=descent.gap,
@@ -109,6 +109,18 @@ def _report(
         time_s=time.perf_counter() - began,
         covariance=Covariance(descent.whitening),
     )
+
+
+def _clock_offset_s(estimate: Estimate) -> FloatArray:
+    """Clock offsets (C,), zero where they are not estimated."""
+    return np.asarray(estimate.clock_s.sum(1).cpu().numpy())
+
+
+def _unsorted(values: Tensor | FloatArray, order: Tensor) -> FloatArray:
+    """Rows of ``values`` back where the problem had them."""
+    out = np.empty(values.shape)
+    out[order.cpu().numpy()] = values.cpu().numpy() if isinstance(values, Tensor) else values
+    return out
 
 
 def _status(descent: Descent, options: SolveOptions, behind: bool) -> Status:
@@ -124,9 +136,9 @@ def _status(descent: Descent, options: SolveOptions, behind: bool) -> Status:
 def _chi2_per_dof(arrays: Arrays, terms: dict[str, Tensor], squared: Tensor) -> float:
     """Chi-square of good observations and priors per degree of freedom."""
     # The median tells the noise's own scale, whatever the outliers.
-    scale = max(1.0, float(squared.median()) / _MEDIAN_SQUARED)
+    scale = max(1.0, float(squared.median()) / MEDIAN_SQUARED)
     good = squared[squared <= _OUTLIER_SQUARED * scale]
-    chi2 = good.sum() + 2 * (terms["camera_centre"] + terms["frame_states"])
+    chi2 = good.sum() + 2 * sum(value for name, value in terms.items() if name != "observations")
     centres = int((arrays.centre_information_root > 0).sum())
     free = 2 * arrays.corner_count + 6 * arrays.camera_count - centres
     return float(chi2) / max(2 * len(good) - free, 1)

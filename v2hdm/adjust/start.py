@@ -45,7 +45,7 @@ def back_project(arrays: Arrays, cam_from_vehicle: Tensor) -> tuple[Tensor, Tens
     usable = sine > _MIN_DEPRESSION_SINE
     each = _one_corner_each(arrays)
     state = torch.zeros_like(arrays.state_information_root)
-    estimate = Estimate(cam_from_vehicle, state, points_map)
+    estimate = Estimate(cam_from_vehicle, state, points_map, arrays.no_clock())
     _, by_corner = jacobians(each, observe(each, estimate))
     information = torch.where(usable[:, None, None], by_corner.mT @ by_corner, torch.zeros_like(by_corner))
     points_map = torch.where(usable[:, None], points_map, torch.zeros_like(points_map))

@@ -22,8 +22,15 @@ import torch
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
-from v2hdm.adjust.reduced import Plan, from_tiles, held_hessian, subtract_corners, to_tiles
-from v2hdm.adjust.residuals import Estimate, Gradient, jacobians, observe, pair_from_state
+from v2hdm.adjust.reduced import Plan, Spread, from_tiles, held_hessian, subtract_corners, to_tiles
+from v2hdm.adjust.residuals import (
+    Estimate,
+    Gradient,
+    jacobians,
+    observe,
+    pair_from_clock,
+    pair_from_state,
+)
 from v2hdm.adjust.tiles import TIP, TiledCholesky, factorise_tiles
 
 # Keeps a corner factorable whose sightings a robust loss has all but switched off.
@@ -43,7 +50,7 @@ class Whitening:
         plan: the tiles of its reduced system.
         corner_factor: L_i, lower, (N, 2, 2).
         coupling: parts of B_i by observation and pair, (K, 2, 6).
-        pair_from_state: (C, J, 6, S).
+        spread: how the pairs move with frames and cameras.
         reduced_factor: L_S.
         smallest_pivot: least share of an unknown's own information that the others leave it.
     """
@@ -52,7 +59,7 @@ class Whitening:
     plan: Plan
     corner_factor: Tensor
     coupling: Tensor
-    pair_from_state: Tensor
+    spread: Spread
     reduced_factor: TiledCholesky
     smallest_pivot: float
 
@@ -70,12 +77,13 @@ class Whitening:
         """The step x, by block, of whitened variables y (size,)."""
         arrays, (reduced, corners) = self.arrays, self._split(whitened)
         solved = self.reduced_factor.solve_transposed(reduced[:, None])[:, 0]
-        states, extrinsics = self._split_reduced(solved)
-        by_pair = extrinsics[:, None] + (self.pair_from_state @ states[None, ..., None])[..., 0]
+        states, extrinsics, clock = self._split_reduced(solved)
+        by_pair = extrinsics[:, None] + (self.spread.state @ states[None, ..., None])[..., 0]
+        by_pair = by_pair + (self.spread.clock @ clock[:, None, :, None])[..., 0]
         moved = by_pair.reshape(-1, 6).index_select(0, arrays.pair)
         coupled = (self.coupling @ moved[..., None])[..., 0]
         rest = corners - torch.zeros_like(corners).index_add_(0, arrays.corner, coupled)
-        return Gradient(extrinsics, states, solve_lower_transposed(self.corner_factor, rest))
+        return Gradient(extrinsics, states, solve_lower_transposed(self.corner_factor, rest), clock)
 
     def whiten(self, gradient: Gradient) -> Tensor:
         """The gradient by y of a gradient by x."""
@@ -84,19 +92,22 @@ class Whitening:
         coupled = (self.coupling.mT @ corners.index_select(0, arrays.corner)[..., None])[..., 0]
         by_pair = coupled.new_zeros(arrays.pair_count, 6).index_add_(0, arrays.pair, coupled)
         by_pair = by_pair.reshape(arrays.camera_count, arrays.frame_count, 6)
-        by_state = gradient.frame_state - (self.pair_from_state.mT @ by_pair[..., None])[..., 0].sum(0)
-        by_extrinsic = gradient.extrinsic - by_pair.sum(1)
-        rest = torch.cat([to_tiles(self.plan, by_state), by_extrinsic.flatten()])
+        by_state = gradient.frame_state - (self.spread.state.mT @ by_pair[..., None])[..., 0].sum(0)
+        by_clock = gradient.clock_s - (self.spread.clock.mT @ by_pair[..., None])[..., 0].sum(1)
+        by_camera = torch.cat([gradient.extrinsic - by_pair.sum(1), by_clock], dim=1)
+        rest = torch.cat([to_tiles(self.plan, by_state), by_camera.flatten()])
         return torch.cat([self.reduced_factor.solve(rest[:, None])[:, 0], corners.flatten()])
 
     def _split(self, whitened: Tensor) -> tuple[Tensor, Tensor]:
         size = self.reduced_factor.size
         return whitened[:size], whitened[size:].reshape(-1, 2)
 
-    def _split_reduced(self, reduced: Tensor) -> tuple[Tensor, Tensor]:
-        arrays, tip = self.arrays, 6 * self.arrays.camera_count
+    def _split_reduced(self, reduced: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Frame states (J, S), extrinsics (C, 6), clock offsets (C, Q)."""
+        arrays, tip = self.arrays, self.arrays.camera_unknowns * self.arrays.camera_count
         states = from_tiles(self.plan, reduced[:-tip], arrays.frame_count, len(arrays.states))
-        return states, reduced[-tip:].reshape(-1, 6)
+        by_camera = reduced[-tip:].reshape(arrays.camera_count, -1)
+        return states, by_camera[:, :6], by_camera[:, 6:]
 
 
 def factorise(
@@ -114,7 +125,7 @@ def factorise(
     blocks.diagonal(dim1=1, dim2=2).mul_(1 + damping).add_(_CORNER_FLOOR)
     corner_factor = cholesky_2x2(blocks)
     coupling = solve_lower_matrix(corner_factor[arrays.corner], by_corner.mT @ by_pair)
-    spread = pair_from_state(arrays, estimate)
+    spread = Spread(pair_from_state(arrays, estimate), pair_from_clock(arrays, estimate))
     tiles = held_hessian(arrays, plan, estimate, by_pair, spread)
     square = [(k, k) for k in range(plan.tile_count)] + [(TIP, TIP)]
     for key in square:

@@ -8,11 +8,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.adjust import Drift, Observations, PoseSigma, Problem, Solution, SolveOptions, solve
+from v2hdm.adjust import (
+    MODELS,
+    Drift,
+    Observations,
+    PoseSigma,
+    Problem,
+    Solution,
+    SolveOptions,
+    Verdict,
+    solve,
+    with_model,
+)
 from v2hdm.errors import MappingError
 from v2hdm.mapping.association import Association
 from v2hdm.mapping.backprojection import camera_centres
 from v2hdm.mapping.location import Rig
+from v2hdm.mapping.motion import vehicle_twists
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.sightings import Sightings
 from v2hdm.records import BoolArray, Camera, FloatArray, PoseNoise
@@ -26,17 +38,34 @@ HEAVE_SIGMA_M = 0.01
 """How far a vehicle's body moves up and down on its suspension on paved ground."""
 
 
+CLOCK_SIGMA_S = 0.01
+"""How far the clocks of camera and receiver may be apart where nobody says that they are synchronised."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """What a solve estimates and how much noise it reckons with beyond that of the corners.
+
+    ``floor_px`` is added to every corner in quadrature, px.
+    """
+
+    pose_sigma: PoseSigma
+    floor_px: float
+    solver: SolveOptions
+
+
 @dataclass(frozen=True)
 class Bundle:
     """A solved bundle and what its arrays refer to.
 
-    ``rig`` holds the adjusted extrinsics and poses. Observation k is corner ``corner`` (K,) of group
-    ``group`` (K,), seen at ``row`` (K,) of the sightings. ``corner_index`` (G, 4) finds a corner in
-    the solution, -1 where it had fewer than two observations. ``camera_index`` maps camera names to
-    rows of the solution's extrinsics.
+    ``rig`` holds the adjusted extrinsics and poses, ``model`` is what was solved for. Observation k is
+    corner ``corner`` (K,) of group ``group`` (K,), seen at ``row`` (K,) of the sightings.
+    ``corner_index`` (G, 4) finds a corner in the solution, -1 where it had fewer than two observations.
+    ``camera_index`` maps camera names to rows of the solution's extrinsics.
     """
 
     rig: Rig
+    model: Model
     problem: Problem
     solution: Solution
     association: Association
@@ -54,31 +83,20 @@ class Bundle:
         out[known] = self.solution.corners_map[self.corner_index[known]]
         return out
 
-    def inliers(self, gate2: float) -> BoolArray:
-        """Which observations (K,) have a squared Mahalanobis distance within ``gate2``.
-
-        Where the stated covariances are too small overall, the gate widens with the median.
-        """
-        mahalanobis2 = self.solution.mahalanobis2
-        # The median of a chi-square distribution with two degrees of freedom is 2 ln 2.
-        scale = max(1.0, float(np.median(mahalanobis2)) / (2 * np.log(2)))
-        return np.asarray(mahalanobis2 <= gate2 * scale)
+    @property
+    def inliers(self) -> BoolArray:
+        """Which observations (K,) nothing contradicts."""
+        return np.isin(self.solution.verdict, (Verdict.ACCEPTED, Verdict.UNCONFIRMED))
 
 
-@dataclass(frozen=True)
-class Model:
-    """What a solve estimates and how much noise it reckons with beyond that of the corners.
+def full_model(pose_noise: PoseNoise, options: MappingOptions, poses: str) -> Model:
+    """Every frame has its own deviation from its recorded pose, in what the pose model ``poses`` says.
 
-    ``floor_px`` is added to every corner in quadrature, px.
+    Args:
+        pose_noise: How far the recorded poses are off.
+        options: Loss and device.
+        poses: One of :data:`v2hdm.adjust.MODELS`.
     """
-
-    pose_sigma: PoseSigma
-    floor_px: float
-    solver: SolveOptions
-
-
-def full_model(pose_noise: PoseNoise, options: MappingOptions) -> Model:
-    """Every frame has its own deviation from its recorded pose, as ``options`` say."""
     pose_sigma = PoseSigma(
         position_m=pose_noise.position_m,
         heading_rad=pose_noise.heading_rad,
@@ -89,13 +107,9 @@ def full_model(pose_noise: PoseNoise, options: MappingOptions) -> Model:
         roll_pitch_drift=Drift(pose_noise.roll_pitch_drift_rad, pose_noise.roll_pitch_drift_over_m),
     )
     solver = SolveOptions(
-        pose_states=tuple(options.pose_states),
-        loss=options.loss,
-        loss_scale=options.loss_scale,
-        coarse=False,
-        device=options.device,
+        loss=options.loss, loss_scale=options.loss_scale, coarse=False, device=options.device
     )
-    return Model(pose_sigma, options.model_floor_px, solver)
+    return Model(pose_sigma, options.model_floor_px, with_model(solver, MODELS[poses]))
 
 
 def coarse_model(rig: Rig, pose_noise: PoseNoise, options: MappingOptions) -> Model:
@@ -156,6 +170,7 @@ def solve_bundle(
     solution = solve(problem, model.solver)
     return Bundle(
         rig=_adjusted_rig(rig, sightings, used, solution),
+        model=model,
         problem=problem,
         solution=solution,
         association=association,
@@ -197,6 +212,8 @@ def _problem(
         centre_vehicle=centre,
         centre_sigma_m=sigma,
         pose_sigma=model.pose_sigma,
+        twist_vehicle=vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s)[used.frames],
+        clock_sigma_s=CLOCK_SIGMA_S,
     )
 
 

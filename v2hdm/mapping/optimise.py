@@ -8,33 +8,37 @@ is solved together, and again without the observations that contradict the rest.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from v2hdm.adjust import Status
+from v2hdm.adjust import Status, select_model
 from v2hdm.errors import MappingError
 from v2hdm.geometry.ground import extrinsic_from_ipm
 from v2hdm.mapping.association import Association, fuse_groups, same_groups
 from v2hdm.mapping.bundle import Bundle, coarse_model, full_model, solve_bundle
 from v2hdm.mapping.conclude import Evidence, Optimised, conclude
+from v2hdm.mapping.corner_order import settle_corner_order
 from v2hdm.mapping.location import Located, Rig, build_rig, locate
 from v2hdm.mapping.merge import merge_groups
-from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.options import AUTO, MappingOptions
 from v2hdm.mapping.sightings import Sightings
 from v2hdm.mapping.tracks import Uncertainty, build_tracks
 from v2hdm.mapping.views import Views
 from v2hdm.records import BoolArray, Camera, CameraInfo, FloatArray, PoseNoise
 
 IntArray = NDArray[np.int64]
+_log = logging.getLogger(__name__)
+
+SETTLED_MODEL = "heave"
+"""Pose model of the solves between which associations still change: it leaves no error of a pose out."""
 
 STEEP_SINE = 0.15
 """Sine of a ray's depression from which the coarse stage uses it (unless most rays are flatter)."""
-
-INLIER_GATE2 = 18.4
-"""Squared Mahalanobis distance that one sound observation in 10,000 exceeds (2 degrees of freedom)."""
 
 
 class Optimiser:
@@ -53,6 +57,7 @@ class Optimiser:
         self._cameras = {name: cameras[name] for name in sightings.cameras}
         self._pose_noise = pose_noise
         self._options = options
+        self._pose_model = SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
         self.camera_names = sightings.cameras
         self.initial_rig = initial_rig(self._cameras, sightings.map_from_vehicle)
 
@@ -72,6 +77,14 @@ class Optimiser:
             if same_groups(association, bundle.association):
                 break
             bundle = self._solve(association, self._locate(bundle.rig).valid, bundle.rig)
+        usable = self._locate(bundle.rig).valid
+        settled = settle_corner_order(bundle, self._sightings, usable)
+        if settled is not bundle.association:
+            tell("joint solve with settled corners")
+            bundle = self._solve(settled, usable, bundle.rig)
+        if self._options.pose_model == AUTO:
+            tell("choice of the pose model")
+            self._pose_model = self._choose_pose_model(bundle)
         tell("final solve")
         usable, inlier = self._gate(bundle)
         final = self._solve(bundle.association, usable, bundle.rig)
@@ -135,16 +148,23 @@ class Optimiser:
             self._cameras,
             coarse_model(rig, self._pose_noise, self._options)
             if coarse
-            else full_model(self._pose_noise, self._options),
+            else full_model(self._pose_noise, self._options, self._pose_model),
         )
         status = bundle.solution.status
         if status is Status.UNDETERMINED or not np.isfinite(bundle.solution.corners_map).all():
             raise MappingError(f"the joint optimisation failed ({status.value}): {status.advice}")
         return bundle
 
+    def _choose_pose_model(self, bundle: Bundle) -> str:
+        """The name of the model that predicts held-out observations best, from where ``bundle`` ended."""
+        start = replace(bundle.problem, cam_from_vehicle=bundle.solution.cam_from_vehicle)
+        selection = select_model(start, bundle.model.solver)
+        _log.info("%s: %s", ", ".join(self.camera_names), selection.sentence)
+        return selection.name
+
     def _gate(self, bundle: Bundle) -> tuple[BoolArray, BoolArray]:
         """Corners (S, 4) of accepted observations, and the verdict on each observation (K,)."""
-        inlier = bundle.inliers(INLIER_GATE2)
+        inlier = bundle.inliers
         order = bundle.association.corner_order()
         usable = np.zeros_like(self._sightings.valid)
         row, corner = bundle.row[inlier], bundle.corner[inlier]

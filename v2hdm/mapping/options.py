@@ -6,6 +6,10 @@ from dataclasses import dataclass, field
 
 from v2hdm.errors import ConfigError
 
+AUTO = "auto"
+POSE_MODELS: tuple[str, ...] = (AUTO, "paper", "roll_pitch", "full", "heave", "clock")
+"""What ``mapping.pose_model`` may be: those of :data:`v2hdm.adjust.MODELS`, or ``auto``."""
+
 
 @dataclass(kw_only=True)
 class AssociationOptions:
@@ -76,16 +80,17 @@ class MappingOptions:
 
     Observations farther than ``max_range_m`` from the camera are left out. ``model_floor_px`` is
     added to every corner's covariance for what no corner fit knows of: lens, shutter, flatness.
-    ``pose_states`` are the components of each frame's pose that are estimated along with the map
-    (all of ``roll pitch heading x y height``; empty is the paper's model, which trusts the
-    recorded poses). ``loss`` and ``loss_scale`` are the robust loss of the solver.
+    ``pose_model`` says what of each frame's pose is estimated along with the map: ``paper``, nothing;
+    ``roll_pitch``; ``full``, heading and position too; ``heave``, the height too; ``clock``, each camera's
+    clock offset too; ``auto``, the one of them that predicts held-out observations best. ``loss`` and
+    ``loss_scale`` are the robust loss of the solver.
     ``rounds`` counts association under the optimised extrinsic followed by a joint solve.
     ``device`` is the torch device that the joint solves run on, ``cpu`` or ``cuda``.
     """
 
     max_range_m: float = 16.0
     model_floor_px: float = 0.15
-    pose_states: list[str] = field(default_factory=lambda: ["roll", "pitch", "heading", "x", "y", "height"])
+    pose_model: str = "auto"
     loss: str = "cauchy"
     loss_scale: float = 2.0
     rounds: int = 2
@@ -113,6 +118,10 @@ def check_options(options: MappingOptions) -> None:
         "lanes.half_width_m": options.lanes.half_width_m,
         "lanes.half_length_m": options.lanes.half_length_m,
     }
+    if options.pose_model not in POSE_MODELS:
+        raise ConfigError(
+            f"mapping.pose_model is {options.pose_model!r}; choose from {', '.join(POSE_MODELS)}."
+        )
     for key, value in positive.items():
         if not value > 0:
             raise ConfigError(f"mapping.{key} is {value}; it must be greater than zero.")

@@ -28,13 +28,14 @@ class Sightings:
     """S quadrilateral detections of a drive, in the order of its images.
 
     ``image`` indexes ``Drive.images``, ``camera`` indexes ``cameras``, ``frame`` indexes the
-    F distinct time stamps whose recorded poses are ``map_from_vehicle`` (F, 4, 4), so that images
-    taken together share a frame. ``kind`` indexes :data:`v2hdm.records.CORNERED_CLASSES`.
+    F distinct time stamps ``stamp_s`` (F,) whose recorded poses are ``map_from_vehicle`` (F, 4, 4), so that
+    images taken together share a frame. ``kind`` indexes :data:`v2hdm.records.CORNERED_CLASSES`.
     ``corners_pinhole_px`` (S, 4, 2) have covariances ``covariance_px`` (S, 4, 2, 2), px^2;
     ``valid`` (S, 4) says which of them may be used.
     """
 
     cameras: tuple[str, ...]
+    stamp_s: FloatArray
     map_from_vehicle: FloatArray
     image: IntArray
     camera: IntArray
@@ -51,6 +52,7 @@ class Sightings:
         """The sightings at ``rows`` (indices or a mask), over the same cameras and frames."""
         return Sightings(
             cameras=self.cameras,
+            stamp_s=self.stamp_s,
             map_from_vehicle=self.map_from_vehicle,
             image=self.image[rows],
             camera=self.camera[rows],
@@ -66,19 +68,24 @@ class Sightings:
 class Frames:
     """The distinct time stamps of a drive.
 
-    ``frame_of_image`` (I,) indexes ``map_from_vehicle`` (F, 4, 4), the recorded poses.
+    ``frame_of_image`` (I,) indexes ``stamp_s`` (F,) and ``map_from_vehicle`` (F, 4, 4), the recorded poses.
     """
 
     frame_of_image: IntArray
+    stamp_s: FloatArray
     map_from_vehicle: FloatArray
 
 
 def frames_of(drive: Drive) -> Frames:
     """Number the distinct time stamps of ``drive``; images of one stamp share a frame."""
     stamps_s = np.array([image.stamp_s for image in drive.images])
-    _, first, inverse = np.unique(stamps_s, return_index=True, return_inverse=True)
+    distinct_s, first, inverse = np.unique(stamps_s, return_index=True, return_inverse=True)
     poses = np.stack([drive.images[i].map_from_vehicle for i in first])
-    return Frames(frame_of_image=inverse.astype(np.int64), map_from_vehicle=poses.astype(np.float64))
+    return Frames(
+        frame_of_image=inverse.astype(np.int64),
+        stamp_s=distinct_s,
+        map_from_vehicle=poses.astype(np.float64),
+    )
 
 
 def collect_sightings(
@@ -114,6 +121,7 @@ def collect_sightings(
     valid &= np.isfinite(corners).all(axis=2) & np.isfinite(covariance).all(axis=(2, 3))
     return Sightings(
         cameras=tuple(cameras),
+        stamp_s=frames.stamp_s,
         map_from_vehicle=frames.map_from_vehicle,
         image=image,
         camera=camera,

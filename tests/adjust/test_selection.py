@@ -1,0 +1,54 @@
+"""The drive itself says which model of its poses' errors is right."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.adjust.scene import make_scene
+from v2hdm.adjust import MODELS, PoseSigma, SolveOptions, select_model, solve
+from v2hdm.adjust.subset import restrict
+from v2hdm.errors import AdjustError
+
+STILL = PoseSigma(position_m=1e-5, heading_rad=1e-6, roll_pitch_rad=1e-6, height_m=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("jitter", "expected"),
+    [
+        (STILL, {"paper"}),
+        (replace(STILL, roll_pitch_rad=0.004), {"roll_pitch"}),
+        (PoseSigma(position_m=0.03, heading_rad=0.003, height_m=1e-5), {"full"}),
+        (PoseSigma(position_m=0.03, heading_rad=0.003, height_m=0.03), {"heave"}),
+    ],
+)
+def test_the_model_is_chosen_that_made_the_drive(jitter, expected):
+    scene = make_scene(30, frames=60, jitter=jitter, start_error_deg=0.2, start_error_m=0.01)
+    told = replace(scene.problem, pose_sigma=PoseSigma(position_m=0.03, heading_rad=0.003, height_m=0.03))
+    selection = select_model(told, SolveOptions(loss_scale=2.0), ("paper", "roll_pitch", "full", "heave"))
+    assert selection.name in expected
+    assert set(selection.scores) == {"paper", "roll_pitch", "full", "heave"}
+    assert repr(selection.name) in selection.sentence
+
+
+def test_an_unknown_model_is_refused_with_the_choices():
+    with pytest.raises(AdjustError, match="unknown model 'm5': choose from paper, roll_pitch, full"):
+        select_model(make_scene(31, frames=20).problem, SolveOptions(), ("m5",))
+
+
+def test_a_clock_needs_the_vehicles_motion_and_is_else_left_out():
+    scene = make_scene(32, frames=20, start_error_deg=0.2)
+    assert set(select_model(scene.problem, SolveOptions(), ("paper", "clock")).scores) == {"paper"}
+    assert MODELS["clock"].clock_offset
+
+
+def test_a_part_of_a_problem_has_the_residuals_of_the_whole():
+    problem = make_scene(33, frames=40, start_error_deg=0.5).problem
+    seen = problem.observations
+    keep = (seen.frame >= 10) & (seen.frame < 30)
+    keep &= np.bincount(seen.corner[keep], minlength=problem.corner_count)[seen.corner] >= 2
+    part, corners = restrict(problem, keep)
+    assert len(part.map_from_vehicle) <= 20
+    assert part.corner_count == len(corners)
+    np.testing.assert_array_equal(corners[part.observations.corner], seen.corner[keep])
+    assert solve(part, SolveOptions(pose_states=(), loss="none")).chi2_per_dof == pytest.approx(1, abs=0.15)

@@ -1,0 +1,104 @@
+"""Which observations the solution stands on, and why the others were left out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v2hdm.adjust.problem import IntArray, Observations
+from v2hdm.records import BoolArray, FloatArray
+
+VerdictArray = NDArray[np.int8]
+
+# The median of a chi-square distribution with two degrees of freedom is 2 ln 2.
+MEDIAN_SQUARED = 2 * float(np.log(2))
+
+
+class Verdict(IntEnum):
+    """What became of an observation; :attr:`reason` says it in words."""
+
+    ACCEPTED = 0
+    CONTRADICTS = 1
+    UNCONFIRMED = 2
+    BEHIND_CAMERA = 3
+
+    @property
+    def reason(self) -> str:
+        """Half a sentence: why."""
+        return _REASONS[self]
+
+
+_REASONS = {
+    Verdict.ACCEPTED: "agrees with the rest",
+    Verdict.CONTRADICTS: "lies where the rest of the drive does not put its corner",
+    Verdict.UNCONFIRMED: "its corner's other observations contradict it and one another",
+    Verdict.BEHIND_CAMERA: "its corner lies behind the camera that is said to have seen it",
+}
+
+
+@dataclass(frozen=True)
+class Excluded:
+    """One observation that was not accepted; ``distance_sigma`` is its residual in standard deviations."""
+
+    observation: int
+    camera: int
+    frame: int
+    corner: int
+    distance_sigma: float
+    verdict: Verdict
+
+    @property
+    def sentence(self) -> str:
+        """What was left out and why."""
+        return (
+            f"observation {self.observation} (corner {self.corner}, camera {self.camera}, "
+            f"frame {self.frame}): {self.verdict.reason} ({self.distance_sigma:.1f} sigma)"
+        )
+
+
+def judge(
+    observations: Observations, mahalanobis2: FloatArray, behind: BoolArray, probability: float
+) -> VerdictArray:
+    """A :class:`Verdict` (K,) for every observation.
+
+    The gate is the squared distance that a sound observation exceeds with ``probability`` (chi-square,
+    two degrees of freedom: -2 ln p). Where the stated covariances are too small overall, the gate
+    widens with the median, so that a wrong noise model does not empty the map. An observation is
+    unconfirmed when the gate leaves it alone with a corner that had others.
+
+    Args:
+        observations: what was seen.
+        mahalanobis2: squared residuals in standard deviations (K,).
+        behind: corners (K,) that lie behind their camera.
+        probability: share of sound observations that one is ready to lose.
+    """
+    scale = max(1.0, float(np.median(mahalanobis2)) / MEDIAN_SQUARED)
+    verdict = np.where(mahalanobis2 > -2 * np.log(probability) * scale, Verdict.CONTRADICTS, Verdict.ACCEPTED)
+    verdict[behind] = Verdict.BEHIND_CAMERA
+    accepted = verdict == Verdict.ACCEPTED
+    left = np.bincount(observations.corner[accepted], minlength=int(observations.corner.max()) + 1)
+    seen = np.bincount(observations.corner, minlength=len(left))
+    verdict[accepted & ((left == 1) & (seen > 1))[observations.corner]] = Verdict.UNCONFIRMED
+    return verdict.astype(np.int8)
+
+
+def excluded(
+    observations: Observations, mahalanobis2: FloatArray, verdict: VerdictArray
+) -> tuple[Excluded, ...]:
+    """The observations that were not accepted, worst first."""
+    rows: IntArray = np.flatnonzero(verdict != Verdict.ACCEPTED)
+    rows = rows[np.argsort(-mahalanobis2[rows], kind="stable")]
+    return tuple(
+        Excluded(
+            observation=int(k),
+            camera=int(observations.camera[k]),
+            frame=int(observations.frame[k]),
+            corner=int(observations.corner[k]),
+            distance_sigma=float(np.sqrt(mahalanobis2[k])),
+            verdict=Verdict(int(verdict[k])),
+        )
+        for k in rows
+    )

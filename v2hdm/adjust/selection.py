@@ -1,0 +1,170 @@
+"""Which model of the poses' errors a drive calls for, judged by observations that it did not see.
+
+Every model is fitted to most of the observations of a stretch of the drive and predicts the others. What
+it predicts best is right, in the one sense that a drive without ground truth can tell: a model that
+leaves an error out mispredicts, and one that fits noise does, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from v2hdm.adjust.problem import Observations, Problem, SolveOptions
+from v2hdm.adjust.solution import Solution
+from v2hdm.adjust.solve import solve
+from v2hdm.adjust.subset import restrict
+from v2hdm.errors import AdjustError
+from v2hdm.geometry.transform import exp
+from v2hdm.records import BoolArray, FloatArray
+
+
+@dataclass(frozen=True)
+class Model:
+    """What is estimated of the poses beside map and extrinsics."""
+
+    pose_states: tuple[str, ...] = ()
+    clock_offset: bool = False
+
+
+MODELS: Mapping[str, Model] = {
+    "paper": Model(),
+    "roll_pitch": Model(("roll", "pitch")),
+    "full": Model(("roll", "pitch", "heading", "x", "y")),
+    "heave": Model(("roll", "pitch", "heading", "x", "y", "height")),
+    "clock": Model(("roll", "pitch", "heading", "x", "y", "height"), clock_offset=True),
+}
+"""Models by name, the simplest first. ``paper`` trusts the recorded poses."""
+
+# Frames of the stretch that models are compared on, and the share of its observations held out.
+_STRETCH_FRAMES = 120
+_HELD_OUT_SHARE = 0.2
+# Where the loss of a held-out residual bends, squared sigmas: wrong associations must not decide.
+_LOSS_SCALE2 = 9.0
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The model chosen, and each model's score: the mean robust loss of the held-out observations.
+
+    Without a model error and for Gaussian noise the score is a little below 2.
+    """
+
+    name: str
+    scores: Mapping[str, float]
+
+    @property
+    def sentence(self) -> str:
+        """What was chosen over what."""
+        scores = ", ".join(f"{name} {score:.2f}" for name, score in self.scores.items())
+        return f"pose model {self.name!r} predicts held-out observations best (mean loss: {scores})"
+
+
+def with_model(options: SolveOptions, model: Model) -> SolveOptions:
+    """``options`` that estimate what ``model`` says."""
+    return replace(options, pose_states=model.pose_states, clock_offset=model.clock_offset)
+
+
+def select_model(
+    problem: Problem, options: SolveOptions, names: Sequence[str] = tuple(MODELS), seed: int = 0
+) -> Selection:
+    """Choose the richest of the models ``names`` that predicts as well as the best.
+
+    As well means: within one standard error of the paired difference, by frames, since errors within a frame
+    go together (Hastie, Tibshirani and Friedman, The Elements of Statistical Learning, section 7.10). Of
+    equals the richest, since its priors keep it from fitting noise, and an error that is not estimated is
+    missing from the stated accuracy, too. A clock offset trades against the camera's forward offset, so it
+    is taken only where it predicts better by more than a standard error.
+
+    Args:
+        problem: the drive; its extrinsics are the start, and had better be near already.
+        options: how to solve.
+        names: of :data:`MODELS`, the simplest first; ``clock`` is left out where twists are not known.
+        seed: draws what is held out.
+
+    Raises:
+        AdjustError: a name is unknown, or a model's problem cannot be solved.
+    """
+    unknown = [name for name in names if name not in MODELS]
+    if unknown:
+        raise AdjustError(f"unknown model {unknown[0]!r}: choose from {', '.join(MODELS)}")
+    candidates = [
+        name for name in names if problem.twist_vehicle is not None or not MODELS[name].clock_offset
+    ]
+    stretch, _ = restrict(problem, _stretch(problem))
+    held_out = _held_out(stretch.observations, np.random.default_rng(seed))
+    fitted, corners = restrict(stretch, ~held_out)
+    losses = {}
+    for name in candidates:
+        solution = solve(fitted, replace(with_model(options, MODELS[name]), coarse=False))
+        squared = predicted_squared(stretch, held_out, fitted, solution, corners)
+        losses[name] = _LOSS_SCALE2 * np.log1p(squared / _LOSS_SCALE2)
+    frame = stretch.observations.frame[held_out]
+    punctual = [name for name in candidates if not MODELS[name].clock_offset] or candidates
+    best = min(punctual, key=lambda name: float(losses[name].mean()))
+    chosen = [name for name in punctual if _as_good(losses[name] - losses[best], frame)][-1]
+    for name in candidates:
+        if not _as_good(losses[chosen] - losses[name], frame):
+            chosen = name
+    return Selection(chosen, {name: float(loss.mean()) for name, loss in losses.items()})
+
+
+def predicted_squared(
+    whole: Problem, held_out: BoolArray, fitted: Problem, solution: Solution, corners: np.ndarray
+) -> FloatArray:
+    """Squared residuals, in standard deviations, of the ``held_out`` observations of ``whole``.
+
+    ``solution`` is that of ``fitted``, the rest of ``whole``, whose corners are ``corners`` of ``whole``.
+    """
+    seen = whole.observations
+    camera, frame = seen.camera[held_out], seen.frame[held_out]
+    first = int(whole.observations.frame[~held_out].min())
+    vehicle_from_map = np.linalg.inv(solution.map_from_vehicle)[frame - first]
+    if fitted.twist_vehicle is not None:
+        moved = fitted.twist_vehicle[frame - first] * solution.clock_offset_s[camera, None]
+        vehicle_from_map = exp(torch.as_tensor(-moved)).numpy() @ vehicle_from_map
+    cam_from_map = solution.cam_from_vehicle[camera] @ vehicle_from_map
+    points_map = solution.corners_map[np.searchsorted(corners, seen.corner[held_out])]
+    ground = np.column_stack([points_map, np.zeros(len(points_map)), np.ones(len(points_map))])
+    points = (cam_from_map @ ground[..., None])[:, :3, 0]
+    intrinsic = whole.intrinsic[camera]
+    pixel = intrinsic[:, :2] * points[:, :2] / points[:, 2:] + intrinsic[:, 2:]
+    off = pixel - seen.pinhole_px[held_out]
+    solved = np.linalg.solve(seen.covariance_px[held_out], off[..., None])[..., 0]
+    return np.asarray(np.sum(off * solved, axis=1))
+
+
+def _stretch(problem: Problem) -> BoolArray:
+    """Observations (K,) of the run of frames that holds most of them, every camera's included."""
+    seen, frames = problem.observations, len(problem.map_from_vehicle)
+    if frames <= _STRETCH_FRAMES:
+        return np.ones(len(seen.frame), dtype=bool)
+    count = np.zeros(frames + 1)
+    count[1:] = np.cumsum(np.bincount(seen.frame, minlength=frames))
+    begin = int(np.argmax(count[_STRETCH_FRAMES:] - count[:-_STRETCH_FRAMES]))
+    keep = (seen.frame >= begin) & (seen.frame < begin + _STRETCH_FRAMES)
+    keep &= np.bincount(seen.corner[keep], minlength=problem.corner_count)[seen.corner] >= 2
+    everywhere = len(np.unique(seen.camera[keep])) == len(problem.intrinsic)
+    return keep if everywhere else np.ones(len(seen.frame), dtype=bool)
+
+
+def _held_out(seen: Observations, rng: np.random.Generator) -> BoolArray:
+    """A share of the observations (K,); two of each corner stay, and the first and last frames."""
+    order = rng.permutation(len(seen.corner))
+    place = np.empty(len(order), dtype=np.int64)
+    by_corner = order[np.argsort(seen.corner[order], kind="stable")]
+    starts = np.flatnonzero(np.diff(seen.corner[by_corner], prepend=-1))
+    place[by_corner] = np.arange(len(order)) - np.repeat(starts, np.diff(starts, append=len(order)))
+    held_out = (place >= 2) & (rng.random(len(order)) < _HELD_OUT_SHARE)
+    fitted = seen.frame[~held_out]
+    return np.asarray(held_out & (seen.frame >= fitted.min()) & (seen.frame <= fitted.max()))
+
+
+def _as_good(excess: FloatArray, frame: np.ndarray) -> bool:
+    """Whether losses exceed the best ones by no more than one standard error, clustered by ``frame``."""
+    mean = float(excess.mean())
+    by_frame = np.bincount(frame, weights=excess - mean)
+    return mean <= float(np.sqrt(np.sum(by_frame**2))) / len(excess)

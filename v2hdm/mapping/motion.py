@@ -1,0 +1,22 @@
+"""How the vehicle moves, from its recorded poses."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from v2hdm.geometry.transform import log
+from v2hdm.records import FloatArray
+
+
+def vehicle_twists(map_from_vehicle: FloatArray, stamp_s: FloatArray) -> FloatArray:
+    """Twists (F, 6) of the vehicle in its own frame, m/s then rad/s, at poses (F, 4, 4) at times (F,).
+
+    Central differences, one-sided at the ends; a single pose has no motion.
+    """
+    count = len(stamp_s)
+    before, after = np.maximum(np.arange(count) - 1, 0), np.minimum(np.arange(count) + 1, count - 1)
+    moved = np.linalg.inv(map_from_vehicle[before]) @ map_from_vehicle[after]
+    tangent = log(torch.as_tensor(moved)).detach().numpy()
+    elapsed_s = stamp_s[after] - stamp_s[before]
+    return np.asarray(tangent / np.where(elapsed_s > 0, elapsed_s, 1.0)[:, None])
