@@ -78,26 +78,37 @@ def test_the_normal_distribution_is_right_to_four_digits():
     np.testing.assert_allclose(pdf[2:4], [0.3989423, 0.2419707], atol=1e-6)
 
 
+def lattice(columns: int, rows: int) -> np.ndarray:
+    """Pixel centres (1, 3, N) as the coverage takes them."""
+    u, v = np.meshgrid(np.arange(columns), np.arange(rows))
+    return np.stack([u.ravel(), v.ravel(), np.ones(u.size)])[None].astype(np.float32)
+
+
 def test_blurred_coverage_is_that_of_a_finely_drawn_and_blurred_shape():
-    columns, rows, blur_px, fine = np.arange(45.0)[None], np.arange(28.0)[None], 0.7, 15
+    blur_px, fine = 0.7, 15
     u, v = np.meshgrid((np.arange(45 * fine) + 0.5) / fine - 0.5, (np.arange(28 * fine) + 0.5) / fine - 0.5)
     _, normal, _ = side_frames(KITE)
     offset = np.stack([u, v], axis=-1)[:, :, None] - KITE
     drawn = ((offset * normal).sum(axis=-1) < 0).all(axis=-1).astype(np.float32)
     drawn = cv2.GaussianBlur(drawn, (0, 0), blur_px * fine)[fine // 2 :: fine, fine // 2 :: fine]
-    coverage, _ = blurred_coverage(KITE[None], columns, rows, blur_px)
-    np.testing.assert_allclose(coverage[0], drawn, atol=4e-3)
+    coverage, _ = blurred_coverage(KITE[None], lattice(45, 28), blur_px)
+    np.testing.assert_allclose(coverage.reshape(28, 45), drawn, atol=4e-3)
     assert coverage.sum() == pytest.approx(-signed_area(KITE), rel=1e-4)
 
 
 def test_the_derivative_of_coverage_is_its_slope():
-    columns, rows, step = np.arange(45.0)[None], np.arange(28.0)[None], 0.02
-    _, derivative = blurred_coverage(KITE[None], columns, rows, 0.7)
+    """Corner c is the start of side c and the end of side c - 1, and moves each along its normal."""
+    points, step = lattice(45, 28), 0.15
+    _, by_side = blurred_coverage(KITE[None], points, 0.7)
+    _, normal, _ = side_frames(KITE)
     for corner, axis in np.ndindex(4, 2):
         shift = np.zeros((1, 4, 2))
         shift[0, corner, axis] = step
-        more, less = (blurred_coverage(KITE + sign * shift, columns, rows, 0.7)[0] for sign in (1, -1))
-        np.testing.assert_allclose(derivative[:, corner, axis], (more - less) / (2 * step), atol=2e-3)
+        moved = [blurred_coverage(KITE + k * shift, points, 0.7)[0] for k in (-2, -1, 1, 2)]
+        difference = (moved[0] - 8 * moved[1] + 8 * moved[2] - moved[3]) / (12 * step)
+        before = (corner - 1) % 4
+        slope = normal[corner, axis] * by_side[:, corner] + normal[before, axis] * by_side[:, 4 + before]
+        np.testing.assert_allclose(slope, difference, atol=2e-3)
 
 
 def test_zero_crossings_are_interpolated_between_neighbours():

@@ -24,7 +24,6 @@ TYPICAL_BLUR_PX = 0.75
 _NEAR_WIDTH_PX = 15.0
 _NEAR_SIDE_PX = 14.0
 _FAR_MAX_PX = 200.0
-_SMALL_PX = np.array([44.0, 18.0])
 _COVARIANCE_FACTOR = 1.4
 _COVARIANCE_FLOOR_PX = 0.03
 _MAX_MISFIT = 0.2
@@ -33,7 +32,7 @@ _MAX_LEVEL_RATIO = 2.0
 _BLUR_QUANTILE = 0.4
 _BLUR_PRIOR_SIDES = 6
 _BLUR_LIMITS_PX = (0.45, 1.5)
-_ROWS_AROUND_PX = 16
+_AROUND_PX = 16
 _MIN_VALID_CORNERS = 2
 
 
@@ -77,10 +76,11 @@ def fit_markings(
         return []
     start = np.stack([s.corners_pinhole_px for s in starts])
     blobs = np.array([s.blob for s in starts])
-    grey = _grey_around(image_bgr, view, start, foreground)
+    start_px = view.distort(start.reshape(-1, 2)).reshape(start.shape)
+    grey = _grey_around(image_bgr, view, start_px, foreground)
     near = _is_near(start)
     found = _Corners(
-        view.distort(start.reshape(-1, 2)).reshape(start.shape),
+        start_px,
         np.tile(np.eye(8), (len(starts), 1, 1)),
         np.zeros((len(starts), 4), dtype=np.bool_),
     )
@@ -90,8 +90,8 @@ def fit_markings(
         _take_edges(found, near, edges, view)
         blur_px = blur_px or _measured_blur(edges)
     far = ~found.valid.any(axis=1) & (np.ptp(found.px, axis=1).max(axis=1) < _FAR_MAX_PX)
-    for group in _similar_sizes(found.px, far):
-        _take_quads(found, group, grey, foreground, blobs, view, blur_px or TYPICAL_BLUR_PX)
+    if far.any():
+        _take_quads(found, np.flatnonzero(far), grey, foreground, blobs, view, blur_px or TYPICAL_BLUR_PX)
     found.covariance = _COVARIANCE_FACTOR * found.covariance + _COVARIANCE_FLOOR_PX**2 * np.eye(8)
     _reject(found, view, options)
     return [
@@ -107,14 +107,15 @@ def _is_near(corners: FloatArray) -> BoolArray:
 
 
 def _grey_around(
-    image_bgr: np.ndarray, view: CameraView, start: FloatArray, foreground: Foreground
+    image_bgr: np.ndarray, view: CameraView, corners_px: FloatArray, foreground: Foreground
 ) -> GreyBand:
-    """Linear grey of the rows that hold the markings."""
-    rows = view.distort(start.reshape(-1, 2))[:, 1]
-    top = max(foreground.top, int(rows.min()) - _ROWS_AROUND_PX)
+    """Linear grey around markings that start at recorded ``corners_px`` (M, 4, 2)."""
+    low = np.floor(corners_px.min(axis=1)).astype(np.intp) - _AROUND_PX
+    high = np.ceil(corners_px.max(axis=1)).astype(np.intp) + _AROUND_PX
+    top = max(foreground.top, int(low[:, 1].min()))
     top -= (top - foreground.top) % foreground.stride
-    bottom = min(view.info.height, max(int(rows.max()) + _ROWS_AROUND_PX, top + 1))
-    return linear_grey(image_bgr, top, bottom, view.camera.linear_response)
+    bottom = min(view.info.height, max(int(high[:, 1].max()), top + 1))
+    return linear_grey(image_bgr, top, bottom, np.hstack([low, high]), view.camera.linear_response)
 
 
 def _take_edges(found: _Corners, near: BoolArray, edges: EdgeFit, view: CameraView) -> None:
@@ -157,13 +158,6 @@ def _take_quads(
     found.px[group[good]] = corners[good]
     found.covariance[group[good]] = fit.covariance[good]
     found.valid[group[good]] = True
-
-
-def _similar_sizes(corners_px: FloatArray, mask: BoolArray) -> list[np.ndarray]:
-    """Indices under the mask, small and large markings apart: a batch is padded to its largest."""
-    size = np.ptp(corners_px, axis=1)
-    small = (size <= _SMALL_PX).all(axis=1)
-    return [group for half in (small, ~small) if len(group := np.flatnonzero(mask & half))]
 
 
 def _measured_blur(edges: EdgeFit) -> float | None:

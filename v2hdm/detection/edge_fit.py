@@ -23,7 +23,9 @@ _SEARCH_PX = 6.0
 _SEARCH_SAMPLES = 25
 _FIT_PX = 2.5
 _FIT_SAMPLES = 13
-_FIT_ITERATIONS = 6
+_FIT_ITERATIONS = 4
+_SEARCH_ITERATIONS = 4
+_LINE_ITERATIONS = 6
 _START_BLUR_PX = 0.8
 _BLUR_LIMITS_PX = (0.35, 3.0)
 _INTERPOLATION_VARIANCE = 0.35**2
@@ -98,14 +100,14 @@ def _search_lines(grey: GreyBand, view: CameraView, corners: FloatArray, reach: 
     strong = np.isfinite(step) & (
         step > 0.3 * np.nanmax(np.where(np.isfinite(step), step, 0), axis=(1, 2), keepdims=True)
     )
-    return _robust_lines(frames, along, offset, strong)
+    return _robust_lines(frames, along, offset, strong, _SEARCH_ITERATIONS)
 
 
 def _fit_lines(grey: GreyBand, view: CameraView, corners: FloatArray) -> EdgeFit:
     t = np.broadcast_to(np.linspace(-_FIT_PX, _FIT_PX, _FIT_SAMPLES), (len(corners), _FIT_SAMPLES))
     values, along, frames = _profiles(grey, view, corners, t, np.full(len(corners), _FIT_PX))
     profile = _fit_profiles(values, t[0].astype(np.float32))
-    lines = _robust_lines(frames, along, profile.offset, profile.good)
+    lines = _robust_lines(frames, along, profile.offset, profile.good, _LINE_ITERATIONS)
     found = lines.inliers >= _MIN_INLIERS
     fitted = lines.corners()
     both = found & np.roll(found, 1, axis=1) & np.isfinite(fitted).all(axis=-1)
@@ -206,15 +208,23 @@ def _update_blur(
 
 
 def _robust_lines(
-    frames: tuple[FloatArray, FloatArray, FloatArray], along: FloatArray, offset: FloatArray, good: BoolArray
+    frames: tuple[FloatArray, FloatArray, FloatArray],
+    along: FloatArray,
+    offset: FloatArray,
+    good: BoolArray,
+    iterations: int,
 ) -> _Lines:
     """Tukey lines through offsets (M, 4, n) at positions ``along`` the sides."""
     weight = good.astype(np.float64)
-    for _ in range(8):
-        constant, slope, normal_matrix = _weighted_line(along, offset, weight)
+    terms = np.stack([np.ones_like(along), along, along * along, offset, along * offset], axis=-1)
+    middle = np.maximum(good.sum(axis=-1, keepdims=True) - 1, 0) // 2
+    for _ in range(iterations):
+        constant, slope, normal_matrix = _weighted_line(weight, terms)
         residual = offset - constant[..., None] - slope[..., None] * along
-        scatter = np.maximum(1.4826 * _masked_median(np.abs(residual), good), _MIN_SCATTER_PX)[..., None]
-        weight = good * np.clip(1 - (residual / (_TUKEY * scatter)) ** 2, 0, None) ** 2
+        ordered = np.sort(np.where(good, np.abs(residual), np.inf), axis=-1)
+        scatter = 1.4826 * np.take_along_axis(ordered, middle, axis=-1)
+        scatter = np.maximum(scatter, _MIN_SCATTER_PX)
+        weight = good * np.maximum(1 - (residual / (_TUKEY * scatter)) ** 2, 0) ** 2
     inliers = (weight > 0.1).sum(axis=-1)
     variance = (weight * residual**2).sum(axis=-1) / np.maximum(weight.sum(axis=-1) - 2, 1)
     variance = np.maximum(variance, _MIN_SCATTER_PX**2) * _correlation_factor(residual, weight)
@@ -222,14 +232,13 @@ def _robust_lines(
     return _Lines(*frames, constant, slope, covariance, inliers)
 
 
-def _weighted_line(
-    x: FloatArray, y: FloatArray, weight: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    s0, s1, s2 = weight.sum(axis=-1) + 1e-9, (weight * x).sum(axis=-1), (weight * x * x).sum(axis=-1) + 1e-9
-    t0, t1 = (weight * y).sum(axis=-1), (weight * x * y).sum(axis=-1)
+def _weighted_line(weight: FloatArray, terms: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Constant, slope and normal matrix of lines from ``terms`` (..., n, 5): 1, x, x^2, y, x y."""
+    s0, s1, s2, t0, t1 = np.moveaxis((weight[..., None, :] @ terms)[..., 0, :], -1, 0)
+    s0, s2 = s0 + 1e-9, s2 + 1e-9
     determinant = np.maximum(s0 * s2 - s1 * s1, 1e-12)
     constant, slope = (s2 * t0 - s1 * t1) / determinant, (s0 * t1 - s1 * t0) / determinant
-    normal_matrix = np.stack([np.stack([s0, s1], axis=-1), np.stack([s1, s2], axis=-1)], axis=-1)
+    normal_matrix = np.stack([s0, s1, s1, s2], axis=-1).reshape(*s0.shape, 2, 2)
     return constant, slope, normal_matrix
 
 

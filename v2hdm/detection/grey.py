@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
 
 _GREY_WEIGHTS_BGR = (0.114, 0.587, 0.299)
+_SUM = np.ones((1, 3), dtype=np.float32)
 _CODED = np.arange(256) / 255
 _LINEAR_FROM_SRGB = np.where(_CODED <= 0.04045, _CODED / 12.92, ((_CODED + 0.055) / 1.055) ** 2.4)
 
@@ -28,15 +30,29 @@ class GreyBand:
         )
 
 
-def linear_grey(image_bgr: np.ndarray, top: int, bottom: int, linear_response: bool) -> GreyBand:
+def linear_grey(
+    image_bgr: np.ndarray, top: int, bottom: int, boxes: np.ndarray, linear_response: bool
+) -> GreyBand:
     """Rows ``top`` to ``bottom`` of an image (H, W, 3) uint8 as grey in [0, 1], proportional to radiance.
 
-    sRGB coding is undone unless ``linear_response``: fitting edges on coded values pushes each side
-    of a bright marking outwards by about a fifth of the blur.
+    Only the ``boxes`` (M, 4) of left, top, right, bottom in px, the last two exclusive, are converted,
+    and what lies outside all of them is NaN: markings cover a small part of the image. sRGB coding is
+    undone unless ``linear_response``: fitting edges on coded values pushes each side of a bright
+    marking outwards by about a fifth of the blur.
     """
-    table = _CODED if linear_response else _LINEAR_FROM_SRGB
-    rows = image_bgr[top:bottom]
-    values = np.zeros(rows.shape[:2], dtype=np.float32)
-    for channel, weight in enumerate(_GREY_WEIGHTS_BGR):
-        values += cv2.LUT(cv2.extractChannel(rows, channel), (weight * table).astype(np.float32))
+    table = _table(linear_response)
+    values = np.full((bottom - top, image_bgr.shape[1]), np.nan, dtype=np.float32)
+    low = np.maximum(boxes[:, :2], [0, top])
+    high = np.minimum(boxes[:, 2:], [image_bgr.shape[1], bottom])
+    for (left, first), (right, last) in zip(low.tolist(), high.tolist(), strict=True):
+        if left < right and first < last:
+            channels = cv2.LUT(image_bgr[first:last, left:right], table)
+            values[first - top : last - top, left:right] = cv2.transform(channels, _SUM)
     return GreyBand(values, top)
+
+
+@cache
+def _table(linear_response: bool) -> np.ndarray:
+    """What each channel's byte adds to the grey value (1, 256, 3)."""
+    table = _CODED if linear_response else _LINEAR_FROM_SRGB
+    return np.asarray(table[None, :, None] * _GREY_WEIGHTS_BGR, dtype=np.float32)
