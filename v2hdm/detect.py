@@ -267,12 +267,15 @@ def _report(stopwatch: Stopwatch) -> None:
 
 def _peak_memory() -> str:
     """The most memory that this process ever held, where the operating system counts it."""
-    if sys.platform == "win32":
+    status = Path("/proc/self/status")
+    if status.is_file():  # getrusage would count what the parent held when it started us
+        peak = next((line for line in status.read_text().splitlines() if line.startswith("VmHWM")), "")
+        return f", peak memory {int(peak.split()[1]) * 1024 / 1e6:.0f} MB" if peak else ""
+    if sys.platform != "darwin":
         return ""
     import resource
 
-    unit = 1 if sys.platform == "darwin" else 1024
-    return f", peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6:.0f} MB"
+    return f", peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.0f} MB"
 
 
 if __name__ == "__main__":

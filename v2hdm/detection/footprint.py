@@ -32,7 +32,8 @@ class GroundPoints:
     def joint_covariance(self, covariance_px: FloatArray) -> FloatArray:
         """Covariance (2N, 2N), m^2, of the stacked points (x0, y0, x1, ...).
 
-        ``covariance_px`` (2N, 2N) is that of their pixels (u0, v0, u1, ...). The rows and columns of points that are not on the ground are nan.
+        ``covariance_px`` (2N, 2N) is that of their pixels (u0, v0, u1, ...). The rows and columns of points
+        that are not on the ground are nan.
         """
         count = len(self.points_vehicle)
         blocks = np.zeros((count, 2, count, 2))
