@@ -1,0 +1,149 @@
+"""Marking by marking, the map is the one that the batch adjustment finds."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.adjust.scene import Scene, make_scene
+from v2hdm.adjust import Observations, PoseSigma, Problem, SolveOptions, solve
+from v2hdm.adjust.incremental import IncrementalMap, RigPrior
+from v2hdm.adjust.marking_fit import MarkingObservations, Noise
+from v2hdm.errors import AdjustError
+
+STILL = Noise(np.zeros(6), np.inf)
+JITTER = PoseSigma(position_m=0.01, heading_rad=0.001, roll_pitch_rad=0.002, height_m=0.005)
+
+
+def street(**changes) -> Scene:
+    return make_scene(3, **{"frames": 60, "start_error_deg": 1.0, "min_views": 4, **changes})
+
+
+def prior_of(problem: Problem) -> RigPrior:
+    assert problem.centre_vehicle is not None
+    assert problem.centre_sigma_m is not None
+    return RigPrior(
+        problem.intrinsic, problem.cam_from_vehicle, problem.centre_vehicle, problem.centre_sigma_m, 10.0
+    )
+
+
+def by_marking(problem: Problem) -> list[MarkingObservations]:
+    """Four corners each, in the order of their numbers."""
+    seen, out = problem.observations, []
+    for first in range(0, problem.corner_count - 3, 4):
+        rows = np.flatnonzero((seen.corner >= first) & (seen.corner < first + 4))
+        out.append(
+            MarkingObservations(
+                seen.camera[rows],
+                seen.corner[rows] - first,
+                seen.frame[rows],
+                np.linalg.inv(problem.map_from_vehicle)[seen.frame[rows]],
+                seen.pinhole_px[rows],
+                seen.covariance_px[rows],
+            )
+        )
+    return out
+
+
+def whole_markings(problem: Problem) -> Problem:
+    """Without the last corners that make no four."""
+    count = problem.corner_count // 4 * 4
+    seen = problem.observations
+    keep = seen.corner < count
+    parts = (seen.camera, seen.frame, seen.corner, seen.pinhole_px, seen.covariance_px)
+    return replace(problem, corner_count=count, observations=Observations(*(part[keep] for part in parts)))
+
+
+def with_frames_of_their_own(problem: Problem) -> Problem:
+    """Every marking sees frames that no other sees: the model of the incremental map, as a batch."""
+    seen = problem.observations
+    frame = (seen.corner // 4) * len(problem.map_from_vehicle) + seen.frame
+    poses = np.tile(problem.map_from_vehicle, (problem.corner_count // 4, 1, 1))
+    used, frame = np.unique(frame, return_inverse=True)
+    return replace(problem, map_from_vehicle=poses[used], observations=replace(seen, frame=frame))
+
+
+def assert_is_the_batch_optimum(grown: IncrementalMap, batch_problem: Problem, options: SolveOptions) -> None:
+    """Within a hundredth of a standard deviation."""
+    best = solve(batch_problem, options)
+    groups = np.arange(batch_problem.corner_count).reshape(-1, 4)
+    sigma = np.sqrt(np.diagonal(best.corner_covariance(groups), axis1=1, axis2=2))
+    corners = np.stack([grown.corners_map(m) for m in range(len(groups))])
+    off = (corners - best.corners_map[groups]).reshape(len(groups), 8)
+    assert np.max(np.abs(off) / sigma) < 0.01
+    stated = np.sqrt([np.diag(grown.corner_covariance(m)) for m in range(len(groups))])
+    np.testing.assert_allclose(stated, sigma, rtol=0.02)
+    np.testing.assert_allclose(grown.extrinsic_covariance, best.extrinsic_covariance, rtol=0.05, atol=1e-9)
+
+
+def grow(problem: Problem, noise: Noise = STILL) -> IncrementalMap:
+    grown = IncrementalMap(prior_of(problem), noise)
+    for marking, observations in enumerate(by_marking(problem)):
+        grown.observe(marking, observations)
+    return grown
+
+
+def test_with_poses_taken_at_their_word_it_is_the_papers_optimum():
+    problem = whole_markings(street().problem)
+    assert_is_the_batch_optimum(grow(problem), problem, SolveOptions(pose_states=(), loss="none"))
+
+
+def test_with_pose_errors_it_is_the_optimum_of_markings_that_share_none():
+    scene = street(frames=40, jitter=JITTER)
+    problem = whole_markings(scene.problem)
+    grown = grow(problem, Noise(JITTER.by_state(), np.inf))
+    assert_is_the_batch_optimum(grown, with_frames_of_their_own(problem), SolveOptions(loss="none"))
+
+
+def test_a_marking_seen_again_is_re_estimated_from_all_it_was_ever_seen_in():
+    problem = whole_markings(street().problem)
+    markings = by_marking(problem)
+    whole, twice = grow(problem), IncrementalMap(prior_of(problem), STILL)
+    later = {}
+    for marking, seen in enumerate(markings):
+        early = seen.frame <= np.median(seen.frame)
+        if len(np.unique(seen.corner[early])) < 4 or len(np.unique(seen.corner[~early])) < 4:
+            early[:] = True
+        parts = [MarkingObservations(*(v[rows] for v in vars(seen).values())) for rows in (early, ~early)]
+        twice.observe(marking, parts[0])
+        if len(parts[1].camera):
+            later[marking] = parts[1]
+    assert len(later) > 5
+    for marking, seen in later.items():
+        twice.observe(marking, seen)
+    for marking in whole.markings:
+        sigma = np.sqrt(np.diag(whole.corner_covariance(marking))).reshape(4, 2)
+        off = twice.corners_map(marking) - whole.corners_map(marking)
+        assert np.max(np.abs(off) / sigma) < 0.01
+        np.testing.assert_allclose(
+            twice.corner_covariance(marking), whole.corner_covariance(marking), rtol=0.05, atol=1e-7
+        )
+
+
+def test_a_forgotten_marking_leaves_no_trace():
+    problem = whole_markings(street().problem)
+    markings = by_marking(problem)
+    without, with_and_back = (IncrementalMap(prior_of(problem), STILL) for _ in range(2))
+    for marking, seen in enumerate(markings[:8]):
+        without.observe(marking, seen)
+        with_and_back.observe(marking, seen)
+    with_and_back.observe(99, markings[9])
+    assert np.abs(with_and_back.cam_from_vehicle - without.cam_from_vehicle).max() > 1e-7
+    with_and_back.forget(99)
+    np.testing.assert_allclose(with_and_back.cam_from_vehicle, without.cam_from_vehicle, atol=1e-9)
+    with pytest.raises(AdjustError, match="marking 99 is not in the map"):
+        with_and_back.corners_map(99)
+
+
+def test_the_time_for_a_marking_does_not_grow_with_the_map():
+    """Between doublings, the two-hundredth costs what the tenth did."""
+    problem = street(frames=20, every_m=3.0).problem
+    markings = by_marking(problem)
+    grown = IncrementalMap(prior_of(problem), STILL)
+    took = []
+    for marking in range(200):
+        began = time.process_time()
+        grown.observe(marking, markings[marking % len(markings)])
+        took.append(time.process_time() - began)
+    assert np.median(took[150:200]) < 1.5 * np.median(took[9:60]) + 1e-3

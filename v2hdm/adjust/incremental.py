@@ -1,0 +1,257 @@
+r"""The map while the vehicle drives: one marking at a time, at a cost that does not grow with the map.
+
+Given the extrinsics the markings are independent, so all that the settled ones say about the extrinsics is
+the sum of their Schur complements, one quadratic in the 6C tangents :math:`\xi` of
+``cam_from_vehicle = exp(xi) @ start``. A further marking is solved for together with that quadratic, and
+its own Schur complement is added. Every corner stays an affine function of :math:`\xi`, read on demand. To
+take a marking back out, subtract what was added; to see it again, do that and solve it with all sightings.
+When the number of markings has doubled, all are linearised anew: a constant share of the cost of each.
+
+The poses' errors are marginalised out marking by marking, so that two markings in one image do not
+share them: what that gives away against the batch adjustment is the price of its independence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag, cho_factor, cho_solve
+
+from v2hdm.adjust.marking_fit import (
+    MarkingObservations,
+    Noise,
+    Normal,
+    back_projected,
+    normal_equations,
+)
+from v2hdm.adjust.rigid import exp, left_jacobians
+from v2hdm.errors import AdjustError
+from v2hdm.records import FloatArray
+
+_MAX_STEPS = 30
+# Squared length of a step, in standard deviations, below which nothing moves any more.
+_STEP_TOLERANCE = 1e-10
+_PASSES = 2
+
+
+@dataclass(frozen=True)
+class RigPrior:
+    """What is known before the first marking.
+
+    ``intrinsic`` (C, 4) is fx, fy, cx, cy; ``cam_from_vehicle`` (C, 4, 4) the start;
+    ``centre_vehicle`` and ``centre_sigma_m`` (C, 3) the survey of the camera centres;
+    ``rotation_sigma_rad`` how far off the start's rotation may be.
+    """
+
+    intrinsic: FloatArray
+    cam_from_vehicle: FloatArray
+    centre_vehicle: FloatArray
+    centre_sigma_m: FloatArray
+    rotation_sigma_rad: float = 0.1
+
+
+@dataclass(frozen=True)
+class Settled:
+    """One marking of the map, linearised at the tangents ``at`` (6C,).
+
+    Its corners are ``corners_map`` (n, 2) there and move by ``-gain`` (2n, 6C) times the change of the
+    tangents; given the extrinsics their covariance is ``covariance_m2`` (2n, 2n). ``information`` (6C, 6C)
+    and ``vector`` (6C,) are the marking's part of the extrinsics' normal equations. ``frame_state`` (F, 6)
+    are the states of the marking's own frames.
+    """
+
+    observations: MarkingObservations
+    at: FloatArray
+    corners_map: FloatArray
+    gain: FloatArray
+    covariance_m2: FloatArray
+    information: FloatArray
+    vector: FloatArray
+    frame_state: FloatArray
+
+    def corners_at(self, tangents: FloatArray) -> FloatArray:
+        """The corners (n, 2) under other extrinsics."""
+        return self.corners_map - (self.gain @ (tangents - self.at)).reshape(-1, 2)
+
+
+class IncrementalMap:
+    """Extrinsics and corners, up to date after every marking."""
+
+    def __init__(self, prior: RigPrior, noise: Noise, drift_m: float = 0.0) -> None:
+        """Begin with an empty map.
+
+        Args:
+            prior: what is known of the cameras.
+            noise: how observations and poses err; of the poses, what differs from image to image.
+            drift_m: standard deviation of the slow part of the position error, which a whole marking
+                shares and no observation can tell: it goes into the corners' covariances.
+        """
+        self.prior = prior
+        self.noise = noise
+        self.drift_m = drift_m
+        self._settled: dict[int, Settled] = {}
+        self._linearised_count = 0
+        self._tangents: FloatArray = np.zeros(6 * len(prior.cam_from_vehicle))
+        self._information, self._vector = self._prior_at(self._tangents)
+
+    @property
+    def markings(self) -> Mapping[int, Settled]:
+        """The settled markings by their number, in the order in which they came."""
+        return self._settled
+
+    @property
+    def cam_from_vehicle(self) -> FloatArray:
+        """The extrinsics (C, 4, 4) that all markings together say."""
+        return self._extrinsics(self._tangents)
+
+    @property
+    def extrinsic_covariance(self) -> FloatArray:
+        """Covariance (C, 6, 6) of each extrinsic's left tangent: translation m, rotation rad."""
+        covariance = self._left_covariance()
+        starts = range(0, len(covariance), 6)
+        return np.stack([covariance[k : k + 6, k : k + 6] for k in starts])
+
+    def corners_map(self, marking: int) -> FloatArray:
+        """Corners (n, 2) of a marking under the present extrinsics."""
+        return self._known(marking).corners_at(self._tangents)
+
+    def corner_covariance(self, marking: int) -> FloatArray:
+        """Joint covariance (2n, 2n), m^2, of a marking's corners."""
+        settled = self._known(marking)
+        shared = np.tile(self.drift_m**2 * np.eye(2), (len(settled.corners_map),) * 2)
+        extrinsic = np.linalg.inv(self._information)
+        return np.asarray(settled.covariance_m2 + settled.gain @ extrinsic @ settled.gain.T + shared)
+
+    def observe(self, marking: int, observations: MarkingObservations) -> None:
+        """Take a marking into the map; one that is in it already is re-estimated from all its observations.
+
+        Raises:
+            AdjustError: a corner has no observation, or the marking cannot be solved for.
+        """
+        unseen = np.flatnonzero(np.bincount(observations.corner) == 0)
+        if len(unseen):
+            raise AdjustError(
+                f"corner {unseen[0]} of marking {marking} has no observation: number them from 0"
+            )
+        if marking in self._settled:
+            observations = self._settled[marking].observations.joined(observations)
+            self.forget(marking)
+        settled, self._tangents = self._solve(marking, observations)
+        self._settled[marking] = settled
+        self._information = self._information + settled.information
+        self._vector = self._vector + settled.vector
+        if len(self._settled) >= 2 * self._linearised_count:
+            self.linearise()
+
+    def forget(self, marking: int) -> None:
+        """Take a marking back out of the map and out of what the extrinsics rest on."""
+        settled = self._known(marking)
+        del self._settled[marking]
+        self._information = self._information - settled.information
+        self._vector = self._vector - settled.vector
+        self._tangents = _solved(self._information, self._vector)
+
+    def linearise(self) -> None:
+        """Linearise everything anew where it is now; happens by itself whenever the map has doubled."""
+        for _ in range(_PASSES):
+            at = self._tangents
+            self._information, self._vector = self._prior_at(at)
+            for marking, settled in self._settled.items():
+                renewed = self._settle(settled.observations, at, settled.corners_at(at), settled.frame_state)
+                self._settled[marking] = renewed
+                self._information = self._information + renewed.information
+                self._vector = self._vector + renewed.vector
+            self._tangents = _solved(self._information, self._vector)
+        self._linearised_count = len(self._settled)
+
+    def _known(self, marking: int) -> Settled:
+        if marking not in self._settled:
+            raise AdjustError(f"marking {marking} is not in the map")
+        return self._settled[marking]
+
+    def _extrinsics(self, tangents: FloatArray) -> FloatArray:
+        return np.asarray(exp(tangents.reshape(-1, 6)) @ self.prior.cam_from_vehicle)
+
+    def _left_covariance(self) -> FloatArray:
+        """Covariance (6C, 6C) of the left tangents at the present extrinsics."""
+        turn = block_diag(*left_jacobians(self._tangents.reshape(-1, 6)))
+        return np.asarray(turn @ np.linalg.inv(self._information) @ turn.T)
+
+    def _prior_at(self, tangents: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The prior's part of the normal equations, linearised at ``tangents``: (6C, 6C) and (6C,)."""
+        extrinsics, prior = self._extrinsics(tangents), self.prior
+        rotation, translation = extrinsics[:, :3, :3], extrinsics[:, :3, 3]
+        off = -np.einsum("cba,cb->ca", rotation, translation) - prior.centre_vehicle
+        root = 1 / prior.centre_sigma_m
+        information = np.zeros((len(tangents),) * 2)
+        vector = np.zeros(len(tangents))
+        for c, chart in enumerate(left_jacobians(tangents.reshape(-1, 6))):
+            part = slice(6 * c, 6 * c + 6)
+            # A left perturbation moves the centre by minus its translation, turned into the vehicle.
+            jacobian = np.zeros((3, 6))
+            jacobian[:, :3] = -rotation[c].T * root[c][:, None]
+            jacobian = jacobian @ chart
+            information[part, part] = jacobian.T @ jacobian
+            vector[part] = -jacobian.T @ (off[c] * root[c])
+        vector += information @ tangents
+        turns = np.tile([0, 0, 0, 1, 1, 1], len(extrinsics)) / prior.rotation_sigma_rad**2
+        return information + np.diag(turns), vector
+
+    def _solve(self, marking: int, observations: MarkingObservations) -> tuple[Settled, FloatArray]:
+        """Gauss-Newton over the marking's corners and the extrinsics, the settled markings as a quadratic."""
+        tangents = self._tangents
+        corners = back_projected(observations, self.prior.intrinsic, self._extrinsics(tangents))
+        state = np.zeros((int(observations.frame_rank.max()) + 1, 6))
+        for _ in range(_MAX_STEPS):
+            settled = self._settle(observations, tangents, corners, state)
+            information = self._information + settled.information
+            reached = _solved(information, self._vector + settled.vector)
+            step = reached - tangents
+            moved = settled.corners_at(reached)
+            shift = (moved - corners).reshape(-1)
+            length = step @ information @ step + shift @ np.linalg.solve(settled.covariance_m2, shift)
+            tangents, corners, state = reached, moved, settled.frame_state
+            if not np.isfinite(length):
+                break
+            if length < _STEP_TOLERANCE:
+                return settled, reached
+        raise AdjustError(
+            f"marking {marking} does not settle: its observations contradict one another or lie above the "
+            "horizon; leave it out"
+        )
+
+    def _settle(
+        self, observations: MarkingObservations, tangents: FloatArray, corners: FloatArray, state: FloatArray
+    ) -> Settled:
+        """Linearise a marking and eliminate its corners."""
+        normal = normal_equations(
+            observations, self.prior.intrinsic, self._extrinsics(tangents), corners, state, self.noise
+        )
+        return _eliminated(observations, normal, tangents, corners)
+
+
+def _solved(information: FloatArray, vector: FloatArray) -> FloatArray:
+    return np.asarray(cho_solve(cho_factor(information, lower=True), vector))
+
+
+def _eliminated(
+    observations: MarkingObservations, normal: Normal, tangents: FloatArray, corners: FloatArray
+) -> Settled:
+    chart = block_diag(*left_jacobians(tangents.reshape(-1, 6)))
+    factor = cho_factor(normal.V, lower=True)
+    gain = cho_solve(factor, normal.W.T)
+    best = corners - cho_solve(factor, normal.by_corner).reshape(-1, 2)
+    information = chart.T @ (normal.U - normal.W @ gain) @ chart
+    gradient = chart.T @ (normal.by_extrinsic - gain.T @ normal.by_corner)
+    return Settled(
+        observations=observations,
+        at=tangents,
+        corners_map=best,
+        gain=gain @ chart,
+        covariance_m2=cho_solve(factor, np.eye(len(normal.V))),
+        information=(information + information.T) / 2,
+        vector=information @ tangents - gradient,
+        frame_state=normal.frame_state,
+    )
