@@ -33,6 +33,10 @@ def test_all_members_end_with_identical_weights(team: tuple[Path, list[dict]]) -
             assert torch.equal(value, other[kind][name]), f"{kind} {name}"
 
 
+def test_an_average_is_that_of_all_members(team: tuple[Path, list[dict]]) -> None:
+    assert [member["mean"].tolist() for member in team[1]] == [[0.5, 5.0]] * 2
+
+
 def test_no_two_members_see_the_same_render(team: tuple[Path, list[dict]]) -> None:
     _, (one, other) = team
     assert one["seen"]
