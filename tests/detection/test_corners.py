@@ -145,6 +145,18 @@ def test_a_side_hidden_by_an_occluder_gives_no_valid_corners(models):
         assert not marking.corner_valid[cut].any()
 
 
+@pytest.mark.parametrize("x", [6.0, 9.0])
+def test_a_marking_cut_by_a_straight_edge_like_the_ground_gives_no_corners(models, x):
+    """Nothing but its shape on the ground tells: the edge's corners are as clean as the others."""
+    camera = make_camera("pinhole")
+    shape = bar(x, 1.5, 2.0, 1.0)
+    image = picture(camera, [shape])
+    assert len(detect(models, image, camera)[0]) == 1
+    middle = int(to_image(camera, np.array([[x, 1.5]]))[0, 0])
+    image[:, middle:] = image[0, 0]
+    assert detect(models, image, camera)[0] == ()
+
+
 def test_narrow_far_dashes_are_fitted_as_a_whole(models):
     shapes = [bar(x, y, 3.0, 0.15) for x in (8.0, 12.0) for y in (-1.7, 1.7)]
     errors, _, found = run(models, shapes, kind="lane_dash")

@@ -13,6 +13,7 @@ import numpy as np
 from v2hdm.detection.edge_fit import EdgeFit, fit_edges
 from v2hdm.detection.grey import GreyBand, linear_grey
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.detection.outline_fit import fit_outlines
 from v2hdm.detection.quad import is_convex, side_frames, width
 from v2hdm.detection.quad_fit import fit_quads, unbow_corners
 from v2hdm.detection.view import CameraView
@@ -34,16 +35,26 @@ _BLUR_PRIOR_SIDES = 6
 _BLUR_LIMITS_PX = (0.45, 1.5)
 _AROUND_PX = 16
 _MIN_VALID_CORNERS = 2
+_MAX_OUTLINE_SIGMA_PX = 2.0
+_MAX_OUTLINE_GAP_PX = 4.0
+"""Corners of the outline are this far from those of the image at most where it is the marking's."""
+_CLOSURE_TOLERANCE = 0.02
+_MAX_CLOSURE_CHI2 = 9.0
+_CLOSURE = np.array([1.0, -1.0, 1.0, -1.0])
 
 
 @dataclass(frozen=True)
 class QuadStart:
-    """A blob's quadrilateral ``corners_pinhole_px`` (4, 2) before refinement; ``blob`` is its index."""
+    """A blob's quadrilateral ``corners_pinhole_px`` (4, 2) before refinement.
+
+    ``blob`` is the blob's index, ``outline_pinhole_px`` (N, 2) its outline.
+    """
 
     kind: str
     score: float
     corners_pinhole_px: FloatArray
     blob: int
+    outline_pinhole_px: FloatArray
 
 
 @dataclass(frozen=True)
@@ -57,11 +68,15 @@ class Foreground:
 
 @dataclass
 class _Corners:
-    """Refined corners of M markings: ``px`` (M, 4, 2), ``covariance`` (M, 8, 8), ``valid`` (M, 4)."""
+    """Refined corners of M markings: ``px`` (M, 4, 2), ``covariance`` (M, 8, 8), ``valid`` (M, 4).
+
+    ``occluded`` (M,) are those of which a side was found to be the edge of something before the ground.
+    """
 
     px: FloatArray
     covariance: FloatArray
     valid: BoolArray
+    occluded: BoolArray
 
 
 def fit_markings(
@@ -83,6 +98,7 @@ def fit_markings(
         start_px,
         np.tile(np.eye(8), (len(starts), 1, 1)),
         np.zeros((len(starts), 4), dtype=np.bool_),
+        np.zeros(len(starts), dtype=np.bool_),
     )
     blur_px = options.blur_px
     if near.any():
@@ -94,6 +110,8 @@ def fit_markings(
         _take_quads(found, np.flatnonzero(far), grey, foreground, blobs, view, blur_px or TYPICAL_BLUR_PX)
     found.covariance = _COVARIANCE_FACTOR * found.covariance + _COVARIANCE_FLOOR_PX**2 * np.eye(8)
     _reject(found, view, options)
+    _take_outlines(found, start, [s.outline_pinhole_px for s in starts], view, options)
+    found.valid[_is_cut(found, view)] = False
     return [
         MarkingDetection(s.kind, s.score, found.px[m], found.covariance[m], found.valid[m])
         for m, s in enumerate(starts)
@@ -125,7 +143,9 @@ def _take_edges(found: _Corners, near: BoolArray, edges: EdgeFit, view: CameraVi
     found.px[near] = view.distort(flat).reshape(corners.shape)
     jacobian = _block_diagonal(view.distort_jacobian(flat).reshape(-1, 4, 2, 2))
     found.covariance[near] = jacobian @ edges.covariance @ np.swapaxes(jacobian, 1, 2)
-    good = edges.side_found & _consistent_levels(edges)
+    alike = _consistent_levels(edges)
+    good = edges.side_found & alike
+    found.occluded[near] = (edges.side_found & ~alike).any(axis=1)
     found.valid[near] = good & np.roll(good, 1, axis=1) & is_convex(corners)[:, None]
 
 
@@ -160,6 +180,40 @@ def _take_quads(
     found.valid[group[good]] = True
 
 
+def _take_outlines(
+    found: _Corners,
+    start: FloatArray,
+    outlines: list[FloatArray],
+    view: CameraView,
+    options: DetectorOptions,
+) -> None:
+    """Enter corners of the network's outline where the image gave none.
+
+    Not where something stands before the marking, and not where the corners that the image did give
+    show that the outline is that of something else.
+    """
+    asked = np.flatnonzero(~found.occluded & ~found.valid.all(axis=1))
+    if not len(asked):
+        return
+    fit = fit_outlines([outlines[m] for m in asked], start[asked])
+    corners = np.where(fit.found[..., None], fit.corners_pinhole_px, start[asked])
+    flat = corners.reshape(-1, 2)
+    px = view.distort(flat).reshape(corners.shape)
+    jacobian = _block_diagonal(view.distort_jacobian(flat).reshape(-1, 4, 2, 2))
+    covariance = jacobian @ fit.covariance @ np.swapaxes(jacobian, 1, 2)
+    apart = np.linalg.norm(px - found.px[asked], axis=2)
+    agrees = (~(found.valid[asked] & fit.found) | (apart < _MAX_OUTLINE_GAP_PX)).all(axis=1)
+    usable = fit.found & agrees[:, None] & view.inside(px, options.border_px)
+    usable &= _largest_sigma(covariance) <= _MAX_OUTLINE_SIGMA_PX
+    for m, at, matrix, use in zip(asked, px, covariance, usable & ~found.valid[asked], strict=True):
+        corner = np.flatnonzero(use)
+        columns = (2 * corner[:, None] + np.arange(2)).ravel()
+        found.px[m, corner] = at[corner]
+        found.covariance[m, columns], found.covariance[m, :, columns] = 0.0, 0.0
+        found.covariance[m][np.ix_(columns, columns)] = matrix[np.ix_(columns, columns)]
+        found.valid[m, corner] = True
+
+
 def _measured_blur(edges: EdgeFit) -> float | None:
     """The point spread from the sides of near markings, drawn to the typical one where they are few.
 
@@ -175,10 +229,37 @@ def _measured_blur(edges: EdgeFit) -> float | None:
 
 def _reject(found: _Corners, view: CameraView, options: DetectorOptions) -> None:
     """Mark the corners that are too uncertain or too near the border as not valid."""
-    blocks = found.covariance.reshape(-1, 4, 2, 4, 2)[:, range(4), :, range(4)].transpose(1, 0, 2, 3)
-    largest = np.linalg.eigvalsh(np.nan_to_num(blocks, nan=1e6, posinf=1e6))[..., -1]
-    found.valid &= np.sqrt(np.maximum(largest, 0)) <= options.max_corner_sigma_px
+    found.valid &= _largest_sigma(found.covariance) <= options.max_corner_sigma_px
     found.valid &= view.inside(found.px, options.border_px)
+    found.occluded |= _is_cut(found, view)
+    found.valid[found.occluded & found.valid.all(axis=1)] = False
+
+
+def _is_cut(found: _Corners, view: CameraView) -> BoolArray:
+    """Markings (M,) whose four valid corners are no parallelogram on the ground, as all are painted.
+
+    An occluder's straight edge or a lost piece of paint gives corners as clean as the true ones; which of
+    the four they are cannot be told, so none is used. The tolerance, in parts of the marking's size,
+    covers an initial IPM that is some degrees off.
+    """
+    pinhole = view.undistort(found.px.reshape(-1, 2))
+    ground = view.ground(pinhole).reshape(-1, 4, 2)
+    size_m = np.linalg.norm(ground[:, :2] - ground[:, 2:], axis=-1).mean(axis=1)
+    by_corner = _CLOSURE[:, None, None] * view.ground_jacobian(pinhole).reshape(-1, 4, 2, 2)
+    jacobian = by_corner.transpose(0, 2, 1, 3).reshape(-1, 2, 8)
+    covariance = jacobian @ found.covariance @ np.swapaxes(jacobian, 1, 2)
+    covariance += ((_CLOSURE_TOLERANCE * size_m) ** 2)[:, None, None] * np.eye(2)
+    usable = np.asarray(found.valid.all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
+    gap = np.where(usable[:, None], _CLOSURE @ ground, 0.0)[..., None]
+    solved = np.linalg.solve(np.where(usable[:, None, None], covariance, np.eye(2)), gap)
+    return np.asarray((gap * solved).sum(axis=(1, 2)) > _MAX_CLOSURE_CHI2)
+
+
+def _largest_sigma(covariance: FloatArray) -> FloatArray:
+    """Standard deviation (M, 4) of each corner in its least certain direction, from (M, 8, 8)."""
+    blocks = covariance.reshape(-1, 4, 2, 4, 2)[:, range(4), :, range(4)].transpose(1, 0, 2, 3)
+    largest = np.linalg.eigvalsh(np.nan_to_num(blocks, nan=1e6, posinf=1e6))[..., -1]
+    return np.asarray(np.sqrt(np.maximum(largest, 0)))
 
 
 def _block_diagonal(blocks: FloatArray) -> FloatArray:

@@ -116,7 +116,8 @@ class Detector:
         ground = view.ground(corners)
         if not np.isfinite(ground).all() or view.range_m(ground.mean(axis=0)) > self.options.max_range_m:
             return None
-        return QuadStart(candidate.kind, candidate.score, corners, candidate.index)
+        outline = candidate.outline_pinhole_px
+        return QuadStart(candidate.kind, candidate.score, corners, candidate.index, outline)
 
     def _symbol(self, candidate: _Candidate, view: CameraView) -> MarkingDetection | None:
         """A marking that has an outline but no four corners, within range."""

@@ -73,6 +73,13 @@ class CameraView:
         ground[self._ground_depth(points) * self._ground_sign <= 0] = np.nan
         return ground
 
+    def ground_jacobian(self, points_pinhole_px: FloatArray) -> FloatArray:
+        """Derivative (N, 2, 2) of :meth:`ground`, m per px; NaN where that is NaN."""
+        points = np.asarray(points_pinhole_px, dtype=np.float64).reshape(-1, 2)
+        homography = self.vehicle_from_pinhole_px
+        slope = homography[:2, :2] - self.ground(points)[..., None] * homography[2, :2]
+        return np.asarray(slope / self._ground_depth(points)[:, None, None])
+
     def range_m(self, points_vehicle: FloatArray) -> FloatArray:
         """Distance on the ground from below the camera; NaN stays NaN."""
         return np.asarray(np.linalg.norm(points_vehicle - self.foot_vehicle, axis=-1))
