@@ -87,7 +87,7 @@ def _kind(name: str, kinds: Mapping[str, str], where: str) -> str:
     if name not in kinds:
         raise LabelError(
             f"{where}: category {name!r} is no class of the detector; say which it is with "
-            f"'data.coco_classes={{{name}: CLASS}}', CLASS one of: {', '.join(PAINT_CLASSES)}, {NOT_PAINT}"
+            f"'+data.coco_classes={{{name}: CLASS}}', CLASS one of: {', '.join(PAINT_CLASSES)}, {NOT_PAINT}"
         )
     return kinds[name]
 

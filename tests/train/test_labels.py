@@ -1,15 +1,18 @@
 """Users' own labels: exact areas, both formats, mixed into the renders, and every mistake by name."""
 
 import json
+import re
 from itertools import islice
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from hydra import compose, initialize_config_dir
 from hypothesis import given
 from hypothesis import strategies as st
 
+from train import __main__ as door
 from train.config import DataConfig, TrainConfig
 from train.data import RenderStream
 from train.labels import LabelledImages, paint_labels, read_labels
@@ -20,6 +23,7 @@ from v2hdm.errors import ConfigError, LabelError
 from v2hdm.records import ARROW, CROSSWALK_BAR, DIAMOND, PAINT_CLASSES
 
 WIDTH, HEIGHT = 96, 64
+CONF = str(Path(__file__).resolve().parents[2] / "conf")
 
 
 def config(**changes: object) -> DataConfig:
@@ -160,6 +164,18 @@ def test_a_category_is_mapped_by_the_configuration_or_left_out(tmp_path):
     assert [shape.kind for image in mapped.images for shape in image.shapes or ()] == [CROSSWALK_BAR]
     dropped = labelled(coco=str(path), coco_classes={"zebra": "none"})
     assert [image.shapes for image in dropped.images] == [(), ()]
+
+
+def test_the_advice_about_an_unknown_category_is_an_argument_that_works(tmp_path):
+    square = [10, 10, 20, 10, 20, 20, 10, 20]
+    path = coco(tmp_path, annotations=[{"id": 3, "image_id": 9, "category_id": 2, "segmentation": [square]}])
+    with pytest.raises(LabelError) as refusal:
+        read_labels(config(coco=str(path)))
+    (argument,) = re.findall("'([+].*?)'", str(refusal.value))
+    assert door.main  # it registers the schema
+    with initialize_config_dir(CONF, version_base="1.3"):
+        composed = compose("train", overrides=[argument.replace("CLASS", CROSSWALK_BAR)])
+    assert composed.data.coco_classes == {"zebra": CROSSWALK_BAR}
 
 
 @pytest.mark.parametrize(("share", "low", "high"), [(0.3, 20, 45), (1.0, 100, 100)])
