@@ -106,7 +106,7 @@ class CameraView:
         return self.ground(self.undistort(grid_px.reshape(-1, 2))).reshape(grid_px.shape)
 
     def _band_rows(self, multiple: int) -> tuple[int, int]:
-        on_ground = np.isfinite(self._row_grid_vehicle()).all(axis=2).any(axis=1)
+        on_ground = np.any(np.isfinite(self._row_grid_vehicle()).all(axis=2), axis=1)
         first = int(np.argmax(on_ground))
         height = self.info.height - max(0, first - _HORIZON_MARGIN_PX)
         height = min(-(-height // multiple) * multiple, self.info.height)
