@@ -170,10 +170,10 @@ def _tinted(grey: float, warmth: float) -> Bgr:
 def _shadows(rng: np.random.Generator, difficulty: float) -> tuple[Shadow, ...]:
     """Shadows of what is out of view: buildings (wide) and poles, wires and gantries (narrow)."""
     out = []
-    for _ in range(int(rng.poisson(2.5 * difficulty))):
+    for _ in range(int(rng.poisson(4.0 * difficulty))):
         wide = rng.uniform(0.1, 0.7) if rng.random() < 0.55 else rng.uniform(1, 14)
         # Near the camera a shadow's edge crosses paint that is large in the image.
-        centre = np.array([np.exp(rng.uniform(np.log(2), np.log(40))), rng.uniform(-8, 8)])
+        centre = np.array([np.exp(rng.uniform(np.log(2), np.log(25))), rng.uniform(-8, 8)])
         polygon = rectangle(centre, rng.uniform(4, 60), wide, rng.uniform(0, np.pi))
         softness = float(np.exp(rng.uniform(np.log(0.02), np.log(0.6))))
         out.append(Shadow(polygon_map=polygon, transmission=float(rng.beta(1, 5)), softness_m=softness))
