@@ -61,8 +61,9 @@ def test_a_model_whose_outputs_disagree_with_its_metadata_is_refused(tmp_path):
         Network(tmp_path / "m.onnx").run(np.zeros((32, 32, 3), dtype=np.uint8))
 
 
-def test_weights_that_are_no_numbers_are_noticed(tmp_path):
-    save_model(tmp_path / "m.onnx", (np.nan, 0.0), KINDS)
+@pytest.mark.parametrize(("slope", "kinds"), [(np.nan, KINDS), (0.1, KINDS * np.nan)])
+def test_weights_that_are_no_numbers_are_noticed(tmp_path, slope, kinds):
+    save_model(tmp_path / "m.onnx", (slope, 0.0), kinds)
     with pytest.raises(DetectorError, match="not finite"):
         Network(tmp_path / "m.onnx").run(np.zeros((32, 32, 3), dtype=np.uint8))
 

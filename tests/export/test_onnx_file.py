@@ -16,7 +16,7 @@ from export import onnx_file
 from export.onnx_file import METADATA_KEY, PARITY_SIZES, export_checkpoint
 from models import MarkingNet, NetConfig, Prediction
 from train.checkpoint import Checkpoint
-from train.config import TrainConfig
+from train.config import DataConfig, TrainConfig
 from train.targets import IGNORE, paint_target
 from v2hdm.errors import ConfigError, DetectorError
 from v2hdm.records import PAINT_CLASSES
@@ -35,7 +35,7 @@ def checkpoint() -> Checkpoint:
     net = MarkingNet(SMALL)
     net.train()
     net(torch.randint(0, 256, (2, 64, 64, 3), dtype=torch.uint8))
-    config = TrainConfig(output="somewhere/private", net=SMALL)
+    config = TrainConfig(output="somewhere/private", net=SMALL, data=DataConfig(coco="private/labels.json"))
     return Checkpoint(config=asdict(config), step=5, averaged=net.state_dict(), metrics={"mean_iou": 0.25})
 
 
@@ -76,6 +76,7 @@ def test_the_label_says_how_to_run_it_and_where_it_comes_from(exported: Path) ->
     assert label["metrics"] == {"mean_iou": 0.25}
     assert label["training"]["batch"] == TrainConfig().batch
     assert "private" not in properties[METADATA_KEY]
+    assert label["training"]["data"]["own_labels"] == {"coco": True, "tusimple": False}
 
 
 def test_a_file_that_differs_from_its_network_is_not_written(

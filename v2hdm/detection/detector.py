@@ -16,6 +16,7 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.plausible import plausible_kind
 from v2hdm.detection.quad import is_convex, quad_from_outline
 from v2hdm.detection.sight import look
+from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.view import CameraView
 from v2hdm.errors import DetectorError
 from v2hdm.records import (
@@ -72,17 +73,21 @@ class Detector:
         view = self.view(camera)
         _check_image(image_bgr, camera)
         info = self.network.info
-        sight = look(self.network, image_bgr, view)
+        with lap("net"):
+            sight = look(self.network, image_bgr, view)
         reach_px = self._reach_px[camera.info.name]
-        blobs, owner = find_blobs(sight, info.classes, info.paint_stride, view.top, reach_px)
-        candidates = self._candidates(blobs, view)
-        paint = [LanePaint(c.blob, c.kind, c.score) for c in candidates if c.kind in LANE_CLASSES]
-        lanes = trace_lanes(paint, view, self.options.lane_step_m, self.options.max_range_m)
-        lanes += link_anchors(sight.anchors, view)
-        starts = [start for c in candidates if (start := self._start(c, view)) is not None]
-        foreground = Foreground(owner, info.paint_stride, view.top)
-        markings = fit_markings(image_bgr, view, starts, foreground, self.options)
-        markings += [symbol for c in candidates if (symbol := self._symbol(c, view)) is not None]
+        with lap("blobs"):
+            blobs, owner = find_blobs(sight, info.classes, info.paint_stride, view.top, reach_px)
+            candidates = self._candidates(blobs, view)
+        with lap("lanes"):
+            paint = [LanePaint(c.blob, c.kind, c.score) for c in candidates if c.kind in LANE_CLASSES]
+            lanes = trace_lanes(paint, view, self.options.lane_step_m, self.options.max_range_m)
+            lanes += link_anchors(sight.anchors, view)
+        with lap("corners"):
+            starts = [start for c in candidates if (start := self._start(c, view)) is not None]
+            foreground = Foreground(owner, info.paint_stride, view.top)
+            markings = fit_markings(image_bgr, view, starts, foreground, self.options)
+            markings += [symbol for c in candidates if (symbol := self._symbol(c, view)) is not None]
         return tuple(markings), tuple(lanes)
 
     def view(self, camera: Camera) -> CameraView:

@@ -93,8 +93,8 @@ class Network:
                 strict=True,
             )
         )
-        # One sum meets every value: not-a-number anywhere in the weights spreads over all of the image.
-        if not np.isfinite(paint.sum()):
+        # A sum meets every value: not-a-number among the weights of an output spreads over all of it.
+        if not all(np.isfinite(output[0].sum()) for output in (paint, kinds, lanes)):
             raise DetectorError(
                 f"{self.path}: the network gives values that are not finite; export an earlier checkpoint"
             )
