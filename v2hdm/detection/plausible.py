@@ -23,7 +23,7 @@ from v2hdm.records import (
 )
 
 _SIZE_LIMITS_M: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
-    DIAMOND: ((0.15, 5.0), (0.1, 3.0)),
+    DIAMOND: ((0.3, 5.0), (0.15, 3.0)),
     LANE_DASH: ((0.7, 12.0), (0.03, 0.8)),
     LANE_LINE: ((0.3, np.inf), (0.03, np.inf)),
     STOP_LINE: ((0.8, 25.0), (0.12, 1.2)),
