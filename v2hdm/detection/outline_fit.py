@@ -67,17 +67,12 @@ def _fit(outline: FloatArray, quad: FloatArray) -> tuple[FloatArray, FloatArray,
     reach = max(_MIN_OFFSET_PX, _MAX_OFFSET_SHARE * float(length.min()))
     half = 0.5 * _CENTRAL_SHARE * length
     near = (np.abs(along) < half) & (np.abs(across) < reach)
-    offset, slope, sigma = np.zeros(4), np.zeros(4), np.zeros((4, 2))
-    straight = np.zeros(4, dtype=np.bool_)
-    for side in range(4):
-        line = _line(along[near[:, side], side] / half[side], across[near[:, side], side])
-        if line is None:
-            continue
-        offset[side], slope[side], roughness, points = line[0], line[1] / half[side], *line[2:]
-        straight[side] = roughness <= max(_MAX_ROUGHNESS_PX, _MAX_ROUGHNESS_SHARE * length[side])
-        # Neighbouring points of an outline err alike, over about four of them.
-        level = np.hypot(_MASK_SIGMA_PX, 2 * roughness / np.sqrt(points))
-        sigma[side] = level, 2 * level / length[side]
+    lines = _straight_lines(along / half, across, near)
+    offset, slope = lines.offset, lines.slope / half
+    straight = lines.known & (lines.roughness <= np.maximum(_MAX_ROUGHNESS_PX, _MAX_ROUGHNESS_SHARE * length))
+    # Neighbouring points of an outline err alike, over about four of them.
+    level = np.hypot(_MASK_SIGMA_PX, 2 * lines.roughness / np.sqrt(np.maximum(lines.points, 1)))
+    sigma = np.stack([level, 2 * level / length], axis=1)
     tilted = normal - slope[:, None] * tangent
     corners = intersect_sides(middle + offset[:, None] * normal, tilted)
     found = straight & np.roll(straight, 1)
@@ -88,26 +83,40 @@ def _fit(outline: FloatArray, quad: FloatArray) -> tuple[FloatArray, FloatArray,
     return np.where(found[:, None], corners, np.nan), covariance * np.outer(keep, keep), found
 
 
-def _line(along: FloatArray, across: FloatArray) -> tuple[float, float, float, int] | None:
-    """Offset, slope, scatter and points of a robust line (Tukey's weights) over ``along`` from -1 to 1."""
-    if len(along) < _MIN_POINTS:
-        return None
-    weight = np.ones(len(along))
+@dataclass(frozen=True)
+class _Lines:
+    """Lines along four sides: ``offset``, ``slope``, ``roughness``, ``points`` (4,), and if ``known`` (4,)."""
+
+    offset: FloatArray
+    slope: FloatArray
+    roughness: FloatArray
+    points: FloatArray
+    known: BoolArray
+
+
+def _straight_lines(along: FloatArray, across: FloatArray, near: BoolArray) -> _Lines:
+    """Robust lines by Tukey's weights through the points (N, 4) near each side; ``along`` from -1 to 1."""
+    count = near.sum(axis=0)
+    weight = near.astype(np.float64)
     for _ in range(_ITERATIONS):
-        total = weight.sum()
-        mean_x, mean_y = (weight @ along) / total, (weight @ across) / total
-        spread = weight @ (along - mean_x) ** 2
-        slope = (weight * (along - mean_x)) @ (across - mean_y) / max(spread, 1e-9)
-        residual = across - mean_y - slope * (along - mean_x)
-        scatter = max(1.4826 * float(np.median(np.abs(residual))), 0.05)
-        weight = np.clip(1 - (residual / (_TUKEY * scatter)) ** 2, 0, None) ** 2
-        if np.count_nonzero(weight) < _MIN_POINTS:
-            return None
+        total = np.maximum(weight.sum(axis=0), 1e-9)
+        mean_x, mean_y = (weight * along).sum(axis=0) / total, (weight * across).sum(axis=0) / total
+        x = along - mean_x
+        slope = (weight * x * (across - mean_y)).sum(axis=0) / np.maximum((weight * x * x).sum(axis=0), 1e-9)
+        residual = across - mean_y - slope * x
+        ordered = np.sort(np.where(near, np.abs(residual), np.inf), axis=0)
+        middle = ordered[np.minimum(count // 2, len(along) - 1), range(4)]
+        scatter = np.maximum(1.4826 * np.where(np.isfinite(middle), middle, 1.0), 0.05)
+        weight = near * np.clip(1 - (residual / (_TUKEY * scatter)) ** 2, 0, None) ** 2
     used = weight > 0
-    parts = np.unique(np.floor((along[used] + 1) / 2 * _BINS))
-    if used.mean() < 0.6 or len(parts) < _LEAST_BINS:
-        return None
-    return float(mean_y - slope * mean_x), float(slope), float(residual[used].std()), int(used.sum())
+    points = used.sum(axis=0)
+    part = np.clip(((along + 1) / 2 * _BINS).astype(np.intp), 0, _BINS - 1)
+    parts = np.zeros((_BINS, 4), dtype=np.bool_)
+    point, side = np.nonzero(used)
+    parts[part[point, side], side] = True
+    known = (points >= _MIN_POINTS) & (points >= 0.6 * count) & (parts.sum(axis=0) >= _LEAST_BINS)
+    roughness = np.sqrt((used * residual**2).sum(axis=0) / np.maximum(points, 1))
+    return _Lines(mean_y - slope * mean_x, slope, roughness, points.astype(np.float64), known)
 
 
 def _covariance(
