@@ -9,6 +9,7 @@ import pytest
 from tests.adjust.scene import Scene, make_scene
 from v2hdm.adjust import Observations, PoseSigma, Problem, SolveOptions, solve
 from v2hdm.adjust.incremental import IncrementalMap, RigPrior
+from v2hdm.adjust.incremental_file import load_map, save_map
 from v2hdm.adjust.marking_fit import MarkingObservations, Noise
 from v2hdm.errors import AdjustError
 
@@ -134,6 +135,41 @@ def test_a_forgotten_marking_leaves_no_trace():
     np.testing.assert_allclose(with_and_back.cam_from_vehicle, without.cam_from_vehicle, atol=1e-9)
     with pytest.raises(AdjustError, match="marking 99 is not in the map"):
         with_and_back.corners_map(99)
+
+
+def test_a_saved_map_goes_on_as_if_nothing_had_happened(tmp_path):
+    problem = whole_markings(street(frames=40, jitter=JITTER).problem)
+    markings = by_marking(problem)
+    noise = Noise(JITTER.by_state(), 3.0)
+    straight_on, stopped = (IncrementalMap(prior_of(problem), noise, 0.01) for _ in range(2))
+    for marking, seen in enumerate(markings[:7]):
+        straight_on.observe(marking, seen)
+        stopped.observe(marking, seen)
+    save_map(stopped, tmp_path / "map.npz")
+    resumed = load_map(tmp_path / "map.npz")
+    for marking, seen in [*enumerate(markings[7:], 7), (2, markings[2])]:
+        straight_on.observe(marking, seen)
+        resumed.observe(marking, seen)
+    assert list(resumed.markings) == list(straight_on.markings)
+    np.testing.assert_array_equal(resumed.cam_from_vehicle, straight_on.cam_from_vehicle)
+    for marking in straight_on.markings:
+        np.testing.assert_array_equal(resumed.corners_map(marking), straight_on.corners_map(marking))
+        np.testing.assert_array_equal(
+            resumed.corner_covariance(marking), straight_on.corner_covariance(marking)
+        )
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["map.npz"]
+
+
+def test_an_empty_map_can_be_saved_and_what_is_no_map_is_refused(tmp_path):
+    problem = street().problem
+    save_map(IncrementalMap(prior_of(problem), STILL), tmp_path / "empty.npz")
+    grown = load_map(tmp_path / "empty.npz")
+    grown.observe(0, by_marking(problem)[0])
+    assert list(grown.markings) == [0]
+    (tmp_path / "text.npz").write_text("no map")
+    for name in ("text.npz", "absent.npz"):
+        with pytest.raises(AdjustError, match=f"{name}: no saved map can be read here"):
+            load_map(tmp_path / name)
 
 
 def test_the_time_for_a_marking_does_not_grow_with_the_map():

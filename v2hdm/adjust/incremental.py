@@ -76,35 +76,53 @@ class Settled:
         return self.corners_map - (self.gain @ (tangents - self.at)).reshape(-1, 2)
 
 
+@dataclass
+class State:
+    """All that changes as the map grows.
+
+    ``settled`` holds the markings by their number, of which ``linearised_count`` were there when all were
+    last linearised anew; ``tangents`` (6C,) solves ``information`` (6C, 6C) times it = ``vector`` (6C,).
+    """
+
+    settled: dict[int, Settled]
+    linearised_count: int
+    tangents: FloatArray
+    information: FloatArray
+    vector: FloatArray
+
+
 class IncrementalMap:
     """Extrinsics and corners, up to date after every marking."""
 
-    def __init__(self, prior: RigPrior, noise: Noise, drift_m: float = 0.0) -> None:
-        """Begin with an empty map.
+    def __init__(
+        self, prior: RigPrior, noise: Noise, drift_m: float = 0.0, state: State | None = None
+    ) -> None:
+        """Begin with an empty map, or go on from ``state``.
 
         Args:
             prior: what is known of the cameras.
             noise: how observations and poses err; of the poses, what differs from image to image.
             drift_m: standard deviation of the slow part of the position error, which a whole marking
                 shares and no observation can tell: it goes into the corners' covariances.
+            state: where another map of the same rig stopped.
         """
         self.prior = prior
         self.noise = noise
         self.drift_m = drift_m
-        self._settled: dict[int, Settled] = {}
-        self._linearised_count = 0
-        self._tangents: FloatArray = np.zeros(6 * len(prior.cam_from_vehicle))
-        self._information, self._vector = self._prior_at(self._tangents)
+        if state is None:
+            tangents = np.zeros(6 * len(prior.cam_from_vehicle))
+            state = State({}, 0, tangents, *self._prior_at(tangents))
+        self.state = state
 
     @property
     def markings(self) -> Mapping[int, Settled]:
         """The settled markings by their number, in the order in which they came."""
-        return self._settled
+        return self.state.settled
 
     @property
     def cam_from_vehicle(self) -> FloatArray:
         """The extrinsics (C, 4, 4) that all markings together say."""
-        return self._extrinsics(self._tangents)
+        return self._extrinsics(self.state.tangents)
 
     @property
     def extrinsic_covariance(self) -> FloatArray:
@@ -115,13 +133,13 @@ class IncrementalMap:
 
     def corners_map(self, marking: int) -> FloatArray:
         """Corners (n, 2) of a marking under the present extrinsics."""
-        return self._known(marking).corners_at(self._tangents)
+        return self._known(marking).corners_at(self.state.tangents)
 
     def corner_covariance(self, marking: int) -> FloatArray:
         """Joint covariance (2n, 2n), m^2, of a marking's corners."""
         settled = self._known(marking)
         shared = np.tile(self.drift_m**2 * np.eye(2), (len(settled.corners_map),) * 2)
-        extrinsic = np.linalg.inv(self._information)
+        extrinsic = np.linalg.inv(self.state.information)
         return np.asarray(settled.covariance_m2 + settled.gain @ extrinsic @ settled.gain.T + shared)
 
     def observe(self, marking: int, observations: MarkingObservations) -> None:
@@ -135,49 +153,49 @@ class IncrementalMap:
             raise AdjustError(
                 f"corner {unseen[0]} of marking {marking} has no observation: number them from 0"
             )
-        if marking in self._settled:
-            observations = self._settled[marking].observations.joined(observations)
+        if marking in self.state.settled:
+            observations = self.state.settled[marking].observations.joined(observations)
             self.forget(marking)
-        settled, self._tangents = self._solve(marking, observations)
-        self._settled[marking] = settled
-        self._information = self._information + settled.information
-        self._vector = self._vector + settled.vector
-        if len(self._settled) >= 2 * self._linearised_count:
+        settled, self.state.tangents = self._solve(marking, observations)
+        self.state.settled[marking] = settled
+        self.state.information = self.state.information + settled.information
+        self.state.vector = self.state.vector + settled.vector
+        if len(self.state.settled) >= 2 * self.state.linearised_count:
             self.linearise()
 
     def forget(self, marking: int) -> None:
         """Take a marking back out of the map and out of what the extrinsics rest on."""
         settled = self._known(marking)
-        del self._settled[marking]
-        self._information = self._information - settled.information
-        self._vector = self._vector - settled.vector
-        self._tangents = _solved(self._information, self._vector)
+        del self.state.settled[marking]
+        self.state.information = self.state.information - settled.information
+        self.state.vector = self.state.vector - settled.vector
+        self.state.tangents = _solved(self.state.information, self.state.vector)
 
     def linearise(self) -> None:
         """Linearise everything anew where it is now; happens by itself whenever the map has doubled."""
         for _ in range(_PASSES):
-            at = self._tangents
-            self._information, self._vector = self._prior_at(at)
-            for marking, settled in self._settled.items():
+            at = self.state.tangents
+            self.state.information, self.state.vector = self._prior_at(at)
+            for marking, settled in self.state.settled.items():
                 renewed = self._settle(settled.observations, at, settled.corners_at(at), settled.frame_state)
-                self._settled[marking] = renewed
-                self._information = self._information + renewed.information
-                self._vector = self._vector + renewed.vector
-            self._tangents = _solved(self._information, self._vector)
-        self._linearised_count = len(self._settled)
+                self.state.settled[marking] = renewed
+                self.state.information = self.state.information + renewed.information
+                self.state.vector = self.state.vector + renewed.vector
+            self.state.tangents = _solved(self.state.information, self.state.vector)
+        self.state.linearised_count = len(self.state.settled)
 
     def _known(self, marking: int) -> Settled:
-        if marking not in self._settled:
+        if marking not in self.state.settled:
             raise AdjustError(f"marking {marking} is not in the map")
-        return self._settled[marking]
+        return self.state.settled[marking]
 
     def _extrinsics(self, tangents: FloatArray) -> FloatArray:
         return np.asarray(exp(tangents.reshape(-1, 6)) @ self.prior.cam_from_vehicle)
 
     def _left_covariance(self) -> FloatArray:
         """Covariance (6C, 6C) of the left tangents at the present extrinsics."""
-        turn = block_diag(*left_jacobians(self._tangents.reshape(-1, 6)))
-        return np.asarray(turn @ np.linalg.inv(self._information) @ turn.T)
+        turn = block_diag(*left_jacobians(self.state.tangents.reshape(-1, 6)))
+        return np.asarray(turn @ np.linalg.inv(self.state.information) @ turn.T)
 
     def _prior_at(self, tangents: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The prior's part of the normal equations, linearised at ``tangents``: (6C, 6C) and (6C,)."""
@@ -201,13 +219,13 @@ class IncrementalMap:
 
     def _solve(self, marking: int, observations: MarkingObservations) -> tuple[Settled, FloatArray]:
         """Gauss-Newton over the marking's corners and the extrinsics, the settled markings as a quadratic."""
-        tangents = self._tangents
+        tangents = self.state.tangents
         corners = back_projected(observations, self.prior.intrinsic, self._extrinsics(tangents))
         state = np.zeros((int(observations.frame_rank.max()) + 1, 6))
         for _ in range(_MAX_STEPS):
             settled = self._settle(observations, tangents, corners, state)
-            information = self._information + settled.information
-            reached = _solved(information, self._vector + settled.vector)
+            information = self.state.information + settled.information
+            reached = _solved(information, self.state.vector + settled.vector)
             step = reached - tangents
             moved = settled.corners_at(reached)
             shift = (moved - corners).reshape(-1)

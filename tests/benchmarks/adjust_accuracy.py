@@ -1,0 +1,230 @@
+"""How right the adjustment is, and how right it is about itself, over simulated drives.
+
+``python -m tests.benchmarks.adjust_accuracy [section ...] [--drives N]`` prints asked and measured figures of
+
+- ``honesty``: normalised estimation error squared (NEES) and coverage of the 95 % regions,
+- ``efficiency``: RMSE against the Cramer-Rao bound, disturbances marginalised,
+- ``disturbances``: corner RMSE beside that of undisturbed poses and of the paper's model,
+- ``convergence``: starts ten degrees away.
+
+tests/adjust/test_accuracy.py runs the same functions on few drives.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from tests.adjust.scene import Scene, make_scene
+from v2hdm.adjust import Drift, PoseSigma, SolveOptions, Status, solve
+from v2hdm.adjust.arrays import make_arrays
+from v2hdm.adjust.covariance import Covariance
+from v2hdm.adjust.problem import POSE_STATES
+from v2hdm.adjust.reduced import make_plan
+from v2hdm.adjust.residuals import Estimate
+from v2hdm.adjust.whitening import factorise
+
+PAPER = SolveOptions(pose_states=(), loss="none")
+PLAIN = SolveOptions(loss="none")
+ROBUST = SolveOptions(loss="cauchy")
+
+WHITE = PoseSigma(
+    position_m=0.02, heading_rad=np.deg2rad(0.1), roll_pitch_rad=np.deg2rad(0.3), height_m=0.005
+)
+DRIFTING = replace(WHITE, position_drift=Drift(0.018, 30.0))
+"""RTK errors correlated over 30 m, little of them white."""
+
+ALL_DRIFTING = replace(
+    DRIFTING,
+    heading_drift=Drift(0.7 * WHITE.heading_rad, 5.0),
+    roll_pitch_drift=Drift(0.7 * WHITE.roll_pitch_rad, 1.2),
+)
+ALL_OVER_30_M = replace(
+    DRIFTING,
+    heading_drift=Drift(0.95 * WHITE.heading_rad, 30.0),
+    roll_pitch_drift=Drift(0.95 * WHITE.roll_pitch_rad, 30.0),
+)
+"""Every error but the height correlated over 30 m."""
+
+# What a chi-square variable with two degrees of freedom exceeds once in twenty times.
+_CHI2_95 = 5.991
+
+
+@dataclass(frozen=True)
+class Honesty:
+    """Of one drive: mean NEES per degree of freedom and share within the 95 % region, by kind of unknown."""
+
+    corner_nees: float
+    corner_coverage: float
+    rotation_nees: float
+    centre_nees: float
+    chi2_per_dof: float
+
+
+def honesty(scene: Scene) -> Honesty:
+    """Compare the errors of one solve with the covariances that it states."""
+    solution = solve(scene.problem, replace(PLAIN, coarse=False))
+    error = solution.corners_map - scene.corners_map
+    covariance = solution.corner_covariance(np.arange(scene.problem.corner_count)[:, None])
+    corner = np.einsum("na,nab,nb->n", error, np.linalg.inv(covariance), error)
+    off = solution.cam_from_vehicle @ np.linalg.inv(scene.cam_from_vehicle)
+    turn = np.stack([off[:, 2, 1], off[:, 0, 2], off[:, 1, 0]], axis=1)
+    # The left tangent's translation is the motion of the vehicle's origin; with the turn taken out.
+    shift = off[:, :3, 3]
+    by_camera = solution.extrinsic_covariance
+    rotation = np.einsum("ca,cab,cb->c", turn, np.linalg.inv(by_camera[:, 3:, 3:]), turn) / 3
+    centre = np.einsum("ca,cab,cb->c", shift, np.linalg.inv(by_camera[:, :3, :3]), shift) / 3
+    return Honesty(
+        corner_nees=float(corner.mean() / 2),
+        corner_coverage=float(np.mean(corner <= _CHI2_95)),
+        rotation_nees=float(rotation.mean()),
+        centre_nees=float(centre.mean()),
+        chi2_per_dof=solution.chi2_per_dof,
+    )
+
+
+def squared_bound_m2(scene: Scene) -> float:
+    """Mean trace of the corners' covariances that no unbiased estimator can beat: the Cramer-Rao bound.
+
+    The inverse of the information at the truth, frame states and extrinsics marginalised out; with a
+    prior it is the bound of van Trees (Detection, Estimation and Modulation Theory, section 2.4).
+    """
+    arrays = make_arrays(scene.problem, POSE_STATES, "cpu")
+    truth = Estimate(
+        torch.as_tensor(scene.cam_from_vehicle),
+        torch.zeros_like(arrays.state_information_root),
+        torch.as_tensor(scene.corners_map)[arrays.corner_order],
+        arrays.no_clock(),
+    )
+    whitening = factorise(arrays, make_plan(arrays), truth, torch.ones_like(arrays.measured[0]))
+    groups = np.arange(scene.problem.corner_count)[:, None]
+    return float(np.trace(Covariance(whitening).corners(groups), axis1=1, axis2=2).mean())
+
+
+def squared_error_m2(scene: Scene, options: SolveOptions) -> float:
+    """Mean squared distance of the adjusted corners from the truth."""
+    return scene.corner_rmse_m(solve(scene.problem, options).corners_map) ** 2
+
+
+def root_ratio(numerators: Iterable[float], denominators: Iterable[float]) -> float:
+    """Root of the ratio of two means."""
+    return float(np.sqrt(np.mean(list(numerators)) / np.mean(list(denominators))))
+
+
+def root_mean_cm(squares_m2: Iterable[float]) -> float:
+    """Root mean square in cm."""
+    return 100 * float(np.sqrt(np.mean(list(squares_m2))))
+
+
+def street(seed: int, jitter: PoseSigma | None = None, outliers: float = 0.0, **changes: float) -> Scene:
+    """A drive of 60 m with turns, two cameras, some 130 corners, 6000 observations; one seed, one street.
+
+    Corners are seen at least five times: of two observations, one of them wrong, nobody can tell which.
+    """
+    options = {
+        "frames": 80,
+        "step_m": 0.75,
+        "every_m": 2.0,
+        "start_error_deg": 1.0,
+        "min_views": 5,
+        **changes,
+    }
+    return make_scene(
+        seed, jitter=jitter, outliers=outliers, noise_seed=10_000 + seed, max_range_m=30.0, **options
+    )
+
+
+def convergence(seed: int, start_error_deg: float = 10.0, **changes: float) -> bool:
+    """Whether a start that far away ends in the optimum that a start at the truth ends in."""
+    scene = street(seed, WHITE, start_error_deg=start_error_deg, **changes)
+    at_truth = replace(scene.problem, cam_from_vehicle=scene.cam_from_vehicle)
+    found, best = solve(scene.problem, ROBUST), solve(at_truth, replace(ROBUST, coarse=False))
+    return found.status is Status.CONVERGED and abs(found.cost - best.cost) <= 1e-6 * best.cost
+
+
+def print_honesty(drives: int) -> None:
+    """The table of :func:`honesty`."""
+    for name, jitter in (("white", WHITE), ("drifting", ALL_DRIFTING)):
+        found = [honesty(street(seed, jitter)) for seed in range(drives)]
+        for figure, wanted in (
+            ("corner_nees", 1.0),
+            ("corner_coverage", 0.95),
+            ("rotation_nees", 1.0),
+            ("centre_nees", 1.0),
+            ("chi2_per_dof", 1.0),
+        ):
+            values = np.array([getattr(one, figure) for one in found])
+            error = values.std(ddof=1) / np.sqrt(drives)
+            print(
+                f"  {name:9s} {figure:16s} asked {wanted:4.2f}  measured {values.mean():5.3f} +- {error:5.3f}"
+            )
+
+
+def print_efficiency(drives: int) -> None:
+    """RMSE over Cramer-Rao bound; the paper's model beside it."""
+    for name, jitter in (("white", WHITE), ("drifting", ALL_DRIFTING)):
+        scenes = [street(seed, jitter) for seed in range(drives)]
+        bound = [squared_bound_m2(scene) for scene in scenes]
+        ours = root_ratio((squared_error_m2(scene, PLAIN) for scene in scenes), bound)
+        paper = root_ratio((squared_error_m2(scene, PAPER) for scene in scenes), bound)
+        print(f"  {name:9s} RMSE / bound  asked <= 1.10  measured {ours:5.3f}  (paper's model {paper:5.2f})")
+
+
+def print_disturbances(drives: int) -> None:
+    """Corner RMSE under disturbances as a multiple of what undisturbed poses allow."""
+    calm = [squared_error_m2(street(seed), PAPER) for seed in range(drives)]
+    print(f"  undisturbed poses, paper's model: {root_mean_cm(calm):.2f} cm")
+    for name, jitter, outliers, options, wanted in (
+        ("white", WHITE, 0.0, PLAIN, "<= 1.2"),
+        ("white, robust", WHITE, 0.0, ROBUST, "<= 1.2"),
+        ("3 % wrong", WHITE, 0.03, ROBUST, "<= 1.3"),
+        ("RTK over 30 m", DRIFTING, 0.0, ROBUST, "<= 0.25 x paper's"),
+        ("all over 30 m", ALL_OVER_30_M, 0.0, ROBUST, "<= 0.25 x paper's"),
+    ):
+        scenes = [street(seed, jitter, outliers) for seed in range(drives)]
+        ours = [squared_error_m2(scene, options) for scene in scenes]
+        paper = [squared_error_m2(scene, PAPER) for scene in scenes]
+        bound = [squared_bound_m2(scene) for scene in scenes]
+        print(
+            f"  {name:14s} {root_mean_cm(ours):5.2f} cm (bound {root_mean_cm(bound):5.2f}) = "
+            f"{root_ratio(ours, calm):5.2f} x undisturbed, {root_ratio(ours, paper):5.2f} x paper's model "
+            f"({root_mean_cm(paper):5.2f} cm); asked {wanted}"
+        )
+
+
+def print_convergence(drives: int) -> None:
+    """How many starts ten degrees away end in the optimum."""
+    reached = sum(convergence(seed) for seed in range(drives))
+    print(f"  from 10 degrees: asked all, measured {reached} of {drives}")
+
+
+SECTIONS = {
+    "honesty": (print_honesty, 100),
+    "efficiency": (print_efficiency, 50),
+    "disturbances": (print_disturbances, 20),
+    "convergence": (print_convergence, 100),
+}
+
+
+def main() -> None:
+    """Print the sections asked for, or all."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("section", nargs="*", choices=[*SECTIONS, []], default=[])
+    parser.add_argument("--drives", type=int, help="drives per figure; the default is what the figure asks")
+    arguments = parser.parse_args()
+    for name in arguments.section or SECTIONS:
+        run, usual = SECTIONS[name]
+        drives = arguments.drives or usual
+        began = time.process_time()
+        print(f"{name}, {drives} drives:", flush=True)
+        run(drives)
+        print(f"  {time.process_time() - began:.0f} s of one core", flush=True)
+
+
+if __name__ == "__main__":
+    main()

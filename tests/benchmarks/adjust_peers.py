@@ -1,0 +1,160 @@
+"""Our adjustment beside native Ceres on the same problem, from the same start.
+
+``python -m tests.benchmarks.adjust_peers [observations ...]`` prints time (set-up and solve apart), final
+cost and memory of each. Ceres runs natively, through pyceres with pycolmap's compiled cost functions and the
+Schur complement that suits few cameras; where these are not installed (the extra ``bench``), it is left out
+and said so.
+
+The model is the paper's, extrinsics and corners, since pycolmap has no frame states: our own per-frame
+states are a row of their own.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import sys
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from tests.adjust.scene import make_scene
+from tests.benchmarks.adjust_scaling import driven_on
+from v2hdm.adjust import PoseSigma, Problem, SolveOptions, solve
+from v2hdm.adjust.arrays import make_arrays
+from v2hdm.adjust.start import back_project
+
+try:
+    import pyceres
+    import pycolmap
+    from pycolmap import cost_functions
+except ImportError as failure:
+    ABSENT = f"Ceres is left out: {failure}; pip install 'v2hdm[bench]'"
+    pyceres: Any = None
+else:
+    ABSENT = ""
+
+PAPER = SolveOptions(pose_states=(), loss="none", coarse=False)
+THREADS = min(2, os.cpu_count() or 1)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One solver's figures; times in s."""
+
+    name: str
+    setup_s: float
+    solve_s: float
+    cost: float
+    note: str
+
+
+def street(observations: int) -> Problem:
+    """At least so many observations by two cameras, started one degree off; corners from back-projection."""
+    one = make_scene(0, frames=400, every_m=1.0, jitter=None, max_range_m=12.0, start_error_deg=1.0).problem
+    problem = driven_on(one, -(-observations // len(one.observations.corner)))
+    arrays = make_arrays(problem, (), "cpu")
+    corners, _ = back_project(arrays, torch.as_tensor(problem.cam_from_vehicle))
+    start = np.empty((problem.corner_count, 2))
+    start[arrays.corner_order.numpy()] = corners.numpy()
+    return replace(problem, corners_start=start)
+
+
+def ours(problem: Problem, options: SolveOptions, name: str) -> Row:
+    """Our solver; what it lays out is part of the solve."""
+    began = time.perf_counter()
+    solution = solve(problem, options)
+    took = time.perf_counter() - began
+    return Row(name, 0.0, took, solution.cost, f"{solution.evaluations} evaluations, gap {solution.gap:.0e}")
+
+
+def ceres(problem: Problem) -> Row:
+    """Native Ceres: Levenberg-Marquardt on the dense Schur complement of the cameras."""
+    began = time.perf_counter()
+    built, keep = _ceres_problem(problem)
+    options = pyceres.SolverOptions()
+    options.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR
+    options.num_threads = THREADS
+    options.max_num_iterations = 100
+    options.function_tolerance = 1e-14
+    options.gradient_tolerance = 1e-14
+    options.parameter_tolerance = 1e-14
+    summary = pyceres.SolverSummary()
+    ready = time.perf_counter()
+    pyceres.solve(options, built, summary)
+    took = time.perf_counter() - ready
+    note = f"{summary.num_successful_steps} steps, {len(keep['points'])} points"
+    return Row("ceres", ready - began, took, summary.final_cost, note)
+
+
+def _ceres_problem(problem: Problem) -> tuple[Any, dict[str, Any]]:
+    """The problem, and the arrays that it points into."""
+    seen = problem.observations
+    quaternions = Rotation.from_matrix(problem.cam_from_vehicle[:, :3, :3]).as_quat()
+    shifts = problem.cam_from_vehicle[:, :3, 3].copy()
+    vehicle_from_map = np.linalg.inv(problem.map_from_vehicle)
+    frame_quaternions = Rotation.from_matrix(vehicle_from_map[:, :3, :3]).as_quat()
+    frame_shifts = vehicle_from_map[:, :3, 3].copy()
+    points = np.column_stack([problem.corners_start, np.zeros(problem.corner_count)])
+    intrinsic = problem.intrinsic.copy()
+    built = pyceres.Problem()
+    model = pycolmap.CameraModelId.PINHOLE
+    for k in range(len(seen.corner)):
+        c, j, n = seen.camera[k], seen.frame[k], seen.corner[k]
+        cost = cost_functions.RigReprojErrorCost(model, seen.covariance_px[k], seen.pinhole_px[k])
+        blocks = [quaternions[c], shifts[c], frame_quaternions[j], frame_shifts[j], points[n], intrinsic[c]]
+        built.add_residual_block(cost, None, blocks)
+    for c in range(len(intrinsic)):
+        assert problem.centre_vehicle is not None
+        assert problem.centre_sigma_m is not None
+        covariance = np.diag(problem.centre_sigma_m[c] ** 2)
+        prior = cost_functions.AbsolutePosePositionPriorCost(covariance, problem.centre_vehicle[c])
+        built.add_residual_block(prior, None, [quaternions[c], shifts[c]])
+        built.set_manifold(quaternions[c], pyceres.EigenQuaternionManifold())
+        built.set_parameter_block_constant(intrinsic[c])
+    for j in np.unique(seen.frame):
+        built.set_parameter_block_constant(frame_quaternions[j])
+        built.set_parameter_block_constant(frame_shifts[j])
+    on_the_ground = pyceres.SubsetManifold(3, [2])
+    for point in points:
+        built.set_manifold(point, on_the_ground)
+    keep = {
+        "cameras": (quaternions, shifts, intrinsic),
+        "frames": (frame_quaternions, frame_shifts),
+        "points": points,
+    }
+    return built, keep
+
+
+def main(sizes: list[int]) -> None:
+    """Print a table per size."""
+    torch.set_num_threads(THREADS)
+    solve(make_scene(0, frames=30).problem)
+    if ABSENT:
+        print(ABSENT)
+    for size in sizes:
+        problem = street(size)
+        print(f"{len(problem.observations.corner)} observations, {THREADS} threads")
+        rows = [ours(problem, PAPER, "ours"), ours(problem, replace(PAPER, solver="lm"), "ours, lm")]
+        if not ABSENT:
+            rows.append(ceres(problem))
+        states = replace(problem, pose_sigma=PoseSigma())
+        rows.append(ours(states, SolveOptions(loss="none", coarse=False), "ours, 6 states a frame"))
+        least = min(row.cost for row in rows[:-1])
+        for row in rows:
+            above = "" if row is rows[-1] else f"above the least {row.cost / least - 1:8.1e}"
+            print(
+                f"  {row.name:22s} set-up {row.setup_s:6.2f} s  solve {row.solve_s:6.2f} s  "
+                f"cost {row.cost:.9e} {above}  {row.note}",
+                flush=True,
+            )
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+        print(f"  peak memory of all of it {peak:.2f} GB")
+
+
+if __name__ == "__main__":
+    main([int(argument) for argument in sys.argv[1:]] or [100_000, 1_000_000])
