@@ -137,6 +137,20 @@ def test_a_forgotten_marking_leaves_no_trace():
         with_and_back.corners_map(99)
 
 
+def test_a_marking_that_cannot_be_re_estimated_stays_as_it_was():
+    problem = whole_markings(street().problem)
+    markings = by_marking(problem)
+    grown = IncrementalMap(prior_of(problem), STILL)
+    for marking, seen in enumerate(markings[:4]):
+        grown.observe(marking, seen)
+    before, corners = grown.cam_from_vehicle, grown.corners_map(2)
+    bad = replace(markings[2], pinhole_px=np.full_like(markings[2].pinhole_px, np.nan))
+    with pytest.raises(AdjustError, match="pinhole_px of marking 2 is not finite"):
+        grown.observe(2, bad)
+    np.testing.assert_allclose(grown.cam_from_vehicle, before, atol=1e-9)
+    np.testing.assert_allclose(grown.corners_map(2), corners, atol=1e-9)
+
+
 def test_a_saved_map_goes_on_as_if_nothing_had_happened(tmp_path):
     problem = whole_markings(street(frames=40, jitter=JITTER).problem)
     markings = by_marking(problem)

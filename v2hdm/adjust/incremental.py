@@ -142,24 +142,32 @@ class IncrementalMap:
         extrinsic = np.linalg.inv(self.state.information)
         return np.asarray(settled.covariance_m2 + settled.gain @ extrinsic @ settled.gain.T + shared)
 
+    def preview(self, observations: MarkingObservations) -> FloatArray:
+        """Where a marking's corners (n, 2) would come to lie, without taking it into the map.
+
+        Raises:
+            AdjustError: a corner has no observation, or the marking cannot be solved for.
+        """
+        settled, tangents = self._solve("preview", observations)
+        return settled.corners_at(tangents)
+
     def observe(self, marking: int, observations: MarkingObservations) -> None:
         """Take a marking into the map; one that is in it already is re-estimated from all its observations.
 
         Raises:
             AdjustError: a corner has no observation, or the marking cannot be solved for.
         """
-        unseen = np.flatnonzero(np.bincount(observations.corner) == 0)
-        if len(unseen):
-            raise AdjustError(
-                f"corner {unseen[0]} of marking {marking} has no observation: number them from 0"
-            )
-        if marking in self.state.settled:
-            observations = self.state.settled[marking].observations.joined(observations)
+        before = self.state.settled.get(marking)
+        if before is not None:
+            observations = before.observations.joined(observations)
             self.forget(marking)
-        settled, self.state.tangents = self._solve(marking, observations)
-        self.state.settled[marking] = settled
-        self.state.information = self.state.information + settled.information
-        self.state.vector = self.state.vector + settled.vector
+        try:
+            settled, _ = self._solve(marking, observations)
+        except AdjustError:
+            if before is not None:
+                self._add(marking, before)
+            raise
+        self._add(marking, settled)
         if len(self.state.settled) >= 2 * self.state.linearised_count:
             self.linearise()
 
@@ -183,6 +191,13 @@ class IncrementalMap:
                 self.state.vector = self.state.vector + renewed.vector
             self.state.tangents = _solved(self.state.information, self.state.vector)
         self.state.linearised_count = len(self.state.settled)
+
+    def _add(self, marking: int, settled: Settled) -> None:
+        """Add a marking's part to the normal equations and solve them."""
+        self.state.settled[marking] = settled
+        self.state.information = self.state.information + settled.information
+        self.state.vector = self.state.vector + settled.vector
+        self.state.tangents = _solved(self.state.information, self.state.vector)
 
     def _known(self, marking: int) -> Settled:
         if marking not in self.state.settled:
@@ -217,8 +232,16 @@ class IncrementalMap:
         turns = np.tile([0, 0, 0, 1, 1, 1], len(extrinsics)) / prior.rotation_sigma_rad**2
         return information + np.diag(turns), vector
 
-    def _solve(self, marking: int, observations: MarkingObservations) -> tuple[Settled, FloatArray]:
+    def _solve(self, marking: int | str, observations: MarkingObservations) -> tuple[Settled, FloatArray]:
         """Gauss-Newton over the marking's corners and the extrinsics, the settled markings as a quadratic."""
+        unseen = np.flatnonzero(np.bincount(observations.corner) == 0)
+        if len(unseen):
+            raise AdjustError(
+                f"corner {unseen[0]} of marking {marking} has no observation: number them from 0"
+            )
+        for name in ("vehicle_from_map", "pinhole_px", "covariance_px"):
+            if not np.isfinite(getattr(observations, name)).all():
+                raise AdjustError(f"{name} of marking {marking} is not finite: leave that observation out")
         tangents = self.state.tangents
         corners = back_projected(observations, self.prior.intrinsic, self._extrinsics(tangents))
         state = np.zeros((int(observations.frame_rank.max()) + 1, 6))

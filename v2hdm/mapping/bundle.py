@@ -201,7 +201,7 @@ def _problem(
     model: Model,
 ) -> Problem:
     """The adjustment of ``observations``, whose ``cameras`` are those of ``used``."""
-    centre, sigma = _centre_priors(cameras, rig.cam_from_vehicle[used.cameras])
+    centre, sigma = centre_priors(cameras, rig.cam_from_vehicle[used.cameras])
     intrinsic = rig.intrinsic[used.cameras]
     return Problem(
         intrinsic=np.column_stack([intrinsic[:, 0, 0], intrinsic[:, 1, 1], intrinsic[:, :2, 2]]),
@@ -233,7 +233,7 @@ def _observed_corners(
     return row[known], group[known], corner[known], number.reshape(-1, 4)
 
 
-def _centre_priors(cameras: Sequence[Camera], cam_from_vehicle: FloatArray) -> tuple[FloatArray, FloatArray]:
+def centre_priors(cameras: Sequence[Camera], cam_from_vehicle: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Prior camera centres and sigmas (C, 3): surveyed, or else implied by the starting extrinsic."""
     centre = camera_centres(cam_from_vehicle)
     sigma = np.full_like(centre, UNSURVEYED_CENTRE_SIGMA_M)

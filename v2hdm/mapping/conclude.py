@@ -79,9 +79,9 @@ def conclude(
         candidates = _candidates(evidence, solved)
         verdict = judge(candidates, options)
     accepted = np.flatnonzero([reason is None for reason in verdict])
-    excluded = _exclusions(candidates, verdict)
+    excluded = exclusions(candidates, verdict)
     if not len(accepted):
-        raise MappingError(_no_marking_message(excluded))
+        raise MappingError(no_marking_message(excluded))
     markings = tuple(
         Marking(
             kind=CORNERED_CLASSES[candidates.kind[group]],
@@ -114,7 +114,7 @@ def _candidates(evidence: Evidence, solved: SolvedCorners) -> Candidates:
     easy = np.stack(
         easy_views(evidence.views, final.rig, list(evidence.cameras.values()), solved.corners_map)
     )
-    found = np.isin(_pair_keys(easy), _pair_keys(seen))
+    found = np.isin(pair_keys(easy), pair_keys(seen))
     return Candidates(
         kind=group_kinds(final.association, sightings),
         corners_map=solved.corners_map,
@@ -127,7 +127,7 @@ def _candidates(evidence: Evidence, solved: SolvedCorners) -> Candidates:
     )
 
 
-def _exclusions(candidates: Candidates, verdict: Sequence[str | None]) -> list[Exclusion]:
+def exclusions(candidates: Candidates, verdict: Sequence[str | None]) -> list[Exclusion]:
     """What was refused and why; groups without a single solved corner were never candidates."""
     return [
         Exclusion(
@@ -168,7 +168,7 @@ def _residuals_under(rig: Rig, evidence: Evidence, jitter_rad: float) -> FloatAr
     return np.asarray(pixel[:, 0] - sightings.corners_pinhole_px[bundle.row, own_corner])
 
 
-def _pair_keys(pairs: IntArray) -> IntArray:
+def pair_keys(pairs: IntArray) -> IntArray:
     """One number per column of ``pairs`` (2, P)."""
     return np.asarray(pairs[0] * (1 << 32) + pairs[1])
 
@@ -180,7 +180,8 @@ def _rms(residual_px: FloatArray) -> float:
     return float(np.sqrt(np.mean(finite))) if len(finite) else float("nan")
 
 
-def _no_marking_message(excluded: Sequence[Exclusion]) -> str:
+def no_marking_message(excluded: Sequence[Exclusion]) -> str:
+    """What to say where no candidate was accepted."""
     reasons = [exclusion.reason for exclusion in excluded]
     commonest = max(set(reasons), key=reasons.count) if reasons else "nothing was seen twice"
     return (

@@ -17,15 +17,16 @@ from v2hdm.mapping.association import Association
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.conclude import Optimised
 from v2hdm.mapping.growth import grow_map
+from v2hdm.mapping.incremental import Grown
 from v2hdm.mapping.lane_points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
 from v2hdm.mapping.lanes import map_lanes
 from v2hdm.mapping.naive import naive_markings
 from v2hdm.mapping.optimise import Optimiser, nearest_extrinsic
-from v2hdm.mapping.options import MappingOptions, check_options
+from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.sightings import Sightings, camera_of, collect_sightings
 from v2hdm.mapping.views import views_of
-from v2hdm.records import Drive, FloatArray, HdMap, ImageDetections, Lane
+from v2hdm.records import Calibration, Drive, FloatArray, HdMap, ImageDetections, Lane
 
 Progress = Callable[[str], None]
 
@@ -75,11 +76,16 @@ def run_methods(
             tell(name)
             results[name] = run_naive(name, drive, detections, sightings, tracks, known, options)
     begin_s = time.perf_counter()
-    optimised = optimiser.run(tracks, tell)
-    optimal = _optimised_result(drive, detections, cameras, optimised, options, begin_s)
-    if growth_steps:
-        tell("growth of the map")
-        optimal = replace(optimal, growth=grow_map(optimiser, optimised, growth_steps))
+    if options.mode == INCREMENTAL:
+        tell("marking by marking")
+        grown = optimiser.run_incrementally(tracks)
+        optimal = _incremental_result(drive, detections, cameras, grown, options, begin_s)
+    else:
+        optimised = optimiser.run(tracks, tell)
+        optimal = _optimised_result(drive, detections, cameras, optimised, options, begin_s)
+        if growth_steps:
+            tell("growth of the map")
+            optimal = replace(optimal, growth=grow_map(optimiser, optimised, growth_steps))
     results["Opt"] = optimal
     tell("ONI")
     found = optimal.calibrations
@@ -144,6 +150,32 @@ def _optimised_result(
             "time_s": time.perf_counter() - begin_s,
         },
         certainty=_certainty(optimised.bundle),
+    )
+
+
+def _incremental_result(
+    drive: Drive,
+    detections: Sequence[ImageDetections],
+    cameras: Sequence[str],
+    grown: Grown,
+    options: MappingOptions,
+    begin_s: float,
+) -> MethodResult:
+    lanes = _lanes(drive, detections, ground_by_rig(drive, cameras, grown.rig), options)
+    covariance = grown.grown.extrinsic_covariance
+    return MethodResult(
+        name="Opt",
+        cameras=tuple(cameras),
+        hd_map=HdMap(grown.markings, lanes, drive.origin),
+        calibrations={
+            name: Calibration(drive.cameras[name].info, grown.rig.cam_from_vehicle[c], covariance[c])
+            for c, name in enumerate(cameras)
+        },
+        excluded=grown.excluded,
+        diagnostics={
+            "candidates": float(len(grown.grown.markings)),
+            "time_s": time.perf_counter() - begin_s,
+        },
     )
 
 

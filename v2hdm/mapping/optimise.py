@@ -23,6 +23,7 @@ from v2hdm.mapping.association import Association, fuse_groups, same_groups
 from v2hdm.mapping.bundle import Bundle, coarse_model, full_model, solve_bundle
 from v2hdm.mapping.conclude import Evidence, Optimised, conclude
 from v2hdm.mapping.corner_order import settle_corner_order
+from v2hdm.mapping.incremental import Grown, IncrementalMapper
 from v2hdm.mapping.location import Located, Rig, build_rig, locate
 from v2hdm.mapping.merge import merge_groups
 from v2hdm.mapping.options import AUTO, MappingOptions
@@ -94,6 +95,14 @@ class Optimiser:
             self._pose_noise.roll_pitch_rad,
             self._options.acceptance,
         )
+
+    def run_incrementally(self, tracks: Association) -> Grown:
+        """Map ``tracks`` one after the other, as the vehicle would while it drives."""
+        usable = self._locate(self.initial_rig).valid
+        mapper = IncrementalMapper(
+            self._sightings, usable, self.initial_rig, self._cameras, self._pose_noise, self._options
+        )
+        return mapper.run(tracks, self._views)
 
     def solve_groups(self, optimised: Optimised, groups: IntArray) -> Bundle:
         """Solve with only some ``groups`` of a finished optimisation, from the initial extrinsics."""

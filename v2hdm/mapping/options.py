@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 
 from v2hdm.errors import ConfigError
 
+BATCH = "batch"
+INCREMENTAL = "incremental"
 AUTO = "auto"
 POSE_MODELS: tuple[str, ...] = (AUTO, "paper", "roll_pitch", "full", "heave", "clock")
 """What ``mapping.pose_model`` may be: those of :data:`v2hdm.adjust.MODELS`, or ``auto``."""
@@ -84,13 +86,15 @@ class MappingOptions:
     ``roll_pitch``; ``full``, heading and position too; ``heave``, the height too; ``clock``, each camera's
     clock offset too; ``auto``, the one of them that predicts held-out observations best. ``loss`` and
     ``loss_scale`` are the robust loss of the solver.
+    ``mode`` is ``batch``, or ``incremental``: the drive as the vehicle would map it, marking by marking.
     ``rounds`` counts association under the optimised extrinsic followed by a joint solve.
     ``device`` is the torch device that the joint solves run on, ``cpu`` or ``cuda``.
     """
 
     max_range_m: float = 16.0
     model_floor_px: float = 0.15
-    pose_model: str = "auto"
+    mode: str = BATCH
+    pose_model: str = AUTO
     loss: str = "cauchy"
     loss_scale: float = 2.0
     rounds: int = 2
@@ -118,6 +122,8 @@ def check_options(options: MappingOptions) -> None:
         "lanes.half_width_m": options.lanes.half_width_m,
         "lanes.half_length_m": options.lanes.half_length_m,
     }
+    if options.mode not in (BATCH, INCREMENTAL):
+        raise ConfigError(f"mapping.mode is {options.mode!r}; choose {BATCH} or {INCREMENTAL}.")
     if options.pose_model not in POSE_MODELS:
         raise ConfigError(
             f"mapping.pose_model is {options.pose_model!r}; choose from {', '.join(POSE_MODELS)}."

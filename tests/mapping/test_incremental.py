@@ -1,0 +1,35 @@
+"""The yard mapped marking by marking, as on the vehicle."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.mapping.scene import SceneOptions, make_scene
+from tests.mapping.test_methods import MATCH_M, match, rotation_error_deg
+from v2hdm.errors import ConfigError
+from v2hdm.mapping.methods import run_methods
+from v2hdm.mapping.options import MappingOptions
+
+INCREMENTAL = MappingOptions(mode="incremental")
+
+
+def test_marking_by_marking_the_map_is_nearly_that_of_all_at_once() -> None:
+    scene = make_scene(SceneOptions(length_m=80.0, seed=21, hidden_corner_rate=0.0))
+    result = run_methods(scene.drive, scene.detections, ("front", "rear"), INCREMENTAL)["Opt"]
+    pairs, rmse_m = match(result.hd_map, scene.markings, MATCH_M)
+    assert len(pairs) == len(result.hd_map.markings)
+    assert len({b for _, b in pairs}) == len(pairs)
+    assert len(pairs) >= 0.9 * len(scene.markings)
+    assert rmse_m < 0.05
+    for name, truth in scene.cam_from_vehicle.items():
+        assert rotation_error_deg(result.calibrations[name].cam_from_vehicle, truth) < 0.1
+    assert all(np.all(np.isfinite(marking.covariance_m2)) for marking in result.hd_map.markings)
+
+
+def test_an_unknown_mode_is_refused() -> None:
+    scene = make_scene(SceneOptions(length_m=20.0, seed=1))
+    with pytest.raises(ConfigError, match=r"mapping.mode is 'online'; choose batch or incremental"):
+        run_methods(scene.drive, scene.detections, ("front",), replace(INCREMENTAL, mode="online"))
