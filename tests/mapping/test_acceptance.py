@@ -123,3 +123,11 @@ def test_of_two_markings_on_one_spot_the_better_supported_stays() -> None:
 def test_an_uncertain_marking_is_refused() -> None:
     sound = row_of_diamonds()
     assert list(refused(replace(sound, sigma_m=np.where(np.arange(COUNT) == 6, 0.5, 0.01)))) == [6]
+
+
+def test_the_shaft_of_an_arrow_is_refused_where_other_images_show_the_arrow() -> None:
+    sound = row_of_diamonds()
+    seen_as_symbol = np.zeros(COUNT, dtype=np.int64)
+    seen_as_symbol[[2, 7]] = 1, 4
+    judged = replace(sound, seen_as_symbol=seen_as_symbol)
+    assert refused(judged) == {7: "part of an arrow or a chevron"}, "one image may err"

@@ -26,6 +26,10 @@ ODD_SHAPE = "not shaped like the others of its class"
 MIN_EASY_VIEWS = 5
 """Easy views below which a share of detections says nothing."""
 
+MIN_SYMBOL_VIEWS = 2
+SYMBOL_SHARE = 0.34
+"""What so many images show as part of a symbol, and so many for each that shows it alone, is no marking."""
+
 MIN_SHAPE_TOLERANCE_M = 0.05
 """Lengths that differ by less are the same, however short they are."""
 
@@ -48,7 +52,8 @@ class Candidates:
     missing; ``completed`` (G,) whether one corner was implied by the other three; ``sigma_m`` (G,)
     of the worst corner; ``sightings`` (G,) images with accepted observations; ``inlier_share`` (G,)
     of the observations; ``easy_views`` (G,) images that had the whole marking in easy view and
-    ``easy_detections`` (G,) those among them that it was found in.
+    ``easy_detections`` (G,) those among them that it was found in; ``seen_as_symbol`` (G,) images in which an
+    arrow or a chevron lies on its centre, None where nobody looked.
     """
 
     kind: IntArray
@@ -59,6 +64,7 @@ class Candidates:
     inlier_share: FloatArray
     easy_views: IntArray
     easy_detections: IntArray
+    seen_as_symbol: IntArray | None = None
 
 
 def judge(candidates: Candidates, options: AcceptanceOptions) -> list[str | None]:
@@ -78,6 +84,9 @@ def judge(candidates: Candidates, options: AcceptanceOptions) -> list[str | None
     )
     _refuse(verdict, ~is_convex(candidates.corners_map), "not a convex quadrilateral")
     _refuse(verdict, _uncertain(candidates, options), "its position is too uncertain")
+    if candidates.seen_as_symbol is not None:
+        limit = np.maximum(MIN_SYMBOL_VIEWS, SYMBOL_SHARE * candidates.sightings)
+        _refuse(verdict, candidates.seen_as_symbol >= limit, "part of an arrow or a chevron")
     typical, odd = _judge_shapes(candidates, verdict, options)
     _refuse(verdict, odd, ODD_SHAPE)
     _refuse(verdict, candidates.completed & ~typical, "a corner was never seen twice")

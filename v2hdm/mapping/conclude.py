@@ -18,6 +18,7 @@ from v2hdm.mapping.merge import group_kinds
 from v2hdm.mapping.options import AcceptanceOptions
 from v2hdm.mapping.results import Exclusion
 from v2hdm.mapping.sightings import Sightings
+from v2hdm.mapping.symbols import images_with_symbol
 from v2hdm.mapping.views import Views, easy_views, project_ground
 from v2hdm.records import CORNERED_CLASSES, BoolArray, Calibration, Camera, FloatArray, Marking
 
@@ -124,6 +125,7 @@ def _candidates(evidence: Evidence, solved: SolvedCorners) -> Candidates:
         inlier_share=agreeing / np.maximum(total, 1),
         easy_views=np.bincount(easy[0], minlength=count),
         easy_detections=np.bincount(easy[0, found], minlength=count),
+        seen_as_symbol=images_with_symbol(sightings.symbols, final.rig, solved.corners_map.mean(axis=1)),
     )
 
 

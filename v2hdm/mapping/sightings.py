@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from v2hdm.detection.lens import has_distortion, undistort_points
 from v2hdm.errors import MappingError
+from v2hdm.mapping.symbols import NO_SYMBOLS, Symbols, collect_symbols
 from v2hdm.records import (
     CORNERED_CLASSES,
     BoolArray,
@@ -31,7 +32,7 @@ class Sightings:
     F distinct time stamps ``stamp_s`` (F,) whose recorded poses are ``map_from_vehicle`` (F, 4, 4), so that
     images taken together share a frame. ``kind`` indexes :data:`v2hdm.records.CORNERED_CLASSES`.
     ``corners_pinhole_px`` (S, 4, 2) have covariances ``covariance_px`` (S, 4, 2, 2), px^2;
-    ``valid`` (S, 4) says which of them may be used.
+    ``valid`` (S, 4) says which of them may be used. ``symbols`` are the same images' arrows and chevrons.
     """
 
     cameras: tuple[str, ...]
@@ -44,6 +45,7 @@ class Sightings:
     corners_pinhole_px: FloatArray
     covariance_px: FloatArray
     valid: BoolArray
+    symbols: Symbols = NO_SYMBOLS
 
     def __len__(self) -> int:
         return len(self.image)
@@ -61,6 +63,7 @@ class Sightings:
             corners_pinhole_px=self.corners_pinhole_px[rows],
             covariance_px=self.covariance_px[rows],
             valid=self.valid[rows],
+            symbols=self.symbols,
         )
 
 
@@ -130,6 +133,7 @@ def collect_sightings(
         corners_pinhole_px=corners,
         covariance_px=covariance,
         valid=valid,
+        symbols=collect_symbols(drive, detections, camera_index, frames.frame_of_image),
     )
 
 

@@ -1,0 +1,83 @@
+"""Arrows and chevrons: no markings of the map, but evidence against those that lie upon them.
+
+From some places only the shaft of an arrow is seen, and is a dash as far as its image goes. Other images
+show the whole arrow there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from v2hdm.detection.lens import undistort_points
+from v2hdm.mapping.backprojection import apply_homographies, posed_homographies
+from v2hdm.records import OUTLINED_CLASSES, Drive, FloatArray, ImageDetections
+
+if TYPE_CHECKING:
+    from v2hdm.mapping.location import Rig
+
+IntArray = NDArray[np.int64]
+
+_MAX_RANGE_M = 16.0
+"""Farther from the camera a symbol's place on the ground is too vague to speak against a neighbour."""
+
+
+@dataclass(frozen=True)
+class Symbols:
+    """N detected arrows and chevrons: ``camera`` and ``frame`` (N,) as in sightings, pinhole outlines."""
+
+    camera: IntArray
+    frame: IntArray
+    outlines_pinhole_px: tuple[FloatArray, ...]
+
+
+NO_SYMBOLS = Symbols(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), ())
+
+
+def collect_symbols(
+    drive: Drive,
+    detections: Sequence[ImageDetections],
+    camera_index: Mapping[str, int],
+    frame_of_image: IntArray,
+) -> Symbols:
+    """The symbols that the images of some cameras show, lens distortion removed."""
+    camera, frame, outlines = [], [], []
+    for found in detections:
+        name = drive.images[found.image].camera
+        if name not in camera_index:
+            continue
+        for marking in found.markings:
+            if marking.kind in OUTLINED_CLASSES and len(marking.outline_px) >= 3:
+                camera.append(camera_index[name])
+                frame.append(int(frame_of_image[found.image]))
+                outlines.append(undistort_points(drive.cameras[name].info, marking.outline_px))
+    return Symbols(np.array(camera, dtype=np.int64), np.array(frame, dtype=np.int64), tuple(outlines))
+
+
+def images_with_symbol(symbols: Symbols, rig: Rig, points_map: FloatArray) -> IntArray:
+    """In how many images a symbol lies on each of the ground points (G, 2); nan points have none."""
+    count = np.zeros(len(points_map), dtype=np.int64)
+    if not len(symbols.camera):
+        return count
+    cam_from_vehicle = rig.cam_from_vehicle[symbols.camera]
+    map_from_vehicle = rig.map_from_vehicle[symbols.frame]
+    homographies = posed_homographies(rig.intrinsic[symbols.camera], cam_from_vehicle, map_from_vehicle)
+    known = np.flatnonzero(np.isfinite(points_map).all(axis=1))
+    for homography, pose, outline in zip(
+        homographies, map_from_vehicle, symbols.outlines_pinhole_px, strict=True
+    ):
+        ground = apply_homographies(np.repeat(homography[None], len(outline), axis=0), outline[:, None])[:, 0]
+        if not np.isfinite(ground).all() or np.linalg.norm(ground - pose[:2, 3], axis=1).max() > _MAX_RANGE_M:
+            continue
+        size_m = float(np.ptp(ground, axis=0).max())
+        near = known[np.linalg.norm(points_map[known] - ground.mean(axis=0), axis=1) < size_m]
+        polygon = (ground - ground.mean(axis=0)).astype(np.float32)
+        for group in near:
+            at = (points_map[group] - ground.mean(axis=0)).tolist()
+            count[group] += cv2.pointPolygonTest(polygon, at, False) >= 0
+    return count
