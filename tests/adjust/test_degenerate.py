@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.adjust.scene import make_scene, mounted
-from v2hdm.adjust import Drift, Observations, PoseSigma, Problem, SolveOptions, Status, solve
+from v2hdm.adjust import ControlPoints, Drift, Observations, PoseSigma, Problem, SolveOptions, Status, solve
 from v2hdm.errors import AdjustError
 
 PAPER = SolveOptions(pose_states=(), loss="none")
@@ -73,6 +73,12 @@ def bad_problems():
         ),
         "intrinsic has shape": replace(problem, intrinsic=np.eye(3)),
         "twist_vehicle has shape": replace(problem, twist_vehicle=np.zeros((3, 6))),
+        "control point 1 names corner -1": replace(
+            problem, control=ControlPoints(np.array([0, -1]), np.zeros((2, 2)), np.ones(2))
+        ),
+        "control point 0 is not finite": replace(
+            problem, control=ControlPoints(np.array([0, 1]), np.zeros((2, 2)), np.array([0.0, 1.0]))
+        ),
         "there is no observation": with_observations(
             problem,
             camera=seen.camera[:0],

@@ -8,7 +8,7 @@ import torch
 
 from tests.adjust.scene import make_scene
 from v2hdm.adjust.arrays import make_arrays
-from v2hdm.adjust.problem import LOSSES, POSE_STATES, Drift, PoseSigma
+from v2hdm.adjust.problem import LOSSES, POSE_STATES, ControlPoints, Drift, PoseSigma
 from v2hdm.adjust.residuals import (
     Estimate,
     Loss,
@@ -29,7 +29,8 @@ POSES = PoseSigma(position_drift=Drift(0.016, 10.0), heading_drift=Drift(0.0006,
 def example(pose_states=POSE_STATES, size=0.0, max_range_m=15.0, frames=14, clock=False):
     scene = make_scene(3, frames=frames, jitter=POSES, max_range_m=max_range_m)
     twist = np.tile([5.0, 0.1, 0.0, 0.0, 0.0, 0.4], (frames, 1)) * np.linspace(0.8, 1.2, frames)[:, None]
-    problem = replace(scene.problem, twist_vehicle=twist)
+    control = ControlPoints(np.array([2, 5]), scene.corners_map[[2, 5]] + 0.01, np.array([0.01, 0.02]))
+    problem = replace(scene.problem, twist_vehicle=twist, control=control)
     arrays = make_arrays(problem, pose_states, "cpu", clock)
     generator = torch.Generator().manual_seed(0)
     state = size * torch.randn(arrays.state_information_root.shape, generator=generator, dtype=torch.float64)

@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from tests.adjust.scene import Scene, exp, make_scene, project
-from v2hdm.adjust import Drift, Observations, PoseSigma, Problem, SolveOptions, Status, solve
+from v2hdm.adjust import ControlPoints, Drift, Observations, PoseSigma, Problem, SolveOptions, Status, solve
 
 PAPER = SolveOptions(pose_states=(), loss="none")
 POSES = PoseSigma()
@@ -196,7 +196,13 @@ def test_the_corners_may_be_given_a_start():
 
 def test_the_cost_is_the_sum_of_its_named_terms():
     solution = solve(make_scene(13, frames=40, jitter=POSES).problem)
-    assert set(solution.cost_terms) == {"observations", "camera_centre", "frame_states", "clock_offsets"}
+    assert set(solution.cost_terms) == {
+        "observations",
+        "camera_centre",
+        "frame_states",
+        "clock_offsets",
+        "control_points",
+    }
     assert solution.cost == pytest.approx(sum(solution.cost_terms.values()))
     assert solution.gap <= 1e-11
 
@@ -229,3 +235,18 @@ def test_a_camera_whose_clock_is_late_is_found_out():
     assert found.chi2_per_dof == pytest.approx(1, abs=0.05)
     assert punctual.chi2_per_dof > 1.2
     assert scene.corner_rmse_m(found.corners_map) < 0.5 * scene.corner_rmse_m(punctual.corners_map)
+
+
+def test_two_control_points_undo_the_drift_of_the_receiver():
+    """A shift of all positions is invisible to the cameras; surveyed corners at both ends show it."""
+    sigma = PoseSigma(position_m=0.05, position_drift=Drift(0.05, 300.0))
+    scene = make_scene(15, frames=60, jitter=sigma, prior_sigma_m=0.005)
+    chosen = np.array([0, 5, scene.problem.corner_count - 2])
+    control = ControlPoints(chosen, scene.corners_map[chosen], np.full(3, 0.002))
+    free, tied = solve(scene.problem), solve(replace(scene.problem, control=control))
+    assert tied.status is Status.CONVERGED
+    assert scene.corner_rmse_m(tied.corners_map) < 0.5 * scene.corner_rmse_m(free.corners_map)
+    assert np.abs(tied.corners_map[chosen] - scene.corners_map[chosen]).max() < 0.006
+    stated = tied.corner_covariance(chosen[:, None])
+    assert np.sqrt(stated.trace(axis1=1, axis2=2)).max() < 0.003
+    assert tied.chi2_per_dof == pytest.approx(1, abs=0.07)

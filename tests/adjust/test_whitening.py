@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.adjust.scene import make_scene
-from v2hdm.adjust import Drift, PoseSigma, SolveOptions, solve
+from v2hdm.adjust import ControlPoints, Drift, PoseSigma, SolveOptions, solve
 from v2hdm.adjust.arrays import make_arrays
 from v2hdm.adjust.descent import Objective
 from v2hdm.adjust.problem import POSE_STATES
@@ -28,7 +28,10 @@ def test_where_all_residuals_vanish_the_whitened_hessian_is_the_identity(pose_st
     scene = make_scene(2, frames=40, pixel_sigma=0.0, jitter=None, prior_sigma_m=0.03)
     centre = -np.einsum("cji,cj->ci", scene.cam_from_vehicle[:, :3, :3], scene.cam_from_vehicle[:, :3, 3])
     twist = np.tile([5.0, 0.0, 0.0, 0.0, 0.0, 0.3], (40, 1))
-    problem = replace(scene.problem, centre_vehicle=centre, pose_sigma=POSES, twist_vehicle=twist)
+    control = ControlPoints(np.array([3]), scene.corners_map[3:4], np.array([0.01]))
+    problem = replace(
+        scene.problem, centre_vehicle=centre, pose_sigma=POSES, twist_vehicle=twist, control=control
+    )
     arrays = make_arrays(problem, pose_states, "cpu", clock)
     estimate = Estimate(
         torch.as_tensor(scene.cam_from_vehicle),

@@ -44,6 +44,8 @@ class Arrays:
         clock_twist: (J, 6, Q) how the vehicle moves with a camera's clock offset; Q is 1, or 0 where no
             offset is estimated.
         clock_information_root: 1 / sigma of a clock offset.
+        control, control_information: surveyed positions (N, 2) of the corners and 1 / sigma^2 (N,), 0 where
+            there is no survey.
     """
 
     order: Tensor
@@ -60,6 +62,8 @@ class Arrays:
     state_information_root: Tensor
     clock_twist: Tensor
     clock_information_root: float
+    control: Tensor
+    control_information: Tensor
 
     @property
     def frame_count(self) -> int:
@@ -104,6 +108,8 @@ class Arrays:
             corner=corner,
             measured=self.measured[:, keep],
             root_information=self.root_information[:, keep],
+            control=self.control[corners],
+            control_information=self.control_information[corners],
         )
         return part, corners
 
@@ -125,6 +131,7 @@ def make_arrays(
     components = _components(problem, pose_states)
     transition, information_root = _state_prior(problem, components)
     centre, centre_root = _centre_prior(problem)
+    control, control_information = _control(problem)
 
     def real(values: FloatArray) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float64, device=device)
@@ -147,7 +154,18 @@ def make_arrays(
         state_information_root=real(information_root),
         clock_twist=real(_clock_twist(problem, clock_offset)),
         clock_information_root=1 / problem.clock_sigma_s,
+        control=real(control[corner_order]),
+        control_information=real(control_information[corner_order]),
     )
+
+
+def _control(problem: Problem) -> tuple[FloatArray, FloatArray]:
+    """Surveyed positions (N, 2) and 1 / sigma^2 (N,) of the problem's corners."""
+    points, information = np.zeros((problem.corner_count, 2)), np.zeros(problem.corner_count)
+    if problem.control is not None:
+        points[problem.control.corner] = problem.control.points_map
+        information[problem.control.corner] = 1 / problem.control.sigma_m**2
+    return points, information
 
 
 def _clock_twist(problem: Problem, clock_offset: bool) -> FloatArray:

@@ -17,6 +17,26 @@ def check_problem(problem: Problem) -> None:
     _check_rigid("map_from_vehicle", problem.map_from_vehicle)
     _check_observations(problem)
     _check_priors(problem)
+    _check_control(problem)
+
+
+def _check_control(problem: Problem) -> None:
+    control = problem.control
+    if control is None:
+        return
+    count = len(control.corner)
+    if np.shape(control.points_map) != (count, 2) or np.shape(control.sigma_m) != (count,):
+        raise AdjustError(f"control points: {count} corners need as many points_map (x, y) and sigma_m")
+    wrong = np.flatnonzero((control.corner < 0) | (control.corner >= problem.corner_count))
+    if len(wrong):
+        raise AdjustError(
+            f"control point {wrong[0]} names corner {control.corner[wrong[0]]}, which is not there"
+        )
+    if len(np.unique(control.corner)) < count:
+        raise AdjustError("two control points name the same corner: keep one of them")
+    wrong = np.flatnonzero(~(np.isfinite(control.points_map).all(1) & (control.sigma_m > 0)))
+    if len(wrong):
+        raise AdjustError(f"control point {wrong[0]} is not finite or its sigma_m is not above 0")
 
 
 def check_model(problem: Problem, options: SolveOptions) -> None:

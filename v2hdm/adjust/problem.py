@@ -64,6 +64,15 @@ class Drift:
 
 
 @dataclass(frozen=True)
+class ControlPoints:
+    """M corners that a survey has measured: ``corner`` (M,), ``points_map`` (M, 2) and ``sigma_m`` (M,)."""
+
+    corner: IntArray
+    points_map: FloatArray
+    sigma_m: FloatArray
+
+
+@dataclass(frozen=True)
 class PoseSigma:
     """How far the recorded poses are off, one standard deviation of each state of a frame.
 
@@ -100,7 +109,8 @@ class Problem:
     ``centre_sigma_m`` (C, 3) are the surveyed camera centres, or None. ``corners_start`` (N, 2), if
     given, replaces the start by weighted back-projection. ``twist_vehicle`` (J, 6) is how the vehicle
     moves at each frame, per second and in its own frame (m/s, then rad/s); a clock offset needs it, and
-    is held near zero by ``clock_sigma_s``.
+    is held near zero by ``clock_sigma_s``. ``control``, if given, ties corners to a survey: the only thing
+    that can tell a shift of the whole map from the drift of the receiver.
     """
 
     intrinsic: FloatArray
@@ -114,6 +124,7 @@ class Problem:
     corners_start: FloatArray | None = None
     twist_vehicle: FloatArray | None = None
     clock_sigma_s: float = 0.02
+    control: ControlPoints | None = None
 
 
 @dataclass(kw_only=True)

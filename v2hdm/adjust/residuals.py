@@ -179,11 +179,14 @@ def cost_and_gradient(arrays: Arrays, estimate: Estimate, robust: Loss) -> tuple
     centre = centre_residual(arrays, estimate)
     state = state_residual(arrays, estimate.frame_state)
     clock = estimate.clock_s * arrays.clock_information_root
+    off_control = estimate.corners_map - arrays.control
+    by_control = off_control * arrays.control_information[:, None]
     terms = {
         "observations": rho.sum() / 2,
         "camera_centre": centre.square().sum() / 2,
         "frame_states": state.square().sum() / 2,
         "clock_offsets": clock.square().sum() / 2,
+        "control_points": (off_control * by_control).sum() / 2,
     }
     by_extrinsic = wrench.sum(1)
     # A left perturbation moves the centre by minus its translation part, turned into the vehicle.
@@ -195,4 +198,4 @@ def cost_and_gradient(arrays: Arrays, estimate: Estimate, robust: Loss) -> tuple
     by_state[:-1] -= (arrays.state_transition.mT @ innovation[..., None])[1:, :, 0]
     by_clock = (pair_from_clock(arrays, estimate).mT @ wrench[..., None])[..., 0].sum(1)
     by_clock += clock * arrays.clock_information_root
-    return terms, Gradient(by_extrinsic, by_state, by_corner, by_clock)
+    return terms, Gradient(by_extrinsic, by_state, by_corner + by_control, by_clock)

@@ -145,5 +145,6 @@ def _chi2_per_dof(arrays: Arrays, terms: dict[str, Tensor], squared: Tensor) -> 
         value for name, value in terms.items() if name != "observations"
     )
     centres = int((arrays.centre_information_root > 0).sum())
-    free = 2 * arrays.corner_count + 6 * arrays.camera_count - centres
+    surveyed = int((arrays.control_information > 0).sum())
+    free = 2 * (arrays.corner_count - surveyed) + 6 * arrays.camera_count - centres
     return float(chi2) / max(2 * len(good) - free, 1)

@@ -61,4 +61,5 @@ def back_project(arrays: Arrays, cam_from_vehicle: Tensor) -> tuple[Tensor, Tens
 def _one_corner_each(arrays: Arrays) -> Arrays:
     """The same observations, each of a corner of its own."""
     own = torch.arange(len(arrays.corner), device=arrays.corner.device)
-    return replace(arrays, corner=own, corner_order=own)
+    control, information = arrays.control[arrays.corner], arrays.control_information[arrays.corner]
+    return replace(arrays, corner=own, corner_order=own, control=control, control_information=information)

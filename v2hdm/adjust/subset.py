@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2hdm.adjust.problem import IntArray, Observations, Problem
+from v2hdm.adjust.problem import ControlPoints, IntArray, Observations, Problem
 from v2hdm.records import BoolArray
 
 
@@ -23,7 +23,11 @@ def restrict(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
     corners, corner = np.unique(seen.corner[keep], return_inverse=True)
     frame = seen.frame[keep]
     used = slice(int(frame.min()), int(frame.max()) + 1)
-    start, twist = problem.corners_start, problem.twist_vehicle
+    start, twist, control = problem.corners_start, problem.twist_vehicle, problem.control
+    if control is not None:
+        left = np.isin(control.corner, corners)
+        number = np.searchsorted(corners, control.corner[left])
+        control = ControlPoints(number, control.points_map[left], control.sigma_m[left])
     part = replace(
         problem,
         map_from_vehicle=problem.map_from_vehicle[used],
@@ -37,5 +41,6 @@ def restrict(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
         corner_count=len(corners),
         corners_start=None if start is None else start[corners],
         twist_vehicle=None if twist is None else twist[used],
+        control=control,
     )
     return part, corners

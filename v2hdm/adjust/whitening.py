@@ -122,6 +122,7 @@ def factorise(
     by_pair, by_corner = by_pair * root, by_corner * root
     blocks = by_corner.new_zeros(arrays.corner_count, 2, 2)
     blocks.index_add_(0, arrays.corner, by_corner.mT @ by_corner)
+    blocks.diagonal(dim1=1, dim2=2).add_(arrays.control_information[:, None])
     blocks.diagonal(dim1=1, dim2=2).mul_(1 + damping).add_(_CORNER_FLOOR)
     corner_factor = cholesky_2x2(blocks)
     coupling = solve_lower_matrix(corner_factor[arrays.corner], by_corner.mT @ by_pair)
