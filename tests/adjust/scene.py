@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -164,6 +164,31 @@ def make_scene(
         pose_sigma=jitter or PoseSigma(),
     )
     return Scene(problem, truth, map_from_vehicle, corners)
+
+
+def with_late_clocks(scene: Scene, offset_s: np.ndarray) -> Scene:
+    """The scene, its poses exact, in images taken ``offset_s`` (C,) later than they say.
+
+    The speed swings by half, so that an offset in time is no offset in place.
+    """
+    poses, seen = scene.problem.map_from_vehicle, scene.problem.observations
+    step = np.linalg.inv(poses[:-1]) @ poses[1:]
+    step = np.concatenate([step, step[-1:]])
+    speed = 6.0 * (1 + 0.5 * np.sin(np.arange(len(poses)) / 7))
+    length = np.linalg.norm(step[:, :2, 3], axis=1)
+    twist = np.zeros((len(poses), 6))
+    twist[:, 0], twist[:, 5] = speed, np.arctan2(step[:, 1, 0], step[:, 0, 0]) / length * speed
+    then = poses[seen.frame] @ exp(twist[seen.frame] * offset_s[seen.camera, None])
+    cam_from_map = scene.cam_from_vehicle[seen.camera] @ np.linalg.inv(then)
+    pixel = project(cam_from_map, scene.corners_map[seen.corner])
+    pixel += np.random.default_rng(0).normal(0, PIXEL_SIGMA, pixel.shape)
+    problem = replace(
+        scene.problem,
+        twist_vehicle=twist,
+        clock_sigma_s=0.05,
+        observations=replace(seen, pinhole_px=pixel),
+    )
+    return replace(scene, problem=problem, map_from_vehicle=poses)
 
 
 def project(cam_from_map: np.ndarray, points_map: np.ndarray) -> np.ndarray:

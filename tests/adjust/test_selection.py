@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.adjust.scene import make_scene
+from tests.adjust.scene import make_scene, with_late_clocks
 from v2hdm.adjust import MODELS, PoseSigma, SolveOptions, select_model, solve
 from v2hdm.adjust.subset import restrict
 from v2hdm.errors import AdjustError
@@ -40,6 +40,23 @@ def test_a_clock_needs_the_vehicles_motion_and_is_else_left_out():
     scene = make_scene(32, frames=20, start_error_deg=0.2)
     assert set(select_model(scene.problem, SolveOptions(), ("paper", "clock")).scores) == {"paper"}
     assert MODELS["clock"].clock_offset
+
+
+@pytest.mark.parametrize(("late_s", "expected"), [(0.0, "heave"), (0.03, "clock")])
+def test_a_clock_offset_is_estimated_where_there_is_one(late_s, expected):
+    scene = make_scene(35, frames=50, turn_deg_per_m=8.0, start_error_deg=0.2, start_error_m=0.01)
+    problem = with_late_clocks(scene, np.array([late_s, 0.0])).problem
+    told = replace(problem, pose_sigma=PoseSigma(0.01, 0.0005, 0.001, 0.003))
+    assert select_model(told, SolveOptions(), ("heave", "clock")).name == expected
+
+
+def test_too_few_observations_leave_the_richest_model():
+    problem = make_scene(34, frames=6, start_error_deg=0.2).problem
+    seen = problem.observations
+    part, _ = restrict(problem, seen.frame < 2)
+    selection = select_model(part, SolveOptions())
+    assert (selection.name, selection.scores) == ("heave", {})
+    assert "too few observations" in selection.sentence
 
 
 def test_a_part_of_a_problem_has_the_residuals_of_the_whole():

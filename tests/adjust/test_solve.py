@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from tests.adjust.scene import Scene, exp, make_scene, project
+from tests.adjust.scene import Scene, make_scene, with_late_clocks
 from v2hdm.adjust import ControlPoints, Drift, Observations, PoseSigma, Problem, SolveOptions, Status, solve
 
 PAPER = SolveOptions(pose_states=(), loss="none")
@@ -209,24 +209,9 @@ def test_the_cost_is_the_sum_of_its_named_terms():
 
 def test_a_camera_whose_clock_is_late_is_found_out():
     """The speed swings, so an offset in time is no offset in place."""
-    scene = make_scene(14, frames=80, turn_deg_per_m=8.0, prior_sigma_m=0.01)
-    poses, offset_s = scene.problem.map_from_vehicle, np.array([0.03, -0.01])
-    step = np.linalg.inv(poses) @ np.roll(poses, -1, axis=0)
-    step[-1] = step[-2]
-    speed = 6.0 * (1 + 0.5 * np.sin(np.arange(len(poses)) / 7))
-    twist = np.zeros((len(poses), 6))
-    twist[:, 0], twist[:, 5] = speed, np.arctan2(step[:, 1, 0], step[:, 0, 0]) / 0.5 * speed
-    seen = scene.problem.observations
-    then = poses[seen.frame] @ exp(twist[seen.frame] * offset_s[seen.camera, None])
-    cam_from_map = scene.cam_from_vehicle[seen.camera] @ np.linalg.inv(then)
-    pixel = project(cam_from_map, scene.corners_map[seen.corner])
-    pixel += np.random.default_rng(0).normal(0, 0.7, pixel.shape)
-    problem = replace(
-        scene.problem,
-        twist_vehicle=twist,
-        clock_sigma_s=0.05,
-        observations=replace(seen, pinhole_px=pixel),
-    )
+    offset_s = np.array([0.03, -0.01])
+    scene = with_late_clocks(make_scene(14, frames=80, turn_deg_per_m=8.0, prior_sigma_m=0.01), offset_s)
+    problem = scene.problem
     punctual, found = solve(problem, PAPER), solve(problem, replace(PAPER, clock_offset=True))
     assert found.status is Status.CONVERGED
     sigma_s = np.sqrt(found.covariance.clock_s2())

@@ -42,6 +42,8 @@ MODELS: Mapping[str, Model] = {
 # Frames of the stretch that models are compared on, and the share of its observations held out.
 _STRETCH_FRAMES = 120
 _HELD_OUT_SHARE = 0.2
+# With fewer than these the residuals cannot tell one model from another.
+_MIN_HELD_OUT = 40
 # Where the loss of a held-out residual bends, squared sigmas: wrong associations must not decide.
 _LOSS_SCALE2 = 9.0
 
@@ -50,6 +52,7 @@ _LOSS_SCALE2 = 9.0
 class Selection:
     """The model chosen, and each model's score: the mean robust loss of the held-out observations.
 
+    There are no scores where too little was seen often enough to hold any of it out.
     Without a model error and for Gaussian noise the score is a little below 2.
     """
 
@@ -59,6 +62,8 @@ class Selection:
     @property
     def sentence(self) -> str:
         """What was chosen over what."""
+        if not self.scores:
+            return f"pose model {self.name!r}, since too few observations repeat to choose by them"
         scores = ", ".join(f"{name} {score:.2f}" for name, score in self.scores.items())
         return f"pose model {self.name!r} predicts held-out observations best (mean loss: {scores})"
 
@@ -94,8 +99,11 @@ def select_model(
     candidates = [
         name for name in names if problem.twist_vehicle is not None or not MODELS[name].clock_offset
     ]
+    punctual = [name for name in candidates if not MODELS[name].clock_offset] or candidates
     stretch, _ = restrict(problem, _stretch(problem))
     held_out = _held_out(stretch.observations, np.random.default_rng(seed))
+    if np.count_nonzero(held_out) < _MIN_HELD_OUT:
+        return Selection(punctual[-1], {})
     fitted, corners = restrict(stretch, ~held_out)
     losses = {}
     for name in candidates:
@@ -103,11 +111,10 @@ def select_model(
         squared = predicted_squared(stretch, held_out, fitted, solution, corners)
         losses[name] = _LOSS_SCALE2 * np.log1p(squared / _LOSS_SCALE2)
     frame = stretch.observations.frame[held_out]
-    punctual = [name for name in candidates if not MODELS[name].clock_offset] or candidates
     best = min(punctual, key=lambda name: float(losses[name].mean()))
     chosen = [name for name in punctual if _as_good(losses[name] - losses[best], frame)][-1]
     for name in candidates:
-        if not _as_good(losses[chosen] - losses[name], frame):
+        if MODELS[name].clock_offset and not _as_good(losses[chosen] - losses[name], frame):
             chosen = name
     return Selection(chosen, {name: float(loss.mean()) for name, loss in losses.items()})
 

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from v2hdm.adjust import Status, select_model
-from v2hdm.errors import MappingError
+from v2hdm.errors import AdjustError, MappingError
 from v2hdm.geometry.ground import extrinsic_from_ipm
 from v2hdm.mapping.association import Association, fuse_groups, same_groups
 from v2hdm.mapping.bundle import Bundle, coarse_model, full_model, solve_bundle
@@ -167,7 +167,11 @@ class Optimiser:
     def _choose_pose_model(self, bundle: Bundle) -> str:
         """The name of the model that predicts held-out observations best, from where ``bundle`` ended."""
         start = replace(bundle.problem, cam_from_vehicle=bundle.solution.cam_from_vehicle)
-        selection = select_model(start, bundle.model.solver)
+        try:
+            selection = select_model(start, bundle.model.solver)
+        except AdjustError as failure:
+            _log.warning("the pose model stays %r, since none could be chosen: %s", SETTLED_MODEL, failure)
+            return SETTLED_MODEL
         _log.info("%s: %s", ", ".join(self.camera_names), selection.sentence)
         return selection.name
 
