@@ -20,8 +20,9 @@ from v2hdm.records import BoolArray, FloatArray
 
 IntArray = NDArray[np.int64]
 
+LACKS_A_CORNER = "a corner was never seen twice"
 ODD_SHAPE = "not shaped like the others of its class"
-"""The reason of a refusal that a single misplaced corner may have brought about."""
+"""Reasons that the shape of the class may mend."""
 
 MIN_EASY_VIEWS = 5
 """Easy views below which a share of detections says nothing."""
@@ -34,7 +35,7 @@ MIN_SHAPE_TOLERANCE_M = 0.05
 """Lengths that differ by less are the same, however short they are."""
 
 MIN_PEERS = 2
-PEER_SHARE = 0.05
+PEER_SHARE = 0.1
 """A shape is established by this many others, and by this share of its class."""
 
 MAX_LONELY_SHARE = 0.25
@@ -71,7 +72,7 @@ def judge(candidates: Candidates, options: AcceptanceOptions) -> list[str | None
     """For each candidate the reason why it is no marking of the map, or None where it is one."""
     verdict: list[str | None] = [None] * len(candidates.kind)
     incomplete = np.asarray(np.isnan(candidates.corners_map).any(axis=(1, 2)))
-    _refuse(verdict, incomplete, "a corner was never seen twice")
+    _refuse(verdict, incomplete, LACKS_A_CORNER)
     _refuse(
         verdict,
         candidates.sightings < options.min_sightings,
@@ -89,7 +90,7 @@ def judge(candidates: Candidates, options: AcceptanceOptions) -> list[str | None
         _refuse(verdict, candidates.seen_as_symbol >= limit, "part of an arrow or a chevron")
     typical, odd = _judge_shapes(candidates, verdict, options)
     _refuse(verdict, odd, ODD_SHAPE)
-    _refuse(verdict, candidates.completed & ~typical, "a corner was never seen twice")
+    _refuse(verdict, candidates.completed & ~typical, LACKS_A_CORNER)
     seldom = _seldom_detected(candidates, verdict, options) & ~typical
     _refuse(verdict, seldom, "found in too few of its images")
     _refuse(verdict, _covered(candidates, verdict), "lies on a better supported marking")

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.errors import MappingError
-from v2hdm.mapping.acceptance import ODD_SHAPE, Candidates, judge
+from v2hdm.mapping.acceptance import LACKS_A_CORNER, ODD_SHAPE, Candidates, judge
 from v2hdm.mapping.association import fuse_groups
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.completion import SolvedCorners, solved_corners, without_misplaced_corners
+from v2hdm.mapping.known_shape import with_known_shapes
 from v2hdm.mapping.location import Rig, locate
 from v2hdm.mapping.merge import group_kinds
 from v2hdm.mapping.options import AcceptanceOptions
@@ -77,6 +78,13 @@ def conclude(
     if len(odd):
         accepted = np.flatnonzero([reason is None for reason in verdict])
         solved = without_misplaced_corners(solved, odd, candidates.kind, accepted, options)
+        candidates = _candidates(evidence, solved)
+        verdict = judge(candidates, options)
+    doubtful = np.flatnonzero([reason in (ODD_SHAPE, LACKS_A_CORNER) for reason in verdict])
+    if len(doubtful):
+        accepted = np.flatnonzero([reason is None for reason in verdict])
+        fused = fuse_groups(final.association, locate(evidence.sightings, final.rig), jitter_rad)
+        solved = with_known_shapes(solved, fused, doubtful, candidates.kind, accepted, options)
         candidates = _candidates(evidence, solved)
         verdict = judge(candidates, options)
     accepted = np.flatnonzero([reason is None for reason in verdict])

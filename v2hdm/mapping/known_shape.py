@@ -1,0 +1,160 @@
+"""Markings too worn or too hidden to be solved corner by corner, placed by the shape of their class.
+
+The diamonds of a yard are painted with one stencil. Where most of a class has one shape, a marking of it of
+which a few corners were seen, some only once, is that shape moved and turned to fit them. Whether what
+results is a marking is then judged like any other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v2hdm.mapping.acceptance import characteristic_lengths, count_peers
+from v2hdm.mapping.association import FusedGroups
+from v2hdm.mapping.completion import SolvedCorners
+from v2hdm.mapping.options import AcceptanceOptions
+from v2hdm.records import FloatArray
+
+IntArray = NDArray[np.int64]
+
+_COMMON_SHARE = 0.6
+"""A class has one shape if this share of its markings has it."""
+
+_LEAST_PEERS = 8
+_MAX_MISS_M = 0.05
+_MAX_MISS_SHARE = 0.08
+"""A corner fits the shape if it misses by no more than this, or by this share of its longer diagonal."""
+
+_LEAST_SEEN = 6
+"""Sightings of the corners that a shape is laid on, all together: one image may err."""
+
+_SHAPE_SIGMA_M = 0.01
+"""How much one painted marking differs from the next."""
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A shape laid on corners: ``corners_map`` (4, 2), ``covariance`` (8, 8), and its largest ``miss_m``."""
+
+    corners_map: FloatArray
+    covariance: FloatArray
+    miss_m: float
+
+
+def with_known_shapes(
+    solved: SolvedCorners,
+    fused: FusedGroups,
+    doubtful: IntArray,
+    kind: IntArray,
+    accepted: IntArray,
+    options: AcceptanceOptions,
+) -> SolvedCorners:
+    """Place the groups ``doubtful`` by the shape of their class where their corners fit it.
+
+    Args:
+        solved: The corners so far.
+        fused: Where every corner was seen, be it once.
+        doubtful: (D,) groups that lack corners or are of an odd shape.
+        kind: (G,) class of every group.
+        accepted: (A,) groups that were accepted.
+        options: When shapes agree.
+
+    Returns:
+        The corners, with those groups placed of which three corners, or two that lie opposite, fit.
+    """
+    corners, covariance = solved.corners_map.copy(), solved.covariance_m2.copy()
+    completed = solved.completed.copy()
+    shapes = {
+        int(k): shape
+        for k in np.unique(kind[accepted])
+        if (shape := _common_shape(corners[accepted[kind[accepted] == k]], options)) is not None
+    }
+    for group in doubtful:
+        shape = shapes.get(int(kind[group]))
+        if shape is None:
+            continue
+        sigma_m = np.sqrt(np.trace(fused.covariance_m2[group], axis1=1, axis2=2) / 2)
+        fit = fit_shape(shape, fused.corners_map[group], sigma_m, fused.seen[group])
+        if fit is not None:
+            corners[group], covariance[group] = fit.corners_map, fit.covariance
+            completed[group] = True
+    return SolvedCorners(corners, covariance, completed)
+
+
+def fit_shape(shape: FloatArray, seen_map: FloatArray, sigma_m: FloatArray, times: IntArray) -> _Fit | None:
+    """Lay a shape (4, 2) on corners (4, 2), nan if unseen, known to ``sigma_m`` (4,) from ``times`` (4,) images.
+
+    Of four corners that were seen one may be wrong. None where no turn of the shape fits, or where two
+    turns that are not the same do.
+    """
+    seen = np.flatnonzero(np.isfinite(seen_map).all(axis=1))
+    limit_m = max(_MAX_MISS_M, _MAX_MISS_SHARE * float(_diagonals(shape).max()))
+    for used in _subsets(seen):
+        if times[used].sum() < _LEAST_SEEN:
+            continue
+        fits = [
+            fit
+            for shift in range(4)
+            if (fit := _rigid(np.roll(shape, -shift, axis=0), seen_map, sigma_m, used)).miss_m <= limit_m
+        ]
+        if not fits:
+            continue
+        best = min(fits, key=lambda fit: fit.miss_m)
+        if all(_same(best, fit, limit_m) for fit in fits):
+            return best
+    return None
+
+
+def _subsets(seen: IntArray) -> list[IntArray]:
+    """Which corners to fit to, most trusted first: all of them, three of four, two opposite ones."""
+    if len(seen) == 4:
+        return [seen, *(np.delete(seen, left_out) for left_out in range(4))]
+    if len(seen) == 3 or (len(seen) == 2 and seen[1] - seen[0] == 2):
+        return [seen]
+    return []
+
+
+def _rigid(shape: FloatArray, seen_map: FloatArray, sigma_m: FloatArray, used: IntArray) -> _Fit:
+    """Move and turn a shape onto the corners ``used``, by weighted least squares (Kabsch, 1976)."""
+    weight = 1 / (sigma_m[used] ** 2 + _SHAPE_SIGMA_M**2)
+    from_centre = (weight @ shape[used]) / weight.sum()
+    to_centre = (weight @ seen_map[used]) / weight.sum()
+    a, b = shape[used] - from_centre, seen_map[used] - to_centre
+    turn = np.arctan2(weight @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), weight @ (a * b).sum(axis=1))
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    arms = (shape - from_centre) @ rotation.T
+    corners = arms + to_centre
+    jacobian = np.zeros((4, 2, 3))
+    jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
+    jacobian[:, :, 2] = np.stack([-arms[:, 1], arms[:, 0]], axis=1)
+    information = np.einsum("c,cij,cik->jk", weight, jacobian[used], jacobian[used])
+    flat = jacobian.reshape(8, 3)
+    covariance = flat @ np.linalg.inv(information) @ flat.T + _SHAPE_SIGMA_M**2 * np.eye(8)
+    miss_m = float(np.linalg.norm(corners[used] - seen_map[used], axis=1).max())
+    return _Fit(corners, covariance, miss_m)
+
+
+def _same(first: _Fit, second: _Fit, limit_m: float) -> bool:
+    """Whether two fits cover the same ground, whichever corner each calls the first."""
+    apart = np.linalg.norm(first.corners_map[:, None] - second.corners_map, axis=2)
+    return bool(apart.min(axis=1).max() <= limit_m)
+
+
+def _common_shape(corners: FloatArray, options: AcceptanceOptions) -> FloatArray | None:
+    """The shape (4, 2) about its centre that most of a class (N, 4, 2) has; None if it has several."""
+    if len(corners) < _LEAST_PEERS:
+        return None
+    lengths = characteristic_lengths(corners)
+    typical = int(np.argmin(np.abs(lengths - np.median(lengths, axis=0)).sum(axis=1)))
+    peers = int(count_peers(lengths[typical][None], lengths, options)[0])
+    if peers < _COMMON_SHARE * len(corners):
+        return None
+    return np.asarray(corners[typical] - corners[typical].mean(axis=0))
+
+
+def _diagonals(shape: FloatArray) -> FloatArray:
+    """Lengths (2,) of the diagonals."""
+    return np.asarray(np.linalg.norm(shape[2:] - shape[:2], axis=1))
