@@ -85,7 +85,7 @@ def with_known_shapes(
 
 
 def fit_shape(shape: FloatArray, seen_map: FloatArray, sigma_m: FloatArray, times: IntArray) -> _Fit | None:
-    """Lay a shape (4, 2) on corners (4, 2), nan if unseen, known to ``sigma_m`` (4,) from ``times`` (4,) images.
+    """Lay a shape (4, 2) on corners (4, 2), nan if unseen, known to ``sigma_m`` (4,), seen ``times`` (4,).
 
     Of four corners that were seen one may be wrong. None where no turn of the shape fits, or where two
     turns that are not the same do.
