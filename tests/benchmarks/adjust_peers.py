@@ -1,9 +1,9 @@
 """Our adjustment beside native Ceres on the same problem, from the same start.
 
-``python -m tests.benchmarks.adjust_peers [observations ...]`` prints time (set-up and solve apart), final
-cost and memory of each. Ceres runs natively, through pyceres with pycolmap's compiled cost functions and the
-Schur complement that suits few cameras; where these are not installed (the extra ``bench``), it is left out
-and said so.
+``python -m tests.benchmarks.adjust_peers [observations ...] [--threads N]`` prints time (set-up and solve
+apart; wall, and CPU for a machine that is busy otherwise), final cost and memory of each. Ceres runs
+natively, through pyceres with pycolmap's compiled cost functions and the Schur complement that suits few
+cameras; where these are not installed (the extra ``bench``), it is left out and said so.
 
 The model is the paper's, extrinsics and corners, since pycolmap has no frame states: our own per-frame
 states are a row of their own.
@@ -11,9 +11,9 @@ states are a row of their own.
 
 from __future__ import annotations
 
+import argparse
 import os
 import resource
-import sys
 import time
 from dataclasses import dataclass, replace
 from typing import Any
@@ -39,16 +39,16 @@ else:
     ABSENT = ""
 
 PAPER = SolveOptions(pose_states=(), loss="none", coarse=False)
-THREADS = min(2, os.cpu_count() or 1)
 
 
 @dataclass(frozen=True)
 class Row:
-    """One solver's figures; times in s."""
+    """One solver's figures; times in s, ``cpu_s`` that of the solve."""
 
     name: str
     setup_s: float
     solve_s: float
+    cpu_s: float
     cost: float
     note: str
 
@@ -66,29 +66,30 @@ def street(observations: int) -> Problem:
 
 def ours(problem: Problem, options: SolveOptions, name: str) -> Row:
     """Our solver; what it lays out is part of the solve."""
-    began = time.perf_counter()
+    began, cpu = time.perf_counter(), time.process_time()
     solution = solve(problem, options)
-    took = time.perf_counter() - began
-    return Row(name, 0.0, took, solution.cost, f"{solution.evaluations} evaluations, gap {solution.gap:.0e}")
+    took, cpu = time.perf_counter() - began, time.process_time() - cpu
+    note = f"{solution.evaluations} evaluations, gap {solution.gap:.0e}"
+    return Row(name, 0.0, took, cpu, solution.cost, note)
 
 
-def ceres(problem: Problem) -> Row:
+def ceres(problem: Problem, threads: int) -> Row:
     """Native Ceres: Levenberg-Marquardt on the dense Schur complement of the cameras."""
     began = time.perf_counter()
     built, keep = _ceres_problem(problem)
     options = pyceres.SolverOptions()
     options.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR
-    options.num_threads = THREADS
+    options.num_threads = threads
     options.max_num_iterations = 100
     options.function_tolerance = 1e-14
     options.gradient_tolerance = 1e-14
     options.parameter_tolerance = 1e-14
     summary = pyceres.SolverSummary()
-    ready = time.perf_counter()
+    ready, cpu = time.perf_counter(), time.process_time()
     pyceres.solve(options, built, summary)
-    took = time.perf_counter() - ready
+    took, cpu = time.perf_counter() - ready, time.process_time() - cpu
     note = f"{summary.num_successful_steps} steps, {len(keep['points'])} points"
-    return Row("ceres", ready - began, took, summary.final_cost, note)
+    return Row("ceres", ready - began, took, cpu, summary.final_cost, note)
 
 
 def _ceres_problem(problem: Problem) -> tuple[Any, dict[str, Any]]:
@@ -130,26 +131,30 @@ def _ceres_problem(problem: Problem) -> tuple[Any, dict[str, Any]]:
     return built, keep
 
 
-def main(sizes: list[int]) -> None:
+def main() -> None:
     """Print a table per size."""
-    torch.set_num_threads(THREADS)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("observations", nargs="*", type=int, default=[100_000, 1_000_000])
+    parser.add_argument("--threads", type=int, default=min(2, os.cpu_count() or 1))
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
     solve(make_scene(0, frames=30).problem)
     if ABSENT:
         print(ABSENT)
-    for size in sizes:
+    for size in arguments.observations:
         problem = street(size)
-        print(f"{len(problem.observations.corner)} observations, {THREADS} threads")
+        print(f"{len(problem.observations.corner)} observations, {arguments.threads} threads")
         rows = [ours(problem, PAPER, "ours"), ours(problem, replace(PAPER, solver="lm"), "ours, lm")]
         if not ABSENT:
-            rows.append(ceres(problem))
+            rows.append(ceres(problem, arguments.threads))
         states = replace(problem, pose_sigma=PoseSigma())
         rows.append(ours(states, SolveOptions(loss="none", coarse=False), "ours, 6 states a frame"))
         least = min(row.cost for row in rows[:-1])
         for row in rows:
             above = "" if row is rows[-1] else f"above the least {row.cost / least - 1:8.1e}"
             print(
-                f"  {row.name:22s} set-up {row.setup_s:6.2f} s  solve {row.solve_s:6.2f} s  "
-                f"cost {row.cost:.9e} {above}  {row.note}",
+                f"  {row.name:22s} set-up {row.setup_s:6.2f} s  solve {row.solve_s:6.2f} s "
+                f"({row.cpu_s:6.2f} s CPU)  cost {row.cost:.9e} {above}  {row.note}",
                 flush=True,
             )
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
@@ -157,4 +162,4 @@ def main(sizes: list[int]) -> None:
 
 
 if __name__ == "__main__":
-    main([int(argument) for argument in sys.argv[1:]] or [100_000, 1_000_000])
+    main()
