@@ -44,6 +44,8 @@ _STRETCH_FRAMES = 120
 _HELD_OUT_SHARE = 0.2
 # With fewer than these the residuals cannot tell one model from another.
 _MIN_HELD_OUT = 40
+# By how much a clock offset must predict better than everything else.
+_CLOCK_STANDARD_ERRORS = 3.0
 # Where the loss of a held-out residual bends, squared sigmas: wrong associations must not decide.
 _LOSS_SCALE2 = 9.0
 
@@ -82,7 +84,7 @@ def select_model(
     go together (Hastie, Tibshirani and Friedman, The Elements of Statistical Learning, section 7.10). Of
     equals the richest, since its priors keep it from fitting noise, and an error that is not estimated is
     missing from the stated accuracy, too. A clock offset trades against the camera's forward offset, so it
-    is taken only where it predicts better by more than a standard error.
+    is taken only where it predicts better than all others by more than three standard errors.
 
     Args:
         problem: the drive; its extrinsics are the start, and had better be near already.
@@ -114,7 +116,8 @@ def select_model(
     best = min(punctual, key=lambda name: float(losses[name].mean()))
     chosen = [name for name in punctual if _as_good(losses[name] - losses[best], frame)][-1]
     for name in candidates:
-        if MODELS[name].clock_offset and not _as_good(losses[chosen] - losses[name], frame):
+        gain = losses[best] - losses[name]
+        if MODELS[name].clock_offset and not _as_good(gain, frame, _CLOCK_STANDARD_ERRORS):
             chosen = name
     return Selection(chosen, {name: float(loss.mean()) for name, loss in losses.items()})
 
@@ -170,8 +173,8 @@ def _held_out(seen: Observations, rng: np.random.Generator) -> BoolArray:
     return np.asarray(held_out & (seen.frame >= fitted.min()) & (seen.frame <= fitted.max()))
 
 
-def _as_good(excess: FloatArray, frame: np.ndarray) -> bool:
-    """Whether losses exceed the best ones by no more than one standard error, clustered by ``frame``."""
+def _as_good(excess: FloatArray, frame: np.ndarray, standard_errors: float = 1.0) -> bool:
+    """Whether losses exceed others by no more than so many standard errors, clustered by ``frame``."""
     mean = float(excess.mean())
     by_frame = np.bincount(frame, weights=excess - mean)
-    return mean <= float(np.sqrt(np.sum(by_frame**2))) / len(excess)
+    return mean <= standard_errors * float(np.sqrt(np.sum(by_frame**2))) / len(excess)
