@@ -58,11 +58,13 @@ def _order_of_sight(optimised: Optimised) -> IntArray:
 
 
 def _step(bundle: Bundle, optimised: Optimised, chosen: IntArray, names: tuple[str, ...]) -> GrowthStep:
+    """The map so far; markings that only the shape of their class can place are left out of it."""
     corners = complete_corners(bundle.corners_map[optimised.groups[chosen]])
     return GrowthStep(
         markings=tuple(
             replace(optimised.markings[m], corners_map=corners[row], covariance_m2=None)
             for row, m in enumerate(chosen)
+            if np.isfinite(corners[row]).all()
         ),
         cam_from_vehicle={name: bundle.rig.cam_from_vehicle[c] for c, name in enumerate(names)},
     )
