@@ -7,6 +7,7 @@ import pytest
 from v2hdm.detection.blobs import find_blobs, outline_polygon, zero_crossings
 from v2hdm.detection.coverage import blurred_coverage
 from v2hdm.detection.normal import normal_pdf_cdf
+from v2hdm.detection.plausible import ends_at_other_paint
 from v2hdm.detection.quad import (
     interior_angles,
     intersect_sides,
@@ -160,3 +161,12 @@ def test_an_empty_picture_has_no_blobs():
     blobs, owner = find_blobs(sight_of(np.zeros((8, 8), dtype=int)), PAINT_CLASSES, 2, 0)
     assert blobs == []
     assert not owner.any()
+
+
+def test_a_dash_that_ends_where_other_paint_begins_is_a_shaft():
+    shaft = np.array([[4.0, 0.9], [6.0, 0.9], [6.0, 1.06], [4.0, 1.06]])
+    head = np.array([[6.2, 0.7], [7.1, 1.0], [6.2, 1.3]])
+    assert ends_at_other_paint(shaft, head)
+    assert not ends_at_other_paint(shaft, head + np.array([1.0, 0.0]))
+    assert not ends_at_other_paint(shaft, head + np.array([-1.2, 1.0])), "beside its middle, not at its end"
+    assert not ends_at_other_paint(shaft, np.empty((0, 2)))

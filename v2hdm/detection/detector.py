@@ -13,7 +13,7 @@ from v2hdm.detection.corners import Foreground, QuadStart, fit_markings
 from v2hdm.detection.lanes import LanePaint, trace_lanes
 from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.plausible import plausible_kind
+from v2hdm.detection.plausible import ends_at_other_paint, plausible_kind
 from v2hdm.detection.quad import is_convex, quad_from_outline
 from v2hdm.detection.sight import look
 from v2hdm.detection.stopwatch import lap
@@ -21,13 +21,19 @@ from v2hdm.detection.view import CameraView
 from v2hdm.errors import DetectorError
 from v2hdm.records import (
     CORNERED_CLASSES,
+    DIAMOND,
     LANE_CLASSES,
+    LANE_DASH,
+    OTHER_PAINT,
     OUTLINED_CLASSES,
     Camera,
     FloatArray,
     LaneDetection,
     MarkingDetection,
 )
+
+_HEADS = (*OUTLINED_CLASSES, OTHER_PAINT, DIAMOND)
+"""What the head of an arrow may be taken for where it is seen apart from the shaft."""
 
 
 @dataclass(frozen=True)
@@ -104,11 +110,17 @@ class Detector:
             return []
         outlines = view.undistort(np.concatenate([blob.outline_px for blob in blobs]))
         ends = np.cumsum([len(blob.outline_px) for blob in blobs])[:-1]
+        on_ground = np.split(view.ground(outlines), ends)
+        symbols = [g for blob, g in zip(blobs, on_ground, strict=True) if blob.kind in _HEADS]
+        heads = np.concatenate(symbols) if symbols else np.empty((0, 2))
         candidates = []
         for index, (blob, outline) in enumerate(zip(blobs, np.split(outlines, ends), strict=True)):
-            found = plausible_kind(blob, outline, view)
-            if found is not None and found[1] >= self.options.min_score:
-                candidates.append(_Candidate(blob, index, *found, outline))
+            found = plausible_kind(blob, on_ground[index], view)
+            if found is None or found[1] < self.options.min_score:
+                continue
+            if found[0] == LANE_DASH and ends_at_other_paint(on_ground[index], heads):
+                continue  # the shaft of an arrow, parted from its head by wear
+            candidates.append(_Candidate(blob, index, *found, outline))
         return candidates
 
     def _start(self, candidate: _Candidate, view: CameraView) -> QuadStart | None:

@@ -85,7 +85,7 @@ def _fit(outline: FloatArray, quad: FloatArray) -> tuple[FloatArray, FloatArray,
 
 @dataclass(frozen=True)
 class _Lines:
-    """Lines along four sides: ``offset``, ``slope``, ``roughness``, ``points`` (4,), and if ``known`` (4,)."""
+    """Lines along four sides, each (4,): ``offset``, ``slope``, ``roughness``, ``points``, and if ``known``."""
 
     offset: FloatArray
     slope: FloatArray

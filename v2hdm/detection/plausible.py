@@ -43,18 +43,20 @@ gives only this share of its lane score to dashes: seen locally, dash and line a
 _LEAST_ELONGATION = 3.0
 """Lane paint is at least this many times as long as wide; far diamonds look like dashes, but are not."""
 
+_HEAD_REACH_M = 0.4
+
 _BORDER_PX = 6.0
 
 
-def plausible_kind(blob: Blob, outline_pinhole_px: FloatArray, view: CameraView) -> tuple[str, float] | None:
+def plausible_kind(blob: Blob, outline_vehicle: FloatArray, view: CameraView) -> tuple[str, float] | None:
     """The likeliest class that the blob's size on the ground allows, with its score; None for none.
 
     Args:
         blob: the blob.
-        outline_pinhole_px: its outline (N, 2).
+        outline_vehicle: its outline on the ground (N, 2), m.
         view: its camera.
     """
-    length_m, width_m = _ground_size(view.ground(outline_pinhole_px))
+    length_m, width_m = _ground_size(outline_vehicle)
     whole = bool(view.inside(blob.outline_px, _BORDER_PX).all())
     if whole and length_m < _LEAST_ELONGATION * width_m:
         kind, score = _likeliest_compact(blob.class_score)
@@ -65,6 +67,22 @@ def plausible_kind(blob: Blob, outline_pinhole_px: FloatArray, view: CameraView)
     if kind == LANE_DASH and not _fits(LANE_DASH, length_m, width_m):
         kind = LANE_LINE
     return (kind, score) if _fits(kind, length_m, width_m) else None
+
+
+def ends_at_other_paint(outline_vehicle: FloatArray, others_vehicle: FloatArray) -> bool:
+    """Whether paint (M, 2) begins where a dash (N, 2) ends, as the head of an arrow does after its shaft.
+
+    Worn paint may part the two. Dashes keep their distance from each other and from everything else.
+    """
+    points = outline_vehicle[np.isfinite(outline_vehicle).all(axis=1)]
+    if len(points) < 3 or not len(others_vehicle):
+        return False
+    box = cv2.boxPoints(cv2.minAreaRect(points.astype(np.float32))).astype(np.float64)
+    sides = np.roll(box, -1, axis=0) - box
+    short = int(np.argmin(np.linalg.norm(sides[:2], axis=1)))
+    ends = np.stack([box[short] + box[short + 1], box[short + 2] + box[(short + 3) % 4]]) / 2
+    apart = np.linalg.norm(others_vehicle[:, None] - ends, axis=2)
+    return bool(np.nanmin(np.where(np.isfinite(apart), apart, np.inf)) < _HEAD_REACH_M)
 
 
 def _likeliest(class_score: dict[str, float], short: bool) -> tuple[str, float]:
