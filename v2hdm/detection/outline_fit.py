@@ -85,7 +85,7 @@ def _fit(outline: FloatArray, quad: FloatArray) -> tuple[FloatArray, FloatArray,
 
 @dataclass(frozen=True)
 class _Lines:
-    """Lines along four sides, each (4,): ``offset``, ``slope``, ``roughness``, ``points``, and if ``known``."""
+    """Lines along four sides, each (4,): ``offset``, ``slope``, ``roughness``, ``points``, if ``known``."""
 
     offset: FloatArray
     slope: FloatArray
