@@ -71,3 +71,9 @@ def test_a_users_own_runs_join_the_shipped_ones(tmp_path: Path) -> None:
     done = run_door("--config-dir", str(tmp_path / "conf"), "+run=mysite", folder=tmp_path)
     assert done.returncode == 2
     assert "nowhere_at_all" in done.stderr
+
+
+def test_device_and_mode_reach_the_mapping() -> None:
+    mapping = composed("+run=port1", "device=cuda", "mode=incremental").mapping
+    assert (mapping.device, mapping.mode) == ("cuda", "incremental")
+    assert composed("+run=port1").mapping.mode == "batch"

@@ -68,6 +68,7 @@ class RunConfig:
         cache: folder that keeps rendered drives.
         workers: processes for rendering and detection; 0 takes one per core.
         device: what ``conf/map.yaml`` hands on as ``mapping.device``, ``cpu`` or ``cuda``.
+        mode: what it hands on as ``mapping.mode``, ``batch`` or ``incremental``.
     """
 
     name: str
@@ -79,6 +80,7 @@ class RunConfig:
     cache: str = "cache"
     workers: int = 0
     device: str = "cpu"
+    mode: str = "batch"
 
 
 @dataclass(frozen=True)
