@@ -78,7 +78,7 @@ def _seam_row(network: Network, view: CameraView) -> int | None:
     seam = -(-(view.fine_row - view.top) // grid) * grid
     seam += (view.height - seam) % (2 * grid)
     worth = view.height - seam >= 3 * _OVERLAP_PX
-    return max(seam, _OVERLAP_PX) if worth and seam >= _OVERLAP_PX else None
+    return seam if worth and seam >= _OVERLAP_PX else None
 
 
 def _joined(far: np.ndarray, near: np.ndarray, seam: int, near_top: int) -> np.ndarray:
