@@ -52,6 +52,27 @@ class Checkpoint:
         return net.eval()
 
 
+def fresh_checkpoint(config: TrainConfig) -> Checkpoint:
+    """The state before the first update: that of no network yet, or with the weights of ``config.start``.
+
+    Raises:
+        ConfigError: ``config.start`` is no checkpoint, or one of another network.
+    """
+    state = Checkpoint(config=asdict(config))
+    if config.start is None:
+        return state
+    earlier = load_checkpoint(Path(config.start))
+    now = asdict(config.net)
+    then = _completed(earlier.config["net"], asdict(NetConfig()))
+    if then != now:
+        raise ConfigError(
+            f"start={config.start} holds the network {then}, not {now}: give its `net` settings"
+        )
+    state.model = state.averaged = earlier.averaged
+    state.renders = earlier.renders
+    return state
+
+
 def save_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
     """Write a checkpoint; a kill leaves the one before it."""
     path.parent.mkdir(parents=True, exist_ok=True)

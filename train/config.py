@@ -67,10 +67,12 @@ class TrainConfig:
     The learning rate rises to ``learning_rate`` over the first ``warmup`` of the run, then falls to
     nothing as a half cosine, by the share of the run that has passed. The weights that are validated, kept
     and exported are averages over about ``ema_updates`` updates. ``resume`` goes on with what ``output``
-    holds.
+    holds. ``start`` is a checkpoint of another run whose averaged weights, and place in the sequence of
+    renders, this one starts from: to learn on, or to learn users' own labels.
     """
 
     output: str = "runs/train"
+    start: str | None = None
     seed: int = 1
     device: str = "auto"
     minutes: float | None = None

@@ -16,7 +16,13 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils.tensorboard import SummaryWriter
 
 from models import MarkingNet, Prediction
-from train.checkpoint import Checkpoint, check_same_experiment, load_checkpoint, save_checkpoint
+from train.checkpoint import (
+    Checkpoint,
+    check_same_experiment,
+    fresh_checkpoint,
+    load_checkpoint,
+    save_checkpoint,
+)
 from train.config import TrainConfig
 from train.data import Pair, training_batches, validation_pairs
 from train.distributed import Team, choose_device
@@ -58,7 +64,7 @@ class Trainer:
         average = get_ema_multi_avg_fn(1.0 - 1.0 / config.ema_updates)  # type: ignore[no-untyped-call]
         self.averaged = AveragedModel(self.net, multi_avg_fn=average, use_buffers=True)
         self.optimizer = torch.optim.AdamW(self.net.parameters(), weight_decay=config.weight_decay)
-        if self.state.step:
+        if self.state.model:
             self._restore()
         self._team.follow([*self.net.state_dict().values(), *self.averaged.module.state_dict().values()])
 
@@ -92,7 +98,7 @@ class Trainer:
         """The state to go on from: the last of this folder, or a fresh one."""
         path = self.output / "last.pt"
         if not (self.config.resume and path.is_file()):
-            return Checkpoint(config=asdict(self.config))
+            return fresh_checkpoint(self.config)
         state = load_checkpoint(path)
         check_same_experiment(state, self.config, path)
         state.config = asdict(self.config)
@@ -103,7 +109,8 @@ class Trainer:
         self.net.load_state_dict(self.state.model)
         self.averaged.module.load_state_dict(self.state.averaged)
         self.averaged.n_averaged.fill_(self.state.step)
-        self.optimizer.load_state_dict(self.state.optimizer)
+        if self.state.optimizer:
+            self.optimizer.load_state_dict(self.state.optimizer)
 
     def _share(self) -> float:
         """How much of the run has passed, 0 to 1."""

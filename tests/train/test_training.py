@@ -143,3 +143,21 @@ def test_a_mistyped_argument_is_one_line_and_exit_code_2(
     assert line.startswith("error: configuration")
     assert argument.split("=")[0] in line
     assert "\n" not in line
+
+
+def test_a_run_starts_from_the_weights_of_another(tmp_path: Path) -> None:
+    first = train(tiny(tmp_path / "first"))
+    config = replace(tiny(tmp_path / "second"), start=str(tmp_path / "first" / "last.pt"))
+    trainer = Trainer(config, lambda share, line: None)
+    for name, value in trainer.net.state_dict().items():
+        assert torch.equal(value, first.averaged[name]), name
+    assert trainer.state.step == 0
+    assert trainer.state.renders == first.renders, "the renders that taught it would be shown again"
+    assert trainer.run().step == 3
+
+
+def test_a_start_of_another_network_is_refused(tmp_path: Path) -> None:
+    train(tiny(tmp_path / "first"))
+    config = replace(tiny(tmp_path / "second"), start=str(tmp_path / "first" / "last.pt"), net=NetConfig())
+    with pytest.raises(ConfigError, match=r"start=.*holds the network"):
+        Trainer(config, lambda share, line: None)
