@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter, defaultdict
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -43,6 +44,10 @@ MAX_RANGE_M = 20.0
 CORNER_RANGE_M = 15.0
 WHOLE_SHARE = 0.97
 """A marking counts as wholly seen when this share of its area is; others may be found or not."""
+
+TOUCHING_PX = 2
+TOUCHED_SHARE = 0.05
+"""Other paint touches a marking if it holds more than this share of a seam of so many px around it."""
 
 MIN_HEIGHT_PX = 4.0
 LANE_TOLERANCE_PX = 20.0
@@ -103,27 +108,38 @@ def _markings(scene: Scene, view: TrainingView, rendered: Rendered) -> list[True
             continue
         polygon_px = distort_points(view.info, pinhole)
         range_m = float(np.linalg.norm(polygon.mean(axis=0) - centre[:2]))
-        whole = _seen_share(polygon_px, PAINT_CLASSES.index(paint.kind) + 1, rendered) >= WHOLE_SHARE
+        whole = _seen_alone(polygon_px, PAINT_CLASSES.index(paint.kind) + 1, rendered)
         tall = float(np.ptp(polygon_px[:, 1])) >= MIN_HEIGHT_PX
         fair = whole and tall and range_m <= MAX_RANGE_M and paint.wear <= 0.4
         out.append(TrueMarking(paint.kind, polygon_px, range_m, fair and paint.kind in CORNERED_CLASSES))
     return out
 
 
-def _seen_share(polygon_px: FloatArray, label: int, rendered: Rendered) -> float:
-    """Share of a polygon's pixels that show it, border of the image included."""
-    low = np.floor(polygon_px.min(axis=0)).astype(int)
-    high = np.ceil(polygon_px.max(axis=0)).astype(int) + 1
+def _seen_alone(polygon_px: FloatArray, label: int, rendered: Rendered) -> bool:
+    """Whether a polygon is wholly seen, border of the image included, and no other paint touches it.
+
+    Where paint runs into other paint there is no outline to be found.
+    """
+    low = np.floor(polygon_px.min(axis=0)).astype(int) - TOUCHING_PX
+    high = np.ceil(polygon_px.max(axis=0)).astype(int) + 1 + TOUCHING_PX
     size = high - low
     mask = np.zeros((size[1], size[0]), dtype=np.uint8)
     cv2.fillConvexPoly(mask, np.round((polygon_px - low) * 16).astype(np.int32), 1, shift=4)
+    around = cv2.dilate(mask, np.ones((2 * TOUCHING_PX + 1,) * 2, np.uint8)) - mask
     mask = cv2.erode(mask, np.ones((3, 3), np.uint8), borderValue=0) if mask.sum() > 200 else mask
+    return _share(mask, low, rendered, (label,)) >= WHOLE_SHARE and (
+        _share(around, low, rendered, range(1, len(PAINT_CLASSES) + 1)) <= TOUCHED_SHARE
+    )
+
+
+def _share(mask: np.ndarray, low: np.ndarray, rendered: Rendered, labels: Iterable[int]) -> float:
+    """Share of a mask's pixels, placed at ``low``, that show one of the labels; 0 if some are outside."""
     v, u = np.nonzero(mask)
     u, v = u + low[0], v + low[1]
     inside = (u >= 0) & (v >= 0) & (u < WIDTH) & (v < HEIGHT)
     if not len(u) or not inside.all():
         return 0.0
-    return float((rendered.labels[v, u] == label).mean())
+    return float(np.isin(rendered.labels[v, u], list(labels)).mean())
 
 
 class Tally:
@@ -216,10 +232,37 @@ def _at_rows(line: FloatArray, rows: FloatArray) -> FloatArray:
 
 
 def _overlap(first: FloatArray, second: FloatArray) -> float:
-    """Intersection over union of two convex polygons."""
-    a, b = (cv2.convexHull(p.astype(np.float32)) for p in (first, second))
-    common, _ = cv2.intersectConvexConvex(a, b)
-    return float(common / max(cv2.contourArea(a) + cv2.contourArea(b) - common, 1e-6))
+    """Intersection over union of the hulls of two polygons."""
+    a, b = (cv2.convexHull(p.astype(np.float32))[:, 0].astype(np.float64) for p in (first, second))
+    common = _area(_clipped(a, b))
+    return common / max(_area(a) + _area(b) - common, 1e-6)
+
+
+def _area(polygon: FloatArray) -> float:
+    return cv2.contourArea(polygon.astype(np.float32)) if len(polygon) > 2 else 0.0
+
+
+def _clipped(polygon: FloatArray, window: FloatArray) -> FloatArray:
+    """A polygon (N, 2) cut to a convex window (Sutherland and Hodgman, CACM 1974).
+
+    OpenCV's own intersection gives nothing for some polygons that nearly coincide.
+    """
+    inwards = np.sign(cv2.contourArea(window.astype(np.float32), oriented=True))
+    for start, end in zip(window, np.roll(window, -1, axis=0), strict=True):
+        along = end - start
+        depth = inwards * (along[0] * (polygon[:, 1] - start[1]) - along[1] * (polygon[:, 0] - start[0]))
+        kept: list[FloatArray] = []
+        for k in range(len(polygon)):
+            before = k - 1
+            if (depth[k] >= 0) != (depth[before] >= 0):
+                part = depth[before] / (depth[before] - depth[k])
+                kept.append(polygon[before] + part * (polygon[k] - polygon[before]))
+            if depth[k] >= 0:
+                kept.append(polygon[k])
+        if not kept:
+            return np.empty((0, 2))
+        polygon = np.array(kept)
+    return polygon
 
 
 def average_precision(scored: list[tuple[float, bool]], truths: int) -> float:

@@ -7,7 +7,7 @@ import pytest
 from v2hdm.detection.blobs import find_blobs, outline_polygon, zero_crossings
 from v2hdm.detection.coverage import blurred_coverage
 from v2hdm.detection.normal import normal_pdf_cdf
-from v2hdm.detection.plausible import ends_at_other_paint
+from v2hdm.detection.plausible import ends_at_a_head
 from v2hdm.detection.quad import (
     interior_angles,
     intersect_sides,
@@ -163,10 +163,52 @@ def test_an_empty_picture_has_no_blobs():
     assert not owner.any()
 
 
-def test_a_dash_that_ends_where_other_paint_begins_is_a_shaft():
-    shaft = np.array([[4.0, 0.9], [6.0, 0.9], [6.0, 1.06], [4.0, 1.06]])
+def test_a_whole_quadrilateral_is_one_marking_whatever_the_network_takes_its_end_for():
+    labels = np.zeros((40, 60), dtype=int)
+    labels[10:30, 10:50] = 1 + PAINT_CLASSES.index("diamond")
+    labels[10:30, 38:50] = 1 + PAINT_CLASSES.index("arrow")
+    blobs, _ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
+    assert [blob.kind for blob in blobs] == ["diamond"]
+    assert not blobs[0].touches_symbol
+
+
+def test_a_shaft_is_split_from_its_head_and_knows_it():
+    labels = np.zeros((60, 60), dtype=int)
+    labels[20:50, 28:32] = 1 + PAINT_CLASSES.index("lane_dash")
+    labels[8:20, 20:40] = 1 + PAINT_CLASSES.index("arrow")
+    blobs, owner = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
+    assert sorted(blob.kind for blob in blobs) == ["arrow", "lane_dash"]
+    assert all(blob.touches_symbol for blob in blobs)
+    assert owner[40, 30] != owner[12, 30]
+
+
+def test_blobs_in_each_others_boxes_keep_to_themselves():
+    labels = np.zeros((60, 60), dtype=int)
+    for k in range(10, 50):
+        labels[k, k : k + 4] = 1
+    labels[15:20, 40:46] = labels[40:45, 12:18] = 1
+    blobs, owner = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
+    assert len(blobs) == 3
+    for index, blob in enumerate(blobs):
+        mine = np.argwhere(owner == index + 1)
+        outline = (blob.outline_px - 0.5) / 2
+        assert np.count_nonzero(blob.level > 0) == len(mine)
+        np.testing.assert_allclose(outline.min(axis=0), mine[:, ::-1].min(axis=0) - 0.5, atol=0.01)
+        np.testing.assert_allclose(outline.max(axis=0), mine[:, ::-1].max(axis=0) + 0.5, atol=0.01)
+
+
+SHAFT = np.array([[4.0, 0.9], [6.0, 0.9], [6.0, 1.06], [4.0, 1.06]])
+
+
+def test_a_dash_that_ends_at_something_wide_astride_its_axis_is_a_shaft():
     head = np.array([[6.2, 0.7], [7.1, 1.0], [6.2, 1.3]])
-    assert ends_at_other_paint(shaft, head)
-    assert not ends_at_other_paint(shaft, head + np.array([1.0, 0.0]))
-    assert not ends_at_other_paint(shaft, head + np.array([-1.2, 1.0])), "beside its middle, not at its end"
-    assert not ends_at_other_paint(shaft, np.empty((0, 2)))
+    assert ends_at_a_head(SHAFT, [head])
+    assert not ends_at_a_head(SHAFT, [head + np.array([1.0, 0.0])])
+    assert not ends_at_a_head(SHAFT, [head + np.array([-1.2, 1.0])]), "beside its middle, not at its end"
+    assert not ends_at_a_head(SHAFT, [])
+
+
+def test_specks_and_neighbours_at_the_end_of_a_dash_are_no_head():
+    speck = np.array([[6.2, 0.95], [6.3, 0.9], [6.3, 1.05]])
+    letter = np.array([[6.1, 1.2], [6.6, 1.2], [6.6, 1.6]])
+    assert not ends_at_a_head(SHAFT, [speck, letter])

@@ -8,6 +8,7 @@ import numpy as np
 
 from v2hdm.mapping.acceptance import Candidates, judge
 from v2hdm.mapping.options import AcceptanceOptions
+from v2hdm.records import CORNERED_CLASSES, LANE_DASH
 
 DIAMOND = np.array([[0.6, 0.0], [0.0, 0.3], [-0.6, 0.0], [0.0, -0.3]])
 COUNT = 12
@@ -129,5 +130,15 @@ def test_the_shaft_of_an_arrow_is_refused_where_other_images_show_the_arrow() ->
     sound = row_of_diamonds()
     seen_as_symbol = np.zeros(COUNT, dtype=np.int64)
     seen_as_symbol[[2, 7]] = 1, 4
-    judged = replace(sound, seen_as_symbol=seen_as_symbol)
+    dashes = replace(sound, kind=np.full(COUNT, CORNERED_CLASSES.index(LANE_DASH)))
+    judged = replace(dashes, seen_as_symbol=seen_as_symbol)
     assert refused(judged) == {7: "part of an arrow or a chevron"}, "one image may err"
+
+
+def test_a_diamond_like_the_others_stays_one_whatever_some_images_take_it_for() -> None:
+    sound = row_of_diamonds()
+    seen_as_symbol = np.zeros(COUNT, dtype=np.int64)
+    seen_as_symbol[[2, 7]] = 4
+    sound.corners_map[7] = sound.corners_map[7].mean(axis=0) + 1.6 * DIAMOND
+    judged = replace(sound, seen_as_symbol=seen_as_symbol)
+    assert list(refused(judged)) == [7], "the odd one is refused, not the typical one"

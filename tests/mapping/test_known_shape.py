@@ -24,37 +24,45 @@ def covers(found: np.ndarray, true: np.ndarray) -> bool:
     return bool(np.linalg.norm(found[:, None] - true, axis=2).min(axis=1).max() < 1e-6)
 
 
-@pytest.mark.parametrize("missing", [[0], [3], [1, 3], [0, 2]])
-def test_three_corners_or_two_opposite_ones_place_the_shape(missing: list[int]) -> None:
+@pytest.mark.parametrize("missing", [[0], [3], [1, 3], [0, 2], [2, 3]])
+def test_three_corners_or_two_place_the_shape(missing: list[int]) -> None:
     seen = placed()
     seen[missing] = np.nan
-    fit = fit_shape(DIAMOND, seen, SIGMA, OFTEN)
+    fit = fit_shape(DIAMOND, seen, SIGMA, OFTEN, placed())
     assert fit is not None
     assert covers(fit.corners_map, placed())
     assert (np.linalg.eigvalsh(fit.covariance) > 0).all()
     assert np.trace(fit.covariance) < 8 * 0.03**2
 
 
-def test_two_neighbouring_corners_leave_two_ways_and_so_none() -> None:
+def test_two_neighbouring_corners_place_it_only_if_the_others_are_about_there() -> None:
     seen = placed()
     seen[[2, 3]] = np.nan
-    assert fit_shape(DIAMOND, seen, SIGMA, OFTEN) is None
+    along = placed()[1] - placed()[0]
+    across = np.array([-along[1], along[0]])
+    there = placed() + np.array([[0, 0], [0, 0], [0.15, -0.1], [-0.1, 0.15]])
+    fit = fit_shape(DIAMOND, seen, SIGMA, OFTEN, there)
+    assert fit is not None
+    assert covers(fit.corners_map, placed())
+    elsewhere = placed() + np.array([0, 0, -2, -2])[:, None] * across
+    assert fit_shape(DIAMOND, seen, SIGMA, OFTEN, elsewhere) is None
+    assert fit_shape(DIAMOND, seen, SIGMA, OFTEN, np.full((4, 2), np.nan)) is None
 
 
 def test_one_wrong_corner_of_four_is_left_out() -> None:
     seen = placed()
     seen[1] += [0.3, 0.2]
-    fit = fit_shape(DIAMOND, seen, SIGMA, OFTEN)
+    fit = fit_shape(DIAMOND, seen, SIGMA, OFTEN, placed())
     assert fit is not None
     assert covers(fit.corners_map, placed())
 
 
 def test_corners_of_something_else_do_not_fit() -> None:
-    assert fit_shape(DIAMOND, 1.4 * placed(), SIGMA, OFTEN) is None
+    assert fit_shape(DIAMOND, 1.4 * placed(), SIGMA, OFTEN, placed()) is None
     seen = placed()
     seen[[0, 2]] = 1.25 * (seen[[0, 2]] - seen.mean(axis=0)) + seen.mean(axis=0)
     seen[[1, 3]] = np.nan
-    assert fit_shape(DIAMOND, seen, SIGMA, OFTEN) is None
+    assert fit_shape(DIAMOND, seen, SIGMA, OFTEN, placed()) is None
 
 
 def test_a_class_lends_its_shape_and_a_class_of_many_shapes_does_not() -> None:
@@ -66,15 +74,15 @@ def test_a_class_lends_its_shape_and_a_class_of_many_shapes_does_not() -> None:
     solved.corners_map[11] = np.nan
     fused = FusedGroups(seen, np.tile(1e-4 * np.eye(2), (12, 4, 1, 1)), np.full((12, 4), 3))
     kind, accepted, options = np.zeros(12, dtype=np.int64), np.arange(11), AcceptanceOptions()
-    found = with_known_shapes(solved, fused, np.array([11]), kind, accepted, options)
+    found = with_known_shapes(solved, fused, corners, np.array([11]), kind, accepted, options)
     assert covers(found.corners_map[11], corners[11])
     assert found.completed.tolist() == [False] * 11 + [True]
     solved.corners_map[:11] *= 1.2 ** np.arange(11)[:, None, None]
-    found = with_known_shapes(solved, fused, np.array([11]), kind, accepted, options)
+    found = with_known_shapes(solved, fused, corners, np.array([11]), kind, accepted, options)
     assert np.isnan(found.corners_map[11]).all()
 
 
 def test_a_shape_is_not_laid_on_what_one_image_shows() -> None:
     seen = placed()
     seen[1] = np.nan
-    assert fit_shape(DIAMOND, seen, SIGMA, np.array([2, 0, 1, 1])) is None
+    assert fit_shape(DIAMOND, seen, SIGMA, np.array([2, 0, 1, 1]), placed()) is None

@@ -25,8 +25,6 @@ from v2hdm.records import (
 _MIN_CELLS = 5
 """Blobs of fewer cells are noise: their outline is not worth four corners."""
 
-_SPLIT_FRACTION = 0.15
-"""Where a second group of classes holds this much of a blob, two markings touch."""
 
 _GROUPS: tuple[tuple[str, ...], ...] = (
     (DIAMOND,),
@@ -39,10 +37,14 @@ _GROUPS: tuple[tuple[str, ...], ...] = (
 
 _SYMBOLS = _GROUPS[-1]
 
-_OUTLINE_SCALE = 4
+_LEAST_SHARE = np.array([0.25 if group == _SYMBOLS else 0.15 for group in _GROUPS])
+"""Where two groups of classes hold this much of a blob, two markings touch. The head is more of an arrow."""
 
-_MAX_VOTES = 400
-"""Cells of a blob that are asked for its class; more of them say nothing new."""
+_LEAST_QUAD_CELLS = 30
+_LEAST_CONVEXITY = 0.9
+"""What a quadrilateral's contour fills of its hull, and its hull of four straight sides."""
+
+_OUTLINE_SCALE = 4
 
 
 @dataclass(frozen=True)
@@ -85,88 +87,151 @@ def find_blobs(
         The blobs, and a map (h, w) int16 with 1 + the index of the blob that covers each element of
         ``paint``, 0 for none.
     """
-    framed_level = np.pad(sight.paint, 1, constant_values=-1.0)
-    level = framed_level[1:-1, 1:-1]
-    contours, _ = cv2.findContours((level > 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    owner = np.zeros(level.shape, dtype=np.int16)
+    # A frame of no paint around it lets every outline close.
+    level = np.pad(sight.paint, 1, constant_values=-1.0)
+    corner_px = np.array([(stride - 1) / 2 - stride, (stride - 1) / 2 - stride + top_px])
+    contours, piece = _connected(level, (reach_px - top_px) / stride + 1)
+    said = _hearsay(sight, classes, piece, level, len(contours))
+    outlines = _outlines(level, piece, len(contours))
+    number = np.zeros(len(contours) + 1, dtype=np.int16)
+    owner = np.zeros_like(piece)
     blobs: list[Blob] = []
-    for contour in contours:
-        if len(contour) < 4:
+    for index, contour in enumerate(contours):
+        if said.cells[index] < _MIN_CELLS:
             continue
         x, y, w, h = cv2.boundingRect(contour)
-        if stride * (y + h) + top_px < reach_px:
+        box = (slice(y - 1, y + h + 1), slice(x - 1, x + w + 1))
+        origin_px = corner_px + stride * np.array([x - 1.0, y - 1.0])
+        inside = piece[box] == index + 1
+        if said.groups[index] < 2 or _is_quadrilateral(contour):
+            scores = dict(zip(classes, said.score[:, index].tolist(), strict=True))
+            outline_px = corner_px + stride * outlines[index]
+            blobs.append(Blob(scores, _signed(inside, level[box]), origin_px, stride, outline_px))
+            number[index + 1] = len(blobs)
             continue
-        filled = np.zeros((h, w), dtype=np.uint8)
-        cv2.drawContours(filled, [contour], -1, 1, cv2.FILLED, offset=(-x, -y))
-        inside = filled.view(np.bool_)
-        box = (slice(y, y + h), slice(x, x + w))
-        siblings: list[int] = []
-        parts = _parts(inside, sight, box, classes)
-        for mask, part_level, scores in parts:
-            framed = framed_level[y : y + h + 2, x : x + w + 2].copy()
-            framed[1:-1, 1:-1] = part_level
-            origin_px = stride * np.array([x - 1.0, y - 1.0]) + (stride - 1) / 2 + [0.0, top_px]
-            blobs.append(_make_blob(mask, framed, scores, classes, stride, origin_px))
-            siblings.append(len(blobs) - 1)
-            owner[box][mask] = len(blobs)
-        if any(blobs[s].kind in _SYMBOLS for s in siblings):
-            for s in siblings:
-                blobs[s] = replace(blobs[s], touches_symbol=True)
-    return blobs, owner
+        for part in _split(inside, level[box], sight, box, classes, origin_px, stride):
+            blobs.append(part)
+            owner[box][part.level > 0] = len(blobs)
+    owner += number[piece]
+    return blobs, owner[1:-1, 1:-1]
 
 
-_Part = tuple[BoolArray, np.ndarray, np.ndarray]
-"""A part's mask (h, w), its signed level (h, w), and the mean probability (K,) of each class in it."""
+def _connected(level: np.ndarray, least_row: float) -> tuple[list[np.ndarray], np.ndarray]:
+    """Contours of paint that reaches ``least_row``, and a map of 1 + the number of each, holes filled."""
+    contours, _ = cv2.findContours((level > 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    kept = [c for c in contours if len(c) >= 4 and c[:, 0, 1].max() + 1 >= least_row]
+    piece = np.zeros(level.shape, dtype=np.int16)
+    for index, contour in enumerate(kept):
+        cv2.drawContours(piece, [contour], -1, index + 1, cv2.FILLED)
+    return kept, piece
 
 
-def _parts(inside: BoolArray, sight: Sight, box: tuple[slice, slice], classes: Sequence[str]) -> list[_Part]:
-    """The parts of a blob that belong to different groups of classes; one where all of it is of one group."""
-    level = sight.paint[box]
-    if np.count_nonzero(inside) < _MIN_CELLS:
-        return []
-    probability = _class_probability(inside, sight, box)
-    certainty = _certainty(inside, level)
-    votes = np.bincount(probability.argmax(axis=0), minlength=len(classes))
+@dataclass(frozen=True)
+class _Hearsay:
+    """What the network says of B pieces of paint.
+
+    ``cells`` (B,) are their sizes, ``score`` (K, B) the mean probability of each class, ``groups`` (B,) how
+    many groups of classes hold a notable part of each piece.
+    """
+
+    cells: np.ndarray
+    score: FloatArray
+    groups: np.ndarray
+
+
+def _hearsay(
+    sight: Sight, classes: Sequence[str], piece: np.ndarray, level: np.ndarray, count: int
+) -> _Hearsay:
+    i, j = np.nonzero(piece)
+    own = piece[i, j] - 1
+    cells = np.bincount(own, minlength=count)
+    share = 1 / np.maximum(cells, 1)
+    certainty = np.bincount(own, _sigmoid(level[i, j]), count) * share
+    probability = _class_probability(sight, i - 1, j - 1)
+    score = np.stack([np.bincount(own, plane, count) for plane in probability]) * share
     group_of = np.array([_group_index(name) for name in classes])
-    share = np.array([votes[group_of == g].sum() for g in range(len(_GROUPS))]) / max(1, votes.sum())
-    present = np.flatnonzero(share >= _SPLIT_FRACTION)
-    if len(present) < 2:
-        return [(inside, level, certainty * probability.mean(axis=1))]
+    groups = len(_GROUPS)
+    votes = np.bincount(own * groups + group_of[probability.argmax(axis=0)], minlength=count * groups)
+    present = votes.reshape(count, groups) * share[:, None] >= _LEAST_SHARE
+    return _Hearsay(cells, certainty * score, present.sum(axis=1))
+
+
+def _outlines(level: np.ndarray, piece: np.ndarray, count: int) -> list[FloatArray]:
+    """Points (N, 2), (column, row), of each piece's outline: where the level falls to zero beside it."""
+    points, owners = [], []
+    for axis in (0, 1):
+        first, second = (piece[:-1], piece[1:]) if axis == 0 else (piece[:, :-1], piece[:, 1:])
+        i, j = np.nonzero(first != second)
+        below, right = (i + 1, j) if axis == 0 else (i, j + 1)
+        here, there = level[i, j], level[below, right]
+        fraction = here / (here - there)
+        points.append(np.column_stack([j, i + fraction] if axis == 0 else [j + fraction, i]))
+        owners.append(np.maximum(first[i, j], second[i, j]))
+    owner = np.concatenate(owners)
+    order = np.argsort(owner, kind="stable")
+    ends = np.searchsorted(owner[order], np.arange(2, count + 1))
+    return np.split(np.concatenate(points).astype(np.float64)[order], ends)
+
+
+def _split(
+    inside: BoolArray,
+    level: np.ndarray,
+    sight: Sight,
+    box: tuple[slice, slice],
+    classes: Sequence[str],
+    origin_px: FloatArray,
+    stride: int,
+) -> list[Blob]:
+    """The parts of a piece (h, w) that belong to different groups of classes."""
+    rows, columns = np.nonzero(inside)
+    probability = _class_probability(sight, rows + box[0].start - 1, columns + box[1].start - 1)
+    group_of = np.array([_group_index(name) for name in classes])
+    votes = np.bincount(group_of[probability.argmax(axis=0)], minlength=len(_GROUPS)) / len(rows)
     kinds = _kinds_at_full(sight, box)
     parts = []
-    for group in present:
+    for group in np.flatnonzero(votes >= _LEAST_SHARE):
         mine = kinds[group_of == group].max(axis=0)
         rest = kinds[group_of != group].max(axis=0)
-        group_level = np.minimum(level, mine - rest)
-        count, labels = cv2.connectedComponents(((group_level > 0) & inside).astype(np.uint8))
+        own_level = np.minimum(level, mine - rest)
+        count, labels = cv2.connectedComponents(((own_level > 0) & inside).astype(np.uint8))
         for label in range(1, count):
             mask = labels == label
-            if np.count_nonzero(mask) >= _MIN_CELLS:
-                own = _class_probability(mask, sight, box).mean(axis=1)
-                parts.append((mask, group_level, _certainty(mask, level) * own))
-    return parts
+            if np.count_nonzero(mask) < _MIN_CELLS:
+                continue
+            scores = _sigmoid(level[mask]).mean() * probability[:, mask[rows, columns]].mean(axis=1)
+            signed = _signed(mask, own_level)
+            outline_px = origin_px + stride * zero_crossings(signed)
+            class_score = dict(zip(classes, scores.tolist(), strict=True))
+            parts.append(Blob(class_score, signed, origin_px, stride, outline_px))
+    touches = any(part.kind in _SYMBOLS for part in parts)
+    return [replace(part, touches_symbol=touches) for part in parts]
 
 
-def _class_probability(mask: BoolArray, sight: Sight, box: tuple[slice, slice]) -> np.ndarray:
-    """Probability (K, n) of each class at cells of the mask (h, w) that is placed at ``box``."""
-    i, j = np.nonzero(mask)
-    step = -(-len(i) // _MAX_VOTES)
+def _is_quadrilateral(contour: np.ndarray) -> bool:
+    """Whether a contour (N, 1, 2) has four straight sides: such a shape is one marking, not two."""
+    hull = cv2.convexHull(contour)
+    area = cv2.contourArea(hull)
+    if len(hull) < 4 or area < _LEAST_QUAD_CELLS or cv2.contourArea(contour) < _LEAST_CONVEXITY * area:
+        return False
+    quad = cv2.approxPolyN(hull, 4)
+    return len(quad.reshape(-1, 2)) == 4 and cv2.contourArea(quad) < area / _LEAST_CONVEXITY
+
+
+def _class_probability(sight: Sight, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Probability (K, N) of each class at elements of ``paint``."""
     scale = sight.kind_scale
-    rows = ((i[::step] + box[0].start) / scale).astype(np.intp)
-    columns = ((j[::step] + box[1].start) / scale).astype(np.intp)
-    logits = sight.kinds[:, rows, columns]
+    logits = sight.kinds[:, (rows / scale).astype(np.intp), (columns / scale).astype(np.intp)]
     odds = np.exp(logits - logits.max(axis=0))
     return np.asarray(odds / odds.sum(axis=0))
 
 
-def _certainty(mask: BoolArray, level: np.ndarray) -> float:
-    """Mean probability of paint where the mask (h, w) is."""
-    return float((1 / (1 + np.exp(-np.clip(level[mask], -30, 30)))).mean())
+def _sigmoid(level: np.ndarray) -> np.ndarray:
+    return np.asarray(1 / (1 + np.exp(-np.clip(level, -30, 30))))
 
 
 def _kinds_at_full(sight: Sight, box: tuple[slice, slice]) -> np.ndarray:
-    """Class logits (K, h, w), interpolated to the elements of ``paint`` in a box."""
-    rows, columns = (np.arange(part.start, part.stop, dtype=np.float32) for part in box)
+    """Class logits (K, h, w), interpolated to the elements of the framed ``paint`` in a box."""
+    rows, columns = (np.arange(part.start, part.stop, dtype=np.float32) - 1 for part in box)
     scale = np.float32(sight.kind_scale)
     u, v = np.meshgrid((columns + 0.5) / scale - 0.5, (rows + 0.5) / scale - 0.5)
     return np.stack(
@@ -178,23 +243,9 @@ def _group_index(name: str) -> int:
     return next(index for index, group in enumerate(_GROUPS) if name in group)
 
 
-def _make_blob(
-    mask: BoolArray,
-    framed_level: np.ndarray,
-    scores: np.ndarray,
-    classes: Sequence[str],
-    stride: int,
-    origin_px: FloatArray,
-) -> Blob:
-    # Holes are filled and other blobs in the same box emptied, so that only this outline crosses zero.
-    level = np.where(np.pad(mask, 1), np.maximum(framed_level, 1e-3), np.minimum(framed_level, -1e-3))
-    return Blob(
-        class_score=dict(zip(classes, scores.tolist(), strict=True)),
-        level=level,
-        origin_px=origin_px,
-        stride=stride,
-        outline_px=origin_px + stride * zero_crossings(level),
-    )
+def _signed(mask: BoolArray, level: np.ndarray) -> np.ndarray:
+    """A level (h, w) that is positive in the mask only: holes filled, other blobs in the same box emptied."""
+    return np.asarray(np.where(mask, np.maximum(level, 1e-3), np.minimum(level, -1e-3)))
 
 
 def zero_crossings(level: np.ndarray) -> FloatArray:

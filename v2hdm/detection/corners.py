@@ -34,7 +34,6 @@ _BLUR_QUANTILE = 0.4
 _BLUR_PRIOR_SIDES = 6
 _BLUR_LIMITS_PX = (0.45, 1.5)
 _AROUND_PX = 16
-_MIN_VALID_CORNERS = 2
 _MAX_OUTLINE_SIGMA_PX = 2.0
 _MAX_OUTLINE_GAP_PX = 4.0
 """Corners of the outline are this far from those of the image at most where it is the marking's."""
@@ -86,7 +85,10 @@ def fit_markings(
     foreground: Foreground,
     options: DetectorOptions,
 ) -> list[MarkingDetection]:
-    """Refine the corners of one image's markings; those with fewer than two valid ones are dropped."""
+    """Refine the corners of one image's markings; where that fails they are those of the start, not valid.
+
+    Markings without two valid corners are kept if ``options.min_score_unfitted`` allows it.
+    """
     if not starts:
         return []
     start = np.stack([s.corners_pinhole_px for s in starts])
@@ -115,7 +117,7 @@ def fit_markings(
     return [
         MarkingDetection(s.kind, s.score, found.px[m], found.covariance[m], found.valid[m])
         for m, s in enumerate(starts)
-        if np.count_nonzero(found.valid[m]) >= _MIN_VALID_CORNERS
+        if np.count_nonzero(found.valid[m]) >= 2 or s.score >= options.min_score_unfitted
     ]
 
 

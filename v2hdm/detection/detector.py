@@ -13,9 +13,9 @@ from v2hdm.detection.corners import Foreground, QuadStart, fit_markings
 from v2hdm.detection.lanes import LanePaint, trace_lanes
 from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.plausible import ends_at_other_paint, plausible_kind
-from v2hdm.detection.quad import is_convex, quad_from_outline
+from v2hdm.detection.plausible import ends_at_a_head, plausible_kind
 from v2hdm.detection.sight import look
+from v2hdm.detection.starts import starting_corners
 from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.view import CameraView
 from v2hdm.errors import DetectorError
@@ -35,6 +35,9 @@ from v2hdm.records import (
 _HEADS = (*OUTLINED_CLASSES, OTHER_PAINT, DIAMOND)
 """What the head of an arrow may be taken for where it is seen apart from the shaft."""
 
+_LEAST_COVER = 0.6
+"""A blob that shares less than this with the best quadrilateral around it is none."""
+
 
 @dataclass(frozen=True)
 class _Candidate:
@@ -43,6 +46,7 @@ class _Candidate:
     kind: str
     score: float
     outline_pinhole_px: FloatArray
+    outline_vehicle: FloatArray
 
 
 class Detector:
@@ -111,36 +115,36 @@ class Detector:
         outlines = view.undistort(np.concatenate([blob.outline_px for blob in blobs]))
         ends = np.cumsum([len(blob.outline_px) for blob in blobs])[:-1]
         on_ground = np.split(view.ground(outlines), ends)
-        symbols = [g for blob, g in zip(blobs, on_ground, strict=True) if blob.kind in _HEADS]
-        heads = np.concatenate(symbols) if symbols else np.empty((0, 2))
+        heads = [g for blob, g in zip(blobs, on_ground, strict=True) if blob.kind in _HEADS]
         candidates = []
         for index, (blob, outline) in enumerate(zip(blobs, np.split(outlines, ends), strict=True)):
             found = plausible_kind(blob, on_ground[index], view)
             if found is None or found[1] < self.options.min_score:
                 continue
-            if found[0] == LANE_DASH and ends_at_other_paint(on_ground[index], heads):
+            if found[0] == LANE_DASH and ends_at_a_head(on_ground[index], heads):
                 continue  # the shaft of an arrow, parted from its head by wear
-            candidates.append(_Candidate(blob, index, *found, outline))
+            candidates.append(_Candidate(blob, index, *found, outline, on_ground[index]))
         return candidates
 
     def _start(self, candidate: _Candidate, view: CameraView) -> QuadStart | None:
         """The quadrilateral to start the corner fit from, if the blob is one within range."""
         if candidate.kind not in CORNERED_CLASSES:
             return None
-        corners = quad_from_outline(candidate.outline_pinhole_px)
-        if corners is None or not is_convex(corners):
+        outline = candidate.outline_pinhole_px
+        start = starting_corners(candidate.kind, outline, candidate.outline_vehicle, view)
+        if start is None or start[1] < _LEAST_COVER:
             return None
+        corners = start[0]
         ground = view.ground(corners)
         if not np.isfinite(ground).all() or view.range_m(ground.mean(axis=0)) > self.options.max_range_m:
             return None
-        outline = candidate.outline_pinhole_px
         return QuadStart(candidate.kind, candidate.score, corners, candidate.index, outline)
 
     def _symbol(self, candidate: _Candidate, view: CameraView) -> MarkingDetection | None:
         """A marking that has an outline but no four corners, within range."""
         if candidate.kind not in OUTLINED_CLASSES:
             return None
-        ground = view.ground(candidate.outline_pinhole_px)
+        ground = candidate.outline_vehicle
         if not np.isfinite(ground).all() or view.range_m(ground.mean(axis=0)) > self.options.max_range_m:
             return None
         nothing = np.full((4, 2), np.nan), np.full((8, 8), np.nan), np.zeros(4, dtype=np.bool_)

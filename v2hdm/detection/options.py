@@ -19,6 +19,7 @@ class DetectorOptions:
             per px of error.
         max_range_m: markings and lane points farther from the camera on the ground are dropped.
         min_score: least mean class probability of a blob.
+        min_score_unfitted: the same for a marking of which not even two corners can be used as points.
         max_corner_sigma_px: corners with a larger standard deviation are not valid.
         border_px: corners nearer to the image border are not valid.
         lane_step_m: spacing of lane points on the ground.
@@ -29,6 +30,7 @@ class DetectorOptions:
     blur_px: float | None = None
     max_range_m: float = 22.0
     min_score: float = 0.5
+    min_score_unfitted: float = 0.8
     max_corner_sigma_px: float = 1.0
     border_px: float = 4.0
     lane_step_m: float = 0.5
@@ -46,5 +48,6 @@ class DetectorOptions:
         for name in ("max_range_m", "max_corner_sigma_px", "lane_step_m"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"detector.{name} is {getattr(self, name)}: set a positive number")
-        if not 0 <= self.min_score < 1:
-            raise ConfigError(f"detector.min_score is {self.min_score}: set a probability in [0, 1)")
+        for name in ("min_score", "min_score_unfitted"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ConfigError(f"detector.{name} is {getattr(self, name)}: set a probability in [0, 1)")

@@ -5,6 +5,8 @@ The initial IPM may be decimetres wrong, so sizes only rule out what is far off.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
@@ -44,6 +46,9 @@ _LEAST_ELONGATION = 3.0
 """Lane paint is at least this many times as long as wide; far diamonds look like dashes, but are not."""
 
 _HEAD_REACH_M = 0.4
+_HEAD_OVERLAP_M = 0.3
+_HEAD_WIDENING = 1.7
+"""The head of an arrow begins so far from the end of the shaft at most, and is so many times as wide."""
 
 _BORDER_PX = 6.0
 
@@ -69,20 +74,34 @@ def plausible_kind(blob: Blob, outline_vehicle: FloatArray, view: CameraView) ->
     return (kind, score) if _fits(kind, length_m, width_m) else None
 
 
-def ends_at_other_paint(outline_vehicle: FloatArray, others_vehicle: FloatArray) -> bool:
-    """Whether paint (M, 2) begins where a dash (N, 2) ends, as the head of an arrow does after its shaft.
+def ends_at_a_head(outline_vehicle: FloatArray, heads_vehicle: Sequence[FloatArray]) -> bool:
+    """Whether a dash is the shaft of an arrow whose head was parted from it by wear.
 
-    Worn paint may part the two. Dashes keep their distance from each other and from everything else.
+    A head begins where the shaft ends, astride its axis, and is much wider.
+
+    Args:
+        outline_vehicle: outline (N, 2) of the dash on the ground, m.
+        heads_vehicle: outlines (M, 2) of what may be heads.
     """
     points = outline_vehicle[np.isfinite(outline_vehicle).all(axis=1)]
-    if len(points) < 3 or not len(others_vehicle):
+    if len(points) < 3:
         return False
-    box = cv2.boxPoints(cv2.minAreaRect(points.astype(np.float32))).astype(np.float64)
-    sides = np.roll(box, -1, axis=0) - box
-    short = int(np.argmin(np.linalg.norm(sides[:2], axis=1)))
-    ends = np.stack([box[short] + box[short + 1], box[short + 2] + box[(short + 3) % 4]]) / 2
-    apart = np.linalg.norm(others_vehicle[:, None] - ends, axis=2)
-    return bool(np.nanmin(np.where(np.isfinite(apart), apart, np.inf)) < _HEAD_REACH_M)
+    centre, size, _ = box = cv2.minAreaRect(points.astype(np.float32))
+    corners = cv2.boxPoints(box).astype(np.float64)
+    sides = np.roll(corners, -1, axis=0) - corners
+    axis = sides[int(np.argmax(np.linalg.norm(sides[:2], axis=1)))]
+    axis = axis / np.linalg.norm(axis)
+    half_m, width_m = max(size) / 2, min(size)
+    across = np.array([-axis[1], axis[0]])
+    for head in heads_vehicle:
+        offset = head[np.isfinite(head).all(axis=1)] - np.array(centre)
+        if len(offset) < 3:
+            continue
+        along, beside = np.abs(offset @ axis) - half_m, offset @ across
+        begins = -_HEAD_OVERLAP_M < along.min() < _HEAD_REACH_M
+        if begins and beside.min() < 0 < beside.max() and np.ptp(beside) > _HEAD_WIDENING * width_m:
+            return True
+    return False
 
 
 def _likeliest(class_score: dict[str, float], short: bool) -> tuple[str, float]:

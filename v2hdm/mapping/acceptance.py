@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from v2hdm.mapping.options import AcceptanceOptions
 from v2hdm.mapping.shapes import is_convex, signed_area
-from v2hdm.records import BoolArray, FloatArray
+from v2hdm.records import CORNERED_CLASSES, LANE_DASH, BoolArray, FloatArray
 
 IntArray = NDArray[np.int64]
 
@@ -24,12 +24,15 @@ LACKS_A_CORNER = "a corner was never seen twice"
 ODD_SHAPE = "not shaped like the others of its class"
 """Reasons that the shape of the class may mend."""
 
+PART_OF_SYMBOL = "part of an arrow or a chevron"
+
 MIN_EASY_VIEWS = 5
 """Easy views below which a share of detections says nothing."""
 
 MIN_SYMBOL_VIEWS = 2
 SYMBOL_SHARE = 0.34
-"""What so many images show as part of a symbol, and so many for each that shows it alone, is no marking."""
+"""What so many images show as part of a symbol, and so many for each that shows it alone, is no marking. It
+is, though, if its shape is that of others of its class, and not a dash: shafts are alike, too."""
 
 MIN_SHAPE_TOLERANCE_M = 0.05
 """Lengths that differ by less are the same, however short they are."""
@@ -85,16 +88,25 @@ def judge(candidates: Candidates, options: AcceptanceOptions) -> list[str | None
     )
     _refuse(verdict, ~is_convex(candidates.corners_map), "not a convex quadrilateral")
     _refuse(verdict, _uncertain(candidates, options), "its position is too uncertain")
-    if candidates.seen_as_symbol is not None:
-        limit = np.maximum(MIN_SYMBOL_VIEWS, SYMBOL_SHARE * candidates.sightings)
-        _refuse(verdict, candidates.seen_as_symbol >= limit, "part of an arrow or a chevron")
+    part_of_symbol = _seen_as_symbol(candidates)
+    shaft = candidates.kind == CORNERED_CLASSES.index(LANE_DASH)
+    _refuse(verdict, part_of_symbol & shaft, PART_OF_SYMBOL)
     typical, odd = _judge_shapes(candidates, verdict, options)
     _refuse(verdict, odd, ODD_SHAPE)
+    _refuse(verdict, part_of_symbol & ~typical, PART_OF_SYMBOL)
     _refuse(verdict, candidates.completed & ~typical, LACKS_A_CORNER)
     seldom = _seldom_detected(candidates, verdict, options) & ~typical
     _refuse(verdict, seldom, "found in too few of its images")
     _refuse(verdict, _covered(candidates, verdict), "lies on a better supported marking")
     return verdict
+
+
+def _seen_as_symbol(candidates: Candidates) -> BoolArray:
+    """Groups that often enough lie under what looks like an arrow or a chevron."""
+    if candidates.seen_as_symbol is None:
+        return np.zeros(len(candidates.kind), dtype=bool)
+    limit = np.maximum(MIN_SYMBOL_VIEWS, SYMBOL_SHARE * candidates.sightings)
+    return np.asarray(candidates.seen_as_symbol >= limit)
 
 
 def _refuse(verdict: list[str | None], refused: NDArray[np.bool_], reason: str) -> None:

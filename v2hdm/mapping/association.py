@@ -104,3 +104,15 @@ def fuse_groups(association: Association, located: Located, jitter_rad: float) -
         covariance_m2=spread[:-1].reshape(-1, 4, 2, 2),
         seen=seen.reshape(-1, 4).astype(np.int64),
     )
+
+
+def vague_corners(association: Association, located: Located) -> FloatArray:
+    """Median (G, 4, 2) of each group's corners, be they ones that may not be used as points; nan for none."""
+    corners = association.in_group_order(located.corners_map)
+    out = np.full((association.count, 4, 2), np.nan)
+    members = np.flatnonzero((association.group >= 0) & np.isfinite(corners).all(axis=(1, 2)))
+    members = members[np.argsort(association.group[members], kind="stable")]
+    groups, begins = np.unique(association.group[members], return_index=True)
+    for group, rows in zip(groups, np.split(members, begins[1:]), strict=True):
+        out[group] = np.median(corners[rows], axis=0)
+    return out

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from v2hdm.errors import MappingError
 from v2hdm.mapping.acceptance import LACKS_A_CORNER, ODD_SHAPE, Candidates, judge
-from v2hdm.mapping.association import fuse_groups
+from v2hdm.mapping.association import fuse_groups, vague_corners
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.completion import SolvedCorners, solved_corners, without_misplaced_corners
 from v2hdm.mapping.known_shape import with_known_shapes
@@ -18,6 +18,7 @@ from v2hdm.mapping.location import Rig, locate
 from v2hdm.mapping.merge import group_kinds
 from v2hdm.mapping.options import AcceptanceOptions
 from v2hdm.mapping.results import Exclusion
+from v2hdm.mapping.shape_prior import with_class_shapes
 from v2hdm.mapping.sightings import Sightings
 from v2hdm.mapping.symbols import images_with_symbol
 from v2hdm.mapping.views import Views, easy_views, project_ground
@@ -83,18 +84,21 @@ def conclude(
     doubtful = np.flatnonzero([reason in (ODD_SHAPE, LACKS_A_CORNER) for reason in verdict])
     if len(doubtful):
         accepted = np.flatnonzero([reason is None for reason in verdict])
-        fused = fuse_groups(final.association, locate(evidence.sightings, final.rig), jitter_rad)
-        solved = with_known_shapes(solved, fused, doubtful, candidates.kind, accepted, options)
+        located = locate(evidence.sightings, final.rig)
+        fused = fuse_groups(final.association, located, jitter_rad)
+        vague_map = vague_corners(final.association, located)
+        solved = with_known_shapes(solved, fused, vague_map, doubtful, candidates.kind, accepted, options)
         candidates = _candidates(evidence, solved)
         verdict = judge(candidates, options)
     accepted = np.flatnonzero([reason is None for reason in verdict])
     excluded = exclusions(candidates, verdict)
     if not len(accepted):
         raise MappingError(no_marking_message(excluded))
+    solved = with_class_shapes(solved, candidates.kind, accepted)
     markings = tuple(
         Marking(
             kind=CORNERED_CLASSES[candidates.kind[group]],
-            corners_map=candidates.corners_map[group],
+            corners_map=solved.corners_map[group],
             sightings=int(candidates.sightings[group]),
             covariance_m2=solved.covariance_m2[group],
         )

@@ -31,6 +31,9 @@ _MAX_MISS_SHARE = 0.08
 _LEAST_SEEN = 6
 """Sightings of the corners that a shape is laid on, all together: one image may err."""
 
+_MAX_VAGUE_SHARE = 0.35
+"""How far corners that may not be used as points may be off, as a share of the longer diagonal."""
+
 _SHAPE_SIGMA_M = 0.01
 """How much one painted marking differs from the next."""
 
@@ -47,6 +50,7 @@ class _Fit:
 def with_known_shapes(
     solved: SolvedCorners,
     fused: FusedGroups,
+    vague_map: FloatArray,
     doubtful: IntArray,
     kind: IntArray,
     accepted: IntArray,
@@ -57,13 +61,14 @@ def with_known_shapes(
     Args:
         solved: The corners so far.
         fused: Where every corner was seen, be it once.
+        vague_map: (G, 4, 2) about where every corner is, be it one that may not be used as a point.
         doubtful: (D,) groups that lack corners or are of an odd shape.
         kind: (G,) class of every group.
         accepted: (A,) groups that were accepted.
         options: When shapes agree.
 
     Returns:
-        The corners, with those groups placed of which three corners, or two that lie opposite, fit.
+        The corners, with those groups placed of which three or two corners fit.
     """
     corners, covariance = solved.corners_map.copy(), solved.covariance_m2.copy()
     completed = solved.completed.copy()
@@ -77,21 +82,24 @@ def with_known_shapes(
         if shape is None:
             continue
         sigma_m = np.sqrt(np.trace(fused.covariance_m2[group], axis1=1, axis2=2) / 2)
-        fit = fit_shape(shape, fused.corners_map[group], sigma_m, fused.seen[group])
+        fit = fit_shape(shape, fused.corners_map[group], sigma_m, fused.seen[group], vague_map[group])
         if fit is not None:
             corners[group], covariance[group] = fit.corners_map, fit.covariance
             completed[group] = True
     return SolvedCorners(corners, covariance, completed)
 
 
-def fit_shape(shape: FloatArray, seen_map: FloatArray, sigma_m: FloatArray, times: IntArray) -> _Fit | None:
+def fit_shape(
+    shape: FloatArray, seen_map: FloatArray, sigma_m: FloatArray, times: IntArray, vague_map: FloatArray
+) -> _Fit | None:
     """Lay a shape (4, 2) on corners (4, 2), nan if unseen, known to ``sigma_m`` (4,), seen ``times`` (4,).
 
-    Of four corners that were seen one may be wrong. None where no turn of the shape fits, or where two
-    turns that are not the same do.
+    Of four corners that were seen one may be wrong. ``vague_map`` (4, 2), about where the corners are, tells
+    one turn of the shape from another. None where no turn fits, or where two that are not the same do.
     """
     seen = np.flatnonzero(np.isfinite(seen_map).all(axis=1))
-    limit_m = max(_MAX_MISS_M, _MAX_MISS_SHARE * float(_diagonals(shape).max()))
+    longest_m = float(_diagonals(shape).max())
+    limit_m = max(_MAX_MISS_M, _MAX_MISS_SHARE * longest_m)
     for used in _subsets(seen):
         if times[used].sum() < _LEAST_SEEN:
             continue
@@ -100,6 +108,8 @@ def fit_shape(shape: FloatArray, seen_map: FloatArray, sigma_m: FloatArray, time
             for shift in range(4)
             if (fit := _rigid(np.roll(shape, -shift, axis=0), seen_map, sigma_m, used)).miss_m <= limit_m
         ]
+        if len(used) == 2:
+            fits = [fit for fit in fits if _is_near(fit, vague_map, _MAX_VAGUE_SHARE * longest_m)]
         if not fits:
             continue
         best = min(fits, key=lambda fit: fit.miss_m)
@@ -109,12 +119,10 @@ def fit_shape(shape: FloatArray, seen_map: FloatArray, sigma_m: FloatArray, time
 
 
 def _subsets(seen: IntArray) -> list[IntArray]:
-    """Which corners to fit to, most trusted first: all of them, three of four, two opposite ones."""
+    """Which corners to fit to, most trusted first: all of them, or three of four."""
     if len(seen) == 4:
         return [seen, *(np.delete(seen, left_out) for left_out in range(4))]
-    if len(seen) == 3 or (len(seen) == 2 and seen[1] - seen[0] == 2):
-        return [seen]
-    return []
+    return [seen] if len(seen) >= 2 else []
 
 
 def _rigid(shape: FloatArray, seen_map: FloatArray, sigma_m: FloatArray, used: IntArray) -> _Fit:
@@ -135,6 +143,12 @@ def _rigid(shape: FloatArray, seen_map: FloatArray, sigma_m: FloatArray, used: I
     covariance = flat @ np.linalg.inv(information) @ flat.T + _SHAPE_SIGMA_M**2 * np.eye(8)
     miss_m = float(np.linalg.norm(corners[used] - seen_map[used], axis=1).max())
     return _Fit(corners, covariance, miss_m)
+
+
+def _is_near(fit: _Fit, vague_map: FloatArray, limit_m: float) -> bool:
+    """Whether every corner of a fit is about where it was seen; corners that nobody saw speak against it."""
+    apart = np.linalg.norm(fit.corners_map - vague_map, axis=1)
+    return bool(np.isfinite(apart).all() and apart.max() <= limit_m)
 
 
 def _same(first: _Fit, second: _Fit, limit_m: float) -> bool:
