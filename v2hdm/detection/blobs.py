@@ -142,11 +142,12 @@ class _Hearsay:
 def _hearsay(
     sight: Sight, classes: Sequence[str], piece: np.ndarray, level: np.ndarray, count: int
 ) -> _Hearsay:
-    i, j = np.nonzero(piece)
-    own = piece[i, j] - 1
+    at = np.flatnonzero(piece.ravel())
+    own = piece.ravel()[at] - 1
     cells = np.bincount(own, minlength=count)
     share = 1 / np.maximum(cells, 1)
-    certainty = np.bincount(own, _sigmoid(level[i, j]), count) * share
+    certainty = np.bincount(own, _sigmoid(level.ravel()[at]), count) * share
+    i, j = np.divmod(at, piece.shape[1])
     probability = _class_probability(sight, i - 1, j - 1)
     score = np.stack([np.bincount(own, plane, count) for plane in probability]) * share
     group_of = np.array([_group_index(name) for name in classes])
@@ -158,15 +159,15 @@ def _hearsay(
 
 def _outlines(level: np.ndarray, piece: np.ndarray, count: int) -> list[FloatArray]:
     """Points (N, 2), (column, row), of each piece's outline: where the level falls to zero beside it."""
+    pieces, levels, columns = piece.ravel(), level.ravel(), piece.shape[1]
     points, owners = [], []
-    for axis in (0, 1):
-        first, second = (piece[:-1], piece[1:]) if axis == 0 else (piece[:, :-1], piece[:, 1:])
-        i, j = np.nonzero(first != second)
-        below, right = (i + 1, j) if axis == 0 else (i, j + 1)
-        here, there = level[i, j], level[below, right]
-        fraction = here / (here - there)
-        points.append(np.column_stack([j, i + fraction] if axis == 0 else [j + fraction, i]))
-        owners.append(np.maximum(first[i, j], second[i, j]))
+    # The frame is empty, so that the step from the end of one row to the start of the next crosses nothing.
+    for step in (columns, 1):
+        here = np.flatnonzero(pieces[:-step] != pieces[step:])
+        fraction = levels[here] / (levels[here] - levels[here + step])
+        i, j = np.divmod(here, columns)
+        points.append(np.column_stack([j, i + fraction] if step == columns else [j + fraction, i]))
+        owners.append(np.maximum(pieces[here], pieces[here + step]))
     owner = np.concatenate(owners)
     order = np.argsort(owner, kind="stable")
     ends = np.searchsorted(owner[order], np.arange(2, count + 1))

@@ -14,6 +14,7 @@ from v2hdm.detection.lanes import LanePaint, trace_lanes
 from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.plausible import ends_at_a_head, plausible_kind
+from v2hdm.detection.quad import is_convex
 from v2hdm.detection.sight import look
 from v2hdm.detection.starts import starting_corners
 from v2hdm.detection.stopwatch import lap
@@ -94,7 +95,7 @@ class Detector:
             lanes = trace_lanes(paint, view, self.options.lane_step_m, self.options.max_range_m)
             lanes += link_anchors(sight.anchors, view)
         with lap("corners"):
-            starts = [start for c in candidates if (start := self._start(c, view)) is not None]
+            starts = self._starts(candidates, view)
             foreground = Foreground(owner, info.paint_stride, view.top)
             markings = fit_markings(image_bgr, view, starts, foreground, self.options)
             markings += [symbol for c in candidates if (symbol := self._symbol(c, view)) is not None]
@@ -126,19 +127,22 @@ class Detector:
             candidates.append(_Candidate(blob, index, *found, outline, on_ground[index]))
         return candidates
 
-    def _start(self, candidate: _Candidate, view: CameraView) -> QuadStart | None:
-        """The quadrilateral to start the corner fit from, if the blob is one within range."""
-        if candidate.kind not in CORNERED_CLASSES:
-            return None
-        outline = candidate.outline_pinhole_px
-        start = starting_corners(candidate.kind, outline, candidate.outline_vehicle, view)
-        if start is None or start[1] < _LEAST_COVER:
-            return None
-        corners = start[0]
-        ground = view.ground(corners)
-        if not np.isfinite(ground).all() or view.range_m(ground.mean(axis=0)) > self.options.max_range_m:
-            return None
-        return QuadStart(candidate.kind, candidate.score, corners, candidate.index, outline)
+    def _starts(self, candidates: list[_Candidate], view: CameraView) -> list[QuadStart]:
+        """The quadrilaterals to start the corner fit from, of the blobs that are one within range."""
+        starts = []
+        for c in candidates:
+            if c.kind not in CORNERED_CLASSES:
+                continue
+            start = starting_corners(c.kind, c.outline_pinhole_px, c.outline_vehicle, view)
+            if start is not None and start[1] >= _LEAST_COVER:
+                starts.append(QuadStart(c.kind, c.score, start[0], c.index, c.outline_pinhole_px))
+        if not starts:
+            return []
+        corners = np.stack([start.corners_pinhole_px for start in starts])
+        ground = view.ground(corners.reshape(-1, 2)).reshape(corners.shape)
+        usable = is_convex(corners) & np.isfinite(ground).all(axis=(1, 2))
+        usable &= view.range_m(ground.mean(axis=1)) <= self.options.max_range_m
+        return [start for start, use in zip(starts, usable, strict=True) if use]
 
     def _symbol(self, candidate: _Candidate, view: CameraView) -> MarkingDetection | None:
         """A marking that has an outline but no four corners, within range."""

@@ -93,9 +93,11 @@ def ends_at_a_head(outline_vehicle: FloatArray, heads_vehicle: Sequence[FloatArr
     axis = axis / np.linalg.norm(axis)
     half_m, width_m = max(size) / 2, min(size)
     across = np.array([-axis[1], axis[0]])
+    reach_m = half_m + width_m + _HEAD_REACH_M
     for head in heads_vehicle:
-        offset = head[np.isfinite(head).all(axis=1)] - np.array(centre)
-        if len(offset) < 3:
+        offset = head - np.array(centre)
+        offset = offset[np.isfinite(offset[:, 0])]
+        if len(offset) < 3 or (np.abs(offset).min(axis=0) > reach_m).any():
             continue
         along, beside = np.abs(offset @ axis) - half_m, offset @ across
         begins = -_HEAD_OVERLAP_M < along.min() < _HEAD_REACH_M

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from v2hdm.detection.ground import apply_homography
-from v2hdm.detection.quad import is_convex, order_corners, quad_from_outline
+from v2hdm.detection.quad import order_corners, quad_from_outline
 from v2hdm.detection.view import CameraView
 from v2hdm.records import CROSSWALK_BAR, LANE_DASH, STOP_LINE, FloatArray
 
@@ -22,7 +22,8 @@ def starting_corners(
 
     Returns:
         The tighter of the quadrilateral around the hull and, for rectangles, the rectangle on the ground,
-        with the share of it that the hull fills; None where there is neither.
+        with the share of it that the hull fills; None where there is neither. It need not be convex where
+        a rectangle reaches behind the camera.
     """
     hull = cv2.convexHull((outline_pinhole_px - outline_pinhole_px[0]).astype(np.float32))
     candidates = [quad_from_outline(outline_pinhole_px)]
@@ -30,7 +31,7 @@ def starting_corners(
         candidates.append(_ground_rectangle(outline_vehicle, view))
     best: tuple[FloatArray, float] | None = None
     for corners in candidates:
-        if corners is None or not is_convex(corners):
+        if corners is None:
             continue
         share = cv2.contourArea(hull) / max(cv2.contourArea(corners.astype(np.float32)), 1e-6)
         if best is None or share > best[1]:
