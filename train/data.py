@@ -79,7 +79,9 @@ class RenderStream(IterableDataset[Pair]):
     def _render(self, index: int) -> TrainingSample:
         config = self.config
         difficulty = min(1.0, index / max(config.easy_samples, 1))
-        return training_sample(self.seed, index, config.render_width, config.render_height, difficulty)
+        return training_sample(
+            self.seed, index, config.render_width, config.render_height, difficulty, config.shadows_on_paint
+        )
 
     def _view(self, rng: np.random.Generator, sample: TrainingSample) -> Pair:
         crop = random_crop(rng, sample, self.config.width, self.config.height)

@@ -12,15 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.detection.lens import distort_points
-from v2hdm.records import FloatArray
+from v2hdm.records import CORNERED_CLASSES, FloatArray
 from v2hdm.simulate.render import Renderer
-from v2hdm.simulate.scene import Backdrop, Bgr, Dapple, Ground, Light, Scene, Shadow
+from v2hdm.simulate.scene import Backdrop, Bgr, Dapple, Ground, Light, Paint, Scene, Shadow
 from v2hdm.simulate.training_clutter import ground_marks, port_boxes, street_boxes
 from v2hdm.simulate.training_paint import Bend, RoadPaint, port_paint, random_brush, rectangle, street_paint
 from v2hdm.simulate.training_views import TrainingView, random_view
 
 # The renderer keeps one tile per fleck size, so sizes come from a short list.
 _NEAR_M = 0.3
+_CROSSED_M = 22.0
 _FLECK_SIZES_M = tuple(float(s) for s in np.geomspace(0.12, 2.5, 10))
 
 
@@ -40,7 +41,12 @@ class TrainingSample:
 
 
 def training_sample(
-    seed: int, index: int, width: int, height: int, difficulty: float = 1.0
+    seed: int,
+    index: int,
+    width: int,
+    height: int,
+    difficulty: float = 1.0,
+    shadows_on_paint: float = 0.0,
 ) -> TrainingSample:
     """Sample ``index`` of the endless, reproducible sequence that ``seed`` stands for.
 
@@ -50,9 +56,10 @@ def training_sample(
         width: Image width, px.
         height: Image height, px.
         difficulty: 0 for fresh paint in plain light, 1 for everything at its worst now and then.
+        shadows_on_paint: as in :func:`random_scene`.
     """
     rng = np.random.default_rng([seed, index])
-    scene, lanes = random_scene(rng, difficulty)
+    scene, lanes = random_scene(rng, difficulty, shadows_on_paint)
     view = random_view(rng, width, height)
     scene = _without_hidden_boxes(scene, view)
     rendered = Renderer(scene).render(view.info, view.cam_from_map, rng, view.optics, view.motion)
@@ -72,8 +79,16 @@ def image_points(view: TrainingView, points_map: FloatArray) -> FloatArray:
     return distort_points(view.info, pinhole[near])
 
 
-def random_scene(rng: np.random.Generator, difficulty: float = 1.0) -> tuple[Scene, list[FloatArray]]:
+def random_scene(
+    rng: np.random.Generator, difficulty: float = 1.0, shadows_on_paint: float = 0.0
+) -> tuple[Scene, list[FloatArray]]:
     """A port (two in five), a street (half) or unpainted ground, seen from the map's origin along +x.
+
+    Args:
+        rng: Where chance comes from.
+        difficulty: 0 for fresh paint in plain light, 1 for everything at its worst now and then.
+        shadows_on_paint: How many shadows more, on average, have an edge that crosses a marking. They change
+            nothing else of the scene.
 
     Returns:
         The scene, and the centre lines (N, 2, map) of its lanes' lines.
@@ -92,7 +107,7 @@ def random_scene(rng: np.random.Generator, difficulty: float = 1.0) -> tuple[Sce
         ground=_ground(rng, place == "port", difficulty),
         paints=tuple(road.paints),
         boxes=boxes,
-        shadows=_shadows(rng, difficulty),
+        shadows=_shadows(rng, difficulty) + _crossing_shadows(rng.spawn(1)[0], road.paints, shadows_on_paint),
         dapples=_dapples(rng, difficulty),
         light=_light(rng),
         backdrop=_backdrop(rng),
@@ -177,6 +192,26 @@ def _shadows(rng: np.random.Generator, difficulty: float) -> tuple[Shadow, ...]:
         polygon = rectangle(centre, rng.uniform(4, 60), wide, rng.uniform(0, np.pi))
         softness = float(np.exp(rng.uniform(np.log(0.02), np.log(0.6))))
         out.append(Shadow(polygon_map=polygon, transmission=float(rng.beta(1, 5)), softness_m=softness))
+    return tuple(out)
+
+
+def _crossing_shadows(rng: np.random.Generator, paints: list[Paint], mean: float) -> tuple[Shadow, ...]:
+    """Shadows laid so that an edge of each crosses a marking within sight, often nearly along its sides."""
+    near = [p for p in paints if p.kind in CORNERED_CLASSES and 1 < p.polygon_map[:, 0].mean() < _CROSSED_M]
+    count = int(rng.poisson(mean)) if near else 0
+    out = []
+    for number in rng.integers(len(near), size=count) if near else ():
+        polygon = near[int(number)].polygon_map
+        side = polygon[1] - polygon[0]
+        along = np.arctan2(side[1], side[0]) + rng.normal(0, 0.15)
+        yaw = float(along if rng.random() < 0.5 else rng.uniform(0, np.pi))
+        wide = float(rng.uniform(0.15, 0.8) if rng.random() < 0.5 else rng.uniform(1, 10))
+        across = np.array([-np.sin(yaw), np.cos(yaw)])
+        crossed = rng.dirichlet(np.ones(len(polygon))) @ polygon
+        centre = crossed + across * wide / 2 * rng.choice([-1.0, 1.0])
+        shape = rectangle(centre, float(rng.uniform(4, 40)), wide, yaw)
+        softness = float(np.exp(rng.uniform(np.log(0.02), np.log(0.3))))
+        out.append(Shadow(polygon_map=shape, transmission=float(rng.beta(1, 5)), softness_m=softness))
     return tuple(out)
 
 
