@@ -49,6 +49,10 @@ TOUCHING_PX = 2
 TOUCHED_SHARE = 0.05
 """Other paint touches a marking if it holds more than this share of a seam of so many px around it."""
 
+NEAREST_M = 0.3
+_FRAME_PX = np.array([[-1.0, -1.0], [2.0, -1.0], [2.0, 2.0], [-1.0, 2.0]]) * (WIDTH, HEIGHT)
+"""Markings are known to be there as far as they lie before the camera and about the image."""
+
 MIN_HEIGHT_PX = 4.0
 LANE_TOLERANCE_PX = 20.0
 LANE_MATCH = 0.85
@@ -100,11 +104,11 @@ def _markings(scene: Scene, view: TrainingView, rendered: Rendered) -> list[True
         if paint.kind not in CORNERED_CLASSES + OUTLINED_CLASSES:
             continue
         polygon = np.asarray(paint.polygon_map, dtype=np.float64)
+        polygon = _before_camera(polygon, view)
         cam = polygon @ view.cam_from_map[:3, :2].T + view.cam_from_map[:3, 3]
-        if cam[:, 2].min() < 0.3:
-            continue
         pinhole = (cam @ view.info.intrinsic.T)[:, :2] / cam[:, 2:]
-        if (np.abs(pinhole - [WIDTH / 2, HEIGHT / 2]) > [WIDTH, HEIGHT]).any():
+        pinhole = _clipped(pinhole, _FRAME_PX) if len(polygon) else pinhole
+        if len(pinhole) < 3:
             continue
         polygon_px = distort_points(view.info, pinhole)
         range_m = float(np.linalg.norm(polygon.mean(axis=0) - centre[:2]))
@@ -113,6 +117,12 @@ def _markings(scene: Scene, view: TrainingView, rendered: Rendered) -> list[True
         fair = whole and tall and range_m <= MAX_RANGE_M and paint.wear <= 0.4
         out.append(TrueMarking(paint.kind, polygon_px, range_m, fair and paint.kind in CORNERED_CLASSES))
     return out
+
+
+def _before_camera(polygon_map: FloatArray, view: TrainingView) -> FloatArray:
+    """The part of a ground polygon (N, 2) that lies before the camera."""
+    depth = polygon_map @ view.cam_from_map[2, :2] + view.cam_from_map[2, 3]
+    return _half(polygon_map, depth - NEAREST_M)
 
 
 def _seen_alone(polygon_px: FloatArray, label: int, rendered: Rendered) -> bool:
@@ -251,18 +261,23 @@ def _clipped(polygon: FloatArray, window: FloatArray) -> FloatArray:
     for start, end in zip(window, np.roll(window, -1, axis=0), strict=True):
         along = end - start
         depth = inwards * (along[0] * (polygon[:, 1] - start[1]) - along[1] * (polygon[:, 0] - start[0]))
-        kept: list[FloatArray] = []
-        for k in range(len(polygon)):
-            before = k - 1
-            if (depth[k] >= 0) != (depth[before] >= 0):
-                part = depth[before] / (depth[before] - depth[k])
-                kept.append(polygon[before] + part * (polygon[k] - polygon[before]))
-            if depth[k] >= 0:
-                kept.append(polygon[k])
-        if not kept:
-            return np.empty((0, 2))
-        polygon = np.array(kept)
+        polygon = _half(polygon, depth)
+        if not len(polygon):
+            break
     return polygon
+
+
+def _half(polygon: FloatArray, depth: FloatArray) -> FloatArray:
+    """The part of a polygon (N, 2) where ``depth`` (N,) of its vertices is positive."""
+    kept: list[FloatArray] = []
+    for k in range(len(polygon)):
+        before = k - 1
+        if (depth[k] >= 0) != (depth[before] >= 0):
+            part = depth[before] / (depth[before] - depth[k])
+            kept.append(polygon[before] + part * (polygon[k] - polygon[before]))
+        if depth[k] >= 0:
+            kept.append(polygon[k])
+    return np.array(kept).reshape(-1, 2)
 
 
 def average_precision(scored: list[tuple[float, bool]], truths: int) -> float:

@@ -103,3 +103,14 @@ def test_camera_rotations_are_rotations() -> None:
         rotation = random_view(np.random.default_rng(index), 64, 32).cam_from_map[:3, :3]
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(rotation) == pytest.approx(1)
+
+
+def test_shadows_laid_on_paint_change_the_light_and_nothing_else():
+    pairs = [
+        (training_sample(5, index, 160, 96), training_sample(5, index, 160, 96, shadows_on_paint=4.0))
+        for index in range(6)
+    ]
+    for plain, shaded in pairs:
+        np.testing.assert_array_equal(plain.labels, shaded.labels)
+        np.testing.assert_array_equal(plain.hidden, shaded.hidden)
+    assert any((plain.image != shaded.image).any() for plain, shaded in pairs)
