@@ -193,13 +193,15 @@ class LaneDetection:
 
     ``kind`` is one of :data:`LANE_CLASSES` for that of one piece of lane paint, or :data:`LANE_BOUNDARY` for
     a whole line. The whole lines of an image have an ``identity``: 1, 2, ... from the vehicle to the left,
-    -1, -2, ... to the right.
+    -1, -2, ... to the right. ``sigma_px`` (N,) is each point's standard deviation along its image row, None
+    where it is not known.
     """
 
     kind: str
     score: float
     points_px: FloatArray
     identity: int | None = None
+    sigma_px: FloatArray | None = None
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Row anchors: lines come out whole, apart, in order, and numbered from the vehicle outwards."""
+"""Row anchors and paint: lines come out whole, apart, in order, and numbered from the vehicle outwards."""
 
 import numpy as np
 import pytest
@@ -7,6 +7,7 @@ from tests.detection.pictures import make_camera, to_image
 from v2hdm.detection.anchors import link_anchors
 from v2hdm.detection.sight import AnchorRow
 from v2hdm.detection.view import CameraView
+from v2hdm.records import LANE_DASH, LaneDetection
 
 STRIDE = 8
 
@@ -32,6 +33,19 @@ def straight(view: CameraView, left_m: float, curvature: float = 0.0) -> np.ndar
     return to_image(view.camera, points)
 
 
+def painted(line_px: np.ndarray, view: CameraView, near_m: float, far_m: float) -> LaneDetection:
+    """The centre line of a line's paint (N, 2) between two distances, a point every half a metre."""
+    x = view.ground(view.undistort(line_px))[:, 0]
+    seen = (x >= near_m) & (x <= far_m) & view.inside(line_px, 0)
+    return LaneDetection(LANE_DASH, 0.9, line_px[seen][::2])
+
+
+def off_px(lane: LaneDetection, line_px: np.ndarray) -> np.ndarray:
+    """How far the points of a lane are from a true line along their rows."""
+    order = np.argsort(line_px[:, 1])
+    return np.interp(lane.points_px[:, 1], line_px[order, 1], line_px[order, 0]) - lane.points_px[:, 0]
+
+
 @pytest.fixture
 def view() -> CameraView:
     return CameraView(make_camera())
@@ -44,13 +58,11 @@ def test_every_line_is_found_where_it_is_and_numbered_outwards(view):
         2: straight(view, 5.0),
         -2: straight(view, -5.2),
     }
-    found = link_anchors(anchors_of(view, list(lines.values())), view)
+    paint = [painted(line, view, 5, 20) for line in lines.values()]
+    found = link_anchors(anchors_of(view, list(lines.values())), view, paint)
     assert sorted(lane.identity for lane in found) == [-2, -1, 1, 2]
     for lane in found:
-        true = lines[lane.identity]
-        order = np.argsort(true[:, 1])
-        u = np.interp(lane.points_px[:, 1], true[order, 1], true[order, 0])
-        assert np.abs(u - lane.points_px[:, 0]).max() < 0.05
+        assert np.abs(off_px(lane, lines[lane.identity])).max() < 0.05
         assert (np.diff(lane.points_px[:, 1]) < 0).all(), "from near to far"
         assert lane.score > 0.9
 
@@ -76,7 +88,8 @@ def test_the_gap_between_two_dashes_does_not_break_a_line(view):
     dashed = [row for row, x in zip(rows, ground[:, 0], strict=True) if not 6.0 < x < 9.0]
     assert len(rows) - len(dashed) > 5
     (lane,) = link_anchors(dashed, view)
-    assert len(lane.points_px) == len(dashed)
+    assert np.abs(np.diff(lane.points_px[:, 1])).max() < 10, "no gap is left"
+    assert np.abs(off_px(lane, line)).max() < 0.5
 
 
 def test_lines_that_run_side_by_side_are_not_joined_across_a_gap(view):
@@ -88,3 +101,55 @@ def test_lines_that_run_side_by_side_are_not_joined_across_a_gap(view):
         if part(row.v_px)
     ]
     assert len(link_anchors(rows, view)) == 2
+
+
+def test_a_dash_nearby_and_one_far_away_are_one_line_where_one_curve_holds_both(view):
+    line = straight(view, 1.6, 0.004)
+    rows = anchors_of(view, [line])
+    ground = view.ground(view.undistort(np.array([[row.u_px[0], row.v_px] for row in rows])))
+    two = [row for row, x in zip(rows, ground[:, 0], strict=True) if x < 6.0 or x > 22.0]
+    (lane,) = link_anchors(two, view)
+    assert np.abs(off_px(lane, line)).max() < 5
+
+
+def test_paint_alone_makes_a_line_that_runs_on_towards_the_vehicle(view):
+    line = straight(view, 1.0)
+    paint = [painted(line, view, 7, 10), painted(line, view, 13, 16)]
+    (lane,) = link_anchors([], view, paint)
+    assert lane.points_px[0, 1] > paint[0].points_px[0, 1] + 60
+    assert np.abs(off_px(lane, line)).max() < 1.0
+    assert lane.sigma_px[0] > 1.5 * lane.sigma_px.min(), "less is known where nothing was seen"
+
+
+def test_paint_across_the_view_is_no_line_of_a_lane(view):
+    across = to_image(view.camera, np.column_stack([np.full(40, 9.0), np.linspace(-3, 3, 40)]))
+    assert link_anchors([], view, [LaneDetection(LANE_DASH, 0.9, across)]) == []
+
+
+def test_crossings_too_unlikely_by_themselves_carry_a_known_line_on(view):
+    line = straight(view, 1.6)
+    rows = anchors_of(view, [line])
+    faint = [AnchorRow(r.v_px, r.u_px, r.odds - 5.0) if r.v_px < 200 else r for r in rows]
+    assert link_anchors([r for r in faint if r.odds[0] < 0], view) == []
+    (lane,) = link_anchors(faint, view)
+    assert lane.points_px[-1, 1] < 130
+
+
+def test_a_double_line_is_one_boundary_along_its_middle(view):
+    pair = [straight(view, 1.5), straight(view, 1.9)]
+    (lane,) = link_anchors(anchors_of(view, pair), view, [painted(line, view, 5, 15) for line in pair])
+    near = lane.points_px[:, 1] > 200
+    assert np.abs(off_px(lane, straight(view, 1.7))[near]).max() < 2
+
+
+def test_what_a_point_errs_by_is_within_its_stated_sigma(view):
+    rng = np.random.default_rng(5)
+    line = straight(view, 1.6)
+    normalised = []
+    for _ in range(40):
+        rows = anchors_of(view, [line])
+        noise = np.repeat(rng.normal(0, 0.45, len(rows) // 3 + 1), 3)
+        noisy = [AnchorRow(r.v_px, r.u_px + n, r.odds) for r, n in zip(rows, noise, strict=False)]
+        (lane,) = link_anchors(noisy, view)
+        normalised.append(np.abs(off_px(lane, line) / lane.sigma_px))
+    assert 0.2 < np.quantile(np.concatenate(normalised), 0.95) < 2

@@ -1,4 +1,4 @@
-"""Centre lines against truth."""
+"""Centre lines of lane paint against truth."""
 
 import numpy as np
 import pytest
@@ -7,15 +7,17 @@ from tests.detection.pictures import bar, brightness_model, diamond, make_camera
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.view import CameraView
+from v2hdm.records import LANE_CLASSES
 
 
 def lanes_of(tmp_path, shapes, kind="lane_line", lens="plumb_bob", **options):
-    """The camera and the lanes found, with their points on the ground."""
+    """Kind and points on the ground of the pieces of lane paint found."""
     camera = make_camera(lens)
     detector = Detector.load(brightness_model(tmp_path, kind), DetectorOptions(**options))
     _, lanes = detector.detect(picture(camera, shapes), camera)
     view = CameraView(camera)
-    return [(lane.kind, view.ground(view.undistort(lane.points_px))) for lane in lanes]
+    pieces = [lane for lane in lanes if lane.kind in LANE_CLASSES]
+    return [(lane.kind, view.ground(view.undistort(lane.points_px))) for lane in pieces]
 
 
 @pytest.mark.parametrize("lens", ["pinhole", "plumb_bob", "equidistant"])

@@ -1,54 +1,65 @@
-"""From crossings of row anchors to the lines of lanes: linked from row to row.
+"""From crossings of row anchors and pieces of lane paint to the whole lines of lanes.
 
-Rows are taken from near to far: near the vehicle lines are far apart, so that each is known by the time
-they run together.
+Crossings are linked from row to row into chains, near ones first: near the vehicle lines are far apart, so
+that each is known by the time they run together. Chains and the centre lines of paint that one curve explains
+are one line (:mod:`v2hdm.detection.lane_groups`), which then runs on through the gaps between its dashes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from v2hdm.detection.lane_curves import LEAST_BELOW_PX, Horizon
+from v2hdm.detection.lane_groups import NEIGHBOURS, IntArray, Line, LinePoints, find_lines
 from v2hdm.detection.sight import AnchorRow
 from v2hdm.detection.view import CameraView
 from v2hdm.records import LANE_BOUNDARY, FloatArray, LaneDetection
 
-_MIN_PIECE_POINTS = 3
-_MIN_POINTS = 6
-"""Lines seen on fewer row anchors are chance."""
+_MIN_CHAIN = 3
+_CHAIN_ODDS = 0.0
+"""Chains are made of crossings more likely than not; what is less likely may join a line that is known."""
 
-_MAX_GAP_M = 16.0
-_MAX_OFFSET_M = 0.3
-_MAX_TURN = 0.15
-"""Pieces of a line may be that far apart along the ground; beyond it, their offset and the angle (rad)
-between them, and per metre between them a sixth as much more, must be no larger than this."""
-
-_DIRECTION_M = 5.0
-_LEAST_LENGTH_M = 1.5
-"""Length of a piece's end that its direction is taken from, and the least that gives one."""
+_LEAST_LOG_ODDS = -0.75
 
 _MAX_GAP_PX = 40.0
 _SLOPE_POINTS = 6
-"""Over how many of its last points a line's direction is taken."""
+"""Over how many of its last points a chain's direction is taken."""
 
 _MAX_SLOPE = 4.5
 _GATE_PX = 12.0
 
+_SIGMA_PX = (0.4, 2.7)
+"""Crossings err by s + t / exp(log odds), in px of the resolution looked at; measured on renders."""
+
+_PAINT_SIGMA_PX = 1.0
+_LEAST_PAINT_LENGTH_M = 0.8
+_MAX_PAINT_SLOPE = 8.0
+"""Paint that runs flatter across the view, px along the horizon per px down, is on no curve of ours."""
+
+_STEP_PX = 8.0
+_SMOOTH_PX = 24.0
+_FREEDOM_M = 0.03
+"""A line is given every so many px; it follows its points within such a distance, and by so much."""
+
+_EXTENSION_SIGMA = 0.02
+"""Lines run on towards the vehicle while known within this share of the image's width."""
+
 
 @dataclass
 class _Chain:
-    """A line so far: image points and log odds, from near to far."""
+    """A line so far: rows and columns, px, and indices of its crossings, from near to far."""
 
     v_px: list[float] = field(default_factory=list)
     u_px: list[float] = field(default_factory=list)
-    odds: list[float] = field(default_factory=list)
+    index: list[int] = field(default_factory=list)
 
-    def add(self, v_px: float, u_px: float, odds: float) -> None:
+    def add(self, v_px: float, u_px: float, index: int) -> None:
         self.v_px.append(v_px)
         self.u_px.append(u_px)
-        self.odds.append(odds)
+        self.index.append(index)
 
     def expected(self, v_px: float) -> tuple[float, float]:
         """Where the line should cross a row farther on, px, and how far off it may be."""
@@ -61,111 +72,145 @@ class _Chain:
         return self.u_px[-1] + slope * ahead, _GATE_PX * young * (1 + 0.04 * (ahead - 8))
 
 
-@dataclass
-class _Piece:
-    """A chain with its points on the ground (N, 2), vehicle frame, near to far."""
+def link_anchors(
+    rows: Sequence[AnchorRow],
+    view: CameraView,
+    paint: Sequence[LaneDetection] = (),
+    paint_step_m: float = 0.5,
+) -> list[LaneDetection]:
+    """The whole lines of one image.
 
-    points_px: FloatArray
-    odds: FloatArray
-    ground: FloatArray
-
-    @property
-    def near_m(self) -> float:
-        """How far ahead it begins."""
-        return float(np.linalg.norm(self.ground[0]))
-
-    def direction(self, far_end: bool) -> FloatArray | None:
-        """Unit vector of one end, from near to far; None where the piece is too short to tell."""
-        end = self.ground[-1] if far_end else self.ground[0]
-        away = np.linalg.norm(self.ground - end, axis=1)
-        other = int(np.argmin(np.abs(away - min(_DIRECTION_M, float(away.max())))))
-        if away[other] < _LEAST_LENGTH_M:
-            return None
-        step = (end - self.ground[other]) * (1 if far_end else -1)
-        return np.asarray(step / np.linalg.norm(step))
-
-
-def link_anchors(rows: Sequence[AnchorRow], view: CameraView) -> list[LaneDetection]:
-    """The whole lines of one image, from its row anchors ``rows``, near to far."""
-    pieces = _joined(_pieces(_chains(rows), view))
-    found = [
-        LaneDetection(LANE_BOUNDARY, float((1 / (1 + np.exp(-piece.odds))).mean()), piece.points_px)
-        for piece in pieces
-        if len(piece.odds) >= _MIN_POINTS
-    ]
+    Args:
+        rows: Its row anchors, near to far; crossings unlikely by themselves help to follow a line.
+        view: Its camera.
+        paint: The centre lines of its lane paint, points ``paint_step_m`` apart.
+        paint_step_m: That distance.
+    """
+    horizon = Horizon(view)
+    points = _crossings(rows, view, horizon)
+    seen = points.below > LEAST_BELOW_PX
+    groups = [np.array(chain.index) for chain in _chains(rows)]
+    groups = [group[seen[group]] for group in groups]
+    groups = [group for group in groups if len(group) >= _MIN_CHAIN]
+    points, on_paint = _with_paint(points, paint, view, horizon)
+    lines = find_lines(points, groups + on_paint, horizon, paint_step_m, _LEAST_LOG_ODDS)
+    found = [lane for line in lines if (lane := _drawn(points, line, view, horizon)) is not None]
     return _identified(found, view)
 
 
-def _pieces(chains: Iterable[_Chain], view: CameraView) -> list[_Piece]:
-    """The chains with their points on the ground; what lies above the horizon is left out."""
+def _crossings(rows: Sequence[AnchorRow], view: CameraView, horizon: Horizon) -> LinePoints:
+    u = np.concatenate([np.empty(0), *(row.u_px for row in rows)])
+    v = np.repeat([row.v_px for row in rows], [len(row.u_px) for row in rows]) if rows else np.empty(0)
+    odds = np.concatenate([np.empty(0), *(row.odds for row in rows)])
+    # Rows so near are looked at in half the resolution.
+    scale = np.where(v >= (np.inf if view.fine_row is None else view.fine_row), 2.0, 1.0)
+    sigma_px = scale * (_SIGMA_PX[0] + _SIGMA_PX[1] * np.exp(-odds))
+    return LinePoints.of(view, horizon, np.column_stack([u, v]), odds, sigma_px)
+
+
+def _with_paint(
+    points: LinePoints, paint: Sequence[LaneDetection], view: CameraView, horizon: Horizon
+) -> tuple[LinePoints, list[IntArray]]:
+    """The points with those of pieces of paint after them, and which those are, piece by piece."""
     pieces = []
-    for chain in chains:
-        points_px = np.column_stack([chain.u_px, chain.v_px])
-        ground = view.ground(view.undistort(points_px))
-        below = np.isfinite(ground).all(axis=1)
-        if below.sum() >= _MIN_PIECE_POINTS:
-            pieces.append(_Piece(points_px[below], np.array(chain.odds)[below], ground[below]))
-    return sorted(pieces, key=lambda piece: piece.near_m)
+    for lane in paint:
+        ends_px = view.undistort(lane.points_px[[0, -1]])
+        ends = view.ground(ends_px)
+        along, below = np.abs(np.diff(horizon.coordinates(ends_px)))[:, 0]
+        long = np.linalg.norm(ends[1] - ends[0]) >= _LEAST_PAINT_LENGTH_M  # false where it is nan
+        if long and along <= _MAX_PAINT_SLOPE * below:
+            pieces.append(lane)
+    if not pieces:
+        return points, []
+    length = [len(lane.points_px) for lane in pieces]
+    odds = np.repeat([_logit(lane.score) for lane in pieces], length)
+    points_px = np.concatenate([lane.points_px for lane in pieces])
+    painted = LinePoints.of(view, horizon, points_px, odds, np.full(len(odds), _PAINT_SIGMA_PX))
+    painted = replace(painted, is_paint=np.ones(len(odds), dtype=np.bool_))
+    ends_at = len(points.odds) + np.cumsum(length)
+    groups = [np.arange(end - n, end) for end, n in zip(ends_at, length, strict=True)]
+    both = {name: np.concatenate([getattr(points, name), getattr(painted, name)]) for name in vars(points)}
+    return LinePoints(**both), groups
 
 
-def _joined(pieces: list[_Piece]) -> list[_Piece]:
-    """Pieces, near ones first, each joined to the line that it continues across a gap."""
-    lines: list[_Piece] = []
-    for piece in pieces:
-        misfits = [_misfit(line, piece) for line in lines]
-        best = int(np.argmin(misfits)) if misfits else -1
-        if best < 0 or misfits[best] > 1:
-            lines.append(piece)
-            continue
-        line = lines[best]
-        lines[best] = _Piece(
-            np.concatenate([line.points_px, piece.points_px]),
-            np.concatenate([line.odds, piece.odds]),
-            np.concatenate([line.ground, piece.ground]),
-        )
-    return lines
+def _logit(probability: float) -> float:
+    clipped = min(max(probability, 1e-3), 1 - 1e-3)
+    return float(np.log(clipped / (1 - clipped)))
 
 
-def _misfit(line: _Piece, piece: _Piece) -> float:
-    """How badly a piece continues a line: up to 1 it does."""
-    gap = piece.ground[0] - line.ground[-1]
-    gap_m = float(np.linalg.norm(gap))
-    ends = [d for d in (line.direction(far_end=True), piece.direction(far_end=False)) if d is not None]
-    if not ends or gap_m > _MAX_GAP_M or min(float(gap @ d) for d in ends) <= 0:
-        return np.inf
-    slack = 1 + gap_m / 6
-    across_m = min(abs(float(d[0] * gap[1] - d[1] * gap[0])) for d in ends)
-    turn = float(np.arccos(np.clip(ends[0] @ ends[-1], -1, 1)))
-    return max(across_m / (_MAX_OFFSET_M * slack), turn / (_MAX_TURN * slack))
+def _drawn(points: LinePoints, line: Line, view: CameraView, horizon: Horizon) -> LaneDetection | None:
+    """A line's points in the image, near to far, with their standard deviations."""
+    below = points.below[line.members]
+    lowest = horizon.coordinates(view.undistort(_lower_corners(view)))[1].max()
+    at = np.arange(below.min(), max(lowest, below.max()) + _STEP_PX, _STEP_PX)[::-1]
+    along, sigma = _followed(points, line, horizon, at)
+    points_px = view.distort(horizon.pinhole_px(along, at))
+    known = (at <= below.max()) | (sigma < _EXTENSION_SIGMA * view.info.width)
+    kept = known & view.inside(points_px, -_STEP_PX)
+    if kept.sum() < 2:
+        return None
+    score = float(1 / (1 + np.exp(-line.log_odds)))
+    return LaneDetection(LANE_BOUNDARY, score, points_px[kept], sigma_px=sigma[kept])
+
+
+def _lower_corners(view: CameraView) -> FloatArray:
+    return np.array([[0.0, view.info.height - 1.0], [view.info.width - 1.0, view.info.height - 1.0]])
+
+
+def _followed(
+    points: LinePoints, line: Line, horizon: Horizon, at: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Where a line is along the horizon and its standard deviation (N,), px, ``at`` (N,) px below it.
+
+    The mean of the points around, weighted, and of the curve, as good as lines follow curves.
+    """
+    curve_sigma = line.curve.sigma(at)
+    freedom = _FREEDOM_M * horizon.px_per_m * at
+    along = line.curve.along(at)
+    if line.double:
+        return along, np.hypot(curve_sigma, freedom)
+    members = line.certain
+    off = points.along[members] - line.curve.along(points.below[members])
+    near = np.maximum(1 - np.abs(at[:, None] - points.below[members]) / _SMOOTH_PX, 0)
+    weight = near / (NEIGHBOURS * points.sigma_px[members] ** 2)
+    own = 1 / (curve_sigma**2 + freedom**2)
+    total = weight.sum(axis=1) + own
+    return along + weight @ off / total, np.sqrt(1 / total)
 
 
 def _chains(rows: Sequence[AnchorRow]) -> list[_Chain]:
     open_chains: list[_Chain] = []
     done: list[_Chain] = []
+    before = 0
     for row in rows:
         done += [chain for chain in open_chains if chain.v_px[-1] - row.v_px > _MAX_GAP_PX]
         open_chains = [chain for chain in open_chains if chain.v_px[-1] - row.v_px <= _MAX_GAP_PX]
-        open_chains += _extend(open_chains, row)
-    return [chain for chain in done + open_chains if len(chain.v_px) >= _MIN_PIECE_POINTS]
+        open_chains += _extend(open_chains, row, before)
+        before += len(row.u_px)
+    return [chain for chain in done + open_chains if len(chain.v_px) >= _MIN_CHAIN]
 
 
-def _extend(chains: list[_Chain], row: AnchorRow) -> list[_Chain]:
-    """Give each crossing of a row to the chain that it suits best; what is left over starts chains."""
-    columns, odds = row.u_px.tolist(), row.odds.tolist()
+def _extend(chains: list[_Chain], row: AnchorRow, before: int) -> list[_Chain]:
+    """Give each likely crossing of a row to the chain that it suits best; what is left over starts chains.
+
+    ``before`` is the number of crossings of the rows before this one.
+    """
+    columns = row.u_px.tolist()
+    likely = np.flatnonzero(row.odds > _CHAIN_ODDS).tolist()
     pairs = []
     for c, chain in enumerate(chains):
         expected, gate = chain.expected(row.v_px)
         pairs += [
-            (abs(u - expected) / gate, c, p) for p, u in enumerate(columns) if abs(u - expected) <= gate
+            (abs(columns[p] - expected) / gate, c, p) for p in likely if abs(columns[p] - expected) <= gate
         ]
     taken: set[int] = set()
     extended: set[int] = set()
     for _, c, p in sorted(pairs):
         if c not in extended and p not in taken:
-            chains[c].add(row.v_px, columns[p], odds[p])
+            chains[c].add(row.v_px, columns[p], before + p)
             extended.add(c)
             taken.add(p)
-    return [_Chain([row.v_px], [columns[p]], [odds[p]]) for p in range(len(columns)) if p not in taken]
+    return [_Chain([row.v_px], [columns[p]], [before + p]) for p in likely if p not in taken]
 
 
 def _identified(lanes: list[LaneDetection], view: CameraView) -> list[LaneDetection]:
@@ -177,9 +222,7 @@ def _identified(lanes: list[LaneDetection], view: CameraView) -> list[LaneDetect
     identity = {int(k): n for n, k in enumerate(left, start=1)} | {
         int(k): -n for n, k in enumerate(right, start=1)
     }
-    return [
-        LaneDetection(lane.kind, lane.score, lane.points_px, identity.get(k)) for k, lane in enumerate(lanes)
-    ]
+    return [replace(lane, identity=identity.get(k)) for k, lane in enumerate(lanes)]
 
 
 def _lateral_m(points_px: FloatArray, view: CameraView) -> float:

@@ -93,7 +93,7 @@ class Detector:
         with lap("lanes"):
             paint = [LanePaint(c.blob, c.kind, c.score) for c in candidates if c.kind in LANE_CLASSES]
             lanes = trace_lanes(paint, view, self.options.lane_step_m, self.options.max_range_m)
-            lanes += link_anchors(sight.anchors, view)
+            lanes += link_anchors(sight.anchors, view, lanes, self.options.lane_step_m)
         with lap("corners"):
             starts = self._starts(candidates, view)
             foreground = Foreground(owner, info.paint_stride, view.top)

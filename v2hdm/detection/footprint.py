@@ -44,9 +44,12 @@ class GroundPoints:
             jacobian @ covariance_px @ jacobian.T + stacked @ self.mounting_covariance @ stacked.T
         )
 
-    def single_covariances(self, sigma_px: float) -> FloatArray:
-        """Covariance (N, 2, 2), m^2, of each point, its pixel being off by ``sigma_px`` in u and v alike."""
-        covariance = sigma_px**2 * self.by_px @ np.swapaxes(self.by_px, 1, 2)
+    def single_covariances(self, sigma_px: float | FloatArray) -> FloatArray:
+        """Covariance (N, 2, 2), m^2, of each point, its pixel being off by ``sigma_px`` in u and v alike.
+
+        ``sigma_px`` is one for all or one for each, (N,).
+        """
+        covariance = np.square(sigma_px)[..., None, None] * self.by_px @ np.swapaxes(self.by_px, 1, 2)
         return np.asarray(
             covariance + self.by_mounting @ self.mounting_covariance @ np.swapaxes(self.by_mounting, 1, 2)
         )

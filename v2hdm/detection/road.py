@@ -27,7 +27,7 @@ from v2hdm.hdmap import read_calibration
 from v2hdm.records import Camera, FloatArray, LaneDetection, MarkingDetection
 
 LANE_SIGMA_PX = 1.0
-"""What a point of a lane's line is taken to err by, since the detector gives it no covariance of its own."""
+"""What a point of a lane's paint is taken to err by; those of whole lines have a sigma of their own."""
 
 
 @dataclass(frozen=True)
@@ -150,4 +150,5 @@ def _marking(image: MarkingDetection, ground: GroundPoints) -> RoadMarking:
 
 
 def _lane(image: LaneDetection, ground: GroundPoints) -> RoadLane:
-    return RoadLane(image, ground.points_vehicle, ground.single_covariances(LANE_SIGMA_PX))
+    sigma_px = LANE_SIGMA_PX if image.sigma_px is None else image.sigma_px
+    return RoadLane(image, ground.points_vehicle, ground.single_covariances(sigma_px))

@@ -22,6 +22,9 @@ _OVERLAP_PX = 64
 _GRID_PX = 16
 """Where the parts are joined is on the grid of all outputs; the network's own multiple may be larger."""
 
+_LEAST_LOG_ODDS = -3.0
+"""Crossings of lanes' lines less likely than this are left out; unlikely ones help to follow a known line."""
+
 
 @dataclass(frozen=True)
 class AnchorRow:
@@ -93,7 +96,7 @@ def _anchor_rows(lanes: np.ndarray, network: Network, top_px: int, scale: int) -
     """Peaks along each row of ``lanes`` (2, h, w), near to far, of an image reduced by ``scale``."""
     odds, offset = lanes
     padded = np.pad(odds, ((0, 0), (1, 1)), constant_values=-np.inf)
-    i, j = np.nonzero((odds > 0) & (odds >= padded[:, :-2]) & (odds > padded[:, 2:]))
+    i, j = np.nonzero((odds > _LEAST_LOG_ODDS) & (odds >= padded[:, :-2]) & (odds > padded[:, 2:]))
     stride = network.info.lane_stride
     u = stride * (j + np.clip(offset[i, j], -0.5, 0.5) + 0.5) - 0.5
     v = stride * np.arange(len(odds)) + (stride - 1) / 2
