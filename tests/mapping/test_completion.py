@@ -41,6 +41,7 @@ def test_the_implied_corner_has_three_times_the_variance_of_independent_ones(mis
     corners[0, missing] = np.nan
     solution = SimpleNamespace(
         chi2_per_dof=0.8,
+        observation_factor=0.8,
         corner_covariance=lambda groups: np.tile(1e-4 * np.eye(2 * groups.shape[1]), (len(groups), 1, 1)),
     )
     bundle = SimpleNamespace(corner_index=index, corners_map=corners, solution=solution)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from v2hdm.mapping.completion import SolvedCorners
-from v2hdm.mapping.shape_prior import common_shape, fuse, with_class_shapes
+from v2hdm.mapping.shape_prior import common_shape, fuse, with_class_shapes, without_guessed_lengths
 
 DIAMOND = np.array([[0.6, 0.0], [0.0, 0.35], [-0.6, 0.0], [0.0, -0.35]])
 DASH = np.array([[1.0, 0.06], [-1.0, 0.06], [-1.0, -0.06], [1.0, -0.06]])
@@ -103,3 +103,18 @@ def test_what_fits_no_hypothesis_is_left_where_it_was_and_said_to_be_uncertain()
     fused, covariance = fuse(odd, solved.covariance_m2[0], shape)
     np.testing.assert_array_equal(fused, odd)
     assert np.trace(covariance) > 10 * np.trace(solved.covariance_m2[0])
+
+
+@pytest.mark.parametrize("lengths", [(1.0,), (1.0, 0.8)])
+def test_one_end_says_where_the_other_is_only_in_a_class_of_one_length(lengths: tuple[float, ...]) -> None:
+    rng = np.random.default_rng(6)
+    true = np.concatenate([painted(DASH * [lengths[k % len(lengths)], 1.0], 1, rng) for k in range(20)])
+    placed = seen(true, rng, 0.005)
+    before = SolvedCorners(placed.corners_map.copy(), placed.covariance_m2, placed.completed)
+    one_end = np.argsort(np.linalg.norm(true[0] - true[0, 0], axis=1))[:2]
+    before.corners_map[0] = np.nan
+    seen_map = placed.corners_map.copy()
+    seen_map[0, np.setdiff1d(np.arange(4), one_end)] = np.nan
+    kept = without_guessed_lengths(before, placed, seen_map, np.zeros(20, dtype=np.int64), np.arange(1, 20))
+    assert np.isfinite(kept.corners_map[0]).all() == (len(lengths) == 1)
+    np.testing.assert_array_equal(kept.corners_map[1:], placed.corners_map[1:])

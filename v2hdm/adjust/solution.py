@@ -66,6 +66,8 @@ class Solution:
         evaluations: of cost and gradient, all stages together.
         gap: predicted decrease still possible, as a fraction of the cost (the certificate).
         chi2_per_dof: about 1 where the noise model is right; outliers are left out.
+        observation_factor: how many times as large as stated the observations' variances are, if the priors'
+            are right; outliers are left out.
         time_s: wall time.
         covariance: of everything estimated, on demand.
     """
@@ -83,6 +85,7 @@ class Solution:
     evaluations: int
     gap: float
     chi2_per_dof: float
+    observation_factor: float
     time_s: float
     covariance: Covariance = field(repr=False)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -93,6 +94,7 @@ def _report(
     residual_px = depth_one.T.cpu().numpy() * problem.intrinsic[camera, :2]
     map_from_vehicle = inverse(arrays.vehicle_from_map) @ exp(frame_tangent(arrays, estimate.frame_state))
 
+    variance = _variance_factors(arrays, terms, squared)
     behind = _unsorted((view.point[2] <= NEAR_M).double(), arrays.order) > 0
     mahalanobis2 = _unsorted(squared, arrays.order)
     return Solution(
@@ -108,7 +110,8 @@ def _report(
         cost_terms={name: float(value) for name, value in terms.items()},
         evaluations=descent.evaluations + spent,
         gap=descent.gap,
-        chi2_per_dof=_chi2_per_dof(arrays, terms, squared),
+        chi2_per_dof=variance.all,
+        observation_factor=variance.observations,
         time_s=time.perf_counter() - began,
         covariance=Covariance(descent.whitening),
     )
@@ -136,15 +139,31 @@ def _status(descent: Descent, options: SolveOptions, behind: bool) -> Status:
     return Status.EVALUATIONS_EXHAUSTED if descent.progressing else Status.STALLED
 
 
-def _chi2_per_dof(arrays: Arrays, terms: dict[str, Tensor], squared: Tensor) -> float:
-    """Chi-square of good observations and priors per degree of freedom."""
+@dataclass(frozen=True)
+class _VarianceFactors:
+    """Variances as multiples of the stated ones: of everything, and of the observations alone."""
+
+    all: float
+    observations: float
+
+
+def _variance_factors(arrays: Arrays, terms: dict[str, Tensor], squared: Tensor) -> _VarianceFactors:
+    """Chi-square per degree of freedom, of good observations and priors together and of the former.
+
+    What the priors have left of their own degrees of freedom is what the observations have taken of them:
+    the expected chi-square of a prior is the one less the other (Foerstner and Wrobel, Photogrammetric
+    Computer Vision, section 4.2.4, on variance components).
+    """
     # The median tells the noise's own scale, whatever the outliers.
     scale = max(1.0, float(squared.median()) / MEDIAN_SQUARED)
     good = squared[squared <= _OUTLIER_SQUARED * scale]
-    chi2 = good.sum() / _TRIMMED_MEAN + 2 * sum(
-        value for name, value in terms.items() if name != "observations"
-    )
+    of_observations = float(good.sum()) / _TRIMMED_MEAN
+    of_priors = 2 * sum(float(value) for name, value in terms.items() if name != "observations")
     centres = int((arrays.centre_information_root > 0).sum())
     surveyed = int((arrays.control_information > 0).sum())
     free = 2 * (arrays.corner_count - surveyed) + 6 * arrays.camera_count - centres
-    return float(chi2) / max(2 * len(good) - free, 1)
+    redundancy = 2 * len(good) - free
+    return _VarianceFactors(
+        all=(of_observations + of_priors) / max(redundancy, 1),
+        observations=of_observations / max(redundancy - of_priors, 1),
+    )

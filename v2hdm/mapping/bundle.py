@@ -46,12 +46,13 @@ CLOCK_SIGMA_S = 0.01
 class Model:
     """What a solve estimates and how much noise it reckons with beyond that of the corners.
 
-    ``floor_px`` is added to every corner in quadrature, px.
+    ``floor_px`` is added to every corner in quadrature, px; the sum is multiplied by ``variance_factor``.
     """
 
     pose_sigma: PoseSigma
     floor_px: float
     solver: SolveOptions
+    variance_factor: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -89,13 +90,16 @@ class Bundle:
         return np.isin(self.solution.verdict, (Verdict.ACCEPTED, Verdict.UNCONFIRMED))
 
 
-def full_model(pose_noise: PoseNoise, options: MappingOptions, poses: str) -> Model:
+def full_model(
+    pose_noise: PoseNoise, options: MappingOptions, poses: str, variance_factor: float = 1.0
+) -> Model:
     """Every frame has its own deviation from its recorded pose, in what the pose model ``poses`` says.
 
     Args:
         pose_noise: How far the recorded poses are off.
         options: Loss and device.
         poses: One of :data:`v2hdm.adjust.MODELS`.
+        variance_factor: How many times as large as stated the variances of corners are.
     """
     pose_sigma = PoseSigma(
         position_m=pose_noise.position_m,
@@ -109,7 +113,7 @@ def full_model(pose_noise: PoseNoise, options: MappingOptions, poses: str) -> Mo
     solver = SolveOptions(
         loss=options.loss, loss_scale=options.loss_scale, coarse=False, device=options.device
     )
-    return Model(pose_sigma, options.model_floor_px, with_model(solver, MODELS[poses]))
+    return Model(pose_sigma, options.model_floor_px, with_model(solver, MODELS[poses]), variance_factor)
 
 
 def coarse_model(rig: Rig, pose_noise: PoseNoise, options: MappingOptions) -> Model:
@@ -158,12 +162,13 @@ def solve_bundle(
         *np.unique(sightings.frame[row], return_inverse=True),
     )
     own_corner = association.corner_order()[row, corner]
+    covariance_px = sightings.covariance_px[row, own_corner] + model.floor_px**2 * np.eye(2)
     observations = Observations(
         camera=used.camera.astype(np.int64),
         frame=used.frame.astype(np.int64),
         corner=corner_index[group, corner],
         pinhole_px=sightings.corners_pinhole_px[row, own_corner],
-        covariance_px=sightings.covariance_px[row, own_corner] + model.floor_px**2 * np.eye(2),
+        covariance_px=model.variance_factor * covariance_px,
     )
     names = [sightings.cameras[c] for c in used.cameras]
     problem = _problem(sightings, rig, used, [cameras[name] for name in names], observations, model)

@@ -18,7 +18,7 @@ from v2hdm.mapping.location import Rig, locate
 from v2hdm.mapping.merge import group_kinds
 from v2hdm.mapping.options import AcceptanceOptions
 from v2hdm.mapping.results import Exclusion
-from v2hdm.mapping.shape_prior import with_class_shapes
+from v2hdm.mapping.shape_prior import with_class_shapes, without_guessed_lengths
 from v2hdm.mapping.sightings import Sightings
 from v2hdm.mapping.symbols import images_with_symbol
 from v2hdm.mapping.views import Views, easy_views, project_ground
@@ -87,7 +87,8 @@ def conclude(
         located = locate(evidence.sightings, final.rig)
         fused = fuse_groups(final.association, located, jitter_rad)
         vague_map = vague_corners(final.association, located)
-        solved = with_known_shapes(solved, fused, vague_map, doubtful, candidates.kind, accepted, options)
+        placed = with_known_shapes(solved, fused, vague_map, doubtful, candidates.kind, accepted, options)
+        solved = without_guessed_lengths(solved, placed, fused.corners_map, candidates.kind, accepted)
         candidates = _candidates(evidence, solved)
         verdict = judge(candidates, options)
     accepted = np.flatnonzero([reason is None for reason in verdict])

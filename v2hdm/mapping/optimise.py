@@ -42,6 +42,13 @@ STEEP_SINE = 0.15
 """Sine of a ray's depression from which the coarse stage uses it (unless most rays are flatter)."""
 
 
+_LEAST_OBSERVATIONS = 200
+"""Of fewer, the residuals cannot tell how large their variance is."""
+
+_VARIANCE_FACTORS = (0.05, 20.0)
+"""Between these a detector's own statement may be corrected."""
+
+
 class Optimiser:
     """Takes one set of cameras through association and solving."""
 
@@ -59,6 +66,7 @@ class Optimiser:
         self._pose_noise = pose_noise
         self._options = options
         self._pose_model = SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
+        self._variance_factor = 1.0
         self.camera_names = sightings.cameras
         self.initial_rig = initial_rig(self._cameras, sightings.map_from_vehicle)
 
@@ -78,11 +86,13 @@ class Optimiser:
             if same_groups(association, bundle.association):
                 break
             bundle = self._solve(association, self._locate(bundle.rig).valid, bundle.rig)
+            self._reweigh(bundle)
         usable = self._locate(bundle.rig).valid
         settled = settle_corner_order(bundle, self._sightings, usable)
         if settled is not bundle.association:
             tell("joint solve with settled corners")
             bundle = self._solve(settled, usable, bundle.rig)
+            self._reweigh(bundle)
         if self._options.pose_model == AUTO:
             tell("choice of the pose model")
             self._pose_model = self._choose_pose_model(bundle)
@@ -157,12 +167,22 @@ class Optimiser:
             self._cameras,
             coarse_model(rig, self._pose_noise, self._options)
             if coarse
-            else full_model(self._pose_noise, self._options, self._pose_model),
+            else full_model(self._pose_noise, self._options, self._pose_model, self._variance_factor),
         )
         status = bundle.solution.status
         if status is Status.UNDETERMINED or not np.isfinite(bundle.solution.corners_map).all():
             raise MappingError(f"the joint optimisation failed ({status.value}): {status.advice}")
         return bundle
+
+    def _reweigh(self, bundle: Bundle) -> None:
+        """Take the observations for as good as their residuals under ``bundle`` say.
+
+        How well the poses are known is on the receiver's data sheet; how well corners are found in this
+        light, on this paint, under what is left of the lens's distortion, only the drive itself can tell.
+        """
+        if len(bundle.row) >= _LEAST_OBSERVATIONS:
+            factor = self._variance_factor * bundle.solution.observation_factor
+            self._variance_factor = float(np.clip(factor, *_VARIANCE_FACTORS))
 
     def _choose_pose_model(self, bundle: Bundle) -> str:
         """The name of the model that predicts held-out observations best, from where ``bundle`` ended."""

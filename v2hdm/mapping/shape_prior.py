@@ -39,8 +39,14 @@ _SHAPE_SIGMA_M = 0.01
 _GATE_PROBABILITY = 1e-3
 """Share of sound markings that a hypothesis on the shape may turn away."""
 
+_AFTERTHOUGHT_PROBABILITY = 0.05
+"""The same for a hypothesis that is made up because the marking contradicts its class."""
+
 _ELONGATED = 2.0
 """Paint this many times as long as wide is rolled by the metre: its width is common, its length its own."""
+
+_ONE_LENGTH_SHARE = 0.95
+"""A class is of one length if this share of its markings has it."""
 
 _UNKNOWN_M2 = 1e4
 """Variance of what a hypothesis leaves open, m^2."""
@@ -83,6 +89,45 @@ def with_class_shapes(solved: SolvedCorners, kind: IntArray, accepted: IntArray)
     return replace(solved, corners_map=corners, covariance_m2=covariance)
 
 
+def without_guessed_lengths(
+    before: SolvedCorners, placed: SolvedCorners, seen_map: FloatArray, kind: IntArray, accepted: IntArray
+) -> SolvedCorners:
+    """Take back the placing of groups by the shape of their class where it guesses how long they are.
+
+    Paint that is rolled by the metre comes in lengths of its own, so that one end of it says where the other
+    is only if the whole class is of one length.
+
+    Args:
+        before: the corners before some groups were placed by their class's shape.
+        placed: the corners after.
+        seen_map: (G, 4, 2) where each corner was seen, nan where it was not.
+        kind: (G,) class of every group.
+        accepted: (A,) the groups that give their classes their shapes.
+    """
+    corners, covariance = placed.corners_map.copy(), placed.covariance_m2.copy()
+    completed = placed.completed.copy()
+    moved = ~np.isclose(before.corners_map, placed.corners_map, equal_nan=True).all(axis=(1, 2))
+    for group in np.flatnonzero(moved):
+        stretch = Shape(_parallelogram(corners[group]), _SHAPE_SIGMA_M).stretch
+        peers = before.corners_map[accepted[kind[accepted] == kind[group]]]
+        if stretch is None or _is_of_one_length(peers):
+            continue
+        off = np.linalg.norm(seen_map[group] - corners[group], axis=1) <= _MAX_MISS_M
+        far = stretch.reshape(4, 2) @ (corners[group][0] - corners[group].mean(axis=0)) > 0
+        if not (off[far].any() and off[~far].any()):
+            corners[group], covariance[group] = before.corners_map[group], before.covariance_m2[group]
+            completed[group] = before.completed[group]
+    return SolvedCorners(corners, covariance, completed)
+
+
+def _is_of_one_length(corners: FloatArray) -> bool:
+    """Whether as good as all markings (N, 4, 2) are as long as the typical one."""
+    length = characteristic_lengths(corners)[:, -1]
+    typical = np.median(length)
+    alike = np.abs(length - typical) <= max(_MAX_MISS_M, _MAX_MISS_SHARE * float(typical))
+    return bool(np.mean(alike) >= _ONE_LENGTH_SHARE)
+
+
 def common_shape(corners: FloatArray, covariance: FloatArray) -> Shape | None:
     """The shape that most of a class's markings (N, 4, 2) of covariances (N, 8, 8) have, if there is one."""
     if len(corners) < _LEAST_MEMBERS:
@@ -110,7 +155,7 @@ def fuse(corners: FloatArray, covariance: FloatArray, shape: Shape | None) -> tu
     doubts = [] if shape is None else _doubts(corners, covariance, shape)
     best = max(doubts, key=lambda doubt: doubt.plausibility, default=update)
     # What contradicts itself for no reason that can be told is known as badly as it contradicts itself.
-    return best.result if best.plausibility > _GATE_PROBABILITY else (corners, excess * covariance)
+    return best.result if best.plausibility > _AFTERTHOUGHT_PROBABILITY else (corners, excess * covariance)
 
 
 @dataclass(frozen=True)
