@@ -7,7 +7,7 @@ import pytest
 from v2hdm.detection.blobs import find_blobs, outline_polygon, zero_crossings
 from v2hdm.detection.coverage import blurred_coverage
 from v2hdm.detection.normal import normal_pdf_cdf
-from v2hdm.detection.plausible import ends_at_a_head
+from v2hdm.detection.plausible import Heads, ends_at_a_head
 from v2hdm.detection.quad import (
     interior_angles,
     intersect_sides,
@@ -202,13 +202,15 @@ SHAFT = np.array([[4.0, 0.9], [6.0, 0.9], [6.0, 1.06], [4.0, 1.06]])
 
 def test_a_dash_that_ends_at_something_wide_astride_its_axis_is_a_shaft():
     head = np.array([[6.2, 0.7], [7.1, 1.0], [6.2, 1.3]])
-    assert ends_at_a_head(SHAFT, [head])
-    assert not ends_at_a_head(SHAFT, [head + np.array([1.0, 0.0])])
-    assert not ends_at_a_head(SHAFT, [head + np.array([-1.2, 1.0])]), "beside its middle, not at its end"
-    assert not ends_at_a_head(SHAFT, [])
+    assert ends_at_a_head(SHAFT, Heads([head]))
+    assert not ends_at_a_head(SHAFT, Heads([head + np.array([1.0, 0.0])]))
+    assert not ends_at_a_head(SHAFT, Heads([head + np.array([-1.2, 1.0])])), (
+        "beside its middle, not at its end"
+    )
+    assert not ends_at_a_head(SHAFT, Heads([]))
 
 
 def test_specks_and_neighbours_at_the_end_of_a_dash_are_no_head():
     speck = np.array([[6.2, 0.95], [6.3, 0.9], [6.3, 1.05]])
     letter = np.array([[6.1, 1.2], [6.6, 1.2], [6.6, 1.6]])
-    assert not ends_at_a_head(SHAFT, [speck, letter])
+    assert not ends_at_a_head(SHAFT, Heads([speck, letter]))

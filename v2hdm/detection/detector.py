@@ -13,7 +13,7 @@ from v2hdm.detection.corners import Foreground, QuadStart, fit_markings
 from v2hdm.detection.lanes import LanePaint, trace_lanes
 from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.plausible import ends_at_a_head, plausible_kind
+from v2hdm.detection.plausible import Heads, ends_at_a_head, plausible_kind
 from v2hdm.detection.quad import is_convex
 from v2hdm.detection.sight import look
 from v2hdm.detection.starts import starting_corners
@@ -116,7 +116,7 @@ class Detector:
         outlines = view.undistort(np.concatenate([blob.outline_px for blob in blobs]))
         ends = np.cumsum([len(blob.outline_px) for blob in blobs])[:-1]
         on_ground = np.split(view.ground(outlines), ends)
-        heads = [g for blob, g in zip(blobs, on_ground, strict=True) if blob.kind in _HEADS]
+        heads = Heads([g for blob, g in zip(blobs, on_ground, strict=True) if blob.kind in _HEADS])
         candidates = []
         for index, (blob, outline) in enumerate(zip(blobs, np.split(outlines, ends), strict=True)):
             found = plausible_kind(blob, on_ground[index], view)

@@ -74,14 +74,29 @@ def plausible_kind(blob: Blob, outline_vehicle: FloatArray, view: CameraView) ->
     return (kind, score) if _fits(kind, length_m, width_m) else None
 
 
-def ends_at_a_head(outline_vehicle: FloatArray, heads_vehicle: Sequence[FloatArray]) -> bool:
+class Heads:
+    """What may be the heads of arrows, by their outlines (N, 2) on the ground, m."""
+
+    def __init__(self, outlines_vehicle: Sequence[FloatArray]):
+        known = [outline[np.isfinite(outline[:, 0])] for outline in outlines_vehicle]
+        self._outlines = [outline for outline in known if len(outline) >= 3]
+        self._low = np.array([outline.min(axis=0) for outline in self._outlines]).reshape(-1, 2)
+        self._high = np.array([outline.max(axis=0) for outline in self._outlines]).reshape(-1, 2)
+
+    def within(self, centre: FloatArray, reach_m: float) -> list[FloatArray]:
+        """Those whose bounding box comes within a square of half the side ``reach_m``."""
+        near = ((self._low < centre + reach_m) & (self._high > centre - reach_m)).all(axis=1)
+        return [self._outlines[k] for k in np.flatnonzero(near)]
+
+
+def ends_at_a_head(outline_vehicle: FloatArray, heads_vehicle: Heads) -> bool:
     """Whether a dash is the shaft of an arrow whose head was parted from it by wear.
 
     A head begins where the shaft ends, astride its axis, and is much wider.
 
     Args:
         outline_vehicle: outline (N, 2) of the dash on the ground, m.
-        heads_vehicle: outlines (M, 2) of what may be heads.
+        heads_vehicle: what may be heads.
     """
     points = outline_vehicle[np.isfinite(outline_vehicle).all(axis=1)]
     if len(points) < 3:
@@ -93,12 +108,8 @@ def ends_at_a_head(outline_vehicle: FloatArray, heads_vehicle: Sequence[FloatArr
     axis = axis / np.linalg.norm(axis)
     half_m, width_m = max(size) / 2, min(size)
     across = np.array([-axis[1], axis[0]])
-    reach_m = half_m + width_m + _HEAD_REACH_M
-    for head in heads_vehicle:
+    for head in heads_vehicle.within(np.array(centre), half_m + width_m + _HEAD_REACH_M):
         offset = head - np.array(centre)
-        offset = offset[np.isfinite(offset[:, 0])]
-        if len(offset) < 3 or (np.abs(offset).min(axis=0) > reach_m).any():
-            continue
         along, beside = np.abs(offset @ axis) - half_m, offset @ across
         begins = -_HEAD_OVERLAP_M < along.min() < _HEAD_REACH_M
         if begins and beside.min() < 0 < beside.max() and np.ptp(beside) > _HEAD_WIDENING * width_m:
