@@ -23,65 +23,70 @@ from v2hdm.detection.quad import side_frames
 
 _CELLS_PER_BLUR = 32
 _REACH = 4.5
+_LAST_CELL = (_CELLS_PER_BLUR * _REACH * np.array([1, 2, 2])[:, None, None, None] - 1.01).astype(np.float32)
 
 
 def blurred_coverage(
-    corners: np.ndarray, points: np.ndarray, blur_px: float
+    corners: np.ndarray, points: np.ndarray, blur_px: np.ndarray | float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Coverage of pixels by convex quadrilaterals and its derivative by their sides.
+    """Coverage of pixels by convex quadrilaterals and its derivative by their sides and by the blur.
 
     Args:
         corners: (M, 4, 2) px, in the order of :mod:`v2hdm.detection.quad`, from a point near each
             quadrilateral, so that float32 keeps a ten-thousandth of a pixel.
         points: (M, 3, N) float32, the pixel centres (u, v, 1) from the same point.
-        blur_px: standard deviation of the point spread, pixel aperture included.
+        blur_px: (M,) or one for all, standard deviation of the point spread, pixel aperture included.
 
     Returns:
-        Coverage (M, N) in [0, 1] and its derivative (M, 8, N) per px by which a side's start (elements
-        0 to 3) or end (4 to 7) moves along the side's outward normal, both float32.
+        Coverage (M, N) in [0, 1] and its derivative (M, 9, N) per px by which a side's start (elements
+        0 to 3) or end (4 to 7) moves along the side's outward normal or (8) the blur grows, both float32.
     """
     tangent, normal, length = side_frames(corners)
+    per_blur = np.broadcast_to(1 / np.asarray(blur_px), (len(corners),))[:, None, None]
     # Rows of a matrix that takes (u, v, 1) to the outward distance, and to the side's start and end.
     rows = np.empty((3, len(corners), 4, 3))
     rows[0, ..., :2], rows[0, ..., 2] = normal, -(normal * corners).sum(axis=-1)
     rows[1:, ..., :2] = -tangent
     rows[1, ..., 2] = (tangent * corners).sum(axis=-1)
     rows[2, ..., 2] = rows[1, ..., 2] + length
-    across, start, end = (rows / blur_px).astype(np.float32) @ points
-    pdf_start, cdf_start = normal_pdf_cdf(start)
-    pdf_end, cdf_end = normal_pdf_cdf(end)
+    rows *= per_blur
+    placed = rows.astype(np.float32) @ points
+    across, start = placed[:2]
+    (pdf_start, pdf_end), (cdf_start, cdf_end) = normal_pdf_cdf(placed[1:])
     share = np.subtract(cdf_end, cdf_start, out=cdf_end)
     by_end = np.subtract(pdf_start, pdf_end, out=pdf_start)
-    by_end -= start * share
-    by_end /= np.maximum(length / blur_px, 1e-3).astype(np.float32)[..., None]
-    share -= by_end
+    by_end -= np.multiply(start, share, out=pdf_end)
+    by_end *= (1 / np.maximum(length[..., None] * per_blur, 1e-3)).astype(np.float32)
     density = normal_pdf(across)
-    density *= np.float32(1 / blur_px)
-    derivative = np.empty((len(corners), 8, points.shape[2]), dtype=np.float32)
-    np.multiply(density, share, out=derivative[:, :4])
-    np.multiply(density, by_end, out=derivative[:, 4:])
-    return _coverage(across, start, end), derivative
+    density *= per_blur.astype(np.float32)
+    derivative = np.empty((len(corners), 9, points.shape[2]), dtype=np.float32)
+    sides = np.multiply(density, share, out=derivative[:, :4])
+    ends = np.multiply(density, by_end, out=derivative[:, 4:8])
+    # A wider blur is a smaller picture: each side comes nearer to the pixel in proportion to its distance.
+    np.multiply(sides, across, out=share).sum(axis=1, out=derivative[:, 8])
+    sides -= ends
+    return _coverage(placed), derivative
 
 
-def _coverage(across: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    flat = (-1, across.shape[-1])
-    table = owen_table()
-    row = _table_index(np.abs(across), 0).reshape(flat)
-    beyond = [
-        cv2.remap(table, _table_index(s, _REACH).reshape(flat), row, cv2.INTER_LINEAR) for s in (start, end)
-    ]
-    term = np.copysign(np.float32(1), across)
-    term *= (beyond[1] - beyond[0]).reshape(across.shape)
-    coverage = term.sum(axis=1)
-    coverage += (across < 0).all(axis=1)
+def _coverage(placed: np.ndarray) -> np.ndarray:
+    """Coverage (M, N) from the pixels' distance, and the sides' starts and ends (3, M, 4, N), overwritten."""
+    pixels = placed.shape[-1]
+    across = placed[0]
+    inside = (across < 0).all(axis=1)
+    sign = np.copysign(np.float32(1), across)
+    np.abs(across, out=across)
+    placed[1:] += np.float32(_REACH)
+    placed *= np.float32(_CELLS_PER_BLUR)
+    np.clip(placed, 0, _LAST_CELL, out=placed)
+    row, start, end = placed.reshape(3, -1, pixels)
+    # Borders are slow in OpenCV; the indices were kept inside.
+    sign *= np.subtract(
+        cv2.remap(owen_table(), end, row, cv2.INTER_LINEAR),
+        cv2.remap(owen_table(), start, row, cv2.INTER_LINEAR),
+    ).reshape(sign.shape)
+    coverage = sign.sum(axis=1)
+    coverage += inside
     return np.asarray(coverage)
-
-
-def _table_index(x: np.ndarray, first: float) -> np.ndarray:
-    """Fractional index of x in a table from ``-first`` to ``_REACH``, kept inside: borders are slow."""
-    index = x + np.float32(first)
-    index *= np.float32(_CELLS_PER_BLUR)
-    return np.clip(index, 0, np.float32((first + _REACH) * _CELLS_PER_BLUR - 1.01), out=index)
 
 
 @cache

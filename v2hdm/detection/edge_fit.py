@@ -12,27 +12,44 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from v2hdm.detection.correlation import variance_inflation
 from v2hdm.detection.grey import GreyBand
 from v2hdm.detection.normal import normal_pdf_cdf
-from v2hdm.detection.quad import interior_angles, intersect_sides, side_frames, width
+from v2hdm.detection.quad import (
+    following,
+    interior_angles,
+    intersect_sides,
+    preceding,
+    side_frames,
+    width,
+)
+from v2hdm.detection.quad_covariance import corner_covariance
 from v2hdm.detection.view import CameraView
 from v2hdm.records import BoolArray, FloatArray
 
-_PROFILES = 24
 _SEARCH_PX = 6.0
+_SEARCH_PROFILES = 16
 _SEARCH_SAMPLES = 25
+_SEARCH_ITERATIONS = 3
+_STRONG_SHARE = 0.3
+_MAX_MOVE_PX = 24.0
+
 _FIT_PX = 2.5
+_FIT_PROFILES = 24
 _FIT_SAMPLES = 13
 _FIT_ITERATIONS = 4
-_SEARCH_ITERATIONS = 4
-_LINE_ITERATIONS = 8
+_LAST_SHIFT_PX = 2.4
+_MAX_UNEXPLAINED = 0.2
 _START_BLUR_PX = 0.8
 _BLUR_LIMITS_PX = (0.35, 3.0)
 _INTERPOLATION_VARIANCE = 0.35**2
+
+_LINE_ITERATIONS = 6
+_SCATTER_ITERATIONS = 3
 _TUKEY = 4.685
 _MIN_SCATTER_PX = 0.02
 _MIN_INLIERS = 8
-_LAST_SHIFT_PX = 2.4
+_MAX_CORRELATION = 0.85
 
 
 @dataclass(frozen=True)
@@ -56,9 +73,7 @@ class EdgeFit:
 class _Lines:
     """Lines through ``middle + tangent * s + normal * (offset + slope * s)`` with covariance (..., 2, 2)."""
 
-    middle: FloatArray
-    tangent: FloatArray
-    normal: FloatArray
+    sides: _Sides
     offset: FloatArray
     slope: FloatArray
     covariance: FloatArray
@@ -66,54 +81,56 @@ class _Lines:
 
     def corners(self) -> FloatArray:
         """Where neighbouring lines meet (M, 4, 2)."""
-        return intersect_sides(self.middle + self.normal * self.offset[..., None], self.tilted_normal())
+        point = self.sides.middle + self.sides.normal * self.offset[..., None]
+        return intersect_sides(point, self.tilted_normal())
 
     def tilted_normal(self) -> FloatArray:
         """Normals (M, 4, 2) of the fitted lines, not of unit length: n - slope * t."""
-        return self.normal - self.slope[..., None] * self.tangent
+        return self.sides.normal - self.slope[..., None] * self.sides.tangent
 
 
 def fit_edges(grey: GreyBand, view: CameraView, corners_pinhole_px: FloatArray) -> EdgeFit:
     """Locate the sides of markings (M, 4, 2) that start within a few px of ``corners_pinhole_px``."""
     reach = np.clip(0.4 * width(corners_pinhole_px), 2.0, _SEARCH_PX)
-    found = _search_lines(grey, view, corners_pinhole_px, reach)
-    moved = found.corners()
-    usable = np.isfinite(moved).all(axis=-1) & (
-        np.linalg.norm(moved - corners_pinhole_px, axis=-1) < 4 * _SEARCH_PX
-    )
-    moved = np.where(usable[..., None], moved, corners_pinhole_px)
-    return _fit_lines(grey, view, moved)
+    moved = _search_lines(grey, view, corners_pinhole_px, reach).corners()
+    usable = np.isfinite(moved).all(axis=-1)
+    usable &= np.abs(moved - corners_pinhole_px).max(axis=-1) < _MAX_MOVE_PX
+    return _fit_lines(grey, view, np.where(usable[..., None], moved, corners_pinhole_px))
 
 
 def _search_lines(grey: GreyBand, view: CameraView, corners: FloatArray, reach: FloatArray) -> _Lines:
     """Lines through the strongest falls of grey value outwards, within ``reach`` (M,) px of the sides."""
-    t = np.linspace(-1.0, 1.0, _SEARCH_SAMPLES) * reach[:, None]
-    values, along, frames = _profiles(grey, view, corners, t, reach)
-    half = 3
-    total = np.cumsum(np.pad(values, [(0, 0)] * 3 + [(1, 0)]), axis=-1)
-    inside = total[..., half : -half - 1] - total[..., : -2 * half - 1]
-    outside = total[..., 2 * half + 1 :] - total[..., half + 1 : -half]
-    fall = (inside - outside) / half
-    best = np.nanargmax(np.where(np.isfinite(fall), fall, -np.inf), axis=-1)
-    step = np.take_along_axis(fall, best[..., None], axis=-1)[..., 0]
-    offset = np.take_along_axis(t, (best.reshape(len(t), -1) + half), axis=1).reshape(best.shape)
-    strong = np.isfinite(step) & (
-        step > 0.3 * np.nanmax(np.where(np.isfinite(step), step, 0), axis=(1, 2), keepdims=True)
-    )
-    return _robust_lines(frames, along, offset, strong, _SEARCH_ITERATIONS)
+    place = np.linspace(-1.0, 1.0, _SEARCH_SAMPLES)
+    sides = _Sides.of(corners, reach, _SEARCH_PROFILES)
+    values = _profiles(grey, view, sides, place[:, None, None, None] * reach[:, None, None])
+    values[~np.isfinite(values)] = np.nan
+    half = _SEARCH_SAMPLES // 8
+    total = np.zeros((_SEARCH_SAMPLES + 1, *values.shape[1:]), dtype=np.float32)
+    np.cumsum(values, axis=0, out=total[1:])
+    inside = total[half : -half - 1] - total[: -2 * half - 1]
+    fall = inside - total[2 * half + 1 :] + total[half + 1 : -half]
+    fall[np.isnan(fall)] = 0.0
+    best = fall.argmax(axis=0)
+    step = fall.max(axis=0)
+    offset = place[best + half] * reach[:, None, None]
+    strong = (step > 0) & (step > _STRONG_SHARE * step.max(axis=(1, 2), keepdims=True))
+    return _robust_lines(sides, offset, strong, _SEARCH_ITERATIONS)
 
 
 def _fit_lines(grey: GreyBand, view: CameraView, corners: FloatArray) -> EdgeFit:
-    t = np.broadcast_to(np.linspace(-_FIT_PX, _FIT_PX, _FIT_SAMPLES), (len(corners), _FIT_SAMPLES))
-    values, along, frames = _profiles(grey, view, corners, t, np.full(len(corners), _FIT_PX))
-    profile = _fit_profiles(values, t[0].astype(np.float32))
-    lines = _robust_lines(frames, along, profile.offset, profile.good, _LINE_ITERATIONS)
+    t = np.linspace(-_FIT_PX, _FIT_PX, _FIT_SAMPLES)[:, None, None, None]
+    sides = _Sides.of(corners, np.full(len(corners), _FIT_PX), _FIT_PROFILES)
+    profile = _fit_profiles(_profiles(grey, view, sides, t), t.astype(np.float32))
+    lines = _robust_lines(sides, profile.offset, profile.good, _LINE_ITERATIONS)
     found = lines.inliers >= _MIN_INLIERS
     fitted = lines.corners()
-    both = found & np.roll(found, 1, axis=1) & np.isfinite(fitted).all(axis=-1)
+    both = found & preceding(found, -1) & np.isfinite(fitted).all(axis=-1)
+    corners = np.where(both[..., None], fitted, corners)
     return EdgeFit(
-        corners_pinhole_px=np.where(both[..., None], fitted, corners),
-        covariance=_corner_covariance(lines, fitted, both),
+        corners_pinhole_px=corners,
+        covariance=corner_covariance(
+            corners, sides.middle, sides.tangent, lines.tilted_normal(), lines.covariance, both
+        ),
         side_found=found,
         side_blur_px=np.sqrt(np.maximum(profile.blur**2 - _INTERPOLATION_VARIANCE, 0.0)),
         side_low=_masked_median(profile.low, profile.good),
@@ -121,34 +138,49 @@ def _fit_lines(grey: GreyBand, view: CameraView, corners: FloatArray) -> EdgeFit
     )
 
 
-def _profiles(
-    grey: GreyBand, view: CameraView, corners: FloatArray, t: FloatArray, reach: FloatArray
-) -> tuple[np.ndarray, FloatArray, tuple[FloatArray, FloatArray, FloatArray]]:
-    """Grey values (M, 4, profiles, samples) across each side, where along the side they are, its frame.
+@dataclass(frozen=True)
+class _Sides:
+    """The sides of M markings and where ``along`` (M, 4, n) them, from their middles, profiles cross them.
 
-    Profiles keep off the corners, so that none crosses a neighbouring side or its blur.
+    ``middle``, ``tangent`` and outward ``normal`` are (M, 4, 2).
     """
-    tangent, normal, length = side_frames(corners)
-    middle = (corners + np.roll(corners, -1, axis=1)) / 2
-    angle = interior_angles(corners)
-    cotangent = np.clip(1 / np.tan(np.clip(angle, 0.1, np.pi / 2)), 0.0, None)
-    margin = reach[:, None] * cotangent + 2.0 / np.sin(angle)
-    first = np.minimum(margin, 0.35 * length)
-    last = length - np.minimum(np.roll(margin, -1, axis=1), 0.35 * length)
-    fraction = (np.arange(_PROFILES) + 0.5) / _PROFILES
-    along = first[..., None] + (last - first)[..., None] * fraction - length[..., None] / 2
-    foot = middle[:, :, None] + along[..., None] * tangent[:, :, None]
-    ends = foot[..., None, :] + t[:, None, None, [0, -1], None] * normal[:, :, None, None]
-    ends_px = view.distort(ends.reshape(-1, 2)).reshape(-1, 2, 2)
+
+    middle: FloatArray
+    tangent: FloatArray
+    normal: FloatArray
+    along: FloatArray
+
+    @classmethod
+    def of(cls, corners: FloatArray, reach: FloatArray, profiles: int) -> _Sides:
+        """The sides between ``corners`` (M, 4, 2), with profiles of ``reach`` (M,) px to either side.
+
+        Profiles keep off the corners, so that none crosses a neighbouring side or its blur.
+        """
+        tangent, normal, length = side_frames(corners)
+        angle = interior_angles(corners)
+        cotangent = np.maximum(1 / np.tan(np.clip(angle, 0.1, np.pi / 2)), 0.0)
+        margin = reach[:, None] * cotangent + 2.0 / np.sin(angle)
+        first = np.minimum(margin, 0.35 * length)
+        last = length - np.minimum(following(margin, -1), 0.35 * length)
+        fraction = (np.arange(profiles) + 0.5) / profiles
+        along = (first - length / 2)[..., None] + (last - first)[..., None] * fraction
+        return cls((corners + following(corners)) / 2, tangent, normal, along)
+
+
+def _profiles(grey: GreyBand, view: CameraView, sides: _Sides, t: FloatArray) -> np.ndarray:
+    """Grey values (samples, M, 4, n) at ``t`` (samples, M or 1, 1, 1) px along the outward normals."""
+    foot = sides.middle[:, :, None] + sides.along[..., None] * sides.tangent[:, :, None]
+    ends = foot + t[[0, -1], ..., None] * sides.normal[:, :, None]
+    first, last = view.distort(ends.reshape(-1, 2)).reshape(2, -1, 2).astype(np.float32)
     # Across a dozen px the lens is straight to a hundredth of a px, so only the ends are distorted.
-    share = np.linspace(0.0, 1.0, t.shape[1])[:, None]
-    points_px = ends_px[:, :1] * (1 - share) + ends_px[:, 1:] * share
-    values = grey.sample(points_px).reshape(*along.shape, t.shape[1])
-    return values, along, (middle, tangent, normal)
+    share = np.linspace(0.0, 1.0, len(t), dtype=np.float32)[:, None, None]
+    return grey.sample(first + share * (last - first)).reshape(len(t), *sides.along.shape)
 
 
 @dataclass(frozen=True)
 class _ProfileFit:
+    """Of profiles (M, 4, n): ``offset`` px, ``low``, ``amplitude``, if ``good``; ``blur`` (M, 4) px of sides."""
+
     offset: FloatArray
     low: FloatArray
     amplitude: FloatArray
@@ -157,79 +189,75 @@ class _ProfileFit:
 
 
 def _fit_profiles(values: np.ndarray, t: np.ndarray) -> _ProfileFit:
-    """Gauss-Newton on every profile (M, 4, n, samples) at once; the blur is shared by a side."""
-    finite = np.isfinite(values).all(axis=-1)
-    y = np.where(finite[..., None], values, 0).astype(np.float32)
-    offset = np.zeros(y.shape[:-1], dtype=np.float32)
-    blur = np.full(y.shape[:2], _START_BLUR_PX, dtype=np.float32)
+    """Gauss-Newton on every profile (samples, M, 4, n) at once; the blur is shared by a side.
+
+    The levels are eliminated: only the part of the derivative that they cannot mimic moves the edge.
+    """
+    finite = np.isfinite(values).all(axis=0)
+    y = np.where(finite, values, np.float32(0))
+    mean = y.mean(axis=0)
+    y -= mean
+    offset = np.zeros(finite.shape, dtype=np.float32)
+    blur = np.full((*finite.shape[:2], 1), _START_BLUR_PX, dtype=np.float32)
     for _ in range(_FIT_ITERATIONS):
-        x = (t - offset[..., None]) / blur[..., None, None]
-        pdf, cdf = normal_pdf_cdf(-x)
-        low, amplitude, residual = _fit_levels(cdf, y)
+        x = (offset - t) / blur
+        slope, shape = normal_pdf_cdf(x)
+        mean_shape = shape.mean(axis=0)
+        shape -= mean_shape
+        power = np.maximum((shape * shape).sum(axis=0), 1e-9)
+        amplitude = (shape * y).sum(axis=0) / power
+        residual = y - amplitude * shape
         usable = finite & (amplitude > 1e-4)
-        slope = amplitude[..., None] * pdf / blur[..., None, None]
-        # The levels are eliminated: only the part of the derivative that they cannot mimic moves the edge.
-        _, _, slope = _fit_levels(cdf, slope)
-        shift = (slope * residual).sum(axis=-1) / np.maximum((slope * slope).sum(axis=-1), 1e-12)
-        offset = np.clip(offset + np.where(usable, np.clip(shift, -0.7, 0.7), 0), -_FIT_PX, _FIT_PX)
-        blur = _update_blur(blur, x, slope, residual, usable & (np.abs(offset) < _LAST_SHIFT_PX))
-    spread = y - y.mean(axis=-1, keepdims=True)
-    explained = 1 - (residual**2).sum(axis=-1) / np.maximum((spread**2).sum(axis=-1), 1e-12)
+        slope *= amplitude / blur
+        slope -= slope.mean(axis=0)
+        slope -= shape * ((shape * slope).sum(axis=0) / power)
+        shift = (slope * residual).sum(axis=0) / np.maximum((slope * slope).sum(axis=0), 1e-12)
+        offset = np.clip(offset + usable * np.clip(shift, -0.7, 0.7), -_FIT_PX, _FIT_PX)
+        x *= slope
+        blur = _update_blur(blur, x, residual, usable & (np.abs(offset) < _LAST_SHIFT_PX))
+    explained = (residual * residual).sum(axis=0) < _MAX_UNEXPLAINED * np.maximum((y * y).sum(axis=0), 1e-12)
     typical = _masked_median(amplitude, usable).max(axis=1)[:, None, None]
-    good = (
-        usable
-        & (np.abs(offset) < _LAST_SHIFT_PX)
-        & (explained > 0.8)
-        & (amplitude > 0.35 * typical)
-        & (amplitude < 2.5 * typical)
-    )
-    return _ProfileFit(offset.astype(np.float64), low, amplitude, good, blur.astype(np.float64))
-
-
-def _fit_levels(shape: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Least squares ``values ~ low + amplitude * shape`` along the last axis; low, amplitude, residual."""
-    mean_shape = shape.mean(axis=-1, keepdims=True)
-    mean_value = values.mean(axis=-1, keepdims=True)
-    centred = shape - mean_shape
-    amplitude = (centred * values).sum(axis=-1, keepdims=True) / np.maximum(
-        (centred * centred).sum(axis=-1, keepdims=True), 1e-9
-    )
-    low = mean_value - amplitude * mean_shape
-    return low[..., 0], amplitude[..., 0], values - low - amplitude * shape
+    good = usable & (np.abs(offset) < _LAST_SHIFT_PX) & explained
+    good &= (amplitude > 0.35 * typical) & (amplitude < 2.5 * typical)
+    low = mean - amplitude * mean_shape
+    return _ProfileFit(offset.astype(np.float64), low, amplitude, good, blur[..., 0].astype(np.float64))
 
 
 def _update_blur(
-    blur: np.ndarray, x: np.ndarray, slope: np.ndarray, residual: np.ndarray, usable: BoolArray
+    blur: np.ndarray, by_less: np.ndarray, residual: np.ndarray, usable: BoolArray
 ) -> np.ndarray:
-    """One Gauss-Newton step on each side's blur (M, 4), from the profiles that are usable."""
-    by_blur = np.where(usable[..., None], slope * x, 0)
-    change = (by_blur * residual).sum(axis=(2, 3)) / np.maximum((by_blur * by_blur).sum(axis=(2, 3)), 1e-12)
-    return np.asarray(np.clip(blur + np.clip(change, -0.3, 0.3), *_BLUR_LIMITS_PX), dtype=np.float32)
+    """One Gauss-Newton step on each side's blur (M, 4, 1), from the profiles (M, 4, n) that are usable.
+
+    ``by_less`` (samples, M, 4, n) is the derivative by less blur.
+    """
+    gradient = (usable * (by_less * residual).sum(axis=0)).sum(axis=2, keepdims=True)
+    power = (usable * (by_less * by_less).sum(axis=0)).sum(axis=2, keepdims=True)
+    change = np.clip(gradient / np.maximum(power, 1e-12), -0.3, 0.3)
+    return np.asarray(np.clip(blur - change, *_BLUR_LIMITS_PX), dtype=np.float32)
 
 
-def _robust_lines(
-    frames: tuple[FloatArray, FloatArray, FloatArray],
-    along: FloatArray,
-    offset: FloatArray,
-    good: BoolArray,
-    iterations: int,
-) -> _Lines:
-    """Tukey lines through offsets (M, 4, n) at positions ``along`` the sides."""
+def _robust_lines(sides: _Sides, offset: FloatArray, good: BoolArray, iterations: int) -> _Lines:
+    """Tukey lines through offsets (M, 4, n) at the profiles of the sides; the scatter soon stays as it is."""
+    along = sides.along
     weight = good.astype(np.float64)
     terms = np.stack([np.ones_like(along), along, along * along, offset, along * offset], axis=-1)
     middle = np.maximum(good.sum(axis=-1, keepdims=True) - 1, 0) // 2
-    for _ in range(iterations):
+    for iteration in range(iterations):
         constant, slope, normal_matrix = _weighted_line(weight, terms)
         residual = offset - constant[..., None] - slope[..., None] * along
-        ordered = np.sort(np.where(good, np.abs(residual), np.inf), axis=-1)
-        scatter = 1.4826 * np.take_along_axis(ordered, middle, axis=-1)
-        scatter = np.maximum(scatter, _MIN_SCATTER_PX)
-        weight = good * np.maximum(1 - (residual / (_TUKEY * scatter)) ** 2, 0) ** 2
+        if iteration < _SCATTER_ITERATIONS:
+            ordered = np.sort(np.where(good, np.abs(residual), np.inf), axis=-1)
+            scatter = 1.4826 * np.take_along_axis(ordered, middle, axis=-1)
+            per_limit = 1 / (_TUKEY * np.maximum(scatter, _MIN_SCATTER_PX))
+        ratio = residual * per_limit
+        weight = good * np.maximum(1 - ratio * ratio, 0) ** 2
     inliers = (weight > 0.1).sum(axis=-1)
     variance = (weight * residual**2).sum(axis=-1) / np.maximum(weight.sum(axis=-1) - 2, 1)
-    variance = np.maximum(variance, _MIN_SCATTER_PX**2) * _correlation_factor(residual, weight)
-    covariance = variance[..., None, None] * np.linalg.inv(normal_matrix)
-    return _Lines(*frames, constant, slope, covariance, inliers)
+    variance = np.maximum(variance, _MIN_SCATTER_PX**2)
+    neighbours = weight[..., 1:] * weight[..., :-1]
+    variance *= variance_inflation(residual[..., 1:], residual[..., :-1], neighbours, _MAX_CORRELATION)
+    covariance = variance[..., None, None] * _inverse(normal_matrix)
+    return _Lines(sides, constant, slope, covariance, inliers)
 
 
 def _weighted_line(weight: FloatArray, terms: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -242,34 +270,11 @@ def _weighted_line(weight: FloatArray, terms: FloatArray) -> tuple[FloatArray, F
     return constant, slope, normal_matrix
 
 
-def _correlation_factor(residual: FloatArray, weight: FloatArray) -> FloatArray:
-    """By how much neighbouring profiles' correlation inflates the variance of a line: (1 + r) / (1 - r)."""
-    pair = weight[..., 1:] * weight[..., :-1]
-    product = (pair * residual[..., 1:] * residual[..., :-1]).sum(axis=-1)
-    power = (pair * (residual[..., 1:] ** 2 + residual[..., :-1] ** 2)).sum(axis=-1) / 2
-    r = np.clip(product / np.maximum(power, 1e-12), 0.0, 0.85)
-    return np.asarray((1 + r) / (1 - r))
-
-
-def _corner_covariance(lines: _Lines, corners: FloatArray, both: BoolArray) -> FloatArray:
-    """Covariance (M, 8, 8) of corners that are intersections: neighbours share a side, so they correlate.
-
-    A line's offset and slope move a corner by N dx = d_offset + s d_slope, N the two lines' normals.
-    """
-    markings = len(corners)
-    jacobian = np.zeros((markings, 4, 2, 4, 2))
-    normals = lines.tilted_normal()
-    for corner in range(4):
-        sides = [(corner - 1) % 4, corner]
-        pair = normals[:, sides]
-        inverse = np.linalg.inv(np.where(both[:, corner, None, None], pair, np.eye(2)))
-        for n, side in enumerate(sides):
-            s = ((corners[:, corner] - lines.middle[:, side]) * lines.tangent[:, side]).sum(axis=-1)
-            lever = np.stack([np.ones_like(s), s], axis=-1)
-            jacobian[:, corner, :, side, :] = inverse[:, :, n, None] * lever[:, None]
-    jacobian[~both] = 0.0
-    covariance = np.einsum("mcasi,msij,mdbsj->mcadb", jacobian, lines.covariance, jacobian, optimize=True)
-    return np.asarray(covariance.reshape(markings, 8, 8))
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """Inverse of symmetric positive matrices (..., 2, 2)."""
+    a, b, c = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]
+    inverse = np.stack([c, -b, -b, a], axis=-1) / np.maximum(a * c - b * b, 1e-12)[..., None]
+    return np.asarray(inverse.reshape(matrix.shape))
 
 
 def _masked_median(values: np.ndarray, mask: BoolArray) -> np.ndarray:

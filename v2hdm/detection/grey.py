@@ -9,6 +9,9 @@ import cv2
 import numpy as np
 
 _GREY_WEIGHTS_BGR = (0.114, 0.587, 0.299)
+_CLIPPED = 250
+"""Codes from here on are those of a sensor at its limit, noise and white balance allowed for."""
+
 _SUM = np.ones((1, 3), dtype=np.float32)
 _CODED = np.arange(256) / 255
 _LINEAR_FROM_SRGB = np.where(_CODED <= 0.04045, _CODED / 12.92, ((_CODED + 0.055) / 1.055) ** 2.4)
@@ -16,13 +19,19 @@ _LINEAR_FROM_SRGB = np.where(_CODED <= 0.04045, _CODED / 12.92, ((_CODED + 0.055
 
 @dataclass(frozen=True)
 class GreyBand:
-    """Linear grey ``values`` (h, w) float32 of the image rows from ``top`` on."""
+    """Linear grey ``values`` (h, w) float32 of the image rows from ``top`` on.
+
+    NaN where it was not looked at, +inf where the sensor was at its limit and the true value is unknown.
+    """
 
     values: np.ndarray
     top: int
 
     def sample(self, points_px: np.ndarray) -> np.ndarray:
-        """Bilinear look-up at recorded pixels (n, m, 2); NaN outside the band. Result (n, m) float32."""
+        """Bilinear look-up at recorded pixels (n, m, 2); not finite where one of the four pixels is not.
+
+        The result is (n, m) float32.
+        """
         u = points_px[..., 0].astype(np.float32)
         v = (points_px[..., 1] - self.top).astype(np.float32)
         return np.asarray(
@@ -38,7 +47,7 @@ def linear_grey(
     Only the ``boxes`` (M, 4) of left, top, right, bottom in px, the last two exclusive, are converted,
     and what lies outside all of them is NaN: markings cover a small part of the image. sRGB coding is
     undone unless ``linear_response``: fitting edges on coded values pushes each side of a bright
-    marking outwards by about a fifth of the blur.
+    marking outwards by about a fifth of the blur. Clipped values do the same, by up to the whole blur.
     """
     table = _table(linear_response)
     values = np.full((bottom - top, image_bgr.shape[1]), np.nan, dtype=np.float32)
@@ -55,4 +64,5 @@ def linear_grey(
 def _table(linear_response: bool) -> np.ndarray:
     """What each channel's byte adds to the grey value (1, 256, 3)."""
     table = _CODED if linear_response else _LINEAR_FROM_SRGB
+    table = np.where(np.arange(len(table)) >= _CLIPPED, np.inf, table)
     return np.asarray(table[None, :, None] * _GREY_WEIGHTS_BGR, dtype=np.float32)

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.detection.quad import intersect_sides, is_convex, side_frames
+from v2hdm.detection.quad import following, intersect_sides, is_convex, preceding, side_frames
+from v2hdm.detection.quad_covariance import corner_covariance
 from v2hdm.records import BoolArray, FloatArray
 
 _CENTRAL_SHARE = 0.8
@@ -29,12 +30,20 @@ _MAX_ROUGHNESS_SHARE = 0.03
 
 _BINS = 8
 _LEAST_BINS = 6
-"""A side is known if its outline is seen in so many of its parts."""
+"""A side is known if its outline is seen in so many of its parts and straight there."""
 
-_MASK_SIGMA_PX = 0.4
+_GATE = 2.5
+_LEAST_SHARE = 0.6
+"""A side's own points are within so many times the most roughness of its line; so many must be its own."""
+
+_MASK_SIGMA_PX = 0.8
 """How far the outline as a whole may be off: nothing in it tells."""
 
+_CORRELATED_POINTS = 9
+"""Neighbouring points of an outline err alike, over about so many of them."""
+
 _TUKEY = 4.0
+_MIN_SCATTER_PX = 0.3
 _ITERATIONS = 4
 
 
@@ -53,39 +62,69 @@ class OutlineFit:
 
 def fit_outlines(outlines_pinhole_px: Sequence[FloatArray], start: FloatArray) -> OutlineFit:
     """Fit four lines to each outline (N, 2) near the sides of its quadrilateral of ``start`` (M, 4, 2)."""
-    fits = [_fit(outline, quad) for outline, quad in zip(outlines_pinhole_px, start, strict=True)]
-    corners, covariance, found = (np.stack(part) for part in zip(*fits, strict=True))
-    return OutlineFit(corners, covariance, found)
-
-
-def _fit(outline: FloatArray, quad: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Corners (4, 2), covariance (8, 8) and which were found (4,), of one marking."""
-    tangent, normal, length = side_frames(quad)
-    middle = (quad + np.roll(quad, -1, axis=0)) / 2
-    relative = outline[:, None] - middle
-    along, across = (relative * tangent).sum(axis=2), (relative * normal).sum(axis=2)
-    reach = max(_MIN_OFFSET_PX, _MAX_OFFSET_SHARE * float(length.min()))
+    tangent, normal, length = side_frames(start)
+    middle = (start + following(start)) / 2
+    reach = np.maximum(_MIN_OFFSET_PX, _MAX_OFFSET_SHARE * length.min(axis=1))
     half = 0.5 * _CENTRAL_SHARE * length
-    near = (np.abs(along) < half) & (np.abs(across) < reach)
-    lines = _straight_lines(along / half, across, near)
-    offset, slope = lines.offset, lines.slope / half
-    straight = lines.known & (lines.roughness <= np.maximum(_MAX_ROUGHNESS_PX, _MAX_ROUGHNESS_SHARE * length))
-    # Neighbouring points of an outline err alike, over about four of them.
-    level = np.hypot(_MASK_SIGMA_PX, 2 * lines.roughness / np.sqrt(np.maximum(lines.points, 1)))
-    sigma = np.stack([level, 2 * level / length], axis=1)
-    tilted = normal - slope[:, None] * tangent
-    corners = intersect_sides(middle + offset[:, None] * normal, tilted)
-    found = straight & np.roll(straight, 1)
-    found &= np.isfinite(corners).all(axis=1) & (np.abs(corners - quad).max(axis=1) < 2 * reach)
-    found &= is_convex(np.where(found[:, None], corners, quad)[None])[0]
-    covariance = _covariance(np.where(found[:, None], corners, quad), middle, tangent, tilted, sigma)
-    keep = np.repeat(found, 2).astype(np.float64)
-    return np.where(found[:, None], corners, np.nan), covariance * np.outer(keep, keep), found
+    marking = np.repeat(np.arange(len(start)), [len(outline) for outline in outlines_pinhole_px])
+    relative = np.concatenate(outlines_pinhole_px)[:, None] - middle[marking]
+    along = (relative * tangent[marking]).sum(axis=2) / half[marking]
+    across = (relative * normal[marking]).sum(axis=2)
+    point, side = np.nonzero((np.abs(along) < 1) & (np.abs(across) < reach[marking, None]))
+    along, across = along[point, side], across[point, side]
+    side += 4 * marking[point]
+    first = _straight_lines(_Parts.of(side, along, across, length.size))
+    # Points of other sides and of what touches the marking are near, too.
+    rough_px = np.maximum(_MAX_ROUGHNESS_PX, _MAX_ROUGHNESS_SHARE * length)
+    off = np.abs(across - first.offset[side] - first.slope[side] * along)
+    own = off < _GATE * rough_px.ravel()[side]
+    lines = _straight_lines(_Parts.of(side[own], along[own], across[own], length.size))
+    own_share = lines.points / np.maximum(np.bincount(side, minlength=length.size), 1)
+    known = (lines.known & (own_share >= _LEAST_SHARE)).reshape(-1, 4)
+    offset, slope, roughness, points = (
+        part.reshape(-1, 4) for part in (lines.offset, lines.slope, lines.roughness, lines.points)
+    )
+    straight = known & (roughness <= rough_px)
+    level = np.hypot(_MASK_SIGMA_PX, roughness * np.sqrt(_CORRELATED_POINTS / np.maximum(points, 1)))
+    sigma = np.stack([level, 2 * level / length], axis=-1)
+    tilted = normal - (slope / half)[..., None] * tangent
+    corners = intersect_sides(middle + offset[..., None] * normal, tilted)
+    found = np.asarray(np.isfinite(corners).all(axis=-1) & straight & preceding(straight, -1))
+    found &= np.abs(corners - start).max(axis=-1) < 2 * reach[:, None]
+    usable = np.where(found[..., None], corners, start)
+    found &= is_convex(usable)[:, None]
+    covariance = corner_covariance(usable, middle, tangent, tilted, _diagonal(sigma**2), found)
+    return OutlineFit(np.where(found[..., None], corners, np.nan), covariance, found)
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """The outline's points near each of S sides, in parts along it.
+
+    ``count`` (S, bins), their mean place ``along`` the side, -1 to 1, mean ``across`` it and ``variance``.
+    """
+
+    count: FloatArray
+    along: FloatArray
+    across: FloatArray
+    variance: FloatArray
+
+    @classmethod
+    def of(cls, side: np.ndarray, along: FloatArray, across: FloatArray, sides: int) -> _Parts:
+        """Gather points (N,) that are near the side of that index."""
+        part = side * _BINS + np.minimum(((along + 1) / 2 * _BINS).astype(np.intp), _BINS - 1)
+        count, first, second, square = (
+            np.bincount(part, values, minlength=sides * _BINS).reshape(sides, _BINS)
+            for values in (None, along, across, across * across)
+        )
+        total = np.maximum(count, 1)
+        mean = second / total
+        return cls(count.astype(np.float64), first / total, mean, np.maximum(square / total - mean**2, 0))
 
 
 @dataclass(frozen=True)
 class _Lines:
-    """Lines along four sides, each (4,): ``offset``, ``slope``, ``roughness``, ``points``, if ``known``."""
+    """Lines along S sides: ``slope`` is over half a side's central part; each (S,), see :class:`_Parts`."""
 
     offset: FloatArray
     slope: FloatArray
@@ -94,41 +133,31 @@ class _Lines:
     known: BoolArray
 
 
-def _straight_lines(along: FloatArray, across: FloatArray, near: BoolArray) -> _Lines:
-    """Robust lines by Tukey's weights through the points (N, 4) near each side; ``along`` from -1 to 1."""
-    count = near.sum(axis=0)
-    weight = near.astype(np.float64)
+def _straight_lines(parts: _Parts) -> _Lines:
+    """Robust lines by Tukey's weights through the parts of S sides."""
+    seen = parts.count > 0
+    middle = np.maximum(seen.sum(axis=1, keepdims=True) - 1, 0) // 2
+    weight = seen.astype(np.float64)
     for _ in range(_ITERATIONS):
-        total = np.maximum(weight.sum(axis=0), 1e-9)
-        mean_x, mean_y = (weight * along).sum(axis=0) / total, (weight * across).sum(axis=0) / total
-        x = along - mean_x
-        slope = (weight * x * (across - mean_y)).sum(axis=0) / np.maximum((weight * x * x).sum(axis=0), 1e-9)
-        residual = across - mean_y - slope * x
-        ordered = np.sort(np.where(near, np.abs(residual), np.inf), axis=0)
-        middle = ordered[np.minimum(count // 2, len(along) - 1), range(4)]
-        scatter = np.maximum(1.4826 * np.where(np.isfinite(middle), middle, 1.0), 0.05)
-        weight = near * np.clip(1 - (residual / (_TUKEY * scatter)) ** 2, 0, None) ** 2
+        total = np.maximum(weight.sum(axis=1), 1e-9)
+        mean_x, mean_y = (
+            (weight * parts.along).sum(axis=1) / total,
+            (weight * parts.across).sum(axis=1) / total,
+        )
+        x = parts.along - mean_x[:, None]
+        weighted = weight * x
+        slope = (weighted * parts.across).sum(axis=1) / np.maximum((weighted * x).sum(axis=1), 1e-9)
+        residual = parts.across - mean_y[:, None] - slope[:, None] * x
+        ordered = np.sort(np.where(seen, np.abs(residual), np.inf), axis=1)
+        scatter = np.maximum(1.4826 * np.take_along_axis(ordered, middle, axis=1), _MIN_SCATTER_PX)
+        weight = seen * np.maximum(1 - (residual / (_TUKEY * scatter)) ** 2, 0) ** 2
     used = weight > 0
-    points = used.sum(axis=0)
-    part = np.clip(((along + 1) / 2 * _BINS).astype(np.intp), 0, _BINS - 1)
-    parts = np.zeros((_BINS, 4), dtype=np.bool_)
-    point, side = np.nonzero(used)
-    parts[part[point, side], side] = True
-    known = (points >= _MIN_POINTS) & (points >= 0.6 * count) & (parts.sum(axis=0) >= _LEAST_BINS)
-    roughness = np.sqrt((used * residual**2).sum(axis=0) / np.maximum(points, 1))
-    return _Lines(mean_y - slope * mean_x, slope, roughness, points.astype(np.float64), known)
+    points = (used * parts.count).sum(axis=1)
+    known = (points >= _MIN_POINTS) & (used.sum(axis=1) >= _LEAST_BINS)
+    square = (used * parts.count * (residual**2 + parts.variance)).sum(axis=1) / np.maximum(points, 1)
+    return _Lines(mean_y - slope * mean_x, slope, np.sqrt(square), points, np.asarray(known))
 
 
-def _covariance(
-    corners: FloatArray, middle: FloatArray, tangent: FloatArray, normal: FloatArray, sigma: FloatArray
-) -> FloatArray:
-    """Covariance (8, 8) of corners where lines meet whose offset and slope have ``sigma`` (4, 2)."""
-    jacobian = np.zeros((4, 2, 4, 2))
-    for corner in range(4):
-        sides = [(corner - 1) % 4, corner]
-        inverse = np.linalg.inv(normal[sides])
-        for n, side in enumerate(sides):
-            lever = (corners[corner] - middle[side]) @ tangent[side]
-            jacobian[corner, :, side] = np.outer(inverse[:, n], [1.0, lever])
-    flat = jacobian.reshape(8, 8) * sigma.ravel()
-    return np.asarray(flat @ flat.T)
+def _diagonal(variance: FloatArray) -> FloatArray:
+    """Matrices (M, 4, 2, 2) with the variances (M, 4, 2) on their diagonal."""
+    return np.asarray(variance[..., None] * np.eye(2))

@@ -12,6 +12,7 @@ from v2hdm.records import BoolArray, FloatArray
 
 _OUTSIDE_PX = 3.0
 _INSIDE_PX = 4.0
+_MEDIAN_STRIDE = 3
 _MAX_PIXELS = 350
 
 
@@ -21,7 +22,8 @@ class Patches:
 
     ``points`` (M, 3, N) float32 are (u, v, 1) in recorded px from ``origin_px`` (M, 2); ``values``
     (M, N) float32 grey; ``use`` (M, N) float32 1 where a pixel takes part, else 0; ``neighbours``
-    (2, M, N) the place in the list of the lattice's next pixel to the right and below, 0 for none.
+    (2, M, N) the place in the list of the lattice's next pixel to the right and below, 0 for none;
+    ``clipped`` (M,) the share of pixels left out since the sensor was at its limit there.
     """
 
     origin_px: FloatArray
@@ -29,6 +31,7 @@ class Patches:
     values: np.ndarray
     use: np.ndarray
     neighbours: np.ndarray
+    clipped: np.ndarray
 
     def take(self, rows: BoolArray) -> Patches:
         """The markings under the mask (M,)."""
@@ -40,12 +43,25 @@ class Patches:
             self.values[rows],
             self.use[rows],
             self.neighbours[:, rows],
+            self.clipped[rows],
+        )
+
+    def every(self, stride: int) -> Patches:
+        """Every ``stride``-th pixel, without neighbours."""
+        return Patches(
+            self.origin_px,
+            np.ascontiguousarray(self.points[..., ::stride]),
+            np.ascontiguousarray(self.values[:, ::stride]),
+            np.ascontiguousarray(self.use[:, ::stride]),
+            self.neighbours[..., :0],
+            self.clipped,
         )
 
     def median_used(self, values: np.ndarray) -> np.ndarray:
-        """Median (M,) of values (M, N) over the pixels that take part; 0 where there is none."""
-        ordered = np.sort(np.where(self.use > 0, values, np.float32(np.inf)), axis=1)
-        count = np.count_nonzero(self.use, axis=1)
+        """Median (M,) of every few values of (M, N) over the pixels that take part; 0 where there is none."""
+        use = self.use[:, ::_MEDIAN_STRIDE] > 0
+        ordered = np.sort(np.where(use, values[:, ::_MEDIAN_STRIDE], np.float32(np.inf)), axis=1)
+        count = np.count_nonzero(use, axis=1)
         median = ordered[np.arange(len(values)), np.maximum(count // 2 - 1, 0)]
         return np.where(count > 0, median, np.float32(0))
 
@@ -83,9 +99,11 @@ def cut_patches(
     patches = _empty(low + size // 2, max(1, int(count.max())))
     patches.points[marking, 0, place] = u - patches.origin_px[marking, 0]
     patches.points[marking, 1, place] = v + grey.top - patches.origin_px[marking, 1]
-    patches.values[marking, place] = grey.values[v, u]
-    patches.use[marking, place] = use & np.isfinite(patches.values[marking, place])
-    np.nan_to_num(patches.values, copy=False)
+    values = grey.values[v, u]
+    known = np.isfinite(values)
+    patches.values[marking, place] = np.where(known, values, np.float32(0))
+    patches.use[marking, place] = use & known
+    patches.clipped[:] = np.bincount(marking, np.isposinf(values), len(low)) / np.maximum(count, 1)
     place_of_cell = np.zeros(band.size, dtype=np.intp)
     place_of_cell[cell] = place
     for axis, following in ((0, 1), (1, width)):
@@ -128,4 +146,4 @@ def _empty(origin_px: np.ndarray, pixels: int) -> Patches:
     points[:, 2] = 1.0
     blank = np.zeros((markings, pixels), dtype=np.float32)
     neighbours = np.zeros((2, markings, pixels), dtype=np.intp)
-    return Patches(origin_px.astype(np.float64), points, blank, blank.copy(), neighbours)
+    return Patches(origin_px.astype(np.float64), points, blank, blank.copy(), neighbours, np.zeros(markings))

@@ -1,9 +1,10 @@
 """Corners of far markings: the whole quadrilateral fitted to the grey image at once.
 
 The grey value is modelled as ``b0 + b1 C + b2 u + b3 v``, with C the quadrilateral's coverage blurred by
-the point spread. The ends of the four sides and four levels are found by Gauss-Newton with Cauchy
-weights, first with a wider blur, which sees farther, then with the image's own. The fit runs in
-recorded pixels; the lens' small bow of the sides is undone afterwards.
+a point spread. The ends of the four sides, the levels and the spread are found by Gauss-Newton with Cauchy
+weights, first with a wider blur, which sees farther, then with one near the image's own. Where the sensor
+was at its limit only the flanks of the sides count: how fast they rise tells the level that was cut off. The
+fit runs in recorded pixels; the lens' small bow of the sides is undone afterwards.
 """
 
 from __future__ import annotations
@@ -12,25 +13,47 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from v2hdm.detection.correlation import variance_inflation
 from v2hdm.detection.coverage import blurred_coverage
 from v2hdm.detection.grey import GreyBand
 from v2hdm.detection.patches import Patches, cut_patches
-from v2hdm.detection.quad import intersect_sides, is_convex, side_frames
+from v2hdm.detection.quad import following, intersect_sides, is_convex, preceding, side_frames
 from v2hdm.detection.view import CameraView
 from v2hdm.records import BoolArray, FloatArray
 
 _WIDER_BLUR_PX = 0.8
-_COARSE_ITERATIONS = 3
-_FINE_ITERATIONS = 3
-_COARSE_STEP_PX = 0.5
-_FINE_STEP_PX = 0.1
+_ITERATIONS = 4
+_COARSE_STRIDE = 2
+_ENOUGH_PX = 0.1
 _MAX_SIDE_STEP_PX = 1.0
 _MAX_CORNER_STEP_PX = 4.0
 _MAX_MOVE_PX = 6.0
-_DAMPING = 1e-3
+_DAMPING = 1.0 + 1e-3 * np.eye(13)
+_RIDGE = 1e-9 * np.eye(13)
 _CAUCHY = 2.385
 _MIN_SCATTER = 2e-3
 _MIN_AMPLITUDE = 1e-3
+_LEVEL_ITERATIONS = 2
+_LEAST_SINE = 1e-3
+_MAX_CORRELATION = 0.7
+_BLUR_SIGMA_PX = 0.2
+_MAX_BLUR_STEP_PX = 0.2
+_BLUR_LIMITS_PX = (0.35, 3.0)
+"""How far a marking's own blur is from the point spread: motion, focus, frayed paint."""
+
+_CLIPPED_SHARE = 0.15
+_BLOOM = 1.2
+"""Where so many pixels are clipped, the outline is about this many blurs outside the paint."""
+
+_UNKNOWNS = 13
+_BLUR = 8
+_LEVELS = 9
+"""Places of the blur and of the first level among the unknowns."""
+
+_CORNER = np.arange(4)
+_END = 4 + (_CORNER - 1) % 4
+"""Each corner is the start of its own side and the end of the one before, in this place among the moves."""
+
 _GAUSS_POINTS = (0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0))
 
 
@@ -70,13 +93,17 @@ def fit_quads(
     """
     patches = cut_patches(grey, owner, owner_stride, blobs, corners_px)
     start = corners_px - patches.origin_px[:, None]
-    wider_px = float(np.hypot(blur_px, _WIDER_BLUR_PX))
-    corners, _ = _iterate(patches, start, wider_px, _COARSE_ITERATIONS, _COARSE_STEP_PX)
-    corners, system = _iterate(patches, corners, blur_px, _FINE_ITERATIONS, _FINE_STEP_PX)
-    settled = (np.abs(corners - start).max(axis=(1, 2)) < _MAX_MOVE_PX) & is_convex(corners)
+    inward_px = np.where(patches.clipped > _CLIPPED_SHARE, -_BLOOM * blur_px, 0.0)
+    corners = start + _moved(_corner_from_side(start), np.repeat(inward_px[:, None], 8, axis=1))
+    typical_px = np.full(len(start), blur_px)
+    quads = _Quads(corners, np.hypot(typical_px, _WIDER_BLUR_PX), np.zeros((len(start), 4)))
+    _iterate(patches.every(_COARSE_STRIDE), quads, 0.0, 1)
+    quads.blur_px = typical_px
+    system = _iterate(patches, quads, _BLUR_SIGMA_PX, _ITERATIONS)
+    settled = (np.abs(quads.corners - start).max(axis=(1, 2)) < _MAX_MOVE_PX) & is_convex(quads.corners)
     rms = np.sqrt((patches.use * system.residual**2).sum(axis=1) / np.maximum(patches.use.sum(axis=1), 1))
     return QuadFit(
-        corners + patches.origin_px[:, None],
+        quads.corners + patches.origin_px[:, None],
         _covariance(system, patches),
         system.amplitude,
         rms / system.amplitude,
@@ -90,20 +117,36 @@ def unbow_corners(view: CameraView, corners_px: FloatArray) -> FloatArray:
     A straight line fitted to a shallow arc crosses it at the two Gauss points of their common chord; so the
     true side is the line through those two points once the lens is undone.
     """
-    following = np.roll(corners_px, -1, axis=1)
-    points = np.stack([corners_px * (1 - s) + following * s for s in _GAUSS_POINTS], axis=2)
+    ahead = following(corners_px)
+    points = np.stack([corners_px * (1 - s) + ahead * s for s in _GAUSS_POINTS], axis=2)
     points = view.undistort(points.reshape(-1, 2)).reshape(points.shape)
     along = points[:, :, 1] - points[:, :, 0]
     normal = np.stack([-along[..., 1], along[..., 0]], axis=-1)
     return intersect_sides(points[:, :, 0], normal)
 
 
+@dataclass
+class _Quads:
+    """State of M markings: corners (M, 4, 2), px from the patches' origins, and blur (M,) px.
+
+    ``levels`` (M, 4) are those of coverage, u, v and 1, all zero before they are first fitted.
+    """
+
+    corners: FloatArray
+    blur_px: FloatArray
+    levels: FloatArray
+
+    def take(self, rows: np.ndarray) -> _Quads:
+        """Some of the markings."""
+        return _Quads(self.corners[rows], self.blur_px[rows], self.levels[rows])
+
+
 @dataclass(frozen=True)
 class _System:
-    """Least squares about the current corners of M markings with N pixels.
+    """Least squares about the current state of M markings with N pixels.
 
-    The unknowns are moves of the four sides' starts, of their ends, then the levels. ``weight`` and
-    ``residual`` (M, N); ``information`` (M, 12, 12) and ``gradient`` (M, 12), weighted;
+    The unknowns are moves of the four sides' starts, of their ends, the growth of the blur, then the levels.
+    ``weight`` and ``residual`` (M, N); ``information`` (M, 13, 13) and ``gradient`` (M, 13), weighted;
     ``corner_from_side`` (M, 8, 8) takes moves of the sides to moves of the corners; ``amplitude`` (M,).
     """
 
@@ -119,75 +162,101 @@ class _System:
         for name, value in vars(self).items():
             value[rows] = getattr(other, name)
 
+    def expect_blur(self, excess_px: FloatArray, sigma_px: float) -> None:
+        """Add that the blur (``excess_px`` (M,) too wide) is known to within ``sigma_px``; 0 holds it."""
+        variance = (self.weight * self.residual**2).sum(axis=1) / np.maximum(self.weight.sum(axis=1), 1)
+        stiffness = variance / sigma_px**2 if sigma_px else np.full(len(variance), 1e9)
+        self.information[:, _BLUR, _BLUR] += stiffness
+        self.gradient[:, _BLUR] -= stiffness * excess_px
 
-def _iterate(
-    patches: Patches, corners: FloatArray, blur_px: float, iterations: int, enough_px: float
-) -> tuple[FloatArray, _System]:
-    """Gauss-Newton until each marking's step is below ``enough_px``; the system is that of its last step."""
-    corners = corners.copy()
-    running = np.arange(len(corners))
+
+def _iterate(patches: Patches, quads: _Quads, blur_sigma_px: float, iterations: int) -> _System:
+    """Gauss-Newton until each marking's step is small; the system is that of its last step.
+
+    ``quads`` are moved; their blur stays within about ``blur_sigma_px`` of what it is at first.
+    """
+    expected_px = quads.blur_px.copy()
+    running = np.arange(len(expected_px))
     system = None
     for _ in range(iterations):
-        part = _linearise(patches, corners[running], blur_px, system.weight[running] if system else None)
+        now = quads.take(running)
+        part = _linearise(patches, now)
+        part.expect_blur(now.blur_px - expected_px[running], blur_sigma_px)
         if system is None:
             system = part
         else:
             system.put(running, part)
-        step = _step(part)
-        corners[running] += step
-        moving = np.abs(step).max(axis=(1, 2)) > enough_px
+        step, wider, levels = _step(part)
+        quads.corners[running] += step
+        quads.blur_px[running] = np.clip(now.blur_px + wider, *_BLUR_LIMITS_PX)
+        quads.levels[running] = now.levels + levels
+        moving = np.abs(step).max(axis=(1, 2)) > _ENOUGH_PX
         patches, running = patches.take(moving), running[moving]
         if not len(running):
             break
     assert system is not None
-    return corners, system
+    return system
 
 
-def _step(system: _System) -> FloatArray:
-    information = system.information.copy()
-    diagonal = np.einsum("mii->mi", information)
-    diagonal *= 1 + _DAMPING
-    diagonal += 1e-9
-    by_side = np.linalg.solve(information, system.gradient[..., None])[:, :8]
-    by_side = np.clip(by_side, -_MAX_SIDE_STEP_PX, _MAX_SIDE_STEP_PX)
-    step = (system.corner_from_side @ by_side).reshape(-1, 4, 2)
-    return np.asarray(np.clip(step, -_MAX_CORNER_STEP_PX, _MAX_CORNER_STEP_PX))
+def _step(system: _System) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Moves (M, 4, 2) of the corners, growth (M,) of the blur, change (M, 4) of the levels."""
+    damped = system.information * _DAMPING + _RIDGE
+    solved = np.linalg.solve(damped, system.gradient[..., None])[..., 0]
+    by_side = np.clip(solved[:, :_BLUR], -_MAX_SIDE_STEP_PX, _MAX_SIDE_STEP_PX)
+    step = np.clip(_moved(system.corner_from_side, by_side), -_MAX_CORNER_STEP_PX, _MAX_CORNER_STEP_PX)
+    wider = np.clip(solved[:, _BLUR], -_MAX_BLUR_STEP_PX, _MAX_BLUR_STEP_PX)
+    return np.asarray(step), np.asarray(wider), np.asarray(solved[:, _LEVELS:])
 
 
-def _linearise(patches: Patches, corners: FloatArray, blur_px: float, weight: np.ndarray | None) -> _System:
-    """The model and its derivative at the current corners, the best levels, and Cauchy weights."""
-    coverage, by_side = blurred_coverage(corners, patches.points, blur_px)
-    design = np.empty((len(corners), 12, coverage.shape[1]), dtype=np.float32)
-    design[:, 8] = coverage
-    design[:, 9:] = patches.points
-    if weight is None:
-        _, _, weight = _fit_levels(patches, design[:, 8:], patches.use)
-    levels, residual, weight = _fit_levels(patches, design[:, 8:], weight)
-    amplitude = np.maximum(levels[:, 0], _MIN_AMPLITUDE)
-    np.multiply(by_side, amplitude[:, None, None], out=design[:, :8])
+def _moved(corner_from_side: FloatArray, by_side: FloatArray) -> FloatArray:
+    """Moves (M, 4, 2) of the corners by moves (M, 8) of the sides' starts and ends."""
+    return np.asarray((corner_from_side @ by_side[..., None]).reshape(-1, 4, 2))
+
+
+def _linearise(patches: Patches, quads: _Quads) -> _System:
+    """The model and its derivative at the current state, and Cauchy weights; the best levels if asked for."""
+    coverage, by_shape = blurred_coverage(quads.corners, patches.points, quads.blur_px)
+    design = np.empty((len(coverage), _UNKNOWNS, coverage.shape[1]), dtype=np.float32)
+    basis = design[:, _LEVELS:]
+    basis[:, 0] = coverage
+    basis[:, 1:] = patches.points
+    if not quads.levels.any():
+        weight = patches.use
+        for _ in range(_LEVEL_ITERATIONS):
+            quads.levels[:] = _best_levels(patches, basis, weight)
+            _, weight = _residual(patches, basis, quads.levels)
+    residual, weight = _residual(patches, basis, quads.levels)
+    amplitude = np.maximum(quads.levels[:, 0], _MIN_AMPLITUDE)
+    np.multiply(by_shape, amplitude[:, None, None], out=design[:, :_LEVELS], casting="same_kind")
     weighted = design * weight[:, None]
     return _System(
         weight,
         residual,
-        (weighted @ np.swapaxes(design, 1, 2)).astype(np.float64),
+        (weighted @ design.swapaxes(1, 2)).astype(np.float64),
         (weighted @ residual[..., None])[..., 0].astype(np.float64),
-        _corner_from_side(corners),
-        amplitude.astype(np.float64),
+        _corner_from_side(quads.corners),
+        amplitude,
     )
 
 
-def _fit_levels(
-    patches: Patches, basis: np.ndarray, weight: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Levels (M, 4) for the shapes ``basis`` (M, 4, N), the residuals they leave, their Cauchy weights."""
+def _best_levels(patches: Patches, basis: np.ndarray, weight: np.ndarray) -> FloatArray:
+    """Levels (M, 4) of least squares for the shapes ``basis`` (M, 4, N)."""
     weighted = basis * weight[:, None]
-    matrix = (weighted @ np.swapaxes(basis, 1, 2)).astype(np.float64) + 1e-6 * np.eye(4)
+    matrix = (weighted @ basis.swapaxes(1, 2)).astype(np.float64) + 1e-6 * np.eye(4)
     target = (weighted @ patches.values[..., None]).astype(np.float64)
-    levels = np.linalg.solve(matrix, target)[..., 0].astype(np.float32)
-    residual = (patches.values - (levels[:, None] @ basis)[:, 0]) * patches.use
-    scatter = np.maximum(1.4826 * patches.median_used(np.abs(residual)), _MIN_SCATTER)
-    ratio = residual * (1 / (_CAUCHY * scatter[:, None])).astype(np.float32)
-    return levels, residual, patches.use / (1 + ratio * ratio)
+    return np.asarray(np.linalg.solve(matrix, target)[..., 0])
+
+
+def _residual(patches: Patches, basis: np.ndarray, levels: FloatArray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (M, N) of the levels (M, 4) and their Cauchy weights."""
+    residual = patches.values - (levels[:, None].astype(np.float32) @ basis)[:, 0]
+    residual *= patches.use
+    ratio = np.abs(residual)
+    scatter = np.maximum(1.4826 * patches.median_used(ratio), _MIN_SCATTER)
+    ratio *= (1 / (_CAUCHY * scatter)).astype(np.float32)[:, None]
+    ratio *= ratio
+    ratio += np.float32(1)
+    return residual, np.divide(patches.use, ratio, out=ratio)
 
 
 def _corner_from_side(corners: FloatArray) -> FloatArray:
@@ -195,34 +264,25 @@ def _corner_from_side(corners: FloatArray) -> FloatArray:
 
     Corner c moves with the end of side c - 1 and the start of side c, each along its own normal.
     """
-    _, normal, _ = side_frames(corners)
-    before = np.roll(normal, 1, axis=1)
-    determinant = before[..., 0] * normal[..., 1] - before[..., 1] * normal[..., 0]
-    determinant = np.where(np.abs(determinant) < 1e-3, 1e-3, determinant)[..., None]
-    by_end = np.stack([normal[..., 1], -normal[..., 0]], axis=-1) / determinant
-    by_start = np.stack([-before[..., 1], before[..., 0]], axis=-1) / determinant
+    tangent, _, _ = side_frames(corners)
+    before = preceding(tangent)
+    determinant = before[..., 0] * tangent[..., 1] - before[..., 1] * tangent[..., 0]
+    determinant = np.where(np.abs(determinant) < _LEAST_SINE, _LEAST_SINE, determinant)[..., None]
     jacobian = np.zeros((len(corners), 4, 2, 8))
-    for corner in range(4):
-        jacobian[:, corner, :, corner] = by_start[:, corner]
-        jacobian[:, corner, :, 4 + (corner - 1) % 4] = by_end[:, corner]
+    # Each lies along the other's line.
+    jacobian[:, _CORNER, :, _CORNER] = (-before / determinant).swapaxes(0, 1)
+    jacobian[:, _CORNER, :, _END] = (tangent / determinant).swapaxes(0, 1)
     return jacobian.reshape(-1, 8, 8)
 
 
 def _covariance(system: _System, patches: Patches) -> FloatArray:
     """Corner covariance (M, 8, 8) from the residuals, inflated by their correlation in both directions."""
-    by_side = np.linalg.inv(system.information + 1e-9 * np.eye(12))[:, :8, :8]
-    effective = np.maximum(system.weight.sum(axis=1) - 12, 1)
-    variance = (system.weight * system.residual**2).sum(axis=1) / effective
+    by_side = np.linalg.inv(system.information + 1e-9 * np.eye(_UNKNOWNS))[:, :8, :8]
+    residual, weight = system.residual, system.weight
+    variance = (weight * residual**2).sum(axis=1) / np.maximum(weight.sum(axis=1) - _UNKNOWNS, 1)
     for neighbour in patches.neighbours:
-        variance = variance * _correlation_factor(system.residual, system.weight, neighbour)
+        second = np.take_along_axis(residual, neighbour, axis=1)
+        pair = weight * np.take_along_axis(weight, neighbour, axis=1) * (neighbour > 0)
+        variance = variance * variance_inflation(residual, second, pair, _MAX_CORRELATION)
     jacobian = system.corner_from_side
     return np.asarray(variance[:, None, None] * (jacobian @ by_side @ np.swapaxes(jacobian, 1, 2)))
-
-
-def _correlation_factor(residual: np.ndarray, weight: np.ndarray, neighbour: np.ndarray) -> FloatArray:
-    """(1 + r) / (1 - r), with r (M,) the correlation of residuals with those of the neighbouring pixels."""
-    second = np.take_along_axis(residual, neighbour, axis=1)
-    pair = weight * np.take_along_axis(weight, neighbour, axis=1) * (neighbour > 0)
-    power = (pair * (residual**2 + second**2)).sum(axis=1) / 2
-    r = np.clip((pair * residual * second).sum(axis=1) / np.maximum(power, 1e-12), 0.0, 0.7)
-    return np.asarray((1 + r) / (1 - r), dtype=np.float64)

@@ -1,0 +1,75 @@
+"""Whole quadrilaterals: overexposed paint, unknown blur; the covariance of corners where lines meet."""
+
+import numpy as np
+import pytest
+
+from tests.detection.pictures import brightness_model, diamond, make_camera, picture, to_image
+from tests.detection.test_corners import errors_px, normalised
+from v2hdm.detection.correlation import variance_inflation
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.detection.quad import intersect_sides, order_corners, side_frames
+from v2hdm.detection.quad_covariance import corner_covariance
+
+SHAPES = [diamond(x, y, 1.2, 0.7, 9.0 * y) for x in (6.0, 8.0, 10.0) for y in (-1.9, -0.3, 1.4)]
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    return brightness_model(tmp_path_factory.mktemp("models"))
+
+
+def fitted(model, **drawing):
+    """Errors (n, 2) and covariances of the valid corners on three pictures, and how many should be there."""
+    camera = make_camera()
+    detector = Detector.load(model, DetectorOptions())
+    truth_px = [to_image(camera, shape) for shape in SHAPES]
+    parts = []
+    for seed in range(3):
+        markings, _ = detector.detect(picture(camera, SHAPES, seed=seed, **drawing), camera)
+        parts.append(errors_px(markings, truth_px))
+    errors, covariances = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return errors, covariances, 3 * 4 * len(SHAPES)
+
+
+@pytest.mark.parametrize("paint", [1.6, 2.5])
+def test_paint_that_is_brighter_than_the_sensor_can_say_is_not_drawn_larger(model, paint):
+    """Where the paint is clipped, the visible edge lies outside the true one, by .3 px and more here."""
+    errors, covariances, asked = fitted(model, paint=paint, blur_px=0.9)
+    assert len(errors) > 0.8 * asked
+    size = np.linalg.norm(errors, axis=1)
+    assert np.median(size) < 0.12
+    assert np.quantile(size, 0.95) < 0.5
+    assert np.median(normalised(errors, covariances)) < 3.0
+
+
+@pytest.mark.parametrize("blur_px", [0.6, 1.2])
+def test_a_blur_that_is_not_the_usual_one_is_found(model, blur_px):
+    errors, _, asked = fitted(model, blur_px=blur_px)
+    assert len(errors) > 0.9 * asked
+    assert np.median(np.linalg.norm(errors, axis=1)) < 0.1
+
+
+def test_the_covariance_of_corners_is_that_of_scattered_lines():
+    corners = order_corners(np.array([[0.0, 0.0], [40.0, 5.0], [37.0, 22.0], [-3.0, 16.0]]))[None]
+    tangent, normal, _ = side_frames(corners)
+    middle = (corners + np.roll(corners, -1, axis=1)) / 2
+    rng = np.random.default_rng(0)
+    root = np.array([[0.2, 0.0], [0.004, 0.006]]) * np.array([1.0, 0.5, 2.0, 1.5])[:, None, None]
+    found = np.array([[True, True, True, False]])
+    stated = corner_covariance(corners, middle, tangent, normal, (root @ root.swapaxes(1, 2))[None], found)[0]
+    offset, slope = np.moveaxis((root @ rng.normal(size=(20000, 4, 2, 1)))[..., 0], -1, 0)
+    moved = intersect_sides(middle + offset[..., None] * normal, normal - slope[..., None] * tangent)
+    seen = np.cov(moved.reshape(-1, 8).T)
+    assert not stated[6:].any()
+    assert not stated[:, 6:].any()
+    np.testing.assert_allclose(stated[:6, :6], seen[:6, :6], atol=0.03 * np.diag(seen).max())
+
+
+def test_correlated_residuals_inflate_the_variance_as_they_do_that_of_a_mean():
+    rng, rho = np.random.default_rng(1), 0.5
+    noise = rng.normal(size=(4000, 200))
+    for n in range(1, 200):
+        noise[:, n] = rho * noise[:, n - 1] + np.sqrt(1 - rho**2) * noise[:, n]
+    factor = variance_inflation(noise[:, 1:], noise[:, :-1], np.ones((4000, 199)), 0.9)
+    assert np.median(factor) == pytest.approx(200 * noise.mean(axis=1).var(), rel=0.1)
