@@ -179,7 +179,7 @@ def _profiles(grey: GreyBand, view: CameraView, sides: _Sides, t: FloatArray) ->
 
 @dataclass(frozen=True)
 class _ProfileFit:
-    """Of profiles (M, 4, n): ``offset`` px, ``low``, ``amplitude``, if ``good``; ``blur`` (M, 4) px of sides."""
+    """Of profiles (M, 4, n): ``offset`` px, ``low``, ``amplitude``, if ``good``; ``blur`` (M, 4) px."""
 
     offset: FloatArray
     low: FloatArray
