@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 
-from v2hdm.mapping.lane_points import LaneCloud
+from v2hdm.mapping.lane_points import Guides, LaneCloud
 from v2hdm.mapping.lanes import map_lanes
 from v2hdm.mapping.options import LaneOptions
 from v2hdm.records import FloatArray, Lane
@@ -35,6 +36,18 @@ def cloud_of(
         np.concatenate(image),
         np.full(count, dash),
     )
+
+
+def guides_of(lines: list[FloatArray]) -> Guides:
+    """Whole lines (N, 2), each as one image saw it."""
+    index = np.arange(len(lines))
+    return Guides(np.concatenate(lines), np.repeat(index, [len(line) for line in lines]), index)
+
+
+def arc(start: float, stop: float, radius: float = 60.0) -> FloatArray:
+    """A bend to the left from the origin, between two distances along it, m."""
+    angle = np.arange(start, stop, 0.3) / radius
+    return radius * np.column_stack([np.sin(angle), 1 - np.cos(angle)])
 
 
 def straight(start: float, stop: float, y: float = 0.0, step: float = 0.3) -> FloatArray:
@@ -134,3 +147,33 @@ def test_a_hundred_thousand_points_take_seconds() -> None:
     lanes = map_lanes(cloud, OPTIONS)
     assert len(lanes) == 4
     assert time.process_time() - begin < 15
+
+
+def test_a_break_is_bridged_along_the_lines_that_images_saw_run_across_it() -> None:
+    cloud = cloud_of([arc(0, 15), arc(30, 45)], dash=True)
+    assert len(map_lanes(cloud, OPTIONS)) == 2
+    beside = arc(5, 40) + np.array([0.0, 0.1])
+    guided = replace(cloud, guides=guides_of([beside] * OPTIONS.min_images))
+    (lane,) = map_lanes(guided, OPTIONS)
+    assert length(lane) > 43
+    assert np.abs(np.linalg.norm(lane.points_map - [0.0, 60.0], axis=1) - 60).max() < 0.05
+
+
+def test_a_break_that_too_few_images_saw_a_line_cross_stays_one() -> None:
+    cloud = cloud_of([arc(0, 15), arc(30, 45)], dash=True)
+    few = [arc(5, 40)] * (OPTIONS.min_images - 1)
+    short_of_it = [arc(5, 27)] * 10 + [arc(20, 40)] * 10
+    assert len(map_lanes(replace(cloud, guides=guides_of(few + short_of_it)), OPTIONS)) == 2
+
+
+def test_lines_beside_each_other_are_not_bridged_whatever_was_seen() -> None:
+    cloud = cloud_of([straight(0, 20), straight(21, 40, y=3.0)])
+    across = np.column_stack([np.linspace(15, 25, 40), np.linspace(-3.0, 6.0, 40)])
+    assert len(map_lanes(replace(cloud, guides=guides_of([across] * 20)), OPTIONS)) == 2
+
+
+def test_a_short_piece_must_be_seen_more_often_than_a_long_one() -> None:
+    piece = straight(0, 4.0)
+    assert map_lanes(cloud_of([piece], images=OPTIONS.min_images), OPTIONS) == ()
+    assert len(map_lanes(cloud_of([piece], images=3 * OPTIONS.min_images), OPTIONS)) == 1
+    assert len(map_lanes(cloud_of([straight(0, 12)], images=OPTIONS.min_images), OPTIONS)) == 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,15 @@ from v2hdm.mapping.backprojection import (
 )
 from v2hdm.mapping.location import Rig
 from v2hdm.mapping.sightings import frames_of
-from v2hdm.records import LANE_CLASSES, LANE_DASH, BoolArray, Drive, FloatArray, ImageDetections
+from v2hdm.records import (
+    LANE_BOUNDARY,
+    LANE_CLASSES,
+    LANE_DASH,
+    BoolArray,
+    Drive,
+    FloatArray,
+    ImageDetections,
+)
 
 IntArray = NDArray[np.int64]
 
@@ -30,6 +38,21 @@ _CENTRE_SIGMA_PX = 1.0
 _TANGENT_REACH = 2
 """Points to either side whose difference gives a point's direction."""
 
+_GUIDE_RANGE = 1.8
+"""Whole lines are followed so many times farther than paint is mapped: they only say what is one line."""
+
+
+@dataclass(frozen=True)
+class Guides:
+    """Whole lines as single images saw them, gaps of dashes included: which paint is one line.
+
+    ``points_map`` (G, 2) m; ``line`` (G,) that a point is of, an index into ``image_of_line`` (L,).
+    """
+
+    points_map: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    line: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    image_of_line: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
 
 @dataclass(frozen=True)
 class LaneCloud:
@@ -37,7 +60,7 @@ class LaneCloud:
 
     ``points_map`` (P, 2) m, unit ``tangent`` (P, 2) of either sense, ``weight`` (P,) = 1 / variance
     across the line in 1 / m^2, ``image`` (P,) that a point was seen in, ``dash`` (P,) whether its
-    detection was a dash.
+    detection was a dash; beside them the ``guides``.
     """
 
     points_map: FloatArray
@@ -45,6 +68,7 @@ class LaneCloud:
     weight: FloatArray
     image: IntArray
     dash: BoolArray
+    guides: Guides = field(default_factory=Guides)
 
 
 @dataclass(frozen=True)
@@ -93,6 +117,7 @@ def collect_lane_points(
     Points farther than ``max_range_m`` from their camera are left out; ``jitter_rad`` of viewing
     direction goes into the weights, so that near points count for more.
     """
+    guides = _guides(drive, detections, ground, _GUIDE_RANGE * max_range_m)
     covered = np.isfinite(ground.centre_map[:, 0])
     pieces = [
         (found.image, lane.kind == LANE_DASH, lane.points_px)
@@ -102,7 +127,8 @@ def collect_lane_points(
         if lane.kind in LANE_CLASSES and len(lane.points_px) >= 2
     ]
     if not pieces:
-        return LaneCloud(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, int), np.zeros(0, bool))
+        empty = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, int), np.zeros(0, bool)
+        return LaneCloud(*empty, guides)
     length = np.array([len(points) for _, _, points in pieces])
     piece = np.repeat(np.arange(len(pieces)), length)
     image = np.array([i for i, _, _ in pieces])[piece]
@@ -123,7 +149,33 @@ def collect_lane_points(
     dash = np.array([is_dash for _, is_dash, _ in pieces])[piece]
     # A centimetre of its own keeps the nearest image from outvoting all others.
     weight = 1.0 / (variance[keep] + 0.01**2)
-    return LaneCloud(points_map[keep], tangent[keep], weight, image[keep].astype(np.int64), dash[keep])
+    return LaneCloud(
+        points_map[keep], tangent[keep], weight, image[keep].astype(np.int64), dash[keep], guides
+    )
+
+
+def _guides(
+    drive: Drive, detections: Sequence[ImageDetections], ground: ImageGround, max_range_m: float
+) -> Guides:
+    """The whole lines of the images that ``ground`` covers, as far as ``max_range_m``."""
+    covered = np.isfinite(ground.centre_map[:, 0])
+    lines = [
+        (found.image, lane.points_px)
+        for found in detections
+        if covered[found.image]
+        for lane in found.lanes
+        if lane.kind == LANE_BOUNDARY
+    ]
+    if not lines:
+        return Guides()
+    image_of_line = np.array([image for image, _ in lines], dtype=np.int64)
+    line = np.repeat(np.arange(len(lines)), [len(points_px) for _, points_px in lines])
+    image = image_of_line[line]
+    points_px = _undistort(drive, image, np.concatenate([points_px for _, points_px in lines]))
+    points_map = apply_homographies(ground.map_from_pinhole_px[image], points_px[:, None])[:, 0]
+    with np.errstate(invalid="ignore"):
+        near = np.linalg.norm(points_map - ground.centre_map[image, :2], axis=1) <= max_range_m
+    return Guides(points_map[near], line[near].astype(np.int64), image_of_line)
 
 
 def _rows(drive: Drive, cameras: Sequence[str]) -> tuple[IntArray, list[str], FloatArray]:

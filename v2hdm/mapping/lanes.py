@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from v2hdm.mapping.lane_bridges import bridge_paths
 from v2hdm.mapping.lane_paths import Path, join_paths, string_nodes
 from v2hdm.mapping.lane_points import LaneCloud
 from v2hdm.mapping.options import LaneOptions
 from v2hdm.mapping.ridges import find_nodes
 from v2hdm.records import LANE_DASH, LANE_LINE, FloatArray, Lane
+
+_LEAST_LENGTH_M = 6.0
+"""Length, m, at which a lane that just enough images saw is one; a shorter one must be seen more often."""
 
 
 def map_lanes(cloud: LaneCloud, options: LaneOptions) -> tuple[Lane, ...]:
@@ -19,7 +23,14 @@ def map_lanes(cloud: LaneCloud, options: LaneOptions) -> tuple[Lane, ...]:
     if len(cloud.points_map) < 2:
         return ()
     paths = join_paths(string_nodes(find_nodes(cloud, options), options), options)
-    return tuple(_lane(path, options) for path in paths if path.length_m >= options.min_length_m)
+    paths = bridge_paths(paths, cloud.guides, options)
+    return tuple(_lane(path, options) for path in paths if _is_seen_enough(path, options))
+
+
+def _is_seen_enough(path: Path, options: LaneOptions) -> bool:
+    """Whether a path is long enough, and a short one seen often enough."""
+    image_metres = path.length_m * path.images
+    return path.length_m >= options.min_length_m and image_metres >= _LEAST_LENGTH_M * options.min_images
 
 
 def _lane(path: Path, options: LaneOptions) -> Lane:

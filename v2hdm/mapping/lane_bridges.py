@@ -1,0 +1,108 @@
+"""Gaps in mapped lanes that are bridged because images saw one line run across them.
+
+Paint under trees or worn away leaves pieces too far apart to be joined by their directions alone. Where
+the detector saw, in several images, one whole line pass the end of one piece and the start of the next, they
+are one lane, and those lines say where it runs between them.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from v2hdm.mapping.lane_paths import Path
+from v2hdm.mapping.lane_points import Guides
+from v2hdm.mapping.options import LaneOptions
+from v2hdm.records import FloatArray
+
+_MAX_BRIDGE_M = 25.0
+_PASSES_M = 0.4
+"""A line that comes so near the end of a piece passes it."""
+
+_LEAST_COSINE = np.cos(np.deg2rad(30.0))
+_END_LENGTH_M = 5.0
+"""A bridge leaves a piece in about the direction of so much of its end."""
+
+
+def bridge_paths(paths: list[Path], guides: Guides, options: LaneOptions) -> list[Path]:
+    """The paths, those joined that ``options.min_images`` images saw as one line, shortest gaps first."""
+    if not len(guides.points_map):
+        return paths
+    tree = cKDTree(guides.points_map)
+    paths = list(paths)
+    while (joined := _shortest_bridge(paths, guides, tree, options)) is not None:
+        a, b, path = joined
+        paths = [p for k, p in enumerate(paths) if k not in (a, b)] + [path]
+    return paths
+
+
+def _shortest_bridge(
+    paths: list[Path], guides: Guides, tree: cKDTree, options: LaneOptions
+) -> tuple[int, int, Path] | None:
+    """Two paths and what they are together, the shortest gap that can be bridged."""
+    pairs = []
+    for a, b in itertools.combinations(range(len(paths)), 2):
+        for flip_a, flip_b in itertools.product((False, True), repeat=2):
+            before, after = _turned(paths[a], flip_a), _turned(paths[b], flip_b)
+            gap_m = float(np.linalg.norm(after.points_map[0] - before.points_map[-1]))
+            if gap_m <= _MAX_BRIDGE_M and _continues(before.points_map, after.points_map):
+                pairs.append((gap_m, a, b, before, after))
+    for _, a, b, before, after in sorted(pairs, key=lambda pair: pair[0]):
+        between = _bridge(before.points_map[-1], after.points_map[0], guides, tree, options)
+        if between is not None:
+            return a, b, _joined(before, between, after)
+    return None
+
+
+def _turned(path: Path, flip: bool) -> Path:
+    return Path(path.points_map[::-1], path.dash, path.images) if flip else path
+
+
+def _continues(before: FloatArray, after: FloatArray) -> bool:
+    """Whether the way from one polyline to the next is roughly that of both."""
+    gap = after[0] - before[-1]
+    gap_m = float(np.linalg.norm(gap))
+    leaving, arriving = _outward(before), -_outward(after[::-1])
+    return gap_m > 0 and min(float(gap @ leaving), float(gap @ arriving)) >= _LEAST_COSINE * gap_m
+
+
+def _outward(points: FloatArray) -> FloatArray:
+    """Direction (2,) in which a polyline ends, over its last metres."""
+    away = np.linalg.norm(points - points[-1], axis=1)
+    direction = points[-1] - points[int(np.argmin(np.abs(away - min(_END_LENGTH_M, float(away.max())))))]
+    return np.asarray(direction / max(float(np.linalg.norm(direction)), 1e-9))
+
+
+def _bridge(
+    start: FloatArray, stop: FloatArray, guides: Guides, tree: cKDTree, options: LaneOptions
+) -> FloatArray | None:
+    """Vertices (N, 2) between two ends, where the lines seen run; None unless enough images saw one."""
+    passing = [np.unique(guides.line[tree.query_ball_point(end, _PASSES_M)]) for end in (start, stop)]
+    common = np.intersect1d(*passing)
+    if len(np.unique(guides.image_of_line[common])) < options.min_images:
+        return None
+    gap = stop - start
+    gap_m = float(np.linalg.norm(gap))
+    ahead = gap / gap_m
+    count = max(int(np.ceil(gap_m / options.node_spacing_m)), 1)
+    at = np.linspace(0.0, gap_m, count + 1)
+    courses = []
+    for line in common:
+        offset = guides.points_map[guides.line == line] - start
+        along, across = offset @ ahead, offset[:, 1] * ahead[0] - offset[:, 0] * ahead[1]
+        order = np.argsort(along)
+        courses.append(np.interp(at, along[order], across[order]))
+    course = np.median(courses, axis=0)
+    # The paint is where the ends are: what the lines seen are off there is taken off along the way.
+    course -= np.interp(at, [0.0, gap_m], [course[0], course[-1]])
+    points = start + at[:, None] * ahead + course[:, None] * np.array([-ahead[1], ahead[0]])
+    return np.asarray(points[1:-1])
+
+
+def _joined(before: Path, between: FloatArray, after: Path) -> Path:
+    lengths = [max(before.length_m, 1e-9), max(after.length_m, 1e-9)]
+    dash = float(np.average([before.dash, after.dash], weights=lengths))
+    images = float(np.average([before.images, after.images], weights=lengths))
+    return Path(np.concatenate([before.points_map, between, after.points_map]), dash, images)
