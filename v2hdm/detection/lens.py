@@ -42,10 +42,29 @@ def distort_points(info: CameraInfo, points_pinhole_px: FloatArray) -> FloatArra
     points = np.ascontiguousarray(points_pinhole_px, dtype=np.float64).reshape(-1, 2)
     if points.size == 0 or not has_distortion(info):
         return points.copy()
-    rays = np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(info.intrinsic).T
-    coefficients = np.asarray(info.distortion, dtype=np.float64)
     if info.distortion_model == "equidistant":
+        rays = np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(info.intrinsic).T
+        coefficients = np.asarray(info.distortion, dtype=np.float64)
         out = cv2.fisheye.distortPoints(rays[:, None, :2].copy(), info.intrinsic, coefficients)
-    else:
-        out, _ = cv2.projectPoints(rays[:, None, :], np.zeros(3), np.zeros(3), info.intrinsic, coefficients)
-    return np.asarray(out, dtype=np.float64).reshape(-1, 2)
+        return np.asarray(out, dtype=np.float64).reshape(-1, 2)
+    return _brown_conrady(info, points)
+
+
+def _brown_conrady(info: CameraInfo, points_pinhole_px: FloatArray) -> FloatArray:
+    """Recorded pixels (N, 2) under OpenCV's ``calib3d`` model of up to eight coefficients.
+
+    OpenCV's own function works out derivatives besides, which takes several times as long. As there, skew
+    is one of the pinhole image only.
+    """
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*info.distortion, *(0.0,) * (8 - len(info.distortion)))
+    (fx, skew, cx), (_, fy, cy), _ = info.intrinsic
+    y = (points_pinhole_px[:, 1] - cy) / fy
+    x = (points_pinhole_px[:, 0] - cx - skew * y) / fx
+    xy, xx, yy = x * y, x * x, y * y
+    r2 = xx + yy
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    if k4 or k5 or k6:
+        radial /= 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    u = x * radial + 2 * p1 * xy + p2 * (r2 + 2 * xx)
+    v = y * radial + p1 * (r2 + 2 * yy) + 2 * p2 * xy
+    return np.column_stack([fx * u + cx, fy * v + cy])
