@@ -49,6 +49,12 @@ _SCATTER_ITERATIONS = 3
 _TUKEY = 4.685
 _MIN_SCATTER_PX = 0.02
 _MIN_INLIERS = 8
+_SHARP_SCATTER_PX = 0.1
+_MOST_FRAYED_PX = 1.5
+_FRAYED_SHARE = 0.8
+"""Offsets of a sharp edge scatter by less than this, those of paint by not much more than that; what is over
+is by this share an error of the whole side."""
+
 _MAX_CORRELATION = 0.85
 
 
@@ -257,7 +263,21 @@ def _robust_lines(sides: _Sides, offset: FloatArray, good: BoolArray, iterations
     neighbours = weight[..., 1:] * weight[..., :-1]
     variance *= variance_inflation(residual[..., 1:], residual[..., :-1], neighbours, _MAX_CORRELATION)
     covariance = variance[..., None, None] * _inverse(normal_matrix)
+    frayed = _frayed_px(residual, good)
+    covariance[..., 0, 0] += frayed**2
+    covariance[..., 1, 1] += (frayed / np.maximum(np.abs(along).max(axis=-1), 1.0)) ** 2
     return _Lines(sides, constant, slope, covariance, inliers)
+
+
+def _frayed_px(residual: FloatArray, good: BoolArray) -> FloatArray:
+    """By how much sides (M, 4) may be off as a whole, from the residuals of all their good profiles.
+
+    Paint wears from its edges inwards, in chips longer than the profiles are apart: what scatters by more
+    than a sharp edge does has no mean of zero.
+    """
+    square = (good * np.minimum(residual * residual, _MOST_FRAYED_PX**2)).sum(axis=-1)
+    scatter = np.sqrt(square / np.maximum(good.sum(axis=-1), 1))
+    return np.asarray(_FRAYED_SHARE * np.maximum(scatter - _SHARP_SCATTER_PX, 0.0))
 
 
 def _weighted_line(weight: FloatArray, terms: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -131,7 +131,8 @@ def _lattice_steps(corners_px: FloatArray, size: np.ndarray) -> np.ndarray:
 def _in_band(corners: FloatArray, columns: np.ndarray, rows: np.ndarray) -> BoolArray:
     """Which pixels (M, H, W) of a lattice are near the nearest side of quadrilaterals (M, 4, 2)."""
     _, normal, _ = side_frames(corners)
-    offset = (normal * corners).sum(axis=-1)
+    offset = (normal * corners).sum(axis=-1).astype(np.float32)
+    normal = normal.astype(np.float32)
     u, v = columns[:, None, :].astype(np.float32), rows[:, :, None].astype(np.float32)
     reach = np.full((len(corners), rows.shape[1], columns.shape[1]), -np.inf, dtype=np.float32)
     for side in range(4):
