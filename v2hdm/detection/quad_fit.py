@@ -28,6 +28,11 @@ _ENOUGH_PX = 0.1
 _MAX_SIDE_STEP_PX = 1.0
 _MAX_CORNER_STEP_PX = 4.0
 _MAX_MOVE_PX = 6.0
+_MAX_MOVE_SHARE = 0.1
+"""A fit that moves a corner by more than this, and than this share of the longest side, has gone astray."""
+
+_NOISE_MISFIT = 0.08
+"""Share of the step up to the paint that noise and texture alone leave."""
 _DAMPING = 1.0 + 1e-3 * np.eye(13)
 _RIDGE = 1e-9 * np.eye(13)
 _CAUCHY = 2.385
@@ -100,13 +105,17 @@ def fit_quads(
     _iterate(patches.every(_COARSE_STRIDE), quads, 0.0, 1)
     quads.blur_px = typical_px
     system = _iterate(patches, quads, _BLUR_SIGMA_PX, _ITERATIONS)
-    settled = (np.abs(quads.corners - start).max(axis=(1, 2)) < _MAX_MOVE_PX) & is_convex(quads.corners)
+    most_px = np.maximum(_MAX_MOVE_PX, _MAX_MOVE_SHARE * side_frames(start)[2].max(axis=1))
+    settled = (np.abs(quads.corners - start).max(axis=(1, 2)) < most_px) & is_convex(quads.corners)
     rms = np.sqrt((patches.use * system.residual**2).sum(axis=1) / np.maximum(patches.use.sum(axis=1), 1))
+    misfit = rms / system.amplitude
+    # Misfit is paint that is missing on one side; a level beyond the sensor's is an extrapolation.
+    doubt = (1 + (misfit / _NOISE_MISFIT) ** 2) * np.maximum(system.amplitude, 1.0) ** 2
     return QuadFit(
         quads.corners + patches.origin_px[:, None],
-        _covariance(system, patches),
+        doubt[:, None, None] * _covariance(system, patches),
         system.amplitude,
-        rms / system.amplitude,
+        misfit,
         settled,
     )
 
