@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from v2hdm.detection.lane_curves import LEAST_BELOW_PX, Horizon
+from v2hdm.detection.lane_curves import LEAST_BELOW_PX, Horizon, basis
 from v2hdm.detection.lane_groups import NEIGHBOURS, IntArray, Line, LinePoints, find_lines
 from v2hdm.detection.sight import AnchorRow
 from v2hdm.detection.view import CameraView
@@ -164,13 +164,13 @@ def _followed(
 
     The mean of the points around, weighted, and of the curve, as good as lines follow curves.
     """
-    curve_sigma = line.curve.sigma(at)
+    phi = basis(at)
+    curve_sigma, along = line.curve.sigma(phi), line.curve.along(phi)
     freedom = _FREEDOM_M * horizon.px_per_m * at
-    along = line.curve.along(at)
     if line.double:
         return along, np.hypot(curve_sigma, freedom)
     members = line.certain
-    off = points.along[members] - line.curve.along(points.below[members])
+    off = points.along[members] - line.curve.along(points.phi[members])
     near = np.maximum(1 - np.abs(at[:, None] - points.below[members]) / _SMOOTH_PX, 0)
     weight = near / (NEIGHBOURS * points.sigma_px[members] ** 2)
     own = 1 / (curve_sigma**2 + freedom**2)
@@ -185,18 +185,19 @@ def _chains(rows: Sequence[AnchorRow]) -> list[_Chain]:
     for row in rows:
         done += [chain for chain in open_chains if chain.v_px[-1] - row.v_px > _MAX_GAP_PX]
         open_chains = [chain for chain in open_chains if chain.v_px[-1] - row.v_px <= _MAX_GAP_PX]
-        open_chains += _extend(open_chains, row, before)
+        likely = np.flatnonzero(row.odds > _CHAIN_ODDS).tolist()
+        if likely:
+            open_chains += _extend(open_chains, row, likely, before)
         before += len(row.u_px)
     return [chain for chain in done + open_chains if len(chain.v_px) >= _MIN_CHAIN]
 
 
-def _extend(chains: list[_Chain], row: AnchorRow, before: int) -> list[_Chain]:
+def _extend(chains: list[_Chain], row: AnchorRow, likely: list[int], before: int) -> list[_Chain]:
     """Give each likely crossing of a row to the chain that it suits best; what is left over starts chains.
 
     ``before`` is the number of crossings of the rows before this one.
     """
     columns = row.u_px.tolist()
-    likely = np.flatnonzero(row.odds > _CHAIN_ODDS).tolist()
     pairs = []
     for c, chain in enumerate(chains):
         expected, gate = chain.expected(row.v_px)
@@ -235,5 +236,7 @@ def _lateral_m(points_px: FloatArray, view: CameraView) -> float:
     along = near[:, 0] - view.foot_vehicle[0]
     if np.ptp(along) < 0.5:
         return float(near[0, 1])
-    slope, beside = np.polyfit(along, near[:, 1], 1)
+    apart = along - along.mean()
+    slope = float(apart @ near[:, 1] / (apart @ apart))
+    beside = float(near[:, 1].mean()) - slope * float(along.mean())
     return float(beside if abs(slope) < 1 else near[0, 1])

@@ -9,6 +9,7 @@ groups of points are one line has a closed answer.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,22 +88,21 @@ class Evidence:
     square: FloatArray
 
     @classmethod
-    def of(cls, horizon: Horizon, along: FloatArray, below: FloatArray, sigma: FloatArray) -> Evidence:
-        """One group: points (M,) with standard deviations (M,) along the horizon, px."""
-        phi = _basis(below)
-        u = along - horizon.centre_px
-        weighted = phi * (sigma**-2.0)[:, None]
-        moment = weighted.T @ u
-        return cls((phi.T @ weighted)[None], moment[None], np.array([sigma**-2.0 @ u**2]))
+    def of(cls, phi: FloatArray, u: FloatArray, sigma: FloatArray, ends: Sequence[int]) -> Evidence:
+        """Groups of points, one after the other.
 
-    @classmethod
-    def stack(cls, groups: list[Evidence]) -> Evidence:
-        """All groups in one."""
-        return cls(
-            np.concatenate([g.information for g in groups]),
-            np.concatenate([g.moment for g in groups]),
-            np.concatenate([g.square for g in groups]),
+        Args:
+            phi: :func:`basis` of the points (M, 3).
+            u: Their place along the horizon from its ``centre_px``, px (M,).
+            sigma: Standard deviations of that (M,).
+            ends: Where in these arrays each group ends, N indices; none is empty.
+        """
+        weighted = phi * (sigma**-2.0)[:, None]
+        terms = np.column_stack(
+            [(phi[:, :, None] * weighted[:, None, :]).reshape(-1, 9), weighted * u[:, None], (u / sigma) ** 2]
         )
+        sums = np.add.reduceat(terms, [0, *ends[:-1]], axis=0)
+        return cls(sums[:, :9].reshape(-1, 3, 3), sums[:, 9:12], sums[:, 12])
 
     def __getitem__(self, index: np.ndarray | slice) -> Evidence:
         return Evidence(self.information[index], self.moment[index], self.square[index])
@@ -137,14 +137,13 @@ class Curve:
     parameters: FloatArray
     covariance: FloatArray
 
-    def along(self, below: FloatArray) -> FloatArray:
-        """Where the line is along the horizon (N,), px."""
-        return np.asarray(_basis(below) @ self.parameters)
+    def along(self, phi: FloatArray) -> FloatArray:
+        """Where the line is along the horizon (N,), px, where the :func:`basis` is ``phi`` (N, 3)."""
+        return np.asarray(phi @ self.parameters)
 
-    def sigma(self, below: FloatArray) -> FloatArray:
+    def sigma(self, phi: FloatArray) -> FloatArray:
         """Standard deviation (N,) of :meth:`along`, px."""
-        phi = _basis(below)
-        return np.asarray(np.sqrt(np.einsum("ni,ij,nj->n", phi, self.covariance, phi)))
+        return np.asarray(np.sqrt(((phi @ self.covariance) * phi).sum(axis=1)))
 
 
 def middle_of(first: Curve, second: Curve) -> Curve:
@@ -152,7 +151,9 @@ def middle_of(first: Curve, second: Curve) -> Curve:
     return Curve((first.parameters + second.parameters) / 2, (first.covariance + second.covariance) / 2)
 
 
-def _basis(below: FloatArray) -> FloatArray:
+def basis(below: FloatArray) -> FloatArray:
     """What (a, b, c) are multiplied by (N, 3) at distances (N,) below the horizon, px."""
     v = np.maximum(below, LEAST_BELOW_PX) / _UNIT_PX
-    return np.column_stack([np.ones_like(v), v, 1.0 / v])
+    phi = np.ones((len(v), 3))
+    phi[:, 1], phi[:, 2] = v, 1.0 / v
+    return phi

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.detection.lane_curves import Curve, Evidence, Horizon, middle_of
+from v2hdm.detection.lane_curves import Curve, Evidence, Horizon, basis, middle_of
 from v2hdm.detection.view import CameraView
 from v2hdm.records import BoolArray, FloatArray
 
@@ -33,6 +33,9 @@ _DOUBLE_LINE_M = 0.75
 """Curves nearer than the first are one line; nearer than the second, the two lines of a double one."""
 
 _LEAST_PAINT_M = 1.0
+_DOUBTFUL = 1.0
+"""Lines by so much in log odds less sure than is asked for may yet be the other half of a double line."""
+
 _CERTAIN_SIGMA_M = 0.3
 
 _WEIGHTS = (0.50, 0.59, 0.41)
@@ -44,7 +47,8 @@ _OFFSET = -2.18
 class LinePoints:
     """N points of an image that lines may run through.
 
-    ``points_px`` (N, 2) recorded px; ``along`` and ``below`` (N,) their place about the horizon;
+    ``points_px`` (N, 2) recorded px; ``along`` and ``below`` (N,) their place about the horizon and ``phi``
+    (N, 3) the basis of curves there;
     ``sigma_px`` (N,) of each along the horizon; ``odds`` (N,) log odds; ``ground`` (N, 2), vehicle frame;
     ``is_paint`` (N,): on the centre line of a piece of paint, not a crossing of a row anchor.
     """
@@ -52,6 +56,7 @@ class LinePoints:
     points_px: FloatArray
     along: FloatArray
     below: FloatArray
+    phi: FloatArray
     sigma_px: FloatArray
     odds: FloatArray
     ground: FloatArray
@@ -66,17 +71,24 @@ class LinePoints:
         along, below = horizon.coordinates(pinhole_px)
         sigma = np.hypot(sigma_px, _MODEL_SIGMA_M * horizon.px_per_m * np.maximum(below, 0))
         none = np.zeros(len(odds), dtype=np.bool_)
-        return cls(points_px, along, below, sigma, odds, view.ground(pinhole_px), none)
+        return cls(points_px, along, below, basis(below), sigma, odds, view.ground(pinhole_px), none)
 
-    def evidence(self, horizon: Horizon, members: IntArray, slope: float) -> Evidence:
-        """What ``members``, on a line that runs ``slope`` px along the horizon per px down, say of it."""
-        sigma = self.sigma_px[members] * np.hypot(1, slope) * np.sqrt(NEIGHBOURS)
-        return Evidence.of(horizon, self.along[members], self.below[members], sigma)
+    def slopes(self, groups: list[IntArray]) -> FloatArray:
+        """Px along the horizon per px down (N,) of groups of points that are roughly a line each."""
+        members, ends = np.concatenate(groups), np.cumsum([len(group) for group in groups])
+        count, begins = np.diff(ends, prepend=0), [0, *ends[:-1]]
+        along, below = self.along[members], self.below[members]
+        down = below - np.repeat(np.add.reduceat(below, begins) / count, count)
+        return np.asarray(
+            np.add.reduceat(down * along, begins) / np.maximum(np.add.reduceat(down**2, begins), 1)
+        )
 
-    def slope(self, members: IntArray) -> float:
-        """Px along the horizon per px down, of points that are roughly a line."""
-        below = self.below[members] - self.below[members].mean()
-        return float(below @ self.along[members] / max(float(below @ below), 1.0))
+    def evidence(self, horizon: Horizon, groups: list[IntArray], slopes: FloatArray) -> Evidence:
+        """What each of N groups of points, on lines of such ``slopes`` (N,), says of its line."""
+        members, count = np.concatenate(groups), [len(group) for group in groups]
+        sigma = self.sigma_px[members] * np.repeat(np.hypot(1, slopes), count) * np.sqrt(NEIGHBOURS)
+        u = self.along[members] - horizon.centre_px
+        return Evidence.of(self.phi[members], u, sigma, np.cumsum(count).tolist())
 
 
 @dataclass(frozen=True)
@@ -102,22 +114,26 @@ def find_lines(
     """The lines through ``groups`` of points, best first, each with the stray crossings that lie on it."""
     if not groups:
         return []
-    joined = _join(points, groups, horizon)
-    joined.sort(key=lambda group: -float(np.maximum(points.odds[group] + 1, 0).sum()))
+    believed = []
+    for group in _join(points, groups, horizon):
+        paint_m = paint_step_m * float(points.is_paint[group].sum())
+        log_odds = _log_odds(points, group, paint_m)
+        if log_odds > least_log_odds - _DOUBTFUL:
+            believed.append((log_odds, paint_m, group))
+    believed.sort(key=lambda found: -found[0])
     free = ~points.is_paint
-    free[np.concatenate(joined)] = False
+    for _, _, group in believed:
+        free[group] = False
     lines = []
-    for group in joined:
-        line = _gather(points, group, free, horizon, paint_step_m)
-        free[line.perhaps] = False
-        lines.append(line)
-    lines.sort(key=lambda line: -line.log_odds)
-    lines = [line for line in lines if line.log_odds > least_log_odds - 1]
+    for log_odds, paint_m, group in believed:
+        curve, perhaps = _gather(points, group, free, horizon)
+        free[perhaps] = False
+        lines.append(Line(curve, group, perhaps, log_odds, paint_m))
     return [line for line in _apart(points, lines, horizon) if line.log_odds > least_log_odds]
 
 
 def _join(points: LinePoints, groups: list[IntArray], horizon: Horizon) -> list[IntArray]:
-    evidence = Evidence.stack([points.evidence(horizon, g, points.slope(g)) for g in groups])
+    evidence = points.evidence(horizon, groups, points.slopes(groups))
     groups = list(groups)
     alone = evidence.log_evidence(horizon)
     count = len(groups)
@@ -132,42 +148,40 @@ def _join(points: LinePoints, groups: list[IntArray], horizon: Horizon) -> list[
         if not gain[a, b] > 0:
             break
         groups[a] = np.concatenate([groups[a], groups[b]])
-        for total, parts in ((evidence.information, a), (evidence.moment, a), (evidence.square, a)):
-            total[parts] += total[b]
+        for total in (evidence.information, evidence.moment, evidence.square):
+            total[a] += total[b]
+            total[b] = 0
         left[b] = False
         gain[b], gain[:, b] = -np.inf, -np.inf
-        alone[a] = evidence[a : a + 1].log_evidence(horizon)[0]
+        # With that of b, which is nought now, comes what the two are together.
+        together = (evidence[np.full(count, a)] + evidence).log_evidence(horizon)
+        alone[a] = together[b]
+        left[a] = False
         others = np.flatnonzero(left)
-        others = others[others != a]
-        one = evidence[np.full(len(others), a)] + evidence[others]
+        left[a] = True
         low, high = np.minimum(others, a), np.maximum(others, a)
-        gain[low, high] = one.log_evidence(horizon) - alone[a] - alone[others]
+        gain[low, high] = together[others] - alone[a] - alone[others]
     return [groups[k] for k in np.flatnonzero(left)]
 
 
-def _gather(
-    points: LinePoints, group: IntArray, free: BoolArray, horizon: Horizon, paint_step_m: float
-) -> Line:
-    """The line of a group, and the free crossings on it, at most one of each row."""
-    slope = points.slope(group)
-    evidence = points.evidence(horizon, group, slope)
+def _gather(points: LinePoints, group: IntArray, free: BoolArray, horizon: Horizon) -> tuple[Curve, IntArray]:
+    """The curve of a group, and the free crossings on it, at most one of each row."""
+    slope = points.slopes([group])
+    evidence = points.evidence(horizon, [group], slope)
     curve = evidence.curve(horizon)
     row = points.points_px[:, 1]
     candidates = np.flatnonzero(free & ~np.isin(row, row[group[~points.is_paint[group]]]))
-    perhaps = np.zeros(0, dtype=np.int64)
-    for _ in range(2):
-        off = np.abs(points.along[candidates] - curve.along(points.below[candidates]))
-        sigma = np.hypot(curve.sigma(points.below[candidates]), points.sigma_px[candidates])
-        misfit = off / np.minimum(_GATE_SIGMAS * sigma, _GATE_PX * np.hypot(1, slope))
-        order = np.argsort(misfit)
-        order = order[misfit[order] < 1]
-        _, nearest = np.unique(row[candidates[order]], return_index=True)
-        perhaps = candidates[order[nearest]]
-        if not len(perhaps):
-            break
-        curve = (evidence + points.evidence(horizon, perhaps, slope)).curve(horizon)
-    paint_m = paint_step_m * float(points.is_paint[group].sum())
-    return Line(curve, group, perhaps, _log_odds(points, group, paint_m), paint_m)
+    phi = points.phi[candidates]
+    off = np.abs(points.along[candidates] - curve.along(phi))
+    sigma = np.hypot(curve.sigma(phi), points.sigma_px[candidates])
+    misfit = off / np.minimum(_GATE_SIGMAS * sigma, _GATE_PX * np.hypot(1, slope[0]))
+    order = np.argsort(misfit)
+    order = order[misfit[order] < 1]
+    _, nearest = np.unique(row[candidates[order]], return_index=True)
+    perhaps = candidates[order[nearest]]
+    if len(perhaps):
+        curve = (evidence + points.evidence(horizon, [perhaps], slope)).curve(horizon)
+    return curve, perhaps
 
 
 def _log_odds(points: LinePoints, group: IntArray, paint_m: float) -> float:
@@ -211,6 +225,7 @@ def _distance_m(points: LinePoints, first: Line, second: Line, horizon: Horizon)
         low, high = spans[0].min(), spans[0].max()
     below = np.linspace(low, high, 9)
     px_per_m = horizon.px_per_m * np.maximum(below, 1.0)
-    if (second.curve.sigma(below) > _CERTAIN_SIGMA_M * px_per_m).any():
+    phi = basis(below)
+    if (second.curve.sigma(phi) > _CERTAIN_SIGMA_M * px_per_m).any():
         return None
-    return np.asarray(np.abs(first.curve.along(below) - second.curve.along(below)) / px_per_m)
+    return np.asarray(np.abs(first.curve.along(phi) - second.curve.along(phi)) / px_per_m)
