@@ -47,6 +47,7 @@ _BLUR_LIMITS_PX = (0.35, 3.0)
 """How far a marking's own blur is from the point spread: motion, focus, frayed paint."""
 
 _CLIPPED_SHARE = 0.15
+_LEAST_CLIPPED = 0.9
 _BLOOM = 1.2
 """Where so many pixels are clipped, the outline is about this many blurs outside the paint."""
 
@@ -107,6 +108,8 @@ def fit_quads(
     system = _iterate(patches, quads, _BLUR_SIGMA_PX, _ITERATIONS)
     most_px = np.maximum(_MAX_MOVE_PX, _MAX_MOVE_SHARE * side_frames(start)[2].max(axis=1))
     settled = (np.abs(quads.corners - start).max(axis=(1, 2)) < most_px) & is_convex(quads.corners)
+    # Pixels at the sensor's limit say that the paint is at least as bright.
+    settled &= (patches.clipped <= _CLIPPED_SHARE) | (quads.levels[:, [0, 3]].sum(axis=1) > _LEAST_CLIPPED)
     rms = np.sqrt((patches.use * system.residual**2).sum(axis=1) / np.maximum(patches.use.sum(axis=1), 1))
     misfit = rms / system.amplitude
     # Misfit is paint that is missing on one side; a level beyond the sensor's is an extrapolation.
