@@ -5,7 +5,8 @@
 Full 1280 x 720 images of ports and streets, in any light and state of wear, with their true markings and
 lanes. Printed: average precision at an overlap of one half (AP50) and recall by class within 20 m, false
 markings, corner errors in px with the normalised squared error of their covariance, and the accuracy of
-lanes by TuSimple's formula.
+lanes: over the points of all lines there are, over those of lines that show paint somewhere in the image,
+and by TuSimple's own formula, whose labels are of such lines only.
 """
 
 from __future__ import annotations
@@ -13,11 +14,12 @@ from __future__ import annotations
 import argparse
 from collections import Counter, defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 
+from tests.benchmarks.tusimple import TuSimple, judge
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.ground import apply_homography, ipm_from_extrinsic
 from v2hdm.detection.lens import distort_points
@@ -25,6 +27,7 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import (
     CORNERED_CLASSES,
     LANE_BOUNDARY,
+    LANE_CLASSES,
     OUTLINED_CLASSES,
     PAINT_CLASSES,
     Camera,
@@ -56,6 +59,13 @@ _FRAME_PX = np.array([[-1.0, -1.0], [2.0, -1.0], [2.0, 2.0], [-1.0, 2.0]]) * (WI
 MIN_HEIGHT_PX = 4.0
 LANE_TOLERANCE_PX = 20.0
 LANE_MATCH = 0.85
+LEAST_SHOWN_M = 1.0
+"""A line shows if so much of its paint is in the image and in front of what stands there; who labels images
+cannot know of others. Those parts of such a line that are hidden or between its dashes are asked for."""
+
+_STATION_M = 0.5
+_BESIDE_M = np.linspace(-0.5, 0.5, 21)
+"""Paint this far beside a line's middle is its own: those of double lines are."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +86,7 @@ class Example:
     camera: Camera
     markings: list[TrueMarking]
     lanes_px: list[FloatArray]
+    lanes_shown: list[bool] = field(default_factory=list)
 
 
 def example(index: int, difficulty: float = 1.0) -> Example:
@@ -85,8 +96,23 @@ def example(index: int, difficulty: float = 1.0) -> Example:
     view = random_view(rng, WIDTH, HEIGHT)
     rendered = Renderer(scene).render(view.info, view.cam_from_map, rng, view.optics, view.motion)
     camera = _camera(view)
-    lanes_px = [points for lane in lanes if len(points := image_points(view, lane)) > 1]
-    return Example(rendered.image, camera, _markings(scene, view, rendered), lanes_px)
+    seen = [lane for lane in lanes if len(image_points(view, lane)) > 1]
+    lanes_px = [image_points(view, lane) for lane in seen]
+    lanes_shown = [_shows(lane, view, rendered) for lane in seen]
+    return Example(rendered.image, camera, _markings(scene, view, rendered), lanes_px, lanes_shown)
+
+
+def _shows(lane_map: FloatArray, view: TrainingView, rendered: Rendered) -> bool:
+    """Whether enough paint of a line (N, 2), a point every half metre, is to be seen in the image."""
+    ahead = np.gradient(lane_map, axis=0)
+    left = np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.linalg.norm(ahead, axis=1, keepdims=True)
+    kinds = [PAINT_CLASSES.index(kind) + 1 for kind in LANE_CLASSES]
+    shown = 0
+    for point, across in zip(lane_map, left, strict=True):
+        u, v = np.round(image_points(view, point + _BESIDE_M[:, None] * across)).astype(int).T
+        inside = (u >= 0) & (v >= 0) & (u < WIDTH) & (v < HEIGHT)
+        shown += bool(np.isin(rendered.labels[v[inside], u[inside]], kinds).any())
+    return shown * _STATION_M >= LEAST_SHOWN_M
 
 
 def _camera(view: TrainingView) -> Camera:
@@ -165,6 +191,9 @@ class Tally:
         self.false = 0
         self.lane_right = 0
         self.lane_points = 0
+        self.shown_right = 0
+        self.shown_points = 0
+        self.tusimple: list[TuSimple] = []
         self.lane_false = 0
         self.lanes_given = 0
 
@@ -209,15 +238,19 @@ class Tally:
             covariance = detection.covariance_px[part, part]
             self.normalised.append(float(error[corner] @ np.linalg.solve(covariance, error[corner])))
 
-    def add_lanes(self, truth: list[FloatArray], given: list[FloatArray], first_row: float) -> None:
-        """TuSimple's accuracy: points within 20 px (widened by the line's slope) on every tenth row.
+    def add_lanes(
+        self, truth: list[FloatArray], shown: list[bool], given: list[FloatArray], first_row: float
+    ) -> None:
+        """Points within 20 px (widened by the line's slope) on every tenth row are right.
 
         A line given is false if fewer than 85 % of its points lie on any true line.
         """
+        official = judge([lane for lane, show in zip(truth, shown, strict=True) if show], given)
+        self.tusimple += [official] if official else []
         rows = np.arange(np.ceil(first_row / 10) * 10, HEIGHT, 10.0)
         lines = [_at_rows(line, rows) for line in given]
         self.lanes_given += len(lines)
-        for lane in truth:
+        for lane, show in zip(truth, shown, strict=True):
             u = _at_rows(lane, rows)
             seen = (u >= 0) & (u < WIDTH)
             if seen.sum() < 5:
@@ -227,6 +260,8 @@ class Tally:
             right = [(np.abs(line - u)[seen] < tolerance).sum() for line in lines]
             self.lane_points += int(seen.sum())
             self.lane_right += int(max(right, default=0))
+            self.shown_points += int(seen.sum()) if show else 0
+            self.shown_right += int(max(right, default=0)) if show else 0
         for line in lines:
             known = np.isfinite(line)
             near = [
@@ -307,7 +342,7 @@ def main() -> None:
         markings, lanes = detector.detect(shown.image, shown.camera)
         tally.add_markings(shown.markings, markings)
         curves = [lane.points_px for lane in lanes if lane.kind == LANE_BOUNDARY]
-        tally.add_lanes(shown.lanes_px, curves, detector.view(shown.camera).top)
+        tally.add_lanes(shown.lanes_px, shown.lanes_shown, curves, detector.view(shown.camera).top)
     print(summary(tally, parsed.images))
 
 
@@ -343,9 +378,13 @@ def _corner_line(tally: Tally) -> str:
 
 def _lane_line(tally: Tally) -> str:
     accuracy = tally.lane_right / max(tally.lane_points, 1)
+    shown = tally.shown_right / max(tally.shown_points, 1)
+    official = np.mean(tally.tusimple, axis=0) if tally.tusimple else np.full(3, np.nan)
     return (
-        f"lanes: accuracy {accuracy:.3f} over {tally.lane_points} points; "
-        f"{tally.lane_false} of {tally.lanes_given} lines false"
+        f"lanes: accuracy {accuracy:.3f} over {tally.lane_points} points, {shown:.3f} over the "
+        f"{tally.shown_points} of lines that show; {tally.lane_false} of {tally.lanes_given} lines false; "
+        f"TuSimple's formula over {len(tally.tusimple)} images: accuracy {official[0]:.3f}, "
+        f"false positive {official[1]:.3f}, false negative {official[2]:.3f}"
     )
 
 
