@@ -201,21 +201,21 @@ def _fit_profiles(values: np.ndarray, t: np.ndarray) -> _ProfileFit:
     """
     finite = np.isfinite(values).all(axis=0)
     y = np.where(finite, values, np.float32(0))
-    mean = y.mean(axis=0)
+    mean = y.sum(axis=0) / len(t)
     y -= mean
     offset = np.zeros(finite.shape, dtype=np.float32)
     blur = np.full((*finite.shape[:2], 1), _START_BLUR_PX, dtype=np.float32)
     for _ in range(_FIT_ITERATIONS):
         x = (offset - t) / blur
         slope, shape = normal_pdf_cdf(x)
-        mean_shape = shape.mean(axis=0)
+        mean_shape = shape.sum(axis=0) / len(t)
         shape -= mean_shape
         power = np.maximum((shape * shape).sum(axis=0), 1e-9)
         amplitude = (shape * y).sum(axis=0) / power
         residual = y - amplitude * shape
         usable = finite & (amplitude > 1e-4)
         slope *= amplitude / blur
-        slope -= slope.mean(axis=0)
+        slope -= slope.sum(axis=0) / len(t)
         slope -= shape * ((shape * slope).sum(axis=0) / power)
         shift = (slope * residual).sum(axis=0) / np.maximum((slope * slope).sum(axis=0), 1e-12)
         offset = np.clip(offset + usable * np.clip(shift, -0.7, 0.7), -_FIT_PX, _FIT_PX)
@@ -247,13 +247,13 @@ def _robust_lines(sides: _Sides, offset: FloatArray, good: BoolArray, iterations
     along = sides.along
     weight = good.astype(np.float64)
     terms = np.stack([np.ones_like(along), along, along * along, offset, along * offset], axis=-1)
-    middle = np.maximum(good.sum(axis=-1, keepdims=True) - 1, 0) // 2
+    middle = np.maximum(good.sum(axis=-1) - 1, 0) // 2
     for iteration in range(iterations):
         constant, slope, normal_matrix = _weighted_line(weight, terms)
         residual = offset - constant[..., None] - slope[..., None] * along
         if iteration < _SCATTER_ITERATIONS:
             ordered = np.sort(np.where(good, np.abs(residual), np.inf), axis=-1)
-            scatter = 1.4826 * np.take_along_axis(ordered, middle, axis=-1)
+            scatter = 1.4826 * _picked(ordered, middle)[..., None]
             per_limit = 1 / (_TUKEY * np.maximum(scatter, _MIN_SCATTER_PX))
         ratio = residual * per_limit
         weight = good * np.maximum(1 - ratio * ratio, 0) ** 2
@@ -302,6 +302,12 @@ def _masked_median(values: np.ndarray, mask: BoolArray) -> np.ndarray:
     ordered = np.sort(np.where(mask, values, np.inf), axis=-1)
     count = mask.sum(axis=-1)
     last = values.shape[-1] - 1
-    low = np.take_along_axis(ordered, np.clip((count - 1) // 2, 0, last)[..., None], axis=-1)[..., 0]
-    high = np.take_along_axis(ordered, np.clip(count // 2, 0, last)[..., None], axis=-1)[..., 0]
+    low = _picked(ordered, np.maximum(count - 1, 0) // 2)
+    high = _picked(ordered, np.minimum(count // 2, last))
     return np.where(count > 0, (low + high) / 2, 0.0)
+
+
+def _picked(values: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Elements (M, 4) of values (M, 4, n) at the places (M, 4)."""
+    flat = values.reshape(-1, values.shape[-1])
+    return np.asarray(flat[np.arange(place.size), place.ravel()].reshape(place.shape))

@@ -292,9 +292,10 @@ def _covariance(system: _System, patches: Patches) -> FloatArray:
     by_side = np.linalg.inv(system.information + 1e-9 * np.eye(_UNKNOWNS))[:, :8, :8]
     residual, weight = system.residual, system.weight
     variance = (weight * residual**2).sum(axis=1) / np.maximum(weight.sum(axis=1) - _UNKNOWNS, 1)
+    rows = np.arange(len(residual))[:, None]
     for neighbour in patches.neighbours:
-        second = np.take_along_axis(residual, neighbour, axis=1)
-        pair = weight * np.take_along_axis(weight, neighbour, axis=1) * (neighbour > 0)
+        second = residual[rows, neighbour]
+        pair = weight * weight[rows, neighbour] * (neighbour > 0)
         variance = variance * variance_inflation(residual, second, pair, _MAX_CORRELATION)
     jacobian = system.corner_from_side
     return np.asarray(variance[:, None, None] * (jacobian @ by_side @ np.swapaxes(jacobian, 1, 2)))
