@@ -97,6 +97,22 @@ def test_with_pose_errors_it_is_the_optimum_of_markings_that_share_none():
     assert_is_the_batch_optimum(grown, with_frames_of_their_own(problem), SolveOptions(loss="none"))
 
 
+def test_markings_of_one_unit_share_the_errors_of_their_images():
+    scene = street(frames=40, jitter=JITTER)
+    problem = whole_markings(scene.problem)
+    shared = IncrementalMap(prior_of(problem), Noise(JITTER.by_state(), np.inf))
+    for marking, seen in enumerate(by_marking(problem)):
+        shared.observe(0, replace(seen, corner=seen.corner + 4 * marking))
+    best = solve(problem, SolveOptions(loss="none"))
+    sigma = np.sqrt(np.diag(best.corner_covariance(np.arange(problem.corner_count)))).reshape(-1, 2)
+    assert np.max(np.abs(shared.corners_map(0) - best.corners_map) / sigma) < 0.01
+    apart = grow(problem, Noise(JITTER.by_state(), np.inf))
+    alone = np.concatenate([apart.corners_map(m) for m in apart.markings])
+    assert scene.corner_rmse_m(shared.corners_map(0)) < 0.8 * np.sqrt(
+        np.mean(np.sum((alone - scene.corners_map[: len(alone)]) ** 2, axis=1))
+    )
+
+
 def test_a_marking_seen_again_is_re_estimated_from_all_it_was_ever_seen_in():
     problem = whole_markings(street().problem)
     markings = by_marking(problem)

@@ -31,8 +31,9 @@ from v2hdm.errors import AdjustError
 from v2hdm.records import FloatArray
 
 _MAX_STEPS = 30
-# Squared length of a step, in standard deviations, below which nothing moves any more.
-_STEP_TOLERANCE = 1e-10
+# Mean squared step of an unknown, in standard deviations, below which nothing moves any more.
+_STEP_TOLERANCE = 1e-4
+_PREVIEW_TOLERANCE = 1e-2
 _PASSES = 2
 
 
@@ -90,6 +91,11 @@ class State:
     information: FloatArray
     vector: FloatArray
 
+    @classmethod
+    def empty(cls, prior: RigPrior, tangents: FloatArray) -> State:
+        """No markings, and extrinsics to begin with at ``tangents`` (6C,)."""
+        return cls({}, 0, tangents, *_prior_at(prior, tangents))
+
 
 class IncrementalMap:
     """Extrinsics and corners, up to date after every marking."""
@@ -110,8 +116,7 @@ class IncrementalMap:
         self.noise = noise
         self.drift_m = drift_m
         if state is None:
-            tangents = np.zeros(6 * len(prior.cam_from_vehicle))
-            state = State({}, 0, tangents, *self._prior_at(tangents))
+            state = State.empty(prior, np.zeros(6 * len(prior.cam_from_vehicle)))
         self.state = state
 
     @property
@@ -148,7 +153,7 @@ class IncrementalMap:
         Raises:
             AdjustError: a corner has no observation, or the marking cannot be solved for.
         """
-        settled, tangents = self._solve("preview", observations)
+        settled, tangents = self._solve("preview", observations, None, _PREVIEW_TOLERANCE)
         return settled.corners_at(tangents)
 
     def observe(self, marking: int, observations: MarkingObservations) -> None:
@@ -162,7 +167,7 @@ class IncrementalMap:
             observations = before.observations.joined(observations)
             self.forget(marking)
         try:
-            settled, _ = self._solve(marking, observations)
+            settled, _ = self._solve(marking, observations, before)
         except AdjustError:
             if before is not None:
                 self._add(marking, before)
@@ -183,7 +188,7 @@ class IncrementalMap:
         """Linearise everything anew where it is now; happens by itself whenever the map has doubled."""
         for _ in range(_PASSES):
             at = self.state.tangents
-            self.state.information, self.state.vector = self._prior_at(at)
+            self.state.information, self.state.vector = _prior_at(self.prior, at)
             for marking, settled in self.state.settled.items():
                 renewed = self._settle(settled.observations, at, settled.corners_at(at), settled.frame_state)
                 self.state.settled[marking] = renewed
@@ -212,28 +217,17 @@ class IncrementalMap:
         turn = block_diag(*left_jacobians(self.state.tangents.reshape(-1, 6)))
         return np.asarray(turn @ np.linalg.inv(self.state.information) @ turn.T)
 
-    def _prior_at(self, tangents: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The prior's part of the normal equations, linearised at ``tangents``: (6C, 6C) and (6C,)."""
-        extrinsics, prior = self._extrinsics(tangents), self.prior
-        rotation, translation = extrinsics[:, :3, :3], extrinsics[:, :3, 3]
-        off = -np.einsum("cba,cb->ca", rotation, translation) - prior.centre_vehicle
-        root = 1 / prior.centre_sigma_m
-        information = np.zeros((len(tangents),) * 2)
-        vector = np.zeros(len(tangents))
-        for c, chart in enumerate(left_jacobians(tangents.reshape(-1, 6))):
-            part = slice(6 * c, 6 * c + 6)
-            # A left perturbation moves the centre by minus its translation, turned into the vehicle.
-            jacobian = np.zeros((3, 6))
-            jacobian[:, :3] = -rotation[c].T * root[c][:, None]
-            jacobian = jacobian @ chart
-            information[part, part] = jacobian.T @ jacobian
-            vector[part] = -jacobian.T @ (off[c] * root[c])
-        vector += information @ tangents
-        turns = np.tile([0, 0, 0, 1, 1, 1], len(extrinsics)) / prior.rotation_sigma_rad**2
-        return information + np.diag(turns), vector
+    def _solve(
+        self,
+        marking: int | str,
+        observations: MarkingObservations,
+        before: Settled | None = None,
+        tolerance: float = _STEP_TOLERANCE,
+    ) -> tuple[Settled, FloatArray]:
+        """Gauss-Newton over the marking's corners and the extrinsics, the settled markings as a quadratic.
 
-    def _solve(self, marking: int | str, observations: MarkingObservations) -> tuple[Settled, FloatArray]:
-        """Gauss-Newton over the marking's corners and the extrinsics, the settled markings as a quadratic."""
+        Corners and frames that were there ``before`` start where they were.
+        """
         unseen = np.flatnonzero(np.bincount(observations.corner) == 0)
         if len(unseen):
             raise AdjustError(
@@ -244,7 +238,11 @@ class IncrementalMap:
                 raise AdjustError(f"{name} of marking {marking} is not finite: leave that observation out")
         tangents = self.state.tangents
         corners = back_projected(observations, self.prior.intrinsic, self._extrinsics(tangents))
-        state = np.zeros((int(observations.frame_rank.max()) + 1, 6))
+        frames = np.unique(observations.frame)
+        state = np.zeros((len(frames), 6))
+        if before is not None:
+            corners[: len(before.corners_map)] = before.corners_at(tangents)
+            state[np.searchsorted(frames, np.unique(before.observations.frame))] = before.frame_state
         for _ in range(_MAX_STEPS):
             settled = self._settle(observations, tangents, corners, state)
             information = self.state.information + settled.information
@@ -256,7 +254,7 @@ class IncrementalMap:
             tangents, corners, state = reached, moved, settled.frame_state
             if not np.isfinite(length):
                 break
-            if length < _STEP_TOLERANCE:
+            if length < tolerance * (len(step) + len(shift)):
                 return settled, reached
         raise AdjustError(
             f"marking {marking} does not settle: its observations contradict one another or lie above the "
@@ -271,6 +269,27 @@ class IncrementalMap:
             observations, self.prior.intrinsic, self._extrinsics(tangents), corners, state, self.noise
         )
         return _eliminated(observations, normal, tangents, corners)
+
+
+def _prior_at(prior: RigPrior, tangents: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The prior's part of the normal equations, linearised at ``tangents``: (6C, 6C) and (6C,)."""
+    extrinsics = exp(tangents.reshape(-1, 6)) @ prior.cam_from_vehicle
+    rotation, translation = extrinsics[:, :3, :3], extrinsics[:, :3, 3]
+    off = -np.einsum("cba,cb->ca", rotation, translation) - prior.centre_vehicle
+    root = 1 / prior.centre_sigma_m
+    information = np.zeros((len(tangents),) * 2)
+    vector = np.zeros(len(tangents))
+    for c, chart in enumerate(left_jacobians(tangents.reshape(-1, 6))):
+        part = slice(6 * c, 6 * c + 6)
+        # A left perturbation moves the centre by minus its translation, turned into the vehicle.
+        jacobian = np.zeros((3, 6))
+        jacobian[:, :3] = -rotation[c].T * root[c][:, None]
+        jacobian = jacobian @ chart
+        information[part, part] = jacobian.T @ jacobian
+        vector[part] = -jacobian.T @ (off[c] * root[c])
+    vector += information @ tangents
+    turns = np.tile([0, 0, 0, 1, 1, 1], len(extrinsics)) / prior.rotation_sigma_rad**2
+    return information + np.diag(turns), vector
 
 
 def _solved(information: FloatArray, vector: FloatArray) -> FloatArray:

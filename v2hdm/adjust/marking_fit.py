@@ -1,9 +1,8 @@
-"""One marking's observations: its corners, and what it says about the extrinsics.
+"""The observations of a marking, or of a few that share images: corners, and what they say of the extrinsics.
 
-Everything is small and dense. The errors of the poses are marginalised out of the residuals, frame by
-frame: with r(s) linearised at the frame's estimated state s, the observations' residual is r(s) - G s and
-they share the covariance G Sigma_s G', G their derivative by the state. That is the Schur complement of the
-joint problem, so iterating it ends in the joint optimum.
+Everything is small. The errors of the poses are eliminated frame by frame: with r(s) linearised at the
+frame's estimated state s, the observations' residual is r(s) - G s where the state is 0, G their derivative
+by it. That is the Schur complement of the joint problem, so iterating it ends in the joint optimum.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from v2hdm.adjust.problem import IntArray
 from v2hdm.adjust.rigid import adjoints, exp, hat, left_jacobians
@@ -25,7 +23,7 @@ _MIN_WEIGHT = 1e-4
 
 @dataclass(frozen=True)
 class MarkingObservations:
-    """K sightings of the corners of one marking.
+    """K sightings of the corners of one marking, or of several that are to share their frames' errors.
 
     ``camera`` (K,) and ``corner`` (K,), 0 to n - 1; ``frame`` (K,) numbers images taken at one time alike;
     ``vehicle_from_map`` (K, 4, 4) are the recorded poses, inverted; ``pinhole_px`` (K, 2) and
@@ -64,7 +62,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Normal:
-    """The normal equations of one marking at one estimate, pose errors marginalised out.
+    """The normal equations of some corners at one estimate, pose errors marginalised out.
 
     With d the left tangents of all C extrinsics, stacked, and x the step of the corners: ``V`` (2n, 2n),
     ``W`` (6C, 2n), ``U`` (6C, 6C) and the gradients ``by_corner`` (2n,), ``by_extrinsic`` (6C,) of half the
@@ -88,49 +86,74 @@ def normal_equations(
     noise: Noise,
 ) -> Normal:
     """Linearise ``seen`` at extrinsics (C, 4, 4), corners (n, 2) and the frames' states (F, 6)."""
-    count, cameras, each = len(seen.camera), len(cam_from_vehicle), 2 * len(corners_map)
-    rank = seen.frame_rank
-    state = frame_state[rank]
-    residual, by_pair, by_corner = _linearise(seen, intrinsic, cam_from_vehicle, corners_map, state)
-    by_state = -by_pair @ adjoints(cam_from_vehicle)[seen.camera] @ left_jacobians(-state)
-    residual = residual - (by_state @ state[..., None])[..., 0]
-    wide = np.zeros((count, 2, cameras, 6))
-    wide[np.arange(count), :, seen.camera] = by_pair
-    narrow = np.zeros((count, 2, each // 2, 2))
-    narrow[np.arange(count), :, seen.corner] = by_corner
-    flat = np.column_stack(
-        [wide.reshape(2 * count, -1), narrow.reshape(2 * count, -1), residual.reshape(2 * count)]
+    cameras, corners, frames = len(cam_from_vehicle), len(corners_map), len(frame_state)
+    camera, corner, rank = seen.camera, seen.corner, seen.frame_rank
+    residual, by_pair, by_corner = _linearise(seen, intrinsic, cam_from_vehicle, corners_map, frame_state)
+    by_state = -by_pair @ adjoints(cam_from_vehicle)[camera] @ left_jacobians(-frame_state)[rank]
+    at_rest = residual[..., None] - by_state @ frame_state[rank][..., None]
+    root = _root_information(seen, residual, noise)
+    # In units of its sigma a state has the prior 1, also where it does not err.
+    pair, place, unit, rest = (root @ j for j in (by_pair, by_corner, by_state * noise.pose_sigma, at_rest))
+    no_row = np.zeros_like(camera)
+    own = np.block(
+        [
+            [
+                _gram((cameras, cameras), (camera, camera), pair, pair),
+                _gram((cameras, corners), (camera, corner), pair, place),
+                _gram((cameras, 1), (camera, no_row), pair, rest),
+            ],
+            [
+                _gram((corners, cameras), (corner, camera), place, pair),
+                _gram((corners, corners), (corner, corner), place, place),
+                _gram((corners, 1), (corner, no_row), place, rest),
+            ],
+        ]
     )
-    spread = (by_state * noise.pose_sigma).reshape(2 * count, 6)
-    factor = cho_factor(_covariance(seen, residual, spread, rank, noise), lower=True)
-    solved = cho_solve(factor, flat)
-    product, size = flat.T @ solved, 6 * cameras
-    moved = np.zeros_like(frame_state)
-    np.add.at(moved, np.repeat(rank, 2), -spread * solved[:, -1:] * noise.pose_sigma)
+    across = np.hstack(
+        [
+            _gram((frames, cameras), (rank, camera), unit, pair),
+            _gram((frames, corners), (rank, corner), unit, place),
+            _gram((frames, 1), (rank, no_row), unit, rest),
+        ]
+    ).reshape(frames, 6, -1)
+    held = np.eye(6) + _summed((frames,), (rank,), np.swapaxes(unit, 1, 2) @ unit)
+    solved = np.linalg.solve(held, across)
+    own -= across[..., :-1].reshape(6 * frames, -1).T @ solved.reshape(6 * frames, -1)
+    size = 6 * cameras
     return Normal(
-        V=product[size:-1, size:-1],
-        W=product[:size, size:-1],
-        U=product[:size, :size],
-        by_corner=product[size:-1, -1],
-        by_extrinsic=product[:size, -1],
-        frame_state=moved,
+        V=own[size:, size:-1],
+        W=own[:size, size:-1],
+        U=own[:size, :size],
+        by_corner=own[size:, -1],
+        by_extrinsic=own[:size, -1],
+        frame_state=-noise.pose_sigma * solved[..., -1],
     )
 
 
-def _covariance(
-    seen: MarkingObservations, residual: FloatArray, spread: FloatArray, rank: IntArray, noise: Noise
-) -> FloatArray:
-    """Covariance (2K, 2K) of the residuals (K, 2): what frames share, and pixels by robust weights."""
-    count = len(residual)
-    shared = spread @ spread.T * np.repeat(np.repeat(rank[:, None] == rank, 2, axis=0), 2, axis=1)
-    blocks, index = shared.reshape(count, 2, count, 2), np.arange(count)
-    own = blocks[index, :, index] + seen.covariance_px
-    squared = np.sum(residual * np.linalg.solve(own, residual[..., None])[..., 0], axis=1)
+def _root_information(seen: MarkingObservations, residual: FloatArray, noise: Noise) -> FloatArray:
+    """Roots (K, 2, 2) of the observations' information, robust weights included."""
+    root = np.linalg.inv(np.linalg.cholesky(seen.covariance_px))
+    squared = np.sum((root @ residual[..., None])[..., 0] ** 2, axis=1)
     # While the fit is poor, all observations look like outliers.
     cut = max(noise.cauchy_scale, 2 * float(np.sqrt(np.median(squared)))) ** 2
     weight = np.maximum(1 / (1 + squared / cut), _MIN_WEIGHT)
-    blocks[index, :, index] += seen.covariance_px / weight[:, None, None]
-    return np.asarray(shared)
+    return np.asarray(np.sqrt(weight)[:, None, None] * root)
+
+
+def _gram(
+    shape: tuple[int, int], index: tuple[IntArray, IntArray], left: FloatArray, right: FloatArray
+) -> FloatArray:
+    """A matrix of ``shape`` blocks: sums over K rows of left' right, put where ``index`` says."""
+    blocks = _summed(shape, index, np.swapaxes(left, 1, 2) @ right)
+    return blocks.transpose(0, 2, 1, 3).reshape(shape[0] * blocks.shape[2], -1)
+
+
+def _summed(shape: tuple[int, ...], index: tuple[IntArray, ...], values: FloatArray) -> FloatArray:
+    """Values (K, ...) summed by index."""
+    flat = np.ravel_multi_index(index, shape)
+    out = np.zeros((int(np.prod(shape)), *values.shape[1:]))
+    np.add.at(out, flat, values)
+    return out.reshape(*shape, *values.shape[1:])
 
 
 def back_projected(
@@ -158,10 +181,11 @@ def _linearise(
     intrinsic: FloatArray,
     cam_from_vehicle: FloatArray,
     corners_map: FloatArray,
-    state: FloatArray,
+    frame_state: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Residuals (K, 2), px, and derivatives by the cameras' left tangents (K, 2, 6) and corners (K, 2, 2)."""
-    cam_from_map = cam_from_vehicle[seen.camera] @ exp(-state) @ seen.vehicle_from_map
+    moved = exp(-frame_state)[seen.frame_rank]
+    cam_from_map = cam_from_vehicle[seen.camera] @ moved @ seen.vehicle_from_map
     plane = cam_from_map[:, :3][..., [0, 1, 3]]
     corners = corners_map[seen.corner]
     point = (plane @ np.column_stack([corners, np.ones(len(corners))])[..., None])[..., 0]

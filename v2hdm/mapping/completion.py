@@ -40,23 +40,32 @@ def solved_corners(bundle: Bundle) -> SolvedCorners:
     than their stated noise make the map less certain than the noise model claims.
     """
     known = bundle.corner_index >= 0
-    whole = np.flatnonzero(known.all(axis=1))
-    partial = np.flatnonzero(known.sum(axis=1) == 3)
     covariance = np.full((len(known), 8, 8), np.nan)
     scale = max(1.0, bundle.solution.chi2_per_dof)
-    if len(whole):
-        covariance[whole] = scale * bundle.solution.corner_covariance(bundle.corner_index[whole])
-    if len(partial):
+    for count in (3, 4):
+        groups = np.flatnonzero(known.sum(axis=1) == count)
+        if not len(groups):
+            continue
+        corner = np.nonzero(known[groups])[1].reshape(-1, count)
+        indices = np.take_along_axis(bundle.corner_index[groups], corner, axis=1)
+        rows = (2 * corner[..., None] + np.arange(2)).reshape(len(groups), -1)
+        blocks = scale * bundle.solution.corner_covariance(indices)
+        covariance[groups[:, None, None], rows[:, :, None], rows[:, None, :]] = blocks
+    return completed_corners(bundle.corners_map, covariance)
+
+
+def completed_corners(corners_map: FloatArray, covariance_m2: FloatArray) -> SolvedCorners:
+    """Corners (G, 4, 2) and covariances (G, 8, 8), nan where unknown, a single missing corner implied."""
+    missing = np.asarray(np.isnan(corners_map).any(axis=2))
+    completed = missing.sum(axis=1) == 1
+    covariance = covariance_m2.copy()
+    for group in np.flatnonzero(completed):
         # Corners in circular order after the missing one: next, opposite, previous.
-        others = (np.argmin(known[partial], axis=1)[:, None] + np.arange(1, 4)) % 4
-        indices = np.take_along_axis(bundle.corner_index[partial], others, axis=1)
-        three = scale * bundle.solution.corner_covariance(indices)
-        for group, order, block in zip(partial, others, three, strict=True):
-            spread = _spread(order)
-            covariance[group] = spread @ block @ spread.T
-    completed = np.zeros(len(known), dtype=bool)
-    completed[partial] = True
-    return SolvedCorners(complete_corners(bundle.corners_map), covariance, completed)
+        others = (int(np.argmax(missing[group])) + np.arange(1, 4)) % 4
+        columns = (2 * others[:, None] + np.arange(2)).ravel()
+        spread = _spread(others)
+        covariance[group] = spread @ covariance_m2[group][np.ix_(columns, columns)] @ spread.T
+    return SolvedCorners(complete_corners(corners_map), covariance, completed)
 
 
 def without_misplaced_corners(

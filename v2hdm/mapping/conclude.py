@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.errors import MappingError
 from v2hdm.mapping.acceptance import LACKS_A_CORNER, ODD_SHAPE, Candidates, judge
-from v2hdm.mapping.association import fuse_groups, vague_corners
+from v2hdm.mapping.association import Association, fuse_groups, vague_corners
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.completion import SolvedCorners, solved_corners, without_misplaced_corners
 from v2hdm.mapping.known_shape import with_known_shapes
@@ -72,30 +72,16 @@ def conclude(
         MappingError: No candidate is accepted.
     """
     final = evidence.final
-    solved = solved_corners(final)
-    candidates = _candidates(evidence, solved)
-    verdict = judge(candidates, options)
-    odd = np.flatnonzero([reason == ODD_SHAPE for reason in verdict])
-    if len(odd):
-        accepted = np.flatnonzero([reason is None for reason in verdict])
-        solved = without_misplaced_corners(solved, odd, candidates.kind, accepted, options)
-        candidates = _candidates(evidence, solved)
-        verdict = judge(candidates, options)
-    doubtful = np.flatnonzero([reason in (ODD_SHAPE, LACKS_A_CORNER) for reason in verdict])
-    if len(doubtful):
-        accepted = np.flatnonzero([reason is None for reason in verdict])
-        located = locate(evidence.sightings, final.rig)
-        fused = fuse_groups(final.association, located, jitter_rad)
-        vague_map = vague_corners(final.association, located)
-        placed = with_known_shapes(solved, fused, vague_map, doubtful, candidates.kind, accepted, options)
-        solved = without_guessed_lengths(solved, placed, fused.corners_map, candidates.kind, accepted)
-        candidates = _candidates(evidence, solved)
-        verdict = judge(candidates, options)
-    accepted = np.flatnonzero([reason is None for reason in verdict])
-    excluded = exclusions(candidates, verdict)
+    judged = judge_and_mend(
+        solved_corners(final),
+        lambda solved: _candidates(evidence, solved),
+        Seen(final.association, evidence.sightings, final.rig, jitter_rad),
+        options,
+    )
+    candidates, accepted, solved = judged.candidates, judged.accepted, judged.solved
+    excluded = exclusions(candidates, judged.verdict)
     if not len(accepted):
         raise MappingError(no_marking_message(excluded))
-    solved = with_class_shapes(solved, candidates.kind, accepted)
     markings = tuple(
         Marking(
             kind=CORNERED_CLASSES[candidates.kind[group]],
@@ -116,6 +102,70 @@ def conclude(
         reprojection_rmse_px=_rms(final.solution.residual_px[used]),
         initial_reprojection_rmse_px=_rms(_residuals_under(initial_rig, evidence, jitter_rad)[used]),
     )
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What was seen of the candidates: their sightings and the rig under which those are located."""
+
+    association: Association
+    sightings: Sightings
+    rig: Rig
+    jitter_rad: float
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Candidates with the corners that their classes' shapes leave them, and the verdict on each."""
+
+    solved: SolvedCorners
+    candidates: Candidates
+    verdict: list[str | None]
+
+    @property
+    def accepted(self) -> IntArray:
+        """The groups that are markings of the map."""
+        return np.flatnonzero([reason is None for reason in self.verdict])
+
+    def refused_for(self, *reasons: str) -> IntArray:
+        """The groups that are none for one of ``reasons``."""
+        return np.flatnonzero([reason in reasons for reason in self.verdict])
+
+
+def judge_and_mend(
+    solved: SolvedCorners,
+    candidates_of: Callable[[SolvedCorners], Candidates],
+    seen: Seen,
+    options: AcceptanceOptions,
+) -> Judged:
+    """Judge candidates; what the shape of their class can mend is mended and judged again.
+
+    Args:
+        solved: The candidates' corners as they were solved for.
+        candidates_of: What the verdict rests on, given corners.
+        seen: Their sightings, for corners that could not be solved for.
+        options: What a marking must show.
+    """
+
+    def judged_as(corners: SolvedCorners) -> Judged:
+        candidates = candidates_of(corners)
+        return Judged(corners, candidates, judge(candidates, options))
+
+    now = judged_as(solved)
+    odd = now.refused_for(ODD_SHAPE)
+    if len(odd):
+        now = judged_as(
+            without_misplaced_corners(now.solved, odd, now.candidates.kind, now.accepted, options)
+        )
+    doubtful = now.refused_for(ODD_SHAPE, LACKS_A_CORNER)
+    if len(doubtful):
+        located = locate(seen.sightings, seen.rig)
+        fused = fuse_groups(seen.association, located, seen.jitter_rad)
+        vague_map = vague_corners(seen.association, located)
+        kind, accepted = now.candidates.kind, now.accepted
+        placed = with_known_shapes(now.solved, fused, vague_map, doubtful, kind, accepted, options)
+        now = judged_as(without_guessed_lengths(now.solved, placed, fused.corners_map, kind, accepted))
+    return replace(now, solved=with_class_shapes(now.solved, now.candidates.kind, now.accepted))
 
 
 def _candidates(evidence: Evidence, solved: SolvedCorners) -> Candidates:

@@ -1,36 +1,54 @@
 """The drive mapped as it would be on the vehicle: marking by marking, with nothing known of what comes.
 
 A track that the vehicle has left behind becomes a marking as soon as it ends: one of the map, where it lies
-on it, or else a further one. Map and extrinsics are up to date after each (:mod:`v2hdm.adjust.incremental`);
-poses' errors are those of the marking's own images, so that accuracies are stated a little too well
-where many markings share an image.
+on it, or else a further one. Map and extrinsics are up to date after each (:mod:`v2hdm.adjust.incremental`).
+Markings that follow one another share most of their images and so the errors of these images' poses: a few
+dozen are solved together, as one unit, from which a marking is taken back out whenever another one joins.
+
+The first tracks are linked under a coarse IPM. Whenever the map has doubled, and when the drive ends, what
+has been seen so far is linked again under the extrinsics that it has led to: a constant share of the cost.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.adjust.incremental import IncrementalMap, RigPrior
+from v2hdm.adjust.incremental import IncrementalMap, RigPrior, State
 from v2hdm.adjust.marking_fit import MarkingObservations, Noise
+from v2hdm.adjust.rigid import exp
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.mapping.acceptance import Candidates, judge
+from v2hdm.mapping.acceptance import Candidates
 from v2hdm.mapping.association import Association
 from v2hdm.mapping.bundle import HEAVE_SIGMA_M, centre_priors
-from v2hdm.mapping.conclude import exclusions, no_marking_message, pair_keys
+from v2hdm.mapping.completion import SolvedCorners, completed_corners
+from v2hdm.mapping.conclude import Seen, exclusions, judge_and_mend, no_marking_message, pair_keys
 from v2hdm.mapping.location import Rig
 from v2hdm.mapping.merge import group_kinds
-from v2hdm.mapping.options import AssociationOptions, MappingOptions
+from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import Exclusion
 from v2hdm.mapping.shapes import align, diameters
 from v2hdm.mapping.sightings import Sightings
+from v2hdm.mapping.symbols import images_with_symbol
 from v2hdm.mapping.views import Views, easy_views, project_ground
 from v2hdm.records import CORNERED_CLASSES, BoolArray, Camera, FloatArray, Marking, PoseNoise
 
 IntArray = NDArray[np.int64]
+
+Link = Callable[[Rig, bool], tuple[Association, BoolArray]]
+"""Tracks under a rig, coarse or not, and which corners (S, 4) may be used."""
+
+_UNIT_MARKINGS = 30
+"""Markings that are solved together; a road or yard shows fewer at a time."""
+
+_FIRST_LINK_MARKINGS = 12
+"""From so many the extrinsics are better than the IPM that they began with."""
+
+_LEAST_CORNERS = 3
+"""Corners that fix a marking: all are parallelograms."""
 
 # Squared distance that one sound observation in ten thousand exceeds (2 degrees of freedom).
 _INLIER_SQUARED = 18.4
@@ -40,7 +58,7 @@ _INLIER_SQUARED = 18.4
 class Grown:
     """What the drive has left behind.
 
-    ``rig`` holds the final extrinsics with the recorded poses; ``grown`` goes on with the next drive.
+    ``rig`` holds the final extrinsics and poses; ``grown`` goes on with the next drive.
     """
 
     grown: IncrementalMap
@@ -50,29 +68,53 @@ class Grown:
     residual_px: FloatArray
 
 
+@dataclass
+class _Place:
+    """Where a marking is kept: the unit, and which of its corners (4,) are the marking's, -1 if none.
+
+    ``images`` are those that showed it; ``preview`` (4, 2) is where it lay before its unit was solved.
+    """
+
+    unit: int
+    corner: IntArray
+    kind: int
+    images: set[int]
+    preview: FloatArray
+
+
+@dataclass(frozen=True)
+class _Track:
+    """The sightings ``rows`` of one track, what they say of the corners 0 to 3, and where these lie alone."""
+
+    rows: IntArray
+    kind: int
+    seen: MarkingObservations
+    corners_map: FloatArray
+
+
 class IncrementalMapper:
     """Takes the tracks of a drive into a map, one after the other."""
 
     def __init__(
         self,
         sightings: Sightings,
-        usable: BoolArray,
         rig: Rig,
         cameras: Mapping[str, Camera],
         pose_noise: PoseNoise,
         options: MappingOptions,
+        link: Link,
     ) -> None:
         """Begin with an empty map.
 
         Args:
             sightings: The table of sightings.
-            usable: Which corners (S, 4) may be used.
             rig: Extrinsics to start from, and the recorded poses.
             cameras: The rig's cameras, in its order.
             pose_noise: How far the recorded poses are off.
             options: Settings of the mapping.
+            link: Finds the tracks.
         """
-        self._sightings, self._usable, self._rig = sightings, usable, rig
+        self._sightings, self._link, self._rig = sightings, link, rig
         self._cameras, self._options = list(cameras.values()), options
         centre, sigma = centre_priors(self._cameras, rig.cam_from_vehicle)
         focal = rig.intrinsic
@@ -80,148 +122,279 @@ class IncrementalMapper:
         white_m = np.sqrt(max(pose_noise.position_m**2 - pose_noise.position_drift_m**2, 0.0))
         tilt = pose_noise.roll_pitch_rad
         pose_sigma = np.array([white_m, white_m, HEAVE_SIGMA_M, tilt, tilt, pose_noise.heading_rad])
-        self.grown = IncrementalMap(
-            RigPrior(intrinsic, rig.cam_from_vehicle, centre, sigma),
-            Noise(pose_sigma, options.loss_scale),
-            pose_noise.position_drift_m,
-        )
+        self._prior = RigPrior(intrinsic, rig.cam_from_vehicle, centre, sigma)
+        self._noise = Noise(pose_sigma, options.loss_scale)
+        self._drift_m = pose_noise.position_drift_m
         self._jitter_rad = float(np.hypot(tilt, pose_noise.heading_rad))
         self._floor_m = float(pose_noise.position_m)
         self._vehicle_from_map: FloatArray = np.asarray(np.linalg.inv(rig.map_from_vehicle), np.float64)
-        self._images: dict[int, set[int]] = {}
-        self._kinds: dict[int, int] = {}
+        self._begin(None, 0)
 
-    def run(self, tracks: Association, views: Views) -> Grown:
-        """Take up all ``tracks`` in the order in which they end, then judge the markings.
+    def run(self, views: Views) -> Grown:
+        """Take up all tracks in the order in which they end, then judge the markings.
 
         Raises:
             MappingError: No marking is accepted.
         """
-        association = self._take_up(tracks)
-        rig = Rig(self._rig.intrinsic, self.grown.cam_from_vehicle, self._rig.map_from_vehicle)
-        candidates, residual_px = self._candidates(association, rig, views)
-        verdict = judge(candidates, self._options.acceptance)
-        accepted = [group for group, reason in enumerate(verdict) if reason is None]
-        excluded = exclusions(candidates, verdict)
-        if not accepted:
-            raise MappingError(no_marking_message(excluded))
-        markings = tuple(
-            Marking(
-                CORNERED_CLASSES[candidates.kind[group]],
-                candidates.corners_map[group],
-                int(candidates.sightings[group]),
-                self.grown.corner_covariance(group),
-            )
-            for group in accepted
-        )
-        return Grown(self.grown, rig, markings, tuple(excluded), residual_px)
+        tracks, usable = self._link(self._rig, True)
+        due, ended = _FIRST_LINK_MARKINGS, False
+        while not ended:
+            ended = self._take_up_safely(tracks, usable, due)[1]
+            tracks, usable = self._link(self._present_rig(), False)
+            self._begin(self.grown, len(self._places))
+            due *= 2
+        association, _ = self._take_up_safely(tracks, usable, len(self._sightings))
+        return self._conclude(association, usable, views)
 
-    def _take_up(self, tracks: Association) -> Association:
-        """Which marking (S,) of the map each sighting became part of, and its corners' order."""
+    def _begin(self, before: IncrementalMap | None, known: int) -> None:
+        """An empty map with the extrinsics that the one ``before`` found, which had ``known`` markings.
+
+        So many need not be up to date one by one again: they are solved a unit at a time.
+        """
+        self.grown = IncrementalMap(self._prior, self._noise, self._drift_m)
+        if before is not None:
+            self.grown.state = State.empty(self._prior, before.state.tangents)
+        self._start, self._known = before, known
+        self._places: list[_Place] = []
+        self._centres = np.zeros((0, 2))
+        self._corner_counts: list[int] = []
+        self._waiting: list[MarkingObservations] = []
+
+    def _take_up_safely(self, tracks: Association, usable: BoolArray, most: int) -> tuple[Association, bool]:
+        """:meth:`_take_up`; where a unit cannot be solved at once, without the tracks that spoil it."""
+        try:
+            return self._take_up(tracks, usable, most)
+        except AdjustError:
+            self._begin(self._start, 0)
+            return self._take_up(tracks, usable, most)
+
+    def _take_up(self, tracks: Association, usable: BoolArray, most: int) -> tuple[Association, bool]:
+        """Take tracks into the map until it has ``most`` markings or the drive ends; and whether it did.
+
+        Returns which marking (S,) of the map each sighting became part of, and its corners' order.
+        """
         number = np.full(len(self._sightings), -1, dtype=np.int64)
         shift = tracks.shift.copy()
-        last = np.zeros(tracks.count, dtype=np.int64)
         rows = np.flatnonzero(tracks.group >= 0)
-        np.maximum.at(last, tracks.group[rows], rows)
+        rows = rows[np.argsort(tracks.group[rows], kind="stable")]
+        members = np.split(rows, np.flatnonzero(np.diff(tracks.group[rows])) + 1) if len(rows) else []
         kinds = group_kinds(tracks, self._sightings)
-        for track in np.argsort(last, kind="stable").tolist():
-            own = np.flatnonzero(tracks.group == track)
-            seen = self._observations(own, tracks)
-            if seen is None:
+        ended = True
+        for own in sorted(members, key=lambda own: int(own[-1])):
+            if len(self._places) >= most:
+                ended = False
+                break
+            track = self._track(own, int(kinds[tracks.group[own[0]]]), tracks, usable)
+            if track is None:
                 continue
-            try:
-                corners = self.grown.preview(seen)
-                marking, turn = self._same_as(corners, int(kinds[track]), own)
-                self.grown.observe(marking, _turned(seen, turn))
-            except AdjustError:
-                continue
-            number[own], shift[own] = marking, (shift[own] + turn) % 4
-            self._kinds[marking] = int(kinds[track])
-            self._images.setdefault(marking, set()).update(self._sightings.image[own].tolist())
-        return Association(number, shift, len(self.grown.markings))
+            marking, turn = self._same_as(track)
+            if self._take(track, marking, turn):
+                number[own] = len(self._places) - 1 if marking is None else marking
+                shift[own] = (shift[own] + turn) % 4
+        self._settle()
+        return Association(number, shift, len(self._places)), ended
 
-    def _observations(self, rows: IntArray, tracks: Association) -> MarkingObservations | None:
-        """What ``rows`` saw of their marking's corners; None where it was too little to map them all."""
+    def _take(self, track: _Track, marking: int | None, turn: int) -> bool:
+        """Take a track into the map as a ``marking``, None for a further one; whether that went well."""
+        corner = (track.seen.corner - turn) % 4
+        place = self._further_place(track) if marking is None else self._places[marking]
+        numbers = place.corner.copy()
+        further = np.setdiff1d(corner, np.flatnonzero(numbers >= 0))
+        numbers[further] = self._corner_counts[place.unit] + np.arange(len(further))
+        observed = MarkingObservations(**dict(vars(track.seen), corner=numbers[corner]))
+        newest = place.unit == len(self._corner_counts) - 1
+        if newest and len(self._places) < self._known:
+            self._waiting.append(observed)
+        else:
+            self._settle()
+            try:
+                self.grown.observe(place.unit, observed)
+            except AdjustError:
+                return False
+        self._corner_counts[place.unit] += len(further)
+        place.corner = numbers
+        place.images |= set(self._sightings.image[track.rows].tolist())
+        if marking is None:
+            self._places.append(place)
+            self._centres = np.vstack([self._centres, np.nanmean(track.corners_map, axis=0)])
+        return True
+
+    def _further_place(self, track: _Track) -> _Place:
+        """A place for a marking that the map does not have, in the newest unit or, if it is full, another."""
+        newest = len(self._corner_counts) - 1
+        last = self._places[-_UNIT_MARKINGS:]
+        if newest < 0 or sum(place.unit == newest for place in last) == _UNIT_MARKINGS:
+            self._settle()
+            self._corner_counts.append(0)
+            newest += 1
+        return _Place(newest, np.full(4, -1, dtype=np.int64), track.kind, set(), track.corners_map)
+
+    def _settle(self) -> None:
+        """Solve for what waits for its unit to be full."""
+        waiting, self._waiting = self._waiting, []
+        if waiting:
+            joined = waiting[0]
+            for more in waiting[1:]:
+                joined = joined.joined(more)
+            self.grown.observe(len(self._corner_counts) - 1, joined)
+
+    def _corners(self, marking: int) -> FloatArray:
+        """Corners (4, 2) of a marking under the present extrinsics, nan where unknown."""
+        place = self._places[marking]
+        if self._waiting and place.unit == len(self._corner_counts) - 1:
+            return place.preview
+        out = np.full((4, 2), np.nan)
+        known = place.corner >= 0
+        out[known] = self.grown.corners_map(place.unit)[place.corner[known]]
+        return out
+
+    def _track(self, rows: IntArray, kind: int, tracks: Association, usable: BoolArray) -> _Track | None:
+        """What ``rows`` saw of corners that they saw twice; None where that fixes no marking."""
         order = tracks.corner_order()[rows]
-        which, corner = np.nonzero(np.take_along_axis(self._usable[rows], order, axis=1))
-        often = np.bincount(corner, minlength=4).min() >= 2
-        if len(rows) < self._options.acceptance.min_sightings or not often:
+        which, corner = np.nonzero(np.take_along_axis(usable[rows], order, axis=1))
+        twice = np.bincount(corner, minlength=4) >= 2
+        if len(rows) < self._options.acceptance.min_sightings or np.count_nonzero(twice) < _LEAST_CORNERS:
             return None
+        which, corner = which[twice[corner]], corner[twice[corner]]
         row, own = rows[which], order[which, corner]
         sightings, floor_px = self._sightings, self._options.model_floor_px
-        return MarkingObservations(
+        known, dense = np.unique(corner, return_inverse=True)
+        seen = MarkingObservations(
             camera=sightings.camera[row],
-            corner=corner,
+            corner=dense.astype(np.int64),
             frame=sightings.frame[row],
             vehicle_from_map=self._vehicle_from_map[sightings.frame[row]],
             pinhole_px=sightings.corners_pinhole_px[row, own],
             covariance_px=sightings.covariance_px[row, own] + floor_px**2 * np.eye(2),
         )
+        corners = np.full((4, 2), np.nan)
+        try:
+            corners[known] = self.grown.preview(seen)
+        except AdjustError:
+            return None
+        return _Track(rows, kind, replace(seen, corner=corner), corners)
 
-    def _same_as(self, corners: FloatArray, kind: int, rows: IntArray) -> tuple[int, int]:
-        """The marking of the map that lies where ``corners`` do, or a new number; and how to turn them.
+    def _same_as(self, track: _Track) -> tuple[int | None, int]:
+        """The marking of the map that lies where a track does, None if none; and how to turn the track.
 
         Corner c of the marking is corner (c + turn) mod 4. Two things seen in one image are two markings.
         """
-        options, images = self._options.association, set(self._sightings.image[rows].tolist())
-        best, found = self._gate_m(options, rows), (len(self.grown.markings), 0)
-        whole = np.ones(4, dtype=bool)
-        size_m = float(diameters(corners, whole))
-        for marking in self.grown.markings:
-            if self._kinds[marking] != kind or not images.isdisjoint(self._images[marking]):
+        corners = track.corners_map
+        valid = np.asarray(np.isfinite(corners).all(axis=1))
+        images = set(self._sightings.image[track.rows].tolist())
+        size_m = float(diameters(np.nan_to_num(corners), valid))
+        tolerance_m = max(self._options.association.shape_tolerance * size_m, 0.05)
+        best: tuple[float, int | None, int] = (self._gate_m(track.rows), None, 0)
+        near = np.linalg.norm(self._centres - np.nanmean(corners, axis=0), axis=1) < best[0] + size_m
+        for marking in np.flatnonzero(near).tolist():
+            place = self._places[marking]
+            if place.kind != track.kind or not images.isdisjoint(place.images):
                 continue
-            there = align(self.grown.corners_map(marking), whole, corners, whole)
+            mapped = self._corners(marking)
+            whole = np.asarray(np.isfinite(mapped).all(axis=1))
+            there = align(np.nan_to_num(mapped), whole, np.nan_to_num(corners), valid)
             off_m = float(np.linalg.norm(there.offset))
-            if off_m < best and there.deformation_m < max(options.shape_tolerance * size_m, 0.05):
-                best, found = off_m, (marking, int(there.shift))
-        return found
+            if off_m < best[0] and there.deformation_m < tolerance_m:
+                best = (off_m, marking, int(there.shift))
+        return best[1], best[2]
 
-    def _gate_m(self, options: AssociationOptions, rows: IntArray) -> float:
+    def _gate_m(self, rows: IntArray) -> float:
         """How far apart two sightings of one marking may lie: poses, and what is left of the extrinsic."""
-        range_m = 0.5 * self._options.max_range_m
+        options, range_m = self._options.association, 0.5 * self._options.max_range_m
         height_m = float(np.median(self._rig.height_m[self._sightings.camera[rows]]))
         floor_m = np.hypot(self._floor_m, options.refined_sigma_rad * range_m**2 / height_m)
         return float(min(options.gate_sigmas * np.sqrt(2) * floor_m, options.max_gate_m))
 
-    def _candidates(self, association: Association, rig: Rig, views: Views) -> tuple[Candidates, FloatArray]:
-        """What the verdict rests on, and the residuals (K, 2), px, of the markings' observations."""
-        sightings, count = self._sightings, association.count
-        corners = (
-            np.stack([self.grown.corners_map(m) for m in range(count)]) if count else np.zeros((0, 4, 2))
+    def _present_rig(self) -> Rig:
+        """The extrinsics, and the poses of the frames as the units that saw most in them say."""
+        poses, most = self._rig.map_from_vehicle.copy(), np.zeros(len(self._rig.map_from_vehicle))
+        for unit in self.grown.markings.values():
+            frames, count = np.unique(unit.observations.frame, return_counts=True)
+            better = count > most[frames]
+            chosen = frames[better]
+            poses[chosen] = self._rig.map_from_vehicle[chosen] @ exp(unit.frame_state[better])
+            most[chosen] = count[better]
+        return Rig(self._rig.intrinsic, self.grown.cam_from_vehicle, poses)
+
+    def _conclude(self, association: Association, usable: BoolArray, views: Views) -> Grown:
+        """Judge the markings as the batch does."""
+        rig = self._present_rig()
+        row, group, residual_px, agrees = self._residuals(association, usable, rig)
+        judged = judge_and_mend(
+            self._solved(),
+            lambda solved: self._candidates(solved, association, rig, views, (row, group, agrees)),
+            Seen(association, self._sightings, rig, self._jitter_rad),
+            self._options.acceptance,
         )
-        variance = np.array([np.diag(self.grown.corner_covariance(m)) for m in range(count)])
-        usable = association.in_group_order(self._usable) & (association.group >= 0)[:, None]
-        row, corner = np.nonzero(usable)
-        group = association.group[row]
-        own = association.corner_order()[row, corner]
-        cam_from_map = (
-            rig.cam_from_vehicle[sightings.camera[row]] @ self._vehicle_from_map[sightings.frame[row]]
+        candidates, excluded = judged.candidates, exclusions(judged.candidates, judged.verdict)
+        if not len(judged.accepted):
+            raise MappingError(no_marking_message(excluded))
+        markings = tuple(
+            Marking(
+                CORNERED_CLASSES[candidates.kind[group]],
+                judged.solved.corners_map[group],
+                int(candidates.sightings[group]),
+                judged.solved.covariance_m2[group],
+            )
+            for group in judged.accepted
         )
+        return Grown(self.grown, rig, markings, tuple(excluded), residual_px)
+
+    def _solved(self) -> SolvedCorners:
+        """All corners and their covariances, a missing fourth corner completed."""
+        count = len(self._places)
+        corners, covariance = np.full((count, 4, 2), np.nan), np.full((count, 8, 8), np.nan)
+        by_unit = {unit: self.grown.corner_covariance(unit) for unit in self.grown.markings}
+        for marking, place in enumerate(self._places):
+            corners[marking] = self._corners(marking)
+            known = np.flatnonzero(place.corner >= 0)
+            rows, own = (2 * at[:, None] + np.arange(2) for at in (known, place.corner[known]))
+            block = by_unit[place.unit][np.ix_(own.ravel(), own.ravel())]
+            covariance[marking][np.ix_(rows.ravel(), rows.ravel())] = block
+        return completed_corners(corners, covariance)
+
+    def _residuals(
+        self, association: Association, usable: BoolArray, rig: Rig
+    ) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
+        """Of all K observations of known corners: row, marking, residual (K, 2) px, and whether it agrees."""
+        sightings = self._sightings
+        corners = np.stack([self._corners(m) for m in range(association.count)] or [np.zeros((4, 2))])
+        inside = association.in_group_order(usable) & (association.group >= 0)[:, None]
+        row, corner = np.nonzero(inside & np.isfinite(corners[association.group]).all(axis=2))
+        group, own = association.group[row], association.corner_order()[row, corner]
+        vehicle_from_map = np.linalg.inv(rig.map_from_vehicle)[sightings.frame[row]]
+        cam_from_map = rig.cam_from_vehicle[sightings.camera[row]] @ vehicle_from_map
         focal = rig.intrinsic[sightings.camera[row]]
         pixel, _ = project_ground(focal, cam_from_map, corners[group, corner][:, None])
         residual = pixel[:, 0] - sightings.corners_pinhole_px[row, own]
         jitter_px = float(np.mean(rig.intrinsic[:, 0, 0])) * self._jitter_rad
         noise = sightings.covariance_px[row, own] + jitter_px**2 * np.eye(2)
         squared = np.sum(residual * np.linalg.solve(noise, residual[..., None])[..., 0], axis=1)
-        agreeing = np.bincount(group[squared < _INLIER_SQUARED], minlength=count)
-        seen = np.unique(np.stack([group, sightings.image[row]]), axis=1)
-        easy = np.stack(easy_views(views, rig, self._cameras, corners))
+        return row, group, residual, squared < _INLIER_SQUARED
+
+    def _candidates(
+        self,
+        solved: SolvedCorners,
+        association: Association,
+        rig: Rig,
+        views: Views,
+        observed: tuple[IntArray, IntArray, BoolArray],
+    ) -> Candidates:
+        """What the verdict on the corners ``solved`` rests on, given what was ``observed``."""
+        count, (row, group, agrees) = association.count, observed
+        variance = np.diagonal(solved.covariance_m2, axis1=1, axis2=2).reshape(-1, 4, 2).sum(axis=2)
+        seen = np.unique(np.stack([group, self._sightings.image[row]]), axis=1)
+        easy = np.stack(easy_views(views, rig, self._cameras, solved.corners_map))
         found = np.isin(pair_keys(easy), pair_keys(seen))
-        candidates = Candidates(
-            kind=np.array([self._kinds[m] for m in range(count)], dtype=np.int64),
-            corners_map=corners,
-            completed=np.zeros(count, dtype=bool),
-            sigma_m=np.sqrt(variance.reshape(count, 4, 2).sum(axis=2).max(axis=1)),
+        return Candidates(
+            kind=np.array([place.kind for place in self._places], dtype=np.int64),
+            corners_map=solved.corners_map,
+            completed=solved.completed,
+            sigma_m=np.sqrt(np.max(variance, axis=1)),
             sightings=np.bincount(seen[0], minlength=count),
-            inlier_share=agreeing / np.maximum(np.bincount(group, minlength=count), 1),
+            inlier_share=np.bincount(group[agrees], minlength=count)
+            / np.maximum(np.bincount(group, minlength=count), 1),
             easy_views=np.bincount(easy[0], minlength=count),
             easy_detections=np.bincount(easy[0, found], minlength=count),
+            seen_as_symbol=images_with_symbol(self._sightings.symbols, rig, solved.corners_map.mean(axis=1)),
         )
-        return candidates, residual
-
-
-def _turned(seen: MarkingObservations, turn: int) -> MarkingObservations:
-    """``seen`` with corners renumbered: corner (c + turn) mod 4 becomes corner c."""
-    parts = dict(vars(seen))
-    parts["corner"] = (seen.corner - turn) % 4
-    return MarkingObservations(**parts)

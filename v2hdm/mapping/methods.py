@@ -78,7 +78,7 @@ def run_methods(
     begin_s = time.perf_counter()
     if options.mode == INCREMENTAL:
         tell("marking by marking")
-        grown = optimiser.run_incrementally(tracks)
+        grown = optimiser.run_incrementally()
         optimal = _incremental_result(drive, detections, cameras, grown, options, begin_s)
     else:
         optimised = optimiser.run(tracks, tell)

@@ -106,13 +106,18 @@ class Optimiser:
             self._options.acceptance,
         )
 
-    def run_incrementally(self, tracks: Association) -> Grown:
-        """Map ``tracks`` one after the other, as the vehicle would while it drives."""
-        usable = self._locate(self.initial_rig).valid
+    def run_incrementally(self) -> Grown:
+        """Map one track after the other, as the vehicle would while it drives."""
+
+        def link(rig: Rig, coarse: bool) -> tuple[Association, BoolArray]:
+            located, options = self._locate(rig), self._options.association
+            direction_rad = options.ipm_sigma_rad if coarse else options.refined_sigma_rad
+            return self._track(rig, located, direction_rad), located.valid
+
         mapper = IncrementalMapper(
-            self._sightings, usable, self.initial_rig, self._cameras, self._pose_noise, self._options
+            self._sightings, self.initial_rig, self._cameras, self._pose_noise, self._options, link
         )
-        return mapper.run(tracks, self._views)
+        return mapper.run(self._views)
 
     def solve_groups(self, optimised: Optimised, groups: IntArray) -> Bundle:
         """Solve with only some ``groups`` of a finished optimisation, from the initial extrinsics."""
