@@ -1,0 +1,115 @@
+"""The incremental map from ten markings to ten thousand: time per marking, and how far from the batch.
+
+``python -m tests.benchmarks.adjust_incremental [markings]`` drives two cameras past so many markings and takes
+them up one by one under the paper's model. It prints the CPU time of a marking up to each decade, without and
+with the share of relinearising, and at the end the largest distance from the batch optimum in sigmas.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from tests.adjust.scene import make_scene
+from tests.benchmarks.adjust_scaling import driven_on
+from v2hdm.adjust import Problem, SolveOptions, solve
+from v2hdm.adjust.incremental import IncrementalMap, RigPrior
+from v2hdm.adjust.marking_fit import MarkingObservations, Noise
+from v2hdm.adjust.subset import restrict
+
+CORNERS = 4
+DECADES = (10, 100, 1000, 10_000)
+
+
+@dataclass(frozen=True)
+class Growth:
+    """CPU times (N,) of taking up each marking, s, and the corners (N, 4, 2) that result."""
+
+    took_s: np.ndarray
+    corners_map: np.ndarray
+
+
+def street(markings: int) -> Problem:
+    """At least so many markings of four corners, each seen in a few images by two cameras."""
+    one = make_scene(0, frames=400, every_m=1.0, max_range_m=12.0, start_error_deg=1.0, min_views=3).problem
+    return driven_on(one, -(-markings * CORNERS // one.corner_count))
+
+
+def by_marking(problem: Problem, markings: int) -> list[MarkingObservations]:
+    """The observations of the first markings: four corners each, in the order of the route."""
+    seen = problem.observations
+    vehicle_from_map = np.linalg.inv(problem.map_from_vehicle)
+    order = np.argsort(seen.corner, kind="stable")
+    bounds = np.searchsorted(seen.corner[order], CORNERS * np.arange(markings + 1))
+    out = []
+    for marking in range(markings):
+        rows = order[bounds[marking] : bounds[marking + 1]]
+        out.append(
+            MarkingObservations(
+                camera=seen.camera[rows],
+                corner=seen.corner[rows] - CORNERS * marking,
+                frame=seen.frame[rows],
+                vehicle_from_map=vehicle_from_map[seen.frame[rows]],
+                pinhole_px=seen.pinhole_px[rows],
+                covariance_px=seen.covariance_px[rows],
+            )
+        )
+    return out
+
+
+def grow(problem: Problem, markings: list[MarkingObservations]) -> Growth:
+    """Take the markings up one by one."""
+    assert problem.centre_vehicle is not None
+    assert problem.centre_sigma_m is not None
+    prior = RigPrior(
+        problem.intrinsic, problem.cam_from_vehicle, problem.centre_vehicle, problem.centre_sigma_m, 10.0
+    )
+    grown = IncrementalMap(prior, Noise(np.zeros(6), np.inf))
+    took_s = np.zeros(len(markings))
+    for marking, seen in enumerate(markings):
+        began = time.process_time()
+        grown.observe(marking, seen)
+        took_s[marking] = time.process_time() - began
+    return Growth(took_s, np.stack([grown.corners_map(m) for m in range(len(markings))]))
+
+
+def largest_distance(problem: Problem, growth: Growth) -> float:
+    """Of all corners' coordinates, the farthest from the batch optimum, in standard deviations."""
+    best = solve(problem, SolveOptions(pose_states=(), loss="none"))
+    count = len(growth.corners_map)
+    groups = np.arange(CORNERS * count).reshape(count, CORNERS)
+    sigma = np.sqrt(np.diagonal(best.corner_covariance(groups), axis1=1, axis2=2))
+    return float(np.max(np.abs((growth.corners_map - best.corners_map[groups]).reshape(count, -1)) / sigma))
+
+
+def restricted(problem: Problem, markings: int) -> Problem:
+    """The problem of the first markings alone."""
+    return restrict(problem, problem.observations.corner < CORNERS * markings)[0]
+
+
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("markings", nargs="?", type=int, default=DECADES[-1])
+    count = parser.parse_args().markings
+    torch.set_num_threads(1)
+    problem = restricted(street(count), count)
+    growth = grow(problem, by_marking(problem, count))
+    usual = None
+    for decade in (size for size in DECADES if size <= count):
+        around = growth.took_s[max(decade // 2, 5) : decade]
+        median_ms, mean_ms = 1000 * np.median(around), 1000 * around.mean()
+        usual = usual or median_ms
+        print(
+            f"  to {decade:6d} markings: {median_ms:6.2f} ms a marking ({median_ms / usual:4.2f} x the first; "
+            f"asked <= 1.5), {mean_ms:6.2f} ms with relinearising"
+        )
+    print(f"  largest distance from the batch: {largest_distance(problem, growth):.4f} sigma; asked <= 0.01")
+
+
+if __name__ == "__main__":
+    main()
