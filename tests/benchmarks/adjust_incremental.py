@@ -1,6 +1,6 @@
 """The incremental map from ten markings to ten thousand: time per marking, and how far from the batch.
 
-``python -m tests.benchmarks.adjust_incremental [markings]`` drives two cameras past so many markings and takes
+``python -m tests.benchmarks.adjust_incremental [markings]`` drives two cameras past so many and takes
 them up one by one under the paper's model. It prints the CPU time of a marking up to each decade, without and
 with the share of relinearising, and at the end the largest distance from the batch optimum in sigmas.
 """
@@ -105,8 +105,8 @@ def main() -> None:
         median_ms, mean_ms = 1000 * np.median(around), 1000 * around.mean()
         usual = usual or median_ms
         print(
-            f"  to {decade:6d} markings: {median_ms:6.2f} ms a marking ({median_ms / usual:4.2f} x the first; "
-            f"asked <= 1.5), {mean_ms:6.2f} ms with relinearising"
+            f"  to {decade:6d} markings: {median_ms:6.2f} ms a marking, {median_ms / usual:4.2f} x the first "
+            f"(asked <= 1.5), {mean_ms:6.2f} ms with relinearising"
         )
     print(f"  largest distance from the batch: {largest_distance(problem, growth):.4f} sigma; asked <= 0.01")
 
