@@ -31,7 +31,7 @@ _MAX_MOVE_PX = 6.0
 _MAX_MOVE_SHARE = 0.1
 """A fit that moves a corner by more than this, and than this share of the longest side, has gone astray."""
 
-_NOISE_MISFIT = 0.08
+_NOISE_MISFIT = 0.1
 """Share of the step up to the paint that noise and texture alone leave."""
 _DAMPING = 1.0 + 1e-3 * np.eye(13)
 _RIDGE = 1e-9 * np.eye(13)
