@@ -126,6 +126,15 @@ def test_paint_across_the_view_is_no_line_of_a_lane(view):
     assert link_anchors([], view, [LaneDetection(LANE_DASH, 0.9, across)]) == []
 
 
+def test_what_is_seen_about_the_horizon_bends_no_line(view):
+    line = straight(view, 1.6)
+    rows = anchors_of(view, [line])
+    beyond = np.arange(rows[-1].v_px - STRIDE, rows[-1].v_px - 40, -STRIDE)
+    hook = [AnchorRow(v, rows[-1].u_px + 30.0 * n, np.array([3.0])) for n, v in enumerate(beyond)]
+    (lane,) = link_anchors(rows + hook, view)
+    assert lane.points_px[-1, 1] > beyond[0] - 2
+
+
 def test_crossings_too_unlikely_by_themselves_carry_a_known_line_on(view):
     line = straight(view, 1.6)
     rows = anchors_of(view, [line])

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from v2hdm.detection.lane_curves import LEAST_BELOW_PX, Horizon, basis
+from v2hdm.detection.lane_curves import Horizon, basis
 from v2hdm.detection.lane_groups import NEIGHBOURS, IntArray, Line, LinePoints, find_lines
 from v2hdm.detection.sight import AnchorRow
 from v2hdm.detection.view import CameraView
@@ -23,6 +23,9 @@ _CHAIN_ODDS = 0.0
 """Chains are made of crossings more likely than not; what is less likely may join a line that is known."""
 
 _LEAST_LOG_ODDS = -0.75
+
+_MAX_RANGE_M = 60.0
+"""Farther away no line is followed: the network was shown none beyond 50 m."""
 
 _MAX_GAP_PX = 40.0
 _SLOPE_POINTS = 6
@@ -87,15 +90,32 @@ def link_anchors(
         paint_step_m: That distance.
     """
     horizon = Horizon(view)
+    rows = _in_reach(rows, view)
     points = _crossings(rows, view, horizon)
-    seen = points.below > LEAST_BELOW_PX
     groups = [np.array(chain.index) for chain in _chains(rows)]
-    groups = [group[seen[group]] for group in groups]
-    groups = [group for group in groups if len(group) >= _MIN_CHAIN]
     points, on_paint = _with_paint(points, paint, view, horizon)
     lines = find_lines(points, groups + on_paint, horizon, paint_step_m, _LEAST_LOG_ODDS)
     found = [lane for line in lines if (lane := _drawn(points, line, view, horizon)) is not None]
     return _identified(found, view)
+
+
+def _in_reach(rows: Sequence[AnchorRow], view: CameraView) -> list[AnchorRow]:
+    """The rows without crossings at and above the horizon, and just below it, where lines run together."""
+    if not rows:
+        return []
+    points_px = np.column_stack(
+        [
+            np.concatenate([row.u_px for row in rows]),
+            np.repeat([r.v_px for r in rows], [len(r.u_px) for r in rows]),
+        ]
+    )
+    near = view.range_m(view.ground(view.undistort(points_px))) <= _MAX_RANGE_M  # false where it is nan
+    parts = np.split(near, np.cumsum([len(row.u_px) for row in rows])[:-1])
+    return [
+        AnchorRow(row.v_px, row.u_px[part], row.odds[part])
+        for row, part in zip(rows, parts, strict=True)
+        if part.any()
+    ]
 
 
 def _crossings(rows: Sequence[AnchorRow], view: CameraView, horizon: Horizon) -> LinePoints:

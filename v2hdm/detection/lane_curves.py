@@ -17,7 +17,7 @@ import numpy as np
 from v2hdm.detection.view import CameraView
 from v2hdm.records import FloatArray
 
-LEAST_BELOW_PX = 4.0
+_LEAST_BELOW_PX = 4.0
 """Nearer to the horizon than this nothing is known of the ground."""
 
 _UNIT_PX = 100.0
@@ -153,7 +153,7 @@ def middle_of(first: Curve, second: Curve) -> Curve:
 
 def basis(below: FloatArray) -> FloatArray:
     """What (a, b, c) are multiplied by (N, 3) at distances (N,) below the horizon, px."""
-    v = np.maximum(below, LEAST_BELOW_PX) / _UNIT_PX
+    v = np.maximum(below, _LEAST_BELOW_PX) / _UNIT_PX
     phi = np.ones((len(v), 3))
     phi[:, 1], phi[:, 2] = v, 1.0 / v
     return phi
