@@ -18,7 +18,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -282,6 +282,10 @@ def report(
     views = views_of_images(drive, optimised)
     route = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
     reference = make_reference(optimised.markings, route, reference_path)
+    views = [
+        replace(view, cam_from_map=reference.cam_from_map.get(index, view.cam_from_map))
+        for index, view in enumerate(views)
+    ]
     tally = Tally(reference, shaded_share(drive, views, reference.markings))
     for index, (view, image) in enumerate(zip(views, drive.images, strict=True)):
         found = detections[index]
@@ -303,7 +307,7 @@ def map_summary(mapped: Sequence[Marking], reference: Reference, tally: Tally) -
         if not any(is_near(marking.corners_map, p.polygon_map) for p in reference.markings)
     ]
     centres = np.array([m.corners_map.mean(axis=0) for m in mapped if m.kind == LANE_DASH]).reshape(-1, 2)
-    dashes = [m for m in tally.markings_seen if reference.markings[m].kind == LANE_DASH]
+    dashes = [m for m in tally.markings_seen if tally.groups[m].startswith("dashes")]
     held = sum(
         float(np.linalg.norm(centres - reference.markings[m].centre_map, axis=1).min(initial=np.inf))
         <= TOLERANCE_M
@@ -311,7 +315,7 @@ def map_summary(mapped: Sequence[Marking], reference: Reference, tally: Tally) -
     )
     return (
         f"map: {len(stray)} markings {_false_name(reference)} (target none) {stray}; "
-        f"{held} of the {len(dashes)} dashes shown are in it"
+        f"{held} of the {len(dashes)} dashes of the road that images showed are in it"
     )
 
 
@@ -326,7 +330,7 @@ def main() -> None:
     parsed = parser.parse_args()
     cv2.setNumThreads(1)
     drive = read_drive(parsed.drive, ReadOptions(cameras=[parsed.camera] if parsed.camera else []))
-    detections = detect_all(drive, DetectorOptions(model=parsed.model))
+    detections = detect_all(drive, replace(DetectorOptions.for_mapping(), model=parsed.model))
     optimised = optimise(drive, detections)
     print(report(drive, detections, optimised, parsed.reference, parsed.overlays))
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -52,12 +52,14 @@ class Painted:
 class Reference:
     """All that is painted; ``whole`` if that is really all, so that anything else is false.
 
-    ``hidden`` are the boxes (u0, v0, u1, v1) of an image behind which something stands before the road.
+    ``hidden`` are the boxes (u0, v0, u1, v1) of an image behind which something stands before the road;
+    ``cam_from_map`` (4, 4) places the camera of an image better than the drive's own map does.
     """
 
     markings: tuple[Painted, ...]
     whole: bool
     hidden: dict[int, list[FloatArray]]
+    cam_from_map: dict[int, FloatArray] = field(default_factory=dict)
 
 
 def centre_of_area(polygon: FloatArray) -> FloatArray:
@@ -75,7 +77,8 @@ def make_reference(mapped: Sequence[Marking], route_map: FloatArray, path: Path 
     The file is JSON: ``markings``, a list of ``{"kind", "polygon_map", "other_road", "optional"}``, each of
     which takes the place of what it lies on; ``remove``, a list of places [x, y] where the map is wrong;
     ``whole``, true if nothing else is painted, whereupon the map is not asked; ``hidden``, a list of
-    ``{"image", "box_px"}``. Lengths are metres in the map frame. All but ``markings`` may be left out.
+    ``{"image", "box_px"}``; ``cam_from_map``, a list of ``{"image", "matrix"}``. Lengths are metres in the
+    map frame. All but ``markings`` may be left out.
 
     Raises:
         MapFileError: the file is missing or not of this form.
@@ -89,13 +92,17 @@ def make_reference(mapped: Sequence[Marking], route_map: FloatArray, path: Path 
         hidden: dict[int, list[FloatArray]] = {}
         for entry in content.get("hidden", []):
             hidden.setdefault(int(entry["image"]), []).append(np.array(entry["box_px"], dtype=np.float64))
+        cameras = {
+            int(entry["image"]): np.array(entry["matrix"], dtype=np.float64).reshape(4, 4)
+            for entry in content.get("cam_from_map", [])
+        }
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise MapFileError(f"{path}: no reference can be read ({error!r}); see make_reference") from error
     whole = bool(content.get("whole", False))
     implied = [] if whole else complete_lines(mapped, route_map)
     taken = np.concatenate([places, *[p.centre_map[None] for p in drawn]])
     kept = [p for p in implied if _nearest(p.centre_map, taken) > 1.0]
-    return Reference((*drawn, *kept), whole, hidden)
+    return Reference((*drawn, *kept), whole, hidden, cameras)
 
 
 def _painted(entry: dict[str, object]) -> Painted:

@@ -50,14 +50,17 @@ def test_dashes_of_two_lines_are_completed_apart_and_not_beyond_their_ends() -> 
     assert len(found.markings) == 8
 
 
-def test_a_file_adds_removes_and_hides(tmp_path: Path) -> None:
+def test_a_file_adds_removes_hides_and_places_cameras(tmp_path: Path) -> None:
     path = tmp_path / "reference.json"
     arrow = {"kind": ARROW, "polygon_map": [[10, 0], [14, 0], [12, 1]]}
     hidden = [{"image": 3, "box_px": [0, 0, 10, 10]}]
-    path.write_text(json.dumps({"markings": [arrow], "remove": [[3.5, 1.5]], "hidden": hidden}))
+    camera = [{"image": 5, "matrix": VIEW.cam_from_map.tolist()}]
+    content = {"markings": [arrow], "remove": [[3.5, 1.5]], "hidden": hidden, "cam_from_map": camera}
+    path.write_text(json.dumps(content))
     found = make_reference(mapped(2, 8, 14), ROUTE, path)
     assert [p.kind for p in found.markings] == [ARROW, LANE_DASH, LANE_DASH]
     assert len(found.hidden[3]) == 1
+    np.testing.assert_array_equal(found.cam_from_map[5], VIEW.cam_from_map)
 
 
 def test_a_file_that_is_whole_leaves_the_map_out(tmp_path: Path) -> None:
@@ -122,4 +125,4 @@ def test_the_map_is_judged_by_what_is_painted() -> None:
     tally.add(judge_image(VIEW, reference, [], []))
     text = map_summary([*mapped(8), Marking(LANE_DASH, dash(8, -4.0), 3)], reference, tally)
     assert "1 markings false" in text
-    assert "1 of the 2 dashes" in text
+    assert "1 of the 2 dashes of the road" in text
