@@ -69,7 +69,7 @@ def fitted_on_a_blank_image(quad_vehicle: np.ndarray) -> tuple[np.ndarray, list[
     blank = np.full((camera.info.height, camera.info.width, 3), 90, dtype=np.uint8)
     owner = np.zeros((view.height // 2, camera.info.width // 2), dtype=np.int16)
     foreground = Foreground(owner, 2, view.top)
-    return view.distort(quad), fit_markings(blank, view, [start], foreground, DetectorOptions())
+    return view.distort(quad), fit_markings(blank, view, [start], foreground, DetectorOptions.for_mapping())
 
 
 def test_a_marking_without_edges_in_the_image_takes_the_corners_of_its_outline() -> None:

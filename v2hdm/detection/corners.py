@@ -34,11 +34,16 @@ _BLUR_QUANTILE = 0.4
 _BLUR_PRIOR_SIDES = 6
 _BLUR_LIMITS_PX = (0.45, 1.5)
 _AROUND_PX = 16
+_BLOOM_SIGMA_PX = 0.5
+"""Where the sensor was at its limit, edges are this far from where they seem to be."""
 _MAX_OUTLINE_SIGMA_PX = 2.0
 _MAX_OUTLINE_GAP_PX = 4.0
 """Corners of the outline are this far from those of the image at most where it is the marking's."""
 _CLOSURE_TOLERANCE = 0.02
 _MAX_CLOSURE_CHI2 = 9.0
+_U = np.arange(0, 8, 2)
+"""Places of the corners' u in their covariance."""
+
 _CLOSURE = np.array([1.0, -1.0, 1.0, -1.0])
 
 
@@ -109,10 +114,13 @@ def fit_markings(
         blur_px = blur_px or _measured_blur(edges)
     far = ~found.valid.any(axis=1) & (np.ptp(found.px, axis=1).max(axis=1) < _FAR_MAX_PX)
     if far.any():
-        _take_quads(found, np.flatnonzero(far), grey, foreground, blobs, view, blur_px or TYPICAL_BLUR_PX)
+        _take_quads(
+            found, np.flatnonzero(far), grey, _Far(foreground, blobs, view, blur_px or TYPICAL_BLUR_PX)
+        )
     found.covariance = _COVARIANCE_FACTOR * found.covariance + _COVARIANCE_FLOOR_PX**2 * np.eye(8)
     _reject(found, view, options)
-    _take_outlines(found, start, [s.outline_pinhole_px for s in starts], view, options)
+    if options.outline_corners:
+        _take_outlines(found, start, [s.outline_pinhole_px for s in starts], view, options)
     found.valid[_is_cut(found, view)] = False
     return [
         MarkingDetection(s.kind, s.score, found.px[m], found.covariance[m], found.valid[m])
@@ -162,24 +170,38 @@ def _consistent_levels(edges: EdgeFit) -> BoolArray:
     return np.asarray(np.abs(ratio - typical) < np.log(_MAX_LEVEL_RATIO))
 
 
-def _take_quads(
-    found: _Corners,
-    group: np.ndarray,
-    grey: GreyBand,
-    foreground: Foreground,
-    blobs: np.ndarray,
-    view: CameraView,
-    blur_px: float,
-) -> None:
+@dataclass(frozen=True)
+class _Far:
+    """What fits to far markings share: ``blobs`` (M,) of all markings, and the point spread ``blur_px``."""
+
+    foreground: Foreground
+    blobs: np.ndarray
+    view: CameraView
+    blur_px: float
+
+
+def _take_quads(found: _Corners, group: np.ndarray, grey: GreyBand, far: _Far) -> None:
     """Enter whole quadrilaterals fitted to the markings ``group`` (indices)."""
+    overexposed = _fit_group(found, group, grey, far, 0.0)
+    if len(overexposed):
+        _fit_group(found, overexposed, grey.at_limit(), far, _BLOOM_SIGMA_PX)
+
+
+def _fit_group(found: _Corners, group: np.ndarray, grey: GreyBand, far: _Far, bloom_px: float) -> np.ndarray:
+    """Fit the markings ``group``, each side in doubt by ``bloom_px``; returns the overexposed that fail."""
+    foreground = far.foreground
     owner = foreground.owner[(grey.top - foreground.top) // foreground.stride :]
-    fit = fit_quads(grey, owner, foreground.stride, blobs[group], found.px[group], blur_px)
-    corners = view.distort(unbow_corners(view, fit.corners_px).reshape(-1, 2)).reshape(-1, 4, 2)
+    fit = fit_quads(grey, owner, foreground.stride, far.blobs[group], found.px[group], far.blur_px)
+    pinhole = unbow_corners(far.view, fit.corners_px)
+    corners = far.view.distort(pinhole.reshape(-1, 2)).reshape(-1, 4, 2)
+    covariance = fit.covariance + bloom_px**2 * np.eye(8)
     good = fit.settled & (fit.misfit < _MAX_MISFIT) & (fit.amplitude > _MIN_AMPLITUDE)
     good &= np.isfinite(corners).all(axis=(1, 2))
+    good &= ~fit.clipped | (_largest_sigma(covariance).max(axis=1) < _BLOOM_SIGMA_PX)
     found.px[group[good]] = corners[good]
-    found.covariance[group[good]] = fit.covariance[good]
+    found.covariance[group[good]] = covariance[good]
     found.valid[group[good]] = True
+    return np.asarray(group[fit.clipped & ~good])
 
 
 def _take_outlines(
@@ -244,24 +266,27 @@ def _is_cut(found: _Corners, view: CameraView) -> BoolArray:
     the four they are cannot be told, so none is used. The tolerance, in parts of the marking's size,
     covers an initial IPM that is some degrees off.
     """
-    pinhole = view.undistort(found.px.reshape(-1, 2))
+    cut = np.zeros(len(found.px), dtype=np.bool_)
+    whole = np.flatnonzero(found.valid.all(axis=1))
+    pinhole = view.undistort(found.px[whole].reshape(-1, 2))
     ground = view.ground(pinhole).reshape(-1, 4, 2)
     size_m = np.linalg.norm(ground[:, :2] - ground[:, 2:], axis=-1).mean(axis=1)
     by_corner = _CLOSURE[:, None, None] * view.ground_jacobian(pinhole).reshape(-1, 4, 2, 2)
     jacobian = by_corner.transpose(0, 2, 1, 3).reshape(-1, 2, 8)
-    covariance = jacobian @ found.covariance @ np.swapaxes(jacobian, 1, 2)
+    covariance = jacobian @ found.covariance[whole] @ np.swapaxes(jacobian, 1, 2)
     covariance += ((_CLOSURE_TOLERANCE * size_m) ** 2)[:, None, None] * np.eye(2)
-    usable = np.asarray(found.valid.all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
+    usable = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
     gap = np.where(usable[:, None], _CLOSURE @ ground, 0.0)[..., None]
     solved = np.linalg.solve(np.where(usable[:, None, None], covariance, np.eye(2)), gap)
-    return np.asarray((gap * solved).sum(axis=(1, 2)) > _MAX_CLOSURE_CHI2)
+    cut[whole] = (gap * solved).sum(axis=(1, 2)) > _MAX_CLOSURE_CHI2
+    return cut
 
 
 def _largest_sigma(covariance: FloatArray) -> FloatArray:
     """Standard deviation (M, 4) of each corner in its least certain direction, from (M, 8, 8)."""
-    blocks = covariance.reshape(-1, 4, 2, 4, 2)[:, range(4), :, range(4)].transpose(1, 0, 2, 3)
-    largest = np.linalg.eigvalsh(np.nan_to_num(blocks, nan=1e6, posinf=1e6))[..., -1]
-    return np.asarray(np.sqrt(np.maximum(largest, 0)))
+    u, v, uv = (covariance[:, _U + row, _U + column] for row, column in ((0, 0), (1, 1), (0, 1)))
+    largest = (u + v) / 2 + np.hypot((u - v) / 2, uv)
+    return np.asarray(np.sqrt(np.maximum(np.nan_to_num(largest, nan=1e6, posinf=1e6), 0)))
 
 
 def _block_diagonal(blocks: FloatArray) -> FloatArray:

@@ -69,7 +69,7 @@ class QuadFit:
 
     ``corners_px`` (M, 4, 2), ``covariance`` (M, 8, 8) px^2, ``amplitude`` (M,) step from ground to
     paint, ``misfit`` (M,) residual over amplitude, ``settled`` (M,) whether the fit stayed near its
-    start and convex.
+    start and convex, ``clipped`` (M,) whether the sensor was at its limit in a notable part of the marking.
     """
 
     corners_px: FloatArray
@@ -77,6 +77,7 @@ class QuadFit:
     amplitude: FloatArray
     misfit: FloatArray
     settled: BoolArray
+    clipped: BoolArray
 
 
 def fit_quads(
@@ -99,7 +100,8 @@ def fit_quads(
     """
     patches = cut_patches(grey, owner, owner_stride, blobs, corners_px)
     start = corners_px - patches.origin_px[:, None]
-    inward_px = np.where(patches.clipped > _CLIPPED_SHARE, -_BLOOM * blur_px, 0.0)
+    clipped = np.asarray(patches.clipped > _CLIPPED_SHARE)
+    inward_px = np.where(clipped, -_BLOOM * blur_px, 0.0)
     corners = start + _moved(_corner_from_side(start), np.repeat(inward_px[:, None], 8, axis=1))
     typical_px = np.full(len(start), blur_px)
     quads = _Quads(corners, np.hypot(typical_px, _WIDER_BLUR_PX), np.zeros((len(start), 4)))
@@ -109,7 +111,7 @@ def fit_quads(
     most_px = np.maximum(_MAX_MOVE_PX, _MAX_MOVE_SHARE * side_frames(start)[2].max(axis=1))
     settled = (np.abs(quads.corners - start).max(axis=(1, 2)) < most_px) & is_convex(quads.corners)
     # Pixels at the sensor's limit say that the paint is at least as bright.
-    settled &= (patches.clipped <= _CLIPPED_SHARE) | (quads.levels[:, [0, 3]].sum(axis=1) > _LEAST_CLIPPED)
+    settled &= ~clipped | (quads.levels[:, [0, 3]].sum(axis=1) > _LEAST_CLIPPED)
     rms = np.sqrt((patches.use * system.residual**2).sum(axis=1) / np.maximum(patches.use.sum(axis=1), 1))
     misfit = rms / system.amplitude
     # Misfit is paint that is missing on one side; a level beyond the sensor's is an extrapolation.
@@ -120,6 +122,7 @@ def fit_quads(
         system.amplitude,
         misfit,
         settled,
+        clipped,
     )
 
 

@@ -79,8 +79,8 @@ def _bridge(
     start: FloatArray, stop: FloatArray, guides: Guides, tree: cKDTree, options: LaneOptions
 ) -> FloatArray | None:
     """Vertices (N, 2) between two ends, where the lines seen run; None unless enough images saw one."""
-    passing = [np.unique(guides.line[tree.query_ball_point(end, _PASSES_M)]) for end in (start, stop)]
-    common = np.intersect1d(*passing)
+    first, last = (np.unique(guides.line[tree.query_ball_point(end, _PASSES_M)]) for end in (start, stop))
+    common = np.intersect1d(first, last)
     if len(np.unique(guides.image_of_line[common])) < options.min_images:
         return None
     gap = stop - start

@@ -74,7 +74,7 @@ class RunConfig:
     name: str
     drive: DriveConfig = field(default_factory=DriveConfig)
     simulate: PortConfig | None = None
-    detector: DetectorOptions = field(default_factory=DetectorOptions)
+    detector: DetectorOptions = field(default_factory=DetectorOptions.for_mapping)
     mapping: MappingOptions = field(default_factory=MappingOptions)
     output: str = "outputs"
     cache: str = "cache"
