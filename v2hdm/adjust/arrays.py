@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,6 +19,9 @@ from v2hdm.records import FloatArray
 _MIN_STEP = 1e-4
 # Below this share of an error its white part is rounding left over from the drift.
 _MIN_WHITE_SHARE = 1e-3
+# Observations that are computed at once: a few megabytes of intermediate results, or a device's fill.
+_RUN = 1 << 14
+_RUN_ON_DEVICE = 1 << 22
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,26 @@ class Arrays:
     def no_clock(self) -> Tensor:
         """Clock offsets (C, Q) of zero."""
         return self.centre.new_zeros(self.camera_count, self.clock_twist.shape[-1])
+
+    def parts(self) -> Iterator[tuple[slice, Arrays]]:
+        """Runs of observations, of the same corners and pairs, and where they are.
+
+        What is computed of a run stays in the processor's cache, and beside the whole takes no memory.
+        """
+        run = _RUN if self.measured.device.type == "cpu" else _RUN_ON_DEVICE
+        for begin in range(0, len(self.pair), run):
+            part = slice(begin, begin + run)
+            yield (
+                part,
+                replace(
+                    self,
+                    order=self.order[part],
+                    pair=self.pair[part],
+                    corner=self.corner[part],
+                    measured=self.measured[:, part],
+                    root_information=self.root_information[:, part],
+                ),
+            )
 
     def take(self, keep: Tensor) -> tuple[Arrays, Tensor]:
         """The problem restricted to the observations ``keep`` (K,) and to the corners they touch.

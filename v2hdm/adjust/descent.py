@@ -10,7 +10,7 @@ from torch import Tensor
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.lbfgs import minimise, predicted_gap
 from v2hdm.adjust.reduced import make_plan
-from v2hdm.adjust.residuals import Estimate, Loss, cost_and_gradient, observe
+from v2hdm.adjust.residuals import Estimate, Loss, cost_and_gradient, squared_residuals
 from v2hdm.adjust.robust import annealed_scale, loss
 from v2hdm.adjust.whitening import Whitening, factorise
 from v2hdm.geometry.transform import exp, left_jacobian
@@ -85,7 +85,7 @@ def descend(
     evaluations, refreshes, damping, scale, progressing = 0, 0, 0.0, float("inf"), True
     plan = make_plan(arrays)
     while True:
-        squared = observe(arrays, estimate).squared
+        squared = squared_residuals(arrays, estimate)
         narrowed = annealed_scale(squared, robust.scale) if robust.name != "none" else robust.scale
         scale = max(robust.scale, min(narrowed, scale / _ANNEALING_STEP))
         current = Loss(robust.name, scale)

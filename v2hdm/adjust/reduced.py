@@ -117,22 +117,21 @@ class Spread:
         return torch.cat([identity.expand(*self.clock.shape[:2], 6, 6), self.clock], dim=-1)
 
 
-def held_hessian(arrays: Arrays, plan: Plan, estimate: Estimate, by_pair: Tensor, spread: Spread) -> Tiles:
+def held_hessian(arrays: Arrays, plan: Plan, estimate: Estimate, blocks: Tensor, spread: Spread) -> Tiles:
     """U: the Hessian of frame states and extrinsics, priors included, with the corners held.
 
     Args:
         arrays: the problem.
         plan: its tiles.
         estimate: where.
-        by_pair: derivatives of the weighted residuals by pair, (K, 2, 6).
+        blocks: the pairs' own, (P, 6, 6).
         spread: how the pairs move with frames and cameras.
     """
     cameras, states, each = arrays.camera_count, len(arrays.states), arrays.camera_unknowns
-    blocks = by_pair.new_zeros(arrays.pair_count, 6, 6).index_add_(0, arrays.pair, by_pair.mT @ by_pair)
     blocks = blocks.reshape(cameras, arrays.frame_count, 6, 6)
     of_camera = spread.camera
     by_camera = blocks @ of_camera
-    tiles = _empty_tiles(plan, states, cameras * each, by_pair)
+    tiles = _empty_tiles(plan, states, cameras * each, blocks)
     if states:
         _add_frames(arrays, plan, (spread.state.mT @ blocks @ spread.state).sum(0), tiles)
         border = to_tiles(plan, (spread.state.mT @ by_camera).permute(1, 2, 0, 3).flatten(2))
@@ -194,7 +193,7 @@ def subtract_corners(arrays: Arrays, plan: Plan, coupling: Tensor, spread: Sprea
     """Take sum_i B_i' B_i off, block by block; ``coupling`` (K, 2, 6) holds B_i by observation."""
     states, cameras, each = len(arrays.states), arrays.camera_count, arrays.camera_unknowns
     camera = arrays.pair // arrays.frame_count
-    by_frame = coupling @ spread.state.reshape(arrays.pair_count, 6, states)[arrays.pair]
+    by_state = spread.state.reshape(arrays.pair_count, 6, states)
     for block in plan.blocks:
         part, rows = slice(block.begin, block.end), int(block.row[-1]) + 1
         by_camera = coupling.new_zeros(rows, cameras, 2, each)
@@ -205,7 +204,8 @@ def subtract_corners(arrays: Arrays, plan: Plan, coupling: Tensor, spread: Sprea
         if not states:
             continue
         frames = coupling.new_zeros(rows, len(block.tiles) * plan.frames_per_tile, 2, states)
-        frames.index_put_((block.row, block.slot), by_frame[part], accumulate=True)
+        by_frame = coupling[part] @ by_state[arrays.pair[part]]
+        frames.index_put_((block.row, block.slot), by_frame, accumulate=True)
         columns = frames.permute(0, 2, 1, 3).reshape(2 * rows, -1).chunk(len(block.tiles), dim=1)
         placed = sorted((plan.pattern.position[tile], k) for k, tile in enumerate(block.tiles))
         for n, (column, first) in enumerate(placed):

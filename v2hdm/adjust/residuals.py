@@ -87,13 +87,18 @@ def frame_tangent(arrays: Arrays, frame_state: Tensor) -> Tensor:
     return tangent.index_add(1, columns, frame_state)
 
 
-def observe(arrays: Arrays, estimate: Estimate) -> View:
-    """Project every corner into every image that saw it."""
+def pair_table(arrays: Arrays, estimate: Estimate) -> Tensor:
+    """The columns of A of every pair, (P, 9)."""
     vehicle_from_map = arrays.vehicle_from_map
     if arrays.states:
         vehicle_from_map = exp(-frame_tangent(arrays, estimate.frame_state)) @ vehicle_from_map
     cam_from_map = _cam_from_vehicle_then(arrays, estimate) @ vehicle_from_map
-    table = cam_from_map[..., :3, [0, 1, 3]].mT.reshape(arrays.pair_count, 9)
+    return cam_from_map[..., :3, [0, 1, 3]].mT.reshape(arrays.pair_count, 9)
+
+
+def observe(arrays: Arrays, estimate: Estimate, table: Tensor | None = None) -> View:
+    """Project every corner into every image that saw it; ``table`` is the :func:`pair_table`, if known."""
+    table = pair_table(arrays, estimate) if table is None else table
     first, second, origin = table.index_select(0, arrays.pair).T.contiguous().chunk(3)
     x, y = estimate.corners_map.index_select(0, arrays.corner).T.contiguous()
     point = torch.addcmul(torch.addcmul(origin, first, x), second, y)
@@ -102,6 +107,12 @@ def observe(arrays: Arrays, estimate: Estimate) -> View:
     a, b, c = arrays.root_information
     residual = torch.stack([a * dx, b * dx + c * dy])
     return View((first, second, origin), point, reciprocal, slope, residual)
+
+
+def squared_residuals(arrays: Arrays, estimate: Estimate) -> Tensor:
+    """Squared Mahalanobis distance (K,) of each observation."""
+    table = pair_table(arrays, estimate)
+    return torch.cat([observe(part, estimate, table).squared for _, part in arrays.parts()])
 
 
 def _cam_from_vehicle_then(arrays: Arrays, estimate: Estimate) -> Tensor:
@@ -113,10 +124,10 @@ def _cam_from_vehicle_then(arrays: Arrays, estimate: Estimate) -> Tensor:
     return cam_from_vehicle @ exp(-moved)
 
 
-def pull_back(arrays: Arrays, view: View, by_residual: Tensor) -> tuple[Tensor, Tensor]:
+def _pull_back(arrays: Arrays, view: View, by_residual: Tensor, wrench: Tensor, by_corner: Tensor) -> None:
     """Carry a gradient by the residuals (2, K) back to pairs and corners.
 
-    Returns the wrench of every pair (P, 6) and the gradient of every corner (N, 2).
+    It is added to the ``wrench`` (6, P) of every pair and the gradient ``by_corner`` (2, N).
     """
     a, b, c = arrays.root_information
     by_dx, by_dy = a * by_residual[0] + b * by_residual[1], c * by_residual[1]
@@ -125,9 +136,9 @@ def pull_back(arrays: Arrays, view: View, by_residual: Tensor) -> tuple[Tensor, 
     fz = (by_dx * x + by_dy * y) * view.slope
     force = torch.stack([fx, fy, fz])
     rows = torch.stack([fx, fy, fz, y * fz - z * fy, z * fx - x * fz, x * fy - y * fx])
-    wrench = rows.new_zeros(6, arrays.pair_count).index_add_(1, arrays.pair, rows).T
+    wrench.index_add_(1, arrays.pair, rows)
     along = torch.stack([(view.axes[0] * force).sum(0), (view.axes[1] * force).sum(0)])
-    return wrench, along.new_zeros(2, arrays.corner_count).index_add_(1, arrays.corner, along).T
+    by_corner.index_add_(1, arrays.corner, along)
 
 
 def jacobians(arrays: Arrays, view: View) -> tuple[Tensor, Tensor]:
@@ -170,19 +181,29 @@ def state_residual(arrays: Arrays, frame_state: Tensor) -> Tensor:
     return (frame_state - expected) * arrays.state_information_root
 
 
+def _observed_cost(arrays: Arrays, estimate: Estimate, robust: Loss) -> tuple[Tensor, Tensor, Tensor]:
+    """The observations' cost, and its gradient: wrenches (C, J, 6) and by corner (N, 2)."""
+    table = pair_table(arrays, estimate)
+    cost, wrench = table.new_zeros(()), table.new_zeros(6, arrays.pair_count)
+    by_corner = table.new_zeros(2, arrays.corner_count)
+    for _, part in arrays.parts():
+        view = observe(part, estimate, table)
+        rho, weight = loss(robust.name, view.squared, robust.scale)
+        cost = cost + rho.sum() / 2
+        _pull_back(part, view, view.residual * weight, wrench, by_corner)
+    return cost, wrench.T.reshape(arrays.camera_count, arrays.frame_count, 6), by_corner.T
+
+
 def cost_and_gradient(arrays: Arrays, estimate: Estimate, robust: Loss) -> tuple[dict[str, Tensor], Gradient]:
     """The named terms of the cost, and the gradient of their sum."""
-    view = observe(arrays, estimate)
-    rho, weight = loss(robust.name, view.squared, robust.scale)
-    wrench, by_corner = pull_back(arrays, view, view.residual * weight)
-    wrench = wrench.reshape(arrays.camera_count, arrays.frame_count, 6)
+    observed, wrench, by_corner = _observed_cost(arrays, estimate, robust)
     centre = centre_residual(arrays, estimate)
     state = state_residual(arrays, estimate.frame_state)
     clock = estimate.clock_s * arrays.clock_information_root
     off_control = estimate.corners_map - arrays.control
     by_control = off_control * arrays.control_information[:, None]
     terms = {
-        "observations": rho.sum() / 2,
+        "observations": observed,
         "camera_centre": centre.square().sum() / 2,
         "frame_states": state.square().sum() / 2,
         "clock_offsets": clock.square().sum() / 2,

@@ -17,7 +17,7 @@ from v2hdm.adjust.covariance import Covariance
 from v2hdm.adjust.descent import Descent, descend
 from v2hdm.adjust.gating import MEDIAN_SQUARED, judge
 from v2hdm.adjust.problem import Problem, SolveOptions
-from v2hdm.adjust.residuals import Estimate, Loss, cost_and_gradient, frame_tangent, observe
+from v2hdm.adjust.residuals import Estimate, Loss, cost_and_gradient, frame_tangent, observe, pair_table
 from v2hdm.adjust.robust import loss
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.start import back_project
@@ -86,16 +86,14 @@ def _report(
     problem: Problem, arrays: Arrays, options: SolveOptions, descent: Descent, spent: int, began: float
 ) -> Solution:
     estimate = descent.estimate
-    view = observe(arrays, estimate)
+    seen = _seen(arrays, estimate)
     terms, _ = cost_and_gradient(arrays, estimate, Loss(options.loss, options.loss_scale))
-    squared = view.squared
-    depth_one = view.point[:2] * view.inverse_depth - arrays.measured
-    camera = (arrays.pair // arrays.frame_count).cpu().numpy()
-    residual_px = depth_one.T.cpu().numpy() * problem.intrinsic[camera, :2]
+    squared, camera = seen.squared, (arrays.pair // arrays.frame_count).cpu().numpy()
+    residual_px = seen.off.T.cpu().numpy() * problem.intrinsic[camera, :2]
     map_from_vehicle = inverse(arrays.vehicle_from_map) @ exp(frame_tangent(arrays, estimate.frame_state))
 
     variance = _variance_factors(arrays, terms, squared)
-    behind = _unsorted((view.point[2] <= NEAR_M).double(), arrays.order) > 0
+    behind = _unsorted(seen.behind.double(), arrays.order) > 0
     mahalanobis2 = _unsorted(squared, arrays.order)
     return Solution(
         status=_status(descent, options, bool(behind.any())),
@@ -115,6 +113,26 @@ def _report(
         time_s=time.perf_counter() - began,
         covariance=Covariance(descent.whitening),
     )
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Observations at the solution: squared residuals (K,), residuals (2, K) at depth 1, who lie behind."""
+
+    squared: Tensor
+    off: Tensor
+    behind: Tensor
+
+
+def _seen(arrays: Arrays, estimate: Estimate) -> _Seen:
+    table = pair_table(arrays, estimate)
+    squared, off, behind = [], [], []
+    for _, part in arrays.parts():
+        view = observe(part, estimate, table)
+        squared.append(view.squared)
+        off.append(view.point[:2] * view.inverse_depth - part.measured)
+        behind.append(view.point[2] <= NEAR_M)
+    return _Seen(torch.cat(squared), torch.cat(off, dim=1), torch.cat(behind))
 
 
 def _clock_offset_s(estimate: Estimate) -> FloatArray:

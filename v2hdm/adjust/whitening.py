@@ -30,6 +30,7 @@ from v2hdm.adjust.residuals import (
     observe,
     pair_from_clock,
     pair_from_state,
+    pair_table,
 )
 from v2hdm.adjust.tiles import TIP, TiledCholesky, factorise_tiles
 
@@ -80,17 +81,21 @@ class Whitening:
         states, extrinsics, clock = self._split_reduced(solved)
         by_pair = extrinsics[:, None] + (self.spread.state @ states[None, ..., None])[..., 0]
         by_pair = by_pair + (self.spread.clock @ clock[:, None, :, None])[..., 0]
-        moved = by_pair.reshape(-1, 6).index_select(0, arrays.pair)
-        coupled = (self.coupling @ moved[..., None])[..., 0]
-        rest = corners - torch.zeros_like(corners).index_add_(0, arrays.corner, coupled)
+        by_pair, rest = by_pair.reshape(-1, 6), corners.clone()
+        for run, part in arrays.parts():
+            moved = by_pair.index_select(0, part.pair)
+            coupled = (self.coupling[run] * moved[:, None]).sum(-1)
+            rest.index_add_(0, part.corner, coupled, alpha=-1)
         return Gradient(extrinsics, states, solve_lower_transposed(self.corner_factor, rest), clock)
 
     def whiten(self, gradient: Gradient) -> Tensor:
         """The gradient by y of a gradient by x."""
         arrays = self.arrays
         corners = solve_lower(self.corner_factor, gradient.corners_map)
-        coupled = (self.coupling.mT @ corners.index_select(0, arrays.corner)[..., None])[..., 0]
-        by_pair = coupled.new_zeros(arrays.pair_count, 6).index_add_(0, arrays.pair, coupled)
+        by_pair = corners.new_zeros(arrays.pair_count, 6)
+        for run, part in arrays.parts():
+            coupled = self.coupling[run] * corners.index_select(0, part.corner)[..., None]
+            by_pair.index_add_(0, part.pair, coupled.sum(1))
         by_pair = by_pair.reshape(arrays.camera_count, arrays.frame_count, 6)
         by_state = gradient.frame_state - (self.spread.state.mT @ by_pair[..., None])[..., 0].sum(0)
         by_clock = gradient.clock_s - (self.spread.clock.mT @ by_pair[..., None])[..., 0].sum(1)
@@ -117,17 +122,23 @@ def factorise(
 
     ``damping`` is added to the diagonal of the Hessian, relative to it (Levenberg-Marquardt).
     """
-    by_pair, by_corner = jacobians(arrays, observe(arrays, estimate))
-    root = weight.clamp(min=_WEIGHT_FLOOR).sqrt()[:, None, None]
-    by_pair, by_corner = by_pair * root, by_corner * root
-    blocks = by_corner.new_zeros(arrays.corner_count, 2, 2)
-    blocks.index_add_(0, arrays.corner, by_corner.mT @ by_corner)
-    blocks.diagonal(dim1=1, dim2=2).add_(arrays.control_information[:, None])
-    blocks.diagonal(dim1=1, dim2=2).mul_(1 + damping).add_(_CORNER_FLOOR)
-    corner_factor = cholesky_2x2(blocks)
-    coupling = solve_lower_matrix(corner_factor[arrays.corner], by_corner.mT @ by_pair)
+    table, root = pair_table(arrays, estimate), weight.clamp(min=_WEIGHT_FLOOR).sqrt()[:, None, None]
+    corner_blocks = table.new_zeros(arrays.corner_count, 2, 2)
+    pair_blocks = table.new_zeros(arrays.pair_count, 6, 6)
+    coupling = table.new_empty(len(arrays.pair), 2, 6)
+    for run, part in arrays.parts():
+        by_pair, by_corner = jacobians(part, observe(part, estimate, table))
+        by_pair, by_corner = by_pair * root[run], by_corner * root[run]
+        corner_blocks.index_add_(0, part.corner, by_corner.mT @ by_corner)
+        pair_blocks.index_add_(0, part.pair, by_pair.mT @ by_pair)
+        coupling[run] = by_corner.mT @ by_pair
+    corner_blocks.diagonal(dim1=1, dim2=2).add_(arrays.control_information[:, None])
+    corner_blocks.diagonal(dim1=1, dim2=2).mul_(1 + damping).add_(_CORNER_FLOOR)
+    corner_factor = cholesky_2x2(corner_blocks)
+    for run, part in arrays.parts():
+        coupling[run] = solve_lower_matrix(corner_factor[part.corner], coupling[run])
     spread = Spread(pair_from_state(arrays, estimate), pair_from_clock(arrays, estimate))
-    tiles = held_hessian(arrays, plan, estimate, by_pair, spread)
+    tiles = held_hessian(arrays, plan, estimate, pair_blocks, spread)
     square = [(k, k) for k in range(plan.tile_count)] + [(TIP, TIP)]
     for key in square:
         tiles[key].diagonal().mul_(1 + damping)
