@@ -134,6 +134,7 @@ def _name_sizes(model: onnx.ModelProto) -> None:
 def _without_paths(config: Mapping[str, Any]) -> dict[str, Any]:
     """The settings of a training less what says something of the machine that it ran on."""
     kept = {key: value for key, value in config.items() if key not in ("output", "device", "resume")}
+    kept["start"] = kept.get("start") and Path(kept["start"]).name
     labels = {key: bool(kept["data"].get(key)) for key in ("coco", "tusimple")}
     paths = ("coco", "coco_images", "tusimple", "tusimple_images")
     kept["data"] = {k: v for k, v in kept["data"].items() if k not in paths} | {"own_labels": labels}
