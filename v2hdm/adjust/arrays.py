@@ -151,7 +151,7 @@ def make_arrays(
     order = np.lexsort((seen.frame, seen.camera, rank[seen.corner]))
     focal, principal = problem.intrinsic[seen.camera, :2], problem.intrinsic[seen.camera, 2:]
     measured = (seen.pinhole_px - principal) / focal
-    root = np.linalg.inv(np.linalg.cholesky(seen.covariance_px)) * focal[:, None, :]
+    root = _root_information(seen.covariance_px, focal)[:, order]
     components = _components(problem, pose_states)
     transition, information_root = _state_prior(problem, components)
     centre, centre_root = _centre_prior(problem)
@@ -169,7 +169,7 @@ def make_arrays(
         pair=index((seen.camera * len(problem.map_from_vehicle) + seen.frame)[order]),
         corner=index(rank[seen.corner][order]),
         measured=real(measured[order].T),
-        root_information=real(np.stack([root[order, 0, 0], root[order, 1, 0], root[order, 1, 1]])),
+        root_information=real(root),
         vehicle_from_map=inverse(real(problem.map_from_vehicle)),
         states=tuple(component.column for component in components),
         centre=real(centre),
@@ -181,6 +181,14 @@ def make_arrays(
         control=real(control[corner_order]),
         control_information=real(control_information[corner_order]),
     )
+
+
+def _root_information(covariance_px: FloatArray, focal: FloatArray) -> FloatArray:
+    """Inverse Cholesky factors (3, K) of covariances (K, 2, 2): a, b, c of :class:`Arrays`."""
+    first = np.sqrt(covariance_px[:, 0, 0])
+    below = covariance_px[:, 1, 0] / first
+    last = np.sqrt(covariance_px[:, 1, 1] - below**2)
+    return np.stack([focal[:, 0] / first, -below * focal[:, 0] / (first * last), focal[:, 1] / last])
 
 
 def _control(problem: Problem) -> tuple[FloatArray, FloatArray]:

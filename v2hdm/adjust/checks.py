@@ -143,8 +143,8 @@ def _check_observations(problem: Problem) -> None:
         unseen = np.flatnonzero(np.bincount(index, minlength=size) == 0)
         if len(unseen):
             raise AdjustError(f"{name} {unseen[0]} has no observation: leave it out of the problem")
-    variance = np.linalg.eigvalsh(seen.covariance_px)[:, 0]
-    wrong = np.flatnonzero(~(variance > 0))
+    own, across = np.diagonal(seen.covariance_px, axis1=1, axis2=2), seen.covariance_px[:, 1, 0]
+    wrong = np.flatnonzero(~((own[:, 0] > 0) & (own.prod(axis=1) > across**2)))
     if len(wrong):
         raise AdjustError(f"covariance_px of observation {wrong[0]} is not positive definite")
 

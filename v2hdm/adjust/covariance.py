@@ -70,7 +70,7 @@ def _reduced_root(whitening: Whitening, chosen: Tensor) -> Tensor:
     spread = whitening.spread.state.reshape(arrays.pair_count, 6, states)
     bounds = torch.searchsorted(arrays.corner, torch.stack([chosen, chosen + 1]))
     for n, (begin, end) in enumerate(bounds.T.tolist()):
-        pair, part = arrays.pair[begin:end], whitening.coupling[begin:end]
+        pair, part = arrays.pair[begin:end], whitening.coupling[:, :, begin:end].permute(2, 0, 1)
         by_frame[:, :, n].index_add_(0, pair % frames, (part @ spread[pair]).mT)
         of_camera = spread_to_cameras(arrays, whitening.spread, part, pair)
         by_camera[:, :, n].index_add_(0, pair // frames, of_camera.mT)

@@ -190,21 +190,22 @@ def _add_between(tiles: Tiles, later: int, earlier: int, coupling: Tensor) -> No
 
 
 def subtract_corners(arrays: Arrays, plan: Plan, coupling: Tensor, spread: Spread, tiles: Tiles) -> None:
-    """Take sum_i B_i' B_i off, block by block; ``coupling`` (K, 2, 6) holds B_i by observation."""
+    """Take sum_i B_i' B_i off, block by block; ``coupling`` (2, 6, K) holds B_i by observation."""
     states, cameras, each = len(arrays.states), arrays.camera_count, arrays.camera_unknowns
     camera = arrays.pair // arrays.frame_count
     by_state = spread.state.reshape(arrays.pair_count, 6, states)
     for block in plan.blocks:
         part, rows = slice(block.begin, block.end), int(block.row[-1]) + 1
+        own = coupling[:, :, part].permute(2, 0, 1)
         by_camera = coupling.new_zeros(rows, cameras, 2, each)
-        of_camera = spread_to_cameras(arrays, spread, coupling[part], arrays.pair[part])
+        of_camera = spread_to_cameras(arrays, spread, own, arrays.pair[part])
         by_camera.index_put_((block.row, camera[part]), of_camera, accumulate=True)
         tip = by_camera.permute(0, 2, 1, 3).reshape(2 * rows, -1)
         tiles[TIP, TIP].addmm_(tip.mT, tip, alpha=-1)
         if not states:
             continue
         frames = coupling.new_zeros(rows, len(block.tiles) * plan.frames_per_tile, 2, states)
-        by_frame = coupling[part] @ by_state[arrays.pair[part]]
+        by_frame = own @ by_state[arrays.pair[part]]
         frames.index_put_((block.row, block.slot), by_frame, accumulate=True)
         columns = frames.permute(0, 2, 1, 3).reshape(2 * rows, -1).chunk(len(block.tiles), dim=1)
         placed = sorted((plan.pattern.position[tile], k) for k, tile in enumerate(block.tiles))

@@ -50,7 +50,7 @@ class Whitening:
         arrays: the problem it belongs to.
         plan: the tiles of its reduced system.
         corner_factor: L_i, lower, (N, 2, 2).
-        coupling: parts of B_i by observation and pair, (K, 2, 6).
+        coupling: parts of B_i by pair and observation, (2, 6, K).
         spread: how the pairs move with frames and cameras.
         reduced_factor: L_S.
         smallest_pivot: least share of an unknown's own information that the others leave it.
@@ -81,22 +81,23 @@ class Whitening:
         states, extrinsics, clock = self._split_reduced(solved)
         by_pair = extrinsics[:, None] + (self.spread.state @ states[None, ..., None])[..., 0]
         by_pair = by_pair + (self.spread.clock @ clock[:, None, :, None])[..., 0]
-        by_pair, rest = by_pair.reshape(-1, 6), corners.clone()
+        by_pair, rest = by_pair.reshape(-1, 6), corners.T.contiguous()
         for run, part in arrays.parts():
-            moved = by_pair.index_select(0, part.pair)
-            coupled = (self.coupling[run] * moved[:, None]).sum(-1)
-            rest.index_add_(0, part.corner, coupled, alpha=-1)
-        return Gradient(extrinsics, states, solve_lower_transposed(self.corner_factor, rest), clock)
+            moved = by_pair.index_select(0, part.pair).T.contiguous()
+            coupled = (self.coupling[:, :, run] * moved).sum(1)
+            rest.index_add_(1, part.corner, coupled, alpha=-1)
+        return Gradient(extrinsics, states, solve_lower_transposed(self.corner_factor, rest.T), clock)
 
     def whiten(self, gradient: Gradient) -> Tensor:
         """The gradient by y of a gradient by x."""
         arrays = self.arrays
         corners = solve_lower(self.corner_factor, gradient.corners_map)
-        by_pair = corners.new_zeros(arrays.pair_count, 6)
+        by_corner, by_pair = corners.T.contiguous(), corners.new_zeros(6, arrays.pair_count)
         for run, part in arrays.parts():
-            coupled = self.coupling[run] * corners.index_select(0, part.corner)[..., None]
-            by_pair.index_add_(0, part.pair, coupled.sum(1))
-        by_pair = by_pair.reshape(arrays.camera_count, arrays.frame_count, 6)
+            first, second = by_corner.index_select(1, part.corner)
+            coupling = self.coupling[:, :, run]
+            by_pair.index_add_(1, part.pair, torch.addcmul(coupling[0] * first, coupling[1], second))
+        by_pair = by_pair.T.reshape(arrays.camera_count, arrays.frame_count, 6)
         by_state = gradient.frame_state - (self.spread.state.mT @ by_pair[..., None])[..., 0].sum(0)
         by_clock = gradient.clock_s - (self.spread.clock.mT @ by_pair[..., None])[..., 0].sum(1)
         by_camera = torch.cat([gradient.extrinsic - by_pair.sum(1), by_clock], dim=1)
@@ -125,18 +126,19 @@ def factorise(
     table, root = pair_table(arrays, estimate), weight.clamp(min=_WEIGHT_FLOOR).sqrt()[:, None, None]
     corner_blocks = table.new_zeros(arrays.corner_count, 2, 2)
     pair_blocks = table.new_zeros(arrays.pair_count, 6, 6)
-    coupling = table.new_empty(len(arrays.pair), 2, 6)
+    coupling = table.new_empty(2, 6, len(arrays.pair))
     for run, part in arrays.parts():
         by_pair, by_corner = jacobians(part, observe(part, estimate, table))
         by_pair, by_corner = by_pair * root[run], by_corner * root[run]
         corner_blocks.index_add_(0, part.corner, by_corner.mT @ by_corner)
         pair_blocks.index_add_(0, part.pair, by_pair.mT @ by_pair)
-        coupling[run] = by_corner.mT @ by_pair
+        coupling[:, :, run] = (by_corner.mT @ by_pair).permute(1, 2, 0)
     corner_blocks.diagonal(dim1=1, dim2=2).add_(arrays.control_information[:, None])
     corner_blocks.diagonal(dim1=1, dim2=2).mul_(1 + damping).add_(_CORNER_FLOOR)
     corner_factor = cholesky_2x2(corner_blocks)
     for run, part in arrays.parts():
-        coupling[run] = solve_lower_matrix(corner_factor[part.corner], coupling[run])
+        held = coupling[:, :, run].permute(2, 0, 1)
+        coupling[:, :, run] = solve_lower_matrix(corner_factor[part.corner], held).permute(1, 2, 0)
     spread = Spread(pair_from_state(arrays, estimate), pair_from_clock(arrays, estimate))
     tiles = held_hessian(arrays, plan, estimate, pair_blocks, spread)
     square = [(k, k) for k in range(plan.tile_count)] + [(TIP, TIP)]
