@@ -2,8 +2,8 @@
 
     python -m tests.benchmarks.real_drive --drive DRIVE [--reference FILE] [--overlays FOLDER]
 
-The drive is detected in and mapped once; the calibration and poses found place the reference, what is
-really painted there, in every image. Without a file it is the dashes of the map and those that must lie
+The drive is detected in, once as single images are and once as for the map, and mapped; the calibration and
+poses found place the reference, what is really painted there, in every image. Without a file it is the dashes of the map and those that must lie
 between them, see :func:`tests.benchmarks.real_reference.make_reference`.
 
 A marking counts in an image if it lies wholly inside, is not hidden and its centre is within 20 m of the
