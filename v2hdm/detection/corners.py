@@ -114,12 +114,13 @@ def fit_markings(
         blur_px = blur_px or _measured_blur(edges)
     far = ~found.valid.any(axis=1) & (np.ptp(found.px, axis=1).max(axis=1) < _FAR_MAX_PX)
     if far.any():
-        _take_quads(
-            found, np.flatnonzero(far), grey, _Far(foreground, blobs, view, blur_px or TYPICAL_BLUR_PX)
-        )
+        shared = _Far(foreground, blobs, view, blur_px or TYPICAL_BLUR_PX)
+        overexposed = _take_quads(found, np.flatnonzero(far), grey, shared, 0.0)
+        if options.vague_corners and len(overexposed):
+            _take_quads(found, overexposed, grey.at_limit(), shared, _BLOOM_SIGMA_PX)
     found.covariance = _COVARIANCE_FACTOR * found.covariance + _COVARIANCE_FLOOR_PX**2 * np.eye(8)
     _reject(found, view, options)
-    if options.outline_corners:
+    if options.vague_corners:
         _take_outlines(found, start, [s.outline_pinhole_px for s in starts], view, options)
     found.valid[_is_cut(found, view)] = False
     return [
@@ -180,15 +181,12 @@ class _Far:
     blur_px: float
 
 
-def _take_quads(found: _Corners, group: np.ndarray, grey: GreyBand, far: _Far) -> None:
-    """Enter whole quadrilaterals fitted to the markings ``group`` (indices)."""
-    overexposed = _fit_group(found, group, grey, far, 0.0)
-    if len(overexposed):
-        _fit_group(found, overexposed, grey.at_limit(), far, _BLOOM_SIGMA_PX)
+def _take_quads(found: _Corners, group: np.ndarray, grey: GreyBand, far: _Far, bloom_px: float) -> np.ndarray:
+    """Enter whole quadrilaterals fitted to the markings ``group`` (indices), in doubt by ``bloom_px`` more.
 
-
-def _fit_group(found: _Corners, group: np.ndarray, grey: GreyBand, far: _Far, bloom_px: float) -> np.ndarray:
-    """Fit the markings ``group``, each side in doubt by ``bloom_px``; returns the overexposed that fail."""
+    Returns:
+        Those of ``group`` that are overexposed and not fitted well.
+    """
     foreground = far.foreground
     owner = foreground.owner[(grey.top - foreground.top) // foreground.stride :]
     fit = fit_quads(grey, owner, foreground.stride, far.blobs[group], found.px[group], far.blur_px)

@@ -21,8 +21,8 @@ class DetectorOptions:
         min_score: least mean class probability of a blob.
         min_score_unfitted: the same for a marking of which not even two corners can be used as points.
         max_corner_sigma_px: corners with a larger standard deviation are not valid.
-        outline_corners: take corners from the network's outline where the image shows none; they are worth
-            having where many images are averaged, not for measuring in one.
+        vague_corners: take corners from the edges of overexposed paint, and from the network's outline, where
+            the image shows nothing better; they are worth having where many images are averaged.
         border_px: corners nearer to the image border are not valid.
         lane_step_m: spacing of lane points on the ground.
     """
@@ -34,14 +34,14 @@ class DetectorOptions:
     min_score: float = 0.5
     min_score_unfitted: float = 0.8
     max_corner_sigma_px: float = 1.0
-    outline_corners: bool = False
+    vague_corners: bool = False
     border_px: float = 4.0
     lane_step_m: float = 0.5
 
     @classmethod
     def for_mapping(cls) -> DetectorOptions:
         """Defaults of the mapping, which weighs corners by their covariance and sees each many times."""
-        return cls(max_corner_sigma_px=1.5, outline_corners=True)
+        return cls(max_corner_sigma_px=1.5, vague_corners=True)
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work.
