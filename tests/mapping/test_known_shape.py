@@ -8,7 +8,6 @@ import pytest
 from v2hdm.mapping.association import FusedGroups
 from v2hdm.mapping.completion import SolvedCorners
 from v2hdm.mapping.known_shape import fit_shape, with_known_shapes
-from v2hdm.mapping.options import AcceptanceOptions
 
 DIAMOND = np.array([[0.6, 0.0], [0.0, 0.3], [-0.6, 0.0], [0.0, -0.3]])
 SIGMA = np.full(4, 0.01)
@@ -73,12 +72,12 @@ def test_a_class_lends_its_shape_and_a_class_of_many_shapes_does_not() -> None:
     solved = SolvedCorners(corners.copy(), np.tile(1e-4 * np.eye(8), (12, 1, 1)), np.zeros(12, dtype=bool))
     solved.corners_map[11] = np.nan
     fused = FusedGroups(seen, np.tile(1e-4 * np.eye(2), (12, 4, 1, 1)), np.full((12, 4), 3))
-    kind, accepted, options = np.zeros(12, dtype=np.int64), np.arange(11), AcceptanceOptions()
-    found = with_known_shapes(solved, fused, corners, np.array([11]), kind, accepted, options)
+    kind, accepted = np.zeros(12, dtype=np.int64), np.arange(11)
+    found = with_known_shapes(solved, fused, corners, np.array([11]), kind, accepted)
     assert covers(found.corners_map[11], corners[11])
     assert found.completed.tolist() == [False] * 11 + [True]
     solved.corners_map[:11] *= 1.2 ** np.arange(11)[:, None, None]
-    found = with_known_shapes(solved, fused, corners, np.array([11]), kind, accepted, options)
+    found = with_known_shapes(solved, fused, corners, np.array([11]), kind, accepted)
     assert np.isnan(found.corners_map[11]).all()
 
 

@@ -163,7 +163,7 @@ def judge_and_mend(
         fused = fuse_groups(seen.association, located, seen.jitter_rad)
         vague_map = vague_corners(seen.association, located)
         kind, accepted = now.candidates.kind, now.accepted
-        placed = with_known_shapes(now.solved, fused, vague_map, doubtful, kind, accepted, options)
+        placed = with_known_shapes(now.solved, fused, vague_map, doubtful, kind, accepted)
         now = judged_as(without_guessed_lengths(now.solved, placed, fused.corners_map, kind, accepted))
     return replace(now, solved=with_class_shapes(now.solved, now.candidates.kind, now.accepted))
 

@@ -12,30 +12,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.mapping.acceptance import characteristic_lengths, count_peers
 from v2hdm.mapping.association import FusedGroups
 from v2hdm.mapping.completion import SolvedCorners
-from v2hdm.mapping.options import AcceptanceOptions
+from v2hdm.mapping.shape_prior import SHAPE_SIGMA_M, class_shapes, miss_limit_m
 from v2hdm.records import FloatArray
 
 IntArray = NDArray[np.int64]
-
-_COMMON_SHARE = 0.6
-"""A class has one shape if this share of its markings has it."""
-
-_LEAST_PEERS = 8
-_MAX_MISS_M = 0.05
-_MAX_MISS_SHARE = 0.08
-"""A corner fits the shape if it misses by no more than this, or by this share of its longer diagonal."""
 
 _LEAST_SEEN = 6
 """Sightings of the corners that a shape is laid on, all together: one image may err."""
 
 _MAX_VAGUE_SHARE = 0.35
 """How far corners that may not be used as points may be off, as a share of the longer diagonal."""
-
-_SHAPE_SIGMA_M = 0.01
-"""How much one painted marking differs from the next."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +42,6 @@ def with_known_shapes(
     doubtful: IntArray,
     kind: IntArray,
     accepted: IntArray,
-    options: AcceptanceOptions,
 ) -> SolvedCorners:
     """Place the groups ``doubtful`` by the shape of their class where their corners fit it.
 
@@ -65,24 +52,19 @@ def with_known_shapes(
         doubtful: (D,) groups that lack corners or are of an odd shape.
         kind: (G,) class of every group.
         accepted: (A,) groups that were accepted.
-        options: When shapes agree.
 
     Returns:
         The corners, with those groups placed of which three or two corners fit.
     """
     corners, covariance = solved.corners_map.copy(), solved.covariance_m2.copy()
     completed = solved.completed.copy()
-    shapes = {
-        int(k): shape
-        for k in np.unique(kind[accepted])
-        if (shape := _common_shape(corners[accepted[kind[accepted] == k]], options)) is not None
-    }
+    shapes = class_shapes(solved, kind, accepted)
     for group in doubtful:
         shape = shapes.get(int(kind[group]))
         if shape is None:
             continue
         sigma_m = np.sqrt(np.trace(fused.covariance_m2[group], axis1=1, axis2=2) / 2)
-        fit = fit_shape(shape, fused.corners_map[group], sigma_m, fused.seen[group], vague_map[group])
+        fit = fit_shape(shape.corners, fused.corners_map[group], sigma_m, fused.seen[group], vague_map[group])
         if fit is not None:
             corners[group], covariance[group] = fit.corners_map, fit.covariance
             completed[group] = True
@@ -99,7 +81,7 @@ def fit_shape(
     """
     seen = np.flatnonzero(np.isfinite(seen_map).all(axis=1))
     longest_m = float(_diagonals(shape).max())
-    limit_m = max(_MAX_MISS_M, _MAX_MISS_SHARE * longest_m)
+    limit_m = miss_limit_m(longest_m)
     for used in _subsets(seen):
         if times[used].sum() < _LEAST_SEEN:
             continue
@@ -127,7 +109,7 @@ def _subsets(seen: IntArray) -> list[IntArray]:
 
 def _rigid(shape: FloatArray, seen_map: FloatArray, sigma_m: FloatArray, used: IntArray) -> _Fit:
     """Move and turn a shape onto the corners ``used``, by weighted least squares (Kabsch, 1976)."""
-    weight = 1 / (sigma_m[used] ** 2 + _SHAPE_SIGMA_M**2)
+    weight = 1 / (sigma_m[used] ** 2 + SHAPE_SIGMA_M**2)
     from_centre = (weight @ shape[used]) / weight.sum()
     to_centre = (weight @ seen_map[used]) / weight.sum()
     a, b = shape[used] - from_centre, seen_map[used] - to_centre
@@ -140,7 +122,7 @@ def _rigid(shape: FloatArray, seen_map: FloatArray, sigma_m: FloatArray, used: I
     jacobian[:, :, 2] = np.stack([-arms[:, 1], arms[:, 0]], axis=1)
     information = np.einsum("c,cij,cik->jk", weight, jacobian[used], jacobian[used])
     flat = jacobian.reshape(8, 3)
-    covariance = flat @ np.linalg.inv(information) @ flat.T + _SHAPE_SIGMA_M**2 * np.eye(8)
+    covariance = flat @ np.linalg.inv(information) @ flat.T + SHAPE_SIGMA_M**2 * np.eye(8)
     miss_m = float(np.linalg.norm(corners[used] - seen_map[used], axis=1).max())
     return _Fit(corners, covariance, miss_m)
 
@@ -155,18 +137,6 @@ def _same(first: _Fit, second: _Fit, limit_m: float) -> bool:
     """Whether two fits cover the same ground, whichever corner each calls the first."""
     apart = np.linalg.norm(first.corners_map[:, None] - second.corners_map, axis=2)
     return bool(apart.min(axis=1).max() <= limit_m)
-
-
-def _common_shape(corners: FloatArray, options: AcceptanceOptions) -> FloatArray | None:
-    """The shape (4, 2) about its centre that most of a class (N, 4, 2) has; None if it has several."""
-    if len(corners) < _LEAST_PEERS:
-        return None
-    lengths = characteristic_lengths(corners)
-    typical = int(np.argmin(np.abs(lengths - np.median(lengths, axis=0)).sum(axis=1)))
-    peers = int(count_peers(lengths[typical][None], lengths, options)[0])
-    if peers < _COMMON_SHARE * len(corners):
-        return None
-    return np.asarray(corners[typical] - corners[typical].mean(axis=0))
 
 
 def _diagonals(shape: FloatArray) -> FloatArray:

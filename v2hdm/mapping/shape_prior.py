@@ -33,7 +33,7 @@ _MAX_MISS_M = 0.05
 _MAX_MISS_SHARE = 0.08
 """A marking has the common shape if no corner misses it by more than this, or by this share of its size."""
 
-_SHAPE_SIGMA_M = 0.01
+SHAPE_SIGMA_M = 0.01
 """How far a painted corner lies from where the stencil would have it, at least."""
 
 _GATE_PROBABILITY = 1e-3
@@ -81,11 +81,10 @@ def with_class_shapes(solved: SolvedCorners, kind: IntArray, accepted: IntArray)
     shape then replaces.
     """
     corners, covariance = solved.corners_map.copy(), solved.covariance_m2.copy()
-    for one in np.unique(kind[accepted]):
-        groups = accepted[kind[accepted] == one]
-        shape = common_shape(corners[groups], covariance[groups])
-        for group in groups:
-            corners[group], covariance[group] = fuse(corners[group], covariance[group], shape)
+    shapes = class_shapes(solved, kind, accepted)
+    for group in accepted:
+        shape = shapes.get(int(kind[group]))
+        corners[group], covariance[group] = fuse(corners[group], covariance[group], shape)
     return replace(solved, corners_map=corners, covariance_m2=covariance)
 
 
@@ -108,7 +107,7 @@ def without_guessed_lengths(
     completed = placed.completed.copy()
     moved = ~np.isclose(before.corners_map, placed.corners_map, equal_nan=True).all(axis=(1, 2))
     for group in np.flatnonzero(moved):
-        stretch = Shape(_parallelogram(corners[group]), _SHAPE_SIGMA_M).stretch
+        stretch = Shape(_parallelogram(corners[group]), SHAPE_SIGMA_M).stretch
         peers = before.corners_map[accepted[kind[accepted] == kind[group]]]
         if stretch is None or _is_of_one_length(peers):
             continue
@@ -124,8 +123,24 @@ def _is_of_one_length(corners: FloatArray) -> bool:
     """Whether as good as all markings (N, 4, 2) are as long as the typical one."""
     length = characteristic_lengths(corners)[:, -1]
     typical = np.median(length)
-    alike = np.abs(length - typical) <= max(_MAX_MISS_M, _MAX_MISS_SHARE * float(typical))
+    alike = np.abs(length - typical) <= miss_limit_m(float(typical))
     return bool(np.mean(alike) >= _ONE_LENGTH_SHARE)
+
+
+def miss_limit_m(size_m: float) -> float:
+    """How far a corner of a marking whose longer diagonal is ``size_m`` may be off the shape of its class."""
+    return max(_MAX_MISS_M, _MAX_MISS_SHARE * size_m)
+
+
+def class_shapes(solved: SolvedCorners, kind: IntArray, accepted: IntArray) -> dict[int, Shape]:
+    """The shapes of those classes, ``kind`` (G,), of which the groups ``accepted`` (A,) have one."""
+    shapes = {}
+    for one in np.unique(kind[accepted]).tolist():
+        groups = accepted[kind[accepted] == one]
+        shape = common_shape(solved.corners_map[groups], solved.covariance_m2[groups])
+        if shape is not None:
+            shapes[one] = shape
+    return shapes
 
 
 def common_shape(corners: FloatArray, covariance: FloatArray) -> Shape | None:
@@ -135,7 +150,7 @@ def common_shape(corners: FloatArray, covariance: FloatArray) -> Shape | None:
     lengths = characteristic_lengths(corners)
     typical = int(np.argmin(np.abs(lengths - np.median(lengths, axis=0)).sum(axis=1)))
     shape, members = _parallelogram(corners[typical]), np.array([typical])
-    limit_m = max(_MAX_MISS_M, _MAX_MISS_SHARE * float(lengths[typical].max()))
+    limit_m = miss_limit_m(float(lengths[typical].max()))
     for _ in range(2):
         laid = [_lay(shape, one, np.ones(4)) for one in corners]
         members = np.flatnonzero([np.linalg.norm(one.off, axis=1).max() <= limit_m for one in laid])
@@ -196,7 +211,7 @@ class _Update:
 
 def _closed(corners: FloatArray, covariance: FloatArray) -> _Update:
     """That it is a parallelogram."""
-    noise = _SHAPE_SIGMA_M**2 * np.eye(2)
+    noise = SHAPE_SIGMA_M**2 * np.eye(2)
     return _Update(corners.reshape(8), covariance, _CLOSURE, _CLOSURE @ corners.reshape(8), noise)
 
 
@@ -297,7 +312,7 @@ def _spread_m(shape: FloatArray, corners: FloatArray, covariance: FloatArray) ->
     off = (directions @ np.stack([laid.off.reshape(8, 1) for laid in lays]))[..., 0]
     own = directions @ covariance @ directions.transpose(0, 2, 1)
     wanted = float(chi2.median(off.shape[1]))
-    low, high = _SHAPE_SIGMA_M, float(np.abs(off).max()) + _SHAPE_SIGMA_M
+    low, high = SHAPE_SIGMA_M, float(np.abs(off).max()) + SHAPE_SIGMA_M
     for _ in range(20):
         sigma_m = np.sqrt(low * high)
         innovation = own + sigma_m**2 * np.eye(off.shape[1])
