@@ -2,10 +2,9 @@
 
     python -m tests.benchmarks.real_drive --drive DRIVE [--reference FILE] [--overlays FOLDER]
 
-The drive is detected in, once as single images are and once as for the map, and mapped; the calibration and
-poses found place the reference, what is really painted there, in every image. Without a file it is the
-dashes of the map and those that must lie between them, see
-:func:`tests.benchmarks.real_reference.make_reference`.
+The drive is detected in with the mapping's own settings and mapped once; the calibration and poses found
+place the reference, what is really painted there, in every image. Without a file it is the dashes of the map
+and those that must lie between them, see :func:`tests.benchmarks.real_reference.make_reference`.
 
 A marking counts in an image if it lies wholly inside, is not hidden and its centre is within 20 m of the
 camera on the ground. It is found by a detection of any class that overlaps it with its centre within half a
