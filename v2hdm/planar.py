@@ -1,4 +1,4 @@
-"""Small plane geometry that every floor needs: what lies inside, and where on the ground, in numpy."""
+"""Small plane geometry that every floor needs: what lies inside or on each other, and where on the ground."""
 
 from __future__ import annotations
 
@@ -19,3 +19,38 @@ def ground_in_vehicle(map_from_vehicle: FloatArray, points_map: FloatArray) -> F
     """Ground points (..., 2) m of the map as (x, y) in the frame of a vehicle at a pose (4 x 4)."""
     offset = np.concatenate([points_map, np.zeros((*np.shape(points_map)[:-1], 1))], axis=-1)
     return np.asarray(((offset - map_from_vehicle[:3, 3]) @ map_from_vehicle[:3, :3])[..., :2])
+
+
+def polygon_area(polygon: FloatArray) -> float:
+    """Shoelace area of a polygon (N, 2) of either turning."""
+    x, y = polygon.T
+    return float(abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2)
+
+
+def clip_convex(polygon: FloatArray, window: FloatArray) -> FloatArray:
+    """A polygon (N, 2) cut to a convex window (M, 2) of either turning (Sutherland and Hodgman, CACM 1974).
+
+    OpenCV's intersectConvexConvex gives nothing for some polygons that nearly coincide.
+    """
+    inside = window.mean(axis=0)
+    for start, end in zip(window, np.roll(window, -1, axis=0), strict=True):
+        along = end - start
+        normal = np.array([-along[1], along[0]])
+        inwards = np.sign(normal @ (inside - start))
+        polygon = clip_half(polygon, inwards * ((polygon - start) @ normal))
+        if not len(polygon):
+            break
+    return polygon
+
+
+def clip_half(polygon: FloatArray, depth: FloatArray) -> FloatArray:
+    """The part of a polygon (N, 2) where ``depth`` (N,), linear in the plane, is not negative."""
+    kept: list[FloatArray] = []
+    for k in range(len(polygon)):
+        before = k - 1
+        if (depth[k] >= 0) != (depth[before] >= 0):
+            part = depth[before] / (depth[before] - depth[k])
+            kept.append(polygon[before] + part * (polygon[k] - polygon[before]))
+        if depth[k] >= 0:
+            kept.append(polygon[k])
+    return np.array(kept).reshape(-1, 2)

@@ -24,6 +24,7 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.ground import apply_homography, ipm_from_extrinsic
 from v2hdm.detection.lens import distort_points
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.planar import clip_convex, clip_half, polygon_area
 from v2hdm.records import (
     CORNERED_CLASSES,
     LANE_BOUNDARY,
@@ -133,7 +134,7 @@ def _markings(scene: Scene, view: TrainingView, rendered: Rendered) -> list[True
         polygon = _before_camera(polygon, view)
         cam = polygon @ view.cam_from_map[:3, :2].T + view.cam_from_map[:3, 3]
         pinhole = (cam @ view.info.intrinsic.T)[:, :2] / cam[:, 2:]
-        pinhole = _clipped(pinhole, _FRAME_PX) if len(polygon) else pinhole
+        pinhole = clip_convex(pinhole, _FRAME_PX) if len(polygon) else pinhole
         if len(pinhole) < 3:
             continue
         polygon_px = distort_points(view.info, pinhole)
@@ -148,7 +149,7 @@ def _markings(scene: Scene, view: TrainingView, rendered: Rendered) -> list[True
 def _before_camera(polygon_map: FloatArray, view: TrainingView) -> FloatArray:
     """The part of a ground polygon (N, 2) that lies before the camera."""
     depth = polygon_map @ view.cam_from_map[2, :2] + view.cam_from_map[2, 3]
-    return _half(polygon_map, depth - NEAREST_M)
+    return clip_half(polygon_map, depth - NEAREST_M)
 
 
 def _seen_alone(polygon_px: FloatArray, label: int, rendered: Rendered) -> bool:
@@ -279,40 +280,8 @@ def _at_rows(line: FloatArray, rows: FloatArray) -> FloatArray:
 def _overlap(first: FloatArray, second: FloatArray) -> float:
     """Intersection over union of the hulls of two polygons."""
     a, b = (cv2.convexHull(p.astype(np.float32))[:, 0].astype(np.float64) for p in (first, second))
-    common = _area(_clipped(a, b))
-    return common / max(_area(a) + _area(b) - common, 1e-6)
-
-
-def _area(polygon: FloatArray) -> float:
-    return cv2.contourArea(polygon.astype(np.float32)) if len(polygon) > 2 else 0.0
-
-
-def _clipped(polygon: FloatArray, window: FloatArray) -> FloatArray:
-    """A polygon (N, 2) cut to a convex window (Sutherland and Hodgman, CACM 1974).
-
-    OpenCV's own intersection gives nothing for some polygons that nearly coincide.
-    """
-    inwards = np.sign(cv2.contourArea(window.astype(np.float32), oriented=True))
-    for start, end in zip(window, np.roll(window, -1, axis=0), strict=True):
-        along = end - start
-        depth = inwards * (along[0] * (polygon[:, 1] - start[1]) - along[1] * (polygon[:, 0] - start[0]))
-        polygon = _half(polygon, depth)
-        if not len(polygon):
-            break
-    return polygon
-
-
-def _half(polygon: FloatArray, depth: FloatArray) -> FloatArray:
-    """The part of a polygon (N, 2) where ``depth`` (N,) of its vertices is positive."""
-    kept: list[FloatArray] = []
-    for k in range(len(polygon)):
-        before = k - 1
-        if (depth[k] >= 0) != (depth[before] >= 0):
-            part = depth[before] / (depth[before] - depth[k])
-            kept.append(polygon[before] + part * (polygon[k] - polygon[before]))
-        if depth[k] >= 0:
-            kept.append(polygon[k])
-    return np.array(kept).reshape(-1, 2)
+    common = polygon_area(clip_convex(a, b))
+    return common / max(polygon_area(a) + polygon_area(b) - common, 1e-6)
 
 
 def average_precision(scored: list[tuple[float, bool]], truths: int) -> float:
