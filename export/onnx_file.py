@@ -86,6 +86,7 @@ def to_onnx(net: MarkingNet, opset: int) -> onnx.ModelProto:
     assert program is not None
     model = program.model_proto
     _name_sizes(model)
+    _forget_source(model)
     onnx.checker.check_model(model)
     return model
 
@@ -129,6 +130,13 @@ def _name_sizes(model: onnx.ModelProto) -> None:
     for value in (*model.graph.input, *model.graph.output):
         for axis, name in names[value.name].items():
             value.type.tensor_type.shape.dim[axis].dim_param = name
+
+
+def _forget_source(model: onnx.ModelProto) -> None:
+    """Drop what the exporter notes of the source of each node: paths of the machine that it ran on."""
+    for part in (*model.graph.node, *model.graph.value_info, *model.graph.initializer):
+        del part.metadata_props[:]
+        part.doc_string = ""
 
 
 def _without_paths(config: Mapping[str, Any]) -> dict[str, Any]:

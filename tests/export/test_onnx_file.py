@@ -79,6 +79,10 @@ def test_the_label_says_how_to_run_it_and_where_it_comes_from(exported: Path) ->
     assert label["training"]["data"]["own_labels"] == {"coco": True, "tusimple": False}
 
 
+def test_the_file_says_nothing_of_the_machine_that_it_was_made_on(exported: Path) -> None:
+    assert str(Path(__file__).parents[2]).encode() not in exported.read_bytes()
+
+
 def test_a_file_that_differs_from_its_network_is_not_written(
     checkpoint: Checkpoint, exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
