@@ -21,12 +21,6 @@ def ground_in_vehicle(map_from_vehicle: FloatArray, points_map: FloatArray) -> F
     return np.asarray(((offset - map_from_vehicle[:3, 3]) @ map_from_vehicle[:3, :3])[..., :2])
 
 
-def polygon_area(polygon: FloatArray) -> float:
-    """Shoelace area of a polygon (N, 2) of either turning."""
-    x, y = polygon.T
-    return float(abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2)
-
-
 def clip_convex(polygon: FloatArray, window: FloatArray) -> FloatArray:
     """A polygon (N, 2) cut to a convex window (M, 2) of either turning (Sutherland and Hodgman, CACM 1974).
 

@@ -24,7 +24,8 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.ground import apply_homography, ipm_from_extrinsic
 from v2hdm.detection.lens import distort_points
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.planar import clip_convex, clip_half, polygon_area
+from v2hdm.mapping.shapes import signed_area
+from v2hdm.planar import clip_convex, clip_half
 from v2hdm.records import (
     CORNERED_CLASSES,
     LANE_BOUNDARY,
@@ -280,8 +281,8 @@ def _at_rows(line: FloatArray, rows: FloatArray) -> FloatArray:
 def _overlap(first: FloatArray, second: FloatArray) -> float:
     """Intersection over union of the hulls of two polygons."""
     a, b = (cv2.convexHull(p.astype(np.float32))[:, 0].astype(np.float64) for p in (first, second))
-    common = polygon_area(clip_convex(a, b))
-    return common / max(polygon_area(a) + polygon_area(b) - common, 1e-6)
+    common, first_area, second_area = (abs(float(signed_area(p))) for p in (clip_convex(a, b), a, b))
+    return common / max(first_area + second_area - common, 1e-6)
 
 
 def average_precision(scored: list[tuple[float, bool]], truths: int) -> float:

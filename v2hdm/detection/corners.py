@@ -122,7 +122,7 @@ def fit_markings(
     _reject(found, view, options)
     if options.vague_corners:
         _take_outlines(found, start, [s.outline_pinhole_px for s in starts], view, options)
-    found.valid[_is_cut(found, view)] = False
+        found.valid[_is_cut(found, view)] = False
     return [
         MarkingDetection(s.kind, s.score, found.px[m], found.covariance[m], found.valid[m])
         for m, s in enumerate(starts)

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from v2hdm.mapping.options import AcceptanceOptions
-from v2hdm.mapping.shapes import is_convex
-from v2hdm.planar import clip_convex, polygon_area
+from v2hdm.mapping.shapes import is_convex, signed_area
+from v2hdm.planar import clip_convex
 from v2hdm.records import CORNERED_CLASSES, LANE_DASH, BoolArray, FloatArray
 
 IntArray = NDArray[np.int64]
@@ -213,4 +213,5 @@ def _covered(candidates: Candidates, verdict: list[str | None]) -> BoolArray:
 
 def _overlap(a: FloatArray, b: FloatArray) -> float:
     """Common area of two convex quadrilaterals as a share of the smaller one's."""
-    return polygon_area(clip_convex(a, b)) / max(min(polygon_area(a), polygon_area(b)), 1e-9)
+    common = abs(float(signed_area(clip_convex(a, b))))
+    return common / max(float(min(signed_area(a), signed_area(b))), 1e-9)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from v2hdm.mapping.association import FusedGroups
 from v2hdm.mapping.completion import SolvedCorners
-from v2hdm.mapping.shape_prior import SHAPE_SIGMA_M, class_shapes, miss_limit_m
+from v2hdm.mapping.shape_prior import SHAPE_SIGMA_M, class_shapes, miss_limit_m, rigid_onto
 from v2hdm.records import FloatArray
 
 IntArray = NDArray[np.int64]
@@ -108,15 +108,11 @@ def _subsets(seen: IntArray) -> list[IntArray]:
 
 
 def _rigid(shape: FloatArray, seen_map: FloatArray, sigma_m: FloatArray, used: IntArray) -> _Fit:
-    """Move and turn a shape onto the corners ``used``, by weighted least squares (Kabsch, 1976)."""
+    """Move and turn a shape onto the corners ``used``, by weighted least squares."""
     weight = 1 / (sigma_m[used] ** 2 + SHAPE_SIGMA_M**2)
-    from_centre = (weight @ shape[used]) / weight.sum()
-    to_centre = (weight @ seen_map[used]) / weight.sum()
-    a, b = shape[used] - from_centre, seen_map[used] - to_centre
-    turn = np.arctan2(weight @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), weight @ (a * b).sum(axis=1))
-    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    arms = (shape - from_centre) @ rotation.T
-    corners = arms + to_centre
+    rotation, shift = rigid_onto(shape[used], seen_map[used], weight)
+    corners = shape @ rotation.T + shift
+    arms = corners - weight @ corners[used] / weight.sum()
     jacobian = np.zeros((4, 2, 3))
     jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
     jacobian[:, :, 2] = np.stack([-arms[:, 1], arms[:, 0]], axis=1)

@@ -276,23 +276,29 @@ class _Laid:
 
 
 def _lay(shape: FloatArray, corners: FloatArray, weight: FloatArray) -> _Laid:
-    """Move and turn a parallelogram (4, 2) onto corners by weighted least squares (Kabsch, 1976).
+    """Move and turn a parallelogram (4, 2) onto corners by weighted least squares.
 
     It looks the same from both ends, so that one shift by a corner is all there is to try.
     """
     best: _Laid | None = None
     for shift in (0, 1):
         rolled = np.roll(shape, -shift, axis=0)
-        from_centre, to_centre = (weight @ points / weight.sum() for points in (rolled, corners))
-        a, b = rolled - from_centre, corners - to_centre
-        turn = np.arctan2(weight @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), weight @ (a * b).sum(axis=1))
-        rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-        placed = a @ rotation.T + to_centre
-        laid = _Laid(shift, rotation, to_centre - rotation @ from_centre, placed, corners - placed)
+        rotation, centre = rigid_onto(rolled, corners, weight)
+        placed = rolled @ rotation.T + centre
+        laid = _Laid(shift, rotation, centre, placed, corners - placed)
         if best is None or weight @ (laid.off**2).sum(1) < weight @ (best.off**2).sum(1):
             best = laid
     assert best is not None
     return best
+
+
+def rigid_onto(points: FloatArray, target: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rotation (2, 2) and shift (2,) that take points (N, 2) nearest to a target, weighted (Kabsch, 1976)."""
+    from_centre, to_centre = (weight @ part / weight.sum() for part in (points, target))
+    a, b = points - from_centre, target - to_centre
+    turn = np.arctan2(weight @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), weight @ (a * b).sum(axis=1))
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    return rotation, np.asarray(to_centre - rotation @ from_centre)
 
 
 def _parallelogram(corners: FloatArray) -> FloatArray:
