@@ -18,11 +18,9 @@ import torch
 from models import MarkingNet, Prediction
 from models.marking_net import KIND_STRIDE, LANE_STRIDE, MULTIPLE, PAINT_STRIDE
 from train.checkpoint import Checkpoint
+from v2hdm.detection.network import METADATA_KEY
 from v2hdm.errors import DetectorError
 from v2hdm.records import PAINT_CLASSES
-
-METADATA_KEY = "v2hdm"
-"""Under which key of the file's ``metadata_props`` its label is, as JSON."""
 
 _STRIDES = dict(zip(Prediction._fields, (PAINT_STRIDE, KIND_STRIDE, LANE_STRIDE), strict=True))
 
@@ -100,6 +98,7 @@ def label(checkpoint: Checkpoint) -> dict[str, Any]:
         "input": "uint8 BGR, NHWC",
         "commit": _commit(),
         "steps": checkpoint.step,
+        "renders": checkpoint.renders,
         "training_minutes": round(checkpoint.elapsed_s / 60, 1),
         "metrics": {name: round(value, 4) for name, value in checkpoint.metrics.items()},
         "training": _without_paths(checkpoint.config),

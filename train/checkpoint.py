@@ -12,6 +12,8 @@ from torch import Tensor
 
 from models import MarkingNet, NetConfig
 from train.config import TrainConfig
+from train.data import validation_pairs
+from train.exported import Exported, read_exported, unfold
 from v2hdm.errors import ConfigError
 
 # What may differ between the parts of a resumed run without making it another experiment.
@@ -25,6 +27,8 @@ _FREE_TO_CHANGE = (
     "resume",
     "validation",
 )
+
+_VIEWS_TO_UNFOLD = 24
 
 
 @dataclass
@@ -56,19 +60,26 @@ def fresh_checkpoint(config: TrainConfig) -> Checkpoint:
     """The state before the first update: that of no network yet, or with the weights of ``config.start``.
 
     Raises:
-        ConfigError: ``config.start`` is no checkpoint, or one of another network.
+        ConfigError: ``config.start`` is no checkpoint or exported file, or one of another network.
     """
     state = Checkpoint(config=asdict(config))
     if config.start is None:
         return state
-    earlier = load_checkpoint(Path(config.start))
+    path = Path(config.start)
+    earlier = read_exported(path) if path.suffix == ".onnx" else load_checkpoint(path)
     now = asdict(config.net)
     then = _completed(earlier.config["net"], asdict(NetConfig()))
     if then != now:
         raise ConfigError(
             f"start={config.start} holds the network {then}, not {now}: give its `net` settings"
         )
-    state.model = state.averaged = earlier.averaged
+    if isinstance(earlier, Exported):
+        pairs = validation_pairs(config.data, config.seed, _VIEWS_TO_UNFOLD)
+        views = (image[None] for image, _ in pairs)
+        state.averaged = unfold(earlier.weights, config.net, views)
+    else:
+        state.averaged = earlier.averaged
+    state.model = state.averaged
     state.renders = earlier.renders
     return state
 

@@ -68,8 +68,8 @@ class TrainConfig:
     The learning rate rises to ``learning_rate`` over the first ``warmup`` of the run, then falls to
     nothing as a half cosine, by the share of the run that has passed. The weights that are validated, kept
     and exported are averages over about ``ema_updates`` updates. ``resume`` goes on with what ``output``
-    holds. ``start`` is a checkpoint of another run whose averaged weights, and place in the sequence of
-    renders, this one starts from: to learn on, or to learn users' own labels.
+    holds. ``start`` is a checkpoint of another run, or an exported file, whose averaged weights and place
+    in the sequence of renders this one starts from: to learn on, or to learn users' own labels.
     """
 
     output: str = "runs/train"

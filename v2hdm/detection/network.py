@@ -16,7 +16,9 @@ from v2hdm.records import PAINT_CLASSES
 
 DEFAULT_MODEL = Path(__file__).with_name("default.onnx")
 
-_METADATA_KEY = "v2hdm"
+METADATA_KEY = "v2hdm"
+"""Under which key of the file's ``metadata_props`` its label is, as JSON."""
+
 _OUTPUTS = ["paint", "kinds", "lanes"]
 
 
@@ -137,7 +139,7 @@ def _open_session(path: Path, threads: int) -> Any:
 
 def _read_info(session: Any, path: Path) -> NetworkInfo:
     try:
-        metadata = json.loads(session.get_modelmeta().custom_metadata_map[_METADATA_KEY])
+        metadata = json.loads(session.get_modelmeta().custom_metadata_map[METADATA_KEY])
         info = NetworkInfo(
             tuple(str(name) for name in metadata["classes"]),
             int(metadata["multiple"]),
@@ -145,7 +147,7 @@ def _read_info(session: Any, path: Path) -> NetworkInfo:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise DetectorError(
-            f"{path}: no usable {_METADATA_KEY!r} metadata ({_one_line(error)}); "
+            f"{path}: no usable {METADATA_KEY!r} metadata ({_one_line(error)}); "
             "this is not a model written by `python -m export`"
         ) from error
     unknown = [name for name in info.classes if name not in PAINT_CLASSES]

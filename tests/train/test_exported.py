@@ -1,0 +1,125 @@
+"""A training that starts from an exported file: the same function, with normalisations that can learn on."""
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import onnx
+import pytest
+import torch
+
+from export.onnx_file import export_checkpoint, to_onnx
+from models import MarkingNet, NetConfig
+from tests.train.test_training import tiny
+from train.checkpoint import Checkpoint, fresh_checkpoint, load_checkpoint
+from train.exported import unfold
+from train.loop import Trainer
+from v2hdm.errors import ConfigError
+
+SHIPPED = Path(__file__).resolve().parents[2] / "v2hdm" / "detection" / "default.onnx"
+
+Images = list[torch.Tensor]
+
+
+@pytest.fixture
+def images() -> Images:
+    generator = torch.Generator().manual_seed(3)
+    return [torch.randint(0, 256, (2, 64, 96, 3), dtype=torch.uint8, generator=generator) for _ in range(4)]
+
+
+@pytest.fixture
+def net(images: Images) -> MarkingNet:
+    """A network whose normalisations all say something."""
+    torch.manual_seed(0)
+    net = MarkingNet(tiny(Path()).net)
+    for name, parameter in net.named_parameters():
+        if ".1." in name and parameter.ndim == 1:
+            torch.nn.init.uniform_(parameter, 0.4, 1.6)
+    with torch.no_grad():
+        for image in images:
+            net.train()(image)
+    return net.eval()
+
+
+def folded(net: MarkingNet) -> dict[str, torch.Tensor]:
+    twin = MarkingNet(tiny(Path()).net)
+    twin.load_state_dict(net.state_dict())
+    return twin.fold().state_dict()
+
+
+def test_an_unfolded_network_says_what_the_folded_one_says(net: MarkingNet, images: Images) -> None:
+    again = MarkingNet(tiny(Path()).net)
+    again.load_state_dict(unfold(folded(net), tiny(Path()).net, images[:1]))
+    with torch.inference_mode():
+        pairs = zip(again.eval()(images[2]), net(images[2]), strict=True)
+        assert max(float((a - b).abs().max()) for a, b in pairs) < 1e-3
+
+
+def test_it_says_the_same_while_it_trains_on_what_its_statistics_are_of(
+    net: MarkingNet, images: Images
+) -> None:
+    again = MarkingNet(tiny(Path()).net)
+    again.load_state_dict(unfold(folded(net), tiny(Path()).net, images[:1]))
+    with torch.no_grad():
+        pairs = zip(again.train()(images[0]), net(images[0]), strict=True)
+        assert max(float((a - b).abs().max()) for a, b in pairs) < 1e-2
+
+
+def test_a_training_starts_from_an_exported_file(net: MarkingNet, images: Images, tmp_path: Path) -> None:
+    config = tiny(tmp_path / "run")
+    taught = Checkpoint(
+        config=vars(config) | {"net": vars(config.net)}, renders=70, averaged=net.state_dict()
+    )
+    taught.config["data"] = vars(config.data)
+    export_checkpoint(taught, tmp_path / "net.onnx", opset=18, tolerance=1e-3)
+    trainer = Trainer(replace(config, start=str(tmp_path / "net.onnx")), lambda share, line: None)
+    assert trainer.state.renders == 70, "the renders that taught it would be shown again"
+    with torch.inference_mode():
+        pairs = zip(trainer.averaged.module.eval()(images[0]), net(images[0]), strict=True)
+        assert max(float((a - b).abs().max()) for a, b in pairs) < 1e-3
+    assert trainer.run().step == 3
+    assert load_checkpoint(tmp_path / "run" / "last.pt").step == 3
+
+
+def test_the_shipped_file_can_learn_on(tmp_path: Path) -> None:
+    config = replace(tiny(tmp_path), start=str(SHIPPED), net=NetConfig())
+    assert set(fresh_checkpoint(config).averaged) == set(MarkingNet().state_dict())
+
+
+def _no_onnx(path: Path) -> None:
+    path.write_bytes(b"no model")
+
+
+def _of_another_program(path: Path) -> None:
+    onnx.save_model(to_onnx(MarkingNet(tiny(path).net).fold(), 18), str(path))
+
+
+def _of_another_network(path: Path) -> None:
+    path.write_bytes(SHIPPED.read_bytes())
+
+
+def _of_other_weights(path: Path) -> None:
+    model = onnx.load_model(str(SHIPPED))
+    (entry,) = model.metadata_props
+    label = json.loads(entry.value)
+    label["training"]["net"] = vars(tiny(path).net)
+    entry.value = json.dumps(label)
+    onnx.save_model(model, str(path))
+
+
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        (lambda path: None, "no file"),
+        (_no_onnx, "was not written by"),
+        (_of_another_program, "was not written by"),
+        (_of_another_network, "holds the network"),
+        (_of_other_weights, "has no weight"),
+    ],
+)
+def test_a_file_that_cannot_start_a_training_is_refused(tmp_path: Path, make: object, reason: str) -> None:
+    assert callable(make)
+    path = tmp_path / "other.onnx"
+    make(path)
+    with pytest.raises(ConfigError, match=reason):
+        fresh_checkpoint(replace(tiny(tmp_path), start=str(path)))

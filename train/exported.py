@@ -1,0 +1,108 @@
+"""An exported file as the start of a training, so that the shipped network can learn a user's own labels."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import onnx
+import torch
+from onnx import numpy_helper
+from torch import Tensor, nn
+
+from models import MarkingNet, NetConfig
+from models.marking_net import ConvNormRelu
+from v2hdm.detection.network import METADATA_KEY
+from v2hdm.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What an exported file says of its training, and its weights by their names in the folded network.
+
+    ``config`` are the training's settings, ``renders`` how many renders had taught it, as in a checkpoint.
+    """
+
+    config: dict[str, Any]
+    renders: int
+    weights: dict[str, Tensor]
+
+
+def read_exported(path: Path) -> Exported:
+    """Read a file written by `python -m export`.
+
+    Raises:
+        ConfigError: There is no such file, or another program wrote it.
+    """
+    if not path.is_file():
+        raise ConfigError(f"no file {path} to start from: give a checkpoint, or an exported .onnx file")
+    try:
+        model = onnx.load_model(str(path))
+        label = json.loads({entry.key: entry.value for entry in model.metadata_props}[METADATA_KEY])
+        config, renders = dict(label["training"]), int(label.get("renders", 0))
+        NetConfig(**config["net"])
+        arrays = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error!s:.120}".replace("\n", " ")
+        raise ConfigError(f"{path} was not written by `python -m export` ({reason})") from error
+    return Exported(config, renders, {name: torch.from_numpy(a.copy()) for name, a in arrays.items()})
+
+
+@torch.no_grad()
+def unfold(folded: dict[str, Tensor], config: NetConfig, images: Iterable[Tensor]) -> dict[str, Tensor]:
+    """The state of a network, with its batch normalisations, that computes what a folded one does.
+
+    Folding leaves of a normalisation only a scale in the convolution and a shift. Its statistics are taken
+    anew from what the convolution gives on ``images``, (B, H, W, 3) uint8, and its scale and shift undo
+    them: the network says the same in eval mode and, on images like these, nearly the same while it trains.
+
+    Raises:
+        ConfigError: A weight is missing or of another shape.
+    """
+    wanted = MarkingNet(config).fold().state_dict()
+    for name, value in wanted.items():
+        if name not in folded or folded[name].shape != value.shape:
+            raise ConfigError(f"the file to start from has no weight {name} of shape {tuple(value.shape)}")
+    net = MarkingNet(config).eval()
+    norms = {name: module[1] for name, module in net.named_modules() if isinstance(module, ConvNormRelu)}
+    state = net.state_dict()
+    for name, norm in norms.items():
+        state[f"{name}.1.weight"] = torch.sqrt(norm.running_var + norm.eps)  # of mean 0: only a shift is left
+    shifts = {f"{name}.0.bias": f"{name}.1.bias" for name in norms}
+    state |= {shifts.get(name, name): value for name, value in folded.items() if name in wanted}
+    net.load_state_dict(state)
+    moments = [_Moments(norm) for norm in norms.values()]
+    for image in images:
+        net(image)
+    for moment in moments:
+        moment.into_norm()
+    return net.state_dict()
+
+
+class _Moments:
+    """Mean and variance of each channel of what a normalisation is given."""
+
+    def __init__(self, norm: nn.BatchNorm2d) -> None:
+        self._norm = norm
+        self._sums = torch.zeros((3, norm.num_features), dtype=torch.float64)
+        self._hook = norm.register_forward_pre_hook(self._add)
+
+    def _add(self, _norm: nn.Module, inputs: tuple[Tensor]) -> None:
+        channels = inputs[0].detach().double().transpose(0, 1).flatten(1)
+        powers = torch.ones_like(channels), channels, channels**2
+        self._sums += torch.stack([power.sum(dim=1) for power in powers])
+
+    def into_norm(self) -> None:
+        """Make them the normalisation's statistics; what it computes stays the same."""
+        self._hook.remove()
+        count, total, squares = self._sums
+        mean = total / count
+        variance = (squares / count - mean**2).clamp(min=0)
+        norm = self._norm
+        norm.bias += mean
+        norm.running_mean.copy_(mean)
+        norm.running_var.copy_(variance)
+        norm.weight.copy_(torch.sqrt(variance + norm.eps))
