@@ -67,10 +67,7 @@ def test_it_says_the_same_while_it_trains_on_what_its_statistics_are_of(
 
 def test_a_training_starts_from_an_exported_file(net: MarkingNet, images: Images, tmp_path: Path) -> None:
     config = tiny(tmp_path / "run")
-    taught = Checkpoint(
-        config=vars(config) | {"net": vars(config.net)}, renders=70, averaged=net.state_dict()
-    )
-    taught.config["data"] = vars(config.data)
+    taught = Checkpoint(config=asdict(config), renders=70, averaged=net.state_dict())
     export_checkpoint(taught, tmp_path / "net.onnx", opset=18, tolerance=1e-3)
     trainer = Trainer(replace(config, start=str(tmp_path / "net.onnx")), lambda share, line: None)
     assert trainer.state.renders == 70, "the renders that taught it would be shown again"
