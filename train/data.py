@@ -14,6 +14,7 @@ from train.augment import random_crop, random_photometry
 from train.config import DataConfig
 from train.labels import LabelledImages, read_labels
 from train.targets import Targets, targets
+from v2hdm.simulate.training_hardships import Hardships
 from v2hdm.simulate.training_scenes import TrainingSample, training_sample
 
 _VALIDATION_SEED_OFFSET = 1_000_003
@@ -42,6 +43,9 @@ class RenderStream(IterableDataset[Pair]):
         labels: LabelledImages | None = None,
     ) -> None:
         self.config = config
+        self.hardships = Hardships(
+            shadows_on_paint=config.shadows_on_paint, seams=config.seams, overexposed=config.overexposed
+        )
         self.seed = seed
         self.first_render = first_render
         self.part = part
@@ -80,7 +84,7 @@ class RenderStream(IterableDataset[Pair]):
         config = self.config
         difficulty = min(1.0, index / max(config.easy_samples, 1))
         return training_sample(
-            self.seed, index, config.render_width, config.render_height, difficulty, config.shadows_on_paint
+            self.seed, index, config.render_width, config.render_height, difficulty, self.hardships
         )
 
     def _view(self, rng: np.random.Generator, sample: TrainingSample) -> Pair:

@@ -6,6 +6,8 @@ import pytest
 from train.config import DataConfig
 from train.data import RenderStream, validation_pairs
 from v2hdm.records import LANE_CLASSES, PAINT_CLASSES
+from v2hdm.simulate.optics import Optics
+from v2hdm.simulate.training_hardships import Hardships, overexposed, with_seams
 from v2hdm.simulate.training_paint import Bend, rectangle, rhombus
 from v2hdm.simulate.training_scenes import random_scene, training_sample
 from v2hdm.simulate.training_views import looking, random_view
@@ -105,12 +107,33 @@ def test_camera_rotations_are_rotations() -> None:
         assert np.linalg.det(rotation) == pytest.approx(1)
 
 
-def test_shadows_laid_on_paint_change_the_light_and_nothing_else():
+@pytest.mark.parametrize("name", ["shadows_on_paint", "seams", "overexposed"])
+def test_hardships_change_what_paint_looks_like_and_not_where_it_is(name: str) -> None:
+    hardships = Hardships(**{name: 1.0})
     pairs = [
-        (training_sample(5, index, 160, 96), training_sample(5, index, 160, 96, shadows_on_paint=4.0))
+        (training_sample(5, index, 160, 96), training_sample(5, index, 160, 96, hardships=hardships))
         for index in range(6)
     ]
-    for plain, shaded in pairs:
-        np.testing.assert_array_equal(plain.labels, shaded.labels)
-        np.testing.assert_array_equal(plain.hidden, shaded.hidden)
-    assert any((plain.image != shaded.image).any() for plain, shaded in pairs)
+    for plain, hard in pairs:
+        np.testing.assert_array_equal(plain.labels, hard.labels)
+        np.testing.assert_array_equal(plain.hidden, hard.hidden)
+    assert any((plain.image != hard.image).any() for plain, hard in pairs)
+
+
+def test_seams_lie_beside_their_lines_and_nowhere_else() -> None:
+    line = np.column_stack([np.arange(0, 40, 0.5), np.full(80, 2.0)])
+    marks = with_seams(np.random.default_rng(1), None, [line], share=1.0)
+    assert marks is not None
+    rows, columns = np.nonzero(marks.factor != 128)
+    x, y = np.array([columns, rows]) * marks.resolution_m + np.array(marks.origin_map)[:, None]
+    assert np.abs(y - 2.0).max() < 1.0
+    assert np.ptp(x) > 38
+    assert with_seams(np.random.default_rng(1), None, [line], share=0.0) is None
+
+
+def test_overexposed_optics_expose_longer_within_reason() -> None:
+    optics = Optics(mean_level=0.2)
+    levels = [overexposed(np.random.default_rng(k), optics, 0.5).mean_level for k in range(60)]
+    assert min(levels) == 0.2
+    assert 0.6 < max(levels) <= 0.9
+    assert 15 < sum(level > 0.2 for level in levels) < 45

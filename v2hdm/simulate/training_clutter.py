@@ -58,8 +58,8 @@ def port_boxes(rng: np.random.Generator) -> tuple[Box, ...]:
 
 def ground_marks(rng: np.random.Generator) -> GroundMarks:
     """Tyre marks, cracks, repairs, rails, covers and spills: unlabelled, dark and up to twice as bright."""
-    columns, rows = (int(m / _MARKS_RESOLUTION_M) for m in _MARKS_M)
-    factor = np.full((rows, columns), 128, dtype=np.uint8)
+    marks = plain_marks()
+    factor = marks.factor
     if rng.random() < 0.2:
         _flecks(rng, factor)
     for side in (-1, 1):
@@ -77,6 +77,13 @@ def ground_marks(rng: np.random.Generator) -> GroundMarks:
         _cover(rng, factor)
     if rng.random() < 0.7:
         factor[:] = cv2.GaussianBlur(factor, (0, 0), float(rng.uniform(0.5, 1.4)))
+    return marks
+
+
+def plain_marks() -> GroundMarks:
+    """Room for marks about the way, none yet."""
+    columns, rows = (int(m / _MARKS_RESOLUTION_M) for m in _MARKS_M)
+    factor = np.full((rows, columns), 128, dtype=np.uint8)
     return GroundMarks(factor=factor, origin_map=(-4.0, -_MARKS_M[1] / 2), resolution_m=_MARKS_RESOLUTION_M)
 
 

@@ -12,16 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.detection.lens import distort_points
-from v2hdm.records import CORNERED_CLASSES, FloatArray
+from v2hdm.records import FloatArray
 from v2hdm.simulate.render import Renderer
-from v2hdm.simulate.scene import Backdrop, Bgr, Dapple, Ground, Light, Paint, Scene, Shadow
+from v2hdm.simulate.scene import Backdrop, Bgr, Dapple, Ground, Light, Scene, Shadow
 from v2hdm.simulate.training_clutter import ground_marks, port_boxes, street_boxes
+from v2hdm.simulate.training_hardships import NONE, Hardships, overexposed, shadows_on_paint, with_seams
 from v2hdm.simulate.training_paint import Bend, RoadPaint, port_paint, random_brush, rectangle, street_paint
 from v2hdm.simulate.training_views import TrainingView, random_view
 
 # The renderer keeps one tile per fleck size, so sizes come from a short list.
 _NEAR_M = 0.3
-_CROSSED_M = 22.0
 _FLECK_SIZES_M = tuple(float(s) for s in np.geomspace(0.12, 2.5, 10))
 
 
@@ -46,7 +46,7 @@ def training_sample(
     width: int,
     height: int,
     difficulty: float = 1.0,
-    shadows_on_paint: float = 0.0,
+    hardships: Hardships = NONE,
 ) -> TrainingSample:
     """Sample ``index`` of the endless, reproducible sequence that ``seed`` stands for.
 
@@ -56,13 +56,14 @@ def training_sample(
         width: Image width, px.
         height: Image height, px.
         difficulty: 0 for fresh paint in plain light, 1 for everything at its worst now and then.
-        shadows_on_paint: as in :func:`random_scene`.
+        hardships: What is added to the scene and done to its image.
     """
     rng = np.random.default_rng([seed, index])
-    scene, lanes = random_scene(rng, difficulty, shadows_on_paint)
+    scene, lanes = random_scene(rng, difficulty, hardships)
     view = random_view(rng, width, height)
     scene = _without_hidden_boxes(scene, view)
-    rendered = Renderer(scene).render(view.info, view.cam_from_map, rng, view.optics, view.motion)
+    optics = overexposed(rng.spawn(1)[0], view.optics, hardships.overexposed)
+    rendered = Renderer(scene).render(view.info, view.cam_from_map, rng, optics, view.motion)
     seen = (image_points(view, lane) for lane in lanes)
     lanes_px = tuple(lane for lane in seen if len(lane) > 1)
     return TrainingSample(rendered.image, rendered.labels, rendered.hidden, lanes_px)
@@ -80,15 +81,14 @@ def image_points(view: TrainingView, points_map: FloatArray) -> FloatArray:
 
 
 def random_scene(
-    rng: np.random.Generator, difficulty: float = 1.0, shadows_on_paint: float = 0.0
+    rng: np.random.Generator, difficulty: float = 1.0, hardships: Hardships = NONE
 ) -> tuple[Scene, list[FloatArray]]:
     """A port (two in five), a street (half) or unpainted ground, seen from the map's origin along +x.
 
     Args:
         rng: Where chance comes from.
         difficulty: 0 for fresh paint in plain light, 1 for everything at its worst now and then.
-        shadows_on_paint: How many shadows more, on average, have an edge that crosses a marking. They change
-            nothing else of the scene.
+        hardships: What is added to the scene, the rest of which stays the same.
 
     Returns:
         The scene, and the centre lines (N, 2, map) of its lanes' lines.
@@ -103,11 +103,14 @@ def random_scene(
         road, boxes = street_paint(rng, brush, bend), street_boxes(rng, road_half_m)
     else:
         road, boxes = RoadPaint(), street_boxes(rng, road_half_m) if rng.random() < 0.7 else port_boxes(rng)
+    ground, shadows = _ground(rng, place == "port", difficulty), _shadows(rng, difficulty)
+    for_shadows, for_seams = rng.spawn(2)
+    marks = with_seams(for_seams, ground.marks, road.lanes, hardships.seams)
     scene = Scene(
-        ground=_ground(rng, place == "port", difficulty),
+        ground=replace(ground, marks=marks),
         paints=tuple(road.paints),
         boxes=boxes,
-        shadows=_shadows(rng, difficulty) + _crossing_shadows(rng.spawn(1)[0], road.paints, shadows_on_paint),
+        shadows=shadows + shadows_on_paint(for_shadows, road.paints, hardships.shadows_on_paint),
         dapples=_dapples(rng, difficulty),
         light=_light(rng),
         backdrop=_backdrop(rng),
@@ -192,26 +195,6 @@ def _shadows(rng: np.random.Generator, difficulty: float) -> tuple[Shadow, ...]:
         polygon = rectangle(centre, rng.uniform(4, 60), wide, rng.uniform(0, np.pi))
         softness = float(np.exp(rng.uniform(np.log(0.02), np.log(0.6))))
         out.append(Shadow(polygon_map=polygon, transmission=float(rng.beta(1, 5)), softness_m=softness))
-    return tuple(out)
-
-
-def _crossing_shadows(rng: np.random.Generator, paints: list[Paint], mean: float) -> tuple[Shadow, ...]:
-    """Shadows laid so that an edge of each crosses a marking within sight, often nearly along its sides."""
-    near = [p for p in paints if p.kind in CORNERED_CLASSES and 1 < p.polygon_map[:, 0].mean() < _CROSSED_M]
-    count = int(rng.poisson(mean)) if near else 0
-    out = []
-    for number in rng.integers(len(near), size=count) if near else ():
-        polygon = near[int(number)].polygon_map
-        side = polygon[1] - polygon[0]
-        along = np.arctan2(side[1], side[0]) + rng.normal(0, 0.15)
-        yaw = float(along if rng.random() < 0.5 else rng.uniform(0, np.pi))
-        wide = float(rng.uniform(0.15, 0.8) if rng.random() < 0.5 else rng.uniform(1, 10))
-        across = np.array([-np.sin(yaw), np.cos(yaw)])
-        crossed = rng.dirichlet(np.ones(len(polygon))) @ polygon
-        centre = crossed + across * wide / 2 * rng.choice([-1.0, 1.0])
-        shape = rectangle(centre, float(rng.uniform(4, 40)), wide, yaw)
-        softness = float(np.exp(rng.uniform(np.log(0.02), np.log(0.3))))
-        out.append(Shadow(polygon_map=shape, transmission=float(rng.beta(1, 5)), softness_m=softness))
     return tuple(out)
 
 

@@ -1,0 +1,85 @@
+"""What a training sees oftener than chance would have it: what networks were seen to fail on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from v2hdm.records import CORNERED_CLASSES, FloatArray
+from v2hdm.simulate.optics import Optics
+from v2hdm.simulate.scene import GroundMarks, Paint, Shadow
+from v2hdm.simulate.training_clutter import plain_marks
+from v2hdm.simulate.training_paint import rectangle
+
+_CROSSED_M = 22.0
+_LONGEST_LEVEL = 0.9
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hardships:
+    """How much is added to random scenes; nothing else of them changes.
+
+    Attributes:
+        shadows_on_paint: mean number of shadows that have an edge across a marking.
+        seams: share of lane lines that have a seam of the surface beside them, as paving leaves it there:
+            dark or bright, and going on where a dash ends.
+        overexposed: share of images that are exposed several times too long, as the sunlit half of a scene
+            is by a camera set for its shade.
+    """
+
+    shadows_on_paint: float = 0.0
+    seams: float = 0.0
+    overexposed: float = 0.0
+
+
+NONE = Hardships()
+
+
+def shadows_on_paint(rng: np.random.Generator, paints: list[Paint], mean: float) -> tuple[Shadow, ...]:
+    """Shadows laid so that an edge of each crosses a marking within sight, often nearly along its sides."""
+    near = [p for p in paints if p.kind in CORNERED_CLASSES and 1 < p.polygon_map[:, 0].mean() < _CROSSED_M]
+    count = int(rng.poisson(mean)) if near else 0
+    out = []
+    for number in rng.integers(len(near), size=count) if near else ():
+        polygon = near[int(number)].polygon_map
+        side = polygon[1] - polygon[0]
+        along = np.arctan2(side[1], side[0]) + rng.normal(0, 0.15)
+        yaw = float(along if rng.random() < 0.5 else rng.uniform(0, np.pi))
+        wide = float(rng.uniform(0.15, 0.8) if rng.random() < 0.5 else rng.uniform(1, 10))
+        across = np.array([-np.sin(yaw), np.cos(yaw)])
+        crossed = rng.dirichlet(np.ones(len(polygon))) @ polygon
+        centre = crossed + across * wide / 2 * rng.choice([-1.0, 1.0])
+        shape = rectangle(centre, float(rng.uniform(4, 40)), wide, yaw)
+        softness = float(np.exp(rng.uniform(np.log(0.02), np.log(0.3))))
+        out.append(Shadow(polygon_map=shape, transmission=float(rng.beta(1, 5)), softness_m=softness))
+    return tuple(out)
+
+
+def with_seams(
+    rng: np.random.Generator, marks: GroundMarks | None, lines_map: Iterable[FloatArray], share: float
+) -> GroundMarks | None:
+    """The marks of a ground and a seam beside a ``share`` of the lines (N, 2, map)."""
+    beside = [line for line in lines_map if rng.random() < share]
+    if not beside:
+        return marks
+    marks = plain_marks() if marks is None else marks
+    factor = marks.factor.copy()
+    for line in beside:
+        ahead = np.gradient(line, axis=0)
+        left = np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.linalg.norm(ahead, axis=1, keepdims=True)
+        offset = rng.normal(0, 0.12) + rng.normal(0, 0.01) * np.cumsum(rng.normal(0, 1, len(line)))
+        at = (line + offset[:, None] * left - marks.origin_map) / marks.resolution_m
+        tone = rng.uniform(35, 110) if rng.random() < 0.75 else rng.uniform(145, 200)
+        wide = int(rng.integers(1, 4))
+        cv2.polylines(factor, [np.round(at * 16).astype(np.int32)], False, tone, wide, cv2.LINE_AA, 4)
+    return replace(marks, factor=factor)
+
+
+def overexposed(rng: np.random.Generator, optics: Optics, share: float) -> Optics:
+    """These optics, or in a ``share`` of cases set to expose up to four times longer."""
+    if rng.random() >= share:
+        return optics
+    return replace(optics, mean_level=float(min(optics.mean_level * rng.uniform(1.5, 4.0), _LONGEST_LEVEL)))
