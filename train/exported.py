@@ -18,6 +18,10 @@ from models.marking_net import ConvNormRelu
 from v2hdm.detection.network import METADATA_KEY
 from v2hdm.errors import ConfigError
 
+_GROWTH = 3.0
+"""How many times larger than at the start the weights of a trained convolution are, about (seen in those
+that no normalisation follows)."""
+
 
 @dataclass(frozen=True)
 class Exported:
@@ -58,6 +62,8 @@ def unfold(folded: dict[str, Tensor], config: NetConfig, images: Iterable[Tensor
     Folding leaves of a normalisation only a scale in the convolution and a shift. Its statistics are taken
     anew from what the convolution gives on ``images``, (B, H, W, 3) uint8, and its scale and shift undo
     them: the network says the same in eval mode and, on images like these, nearly the same while it trains.
+    The convolution's own scale is then free; it gets that of a trained one, since updates of the usual size
+    would tear smaller weights about.
 
     Raises:
         ConfigError: A weight is missing or of another shape.
@@ -68,11 +74,14 @@ def unfold(folded: dict[str, Tensor], config: NetConfig, images: Iterable[Tensor
             raise ConfigError(f"the file to start from has no weight {name} of shape {tuple(value.shape)}")
     net = MarkingNet(config).eval()
     norms = {name: module[1] for name, module in net.named_modules() if isinstance(module, ConvNormRelu)}
-    state = net.state_dict()
-    for name, norm in norms.items():
-        state[f"{name}.1.weight"] = torch.sqrt(norm.running_var + norm.eps)  # of mean 0: only a shift is left
     shifts = {f"{name}.0.bias": f"{name}.1.bias" for name in norms}
+    state = net.state_dict()
     state |= {shifts.get(name, name): value for name, value in folded.items() if name in wanted}
+    for name in norms:
+        convolution = f"{name}.0.weight"
+        scale = _GROWTH * _size(wanted[convolution]).mean() / _size(folded[convolution]).clamp(min=1e-6)
+        state[convolution] = folded[convolution] * scale
+        state[f"{name}.1.weight"] = 1 / scale.flatten()
     net.load_state_dict(state)
     moments = [_Moments(norm) for norm in norms.values()]
     for image in images:
@@ -82,12 +91,18 @@ def unfold(folded: dict[str, Tensor], config: NetConfig, images: Iterable[Tensor
     return net.state_dict()
 
 
+def _size(convolution: Tensor) -> Tensor:
+    """Norm (outputs, 1, 1, 1) of the weights of each output."""
+    return convolution.flatten(1).norm(dim=1)[:, None, None, None]
+
+
 class _Moments:
     """Mean and variance of each channel of what a normalisation is given."""
 
     def __init__(self, norm: nn.BatchNorm2d) -> None:
         self._norm = norm
         self._sums = torch.zeros((3, norm.num_features), dtype=torch.float64)
+        norm.running_var.fill_(1 - norm.eps)  # with a mean of 0: nothing but scale and shift
         self._hook = norm.register_forward_pre_hook(self._add)
 
     def _add(self, _norm: nn.Module, inputs: tuple[Tensor]) -> None:
@@ -102,7 +117,7 @@ class _Moments:
         mean = total / count
         variance = (squares / count - mean**2).clamp(min=0)
         norm = self._norm
-        norm.bias += mean
+        norm.bias += mean * norm.weight
+        norm.weight *= torch.sqrt(variance + norm.eps)
         norm.running_mean.copy_(mean)
         norm.running_var.copy_(variance)
-        norm.weight.copy_(torch.sqrt(variance + norm.eps))

@@ -17,7 +17,7 @@ from v2hdm.detection.correlation import variance_inflation
 from v2hdm.detection.coverage import blurred_coverage
 from v2hdm.detection.grey import GreyBand
 from v2hdm.detection.patches import Patches, cut_patches
-from v2hdm.detection.quad import following, intersect_sides, is_convex, preceding, side_frames
+from v2hdm.detection.quad import following, intersect_sides, is_convex, preceding, side_frames, signed_area
 from v2hdm.detection.view import CameraView
 from v2hdm.records import BoolArray, FloatArray
 
@@ -29,7 +29,14 @@ _MAX_SIDE_STEP_PX = 1.0
 _MAX_CORNER_STEP_PX = 4.0
 _MAX_MOVE_PX = 6.0
 _MAX_MOVE_SHARE = 0.1
-"""A fit that moves a corner by more than this, and than this share of the longest side, has gone astray."""
+"""A fit that moves a corner by more than this, and than this share of the longest side, has gone astray
+unless it fits the image so well that its start must have been too small."""
+
+_GOOD_MISFIT = 0.15
+_MAX_GROWTH = 4.0
+_ENCLOSED_PX = 2.0
+"""Such a fit is repeated from where it got to. It still encloses where it started, but for so many px, and
+is at most so many times as large: the network draws the thin ends of far markings short."""
 
 _NOISE_MISFIT = 0.1
 """Share of the step up to the paint that noise and texture alone leave."""
@@ -98,6 +105,34 @@ def fit_quads(
         corners_px: starting corners, recorded px.
         blur_px: the point spread's standard deviation, pixel aperture included.
     """
+    fit = _fit_near(grey, owner, owner_stride, blobs, corners_px, blur_px)
+    grown = ~fit.settled & (fit.misfit < _GOOD_MISFIT) & _has_grown(corners_px, fit.corners_px)
+    if grown.any():
+        again = _fit_near(grey, owner, owner_stride, blobs[grown], fit.corners_px[grown], blur_px)
+        better = (again.misfit < _GOOD_MISFIT) & _has_grown(corners_px[grown], again.corners_px)
+        again.settled[~better] = False
+        for name, value in vars(fit).items():
+            value[grown] = getattr(again, name)
+    return fit
+
+
+def _has_grown(start: FloatArray, corners: FloatArray) -> BoolArray:
+    """Which quadrilaterals (M, 4, 2) enclose the smaller ones (M, 4, 2) that they come from."""
+    _, normal, _ = side_frames(corners)
+    outside_px = (normal[:, :, None] * (start[:, None] - corners[:, :, None])).sum(axis=-1).max(axis=(1, 2))
+    small = np.abs(signed_area(corners)) < _MAX_GROWTH * np.abs(signed_area(start))
+    return np.asarray(is_convex(corners) & (outside_px < _ENCLOSED_PX) & small)
+
+
+def _fit_near(
+    grey: GreyBand,
+    owner: np.ndarray,
+    owner_stride: int,
+    blobs: np.ndarray,
+    corners_px: FloatArray,
+    blur_px: float,
+) -> QuadFit:
+    """Fit quadrilaterals to what is within a few px of the sides of ``corners_px`` (M, 4, 2)."""
     patches = cut_patches(grey, owner, owner_stride, blobs, corners_px)
     start = corners_px - patches.origin_px[:, None]
     clipped = np.asarray(patches.clipped > _CLIPPED_SHARE)
