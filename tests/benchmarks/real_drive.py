@@ -30,11 +30,11 @@ from v2hdm.detection.batch import detect_all, read_image
 from v2hdm.detection.draw import draw_detections
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.drive import ReadOptions, read_drive
-from v2hdm.mapping.conclude import Optimised
+from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.mapping.sightings import collect_sightings, frames_of
-from v2hdm.mapping.views import views_of
+from v2hdm.mapping.sightings.table import collect_sightings, frames_of
+from v2hdm.mapping.sightings.views import views_of
 from v2hdm.records import (
     ARROW,
     LANE_DASH,

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2hdm.mapping.acceptance import Candidates, judge
+from v2hdm.mapping.markings.acceptance import Candidates, judge
 from v2hdm.mapping.options import AcceptanceOptions
 from v2hdm.records import CORNERED_CLASSES, LANE_DASH
 

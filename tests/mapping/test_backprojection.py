@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.mapping.scene import MOUNTS, SceneOptions, extrinsic, make_scene
 from v2hdm.detection.ground import ipm_from_extrinsic
-from v2hdm.mapping.backprojection import (
+from v2hdm.mapping.sightings.backprojection import (
     apply_homographies,
     direction_covariance,
     forward_ipm,
@@ -15,7 +15,7 @@ from v2hdm.mapping.backprojection import (
     plain_homographies,
     posed_homographies,
 )
-from v2hdm.mapping.views import project_ground
+from v2hdm.mapping.sightings.views import project_ground
 
 INTRINSIC = np.array([[900.0, 0, 640], [0, 900, 350], [0, 0, 1]])
 

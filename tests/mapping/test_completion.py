@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.mapping.completion import (
+from v2hdm.mapping.markings.completion import (
     SolvedCorners,
     complete_corners,
     solved_corners,

@@ -10,8 +10,8 @@ from tests.mapping.scene import SceneOptions, make_scene
 from v2hdm.mapping.corner_order import settle_corner_order
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.mapping.sightings import collect_sightings
-from v2hdm.mapping.views import views_of
+from v2hdm.mapping.sightings.table import collect_sightings
+from v2hdm.mapping.sightings.views import views_of
 
 
 def test_turned_sightings_are_found_and_turned_back() -> None:

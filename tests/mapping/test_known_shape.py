@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from v2hdm.mapping.association import FusedGroups
-from v2hdm.mapping.completion import SolvedCorners
-from v2hdm.mapping.known_shape import fit_shape, with_known_shapes
+from v2hdm.mapping.association.groups import FusedGroups
+from v2hdm.mapping.markings.completion import SolvedCorners
+from v2hdm.mapping.markings.known_shape import fit_shape, with_known_shapes
 
 DIAMOND = np.array([[0.6, 0.0], [0.0, 0.3], [-0.6, 0.0], [0.0, -0.3]])
 SIGMA = np.full(4, 0.01)

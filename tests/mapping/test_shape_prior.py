@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from v2hdm.mapping.completion import SolvedCorners
-from v2hdm.mapping.shape_prior import common_shape, fuse, with_class_shapes, without_guessed_lengths
+from v2hdm.mapping.markings.completion import SolvedCorners
+from v2hdm.mapping.markings.shape_prior import common_shape, fuse, with_class_shapes, without_guessed_lengths
 
 DIAMOND = np.array([[0.6, 0.0], [0.0, 0.35], [-0.6, 0.0], [0.0, -0.35]])
 DASH = np.array([[1.0, 0.06], [-1.0, 0.06], [-1.0, -0.06], [1.0, -0.06]])

@@ -21,12 +21,12 @@ from v2hdm.adjust import (
     with_model,
 )
 from v2hdm.errors import MappingError
-from v2hdm.mapping.association import Association
-from v2hdm.mapping.backprojection import camera_centres
-from v2hdm.mapping.location import Rig
+from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.motion import vehicle_twists
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.mapping.sightings import Sightings
+from v2hdm.mapping.sightings.backprojection import camera_centres
+from v2hdm.mapping.sightings.rig import Rig
+from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.records import BoolArray, Camera, FloatArray, PoseNoise
 
 IntArray = NDArray[np.int64]

@@ -12,11 +12,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.mapping.association import Association
+from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.shapes import SHIFTS
-from v2hdm.mapping.sightings import Sightings
-from v2hdm.mapping.views import project_ground
+from v2hdm.mapping.sightings.table import Sightings
+from v2hdm.mapping.sightings.views import project_ground
 from v2hdm.records import BoolArray, FloatArray
 
 IntArray = NDArray[np.int64]

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.mapping.completion import complete_corners
-from v2hdm.mapping.conclude import Optimised
+from v2hdm.mapping.markings.completion import complete_corners
+from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.results import GrowthStep
 

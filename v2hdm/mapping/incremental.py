@@ -21,19 +21,19 @@ from v2hdm.adjust.incremental import IncrementalMap, RigPrior, State
 from v2hdm.adjust.marking_fit import MarkingObservations, Noise
 from v2hdm.adjust.rigid import exp
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.mapping.acceptance import Candidates
-from v2hdm.mapping.association import Association
+from v2hdm.mapping.association.groups import Association
+from v2hdm.mapping.association.merge import group_kinds
 from v2hdm.mapping.bundle import HEAVE_SIGMA_M, centre_priors
-from v2hdm.mapping.completion import SolvedCorners, completed_corners
-from v2hdm.mapping.conclude import Seen, exclusions, judge_and_mend, no_marking_message, pair_keys
-from v2hdm.mapping.location import Rig
-from v2hdm.mapping.merge import group_kinds
+from v2hdm.mapping.markings.acceptance import Candidates
+from v2hdm.mapping.markings.completion import SolvedCorners, completed_corners
+from v2hdm.mapping.markings.conclude import Seen, exclusions, judge_and_mend, no_marking_message, pair_keys
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import Exclusion
 from v2hdm.mapping.shapes import align, diameters
-from v2hdm.mapping.sightings import Sightings
-from v2hdm.mapping.symbols import images_with_symbol
-from v2hdm.mapping.views import Views, easy_views, project_ground
+from v2hdm.mapping.sightings.rig import Rig
+from v2hdm.mapping.sightings.symbols import images_with_symbol
+from v2hdm.mapping.sightings.table import Sightings
+from v2hdm.mapping.sightings.views import Views, easy_views, project_ground
 from v2hdm.records import CORNERED_CLASSES, BoolArray, Camera, FloatArray, Marking, PoseNoise
 
 IntArray = NDArray[np.int64]

@@ -13,19 +13,19 @@ from dataclasses import replace
 
 from v2hdm.adjust import Status, observability
 from v2hdm.detection.ground import ipm_from_extrinsic
-from v2hdm.mapping.association import Association
+from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.mapping.conclude import Optimised
 from v2hdm.mapping.growth import grow_map
 from v2hdm.mapping.incremental import Grown
-from v2hdm.mapping.lane_points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
-from v2hdm.mapping.lanes import map_lanes
+from v2hdm.mapping.lanes.fuse import map_lanes
+from v2hdm.mapping.lanes.points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
+from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.naive import naive_markings
 from v2hdm.mapping.optimise import Optimiser, nearest_extrinsic
 from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
 from v2hdm.mapping.results import MethodResult
-from v2hdm.mapping.sightings import Sightings, camera_of, collect_sightings
-from v2hdm.mapping.views import views_of
+from v2hdm.mapping.sightings.table import Sightings, camera_of, collect_sightings
+from v2hdm.mapping.sightings.views import views_of
 from v2hdm.records import Calibration, Drive, FloatArray, HdMap, ImageDetections, Lane
 
 Progress = Callable[[str], None]

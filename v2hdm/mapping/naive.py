@@ -10,17 +10,17 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from v2hdm.mapping.association import Association, FusedGroups, keep_rows
-from v2hdm.mapping.backprojection import (
+from v2hdm.mapping.association.groups import Association, FusedGroups, keep_rows
+from v2hdm.mapping.association.merge import group_kinds, merge_groups
+from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.results import Exclusion
+from v2hdm.mapping.shapes import is_convex
+from v2hdm.mapping.sightings.backprojection import (
     apply_homographies,
     forward_ipm,
     plain_homographies,
 )
-from v2hdm.mapping.merge import group_kinds, merge_groups
-from v2hdm.mapping.options import MappingOptions
-from v2hdm.mapping.results import Exclusion
-from v2hdm.mapping.shapes import is_convex
-from v2hdm.mapping.sightings import Sightings
+from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.planar import inside_convex
 from v2hdm.records import CORNERED_CLASSES, BoolArray, Camera, FloatArray, Marking
 

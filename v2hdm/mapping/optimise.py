@@ -19,17 +19,18 @@ from numpy.typing import NDArray
 from v2hdm.adjust import Status, select_model
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.geometry.ground import extrinsic_from_ipm
-from v2hdm.mapping.association import Association, fuse_groups, same_groups
+from v2hdm.mapping.association.groups import Association, fuse_groups, same_groups
+from v2hdm.mapping.association.merge import merge_groups
+from v2hdm.mapping.association.tracks import Uncertainty, build_tracks
 from v2hdm.mapping.bundle import Bundle, coarse_model, full_model, solve_bundle
-from v2hdm.mapping.conclude import Evidence, Optimised, conclude
 from v2hdm.mapping.corner_order import settle_corner_order
 from v2hdm.mapping.incremental import Grown, IncrementalMapper
-from v2hdm.mapping.location import Located, Rig, build_rig, locate
-from v2hdm.mapping.merge import merge_groups
+from v2hdm.mapping.markings.conclude import Evidence, Optimised, conclude
 from v2hdm.mapping.options import AUTO, MappingOptions
-from v2hdm.mapping.sightings import Sightings
-from v2hdm.mapping.tracks import Uncertainty, build_tracks
-from v2hdm.mapping.views import Views
+from v2hdm.mapping.sightings.location import Located, locate
+from v2hdm.mapping.sightings.rig import Rig, build_rig
+from v2hdm.mapping.sightings.table import Sightings
+from v2hdm.mapping.sightings.views import Views
 from v2hdm.records import BoolArray, Camera, CameraInfo, FloatArray, PoseNoise
 
 IntArray = NDArray[np.int64]

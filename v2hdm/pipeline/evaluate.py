@@ -14,8 +14,8 @@ from v2hdm.mapping.methods import run_naive
 from v2hdm.mapping.optimise import Optimiser, nearest_extrinsic
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import MethodResult
-from v2hdm.mapping.sightings import collect_sightings
-from v2hdm.mapping.views import views_of
+from v2hdm.mapping.sightings.table import collect_sightings
+from v2hdm.mapping.sightings.views import views_of
 from v2hdm.records import Drive, HdMap, ImageDetections, Truth
 from v2hdm.report.evaluation import extrinsic_figures, growth_figures, headline, map_figures
 from v2hdm.report.metrics import driven_past

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.mapping.lane_bridges import bridge_paths
-from v2hdm.mapping.lane_paths import Path, join_paths, string_nodes
-from v2hdm.mapping.lane_points import LaneCloud
+from v2hdm.mapping.lanes.bridges import bridge_paths
+from v2hdm.mapping.lanes.paths import Path, join_paths, string_nodes
+from v2hdm.mapping.lanes.points import LaneCloud
+from v2hdm.mapping.lanes.ridges import find_nodes
 from v2hdm.mapping.options import LaneOptions
-from v2hdm.mapping.ridges import find_nodes
 from v2hdm.records import LANE_DASH, LANE_LINE, FloatArray, Lane
 
 _LEAST_LENGTH_M = 6.0

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from v2hdm.detection.lens import has_distortion, undistort_points
 from v2hdm.errors import MappingError
-from v2hdm.mapping.symbols import NO_SYMBOLS, Symbols, collect_symbols
+from v2hdm.mapping.sightings.symbols import NO_SYMBOLS, Symbols, collect_symbols
 from v2hdm.records import (
     CORNERED_CLASSES,
     BoolArray,

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from v2hdm.mapping.location import Rig
-from v2hdm.mapping.sightings import frames_of
+from v2hdm.mapping.sightings.rig import Rig
+from v2hdm.mapping.sightings.table import frames_of
 from v2hdm.planar import inside_convex
 from v2hdm.records import Camera, Drive, FloatArray
 

@@ -12,8 +12,8 @@ import itertools
 import numpy as np
 from scipy.spatial import cKDTree
 
-from v2hdm.mapping.lane_paths import Path
-from v2hdm.mapping.lane_points import Guides
+from v2hdm.mapping.lanes.paths import Path
+from v2hdm.mapping.lanes.points import Guides
 from v2hdm.mapping.options import LaneOptions
 from v2hdm.records import FloatArray
 

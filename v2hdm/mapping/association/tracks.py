@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from v2hdm.mapping.association import Association
-from v2hdm.mapping.location import Located, Rig
+from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.options import AssociationOptions
 from v2hdm.mapping.shapes import SHIFTS, align, diameters
-from v2hdm.mapping.sightings import Sightings
+from v2hdm.mapping.sightings.location import Located
+from v2hdm.mapping.sightings.rig import Rig
+from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.records import BoolArray, FloatArray
 
 IntArray = NDArray[np.int64]

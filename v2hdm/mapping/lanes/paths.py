@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from v2hdm.mapping.lanes.ridges import Nodes
 from v2hdm.mapping.options import LaneOptions
-from v2hdm.mapping.ridges import Nodes
 from v2hdm.records import BoolArray, FloatArray
 
 IntArray = NDArray[np.int64]

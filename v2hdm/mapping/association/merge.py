@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from v2hdm.mapping.association import Association, FusedGroups
+from v2hdm.mapping.association.groups import Association, FusedGroups
 from v2hdm.mapping.shapes import align, diameters
-from v2hdm.mapping.sightings import Sightings
+from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.records import FloatArray
 
 IntArray = NDArray[np.int64]

@@ -9,19 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.errors import MappingError
-from v2hdm.mapping.acceptance import LACKS_A_CORNER, ODD_SHAPE, Candidates, judge
-from v2hdm.mapping.association import Association, fuse_groups, vague_corners
+from v2hdm.mapping.association.groups import Association, fuse_groups, vague_corners
+from v2hdm.mapping.association.merge import group_kinds
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.mapping.completion import SolvedCorners, solved_corners, without_misplaced_corners
-from v2hdm.mapping.known_shape import with_known_shapes
-from v2hdm.mapping.location import Rig, locate
-from v2hdm.mapping.merge import group_kinds
+from v2hdm.mapping.markings.acceptance import LACKS_A_CORNER, ODD_SHAPE, Candidates, judge
+from v2hdm.mapping.markings.completion import SolvedCorners, solved_corners, without_misplaced_corners
+from v2hdm.mapping.markings.known_shape import with_known_shapes
+from v2hdm.mapping.markings.shape_prior import with_class_shapes, without_guessed_lengths
 from v2hdm.mapping.options import AcceptanceOptions
 from v2hdm.mapping.results import Exclusion
-from v2hdm.mapping.shape_prior import with_class_shapes, without_guessed_lengths
-from v2hdm.mapping.sightings import Sightings
-from v2hdm.mapping.symbols import images_with_symbol
-from v2hdm.mapping.views import Views, easy_views, project_ground
+from v2hdm.mapping.sightings.location import locate
+from v2hdm.mapping.sightings.rig import Rig
+from v2hdm.mapping.sightings.symbols import images_with_symbol
+from v2hdm.mapping.sightings.table import Sightings
+from v2hdm.mapping.sightings.views import Views, easy_views, project_ground
 from v2hdm.records import CORNERED_CLASSES, BoolArray, Calibration, Camera, FloatArray, Marking
 
 IntArray = NDArray[np.int64]

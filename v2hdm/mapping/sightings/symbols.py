@@ -8,18 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.detection.lens import undistort_points
-from v2hdm.mapping.backprojection import apply_homographies, posed_homographies
+from v2hdm.mapping.sightings.backprojection import apply_homographies, posed_homographies
+from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.records import OUTLINED_CLASSES, Drive, FloatArray, ImageDetections
-
-if TYPE_CHECKING:
-    from v2hdm.mapping.location import Rig
 
 IntArray = NDArray[np.int64]
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from v2hdm.mapping.lane_points import LaneCloud
+from v2hdm.mapping.lanes.points import LaneCloud
 from v2hdm.mapping.options import LaneOptions
 from v2hdm.records import FloatArray
 

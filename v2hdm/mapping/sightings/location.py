@@ -2,43 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.mapping.backprojection import (
+from v2hdm.mapping.sightings.backprojection import (
     apply_homographies,
     camera_centres,
     direction_covariance,
     homography_jacobians,
     posed_homographies,
 )
-from v2hdm.mapping.sightings import Sightings
-from v2hdm.records import CameraInfo, FloatArray
+from v2hdm.mapping.sightings.rig import Rig
+from v2hdm.mapping.sightings.table import Sightings
+from v2hdm.records import FloatArray
 
 IntArray = NDArray[np.int64]
 
 # Half the trace of a ground covariance beyond which a point is as good as on the horizon, m^2.
 _HORIZON_M2 = 1e4
-
-
-@dataclass(frozen=True)
-class Rig:
-    """Cameras and frames as the mapping currently believes them to be.
-
-    ``intrinsic`` (C, 3, 3), ``cam_from_vehicle`` (C, 4, 4), ``map_from_vehicle`` (F, 4, 4).
-    """
-
-    intrinsic: FloatArray
-    cam_from_vehicle: FloatArray
-    map_from_vehicle: FloatArray
-
-    @property
-    def height_m(self) -> FloatArray:
-        """Heights (C,) of the camera centres above the ground of the vehicle."""
-        return np.asarray(np.maximum(camera_centres(self.cam_from_vehicle)[:, 2], 0.1))
 
 
 @dataclass(frozen=True)
@@ -69,17 +52,6 @@ class Located:
     def direction_covariance_m2(self, sigma_rad: float) -> FloatArray:
         """What an uncertain viewing direction adds to ``covariance_m2``: (S, 4, 2, 2)."""
         return direction_covariance(self.ray_map, self.height_m[:, None], sigma_rad)
-
-
-def build_rig(
-    infos: Mapping[str, CameraInfo], cam_from_vehicle: Mapping[str, FloatArray], map_from_vehicle: FloatArray
-) -> Rig:
-    """Stack cameras in the order of ``infos`` with the frames' poses (F, 4, 4)."""
-    return Rig(
-        intrinsic=np.stack([info.intrinsic for info in infos.values()]),
-        cam_from_vehicle=np.stack([cam_from_vehicle[name] for name in infos]),
-        map_from_vehicle=map_from_vehicle,
-    )
 
 
 def locate(sightings: Sightings, rig: Rig) -> Located:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.mapping.association import FusedGroups
-from v2hdm.mapping.completion import SolvedCorners
-from v2hdm.mapping.shape_prior import SHAPE_SIGMA_M, class_shapes, miss_limit_m, rigid_onto
+from v2hdm.mapping.association.groups import FusedGroups
+from v2hdm.mapping.markings.completion import SolvedCorners
+from v2hdm.mapping.markings.shape_prior import SHAPE_SIGMA_M, class_shapes, miss_limit_m, rigid_onto
 from v2hdm.records import FloatArray
 
 IntArray = NDArray[np.int64]

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from v2hdm.mapping.acceptance import characteristic_lengths
-from v2hdm.mapping.completion import SolvedCorners
+from v2hdm.mapping.markings.acceptance import characteristic_lengths
+from v2hdm.mapping.markings.completion import SolvedCorners
 from v2hdm.records import FloatArray
 
 IntArray = NDArray[np.int64]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.detection.lens import undistort_points
-from v2hdm.mapping.backprojection import (
+from v2hdm.mapping.sightings.backprojection import (
     apply_homographies,
     camera_centres,
     direction_covariance,
@@ -18,8 +18,8 @@ from v2hdm.mapping.backprojection import (
     plain_homographies,
     posed_homographies,
 )
-from v2hdm.mapping.location import Rig
-from v2hdm.mapping.sightings import frames_of
+from v2hdm.mapping.sightings.rig import Rig
+from v2hdm.mapping.sightings.table import frames_of
 from v2hdm.records import (
     LANE_BOUNDARY,
     LANE_CLASSES,

@@ -8,7 +8,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.mapping.location import Located
+from v2hdm.mapping.sightings.location import Located
 from v2hdm.records import BoolArray, FloatArray
 
 IntArray = NDArray[np.int64]

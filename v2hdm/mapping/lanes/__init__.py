@@ -1,0 +1,1 @@
+"""Lane paint of all images, fused into polylines."""

@@ -1,0 +1,1 @@
+"""What was seen, as one table, and where it lies on the ground under a rig."""
