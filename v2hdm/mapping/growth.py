@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.mapping.markings.completion import complete_corners
+from v2hdm.mapping.markings.completion import solved_corners
 from v2hdm.mapping.markings.conclude import Optimised
+from v2hdm.mapping.markings.shape_prior import with_class_shapes
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.results import GrowthStep
+from v2hdm.records import CORNERED_CLASSES, Marking
 
 IntArray = NDArray[np.int64]
 
@@ -27,7 +29,8 @@ def grow_map(
 
     Markings count in the order in which the drive first saw them; n grows geometrically, since most
     happens early. Associations and accepted observations are those of the whole drive; each solve
-    starts from the initial extrinsics. ``progress`` is called with (done, total).
+    starts from the initial extrinsics, and its corners are fused with the shapes of their classes.
+    ``progress`` is called with (done, total).
     """
     order = _order_of_sight(optimised)
     counts = growth_counts(len(order), steps)
@@ -36,9 +39,13 @@ def grow_map(
         if progress:
             progress(len(out), len(counts))
         chosen = order[:count]
-        whole = count == len(order)
-        bundle = optimised.bundle if whole else optimiser.solve_groups(optimised, optimised.groups[chosen])
-        out.append(_step(bundle, optimised, chosen, optimiser.camera_names))
+        if count == len(order):
+            bundle, markings = optimised.bundle, tuple(optimised.markings[m] for m in order)
+        else:
+            bundle = optimiser.solve_groups(optimised, optimised.groups[chosen])
+            markings = _markings(bundle, optimised, chosen)
+        extrinsics = bundle.rig.cam_from_vehicle
+        out.append(GrowthStep(markings, dict(zip(optimiser.camera_names, extrinsics, strict=True))))
     return tuple(out)
 
 
@@ -57,14 +64,15 @@ def _order_of_sight(optimised: Optimised) -> IntArray:
     return np.argsort(first[optimised.groups], kind="stable")
 
 
-def _step(bundle: Bundle, optimised: Optimised, chosen: IntArray, names: tuple[str, ...]) -> GrowthStep:
-    """The map so far; markings that only the shape of their class can place are left out of it."""
-    corners = complete_corners(bundle.corners_map[optimised.groups[chosen]])
-    return GrowthStep(
-        markings=tuple(
-            replace(optimised.markings[m], corners_map=corners[row], covariance_m2=None)
-            for row, m in enumerate(chosen)
-            if np.isfinite(corners[row]).all()
-        ),
-        cam_from_vehicle={name: bundle.rig.cam_from_vehicle[c] for c, name in enumerate(names)},
+def _markings(bundle: Bundle, optimised: Optimised, chosen: IntArray) -> tuple[Marking, ...]:
+    """The map so far; markings of too few corners, which the whole map's shapes would place, are left out."""
+    solved = solved_corners(bundle)
+    groups = optimised.groups[chosen]
+    whole = np.isfinite(solved.corners_map[groups]).all(axis=(1, 2))
+    kind = np.zeros(bundle.association.count, dtype=np.int64)
+    kind[optimised.groups] = [CORNERED_CLASSES.index(marking.kind) for marking in optimised.markings]
+    fused = with_class_shapes(solved, kind, groups[whole])
+    return tuple(
+        replace(optimised.markings[m], corners_map=fused.corners_map[g], covariance_m2=fused.covariance_m2[g])
+        for m, g in zip(chosen[whole], groups[whole], strict=True)
     )
