@@ -20,21 +20,19 @@ from numpy.typing import NDArray
 from v2hdm.adjust.incremental import IncrementalMap, RigPrior, State
 from v2hdm.adjust.marking_fit import MarkingObservations, Noise
 from v2hdm.adjust.rigid import exp
-from v2hdm.errors import AdjustError, MappingError
+from v2hdm.errors import AdjustError
 from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.association.merge import group_kinds
 from v2hdm.mapping.bundle import HEAVE_SIGMA_M, centre_priors
-from v2hdm.mapping.markings.acceptance import Candidates
 from v2hdm.mapping.markings.completion import SolvedCorners, completed_corners
-from v2hdm.mapping.markings.conclude import Seen, exclusions, judge_and_mend, no_marking_message, pair_keys
+from v2hdm.mapping.markings.verdict import Seen, judge_and_mend
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import Exclusion
 from v2hdm.mapping.shapes import align, diameters
 from v2hdm.mapping.sightings.rig import Rig
-from v2hdm.mapping.sightings.symbols import images_with_symbol
 from v2hdm.mapping.sightings.table import Sightings
-from v2hdm.mapping.sightings.views import Views, easy_views, project_ground
-from v2hdm.records import CORNERED_CLASSES, BoolArray, Camera, FloatArray, Marking, PoseNoise
+from v2hdm.mapping.sightings.views import Views, project_ground
+from v2hdm.records import BoolArray, Camera, FloatArray, Marking, PoseNoise
 
 IntArray = NDArray[np.int64]
 
@@ -320,25 +318,21 @@ class IncrementalMapper:
         """Judge the markings as the batch does."""
         rig = self._present_rig()
         row, group, residual_px, agrees = self._residuals(association, usable, rig)
-        judged = judge_and_mend(
-            self._solved(),
-            lambda solved: self._candidates(solved, association, rig, views, (row, group, agrees)),
-            Seen(association, self._sightings, rig, self._jitter_rad),
-            self._options.acceptance,
+        share = np.bincount(group[agrees], minlength=association.count)
+        seen = Seen(
+            association=association,
+            kind=np.array([place.kind for place in self._places], dtype=np.int64),
+            sightings=self._sightings,
+            rig=rig,
+            views=views,
+            cameras=tuple(self._cameras),
+            jitter_rad=self._jitter_rad,
+            row=row,
+            group=group,
+            inlier_share=share / np.maximum(np.bincount(group, minlength=association.count), 1),
         )
-        candidates, excluded = judged.candidates, exclusions(judged.candidates, judged.verdict)
-        if not len(judged.accepted):
-            raise MappingError(no_marking_message(excluded))
-        markings = tuple(
-            Marking(
-                CORNERED_CLASSES[candidates.kind[group]],
-                judged.solved.corners_map[group],
-                int(candidates.sightings[group]),
-                judged.solved.covariance_m2[group],
-            )
-            for group in judged.accepted
-        )
-        return Grown(self.grown, rig, markings, tuple(excluded), residual_px)
+        judged = judge_and_mend(self._solved(), seen, self._options.acceptance)
+        return Grown(self.grown, rig, judged.markings(), judged.exclusions(), residual_px)
 
     def _solved(self) -> SolvedCorners:
         """All corners and their covariances, a missing fourth corner completed."""
@@ -371,30 +365,3 @@ class IncrementalMapper:
         noise = sightings.covariance_px[row, own] + jitter_px**2 * np.eye(2)
         squared = np.sum(residual * np.linalg.solve(noise, residual[..., None])[..., 0], axis=1)
         return row, group, residual, squared < _INLIER_SQUARED
-
-    def _candidates(
-        self,
-        solved: SolvedCorners,
-        association: Association,
-        rig: Rig,
-        views: Views,
-        observed: tuple[IntArray, IntArray, BoolArray],
-    ) -> Candidates:
-        """What the verdict on the corners ``solved`` rests on, given what was ``observed``."""
-        count, (row, group, agrees) = association.count, observed
-        variance = np.diagonal(solved.covariance_m2, axis1=1, axis2=2).reshape(-1, 4, 2).sum(axis=2)
-        seen = np.unique(np.stack([group, self._sightings.image[row]]), axis=1)
-        easy = np.stack(easy_views(views, rig, self._cameras, solved.corners_map))
-        found = np.isin(pair_keys(easy), pair_keys(seen))
-        return Candidates(
-            kind=np.array([place.kind for place in self._places], dtype=np.int64),
-            corners_map=solved.corners_map,
-            completed=solved.completed,
-            sigma_m=np.sqrt(np.max(variance, axis=1)),
-            sightings=np.bincount(seen[0], minlength=count),
-            inlier_share=np.bincount(group[agrees], minlength=count)
-            / np.maximum(np.bincount(group, minlength=count), 1),
-            easy_views=np.bincount(easy[0], minlength=count),
-            easy_detections=np.bincount(easy[0, found], minlength=count),
-            seen_as_symbol=images_with_symbol(self._sightings.symbols, rig, solved.corners_map.mean(axis=1)),
-        )
