@@ -36,10 +36,10 @@ from v2hdm.records import (
     FloatArray,
     MarkingDetection,
 )
-from v2hdm.simulate.render import Rendered, Renderer
-from v2hdm.simulate.scene import Scene
-from v2hdm.simulate.training_scenes import image_points, random_scene
-from v2hdm.simulate.training_views import TrainingView, random_view
+from v2hdm.simulate.render.renderer import Rendered, Renderer
+from v2hdm.simulate.render.scene import Scene
+from v2hdm.simulate.training.scenes import image_points, random_scene
+from v2hdm.simulate.training.views import TrainingView, random_view
 
 SEED = 771_000_003
 """No training or validation seed, whatever their index: those start from single-digit seeds."""
@@ -91,9 +91,9 @@ class Example:
     lanes_shown: list[bool] = field(default_factory=list)
 
 
-def example(index: int, difficulty: float = 1.0) -> Example:
-    """Example ``index`` of the fixed set."""
-    rng = np.random.default_rng([SEED, index])
+def example(index: int, difficulty: float = 1.0, seed: int = SEED) -> Example:
+    """Example ``index`` of the fixed set, or of that of another ``seed``."""
+    rng = np.random.default_rng([seed, index])
     scene, lanes = random_scene(rng, difficulty)
     view = random_view(rng, WIDTH, HEIGHT)
     rendered = Renderer(scene).render(view.info, view.cam_from_map, rng, view.optics, view.motion)
@@ -206,7 +206,7 @@ class Tally:
         free = set(range(len(truth)))
         for detection in sorted(given, key=lambda d: -d.score):
             quad = detection.outline_px if len(detection.outline_px) else detection.corners_px
-            overlap = {k: _overlap(quad, truth[k].polygon_px) for k in range(len(truth))}
+            overlap = {k: polygon_overlap(quad, truth[k].polygon_px) for k in range(len(truth))}
             best = max(
                 (k for k in free if truth[k].kind == detection.kind), key=overlap.__getitem__, default=-1
             )
@@ -278,7 +278,7 @@ def _at_rows(line: FloatArray, rows: FloatArray) -> FloatArray:
     return np.interp(rows, line[order, 1], line[order, 0], left=np.nan, right=np.nan)
 
 
-def _overlap(first: FloatArray, second: FloatArray) -> float:
+def polygon_overlap(first: FloatArray, second: FloatArray) -> float:
     """Intersection over union of the hulls of two polygons."""
     a, b = (cv2.convexHull(p.astype(np.float32))[:, 0].astype(np.float64) for p in (first, second))
     common, first_area, second_area = (abs(float(signed_area(p))) for p in (clip_convex(a, b), a, b))

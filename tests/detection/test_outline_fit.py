@@ -1,10 +1,14 @@
 """Corners from the outline alone: right, honest about it, refused where it is no quadrilateral."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tests.detection.pictures import diamond, make_camera, to_image
-from v2hdm.detection.corners import Foreground, QuadStart, fit_markings
+from v2hdm.detection.corners import QuadStart, fit_markings
+from v2hdm.detection.evidence import Claim
+from v2hdm.detection.foreground import Foreground
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.outline_fit import fit_outlines
 from v2hdm.detection.quad import order_corners
@@ -65,11 +69,12 @@ def fitted_on_a_blank_image(quad_vehicle: np.ndarray) -> tuple[np.ndarray, list[
     view = CameraView(camera)
     corners_px = to_image(camera, quad_vehicle)
     quad = order_corners(view.undistort(corners_px))
-    start = QuadStart("diamond", 0.9, quad, 0, outline_of(quad, 0.1))
+    start = QuadStart("diamond", Claim(0.9, 1.0, False), quad, 0, outline_of(quad, 0.1))
     blank = np.full((camera.info.height, camera.info.width, 3), 90, dtype=np.uint8)
     owner = np.zeros((view.height // 2, camera.info.width // 2), dtype=np.int16)
-    foreground = Foreground(owner, 2, view.top)
-    return view.distort(quad), fit_markings(blank, view, [start], foreground, DetectorOptions.for_mapping())
+    foreground = Foreground(np.zeros(owner.shape, np.float32), owner, 2, view.top)
+    options = replace(DetectorOptions.for_mapping(), min_confidence=0.0)
+    return view.distort(quad), fit_markings(blank, view, [start], foreground, options)
 
 
 def test_a_marking_without_edges_in_the_image_takes_the_corners_of_its_outline() -> None:

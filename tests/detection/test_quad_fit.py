@@ -7,9 +7,11 @@ from tests.detection.pictures import brightness_model, diamond, make_camera, pic
 from tests.detection.test_corners import errors_px, normalised
 from v2hdm.detection.correlation import variance_inflation
 from v2hdm.detection.detector import Detector
+from v2hdm.detection.grey import linear_grey
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.quad import intersect_sides, order_corners, side_frames
 from v2hdm.detection.quad_covariance import corner_covariance
+from v2hdm.detection.quad_fit import fit_quads
 
 SHAPES = [diamond(x, y, 1.2, 0.7, 9.0 * y) for x in (6.0, 8.0, 10.0) for y in (-1.9, -0.3, 1.4)]
 
@@ -48,6 +50,34 @@ def test_a_blur_that_is_not_the_usual_one_is_found(model, blur_px):
     errors, _, asked = fitted(model, blur_px=blur_px)
     assert len(errors) > 0.9 * asked
     assert np.median(np.linalg.norm(errors, axis=1)) < 0.1
+
+
+@pytest.mark.parametrize("kept", [0.7, 0.5])
+def test_a_marking_that_the_network_draws_small_is_fitted_as_a_whole(kept):
+    """Blur takes the thin ends of far markings: the start is that much of the diamond, the fit all of it."""
+    true_px, fit, moved_px = fitted_from(
+        diamond(12.0, 0.0, 0.7, 1.4), diamond(12.0, 0.0, 0.7 * kept, 1.4 * kept)
+    )
+    assert moved_px > 9
+    assert fit.settled[0]
+    assert np.abs(fit.corners_px[0] - true_px).max() < 0.3
+
+
+def test_a_fit_that_leaves_its_start_behind_has_not_settled():
+    """The start lies beside the only marking there is: to reach it the fit would have to wander off."""
+    true_px, fit, _ = fitted_from(diamond(12.0, 0.0, 0.7, 1.4), diamond(12.0, 1.0, 0.7, 0.8))
+    assert not (fit.settled[0] and np.abs(fit.corners_px[0] - true_px).max() < 5)
+
+
+def fitted_from(shape, start):
+    """True corners, the fit of a drawn shape from that of a start, and how far that was off at most."""
+    camera = make_camera("pinhole")
+    true_px, start_px = (order_corners(to_image(camera, s)) for s in (shape, start))
+    box = np.array([[0, 0, camera.info.width, camera.info.height]])
+    grey = linear_grey(picture(camera, [shape]), 0, camera.info.height, box, False)
+    owner = np.zeros((camera.info.height // 2, camera.info.width // 2), dtype=np.int16)
+    fit = fit_quads(grey, owner, 2, np.array([0]), start_px[None], 0.75)
+    return true_px, fit, np.abs(true_px - start_px).max()
 
 
 def test_the_covariance_of_corners_is_that_of_scattered_lines():

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from v2hdm.detection.pieces import settle_pieces
 from v2hdm.detection.sight import Sight
 from v2hdm.records import (
     ARROW,
@@ -41,7 +42,7 @@ _LEAST_SHARE = np.array([0.25 if group == _SYMBOLS else 0.15 for group in _GROUP
 """Where two groups of classes hold this much of a blob, two markings touch. The head is more of an arrow."""
 
 _LEAST_QUAD_CELLS = 30
-_LEAST_CONVEXITY = 0.9
+_LEAST_CONVEXITY = 0.82
 """What a quadrilateral's contour fills of its hull, and its hull of four straight sides."""
 
 _OUTLINE_SCALE = 4
@@ -90,7 +91,7 @@ def find_blobs(
     # A frame of no paint around it lets every outline close.
     level = np.pad(sight.paint, 1, constant_values=-1.0)
     corner_px = np.array([(stride - 1) / 2 - stride, (stride - 1) / 2 - stride + top_px])
-    contours, piece = _connected(level, (reach_px - top_px) / stride + 1)
+    level, contours, piece = _connected(level, (reach_px - top_px) / stride + 1)
     said = _hearsay(sight, classes, piece, level, len(contours))
     outlines = _outlines(level, piece, len(contours))
     number = np.zeros(len(contours) + 1, dtype=np.int16)
@@ -116,14 +117,18 @@ def find_blobs(
     return blobs, owner[1:-1, 1:-1]
 
 
-def _connected(level: np.ndarray, least_row: float) -> tuple[list[np.ndarray], np.ndarray]:
-    """Contours of paint that reaches ``least_row``, and a map of 1 + the number of each, holes filled."""
+def _connected(level: np.ndarray, least_row: float) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
+    """Contours of paint that reaches ``least_row``, and a map of 1 + the number of each, holes filled.
+
+    They are zero crossings of the level that comes first.
+    """
     contours, _ = cv2.findContours((level > 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     kept = [c for c in contours if len(c) >= 4 and c[:, 0, 1].max() + 1 >= least_row]
+    level, kept = settle_pieces(level, kept)
     piece = np.zeros(level.shape, dtype=np.int16)
     for index, contour in enumerate(kept):
         cv2.drawContours(piece, [contour], -1, index + 1, cv2.FILLED)
-    return kept, piece
+    return level, kept, piece
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from v2hdm.detection.confidence import confidence
 from v2hdm.detection.edge_fit import EdgeFit, fit_edges
+from v2hdm.detection.evidence import Claim, gather, grey_steps
+from v2hdm.detection.foreground import Foreground
 from v2hdm.detection.grey import GreyBand, linear_grey
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.outline_fit import fit_outlines
@@ -51,23 +54,14 @@ _CLOSURE = np.array([1.0, -1.0, 1.0, -1.0])
 class QuadStart:
     """A blob's quadrilateral ``corners_pinhole_px`` (4, 2) before refinement.
 
-    ``blob`` is the blob's index, ``outline_pinhole_px`` (N, 2) its outline.
+    ``claim`` is the network's, ``blob`` the blob's index, ``outline_pinhole_px`` (N, 2) its outline.
     """
 
     kind: str
-    score: float
+    claim: Claim
     corners_pinhole_px: FloatArray
     blob: int
     outline_pinhole_px: FloatArray
-
-
-@dataclass(frozen=True)
-class Foreground:
-    """Which blob owns each logit: ``owner`` (h, w) 1 + index or 0, ``stride`` px apart, from row ``top``."""
-
-    owner: np.ndarray
-    stride: int
-    top: int
 
 
 @dataclass
@@ -92,7 +86,7 @@ def fit_markings(
 ) -> list[MarkingDetection]:
     """Refine the corners of one image's markings; where that fails they are those of the start, not valid.
 
-    Markings without two valid corners are kept if ``options.min_score_unfitted`` allows it.
+    Markings are kept if the evidence for them reaches ``options.min_confidence``.
     """
     if not starts:
         return []
@@ -116,17 +110,22 @@ def fit_markings(
     if far.any():
         shared = _Far(foreground, blobs, view, blur_px or TYPICAL_BLUR_PX)
         overexposed = _take_quads(found, np.flatnonzero(far), grey, shared, 0.0)
-        if options.vague_corners and len(overexposed):
+        if len(overexposed):
             _take_quads(found, overexposed, grey.at_limit(), shared, _BLOOM_SIGMA_PX)
+            found.valid[overexposed] &= options.vague_corners
     found.covariance = _COVARIANCE_FACTOR * found.covariance + _COVARIANCE_FLOOR_PX**2 * np.eye(8)
+    steps = grey_steps(grey, found.px)
+    found.valid &= ~steps.runs_on()
     _reject(found, view, options)
+    kinds, claims = [s.kind for s in starts], [s.claim for s in starts]
+    score = confidence(gather(steps, foreground, view, found.px, kinds, claims, found.valid))
     if options.vague_corners:
         _take_outlines(found, start, [s.outline_pinhole_px for s in starts], view, options)
         found.valid[_is_cut(found, view)] = False
     return [
-        MarkingDetection(s.kind, s.score, found.px[m], found.covariance[m], found.valid[m])
-        for m, s in enumerate(starts)
-        if np.count_nonzero(found.valid[m]) >= 2 or s.score >= options.min_score_unfitted
+        MarkingDetection(kind, float(score[m]), found.px[m], found.covariance[m], found.valid[m])
+        for m, kind in enumerate(kinds)
+        if score[m] >= options.min_confidence
     ]
 
 

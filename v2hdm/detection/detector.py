@@ -9,11 +9,13 @@ import numpy as np
 
 from v2hdm.detection.anchors import link_anchors
 from v2hdm.detection.blobs import Blob, find_blobs, outline_polygon
-from v2hdm.detection.corners import Foreground, QuadStart, fit_markings
+from v2hdm.detection.corners import QuadStart, fit_markings
+from v2hdm.detection.evidence import Claim
+from v2hdm.detection.foreground import Foreground
 from v2hdm.detection.lanes import LanePaint, trace_lanes
 from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.plausible import Heads, ends_at_a_head, plausible_kind
+from v2hdm.detection.plausible import Heads, cornered_kind, ends_at_a_head, plausible_kind
 from v2hdm.detection.quad import is_convex
 from v2hdm.detection.sight import look
 from v2hdm.detection.starts import starting_corners
@@ -21,7 +23,6 @@ from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.view import CameraView
 from v2hdm.errors import DetectorError
 from v2hdm.records import (
-    CORNERED_CLASSES,
     DIAMOND,
     LANE_CLASSES,
     LANE_DASH,
@@ -38,6 +39,9 @@ _HEADS = (*OUTLINED_CLASSES, OTHER_PAINT, DIAMOND)
 
 _LEAST_COVER = 0.6
 """A blob that shares less than this with the best quadrilateral around it is none."""
+
+_LEAST_SCORE = 0.2
+"""Blobs of a lower mean class probability are not worth a look; what the image shows decides on others."""
 
 
 @dataclass(frozen=True)
@@ -91,12 +95,13 @@ class Detector:
             blobs, owner = find_blobs(sight, info.classes, info.paint_stride, view.top, reach_px)
             candidates = self._candidates(blobs, view)
         with lap("lanes"):
-            paint = [LanePaint(c.blob, c.kind, c.score) for c in candidates if c.kind in LANE_CLASSES]
-            lanes = trace_lanes(paint, view, self.options.lane_step_m, self.options.max_range_m)
+            lanes = trace_lanes(
+                self._lane_paint(candidates), view, self.options.lane_step_m, self.options.max_range_m
+            )
             lanes += link_anchors(sight.anchors, view, lanes, self.options.lane_step_m)
         with lap("corners"):
             starts = self._starts(candidates, view)
-            foreground = Foreground(owner, info.paint_stride, view.top)
+            foreground = Foreground(sight.paint, owner, info.paint_stride, view.top)
             markings = fit_markings(image_bgr, view, starts, foreground, self.options)
             markings += [symbol for c in candidates if (symbol := self._symbol(c, view)) is not None]
         return tuple(markings), tuple(lanes)
@@ -120,22 +125,33 @@ class Detector:
         candidates = []
         for index, (blob, outline) in enumerate(zip(blobs, np.split(outlines, ends), strict=True)):
             found = plausible_kind(blob, on_ground[index], view)
-            if found is None or found[1] < self.options.min_score:
+            if found is None or found[1] < min(_LEAST_SCORE, self.options.min_score):
                 continue
             if found[0] == LANE_DASH and ends_at_a_head(on_ground[index], heads):
                 continue  # the shaft of an arrow, parted from its head by wear
             candidates.append(_Candidate(blob, index, *found, outline, on_ground[index]))
         return candidates
 
+    def _lane_paint(self, candidates: list[_Candidate]) -> list[LanePaint]:
+        return [
+            LanePaint(c.blob, c.kind, c.score)
+            for c in candidates
+            if c.kind in LANE_CLASSES
+            and c.score >= self.options.min_score
+            # Else it is the shaft of an arrow, the stroke of a letter.
+            and not (c.kind == LANE_DASH and c.blob.touches_symbol)
+        ]
+
     def _starts(self, candidates: list[_Candidate], view: CameraView) -> list[QuadStart]:
         """The quadrilaterals to start the corner fit from, of the blobs that are one within range."""
         starts = []
         for c in candidates:
-            if c.kind not in CORNERED_CLASSES:
+            kind = cornered_kind(c.blob, c.outline_vehicle, c.kind, view)
+            if kind is None:
                 continue
-            start = starting_corners(c.kind, c.outline_pinhole_px, c.outline_vehicle, view)
+            start = starting_corners(kind, c.outline_pinhole_px, c.outline_vehicle, view)
             if start is not None and start[1] >= _LEAST_COVER:
-                starts.append(QuadStart(c.kind, c.score, start[0], c.index, c.outline_pinhole_px))
+                starts.append(QuadStart(kind, _claim(c.blob, kind), start[0], c.index, c.outline_pinhole_px))
         if not starts:
             return []
         corners = np.stack([start.corners_pinhole_px for start in starts])
@@ -146,13 +162,18 @@ class Detector:
 
     def _symbol(self, candidate: _Candidate, view: CameraView) -> MarkingDetection | None:
         """A marking that has an outline but no four corners, within range."""
-        if candidate.kind not in OUTLINED_CLASSES:
+        if candidate.kind not in OUTLINED_CLASSES or candidate.score < self.options.min_score:
             return None
         ground = candidate.outline_vehicle
         if not np.isfinite(ground).all() or view.range_m(ground.mean(axis=0)) > self.options.max_range_m:
             return None
         nothing = np.full((4, 2), np.nan), np.full((8, 8), np.nan), np.zeros(4, dtype=np.bool_)
         return MarkingDetection(candidate.kind, candidate.score, *nothing, outline_polygon(candidate.blob))
+
+
+def _claim(blob: Blob, kind: str) -> Claim:
+    certainty = sum(blob.class_score.values())
+    return Claim(certainty, blob.class_score.get(kind, 0.0) / max(certainty, 1e-9), blob.touches_symbol)
 
 
 def _check_image(image_bgr: np.ndarray, camera: Camera) -> None:

@@ -29,7 +29,7 @@ class GreyBand:
 
     def at_limit(self) -> GreyBand:
         """The same with the sensor's limit where it was reached, so that edges seem farther outside."""
-        return GreyBand(np.where(np.isposinf(self.values), np.float32(1), self.values), self.top)
+        return GreyBand(np.minimum(self.values, np.float32(1)), self.top)
 
     def sample(self, points_px: np.ndarray) -> np.ndarray:
         """Bilinear look-up at recorded pixels (n, m, 2); not finite where one of the four pixels is not.

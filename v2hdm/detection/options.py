@@ -18,8 +18,8 @@ class DetectorOptions:
             None measures it on the near markings. It decides the far corners' bias: 0.6 to 1.2 px
             per px of error.
         max_range_m: markings and lane points farther from the camera on the ground are dropped.
-        min_score: least mean class probability of a blob.
-        min_score_unfitted: the same for a marking of which not even two corners can be used as points.
+        min_score: least mean class probability of a blob that is lane paint or an outlined symbol.
+        min_confidence: least probability, by all evidence, that a quadrilateral is a whole marking.
         max_corner_sigma_px: corners with a larger standard deviation are not valid.
         vague_corners: take corners from the edges of overexposed paint, and from the network's outline, where
             the image shows nothing better; they are worth having where many images are averaged.
@@ -32,8 +32,8 @@ class DetectorOptions:
     blur_px: float | None = None
     max_range_m: float = 22.0
     min_score: float = 0.5
-    min_score_unfitted: float = 0.8
-    max_corner_sigma_px: float = 1.0
+    min_confidence: float = 0.7
+    max_corner_sigma_px: float = 0.8
     vague_corners: bool = False
     border_px: float = 4.0
     lane_step_m: float = 0.5
@@ -41,7 +41,7 @@ class DetectorOptions:
     @classmethod
     def for_mapping(cls) -> DetectorOptions:
         """Defaults of the mapping, which weighs corners by their covariance and sees each many times."""
-        return cls(max_corner_sigma_px=1.5, vague_corners=True)
+        return cls(min_confidence=0.3, max_corner_sigma_px=1.5, vague_corners=True)
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work.
@@ -56,6 +56,6 @@ class DetectorOptions:
         for name in ("max_range_m", "max_corner_sigma_px", "lane_step_m"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"detector.{name} is {getattr(self, name)}: set a positive number")
-        for name in ("min_score", "min_score_unfitted"):
+        for name in ("min_score", "min_confidence"):
             if not 0 <= getattr(self, name) < 1:
                 raise ConfigError(f"detector.{name} is {getattr(self, name)}: set a probability in [0, 1)")

@@ -15,6 +15,7 @@ from v2hdm.detection.view import CameraView
 from v2hdm.records import (
     ARROW,
     CHEVRON,
+    CORNERED_CLASSES,
     CROSSWALK_BAR,
     DIAMOND,
     LANE_CLASSES,
@@ -25,7 +26,7 @@ from v2hdm.records import (
 )
 
 _SIZE_LIMITS_M: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
-    DIAMOND: ((0.3, 5.0), (0.15, 3.0)),
+    DIAMOND: ((0.25, 5.0), (0.1, 3.0)),
     LANE_DASH: ((0.7, 12.0), (0.03, 0.8)),
     LANE_LINE: ((0.3, np.inf), (0.03, np.inf)),
     STOP_LINE: ((0.8, 25.0), (0.12, 1.2)),
@@ -42,6 +43,9 @@ _DASH_SHARE = 0.25
 """A piece of lane paint that ends at both sides, no longer than that, is a dash even if the network
 gives only this share of its lane score to dashes: seen locally, dash and line are the same paint."""
 
+_LEAST_DASH_SHARE = 0.08
+"""With this share a whole piece of that length is tried as a dash: its four sides must show it to be one."""
+
 _LEAST_ELONGATION = 3.0
 """Lane paint is at least this many times as long as wide; far diamonds look like dashes, but are not."""
 
@@ -50,7 +54,7 @@ _HEAD_OVERLAP_M = 0.3
 _HEAD_WIDENING = 1.7
 """The head of an arrow begins so far from the end of the shaft at most, and is so many times as wide."""
 
-_BORDER_PX = 6.0
+_BORDER_PX = 4.0
 
 
 def plausible_kind(blob: Blob, outline_vehicle: FloatArray, view: CameraView) -> tuple[str, float] | None:
@@ -62,16 +66,38 @@ def plausible_kind(blob: Blob, outline_vehicle: FloatArray, view: CameraView) ->
         view: its camera.
     """
     length_m, width_m = _ground_size(outline_vehicle)
-    whole = bool(view.inside(blob.outline_px, _BORDER_PX).all())
+    whole = is_whole(blob, view)
     if whole and length_m < _LEAST_ELONGATION * width_m:
         kind, score = _likeliest_compact(blob.class_score)
     else:
         kind, score = _likeliest(blob.class_score, whole and length_m <= _DASH_LENGTH_M)
-    if kind == LANE_DASH and blob.touches_symbol:
-        return None  # the shaft of an arrow, the stroke of a letter
     if kind == LANE_DASH and not _fits(LANE_DASH, length_m, width_m):
         kind = LANE_LINE
     return (kind, score) if _fits(kind, length_m, width_m) else None
+
+
+def cornered_kind(blob: Blob, outline_vehicle: FloatArray, kind: str, view: CameraView) -> str | None:
+    """The class as which a blob, taken for ``kind``, is tried as a quadrilateral; None for none.
+
+    Short lane paint that ends at both sides may be a dash although the network says line, or, if shorter than
+    any dash, a slim diamond: seen locally they are alike.
+    """
+    if kind != LANE_LINE:
+        return kind if kind in CORNERED_CLASSES else None
+    length_m, width_m = _ground_size(outline_vehicle)
+    if not is_whole(blob, view) or not length_m <= _DASH_LENGTH_M:
+        return None
+    if length_m < _SIZE_LIMITS_M[LANE_DASH][0][0]:
+        kind, _ = _likeliest_compact(blob.class_score)
+        return kind if kind in CORNERED_CLASSES and _fits(kind, length_m, width_m) else None
+    lane_score = sum(blob.class_score.get(name, 0.0) for name in LANE_CLASSES)
+    dash = blob.class_score.get(LANE_DASH, 0.0) >= _LEAST_DASH_SHARE * lane_score
+    return LANE_DASH if dash and _fits(LANE_DASH, length_m, width_m) else None
+
+
+def is_whole(blob: Blob, view: CameraView) -> bool:
+    """Whether a blob keeps off the image's border."""
+    return bool(view.inside(blob.outline_px, _BORDER_PX).all())
 
 
 class Heads:

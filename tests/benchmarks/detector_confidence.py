@@ -1,0 +1,124 @@
+"""Fits the weights of the detector's confidence, ``v2hdm/detection/confidence.json``, to the shipped network.
+
+    python -m tests.benchmarks.detector_confidence --images 600 --write
+
+Run it after another network was put in place. Quadrilaterals that the detector proposes on rendered scenes,
+two in three of full difficulty, are true if they overlap a marking of their class by half, and false where
+the quality benchmark would say so; a logistic regression with a weak ridge tells them apart. Its seed is
+neither that of the quality benchmark nor one of training. Printed: what each feature adds to the log odds per
+standard deviation, and the log loss on the images of each fifth by weights that were fitted to the others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import dataclass, field
+from unittest.mock import patch
+
+import cv2
+import numpy as np
+
+from tests.benchmarks.detector_quality import Example, example, polygon_overlap
+from v2hdm.detection.confidence import CONFIDENCE_FILE, confidence
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.evidence import FEATURES
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.records import BoolArray, FloatArray, MarkingDetection
+
+SEED = 917_000_011
+EASY = 0.2
+RIDGE = 2.0
+FOLDS = 5
+
+
+@dataclass
+class Gathered:
+    """Evidence of N quadrilaterals, which of them are true, and the images that they are from."""
+
+    evidence: list[FloatArray] = field(default_factory=list)
+    true: list[bool] = field(default_factory=list)
+    image: list[int] = field(default_factory=list)
+
+    def add(self, index: int, shown: Example, detector: Detector) -> None:
+        """What the detector proposes in one image."""
+        rows: list[FloatArray] = []
+
+        def spy(evidence: FloatArray) -> FloatArray:
+            rows.extend(evidence)
+            return np.ones(len(evidence))
+
+        with patch("v2hdm.detection.corners.confidence", spy):
+            markings, _ = detector.detect(shown.image, shown.camera)
+        for row, marking in zip(rows, markings, strict=False):  # the outlined symbols come last
+            true = is_true(shown, marking)
+            if true is not None:
+                self.evidence.append(row)
+                self.true.append(true)
+                self.image.append(index)
+
+
+def is_true(shown: Example, marking: MarkingDetection) -> bool | None:
+    """Whether a quadrilateral is a marking; None where the quality benchmark lets it be."""
+    overlaps = [(polygon_overlap(marking.corners_px, true.polygon_px), true) for true in shown.markings]
+    if any(share >= 0.5 and true.kind == marking.kind for share, true in overlaps):
+        return True
+    share, nearest = max(overlaps, key=lambda pair: pair[0], default=(0.0, None))
+    if share <= 0.05 or (nearest is not None and nearest.fair and nearest.kind != marking.kind):
+        return False
+    return None
+
+
+def fit(evidence: FloatArray, true: BoolArray) -> tuple[FloatArray, float]:
+    """Weights (F,) and bias of a logistic regression, by Newton's method on standardised features."""
+    mean, deviation = evidence.mean(axis=0), np.maximum(evidence.std(axis=0), 1e-6)
+    design = np.column_stack([(evidence - mean) / deviation, np.ones(len(evidence))])
+    ridge = RIDGE * np.diag(np.append(np.ones(evidence.shape[1]), 1e-6))
+    solution = np.zeros(design.shape[1])
+    for _ in range(30):
+        probability = 1 / (1 + np.exp(-design @ solution))
+        slope = design.T @ (true - probability) - ridge @ solution
+        curvature = (design * (probability * (1 - probability))[:, None]).T @ design + ridge
+        solution = solution + np.linalg.solve(curvature, slope)
+    weights = solution[:-1] / deviation
+    return weights, float(solution[-1] - mean @ weights)
+
+
+def log_loss(evidence: FloatArray, true: BoolArray, weights: FloatArray, bias: float) -> float:
+    """Mean of minus the log probability of what is the case."""
+    odds = np.where(true, 1.0, -1.0) * (evidence @ weights + bias)
+    return float(np.log1p(np.exp(-odds)).mean())
+
+
+def main() -> None:
+    """Gather, fit, print, and write if asked to."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--images", type=int, default=600)
+    parser.add_argument("--model")
+    parser.add_argument("--write", action="store_true")
+    parsed = parser.parse_args()
+    cv2.setNumThreads(1)
+    options = DetectorOptions(model=parsed.model, max_range_m=24.0, min_confidence=0.0)
+    detector = Detector.load(options=options)
+    gathered = Gathered()
+    for index in range(parsed.images):
+        gathered.add(index, example(index, EASY if index % 3 == 2 else 1.0, SEED), detector)
+    evidence, true = np.array(gathered.evidence), np.array(gathered.true)
+    weights, bias = fit(evidence, true)
+    fold = np.array(gathered.image) % FOLDS
+    losses = [
+        log_loss(evidence[fold == k], true[fold == k], *fit(evidence[fold != k], true[fold != k]))
+        for k in range(FOLDS)
+    ]
+    print(f"{true.sum()} true, {(~true).sum()} false in {parsed.images} images")
+    for name, weight, deviation in zip(FEATURES, weights, evidence.std(axis=0), strict=True):
+        print(f"{name:16s} {weight * deviation:+.2f}")
+    old = -np.log(np.where(true, confidence(evidence), 1 - confidence(evidence))).mean()
+    print(f"log loss of images left out {np.mean(losses):.3f}; of the weights so far {old:.3f}")
+    if parsed.write:
+        fitted = dict(zip(FEATURES, weights.round(4).tolist(), strict=True))
+        CONFIDENCE_FILE.write_text(json.dumps({"bias": round(bias, 4), "weights": fitted}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

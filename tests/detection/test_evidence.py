@@ -1,0 +1,96 @@
+"""What speaks for a marking: the image about its sides, and the probability that is made of it."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.benchmarks.detector_confidence import fit
+from tests.detection.pictures import bar, brightness_model, diamond, make_camera, picture, to_image
+from v2hdm.detection.confidence import CONFIDENCE_FILE, confidence
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.evidence import FEATURES, Steps, grey_steps
+from v2hdm.detection.grey import linear_grey
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.detection.quad import order_corners
+
+
+def steps_of(image: np.ndarray, corners_px: np.ndarray) -> Steps:
+    whole = np.array([[0, 0, image.shape[1], image.shape[0]]])
+    return grey_steps(linear_grey(image, 0, len(image), whole, False), corners_px)
+
+
+def test_the_steps_of_a_marking_are_those_of_its_paint_and_end_at_its_corners():
+    camera = make_camera("pinhole")
+    shapes = [diamond(6.0, 0.0), bar(6.0, 1.6, 1.5, 0.4)]
+    corners_px = np.stack([order_corners(to_image(camera, shape)) for shape in shapes])
+    steps = steps_of(picture(camera, shapes, ground=0.1, paint=0.5), corners_px)
+    np.testing.assert_allclose(steps.typical, np.log(0.51 / 0.11), atol=0.1)
+    assert np.abs(steps.beyond).max() < 0.4
+    assert not steps.runs_on().any()
+
+
+def test_a_side_that_runs_on_spoils_the_corner_that_it_passes():
+    """A quadrilateral laid over part of a bar: its far end is nowhere, and its long sides run on there."""
+    camera = make_camera("pinhole")
+    image = picture(camera, [bar(6.0, 0.0, 3.0, 0.5)])
+    part_px = order_corners(to_image(camera, bar(5.5, 0.0, 2.0, 0.5)))
+    runs_on = steps_of(image, part_px[None]).runs_on()[0]
+    upper = part_px[:, 1] < part_px[:, 1].mean()
+    np.testing.assert_array_equal(runs_on, upper)
+
+
+def test_corners_on_the_border_of_a_shadow_are_not_valid(tmp_path):
+    """The network sees the sunny part of a bar only; the shadow's border runs on over the ground."""
+    camera = make_camera("pinhole")
+    shape = bar(5.4, 0.0, 1.4, 0.9)
+    image = picture(camera, [shape], ground=0.2, paint=0.6).astype(np.float64)
+    border = int(to_image(camera, np.array([[5.4, 0.0]]))[0, 1])
+    image[:border] *= 0.4
+    detector = Detector.load(brightness_model(tmp_path, "crosswalk_bar", 160), DetectorOptions())
+    for marking in detector.detect(image.astype(np.uint8), camera)[0]:
+        on_border = np.abs(marking.corners_px[:, 1] - border) < 3
+        assert not marking.corner_valid[on_border].any()
+
+
+def confidences(image: np.ndarray, folder) -> list[float]:
+    options = DetectorOptions(min_confidence=0.0)
+    detector = Detector.load(brightness_model(folder), options)
+    return [marking.score for marking in detector.detect(image, make_camera("pinhole"))[0]]
+
+
+@pytest.mark.parametrize("x", [6.0, 10.0])
+def test_a_round_soft_fleck_is_improbable_where_a_diamond_is_not(tmp_path, x):
+    camera = make_camera("pinhole")
+    (painted,) = confidences(picture(camera, [diamond(x, 0.0, 1.2, 0.7)]), tmp_path)
+    image = np.full((camera.info.height, camera.info.width), 95, dtype=np.float32)
+    box_px = to_image(camera, diamond(x, 0.0, 1.2, 0.9))
+    size = np.ptp(box_px, axis=0) / 2
+    centre = tuple(box_px.mean(axis=0).astype(int).tolist())
+    cv2.ellipse(image, centre, tuple(size.astype(int).tolist()), 0, 0, 360, 190, cv2.FILLED)
+    soft = cv2.GaussianBlur(image, (0, 0), float(size[1] / 3))
+    fleck = np.repeat(np.round(soft)[..., None], 3, axis=2).astype(np.uint8)
+    found = confidences(fleck, tmp_path)
+    assert found, "the network takes it for paint"
+    assert painted > DetectorOptions().min_confidence
+    assert 1 - max(found) > 10 * (1 - painted)
+
+
+def test_the_fitted_weights_are_those_of_the_features_and_prefer_evidence():
+    fitted = json.loads(CONFIDENCE_FILE.read_text())
+    assert set(fitted["weights"]) == set(FEATURES)
+    none, all_around = np.zeros((2, 1, len(FEATURES)))
+    all_around[0, FEATURES.index("support")] = 1.0
+    all_around[0, FEATURES.index("odds_inside")] = 5.0
+    assert 0 <= confidence(none)[0] < confidence(all_around)[0] <= 1
+
+
+def test_the_fit_of_the_weights_finds_those_that_made_the_data():
+    rng = np.random.default_rng(0)
+    evidence = rng.normal(size=(20000, 3)) * [1.0, 10.0, 0.1] + [0.0, 5.0, 1.0]
+    weights, bias = np.array([1.0, -0.1, 8.0]), -7.0
+    true = rng.random(20000) < 1 / (1 + np.exp(-evidence @ weights - bias))
+    found, found_bias = fit(evidence, true)
+    np.testing.assert_allclose(found, weights, rtol=0.1)
+    assert found_bias == pytest.approx(bias, rel=0.1)

@@ -1,0 +1,192 @@
+"""What speaks for a quadrilateral being a whole marking: the image about its sides, the network, its shape.
+
+A network that is sure of paint may be wrong about where it ends, or take a fleck of sun for it. A marking is
+brighter than the ground along all of its sides, its sides end where they meet, and it has a marking's shape.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from v2hdm.detection.foreground import Foreground
+from v2hdm.detection.grey import GreyBand
+from v2hdm.detection.quad import preceding, side_frames, width
+from v2hdm.detection.view import CameraView
+from v2hdm.records import DIAMOND, LANE_DASH, BoolArray, FloatArray
+
+FEATURES = (
+    "odds_inside",
+    "certainty",
+    "share",
+    "touches_symbol",
+    "four_corners",
+    "support",
+    "contrast",
+    "sharpness",
+    "goes_on",
+    "log_width_px",
+    "log_length",
+    "log_width",
+    "dash",
+    "bar",
+    "dash_share",
+    "dash_log_width",
+    "dash_at_border",
+    "diamond_skew",
+)
+"""Names of the columns of :func:`gather`, in order.
+
+From the network: mean log odds of paint inside, mean probability of paint over the blob, the class's share
+of it, and whether the blob was split off an arrow or a letter. From the image: whether it gave four corners,
+the share of profiles across the sides that show paint inside, the log of the typical step, how much of that
+is within a px of the side, how far the steps go on beyond the corners, the log of the width in px. On the
+ground, in metres: log of length and width, and what differs between classes."""
+
+_PROFILES = 12
+_FAR_PX = 2.0
+_NEAR_PX = 1.0
+_ACROSS_SHARE = 0.35
+"""Profiles compare the grey so far inside and outside a side; inside at most this share of the width."""
+
+_BEYOND_PX = np.array([3.0, 4.5, 6.0])
+"""Where a side's line is looked at beyond the corner."""
+
+_RUNS_ON = 0.6
+"""A step of this share of the side's own is the side's continuation: half the corners where there is one all
+the way are off by half a px and more, of the others one in eight."""
+
+_DARK = 0.01
+"""Added to grey values before taking logarithms: in shade a step is as large as in the sun, noise is not."""
+
+_LEAST_STEP = 0.05
+_SUPPORT_SHARE = 0.4
+"""A profile supports its side with a step above noise, and above this share of the typical one."""
+
+_GRID = (np.arange(6) + 0.5) / 6
+_BORDER_PX = 6.0
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What the network claims of a blob: ``certainty`` that it is paint, ``share`` of its class in that."""
+
+    certainty: float
+    share: float
+    touches_symbol: bool
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Steps of log grey from outside to inside across the sides of M quadrilaterals.
+
+    ``along`` (M, 4, n) at profiles of each side, ``near`` (M, 4, n) the part of them within a px of it,
+    ``beyond`` (M, 4, 2, k) on its line's continuation beyond its start and its end; 0 where unknown.
+    """
+
+    along: FloatArray
+    near: FloatArray
+    beyond: FloatArray
+
+    @property
+    def typical(self) -> FloatArray:
+        """Median step (M,)."""
+        return np.asarray(np.median(self.along.reshape(len(self.along), -1), axis=1))
+
+    def going_on(self) -> FloatArray:
+        """How much of each side's step is still there beyond its ends: (M, 4, 2, k), from -1 to 2."""
+        by_side = np.maximum(np.median(self.along, axis=2), self.typical[:, None])
+        ratio = self.beyond / np.maximum(by_side, _LEAST_STEP)[..., None, None]
+        return np.asarray(np.clip(ratio, -1.0, 2.0))
+
+    def runs_on(self) -> BoolArray:
+        """Corners (M, 4) beyond which one of their two sides goes on, wherever it was looked at.
+
+        Such a side is that of a shadow, of something before the ground, or of other paint, and where it
+        meets the next is no corner of the marking.
+        """
+        start, end = np.moveaxis(self.going_on().min(axis=3) > _RUNS_ON, 2, 0)
+        return np.asarray(start | preceding(end, -1))
+
+
+def grey_steps(grey: GreyBand, corners_px: FloatArray) -> Steps:
+    """Look across the sides of quadrilaterals (M, 4, 2), recorded px, and across their continuations."""
+    tangent, normal, length = side_frames(corners_px)
+    along = (np.arange(_PROFILES) + 0.5) / _PROFILES * length[..., None]
+    beyond = np.concatenate([-_BEYOND_PX + 0 * length[..., None], length[..., None] + _BEYOND_PX], axis=-1)
+    place = np.concatenate([along, beyond, along], axis=-1)
+    inside_px = np.minimum(_FAR_PX, _ACROSS_SHARE * width(corners_px))[:, None, None]
+    near = np.arange(place.shape[-1]) >= _PROFILES + beyond.shape[-1]
+    inside_px = np.where(near, np.minimum(_NEAR_PX, inside_px / 2), inside_px)
+    outside_px = np.broadcast_to(np.where(near, _NEAR_PX, _FAR_PX), inside_px.shape)
+    foot = corners_px[:, :, None] + place[..., None] * tangent[:, :, None]
+    across = np.stack([-inside_px, outside_px])[..., None] * normal[:, :, None]
+    values = grey.at_limit().sample((foot + across).reshape(2, -1, 2)).reshape(2, *place.shape)
+    logs = np.log(np.maximum(values, 0) + np.float32(_DARK))
+    steps = np.nan_to_num(logs[0] - logs[1]).astype(np.float64)
+    first, second = _PROFILES, _PROFILES + beyond.shape[-1]
+    return Steps(
+        steps[..., :first], steps[..., second:], steps[..., first:second].reshape(*length.shape, 2, -1)
+    )
+
+
+def gather(
+    steps: Steps,
+    foreground: Foreground,
+    view: CameraView,
+    corners_px: FloatArray,
+    kinds: list[str],
+    claims: list[Claim],
+    valid: BoolArray,
+) -> FloatArray:
+    """The :data:`FEATURES` (M, F) of quadrilaterals ``corners_px`` (M, 4, 2) of classes ``kinds``.
+
+    Args:
+        steps: what the image shows across their sides.
+        foreground: what the network says of the image.
+        view: the camera.
+        corners_px: recorded px.
+        kinds: class of each.
+        claims: what the network claims of each one's blob.
+        valid: (M, 4) which corners the image gave.
+    """
+    ground = view.ground(view.undistort(corners_px.reshape(-1, 2))).reshape(corners_px.shape)
+    sides = np.sort(side_frames(ground)[2], axis=1)
+    log_sides = np.log(np.clip(np.nan_to_num(sides, nan=1.0), 0.01, 100.0))
+    log_width = np.log(np.clip(sides[:, :2].mean(axis=1), 0.01, 100.0))
+    log_length = np.log(np.clip(sides[:, 2:].mean(axis=1), 0.01, 100.0))
+    dash, diamond = (np.array([kind == name for kind in kinds]) for name in (LANE_DASH, DIAMOND))
+    typical = np.maximum(steps.typical, _LEAST_STEP)
+    share = np.array([claim.share for claim in claims])
+    good = steps.along > np.maximum(_SUPPORT_SHARE * typical, _LEAST_STEP)[:, None, None]
+    near = np.median(steps.near.reshape(len(corners_px), -1), axis=1)
+    at_border = ~view.inside(corners_px.reshape(-1, 2), _BORDER_PX).reshape(-1, 4).all(axis=1)
+    columns = {
+        "odds_inside": foreground.odds_at(_inner_grid(corners_px)).mean(axis=1),
+        "certainty": np.array([claim.certainty for claim in claims]),
+        "share": share,
+        "touches_symbol": np.array([claim.touches_symbol for claim in claims]),
+        "four_corners": valid.all(axis=1),
+        "support": good.mean(axis=(1, 2)),
+        "contrast": np.log(typical),
+        "sharpness": np.clip(near / typical, 0.0, 1.2),
+        "goes_on": np.median(steps.going_on(), axis=3).mean(axis=(1, 2)),
+        "log_width_px": np.log(np.maximum(width(corners_px), 0.3)),
+        "log_length": log_length,
+        "log_width": log_width,
+        "dash": dash,
+        "bar": ~dash & ~diamond,
+        "dash_share": dash * share,
+        "dash_log_width": np.where(dash, log_width, 0.0),
+        "dash_at_border": dash & at_border,
+        "diamond_skew": diamond * np.minimum(log_sides[:, 3] - log_sides[:, 0], 2.0),
+    }
+    return np.nan_to_num(np.column_stack([columns[name] for name in FEATURES]).astype(np.float64))
+
+
+def _inner_grid(corners_px: FloatArray) -> FloatArray:
+    """Points (M, 36, 2) all over the inside of quadrilaterals (M, 4, 2), by bilinear interpolation."""
+    a, b = (part.reshape(-1) for part in np.meshgrid(_GRID, _GRID))
+    weight = np.stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b], axis=1)
+    return np.asarray(weight @ corners_px)
