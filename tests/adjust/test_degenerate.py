@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 
 from tests.adjust.scene import make_scene, mounted
-from v2hdm.adjust import ControlPoints, Drift, Observations, PoseSigma, Problem, SolveOptions, Status, solve
+from v2hdm.adjust import (
+    ControlPoints,
+    Drift,
+    KnownLengths,
+    Observations,
+    PoseSigma,
+    Problem,
+    SolveOptions,
+    Status,
+    solve,
+)
 from v2hdm.errors import AdjustError
 
 PAPER = SolveOptions(pose_states=(), loss="none")
@@ -24,6 +34,27 @@ def changed(values: np.ndarray, index, value) -> np.ndarray:
     out = values.copy()
     out[index] = value
     return out
+
+
+def lengths(first=(0, 4), second=(1, 6), length_m=(0.5, 0.7), sigma_m=(0.01, 0.01)) -> KnownLengths:
+    return KnownLengths(np.array(first), np.array(second), np.array(length_m), np.array(sigma_m))
+
+
+def bad_lengths():
+    return {
+        "known length 1 is from corner 4 to itself": lengths(second=(1, 4)),
+        "the distance of corners 4 and 6 is given twice": lengths(first=(4, 6), second=(6, 4)),
+        "known length 1 names corners 4 and 9999; one is not there": lengths(second=(1, 9999)),
+        "known length 0 names corners -1 and 1; one is not there": lengths(first=(-1, 4)),
+        "known length 0 is -0.5 m: give one above 0": lengths(length_m=(-0.5, 0.7)),
+        "known length 1 is nan m: give one above 0": lengths(length_m=(0.5, np.nan)),
+        "sigma_m of known length 0 is not above 0 and finite": lengths(sigma_m=(0.0, 0.01)),
+        "sigma_m of known length 1 is not above 0 and finite": lengths(sigma_m=(0.01, np.nan)),
+        "known lengths: 2 first corners need as many second": lengths(sigma_m=(0.01,)),
+        "known lengths join 300 corners": lengths(
+            np.arange(299), np.arange(1, 300), np.ones(299), np.ones(299)
+        ),
+    }
 
 
 def bad_problems():
@@ -98,6 +129,13 @@ def test_a_malformed_problem_is_refused_by_name(message):
     with pytest.raises(AdjustError, match=message) as caught:
         solve(problem)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("message", bad_lengths())
+def test_a_known_length_that_cannot_be_is_refused_by_name(message):
+    problem = make_scene(1, frames=200, every_m=1.0).problem
+    with pytest.raises(AdjustError, match=message):
+        solve(replace(problem, lengths=bad_lengths()[message]))
 
 
 @pytest.mark.parametrize(

@@ -7,18 +7,22 @@ import pytest
 import torch
 
 from tests.adjust.scene import make_scene
-from v2hdm.adjust.arrays import make_arrays
-from v2hdm.adjust.problem import LOSSES, POSE_STATES, ControlPoints, Drift, PoseSigma
+from v2hdm.adjust.layout import make_arrays
+from v2hdm.adjust.linear import Linear, corner_blocks, coupling, jacobians, pair_blocks
+from v2hdm.adjust.problem import LOSSES, POSE_STATES, ControlPoints, Drift, KnownLengths, PoseSigma
 from v2hdm.adjust.residuals import (
     Estimate,
     Loss,
     centre_residual,
     cost_and_gradient,
-    jacobians,
+    length_residual,
+    moved_columns,
     observe,
     pair_from_clock,
     pair_from_state,
+    pair_table,
     state_residual,
+    wrenches,
 )
 from v2hdm.adjust.robust import loss
 from v2hdm.geometry.transform import exp
@@ -30,7 +34,8 @@ def example(pose_states=POSE_STATES, size=0.0, max_range_m=15.0, frames=14, cloc
     scene = make_scene(3, frames=frames, jitter=POSES, max_range_m=max_range_m)
     twist = np.tile([5.0, 0.1, 0.0, 0.0, 0.0, 0.4], (frames, 1)) * np.linspace(0.8, 1.2, frames)[:, None]
     control = ControlPoints(np.array([2, 5]), scene.corners_map[[2, 5]] + 0.01, np.array([0.01, 0.02]))
-    problem = replace(scene.problem, twist_vehicle=twist, control=control)
+    lengths = KnownLengths(np.array([0, 7, 6]), np.array([1, 4, 7]), np.full(3, 0.5), np.full(3, 0.01))
+    problem = replace(scene.problem, twist_vehicle=twist, control=control, lengths=lengths)
     arrays = make_arrays(problem, pose_states, "cpu", clock)
     generator = torch.Generator().manual_seed(0)
     state = size * torch.randn(arrays.state_information_root.shape, generator=generator, dtype=torch.float64)
@@ -46,6 +51,10 @@ def moved(estimate, extrinsic, state, corners, clock=None):
         estimate.corners_map + corners,
         estimate.clock_s if clock is None else estimate.clock_s + clock,
     )
+
+
+def residuals(arrays, estimate):
+    return observe(arrays.whole(), pair_table(arrays, estimate), estimate.corners_map).residual
 
 
 @pytest.mark.parametrize("name", LOSSES)
@@ -80,7 +89,7 @@ def test_gradcheck_of_the_observation_residual_holds_up_to_the_horizon(distance_
         value.requires_grad_()
 
     def residual(*steps):
-        return observe(arrays, moved(estimate, *steps)).residual
+        return residuals(arrays, moved(estimate, *steps))
 
     assert torch.autograd.gradcheck(residual, inputs, eps=1e-6, atol=1e-5, rtol=1e-4)
 
@@ -88,7 +97,8 @@ def test_gradcheck_of_the_observation_residual_holds_up_to_the_horizon(distance_
 @pytest.mark.parametrize("size", [0.0, 0.05])
 def test_jacobians_by_pair_and_corner_spread_to_the_full_derivative(size):
     arrays, estimate = example(size=size, frames=6, clock=True)
-    by_pair, by_corner = jacobians(arrays, observe(arrays, estimate))
+    run = arrays.whole()
+    by_pair, by_corner = jacobians(run, observe(run, pair_table(arrays, estimate), estimate.corners_map))
     spread = pair_from_state(arrays, estimate).reshape(arrays.pair_count, 6, -1)
     by_clock = pair_from_clock(arrays, estimate).reshape(arrays.pair_count, 6, 1)
     k = len(arrays.corner) // 2
@@ -96,13 +106,64 @@ def test_jacobians_by_pair_and_corner_spread_to_the_full_derivative(size):
     steps = [step.to(torch.float64) for step in [*steps, torch.zeros_like(estimate.corners_map)]]
     steps += [torch.zeros_like(estimate.clock_s)]
     full = torch.autograd.functional.jacobian(
-        lambda *s: observe(arrays, moved(estimate, *s)).residual[:, k], tuple(steps)
+        lambda *s: residuals(arrays, moved(estimate, *s))[:, k], tuple(steps)
     )
     camera, frame = divmod(int(arrays.pair[k]), arrays.frame_count)
-    torch.testing.assert_close(by_pair[k], full[0][:, camera])
-    torch.testing.assert_close(by_pair[k] @ spread[arrays.pair[k]], full[1][:, frame])
-    torch.testing.assert_close(by_corner[k], full[2][:, arrays.corner[k]])
-    torch.testing.assert_close(by_pair[k] @ by_clock[arrays.pair[k]], full[3][:, camera])
+    torch.testing.assert_close(by_pair[..., k], full[0][:, camera])
+    torch.testing.assert_close(by_pair[..., k] @ spread[arrays.pair[k]], full[1][:, frame])
+    torch.testing.assert_close(by_corner[..., k], full[2][:, arrays.corner[k]])
+    torch.testing.assert_close(by_pair[..., k] @ by_clock[arrays.pair[k]], full[3][:, camera])
+
+
+def test_products_that_store_no_matrix_are_those_with_the_jacobians():
+    arrays, estimate = example(size=0.05, frames=6)
+    run, table = arrays.whole(), pair_table(arrays, estimate)
+    generator = torch.Generator().manual_seed(0)
+    weight = torch.rand(len(arrays.corner), generator=generator, dtype=torch.float64)
+    view = observe(run, table, estimate.corners_map)
+    by_pair, by_corner = (rows * weight.sqrt() for rows in jacobians(run, view))
+    linear, between = Linear.at(run, view, weight), coupling(by_pair, by_corner)
+    motion = torch.randn(6, arrays.pair_count, generator=generator, dtype=torch.float64)
+    step = torch.randn(arrays.corner_count, 2, generator=generator, dtype=torch.float64)
+    onto_corners = torch.zeros_like(step).index_add(
+        0, run.corner, torch.einsum("rak,ak->kr", between, motion[:, run.pair])
+    )
+    onto_pairs = torch.zeros_like(motion).index_add(
+        1, run.pair, torch.einsum("rak,kr->ak", between, step[run.corner])
+    )
+    by_table = torch.zeros_like(table).index_add(1, run.pair, linear.pairs_from_corners(step))
+    torch.testing.assert_close(linear.corners_from_pairs(moved_columns(table, motion)), onto_corners)
+    torch.testing.assert_close(wrenches(table, by_table), onto_pairs)
+    row, column = torch.triu_indices(6, 6)
+    expected = torch.einsum("rak,rbk->abk", by_pair, by_pair)[row, column]
+    torch.testing.assert_close(pair_blocks(by_pair), expected)
+    expected = torch.einsum("rak,rbk->abk", by_corner, by_corner)[[0, 1, 1], [0, 0, 1]]
+    torch.testing.assert_close(corner_blocks(by_corner), expected)
+
+
+@pytest.mark.parametrize("apart_m", [30.0, 1e-3])
+def test_the_derivative_of_a_known_length_is_the_numerical_one_for_corners_that_all_but_coincide_too(apart_m):
+    arrays, estimate = example(())
+    corners = apart_m * torch.randn(estimate.corners_map.shape, dtype=torch.float64)
+    corners.requires_grad_()
+
+    def residual(moved):
+        return length_residual(arrays, moved)[0]
+
+    eps = 1e-5 * apart_m
+    assert torch.autograd.gradcheck(residual, corners, eps=eps, atol=1e-6, rtol=1e-6)
+    full = torch.autograd.functional.jacobian(residual, corners)
+    _, by_first = length_residual(arrays, corners)
+    each = torch.arange(len(by_first))
+    torch.testing.assert_close(full[each, arrays.lengths.first], by_first)
+    torch.testing.assert_close(full[each, arrays.lengths.second], -by_first)
+
+
+def test_two_corners_in_one_place_have_a_finite_residual_and_no_direction():
+    arrays, estimate = example(())
+    residual, by_first = length_residual(arrays, torch.zeros_like(estimate.corners_map))
+    torch.testing.assert_close(residual, -arrays.lengths.length_m * arrays.lengths.information_root)
+    assert not by_first.any()
 
 
 @pytest.mark.parametrize("name", LOSSES)

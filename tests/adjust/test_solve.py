@@ -8,7 +8,17 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from tests.adjust.scene import Scene, make_scene, with_late_clocks
-from v2hdm.adjust import ControlPoints, Drift, Observations, PoseSigma, Problem, SolveOptions, Status, solve
+from v2hdm.adjust import (
+    ControlPoints,
+    Drift,
+    KnownLengths,
+    Observations,
+    PoseSigma,
+    Problem,
+    SolveOptions,
+    Status,
+    solve,
+)
 
 PAPER = SolveOptions(pose_states=(), loss="none")
 POSES = PoseSigma()
@@ -39,7 +49,11 @@ def reference_residuals(problem: Problem, x: np.ndarray) -> np.ndarray:
     off = focal * point[:, :2] / point[:, 2:] + principal - seen.pinhole_px
     whitened = np.einsum("kab,kb->ka", np.linalg.inv(np.linalg.cholesky(seen.covariance_px)), off)
     prior = (centre - problem.centre_vehicle) / problem.centre_sigma_m
-    return np.concatenate([whitened.ravel(), prior.ravel(), (state / problem.pose_sigma.by_state()).ravel()])
+    parts = [whitened.ravel(), prior.ravel(), (state / problem.pose_sigma.by_state()).ravel()]
+    if problem.lengths is not None:
+        apart = np.linalg.norm(corners[problem.lengths.first] - corners[problem.lengths.second], axis=1)
+        parts.append((apart - problem.lengths.length_m) / problem.lengths.sigma_m)
+    return np.concatenate(parts)
 
 
 def reference_optimum(scene: Scene) -> float:
@@ -61,13 +75,25 @@ def reference_optimum(scene: Scene) -> float:
     return float(found.cost)
 
 
+def sides(scene: Scene, sigma_m: float, error_m: float = 0.0) -> KnownLengths:
+    """Two sides and a diagonal of every other diamond of which all corners are seen, off by ``error_m``."""
+    corners = scene.corners_map
+    whole = [k for k in range(len(corners) - 3) if np.ptp(corners[k : k + 4], axis=0).max() < 0.75][::2]
+    first, second = np.add.outer(whole, [0, 1, 0]).ravel(), np.add.outer(whole, [1, 2, 2]).ravel()
+    length_m = np.linalg.norm(corners[first] - corners[second], axis=1) + error_m
+    return KnownLengths(first, second, length_m, np.full(len(first), sigma_m))
+
+
 @pytest.mark.parametrize("solver", ["lbfgs", "lm"])
-def test_the_cost_is_that_of_an_independent_least_squares_solver_to_nine_digits(solver):
+@pytest.mark.parametrize("sigma_m", [None, 0.02, 0.0005])
+def test_the_cost_is_that_of_an_independent_least_squares_solver_to_nine_digits(solver, sigma_m):
     rng = np.random.default_rng(0)
     scene = make_scene(1, frames=12, step_m=1.2, jitter=POSES, every_m=3.0)
     root = rng.normal(0, 0.4, (len(scene.problem.observations.corner), 2, 2)) + 0.8 * np.eye(2)
     seen = replace(scene.problem.observations, covariance_px=root @ root.transpose(0, 2, 1))
     scene = replace(scene, problem=replace(scene.problem, observations=seen))
+    if sigma_m is not None:
+        scene = replace(scene, problem=replace(scene.problem, lengths=sides(scene, sigma_m, 0.01)))
     solution = solve(scene.problem, SolveOptions(loss="none", solver=solver))
     expected = reference_optimum(scene)
     assert solution.status is Status.CONVERGED
@@ -202,6 +228,7 @@ def test_the_cost_is_the_sum_of_its_named_terms():
         "frame_states",
         "clock_offsets",
         "control_points",
+        "known_lengths",
     }
     assert solution.cost == pytest.approx(sum(solution.cost_terms.values()))
     assert solution.gap <= 1e-11
@@ -235,3 +262,42 @@ def test_two_control_points_undo_the_drift_of_the_receiver():
     stated = tied.corner_covariance(chosen[:, None])
     assert np.sqrt(stated.trace(axis1=1, axis2=2)).max() < 0.003
     assert tied.chi2_per_dof == pytest.approx(1, abs=0.07)
+
+
+def far_marking(seed: int) -> tuple[Scene, np.ndarray]:
+    """A street on which one diamond, the corners that are returned, is only seen from beyond 18 m."""
+    scene = make_scene(seed, frames=60, max_range_m=30.0, cameras=1, prior_sigma_m=0.005, start_error_deg=1.0)
+    seen, corners = scene.problem.observations, scene.corners_map
+    apart = np.linalg.norm(corners[seen.corner] - scene.map_from_vehicle[seen.frame, :2, 3], axis=1)
+    whole = [k for k in range(40, len(corners) - 3) if np.ptp(corners[k : k + 4], axis=0).max() < 0.75]
+    mine = np.arange(whole[0], whole[0] + 4)
+    keep = ~np.isin(seen.corner, mine) | (apart > 18)
+    parts = (seen.camera, seen.frame, seen.corner, seen.pinhole_px, seen.covariance_px)
+    problem = replace(scene.problem, observations=Observations(*(part[keep] for part in parts)))
+    return replace(scene, problem=problem), mine
+
+
+def test_known_sizes_make_a_far_marking_better_and_its_covariance_says_how_much():
+    free, tied, surprise = [], [], []
+    for seed in range(8):
+        scene, mine = far_marking(30 + seed)
+        first, second = mine[[0, 1, 2, 3, 0]], mine[[1, 2, 3, 0, 2]]
+        length_m = np.linalg.norm(scene.corners_map[first] - scene.corners_map[second], axis=1)
+        told_m = length_m + np.random.default_rng(seed).normal(0, 0.002, 5)
+        lengths = KnownLengths(first, second, told_m, np.full(5, 0.002))
+        plain, known = (solve(replace(scene.problem, lengths=given), PAPER) for given in (None, lengths))
+        assert known.status is Status.CONVERGED
+        error = (known.corners_map - scene.corners_map)[mine]
+        free.append(np.mean((plain.corners_map - scene.corners_map)[mine] ** 2))
+        tied.append(np.mean(error**2))
+        covariance = known.corner_covariance(mine)
+        surprise.append(error.ravel() @ np.linalg.solve(covariance, error.ravel()))
+        # A corner alone says the same as within its marking, whatever it is tied to.
+        alone = known.corner_covariance(mine[[2]])
+        np.testing.assert_allclose(alone, covariance[4:6, 4:6], rtol=1e-6)
+        direction = (scene.corners_map[mine[0]] - scene.corners_map[mine[2]]) / length_m[4]
+        along = np.concatenate([direction, 0 * direction, -direction, 0 * direction])
+        assert np.sqrt(along @ covariance @ along) < 0.0021
+    assert np.sqrt(np.mean(tied) / np.mean(free)) < 0.8
+    # Eight draws of a chi-square with eight degrees of freedom; three standard errors.
+    assert np.mean(surprise) == pytest.approx(8, abs=3 * np.sqrt(16 / 8))

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from tests.adjust.scene import make_scene
-from v2hdm.adjust import ControlPoints, Drift, PoseSigma, SolveOptions, solve
-from v2hdm.adjust.arrays import make_arrays
+from v2hdm.adjust import ControlPoints, Drift, KnownLengths, PoseSigma, SolveOptions, solve
 from v2hdm.adjust.descent import Objective
+from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.problem import POSE_STATES
 from v2hdm.adjust.reduced import make_plan
 from v2hdm.adjust.residuals import Estimate, Loss
@@ -29,8 +29,15 @@ def test_where_all_residuals_vanish_the_whitened_hessian_is_the_identity(pose_st
     centre = -np.einsum("cji,cj->ci", scene.cam_from_vehicle[:, :3, :3], scene.cam_from_vehicle[:, :3, 3])
     twist = np.tile([5.0, 0.0, 0.0, 0.0, 0.0, 0.3], (40, 1))
     control = ControlPoints(np.array([3]), scene.corners_map[3:4], np.array([0.01]))
+    first, second = np.array([8, 9, 20, 12]), np.array([9, 11, 14, 13])
+    length_m = np.linalg.norm(scene.corners_map[first] - scene.corners_map[second], axis=1)
     problem = replace(
-        scene.problem, centre_vehicle=centre, pose_sigma=POSES, twist_vehicle=twist, control=control
+        scene.problem,
+        centre_vehicle=centre,
+        pose_sigma=POSES,
+        twist_vehicle=twist,
+        control=control,
+        lengths=KnownLengths(first, second, length_m, np.array([0.01, 0.002, 0.003, 0.1])),
     )
     arrays = make_arrays(problem, pose_states, "cpu", clock)
     estimate = Estimate(
@@ -39,9 +46,10 @@ def test_where_all_residuals_vanish_the_whitened_hessian_is_the_identity(pose_st
         torch.as_tensor(scene.corners_map)[arrays.corner_order],
         arrays.no_clock(),
     )
-    whitening = factorise(arrays, make_plan(arrays), estimate, torch.ones_like(arrays.measured[0]))
-    objective = Objective(whitening, estimate, Loss("none", 1.0))
-    direction = torch.randn(whitening.size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    objective = Objective(factorise(arrays, make_plan(arrays), estimate, Loss("none", 1.0)))
+    direction = torch.randn(
+        objective.whitening.size, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     step = 1e-5 * direction
     _, gradient = objective(step)
     _, opposite = objective(-step)
@@ -88,7 +96,10 @@ def test_the_tiled_factor_is_that_of_the_dense_matrix(cliques):
                 tiles[row, column] += torch.randn(size, size, generator=generator, dtype=torch.float64)
     matrix = dense(tiles, pattern, size, tip)
     lower = torch.linalg.cholesky(matrix)
+    indefinite = {key: -tile if key == (TIP, TIP) else tile.clone() for key, tile in tiles.items()}
+    assert factorise_tiles(indefinite, pattern) is None
     factor = factorise_tiles(tiles, pattern)
+    assert factor is not None
     right = torch.randn(len(matrix), 3, generator=generator, dtype=torch.float64)
     torch.testing.assert_close(factor.solve(right), torch.linalg.solve_triangular(lower, right, upper=False))
     torch.testing.assert_close(

@@ -22,11 +22,11 @@ import torch
 
 from tests.adjust.scene import Scene, make_scene
 from v2hdm.adjust import Drift, PoseSigma, SolveOptions, Status, solve
-from v2hdm.adjust.arrays import make_arrays
 from v2hdm.adjust.covariance import Covariance
+from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.problem import POSE_STATES
 from v2hdm.adjust.reduced import make_plan
-from v2hdm.adjust.residuals import Estimate
+from v2hdm.adjust.residuals import Estimate, Loss
 from v2hdm.adjust.whitening import factorise
 
 PAPER = SolveOptions(pose_states=(), loss="none")
@@ -101,7 +101,7 @@ def squared_bound_m2(scene: Scene) -> float:
         torch.as_tensor(scene.corners_map)[arrays.corner_order],
         arrays.no_clock(),
     )
-    whitening = factorise(arrays, make_plan(arrays), truth, torch.ones_like(arrays.measured[0]))
+    whitening = factorise(arrays, make_plan(arrays), truth, Loss("none", 1.0))
     groups = np.arange(scene.problem.corner_count)[:, None]
     return float(np.trace(Covariance(whitening).corners(groups), axis1=1, axis2=2).mean())
 

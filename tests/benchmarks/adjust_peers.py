@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from tests.adjust.scene import make_scene
 from tests.benchmarks.adjust_scaling import driven_on
 from v2hdm.adjust import PoseSigma, Problem, SolveOptions, solve
-from v2hdm.adjust.arrays import make_arrays
+from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.start import back_project
 
 try:

@@ -6,7 +6,15 @@ inside. :mod:`v2hdm.adjust.problem` states the model.
 
 from v2hdm.adjust.gating import Excluded, Verdict
 from v2hdm.adjust.observability import Observability, observability
-from v2hdm.adjust.problem import ControlPoints, Drift, Observations, PoseSigma, Problem, SolveOptions
+from v2hdm.adjust.problem import (
+    ControlPoints,
+    Drift,
+    KnownLengths,
+    Observations,
+    PoseSigma,
+    Problem,
+    SolveOptions,
+)
 from v2hdm.adjust.selection import MODELS, Model, Selection, select_model, with_model
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
@@ -16,6 +24,7 @@ __all__ = [
     "ControlPoints",
     "Drift",
     "Excluded",
+    "KnownLengths",
     "Model",
     "Observability",
     "Observations",

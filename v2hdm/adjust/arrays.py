@@ -1,27 +1,57 @@
-"""A problem as tensors, laid out for speed: sorted by corner, corners in route order."""
+"""A problem as tensors: 52 bytes an observation, sorted by corner, corners in route order, read in runs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import cached_property
+from itertools import pairwise
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from v2hdm.adjust.problem import POSE_STATES, Problem
-from v2hdm.geometry.transform import inverse
-from v2hdm.records import FloatArray
-
-# Least step between frames, as a fraction of the correlation length.
-_MIN_STEP = 1e-4
-# Below this share of an error its white part is rounding left over from the drift.
-_MIN_WHITE_SHARE = 1e-3
-# Observations that are computed at once: a few megabytes of intermediate results, or a device's fill.
+# Observations that are computed at once: their intermediate results stay in the processor's cache, and
+# beside the whole take no memory.
 _RUN = 1 << 14
 _RUN_ON_DEVICE = 1 << 22
+
+
+@dataclass(frozen=True)
+class Lengths:
+    """Known distances: between the corners ``first`` and ``second`` (M,), and 1 / sigma of each."""
+
+    first: Tensor
+    second: Tensor
+    length_m: Tensor
+    information_root: Tensor
+
+
+@dataclass(frozen=True)
+class Run:
+    """Neighbouring corners and all that was seen of them: k observations of n corners.
+
+    Attributes:
+        observations, corners: which of the problem's.
+        pair: (k,) as in :class:`Arrays`.
+        corner: (k,) counted from the run's first.
+        measured, root_information: (2, k) and (3, k), as in :class:`Arrays`.
+    """
+
+    observations: slice
+    corners: slice
+    pair: Tensor
+    corner: Tensor
+    measured: Tensor
+    root_information: Tensor
+
+    @property
+    def corner_count(self) -> int:
+        """The n corners."""
+        return int(self.corners.stop - self.corners.start)
+
+    def sum_by_corner(self, rows: Tensor) -> Tensor:
+        """Sums (n, m) over each corner's observations of values (m, k)."""
+        return rows.new_zeros(len(rows), self.corner_count).index_add_(1, self.corner, rows).T
 
 
 @dataclass(frozen=True)
@@ -35,6 +65,7 @@ class Arrays:
     Attributes:
         order: (K,) where each sorted observation stood in the problem.
         corner_order: (N,) which corner of the problem each one here is.
+        joined: (N,) whether known lengths join a corner to the one before it: such corners lie side by side.
         pair: (K,) index of the (camera, frame) pair.
         corner: (K,) index of the corner, ascending.
         measured: (2, K) where it was seen, on the plane at depth 1.
@@ -50,10 +81,12 @@ class Arrays:
         clock_information_root: 1 / sigma of a clock offset.
         control, control_information: surveyed positions (N, 2) of the corners and 1 / sigma^2 (N,), 0 where
             there is no survey.
+        lengths: known distances between corners.
     """
 
     order: Tensor
     corner_order: Tensor
+    joined: Tensor
     pair: Tensor
     corner: Tensor
     measured: Tensor
@@ -68,6 +101,7 @@ class Arrays:
     clock_information_root: float
     control: Tensor
     control_information: Tensor
+    lengths: Lengths
 
     @property
     def frame_count(self) -> int:
@@ -98,160 +132,83 @@ class Arrays:
         """Clock offsets (C, Q) of zero."""
         return self.centre.new_zeros(self.camera_count, self.clock_twist.shape[-1])
 
-    def parts(self) -> Iterator[tuple[slice, Arrays]]:
-        """Runs of observations, of the same corners and pairs, and where they are.
+    @cached_property
+    def unit_bounds(self) -> tuple[Tensor, Tensor]:
+        """Corners that may begin a run, the end appended, and where their observations begin."""
+        end = self.joined.new_full((1,), self.corner_count, dtype=torch.int64)
+        corners = torch.cat([(~self.joined).nonzero()[:, 0], end])
+        return corners, torch.searchsorted(self.corner, corners.to(self.corner.dtype))
 
-        What is computed of a run stays in the processor's cache, and beside the whole takes no memory.
-        """
-        run = _RUN if self.measured.device.type == "cpu" else _RUN_ON_DEVICE
-        for begin in range(0, len(self.pair), run):
-            part = slice(begin, begin + run)
-            yield (
-                part,
-                replace(
-                    self,
-                    order=self.order[part],
-                    pair=self.pair[part],
-                    corner=self.corner[part],
-                    measured=self.measured[:, part],
-                    root_information=self.root_information[:, part],
-                ),
-            )
+    @cached_property
+    def _run_bounds(self) -> list[tuple[int, int]]:
+        """(observation, corner) at which each run begins, and the end."""
+        corners, begins = self.unit_bounds
+        size = _RUN if self.measured.device.type == "cpu" else _RUN_ON_DEVICE
+        wanted = torch.arange(0, len(self.corner), size, device=begins.device)
+        chosen = [*torch.unique(torch.searchsorted(begins, wanted)).tolist(), len(corners) - 1]
+        return list(zip(begins[chosen].tolist(), corners[chosen].tolist(), strict=True))
+
+    def runs(self) -> Iterator[Run]:
+        """The whole problem, run by run; corners that are joined are never parted."""
+        for (begin, first), (end, last) in pairwise(self._run_bounds):
+            yield self.run(slice(begin, end), slice(first, last))
+
+    def run(self, observations: slice, corners: slice) -> Run:
+        """The run of these observations, which are all those of these corners."""
+        return Run(
+            observations,
+            corners,
+            self.pair[observations].long(),
+            self.corner[observations].long() - corners.start,
+            self.measured[:, observations],
+            self.root_information[:, observations],
+        )
+
+    def gather(self, corners: Tensor) -> Run:
+        """Some corners (n,), ascending, as a run of their own, in which they are counted from 0."""
+        bounds = torch.searchsorted(self.corner, torch.stack([corners, corners + 1]).to(self.corner.dtype))
+        count = bounds[1] - bounds[0]
+        corner = torch.repeat_interleave(count)
+        rows = torch.arange(len(corner), device=corner.device) + (bounds[1] - count.cumsum(0))[corner]
+        return Run(
+            slice(0, len(rows)),
+            slice(0, len(corners)),
+            self.pair[rows].long(),
+            corner,
+            self.measured[:, rows],
+            self.root_information[:, rows],
+        )
+
+    def whole(self) -> Run:
+        """Everything as one run."""
+        return self.run(slice(0, len(self.corner)), slice(0, self.corner_count))
 
     def take(self, keep: Tensor) -> tuple[Arrays, Tensor]:
         """The problem restricted to the observations ``keep`` (K,) and to the corners they touch.
 
-        Returns it with the indices here of the corners that are left.
+        Of the known lengths, those are left whose corners both are. Returns it with the indices here of
+        the corners that are left.
         """
         corners, corner = torch.unique(self.corner[keep], return_inverse=True)
+        corners = corners.long()
+        rank = torch.full_like(self.corner_order, -1)
+        rank[corners] = torch.arange(len(corners), device=rank.device)
+        first, second = rank[self.lengths.first], rank[self.lengths.second]
+        both = (first >= 0) & (second >= 0)
+        unit = (~self.joined).cumsum(0)[corners]
         part = replace(
             self,
             order=self.order[keep],
             corner_order=self.corner_order[corners],
+            joined=torch.cat([torch.zeros_like(self.joined[:1]), unit[1:] == unit[:-1]]),
             pair=self.pair[keep],
-            corner=corner,
+            corner=corner.to(self.corner.dtype),
             measured=self.measured[:, keep],
             root_information=self.root_information[:, keep],
             control=self.control[corners],
             control_information=self.control_information[corners],
+            lengths=Lengths(
+                first[both], second[both], self.lengths.length_m[both], self.lengths.information_root[both]
+            ),
         )
         return part, corners
-
-
-def make_arrays(
-    problem: Problem, pose_states: tuple[str, ...], device: str, clock_offset: bool = False
-) -> Arrays:
-    """Lay a checked problem out for the solver."""
-    seen = problem.observations
-    first_frame = np.full(problem.corner_count, len(problem.map_from_vehicle))
-    np.minimum.at(first_frame, seen.corner, seen.frame)
-    corner_order = np.argsort(first_frame, kind="stable")
-    rank = np.empty_like(corner_order)
-    rank[corner_order] = np.arange(len(corner_order))
-    order = np.lexsort((seen.frame, seen.camera, rank[seen.corner]))
-    focal, principal = problem.intrinsic[seen.camera, :2], problem.intrinsic[seen.camera, 2:]
-    measured = (seen.pinhole_px - principal) / focal
-    root = _root_information(seen.covariance_px, focal)[:, order]
-    components = _components(problem, pose_states)
-    transition, information_root = _state_prior(problem, components)
-    centre, centre_root = _centre_prior(problem)
-    control, control_information = _control(problem)
-
-    def real(values: FloatArray) -> Tensor:
-        return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float64, device=device)
-
-    def index(values: NDArray[np.integer[Any]]) -> Tensor:
-        return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.int64, device=device)
-
-    return Arrays(
-        order=index(order),
-        corner_order=index(corner_order),
-        pair=index((seen.camera * len(problem.map_from_vehicle) + seen.frame)[order]),
-        corner=index(rank[seen.corner][order]),
-        measured=real(measured[order].T),
-        root_information=real(root),
-        vehicle_from_map=inverse(real(problem.map_from_vehicle)),
-        states=tuple(component.column for component in components),
-        centre=real(centre),
-        centre_information_root=real(centre_root),
-        state_transition=real(transition),
-        state_information_root=real(information_root),
-        clock_twist=real(_clock_twist(problem, clock_offset)),
-        clock_information_root=1 / problem.clock_sigma_s,
-        control=real(control[corner_order]),
-        control_information=real(control_information[corner_order]),
-    )
-
-
-def _root_information(covariance_px: FloatArray, focal: FloatArray) -> FloatArray:
-    """Inverse Cholesky factors (3, K) of covariances (K, 2, 2): a, b, c of :class:`Arrays`."""
-    first = np.sqrt(covariance_px[:, 0, 0])
-    below = covariance_px[:, 1, 0] / first
-    last = np.sqrt(covariance_px[:, 1, 1] - below**2)
-    return np.stack([focal[:, 0] / first, -below * focal[:, 0] / (first * last), focal[:, 1] / last])
-
-
-def _control(problem: Problem) -> tuple[FloatArray, FloatArray]:
-    """Surveyed positions (N, 2) and 1 / sigma^2 (N,) of the problem's corners."""
-    points, information = np.zeros((problem.corner_count, 2)), np.zeros(problem.corner_count)
-    if problem.control is not None:
-        points[problem.control.corner] = problem.control.points_map
-        information[problem.control.corner] = 1 / problem.control.sigma_m**2
-    return points, information
-
-
-def _clock_twist(problem: Problem, clock_offset: bool) -> FloatArray:
-    """(J, 6, Q), Q = 1 if clock offsets are estimated."""
-    if not clock_offset or problem.twist_vehicle is None:
-        return np.zeros((len(problem.map_from_vehicle), 6, 0))
-    return problem.twist_vehicle[:, :, None]
-
-
-def _centre_prior(problem: Problem) -> tuple[FloatArray, FloatArray]:
-    """Prior centres and inverse sigmas (C, 3); without a survey the latter are 0."""
-    if problem.centre_vehicle is None or problem.centre_sigma_m is None:
-        nothing = np.zeros((len(problem.intrinsic), 3))
-        return nothing, nothing
-    return problem.centre_vehicle, 1 / problem.centre_sigma_m
-
-
-@dataclass(frozen=True)
-class _Component:
-    """One state of a frame: the tangent's column, its sigma, and how far it fades (0: white)."""
-
-    column: int
-    sigma: float
-    over_m: float
-
-
-def _components(problem: Problem, pose_states: tuple[str, ...]) -> list[_Component]:
-    """The states of a frame: for each error its white part, then its drift, where there are any."""
-    total, drifts = problem.pose_sigma.by_state(), problem.pose_sigma.drift_by_state()
-    chosen = [k for k, name in enumerate(POSE_STATES) if name in pose_states]
-    white = {k: float(np.sqrt(max(total[k] ** 2 - drifts[k].sigma ** 2, 0.0))) for k in chosen}
-    components = [_Component(k, white[k], 0.0) for k in chosen if white[k] > _MIN_WHITE_SHARE * total[k]]
-    return components + [_Component(k, drifts[k].sigma, drifts[k].over_m) for k in chosen if drifts[k].sigma]
-
-
-def _state_prior(problem: Problem, components: list[_Component]) -> tuple[FloatArray, FloatArray]:
-    """Transition (J, S, S) and inverse sigma (J, S) of the innovation of each frame's states.
-
-    A drift is a first-order Gauss-Markov process along the driven distance d: memory m = exp(-d / over_m),
-    innovation variance sigma^2 (1 - m^2) (Gelb, Applied Optimal Estimation, section 3.8).
-    """
-    poses = problem.map_from_vehicle
-    step_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    turn = np.tile(np.eye(6), (max(len(poses) - 1, 0), 1, 1))
-    turn[:, :2, :2] = poses[1:, :2, :2].transpose(0, 2, 1) @ poses[:-1, :2, :2]
-    transition = np.zeros((len(poses), len(components), len(components)))
-    information_root = np.empty((len(poses), len(components)))
-    for a, state in enumerate(components):
-        memory = np.zeros(len(poses))
-        if state.over_m:
-            # A vehicle at rest repeats its error; a floor on the step keeps the innovation's sigma above 0.
-            memory[1:] = np.exp(-np.maximum(step_m / state.over_m, _MIN_STEP))
-            for b, before in enumerate(components):
-                if before.over_m:
-                    transition[1:, a, b] = memory[1:] * turn[:, state.column, before.column]
-        information_root[:, a] = 1 / (state.sigma * np.sqrt(1 - memory**2))
-    return transition, information_root

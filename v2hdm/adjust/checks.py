@@ -8,9 +8,15 @@ from v2hdm.adjust.problem import LOSSES, POSE_STATES, SOLVERS, IntArray, Problem
 from v2hdm.errors import AdjustError
 from v2hdm.records import FloatArray
 
+# Observations whose covariances are checked at once.
+_ROWS = 1 << 18
+
 
 def check_problem(problem: Problem) -> None:
-    """Raise :class:`AdjustError` for the first thing in ``problem`` that cannot be solved with."""
+    """Raise :class:`AdjustError` for the first thing in ``problem`` that cannot be solved with.
+
+    Except observations that are there twice: :func:`v2hdm.adjust.layout.make_arrays` finds them as it sorts.
+    """
     _check_shapes(problem)
     _check_finite(problem)
     _check_rigid("cam_from_vehicle", problem.cam_from_vehicle)
@@ -18,6 +24,7 @@ def check_problem(problem: Problem) -> None:
     _check_observations(problem)
     _check_priors(problem)
     _check_control(problem)
+    _check_lengths(problem)
 
 
 def _check_control(problem: Problem) -> None:
@@ -37,6 +44,33 @@ def _check_control(problem: Problem) -> None:
     wrong = np.flatnonzero(~(np.isfinite(control.points_map).all(1) & (control.sigma_m > 0)))
     if len(wrong):
         raise AdjustError(f"control point {wrong[0]} is not finite or its sigma_m is not above 0")
+
+
+def _check_lengths(problem: Problem) -> None:
+    known = problem.lengths
+    if known is None:
+        return
+    count = len(known.first)
+    if any(np.shape(values) != (count,) for values in (known.second, known.length_m, known.sigma_m)):
+        raise AdjustError(f"known lengths: {count} first corners need as many second, length_m and sigma_m")
+    ends = np.stack([known.first, known.second])
+    wrong = np.flatnonzero(((ends < 0) | (ends >= problem.corner_count)).any(0))
+    if len(wrong):
+        first, second = ends[:, wrong[0]]
+        raise AdjustError(f"known length {wrong[0]} names corners {first} and {second}; one is not there")
+    wrong = np.flatnonzero(ends[0] == ends[1])
+    if len(wrong):
+        raise AdjustError(f"known length {wrong[0]} is from corner {ends[0, wrong[0]]} to itself")
+    _, index, times = np.unique(np.sort(ends, axis=0), axis=1, return_index=True, return_counts=True)
+    if (times > 1).any():
+        first, second = ends[:, index[np.argmax(times > 1)]]
+        raise AdjustError(f"the distance of corners {first} and {second} is given twice: keep one of them")
+    wrong = np.flatnonzero(~(np.isfinite(known.length_m) & (known.length_m > 0)))
+    if len(wrong):
+        raise AdjustError(f"known length {wrong[0]} is {known.length_m[wrong[0]]:g} m: give one above 0")
+    wrong = np.flatnonzero(~(np.isfinite(known.sigma_m) & (known.sigma_m > 0)))
+    if len(wrong):
+        raise AdjustError(f"sigma_m of known length {wrong[0]} is not above 0 and finite")
 
 
 def check_model(problem: Problem, options: SolveOptions) -> None:
@@ -127,15 +161,6 @@ def _check_rigid(name: str, transforms: FloatArray) -> None:
 
 def _check_observations(problem: Problem) -> None:
     seen = problem.observations
-    key = np.stack([seen.corner, seen.camera, seen.frame])
-    order = np.lexsort(key)
-    same = np.flatnonzero((np.diff(key[:, order], axis=1) == 0).all(0))
-    if len(same):
-        first, second = sorted(order[same[0] : same[0] + 2])
-        raise AdjustError(
-            f"observations {first} and {second} are the same corner {seen.corner[first]} in frame "
-            f"{seen.frame[first]} of camera {seen.camera[first]}: keep one of them"
-        )
     for name, index, size in (
         ("corner", seen.corner, problem.corner_count),
         ("camera", seen.camera, len(problem.intrinsic)),
@@ -143,10 +168,12 @@ def _check_observations(problem: Problem) -> None:
         unseen = np.flatnonzero(np.bincount(index, minlength=size) == 0)
         if len(unseen):
             raise AdjustError(f"{name} {unseen[0]} has no observation: leave it out of the problem")
-    own, across = np.diagonal(seen.covariance_px, axis1=1, axis2=2), seen.covariance_px[:, 1, 0]
-    wrong = np.flatnonzero(~((own[:, 0] > 0) & (own.prod(axis=1) > across**2)))
-    if len(wrong):
-        raise AdjustError(f"covariance_px of observation {wrong[0]} is not positive definite")
+    for begin in range(0, len(seen.corner), _ROWS):
+        covariance = seen.covariance_px[begin : begin + _ROWS]
+        own, across = np.diagonal(covariance, axis1=1, axis2=2), covariance[:, 1, 0]
+        wrong = np.flatnonzero(~((own[:, 0] > 0) & (own.prod(axis=1) > across**2)))
+        if len(wrong):
+            raise AdjustError(f"covariance_px of observation {begin + wrong[0]} is not positive definite")
 
 
 def _check_priors(problem: Problem) -> None:

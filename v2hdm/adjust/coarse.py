@@ -10,7 +10,7 @@ from torch import Tensor
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.descent import descend
 from v2hdm.adjust.residuals import Estimate, Loss
-from v2hdm.adjust.start import back_project, ground_hits
+from v2hdm.adjust.start import back_project, ground_hits, ray_table
 
 # Sines of the depression below which rays are left out, in turn.
 _MIN_DEPRESSION_SINES = (0.2, 0.1)
@@ -31,10 +31,12 @@ def coarse_extrinsics(arrays: Arrays, cam_from_vehicle: Tensor) -> tuple[Tensor,
     here. The loss is convex, and wide enough for the residuals that are found.
     """
     subset = _route_blocks(arrays)
+    if not bool(subset.all()):
+        arrays, _ = arrays.take(subset[arrays.corner])
     evaluations = 0
     for min_sine in _MIN_DEPRESSION_SINES:
-        _, sine = ground_hits(arrays, cam_from_vehicle)
-        part = _seen_twice(arrays, subset[arrays.corner] & (sine > min_sine))
+        _, sine = ground_hits(arrays.whole(), ray_table(arrays, cam_from_vehicle))
+        part = _seen_twice(arrays, sine > min_sine)
         if part is None:
             continue
         corners, _ = back_project(part, cam_from_vehicle)
@@ -42,7 +44,7 @@ def coarse_extrinsics(arrays: Arrays, cam_from_vehicle: Tensor) -> tuple[Tensor,
         descent = descend(
             part, start, Loss("huber", 1.0), "lbfgs", _GAP_TOLERANCE, _MAX_REFRESHES, _MAX_EVALUATIONS
         )
-        cam_from_vehicle = descent.estimate.cam_from_vehicle
+        cam_from_vehicle = descent.whitening.estimate.cam_from_vehicle
         evaluations += descent.evaluations
     return cam_from_vehicle, evaluations
 

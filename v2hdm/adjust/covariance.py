@@ -9,20 +9,25 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v2hdm.adjust.reduced import spread_to_cameras, to_tiles
+from v2hdm.adjust.arrays import Arrays
+from v2hdm.adjust.linear import coupling, jacobians
+from v2hdm.adjust.reduced import coupling_by_camera, to_tiles
+from v2hdm.adjust.residuals import observe
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.records import FloatArray
 
-# Right-hand sides solved for together: enough for fast products, few enough to stay small.
+# Corners whose right-hand sides are solved for together: enough for fast products, and of how many numbers
+# these may consist.
 _CORNERS_AT_ONCE = 256
+_NUMBERS_AT_ONCE = 1 << 25
 
 
 @dataclass(frozen=True)
 class Covariance:
     """Marginal covariances at the solution, of whatever was estimated beside marginalised out.
 
-    With the factors of :mod:`v2hdm.adjust.whitening`, the reduced unknowns have S^-1 and corners
-    L_i^-T (delta_ij + B_i S^-1 B_j') L_j^-1.
+    With the factors of :mod:`v2hdm.adjust.whitening`, the reduced unknowns have S^-1 and the corners
+    V^-1 + V^-1 W' S^-1 W V^-1.
     """
 
     whitening: Whitening
@@ -44,35 +49,74 @@ class Covariance:
 
     def corners(self, groups: NDArray[np.int64]) -> FloatArray:
         """Joint covariance (M, 2 n, 2 n), m^2, within each of M groups (M, n) of corners of the problem."""
-        parts = np.array_split(groups, max(-(-groups.size // _CORNERS_AT_ONCE), 1))
+        at_once = min(max(_NUMBERS_AT_ONCE // (2 * self.whitening.reduced_factor.size), 1), _CORNERS_AT_ONCE)
+        parts = np.array_split(groups, min(max(-(-groups.size // at_once), 1), len(groups)))
         return np.concatenate([self._corners(part) for part in parts])
 
     def _corners(self, groups: NDArray[np.int64]) -> FloatArray:
-        count, each = groups.shape
-        rank = torch.argsort(self.whitening.arrays.corner_order)
-        chosen = rank[torch.as_tensor(groups.flatten(), device=rank.device)]
-        root = _reduced_root(self.whitening, chosen).reshape(-1, count, 2 * each).transpose(0, 1)
-        middle = root.mT @ root + torch.eye(2 * each, dtype=root.dtype, device=root.device)
-        blocks = middle.new_zeros(count, each, 2, each, 2)
-        index = torch.arange(each, device=rank.device)
-        inverse = torch.linalg.inv(self.whitening.corner_factor[chosen]).reshape(count, each, 2, 2)
-        blocks[:, index, :, index, :] = inverse.transpose(0, 1)
-        spread = blocks.reshape(count, 2 * each, 2 * each)
-        return np.asarray((spread.mT @ middle @ spread).cpu().numpy())
+        arrays = self.whitening.arrays
+        rank = torch.argsort(arrays.corner_order)
+        chosen = rank[torch.as_tensor(groups, device=rank.device)]
+        # Known lengths tie corners to others outside their group, and V^-1 with them.
+        near = _with_joined(arrays, chosen)
+        corners = torch.unique(near)
+        root = _reduced_root(self.whitening, corners)
+        by_near = root.T[_columns(corners, near)]
+        inverse = _corner_inverse(self.whitening, corners)
+        rows = _columns(corners, chosen)
+        spread = _blocks(inverse, rows, _columns(corners, near)) * _once(near)
+        covariance = _blocks(inverse, rows, rows) + spread @ (by_near @ by_near.mT) @ spread.mT
+        return np.asarray(covariance.cpu().numpy())
 
 
-def _reduced_root(whitening: Whitening, chosen: Tensor) -> Tensor:
-    """L_S^-1 [B_1' B_2' ...] (D, 2 n) for n chosen corners."""
-    arrays, plan = whitening.arrays, whitening.plan
-    frames, states, columns = arrays.frame_count, len(arrays.states), 2 * len(chosen)
-    by_frame = whitening.coupling.new_zeros(frames, states, len(chosen), 2)
-    by_camera = whitening.coupling.new_zeros(arrays.camera_count, arrays.camera_unknowns, len(chosen), 2)
-    spread = whitening.spread.state.reshape(arrays.pair_count, 6, states)
-    bounds = torch.searchsorted(arrays.corner, torch.stack([chosen, chosen + 1]))
-    for n, (begin, end) in enumerate(bounds.T.tolist()):
-        pair, part = arrays.pair[begin:end], whitening.coupling[:, :, begin:end].permute(2, 0, 1)
-        by_frame[:, :, n].index_add_(0, pair % frames, (part @ spread[pair]).mT)
-        of_camera = spread_to_cameras(arrays, whitening.spread, part, pair)
-        by_camera[:, :, n].index_add_(0, pair // frames, of_camera.mT)
-    top = to_tiles(plan, by_frame.reshape(frames, states, columns))
-    return whitening.reduced_factor.solve(torch.cat([top, by_camera.reshape(-1, columns)]))
+def _with_joined(arrays: Arrays, chosen: Tensor) -> Tensor:
+    """Groups (M, n) of corners, and all that known lengths join to them (M, m).
+
+    Shorter rows are filled up with their last corner.
+    """
+    if not bool(arrays.joined.any()):
+        return chosen
+    unit = (~arrays.joined).cumsum(0)
+    groups = [torch.isin(unit, unit[group]).nonzero()[:, 0] for group in chosen]
+    longest = max(len(group) for group in groups)
+    return torch.stack([torch.cat([g, g[-1:].expand(longest - len(g))]) for g in groups])
+
+
+def _once(near: Tensor) -> Tensor:
+    """1 for the columns (M, 1, 2 m) of each row's corners, 0 for what repeats one."""
+    again = (near[:, :, None] == near[:, None, :]).tril(-1).any(2)
+    return (~again).repeat_interleave(2, dim=1)[:, None].to(torch.float64)
+
+
+def _columns(corners: Tensor, wanted: Tensor) -> Tensor:
+    """Where x and y (M, 2 m) of the corners ``wanted`` (M, m) stand among those of ``corners``, ascending."""
+    place = 2 * torch.searchsorted(corners, wanted.contiguous())
+    return torch.stack([place, place + 1], dim=-1).flatten(1)
+
+
+def _blocks(matrix: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """(M, r, c) of a matrix, for rows (M, r) and columns (M, c)."""
+    return matrix[rows[:, :, None], columns[:, None, :]]
+
+
+def _corner_inverse(whitening: Whitening, corners: Tensor) -> Tensor:
+    """V^-1 (2 n, 2 n) of corners (n,), all those with them that known lengths join."""
+    unit = torch.eye(2 * len(corners), dtype=whitening.table.dtype, device=corners.device)
+    factor = whitening.corner_factor.take(corners)
+    return factor.solve_transposed(factor.solve(unit.view(len(corners), 2, -1))).flatten(0, 1)
+
+
+def _reduced_root(whitening: Whitening, corners: Tensor) -> Tensor:
+    """L_S^-1 W (D, 2 n) for n corners, ascending."""
+    arrays, spread, states = whitening.arrays, whitening.spread, len(whitening.arrays.states)
+    run = arrays.gather(corners)
+    view = observe(run, whitening.table, whitening.estimate.corners_map[corners])
+    root = whitening.weight(view).sqrt()
+    by_pair = coupling(*(rows * root for rows in jacobians(run, view)))
+    by_state = by_pair.permute(2, 0, 1) @ spread.state.reshape(arrays.pair_count, 6, states)[run.pair]
+    by_frame = by_pair.new_zeros(arrays.frame_count, states, len(corners), 2)
+    place = (run.pair % arrays.frame_count, run.corner)
+    by_frame.permute(0, 2, 1, 3).index_put_(place, by_state.mT, accumulate=True)
+    by_camera = coupling_by_camera(arrays, spread, run, by_pair)
+    right = [to_tiles(whitening.plan, by_frame.flatten(2)), by_camera.permute(2, 0, 1).flatten(1)]
+    return whitening.reduced_factor.solve(torch.cat(right))

@@ -14,7 +14,9 @@ from v2hdm.records import BoolArray, FloatArray
 VerdictArray = NDArray[np.int8]
 
 # The median of a chi-square distribution with two degrees of freedom is 2 ln 2.
-MEDIAN_SQUARED = 2 * float(np.log(2))
+_MEDIAN_SQUARED = 2 * float(np.log(2))
+# Observations that are judged at once.
+_ROWS = 1 << 18
 
 
 class Verdict(IntEnum):
@@ -59,8 +61,17 @@ class Excluded:
         )
 
 
+def noise_scale(mahalanobis2: FloatArray) -> float:
+    """How many times as large as stated the noise's variance is, by the median; at least 1."""
+    return max(1.0, float(np.median(mahalanobis2)) / _MEDIAN_SQUARED)
+
+
 def judge(
-    observations: Observations, mahalanobis2: FloatArray, behind: BoolArray, probability: float
+    observations: Observations,
+    mahalanobis2: FloatArray,
+    behind: BoolArray,
+    probability: float,
+    scale: float,
 ) -> VerdictArray:
     """A :class:`Verdict` (K,) for every observation.
 
@@ -74,15 +85,24 @@ def judge(
         mahalanobis2: squared residuals in standard deviations (K,).
         behind: corners (K,) that lie behind their camera.
         probability: share of sound observations that one is ready to lose.
+        scale: of the noise's variance, :func:`noise_scale`.
     """
-    scale = max(1.0, float(np.median(mahalanobis2)) / MEDIAN_SQUARED)
-    verdict = np.where(mahalanobis2 > -2 * np.log(probability) * scale, Verdict.CONTRADICTS, Verdict.ACCEPTED)
+    gate = -2 * np.log(probability) * scale
+    verdict = np.full(len(mahalanobis2), Verdict.ACCEPTED, dtype=np.int8)
+    verdict[mahalanobis2 > gate] = Verdict.CONTRADICTS
     verdict[behind] = Verdict.BEHIND_CAMERA
-    accepted = verdict == Verdict.ACCEPTED
-    left = np.bincount(observations.corner[accepted], minlength=int(observations.corner.max()) + 1)
-    seen = np.bincount(observations.corner, minlength=len(left))
-    verdict[accepted & ((left == 1) & (seen > 1))[observations.corner]] = Verdict.UNCONFIRMED
-    return verdict.astype(np.int8)
+    count = int(observations.corner.max()) + 1
+    left, seen = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
+    parts = [slice(begin, begin + _ROWS) for begin in range(0, len(verdict), _ROWS)]
+    for part in parts:
+        np.add.at(seen, observations.corner[part], 1)
+        np.add.at(left, observations.corner[part], verdict[part] == Verdict.ACCEPTED)
+    alone = (left == 1) & (seen > 1)
+    for part in parts:
+        verdict[part][alone[observations.corner[part]] & (verdict[part] == Verdict.ACCEPTED)] = (
+            Verdict.UNCONFIRMED
+        )
+    return verdict
 
 
 def excluded(

@@ -12,6 +12,9 @@ Objective = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 _HISTORY = 20
 _LINE_SEARCH_EVALUATIONS = 25
+# A whitening after which a step, the first aside, leaves more than this of the gap was made too far away: a
+# new one, though it costs several evaluations, pays.
+_SLOW = 0.25
 # A relative decrease below this is rounding.
 _NO_PROGRESS = 1e-15
 
@@ -68,8 +71,9 @@ def minimise(
     recent = [(torch.zeros_like(gradient), cost, gradient)]
     optimizer = _one_step_optimizer(u)
     best, best_gradient = cost, gradient
-    for _ in range(max_iterations):
-        if predicted_gap(best, best_gradient) <= tolerance:
+    gap, slow = predicted_gap(best, best_gradient), False
+    for iteration in range(max_iterations):
+        if gap <= tolerance or slow:
             break
         optimizer.step(closure)  # type: ignore[no-untyped-call]
         reached, reached_gradient = evaluate(u.detach())
@@ -78,6 +82,8 @@ def minimise(
         best, best_gradient = reached, reached_gradient
         if progress <= _NO_PROGRESS * float(best):
             break
+        before, gap = gap, predicted_gap(best, best_gradient)
+        slow = iteration > 0 and gap > _SLOW * before
     return u.detach() * scale, best, best_gradient
 
 

@@ -13,7 +13,8 @@ The cost, in units of half a squared standard deviation, is
 .. math:: f = \tfrac12 \sum_k \rho(\|\Sigma_k^{-1/2} (\pi(T_c\,e^{-s_j} P_j^{-1}\, l) - u_k)\|^2)
     + \tfrac12 \sum_c \|(o_c - \bar o_c) / \sigma_c\|^2 + \tfrac12 \sum_j \|s_j / \sigma_s\|^2
 
-over observations k (one corner in one image), camera centres o and frame states s. The prior acts on
+over observations k (one corner in one image), camera centres o and frame states s; to which come, where they
+are known, the surveyed positions of corners, the distances between them, and clock offsets. The prior acts on
 the camera's *centre in the vehicle frame*, which a survey measures, and not on the translation of
 ``cam_from_vehicle``, which a rotation error would drag along.
 """
@@ -73,6 +74,21 @@ class ControlPoints:
 
 
 @dataclass(frozen=True)
+class KnownLengths:
+    """M distances that are known beforehand, such as the sides of a painted sign.
+
+    Between the corners ``first`` (M,) and ``second`` (M,) there are ``length_m`` (M,), give or take
+    ``sigma_m`` (M,). Corners that lengths join, directly or through others, are eliminated together: meant
+    for those of one marking, not for a net over the whole map.
+    """
+
+    first: IntArray
+    second: IntArray
+    length_m: FloatArray
+    sigma_m: FloatArray
+
+
+@dataclass(frozen=True)
 class PoseSigma:
     """How far the recorded poses are off, one standard deviation of each state of a frame.
 
@@ -110,7 +126,8 @@ class Problem:
     given, replaces the start by weighted back-projection. ``twist_vehicle`` (J, 6) is how the vehicle
     moves at each frame, per second and in its own frame (m/s, then rad/s); a clock offset needs it, and
     is held near zero by ``clock_sigma_s``. ``control``, if given, ties corners to a survey: the only thing
-    that can tell a shift of the whole map from the drift of the receiver.
+    that can tell a shift of the whole map from the drift of the receiver. ``lengths``, if given, are known
+    distances between corners.
     """
 
     intrinsic: FloatArray
@@ -125,6 +142,7 @@ class Problem:
     twist_vehicle: FloatArray | None = None
     clock_sigma_s: float = 0.02
     control: ControlPoints | None = None
+    lengths: KnownLengths | None = None
 
 
 @dataclass(kw_only=True)

@@ -1,6 +1,6 @@
 """The reduced system of frame states and extrinsics, corners eliminated, in tiles along the route.
 
-S = U - sum_i B_i' B_i (see :mod:`v2hdm.adjust.whitening`). Vectors of the reduced unknowns hold the
+S = U - B' B (see :mod:`v2hdm.adjust.whitening`). Vectors of the reduced unknowns hold the
 frame states, tile by tile in elimination order and padded to whole tiles, then the extrinsics.
 """
 
@@ -12,9 +12,11 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from v2hdm.adjust.arrays import Arrays
-from v2hdm.adjust.residuals import Estimate
-from v2hdm.adjust.tiles import TIP, Pattern, Tiles, find_pattern
+from v2hdm.adjust.arrays import Arrays, Run
+from v2hdm.adjust.corner_factor import CornerFactor
+from v2hdm.adjust.linear import PAIR_BLOCK
+from v2hdm.adjust.residuals import Estimate, of_each
+from v2hdm.adjust.tiles import TIP, Pattern, TiledCholesky, Tiles, factorise_tiles, find_pattern
 
 # Rows of a tile, about: large enough for fast products, small against a corner's span of frames.
 _TILE_ROWS = 96
@@ -24,26 +26,23 @@ _BLOCK_CORNERS = 32
 
 @dataclass(frozen=True)
 class Block:
-    """A run of corners: their observations [begin, end), the tiles they touch, and its place there.
+    """Some corners of a run and their observations, counted within it, and the tiles that they touch."""
 
-    ``row`` is each observation's corner, counted within the block; ``slot`` its frame, counted
-    over the touched tiles.
-    """
-
-    begin: int
-    end: int
+    observations: slice
+    corners: slice
     tiles: tuple[int, ...]
-    row: Tensor
-    slot: Tensor
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How a problem's reduced system is cut into tiles; depends on who saw what, not on numbers."""
+    """How a problem's reduced system is cut into tiles; depends on who saw what, not on numbers.
+
+    ``blocks`` are those of each run; where frames have no states there are none.
+    """
 
     frames_per_tile: int
     pattern: Pattern
-    blocks: tuple[Block, ...]
+    blocks: tuple[tuple[Block, ...], ...]
 
     @property
     def tile_count(self) -> int:
@@ -53,29 +52,33 @@ class Plan:
 
 def make_plan(arrays: Arrays) -> Plan:
     """Cut the frames into tiles and the corners into blocks, and find the factor's pattern."""
-    states = len(arrays.states)
-    per_tile = max(_TILE_ROWS // states, 1) if states else arrays.frame_count
-    count = -(-arrays.frame_count // per_tile) if states else 0
-    frame = arrays.pair % arrays.frame_count
-    starts = torch.arange(0, arrays.corner_count, _BLOCK_CORNERS, device=frame.device)
-    bounds = [*torch.searchsorted(arrays.corner, starts).tolist(), len(frame)]
-    blocks = []
-    for begin, end in pairwise(bounds):
-        touched = torch.unique(frame[begin:end] // per_tile)
-        slot = torch.searchsorted(touched, frame[begin:end] // per_tile) * per_tile
-        blocks.append(
-            Block(
-                begin,
-                end,
-                tuple(touched.tolist()) if states else (),
-                arrays.corner[begin:end] - arrays.corner[begin],
-                slot + frame[begin:end] % per_tile,
-            )
-        )
-    cliques = [list(block.tiles) for block in blocks]
+    if not arrays.states:
+        return Plan(arrays.frame_count, find_pattern(0, []), tuple(() for _ in arrays.runs()))
+    per_tile = max(_TILE_ROWS // len(arrays.states), 1)
+    count = -(-arrays.frame_count // per_tile)
+    blocks = tuple(tuple(_blocks(arrays, run, per_tile)) for run in arrays.runs())
+    cliques = [list(block.tiles) for of_run in blocks for block in of_run]
     if bool(arrays.state_transition.any()):
         cliques += [[tile, tile + 1] for tile in range(count - 1)]
-    return Plan(per_tile, find_pattern(count, cliques), tuple(blocks))
+    return Plan(per_tile, find_pattern(count, cliques), blocks)
+
+
+def _blocks(arrays: Arrays, run: Run, per_tile: int) -> list[Block]:
+    """Cut a run; corners that are joined are not parted."""
+    units, begins = arrays.unit_bounds
+    wanted = torch.arange(run.corners.start, run.corners.stop + _BLOCK_CORNERS, _BLOCK_CORNERS)
+    wanted = wanted.clamp(max=run.corners.stop).to(units.device)
+    cuts = torch.unique(torch.searchsorted(units, wanted))
+    bounds = zip(
+        (begins[cuts] - run.observations.start).tolist(),
+        (units[cuts] - run.corners.start).tolist(),
+        strict=True,
+    )
+    tile = run.pair % arrays.frame_count // per_tile
+    return [
+        Block(slice(begin, end), slice(first, last), tuple(torch.unique(tile[begin:end]).tolist()))
+        for (begin, first), (end, last) in pairwise(bounds)
+    ]
 
 
 def to_tiles(plan: Plan, by_frame: Tensor) -> Tensor:
@@ -117,107 +120,161 @@ class Spread:
         return torch.cat([identity.expand(*self.clock.shape[:2], 6, 6), self.clock], dim=-1)
 
 
-def held_hessian(arrays: Arrays, plan: Plan, estimate: Estimate, blocks: Tensor, spread: Spread) -> Tiles:
-    """U: the Hessian of frame states and extrinsics, priors included, with the corners held.
+class ReducedSystem:
+    """S while it is put together: the corners' part comes off run by run, then U is added."""
 
-    Args:
-        arrays: the problem.
-        plan: its tiles.
-        estimate: where.
-        blocks: the pairs' own, (P, 6, 6).
-        spread: how the pairs move with frames and cameras.
-    """
-    cameras, states, each = arrays.camera_count, len(arrays.states), arrays.camera_unknowns
-    blocks = blocks.reshape(cameras, arrays.frame_count, 6, 6)
-    of_camera = spread.camera
-    by_camera = blocks @ of_camera
-    tiles = _empty_tiles(plan, states, cameras * each, blocks)
-    if states:
-        _add_frames(arrays, plan, (spread.state.mT @ blocks @ spread.state).sum(0), tiles)
-        border = to_tiles(plan, (spread.state.mT @ by_camera).permute(1, 2, 0, 3).flatten(2))
-        for column, part in enumerate(border.chunk(plan.tile_count)):
-            tiles[TIP, column] = part.mT.contiguous()
-    tip = tiles[TIP, TIP].view(cameras, each, cameras, each)
-    rotation, root = estimate.cam_from_vehicle[:, :3, :3], arrays.centre_information_root
-    information = rotation * root.square()[:, None] @ rotation.mT
-    for camera in range(cameras):
-        tip[camera, :, camera] = (of_camera[camera].mT @ by_camera[camera]).sum(0)
-        tip[camera, :3, camera, :3] += information[camera]
-        tip[camera, :, camera].diagonal()[6:] += arrays.clock_information_root**2
-    return tiles
+    def __init__(self, arrays: Arrays, plan: Plan, spread: Spread) -> None:
+        self.arrays, self.plan, self.spread = arrays, plan, spread
+        self._state_table = spread.state.reshape(arrays.pair_count, -1).T.contiguous()
+        tip = arrays.camera_count * arrays.camera_unknowns
+        size = plan.frames_per_tile * len(arrays.states)
+        self.tiles: Tiles = {(TIP, TIP): arrays.centre.new_zeros(tip, tip)}
+        for column, below in enumerate(plan.pattern.below):
+            self.tiles[TIP, column] = arrays.centre.new_zeros(tip, size)
+            for row in (column, *below):
+                self.tiles[row, column] = arrays.centre.new_zeros(size, size)
 
+    def subtract(self, number: int, run: Run, coupling: Tensor, factor: CornerFactor) -> None:
+        """Take B' B of run ``number`` off; ``coupling`` (2, 6, k) is W' by observation."""
+        by_camera = factor.solve(coupling_by_camera(self.arrays, self.spread, run, coupling))
+        tip = by_camera.flatten(0, 1)
+        self.tiles[TIP, TIP].addmm_(tip.mT, tip, alpha=-1)
+        blocks = self.plan.blocks[number]
+        by_state = self._by_state(run, coupling) if blocks else coupling
+        for block in blocks:
+            columns = factor.part(block.corners).solve(self._by_frame(block, run, by_state)).flatten(0, 1)
+            self._subtract_block(block, columns, by_camera[block.corners].flatten(0, 1))
 
-def _empty_tiles(plan: Plan, states: int, tip: int, like: Tensor) -> Tiles:
-    size = plan.frames_per_tile * states
-    tiles = {(TIP, TIP): like.new_zeros(tip, tip)}
-    for column, below in enumerate(plan.pattern.below):
-        tiles[TIP, column] = like.new_zeros(tip, size)
-        for row in (column, *below):
-            tiles[row, column] = like.new_zeros(size, size)
-    return tiles
+    def _by_state(self, run: Run, coupling: Tensor) -> Tensor:
+        """W' by the states of each observation's frame, (2, S, k)."""
+        states = len(self.arrays.states)
+        spread = of_each(self._state_table, run.pair).view(6, states, -1)
+        out = coupling[:, :1] * spread[0]
+        for row in range(1, 6):
+            out.addcmul_(coupling[:, row : row + 1], spread[row])
+        return out
 
+    def _by_frame(self, block: Block, run: Run, by_state: Tensor) -> Tensor:
+        """W' of a block by the states of the frames of its tiles, (n, 2, tiles * F * S)."""
+        per_tile, states = self.plan.frames_per_tile, len(self.arrays.states)
+        part, corners = block.observations, block.corners.stop - block.corners.start
+        tiles = torch.tensor(block.tiles, device=run.pair.device)
+        frame, slots = run.pair[part] % self.arrays.frame_count, per_tile * len(block.tiles)
+        slot = torch.searchsorted(tiles, frame // per_tile) * per_tile + frame % per_tile
+        rows = by_state.new_zeros(2 * states, corners * slots)
+        place = (run.corner[part] - block.corners.start) * slots + slot
+        rows.index_add_(1, place, by_state[:, :, part].reshape(2 * states, -1))
+        by_frame = rows.view(2, states, corners, slots).permute(2, 0, 3, 1)
+        return by_frame.reshape(corners, 2, -1)
 
-def _add_frames(arrays: Arrays, plan: Plan, by_frame: Tensor, tiles: Tiles) -> None:
-    """Each frame's own information and prior, and the prior's coupling to the frame before."""
-    root, transition = arrays.state_information_root, arrays.state_transition
-    carried = root[..., None] * transition
-    own = torch.diag_embed(root.square())
-    own[:-1] += (carried.mT @ carried)[1:]
-    across = -root[..., None] * carried
-    per_tile, position, states = plan.frames_per_tile, plan.pattern.position, root.shape[1]
-    by_frame = by_frame + own
-    for tile, begin in enumerate(range(0, arrays.frame_count, per_tile)):
-        part, coupling = by_frame[begin : begin + per_tile], across[begin : begin + per_tile]
-        count = len(part)
-        view = tiles[position[tile], position[tile]].view(per_tile, states, per_tile, states)
-        index = torch.arange(per_tile, device=root.device)
-        # Frames that only fill up the last tile are fixed at 0.
-        view[index, :, index, :] = torch.eye(states, dtype=root.dtype, device=root.device)
-        view[index[:count], :, index[:count], :] = part
-        view[index[1:count], :, index[: count - 1], :] = coupling[1:]
-        view[index[: count - 1], :, index[1:count], :] = coupling[1:].mT
-        if tile and bool(coupling[0].any()):
-            _add_between(tiles, position[tile], position[tile - 1], coupling[0])
-
-
-def _add_between(tiles: Tiles, later: int, earlier: int, coupling: Tensor) -> None:
-    """Couple the first frame of one tile with the last of the one before it on the route."""
-    states = len(coupling)
-    if later > earlier:
-        tiles[later, earlier][:states, -states:] += coupling
-    else:
-        tiles[earlier, later][-states:, :states] += coupling.mT
-
-
-def subtract_corners(arrays: Arrays, plan: Plan, coupling: Tensor, spread: Spread, tiles: Tiles) -> None:
-    """Take sum_i B_i' B_i off, block by block; ``coupling`` (2, 6, K) holds B_i by observation."""
-    states, cameras, each = len(arrays.states), arrays.camera_count, arrays.camera_unknowns
-    camera = arrays.pair // arrays.frame_count
-    by_state = spread.state.reshape(arrays.pair_count, 6, states)
-    for block in plan.blocks:
-        part, rows = slice(block.begin, block.end), int(block.row[-1]) + 1
-        own = coupling[:, :, part].permute(2, 0, 1)
-        by_camera = coupling.new_zeros(rows, cameras, 2, each)
-        of_camera = spread_to_cameras(arrays, spread, own, arrays.pair[part])
-        by_camera.index_put_((block.row, camera[part]), of_camera, accumulate=True)
-        tip = by_camera.permute(0, 2, 1, 3).reshape(2 * rows, -1)
-        tiles[TIP, TIP].addmm_(tip.mT, tip, alpha=-1)
-        if not states:
-            continue
-        frames = coupling.new_zeros(rows, len(block.tiles) * plan.frames_per_tile, 2, states)
-        by_frame = own @ by_state[arrays.pair[part]]
-        frames.index_put_((block.row, block.slot), by_frame, accumulate=True)
-        columns = frames.permute(0, 2, 1, 3).reshape(2 * rows, -1).chunk(len(block.tiles), dim=1)
-        placed = sorted((plan.pattern.position[tile], k) for k, tile in enumerate(block.tiles))
+    def _subtract_block(self, block: Block, columns: Tensor, tip: Tensor) -> None:
+        """Take off the products of a block's frames (2 n, tiles * F * S) with each other and the cameras."""
+        parts = columns.chunk(len(block.tiles), dim=1)
+        placed = sorted((self.plan.pattern.position[tile], part) for part, tile in enumerate(block.tiles))
         for n, (column, first) in enumerate(placed):
-            tiles[TIP, column].addmm_(tip.mT, columns[first], alpha=-1)
+            self.tiles[TIP, column].addmm_(tip.mT, parts[first], alpha=-1)
             for row, second in placed[n:]:
-                tiles[row, column].addmm_(columns[second].mT, columns[first], alpha=-1)
+                self.tiles[row, column].addmm_(parts[second].mT, parts[first], alpha=-1)
+
+    def factorise(
+        self, estimate: Estimate, own: Tensor, damping: float, jitter: float
+    ) -> tuple[TiledCholesky, float] | None:
+        """Add U, whose pairs' part is ``own`` (21, P), and factorise; the tiles are used up.
+
+        ``damping`` is added to U's diagonal, ``jitter`` to that of the pivots, relative to them. Returns the
+        factor and the smallest pivot as a share of U's diagonal; None where S cannot be factorised.
+        """
+        diagonal = [*self._add_frames(own), self._add_cameras(estimate, own)]
+        keys = [*((k, k) for k in range(self.plan.tile_count)), (TIP, TIP)]
+        for key, values in zip(keys, diagonal, strict=True):
+            self.tiles[key].diagonal().add_(values, alpha=damping)
+        factor = factorise_tiles(self.tiles, self.plan.pattern, jitter)
+        if factor is None:
+            return None
+        return factor, float((factor.pivots() / (1 + damping) / torch.cat(diagonal)).min())
+
+    def _add_cameras(self, estimate: Estimate, own: Tensor) -> Tensor:
+        """Add the cameras' own information and priors; returns its diagonal."""
+        arrays, each = self.arrays, self.arrays.camera_unknowns
+        by_pair = own.reshape(21, arrays.camera_count, arrays.frame_count)
+        if each == 6:
+            by_camera = _symmetric(by_pair.sum(2))
+        else:
+            spread = self.spread.camera
+            by_camera = (spread.mT @ _symmetric(by_pair) @ spread).sum(1)
+        rotation, root = estimate.cam_from_vehicle[:, :3, :3], arrays.centre_information_root
+        by_camera[:, :3, :3] += rotation * root.square()[:, None] @ rotation.mT
+        by_camera.diagonal(dim1=1, dim2=2)[:, 6:] += arrays.clock_information_root**2
+        tip = torch.block_diag(*by_camera)  # type: ignore[no-untyped-call]
+        self.tiles[TIP, TIP] += tip
+        return torch.diagonal(tip)
+
+    def _add_frames(self, own: Tensor) -> list[Tensor]:
+        """Add the frames' own information, prior and coupling to the cameras; returns the diagonals."""
+        arrays, plan, spread = self.arrays, self.plan, self.spread
+        if not arrays.states:
+            return []
+        blocks = _symmetric(own.reshape(21, arrays.camera_count, arrays.frame_count))
+        by_state = blocks @ spread.state
+        by_frame = (spread.state.mT @ by_state).sum(0)
+        border = (by_state.mT @ spread.camera).permute(1, 2, 0, 3).flatten(2)
+        for column, part in enumerate(to_tiles(plan, border).chunk(plan.tile_count)):
+            self.tiles[TIP, column] += part.mT
+        root, transition = arrays.state_information_root, arrays.state_transition
+        carried = root[..., None] * transition
+        by_frame += torch.diag_embed(root.square())
+        by_frame[:-1] += (carried.mT @ carried)[1:]
+        across = -root[..., None] * carried
+        diagonal = [root.new_empty(0)] * plan.tile_count
+        for tile, begin in enumerate(range(0, arrays.frame_count, plan.frames_per_tile)):
+            frames = slice(begin, begin + plan.frames_per_tile)
+            place = plan.pattern.position[tile]
+            matrix = _along_route(by_frame[frames], across[frames], plan.frames_per_tile)
+            self.tiles[place, place] += matrix
+            diagonal[place] = matrix.diagonal()
+            if tile and bool(across[begin].any()):
+                self._add_between(place, plan.pattern.position[tile - 1], across[begin])
+        return diagonal
+
+    def _add_between(self, later: int, earlier: int, coupling: Tensor) -> None:
+        """Couple the first frame of one tile with the last of the one before it on the route."""
+        states = len(coupling)
+        if later > earlier:
+            self.tiles[later, earlier][:states, -states:] += coupling
+        else:
+            self.tiles[earlier, later][-states:, :states] += coupling.mT
 
 
-def spread_to_cameras(arrays: Arrays, spread: Spread, by_pair: Tensor, pair: Tensor) -> Tensor:
-    """Derivatives (M, 2, 6 + Q) by the unknowns of the cameras, from those (M, 2, 6) by ``pair`` (M,)."""
-    if arrays.camera_unknowns == 6:
-        return by_pair
-    clock = spread.clock.reshape(arrays.pair_count, 6, -1)
-    return torch.cat([by_pair, by_pair @ clock[pair]], dim=-1)
+def coupling_by_camera(arrays: Arrays, spread: Spread, run: Run, coupling: Tensor) -> Tensor:
+    """W' of a run by the unknowns of the cameras, (n, 2, C (6 + Q)), from that by observation (2, 6, k)."""
+    each, cameras = arrays.camera_unknowns, arrays.camera_count
+    if each > 6:
+        clock = of_each(spread.clock.reshape(arrays.pair_count, 6).T, run.pair)
+        coupling = torch.cat([coupling, (coupling * clock).sum(1, keepdim=True)], dim=1)
+    place = run.corner * cameras + run.pair // arrays.frame_count
+    rows = coupling.new_zeros(2 * each, run.corner_count * cameras)
+    rows.index_add_(1, place, coupling.flatten(0, 1))
+    by_camera = rows.view(2, each, run.corner_count, cameras).permute(2, 0, 3, 1)
+    return by_camera.reshape(run.corner_count, 2, -1)
+
+
+def _symmetric(entries: Tensor) -> Tensor:
+    """Full blocks (..., 6, 6) of their 21 entries (21, ...)."""
+    row, column = PAIR_BLOCK
+    blocks = entries.new_empty(*entries.shape[1:], 6, 6)
+    blocks[..., row, column] = entries.movedim(0, -1)
+    blocks[..., column, row] = entries.movedim(0, -1)
+    return blocks
+
+
+def _along_route(by_frame: Tensor, across: Tensor, per_tile: int) -> Tensor:
+    """A tile of frames' blocks (n, S, S) on the diagonal and the couplings to the frame before beside it."""
+    count, states = by_frame.shape[:2]
+    matrix = by_frame.new_zeros(per_tile, states, per_tile, states)
+    index = torch.arange(per_tile, device=by_frame.device)
+    # Frames that only fill up the last tile are fixed at 0.
+    matrix[index, :, index, :] = torch.eye(states, dtype=by_frame.dtype, device=by_frame.device)
+    matrix[index[:count], :, index[:count], :] = by_frame
+    matrix[index[1:count], :, index[: count - 1], :] = across[1:]
+    matrix[index[: count - 1], :, index[1:count], :] = across[1:].mT
+    return matrix.view(per_tile * states, -1)

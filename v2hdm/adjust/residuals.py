@@ -1,4 +1,4 @@
-"""The residuals, their derivatives and the cost: pure functions of an estimate.
+"""The residuals and the cost with its gradient: pure functions of an estimate.
 
 With ``A = [r1 r2 t]`` of a pair's ``cam_from_map`` a corner l lies at p = A (l_x, l_y, 1) in the
 camera and is seen at (p_x / p_z, p_y / p_z). Let a (2 x 3) be the whitened derivative of that with
@@ -13,7 +13,8 @@ and that is what extrinsics and frame states act through:
   twist v_j, so dq perturbs the pair by -Ad(cam_from_vehicle) v_j dq (see :func:`pair_from_clock`).
 
 A gradient of the cost with respect to p is a force, so that of a pair is its *wrench*: the sums of the
-forces and of their moments p x force.
+forces and of their moments p x force. Both are sums over f, x f and y f, the gradient by A, which is what is
+added up (see :func:`wrenches`).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from v2hdm.adjust.arrays import Arrays
+from v2hdm.adjust.arrays import Arrays, Run
 from v2hdm.adjust.robust import loss
 from v2hdm.geometry.camera import inverse_depth
 from v2hdm.geometry.transform import adjoint, exp, left_jacobian
@@ -54,22 +55,38 @@ class Gradient:
 
 @dataclass(frozen=True)
 class View:
-    """All observations under one estimate; each entry holds K columns.
+    """The observations of a run under one estimate; each entry holds k columns.
 
-    ``axes``: the three columns of A, each (3, K). ``point``: p. ``inverse_depth`` and its ``slope``.
-    ``residual``: (2, K), whitened.
+    ``ground``: (2, k), the points of the map. ``axes``: the first two columns of A, each (3, k).
+    ``point``: p. ``inverse_depth`` and its ``slope``. ``off``: (2, k), projected minus measured, at depth 1.
+    ``residual``: (2, k), the same whitened.
     """
 
-    axes: tuple[Tensor, Tensor, Tensor]
+    ground: Tensor
+    axes: tuple[Tensor, Tensor]
     point: Tensor
     inverse_depth: Tensor
     slope: Tensor
+    off: Tensor
     residual: Tensor
 
     @property
     def squared(self) -> Tensor:
-        """Squared Mahalanobis distance (K,) of each observation."""
+        """Squared Mahalanobis distance (k,) of each observation."""
         return self.residual.square().sum(0)
+
+    def force(self, by_off: Tensor) -> Tensor:
+        """The gradient (3, k) by p of what has the gradient ``by_off`` (2, k)."""
+        along = (by_off * self.point[:2]).sum(0) * self.slope
+        return torch.cat([by_off * self.inverse_depth, along[None]])
+
+    def by_table(self, force: Tensor) -> Tensor:
+        """The gradient (9, k) by the columns of A."""
+        return torch.cat([force * self.ground[0], force * self.ground[1], force])
+
+    def along_axes(self, force: Tensor) -> Tensor:
+        """The gradient (2, k) by the observed corner."""
+        return torch.stack([(self.axes[0] * force).sum(0), (self.axes[1] * force).sum(0)])
 
 
 @dataclass(frozen=True)
@@ -88,31 +105,55 @@ def frame_tangent(arrays: Arrays, frame_state: Tensor) -> Tensor:
 
 
 def pair_table(arrays: Arrays, estimate: Estimate) -> Tensor:
-    """The columns of A of every pair, (P, 9)."""
+    """The columns of A of every pair, one below the other, (9, P)."""
     vehicle_from_map = arrays.vehicle_from_map
     if arrays.states:
         vehicle_from_map = exp(-frame_tangent(arrays, estimate.frame_state)) @ vehicle_from_map
     cam_from_map = _cam_from_vehicle_then(arrays, estimate) @ vehicle_from_map
-    return cam_from_map[..., :3, [0, 1, 3]].mT.reshape(arrays.pair_count, 9)
+    return cam_from_map[..., :3, [0, 1, 3]].permute(3, 2, 0, 1).reshape(9, arrays.pair_count)
 
 
-def observe(arrays: Arrays, estimate: Estimate, table: Tensor | None = None) -> View:
-    """Project every corner into every image that saw it; ``table`` is the :func:`pair_table`, if known."""
-    table = pair_table(arrays, estimate) if table is None else table
-    first, second, origin = table.index_select(0, arrays.pair).T.contiguous().chunk(3)
-    x, y = estimate.corners_map.index_select(0, arrays.corner).T.contiguous()
-    point = torch.addcmul(torch.addcmul(origin, first, x), second, y)
+def wrenches(table: Tensor, by_table: Tensor) -> Tensor:
+    """Gradients (6, P) by the pairs' left tangents, from those (9, P) by their columns."""
+    shift = by_table[6:]
+    columns, forces = table.view(3, 3, -1), by_table.view(3, 3, -1)
+    return torch.cat([shift, torch.linalg.cross(columns, forces, dim=1).sum(0)])
+
+
+def moved_columns(table: Tensor, tangents: Tensor) -> Tensor:
+    """Derivative (9, P) of the pairs' columns along left tangents (6, P)."""
+    shift, turn = tangents.chunk(2)
+    moved: Tensor = torch.linalg.cross(turn.expand(3, -1, -1), table.view(3, 3, -1), dim=1)
+    moved[2] += shift
+    return moved.reshape(9, -1)
+
+
+def of_each(table: Tensor, index: Tensor) -> Tensor:
+    """Columns (m, k) of a table (m, n)."""
+    # Faster than index_select, whose rows lie apart.
+    return table.gather(1, index.expand(len(table), -1))
+
+
+def project(run: Run, table: Tensor, ground: Tensor) -> View:
+    """Project a ground point (2, k) for each observation; ``table`` is the :func:`pair_table`."""
+    first, second, origin = of_each(table, run.pair).chunk(3)
+    point = torch.addcmul(torch.addcmul(origin, first, ground[0]), second, ground[1])
     reciprocal, slope = inverse_depth(point[2])
-    dx, dy = torch.addcmul(-arrays.measured, point[:2], reciprocal)
-    a, b, c = arrays.root_information
-    residual = torch.stack([a * dx, b * dx + c * dy])
-    return View((first, second, origin), point, reciprocal, slope, residual)
+    off = torch.addcmul(-run.measured, point[:2], reciprocal)
+    a, b, c = run.root_information
+    residual = torch.stack([a * off[0], torch.addcmul(c * off[1], b, off[0])])
+    return View(ground, (first, second), point, reciprocal, slope, off, residual)
+
+
+def observe(run: Run, table: Tensor, corners_map: Tensor) -> View:
+    """Project the run's own of the corners (N, 2) of the map into every image that saw them."""
+    return project(run, table, of_each(corners_map[run.corners].T, run.corner))
 
 
 def squared_residuals(arrays: Arrays, estimate: Estimate) -> Tensor:
     """Squared Mahalanobis distance (K,) of each observation."""
     table = pair_table(arrays, estimate)
-    return torch.cat([observe(part, estimate, table).squared for _, part in arrays.parts()])
+    return torch.cat([observe(run, table, estimate.corners_map).squared for run in arrays.runs()])
 
 
 def _cam_from_vehicle_then(arrays: Arrays, estimate: Estimate) -> Tensor:
@@ -124,40 +165,10 @@ def _cam_from_vehicle_then(arrays: Arrays, estimate: Estimate) -> Tensor:
     return cam_from_vehicle @ exp(-moved)
 
 
-def _pull_back(arrays: Arrays, view: View, by_residual: Tensor, wrench: Tensor, by_corner: Tensor) -> None:
-    """Carry a gradient by the residuals (2, K) back to pairs and corners.
-
-    It is added to the ``wrench`` (6, P) of every pair and the gradient ``by_corner`` (2, N).
-    """
-    a, b, c = arrays.root_information
-    by_dx, by_dy = a * by_residual[0] + b * by_residual[1], c * by_residual[1]
-    x, y, z = view.point
-    fx, fy = by_dx * view.inverse_depth, by_dy * view.inverse_depth
-    fz = (by_dx * x + by_dy * y) * view.slope
-    force = torch.stack([fx, fy, fz])
-    rows = torch.stack([fx, fy, fz, y * fz - z * fy, z * fx - x * fz, x * fy - y * fx])
-    wrench.index_add_(1, arrays.pair, rows)
-    along = torch.stack([(view.axes[0] * force).sum(0), (view.axes[1] * force).sum(0)])
-    by_corner.index_add_(1, arrays.corner, along)
-
-
-def jacobians(arrays: Arrays, view: View) -> tuple[Tensor, Tensor]:
-    """Derivatives of the whitened residuals by pair (K, 2, 6) and by corner (K, 2, 2)."""
-    a, b, c = arrays.root_information
-    x, y = view.point[:2]
-    direct, across = view.inverse_depth, view.slope
-    o = torch.zeros_like(a)
-    top = torch.stack([a * direct, o, a * x * across])
-    low = torch.stack([b * direct, c * direct, (b * x + c * y) * across])
-    by_point = torch.stack([top, low]).permute(2, 0, 1)
-    position = view.point.T[:, None].expand_as(by_point)
-    by_pair = torch.cat([by_point, torch.linalg.cross(position, by_point)], dim=-1)
-    by_corner = by_point @ torch.stack([view.axes[0], view.axes[1]], dim=-1).permute(1, 0, 2)
-    return by_pair, by_corner
-
-
 def pair_from_state(arrays: Arrays, estimate: Estimate) -> Tensor:
     """Derivative (C, J, 6, S) of each pair's left tangent by the states of its frame."""
+    if not arrays.states:
+        return arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6, 0)
     by_tangent = left_jacobian(-frame_tangent(arrays, estimate.frame_state))[..., list(arrays.states)]
     return -adjoint(_cam_from_vehicle_then(arrays, estimate)) @ by_tangent
 
@@ -181,34 +192,82 @@ def state_residual(arrays: Arrays, frame_state: Tensor) -> Tensor:
     return (frame_state - expected) * arrays.state_information_root
 
 
-def _observed_cost(arrays: Arrays, estimate: Estimate, robust: Loss) -> tuple[Tensor, Tensor, Tensor]:
-    """The observations' cost, and its gradient: wrenches (C, J, 6) and by corner (N, 2)."""
-    table = pair_table(arrays, estimate)
-    cost, wrench = table.new_zeros(()), table.new_zeros(6, arrays.pair_count)
-    by_corner = table.new_zeros(2, arrays.corner_count)
-    for _, part in arrays.parts():
-        view = observe(part, estimate, table)
+def length_residual(arrays: Arrays, corners_map: Tensor) -> tuple[Tensor, Tensor]:
+    """Whitened residuals (M,) of the known lengths, and their derivatives (M, 2) by the first corner.
+
+    Those by the second are the opposite.
+    """
+    known = arrays.lengths
+    apart = corners_map[known.first] - corners_map[known.second]
+    distance = apart.norm(dim=1)
+    # Two corners in one place have no direction; the derivative is then 0.
+    direction = apart / distance.clamp(min=torch.finfo(apart.dtype).tiny)[:, None]
+    return (distance - known.length_m) * known.information_root, direction * known.information_root[:, None]
+
+
+def by_corner_priors(arrays: Arrays, estimate: Estimate, corners: slice) -> Tensor:
+    """The gradient (n, 2), by some corners, of what the survey and the known lengths cost.
+
+    Corners that lengths join are all among them, or none.
+    """
+    off = estimate.corners_map[corners] - arrays.control[corners]
+    gradient = off * arrays.control_information[corners, None]
+    if bool(arrays.joined[corners].any()):
+        known = arrays.lengths
+        residual, by_first = length_residual(arrays, estimate.corners_map)
+        inside = (known.first >= corners.start) & (known.first < corners.stop)
+        pull = (by_first * residual[:, None])[inside]
+        gradient.index_add_(0, known.first[inside] - corners.start, pull)
+        gradient.index_add_(0, known.second[inside] - corners.start, pull, alpha=-1)
+    return gradient
+
+
+class Tally:
+    """The observations' cost, added up run by run, and its gradient by the pairs' columns and by corner."""
+
+    def __init__(self, arrays: Arrays) -> None:
+        self.cost = arrays.centre.new_zeros(())
+        self.by_table = arrays.centre.new_zeros(9, arrays.pair_count)
+        self.by_corner = arrays.centre.new_zeros(arrays.corner_count, 2)
+
+    def add(self, run: Run, view: View, robust: Loss) -> Tensor:
+        """Add a run; returns the weights (k,) that the loss gives its observations."""
         rho, weight = loss(robust.name, view.squared, robust.scale)
-        cost = cost + rho.sum() / 2
-        _pull_back(part, view, view.residual * weight, wrench, by_corner)
-    return cost, wrench.T.reshape(arrays.camera_count, arrays.frame_count, 6), by_corner.T
+        a, b, c = run.root_information
+        first, second = view.residual * weight
+        force = view.force(torch.stack([torch.addcmul(a * first, b, second), c * second]))
+        self.cost += rho.sum() / 2
+        self.by_table.index_add_(1, run.pair, view.by_table(force))
+        self.by_corner[run.corners] = run.sum_by_corner(view.along_axes(force))
+        return weight
 
 
 def cost_and_gradient(arrays: Arrays, estimate: Estimate, robust: Loss) -> tuple[dict[str, Tensor], Gradient]:
     """The named terms of the cost, and the gradient of their sum."""
-    observed, wrench, by_corner = _observed_cost(arrays, estimate, robust)
+    tally, table = Tally(arrays), pair_table(arrays, estimate)
+    for run in arrays.runs():
+        tally.add(run, observe(run, table, estimate.corners_map), robust)
+    return with_priors(arrays, estimate, table, tally)
+
+
+def with_priors(
+    arrays: Arrays, estimate: Estimate, table: Tensor, tally: Tally
+) -> tuple[dict[str, Tensor], Gradient]:
+    """The named terms of the cost, and the gradient of their sum, from the observations' part."""
     centre = centre_residual(arrays, estimate)
     state = state_residual(arrays, estimate.frame_state)
     clock = estimate.clock_s * arrays.clock_information_root
     off_control = estimate.corners_map - arrays.control
-    by_control = off_control * arrays.control_information[:, None]
+    length, _ = length_residual(arrays, estimate.corners_map)
     terms = {
-        "observations": observed,
+        "observations": tally.cost,
         "camera_centre": centre.square().sum() / 2,
         "frame_states": state.square().sum() / 2,
         "clock_offsets": clock.square().sum() / 2,
-        "control_points": (off_control * by_control).sum() / 2,
+        "control_points": (off_control.square().sum(1) * arrays.control_information).sum() / 2,
+        "known_lengths": length.square().sum() / 2,
     }
+    wrench = wrenches(table, tally.by_table).T.reshape(arrays.camera_count, arrays.frame_count, 6)
     by_extrinsic = wrench.sum(1)
     # A left perturbation moves the centre by minus its translation part, turned into the vehicle.
     rotation = estimate.cam_from_vehicle[:, :3, :3]
@@ -219,4 +278,5 @@ def cost_and_gradient(arrays: Arrays, estimate: Estimate, robust: Loss) -> tuple
     by_state[:-1] -= (arrays.state_transition.mT @ innovation[..., None])[1:, :, 0]
     by_clock = (pair_from_clock(arrays, estimate).mT @ wrench[..., None])[..., 0].sum(1)
     by_clock += clock * arrays.clock_information_root
-    return terms, Gradient(by_extrinsic, by_state, by_corner + by_control, by_clock)
+    by_corner = tally.by_corner + by_corner_priors(arrays, estimate, slice(0, arrays.corner_count))
+    return terms, Gradient(by_extrinsic, by_state, by_corner, by_clock)

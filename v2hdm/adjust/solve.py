@@ -10,12 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from v2hdm.adjust.arrays import Arrays, make_arrays
+from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.checks import check_model, check_options, check_problem
 from v2hdm.adjust.coarse import coarse_extrinsics
 from v2hdm.adjust.covariance import Covariance
 from v2hdm.adjust.descent import Descent, descend
-from v2hdm.adjust.gating import MEDIAN_SQUARED, judge
+from v2hdm.adjust.gating import judge, noise_scale
+from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.problem import Problem, SolveOptions
 from v2hdm.adjust.residuals import Estimate, Loss, cost_and_gradient, frame_tangent, observe, pair_table
 from v2hdm.adjust.robust import loss
@@ -24,7 +25,7 @@ from v2hdm.adjust.start import back_project
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.camera import NEAR_M
 from v2hdm.geometry.transform import exp, inverse
-from v2hdm.records import FloatArray
+from v2hdm.records import BoolArray, FloatArray
 
 # Squared residual that one good observation in a thousand exceeds: chi-square, 2 degrees of freedom.
 _OUTLIER_SQUARED = 13.8
@@ -85,25 +86,23 @@ def _start(problem: Problem, arrays: Arrays, options: SolveOptions) -> tuple[Est
 def _report(
     problem: Problem, arrays: Arrays, options: SolveOptions, descent: Descent, spent: int, began: float
 ) -> Solution:
-    estimate = descent.estimate
-    seen = _seen(arrays, estimate)
-    terms, _ = cost_and_gradient(arrays, estimate, Loss(options.loss, options.loss_scale))
-    squared, camera = seen.squared, (arrays.pair // arrays.frame_count).cpu().numpy()
-    residual_px = seen.off.T.cpu().numpy() * problem.intrinsic[camera, :2]
+    whitening, robust = descent.whitening, Loss(options.loss, options.loss_scale)
+    estimate, terms = whitening.estimate, whitening.terms
+    if whitening.robust != robust:
+        terms, _ = cost_and_gradient(arrays, estimate, robust)
     map_from_vehicle = inverse(arrays.vehicle_from_map) @ exp(frame_tangent(arrays, estimate.frame_state))
-
-    variance = _variance_factors(arrays, terms, squared)
-    behind = _unsorted(seen.behind.double(), arrays.order) > 0
-    mahalanobis2 = _unsorted(squared, arrays.order)
+    seen = _seen(problem, arrays, estimate, robust)
+    scale = noise_scale(seen.mahalanobis2)
+    variance = _variance_factors(arrays, terms, seen.mahalanobis2, scale)
     return Solution(
-        status=_status(descent, options, bool(behind.any())),
+        status=_status(descent, options, bool(seen.behind.any())),
         cam_from_vehicle=estimate.cam_from_vehicle.cpu().numpy(),
         map_from_vehicle=map_from_vehicle.cpu().numpy(),
         corners_map=_unsorted(estimate.corners_map, arrays.corner_order),
-        residual_px=_unsorted(residual_px, arrays.order),
-        mahalanobis2=mahalanobis2,
-        verdict=judge(problem.observations, mahalanobis2, behind, options.gate_probability),
-        weight=_unsorted(loss(options.loss, squared, options.loss_scale)[1], arrays.order),
+        residual_px=seen.residual_px,
+        mahalanobis2=seen.mahalanobis2,
+        verdict=judge(problem.observations, seen.mahalanobis2, seen.behind, options.gate_probability, scale),
+        weight=seen.weight,
         clock_offset_s=_clock_offset_s(estimate),
         cost_terms={name: float(value) for name, value in terms.items()},
         evaluations=descent.evaluations + spent,
@@ -111,28 +110,31 @@ def _report(
         chi2_per_dof=variance.all,
         observation_factor=variance.observations,
         time_s=time.perf_counter() - began,
-        covariance=Covariance(descent.whitening),
+        covariance=Covariance(whitening),
     )
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """Observations at the solution: squared residuals (K,), residuals (2, K) at depth 1, who lie behind."""
+    """The problem's observations at the solution: what :class:`Solution` says of each, and who lie behind."""
 
-    squared: Tensor
-    off: Tensor
-    behind: Tensor
+    residual_px: FloatArray
+    mahalanobis2: FloatArray
+    weight: FloatArray
+    behind: BoolArray
 
 
-def _seen(arrays: Arrays, estimate: Estimate) -> _Seen:
-    table = pair_table(arrays, estimate)
-    squared, off, behind = [], [], []
-    for _, part in arrays.parts():
-        view = observe(part, estimate, table)
-        squared.append(view.squared)
-        off.append(view.point[:2] * view.inverse_depth - part.measured)
-        behind.append(view.point[2] <= NEAR_M)
-    return _Seen(torch.cat(squared), torch.cat(off, dim=1), torch.cat(behind))
+def _seen(problem: Problem, arrays: Arrays, estimate: Estimate, robust: Loss) -> _Seen:
+    table, count = pair_table(arrays, estimate), len(arrays.pair)
+    out = _Seen(np.empty((count, 2)), np.empty(count), np.empty(count), np.empty(count, dtype=bool))
+    for run in arrays.runs():
+        view, rows = observe(run, table, estimate.corners_map), arrays.order[run.observations].cpu().numpy()
+        focal = problem.intrinsic[problem.observations.camera[rows], :2]
+        out.residual_px[rows] = view.off.T.cpu().numpy() * focal
+        out.mahalanobis2[rows] = view.squared.cpu().numpy()
+        out.weight[rows] = loss(robust.name, view.squared, robust.scale)[1].cpu().numpy()
+        out.behind[rows] = (view.point[2] <= NEAR_M).cpu().numpy()
+    return out
 
 
 def _clock_offset_s(estimate: Estimate) -> FloatArray:
@@ -140,10 +142,10 @@ def _clock_offset_s(estimate: Estimate) -> FloatArray:
     return np.asarray(estimate.clock_s.sum(1).cpu().numpy())
 
 
-def _unsorted(values: Tensor | FloatArray, order: Tensor) -> FloatArray:
+def _unsorted(values: Tensor, order: Tensor) -> FloatArray:
     """Rows of ``values`` back where the problem had them."""
     out = np.empty(values.shape)
-    out[order.cpu().numpy()] = values.cpu().numpy() if isinstance(values, Tensor) else values
+    out[order.cpu().numpy()] = values.cpu().numpy()
     return out
 
 
@@ -165,22 +167,23 @@ class _VarianceFactors:
     observations: float
 
 
-def _variance_factors(arrays: Arrays, terms: dict[str, Tensor], squared: Tensor) -> _VarianceFactors:
+def _variance_factors(
+    arrays: Arrays, terms: dict[str, Tensor], squared: FloatArray, scale: float
+) -> _VarianceFactors:
     """Chi-square per degree of freedom, of good observations and priors together and of the former.
 
     What the priors have left of their own degrees of freedom is what the observations have taken of them:
     the expected chi-square of a prior is the one less the other (Foerstner and Wrobel, Photogrammetric
     Computer Vision, section 4.2.4, on variance components).
     """
-    # The median tells the noise's own scale, whatever the outliers.
-    scale = max(1.0, float(squared.median()) / MEDIAN_SQUARED)
-    good = squared[squared <= _OUTLIER_SQUARED * scale]
-    of_observations = float(good.sum()) / _TRIMMED_MEAN
+    good = squared <= _OUTLIER_SQUARED * scale
+    of_observations = float(squared.sum(where=good)) / _TRIMMED_MEAN
     of_priors = 2 * sum(float(value) for name, value in terms.items() if name != "observations")
     centres = int((arrays.centre_information_root > 0).sum())
     surveyed = int((arrays.control_information > 0).sum())
-    free = 2 * (arrays.corner_count - surveyed) + 6 * arrays.camera_count - centres
-    redundancy = 2 * len(good) - free
+    known = 2 * surveyed + centres + len(arrays.lengths.first)
+    free = 2 * arrays.corner_count + 6 * arrays.camera_count - known
+    redundancy = 2 * int(good.sum()) - free
     return _VarianceFactors(
         all=(of_observations + of_priors) / max(redundancy, 1),
         observations=of_observations / max(redundancy - of_priors, 1),

@@ -2,35 +2,38 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
-from v2hdm.adjust.arrays import Arrays
-from v2hdm.adjust.residuals import Estimate, jacobians, observe
-from v2hdm.adjust.whitening import cholesky_2x2, solve_lower, solve_lower_transposed
+from v2hdm.adjust.arrays import Arrays, Run
+from v2hdm.adjust.corner_factor import CornerFactor, cholesky_2x2
+from v2hdm.adjust.linear import corner_blocks, jacobians
+from v2hdm.adjust.residuals import Estimate, of_each, pair_table, project
 from v2hdm.geometry.transform import inverse
 
 # Below this sine of the depression a ray meets the ground too far away to say where.
 _MIN_DEPRESSION_SINE = 0.01
 
 
-def ground_hits(arrays: Arrays, cam_from_vehicle: Tensor) -> tuple[Tensor, Tensor]:
-    """Where each observation's ray meets the ground.
+def ray_table(arrays: Arrays, cam_from_vehicle: Tensor) -> Tensor:
+    """``map_from_cam`` of every pair, row by row, (12, P)."""
+    map_from_vehicle = inverse(arrays.vehicle_from_map)
+    map_from_cam = map_from_vehicle[None] @ inverse(cam_from_vehicle)[:, None]
+    return map_from_cam[:, :, :3].permute(2, 3, 0, 1).reshape(12, arrays.pair_count)
 
-    Returns the points (K, 2) of the map, and the sine (K,) of the ray's depression below the horizon;
+
+def ground_hits(run: Run, table: Tensor) -> tuple[Tensor, Tensor]:
+    """Where the rays of a run meet the ground; ``table`` is the :func:`ray_table`.
+
+    Returns the points (2, k) of the map, and the sine (k,) of the ray's depression below the horizon;
     where that is not positive, the ray misses the ground and the point means nothing.
     """
-    map_from_vehicle = inverse(arrays.vehicle_from_map)
-    map_from_cam = (map_from_vehicle[None] @ inverse(cam_from_vehicle)[:, None]).reshape(-1, 4, 4)
-    rays_cam = torch.cat([arrays.measured, torch.ones_like(arrays.measured[:1])]).T
-    rays_map = (map_from_cam[arrays.pair, :3, :3] @ rays_cam[..., None])[..., 0]
-    centres_map = map_from_cam[arrays.pair, :3, 3]
-    sine = -rays_map[:, 2] / rays_map.norm(dim=-1)
-    usable = torch.where(sine > _MIN_DEPRESSION_SINE, rays_map[:, 2], -torch.ones_like(sine))
-    reach = -centres_map[:, 2] / usable
-    return (centres_map + reach[:, None] * rays_map)[:, :2], sine
+    map_from_cam = of_each(table, run.pair).view(3, 4, -1)
+    ray = map_from_cam[:, 0] * run.measured[0] + map_from_cam[:, 1] * run.measured[1] + map_from_cam[:, 2]
+    centre = map_from_cam[:, 3]
+    sine = -ray[2] / ray.norm(dim=0)
+    usable = torch.where(sine > _MIN_DEPRESSION_SINE, ray[2], -1.0)
+    return torch.addcmul(centre[:2], ray[:2], -centre[2] / usable), sine
 
 
 def back_project(arrays: Arrays, cam_from_vehicle: Tensor) -> tuple[Tensor, Tensor]:
@@ -41,25 +44,22 @@ def back_project(arrays: Arrays, cam_from_vehicle: Tensor) -> tuple[Tensor, Tens
 
     Returns the corners, and which of them (N,) at least one ray fixes.
     """
-    points_map, sine = ground_hits(arrays, cam_from_vehicle)
-    usable = sine > _MIN_DEPRESSION_SINE
-    each = _one_corner_each(arrays)
+    corners = arrays.centre.new_empty(arrays.corner_count, 2)
     state = torch.zeros_like(arrays.state_information_root)
-    estimate = Estimate(cam_from_vehicle, state, points_map, arrays.no_clock())
-    _, by_corner = jacobians(each, observe(each, estimate))
-    information = torch.where(usable[:, None, None], by_corner.mT @ by_corner, torch.zeros_like(by_corner))
-    points_map = torch.where(usable[:, None], points_map, torch.zeros_like(points_map))
-    total = information.new_zeros(arrays.corner_count, 2, 2).index_add_(0, arrays.corner, information)
-    right = (information @ points_map[..., None])[..., 0]
-    right = right.new_zeros(arrays.corner_count, 2).index_add_(0, arrays.corner, right)
-    fixed = total[:, 0, 0] > 0
-    total[~fixed] = torch.eye(2, dtype=total.dtype, device=total.device)
-    factor = cholesky_2x2(total)
-    return solve_lower_transposed(factor, solve_lower(factor, right)), fixed
-
-
-def _one_corner_each(arrays: Arrays) -> Arrays:
-    """The same observations, each of a corner of its own."""
-    own = torch.arange(len(arrays.corner), device=arrays.corner.device)
-    control, information = arrays.control[arrays.corner], arrays.control_information[arrays.corner]
-    return replace(arrays, corner=own, corner_order=own, control=control, control_information=information)
+    table = pair_table(arrays, Estimate(cam_from_vehicle, state, corners, arrays.no_clock()))
+    rays = ray_table(arrays, cam_from_vehicle)
+    fixed = torch.empty_like(arrays.joined)
+    for run in arrays.runs():
+        ground, sine = ground_hits(run, rays)
+        usable = sine > _MIN_DEPRESSION_SINE
+        ground = torch.where(usable, ground, 0.0)
+        _, by_corner = jacobians(run, project(run, table, ground))
+        xx, yx, yy = torch.where(usable, corner_blocks(by_corner), 0.0)
+        x, y = ground
+        sums = run.sum_by_corner(torch.stack([xx, yx, yy, xx * x + yx * y, yx * x + yy * y]))
+        some = sums[:, 0] > 0
+        sums[~some] = sums.new_tensor([1.0, 0.0, 1.0, 0.0, 0.0])
+        factor = CornerFactor(cholesky_2x2(*sums[:, :3].T), ())
+        corners[run.corners] = factor.solve_transposed(factor.solve(sums[:, 3:]))
+        fixed[run.corners] = some
+    return corners, fixed

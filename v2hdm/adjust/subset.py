@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2hdm.adjust.problem import ControlPoints, IntArray, Observations, Problem
+from v2hdm.adjust.problem import ControlPoints, IntArray, KnownLengths, Observations, Problem
 from v2hdm.records import BoolArray
 
 
@@ -28,6 +28,11 @@ def restrict(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
         left = np.isin(control.corner, corners)
         number = np.searchsorted(corners, control.corner[left])
         control = ControlPoints(number, control.points_map[left], control.sigma_m[left])
+    lengths = problem.lengths
+    if lengths is not None:
+        left = np.isin(lengths.first, corners) & np.isin(lengths.second, corners)
+        first, second = (np.searchsorted(corners, ends[left]) for ends in (lengths.first, lengths.second))
+        lengths = KnownLengths(first, second, lengths.length_m[left], lengths.sigma_m[left])
     part = replace(
         problem,
         map_from_vehicle=problem.map_from_vehicle[used],
@@ -42,5 +47,6 @@ def restrict(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
         corners_start=None if start is None else start[corners],
         twist_vehicle=None if twist is None else twist[used],
         control=control,
+        lengths=lengths,
     )
     return part, corners

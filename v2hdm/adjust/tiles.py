@@ -19,14 +19,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from torch import Tensor
 
-from v2hdm.errors import AdjustError
-
 Tiles = dict[tuple[int, int], Tensor]
 """Lower tiles by (row, column) in elimination order; row :data:`TIP` holds the border."""
 
 TIP = -1
-
-_DAMPING_STEPS = (0.0, 1e-12, 1e-9, 1e-6, 1e-3)
 
 
 @dataclass(frozen=True)
@@ -114,36 +110,27 @@ class TiledCholesky:
         return out
 
 
-def factorise_tiles(tiles: Tiles, pattern: Pattern) -> TiledCholesky:
-    """Factorise, with the least damping that makes it possible."""
-    for damping in _DAMPING_STEPS:
-        factor = _factorise(tiles, pattern, damping)
-        if factor is not None:
-            return factor
-    raise AdjustError(
-        "the normal equations cannot be factorised even when damped: look for observations or priors "
-        "whose sigmas differ by many orders of magnitude"
-    )
+def factorise_tiles(tiles: Tiles, pattern: Pattern, damping: float = 0.0) -> TiledCholesky | None:
+    """Factorise, using the tiles up; None where the matrix is not positive definite.
 
-
-def _factorise(tiles: Tiles, pattern: Pattern, damping: float) -> TiledCholesky | None:
-    """Right-looking: each column, once factorised, is subtracted from those it couples to."""
-    rest = {key: tile.clone() for key, tile in tiles.items()}
+    ``damping`` is added to the pivots' diagonal, relative to it. Right-looking: each column, once factorised,
+    is subtracted from those it couples to.
+    """
     diagonal, panels, rows = [], [], []
     for column, below in enumerate(pattern.below):
-        factor = _factorise_tile(rest.pop((column, column)), damping)
+        factor = _factorise_tile(tiles.pop((column, column)), damping)
         if factor is None:
             return None
         keys = (*below, TIP)
-        stacked = torch.cat([rest.pop((row, column)) for row in keys])
+        stacked = torch.cat([tiles.pop((row, column)) for row in keys])
         panel = torch.linalg.solve_triangular(factor, stacked.mT, upper=False).mT
-        parts = dict(zip(keys, panel.split([len(factor)] * len(below) + [len(rest[TIP, TIP])]), strict=True))
+        parts = dict(zip(keys, panel.split([len(factor)] * len(below) + [len(tiles[TIP, TIP])]), strict=True))
         for first, second in _lower_pairs(keys):
-            rest[second, first].addmm_(parts[second], parts[first].mT, alpha=-1)
+            tiles[second, first].addmm_(parts[second], parts[first].mT, alpha=-1)
         diagonal.append(factor)
         panels.append(panel)
-        rows.append(_row_index(below, len(factor), len(pattern.below), len(rest[TIP, TIP]), panel))
-    tip = _factorise_tile(rest.pop((TIP, TIP)), damping)
+        rows.append(_row_index(below, len(factor), len(pattern.below), len(tiles[TIP, TIP]), panel))
+    tip = _factorise_tile(tiles.pop((TIP, TIP)), damping)
     return None if tip is None else TiledCholesky(tuple(diagonal), tuple(panels), tuple(rows), tip, damping)
 
 
