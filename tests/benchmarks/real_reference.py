@@ -78,7 +78,8 @@ def make_reference(mapped: Sequence[Marking], route_map: FloatArray, path: Path 
     which takes the place of what it lies on; ``remove``, a list of places [x, y] where the map is wrong;
     ``whole``, true if nothing else is painted, whereupon the map is not asked; ``hidden``, a list of
     ``{"image", "box_px"}``; ``cam_from_map``, a list of ``{"image", "matrix"}``. Lengths are metres in the
-    map frame. All but ``markings`` may be left out.
+    map frame; a marking may give ``polygon_road``, ways along ``route_map`` (N, 2) and offsets to its left,
+    instead of ``polygon_map``. All but ``markings`` may be left out.
 
     Raises:
         MapFileError: the file is missing or not of this form.
@@ -87,7 +88,7 @@ def make_reference(mapped: Sequence[Marking], route_map: FloatArray, path: Path 
         return Reference(tuple(complete_lines(mapped, route_map)), False, {})
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        drawn = [_painted(entry) for entry in content["markings"]]
+        drawn = [_painted(entry, route_map) for entry in content["markings"]]
         places = np.array(content.get("remove", []), dtype=np.float64).reshape(-1, 2)
         hidden: dict[int, list[FloatArray]] = {}
         for entry in content.get("hidden", []):
@@ -105,10 +106,13 @@ def make_reference(mapped: Sequence[Marking], route_map: FloatArray, path: Path 
     return Reference((*drawn, *kept), whole, hidden, cameras)
 
 
-def _painted(entry: dict[str, object]) -> Painted:
-    polygon = np.array(entry["polygon_map"], dtype=np.float64)
+def _painted(entry: dict[str, object], route_map: FloatArray) -> Painted:
+    on_road = "polygon_road" in entry
+    polygon = np.array(entry["polygon_road" if on_road else "polygon_map"], dtype=np.float64)
     if entry["kind"] not in PAINT_CLASSES or polygon.ndim != 2 or polygon.shape[1] != 2 or len(polygon) < 3:
         raise ValueError(f"not a marking: {entry}")
+    if on_road:
+        polygon = Route(route_map).at(polygon)
     return Painted(str(entry["kind"]), polygon, bool(entry.get("other_road")), bool(entry.get("optional")))
 
 
@@ -126,7 +130,7 @@ def complete_lines(mapped: Sequence[Marking], route_map: FloatArray) -> list[Pai
     dashes = [m.corners_map for m in mapped if m.kind == LANE_DASH]
     if len(dashes) < _LEAST_DASHES:
         return out
-    route = _Route(route_map)
+    route = Route(route_map)
     way = route.along(np.array([centre_of_area(dash) for dash in dashes]))
     for line in _lines(way):
         size = np.median([_size(dashes[k]) for k in line], axis=0)
@@ -140,7 +144,7 @@ def complete_lines(mapped: Sequence[Marking], route_map: FloatArray) -> list[Pai
     return out
 
 
-class _Route:
+class Route:
     """A driven path as a smooth curve: points as (way along it, offset to the left), m."""
 
     def __init__(self, route_map: FloatArray):
@@ -172,7 +176,7 @@ class _Route:
         """Points (N, 2) at (way, offset) (N, 2)."""
         at = [np.interp(way_offset[:, 0], self.way, self.points[:, k]) for k in (0, 1)]
         tx, ty = (np.interp(way_offset[:, 0], self.way, self.tangent[:, k]) for k in (0, 1))
-        return np.column_stack(at) + way_offset[:, 1:] * np.column_stack([-ty, tx])
+        return np.asarray(np.column_stack(at) + way_offset[:, 1:] * np.column_stack([-ty, tx]))
 
 
 def _lines(way: FloatArray) -> list[list[int]]:

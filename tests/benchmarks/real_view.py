@@ -44,8 +44,12 @@ class View:
 
     def range_m(self, point_map: FloatArray) -> float:
         """Distance on the ground of a point (2,) from the camera."""
+        return float(self.ranges_m(point_map[None])[0])
+
+    def ranges_m(self, points_map: FloatArray) -> FloatArray:
+        """Distances (N,) on the ground of points (N, 2) from the camera."""
         centre = -self.cam_from_map[:3, :3].T @ self.cam_from_map[:3, 3]
-        return float(np.linalg.norm(point_map - centre[:2]))
+        return np.asarray(np.linalg.norm(points_map - centre[:2], axis=1))
 
     def holds(self, polygon_px: FloatArray) -> bool:
         """Whether a polygon lies wholly inside the image."""
