@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.simulate.training_scenes import TrainingSample
+from v2hdm.simulate.training.scenes import TrainingSample
 
 Bytes = NDArray[np.uint8]
 

@@ -14,8 +14,8 @@ from train.augment import random_crop, random_photometry
 from train.config import DataConfig
 from train.labels import LabelledImages, read_labels
 from train.targets import Targets, targets
-from v2hdm.simulate.training_hardships import Hardships
-from v2hdm.simulate.training_scenes import TrainingSample, training_sample
+from v2hdm.simulate.training.hardships import Hardships
+from v2hdm.simulate.training.scenes import TrainingSample, training_sample
 
 _VALIDATION_SEED_OFFSET = 1_000_003
 

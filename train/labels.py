@@ -20,7 +20,7 @@ from v2hdm.detection.image_file import read_bgr
 from v2hdm.drive.image_header import image_size
 from v2hdm.errors import ConfigError, DriveError, LabelError
 from v2hdm.records import PAINT_CLASSES
-from v2hdm.simulate.training_scenes import TrainingSample
+from v2hdm.simulate.training.scenes import TrainingSample
 
 _NEAR_A_LABEL = 0.75
 """How often a view is taken around something that is labelled; the rest is taken anywhere."""

@@ -32,10 +32,10 @@ from v2hdm.detection.road import RoadDetector
 from v2hdm.detection.stopwatch import Stopwatch, lap
 from v2hdm.hdmap import write_calibration
 from v2hdm.records import Calibration, CameraInfo
-from v2hdm.simulate.optics import Motion, Optics
-from v2hdm.simulate.render import Renderer
-from v2hdm.simulate.training_scenes import random_scene
-from v2hdm.simulate.training_views import looking
+from v2hdm.simulate.render.optics import Motion, Optics
+from v2hdm.simulate.render.renderer import Renderer
+from v2hdm.simulate.training.scenes import random_scene
+from v2hdm.simulate.training.views import looking
 
 WIDTH, HEIGHT = 1280, 720
 OURS = "ours, read to metres"

@@ -20,7 +20,7 @@ from train.config import DataConfig, TrainConfig
 from train.targets import IGNORE, paint_target
 from v2hdm.errors import ConfigError, DetectorError
 from v2hdm.records import PAINT_CLASSES
-from v2hdm.simulate.training_scenes import training_sample
+from v2hdm.simulate.training.scenes import training_sample
 
 ROOT = Path(__file__).resolve().parents[2]
 CONF = str(ROOT / "conf")

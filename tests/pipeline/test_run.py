@@ -17,7 +17,7 @@ from v2hdm.hdmap.geojson import read_geojson
 from v2hdm.pipeline import DriveConfig, RunConfig, run
 from v2hdm.pipeline.run import camera_sets
 from v2hdm.simulate import PortConfig, render_drive
-from v2hdm.simulate.port_config import RouteConfig, YardConfig
+from v2hdm.simulate.port.config import RouteConfig, YardConfig
 
 
 def short_port() -> PortConfig:

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from v2hdm.simulate.port_config import (
+from v2hdm.simulate.port.config import (
     CalibrationConfig,
     CameraConfig,
     MountConfig,
@@ -11,7 +11,7 @@ from v2hdm.simulate.port_config import (
     SurfaceConfig,
     YardConfig,
 )
-from v2hdm.simulate.rendering import render_drive
+from v2hdm.simulate.port.drive import render_drive
 
 FRONT = MountConfig(x_m=3.6, y_m=0.05, z_m=2.45, yaw_deg=0.6, pitch_deg=16.0, roll_deg=0.3)
 LENDER = MountConfig(x_m=3.4, y_m=-0.07, z_m=2.58, yaw_deg=-0.7, pitch_deg=17.1, roll_deg=-0.6)

@@ -7,21 +7,21 @@ from v2hdm.detection.lens import distort_points
 from v2hdm.drive.trajectory import interpolate
 from v2hdm.errors import ConfigError
 from v2hdm.records import DIAMOND, LANE_DASH, CameraInfo
-from v2hdm.simulate.calibration import calibrate, cam_from_vehicle, camera_info, project_ground
-from v2hdm.simulate.disturbance import correlated_noise, drive_along, pose_noise
-from v2hdm.simulate.layout import build_layout
-from v2hdm.simulate.port import Port, build_port
-from v2hdm.simulate.port_config import (
+from v2hdm.simulate.port.build import Port, build_port
+from v2hdm.simulate.port.calibration import calibrate, cam_from_vehicle, camera_info, project_ground
+from v2hdm.simulate.port.config import (
     CalibrationConfig,
     DisturbanceConfig,
     PaintConfig,
     PortConfig,
     RouteConfig,
 )
-from v2hdm.simulate.render import Renderer
-from v2hdm.simulate.route import build_route
-from v2hdm.simulate.scene import Box, Ground, Scene
-from v2hdm.simulate.visibility import hidden_by, inside_image, points_seen
+from v2hdm.simulate.port.disturbance import correlated_noise, drive_along, pose_noise
+from v2hdm.simulate.port.layout import build_layout
+from v2hdm.simulate.port.route import build_route
+from v2hdm.simulate.port.visibility import hidden_by, inside_image, points_seen
+from v2hdm.simulate.render.renderer import Renderer
+from v2hdm.simulate.render.scene import Box, Ground, Scene
 
 
 @pytest.fixture(scope="module")

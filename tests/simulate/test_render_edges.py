@@ -5,10 +5,10 @@ import pytest
 
 from v2hdm.detection.lens import distort_points
 from v2hdm.records import DIAMOND, CameraInfo
-from v2hdm.simulate.optics import Motion, Optics
-from v2hdm.simulate.render import Rendered, render
-from v2hdm.simulate.scene import Box, Ground, Light, Paint, Scene
-from v2hdm.simulate.view import camera_rays
+from v2hdm.simulate.render.optics import Motion, Optics
+from v2hdm.simulate.render.renderer import Rendered, render
+from v2hdm.simulate.render.scene import Box, Ground, Light, Paint, Scene
+from v2hdm.simulate.render.view import camera_rays
 
 INFO = CameraInfo(
     "front", 640, 360, np.array([[450.0, 0, 322.0], [0, 450.0, 178.0], [0, 0, 1]]), "plumb_bob",

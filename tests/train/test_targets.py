@@ -5,7 +5,7 @@ import pytest
 
 from train.targets import IGNORE, kind_target, lane_targets, paint_target, targets
 from v2hdm.records import PAINT_CLASSES
-from v2hdm.simulate.training_scenes import TrainingSample
+from v2hdm.simulate.training.scenes import TrainingSample
 
 
 def test_a_block_is_paint_by_most_of_its_pixels_and_a_tie_is_ignored() -> None:

@@ -21,7 +21,7 @@ from train.door import open_door
 from train.loop import Trainer
 from train.targets import Targets, targets
 from v2hdm.errors import ConfigError
-from v2hdm.simulate.training_scenes import TrainingSample
+from v2hdm.simulate.training.scenes import TrainingSample
 
 CONF = str(Path(__file__).resolve().parents[2] / "conf")
 

@@ -6,11 +6,11 @@ import pytest
 from train.config import DataConfig
 from train.data import RenderStream, validation_pairs
 from v2hdm.records import LANE_CLASSES, PAINT_CLASSES
-from v2hdm.simulate.optics import Optics
-from v2hdm.simulate.training_hardships import Hardships, overexposed, with_seams
-from v2hdm.simulate.training_paint import Bend, rectangle, rhombus
-from v2hdm.simulate.training_scenes import random_scene, training_sample
-from v2hdm.simulate.training_views import looking, random_view
+from v2hdm.simulate.render.optics import Optics
+from v2hdm.simulate.training.hardships import Hardships, overexposed, with_seams
+from v2hdm.simulate.training.paint import Bend, rectangle, rhombus
+from v2hdm.simulate.training.scenes import random_scene, training_sample
+from v2hdm.simulate.training.views import looking, random_view
 
 TINY = DataConfig(width=64, height=32, render_width=80, render_height=48, views_per_render=2, reservoir=3)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from v2hdm.records import FloatArray
-from v2hdm.simulate.port_config import RouteConfig
+from v2hdm.simulate.port.config import RouteConfig
 
 _STEP_M = 0.05
 _TRANSITION_M = 4.0

@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.records import CameraInfo, FloatArray
-from v2hdm.simulate.box_layer import draw_boxes
-from v2hdm.simulate.ground_layer import GroundField, intersect_ground, sun_visibility, tone, wetness
-from v2hdm.simulate.optics import Motion, Optics, expose
-from v2hdm.simulate.paint_layer import PaintLayer
-from v2hdm.simulate.scene import Box, Light, Scene, Shadow, box_shadow
-from v2hdm.simulate.sky_layer import draw_background
-from v2hdm.simulate.textures import Float32
-from v2hdm.simulate.view import View, camera_rays
+from v2hdm.simulate.render.box_layer import draw_boxes
+from v2hdm.simulate.render.ground_layer import GroundField, intersect_ground, sun_visibility, tone, wetness
+from v2hdm.simulate.render.optics import Motion, Optics, expose
+from v2hdm.simulate.render.paint_layer import PaintLayer
+from v2hdm.simulate.render.scene import Box, Light, Scene, Shadow, box_shadow
+from v2hdm.simulate.render.sky_layer import draw_background
+from v2hdm.simulate.render.textures import Float32
+from v2hdm.simulate.render.view import View, camera_rays
 
 RENDERER_VERSION = 2
 """Raised whenever a scene comes out as another picture or truth: cached drives are made afresh then."""

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.simulate.scene import Bgr, Box, GroundMarks
+from v2hdm.simulate.render.scene import Bgr, Box, GroundMarks
 
 Factor = NDArray[np.uint8]
 Thing = Callable[[np.random.Generator, float, float], list[Box]]

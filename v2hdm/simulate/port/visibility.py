@@ -8,7 +8,7 @@ import numpy as np
 
 from v2hdm.detection.lens import distort_points
 from v2hdm.records import BoolArray, CameraInfo, FloatArray
-from v2hdm.simulate.scene import Box
+from v2hdm.simulate.render.scene import Box
 
 _SAMPLES = 5
 _FARTHEST_M = 40.0

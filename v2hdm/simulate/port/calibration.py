@@ -9,8 +9,8 @@ from v2hdm.detection.lens import distort_points, undistort_points
 from v2hdm.drive.rotation import rotation_from_euler
 from v2hdm.errors import ConfigError
 from v2hdm.records import Camera, CameraInfo, CentrePrior, FloatArray
-from v2hdm.simulate.port_config import CalibrationConfig, CameraConfig, MountConfig
-from v2hdm.simulate.scene import convex_hull
+from v2hdm.simulate.port.config import CalibrationConfig, CameraConfig, MountConfig
+from v2hdm.simulate.render.scene import convex_hull
 
 # Columns: the camera's x, y and z axes (right, down, forward) in a frame with x forward, y left, z up.
 _FORWARD_LEFT_UP_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

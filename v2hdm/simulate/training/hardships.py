@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 
 from v2hdm.records import CORNERED_CLASSES, FloatArray
-from v2hdm.simulate.optics import Optics
-from v2hdm.simulate.scene import GroundMarks, Paint, Shadow
-from v2hdm.simulate.training_clutter import plain_marks
-from v2hdm.simulate.training_paint import rectangle
+from v2hdm.simulate.render.optics import Optics
+from v2hdm.simulate.render.scene import GroundMarks, Paint, Shadow
+from v2hdm.simulate.training.clutter import plain_marks
+from v2hdm.simulate.training.paint import rectangle
 
 _CROSSED_M = 22.0
 _LONGEST_LEVEL = 0.9

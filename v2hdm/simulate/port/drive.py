@@ -27,11 +27,11 @@ from v2hdm.drive.truth import write_truth
 from v2hdm.errors import DriveError
 from v2hdm.planar import ground_in_vehicle, inside_convex
 from v2hdm.records import Drive, Image, Truth
-from v2hdm.simulate.disturbance import measured_disturbances, pose_noise
-from v2hdm.simulate.port import Port, build_port
-from v2hdm.simulate.port_config import PortConfig
-from v2hdm.simulate.render import RENDERER_VERSION
-from v2hdm.simulate.visibility import points_seen, quad_samples
+from v2hdm.simulate.port.build import Port, build_port
+from v2hdm.simulate.port.config import PortConfig
+from v2hdm.simulate.port.disturbance import measured_disturbances, pose_noise
+from v2hdm.simulate.port.visibility import points_seen, quad_samples
+from v2hdm.simulate.render.renderer import RENDERER_VERSION
 
 Progress = Callable[[int, int], None]
 _Job = tuple[str, int, str]

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.simulate.scene import Dapple, Ground, GroundMarks, Shadow
-from v2hdm.simulate.textures import Float32, Tile, fade, noise_tile, photo_tile, sample, smoothstep
-from v2hdm.simulate.view import View, following_row, outline, windows
+from v2hdm.simulate.render.scene import Dapple, Ground, GroundMarks, Shadow
+from v2hdm.simulate.render.textures import Float32, Tile, fade, noise_tile, photo_tile, sample, smoothstep
+from v2hdm.simulate.render.view import View, following_row, outline, windows
 
 _FARTHEST_M = 400.0
 _SHADOWS_TO_M = 90.0

@@ -9,8 +9,8 @@ import numpy as np
 from v2hdm.drive.rotation import rotation_from_euler
 from v2hdm.drive.trajectory import Trajectory, interpolate
 from v2hdm.records import FloatArray, PoseNoise
-from v2hdm.simulate.port_config import DisturbanceConfig, RouteConfig
-from v2hdm.simulate.route import Route
+from v2hdm.simulate.port.config import DisturbanceConfig, RouteConfig
+from v2hdm.simulate.port.route import Route
 
 _LEAD_S = 0.35
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.records import FloatArray
-from v2hdm.simulate.port_config import SurfaceConfig, YardConfig
-from v2hdm.simulate.route import Route
-from v2hdm.simulate.scene import (
+from v2hdm.simulate.port.config import SurfaceConfig, YardConfig
+from v2hdm.simulate.port.route import Route
+from v2hdm.simulate.render.scene import (
     Backdrop,
     Bgr,
     Box,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from v2hdm.records import CameraInfo, FloatArray
-from v2hdm.simulate.optics import Motion, Optics
+from v2hdm.simulate.render.optics import Motion, Optics
 
 
 @dataclass(frozen=True)

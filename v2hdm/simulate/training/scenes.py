@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from v2hdm.detection.lens import distort_points
 from v2hdm.records import FloatArray
-from v2hdm.simulate.render import Renderer
-from v2hdm.simulate.scene import Backdrop, Bgr, Dapple, Ground, Light, Scene, Shadow
-from v2hdm.simulate.training_clutter import ground_marks, port_boxes, street_boxes
-from v2hdm.simulate.training_hardships import NONE, Hardships, overexposed, shadows_on_paint, with_seams
-from v2hdm.simulate.training_paint import Bend, RoadPaint, port_paint, random_brush, rectangle, street_paint
-from v2hdm.simulate.training_views import TrainingView, random_view
+from v2hdm.simulate.render.renderer import Renderer
+from v2hdm.simulate.render.scene import Backdrop, Bgr, Dapple, Ground, Light, Scene, Shadow
+from v2hdm.simulate.training.clutter import ground_marks, port_boxes, street_boxes
+from v2hdm.simulate.training.hardships import NONE, Hardships, overexposed, shadows_on_paint, with_seams
+from v2hdm.simulate.training.paint import Bend, RoadPaint, port_paint, random_brush, rectangle, street_paint
+from v2hdm.simulate.training.views import TrainingView, random_view
 
 # The renderer keeps one tile per fleck size, so sizes come from a short list.
 _NEAR_M = 0.3
@@ -30,8 +30,9 @@ class TrainingSample:
     """One rendered image with its labels.
 
     ``image`` (H, W, 3) uint8 BGR, ``labels`` (H, W) uint8 and ``hidden`` (H, W) bool are those of
-    :class:`v2hdm.simulate.render.Rendered`. ``lanes_px`` are the centre lines (N, 2) of the lanes' lines in
-    recorded pixels, from near to far, whatever stands in front of them; parts may be outside the image.
+    :class:`v2hdm.simulate.render.renderer.Rendered`. ``lanes_px`` are the centre lines (N, 2) of the lanes'
+    lines in recorded pixels, from near to far, whatever stands in front of them; parts may be outside the
+    image.
     """
 
     image: NDArray[np.uint8]

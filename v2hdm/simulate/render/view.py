@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from v2hdm.detection.lens import distort_points, undistort_points
 from v2hdm.records import CameraInfo, FloatArray
-from v2hdm.simulate.textures import Float32
+from v2hdm.simulate.render.textures import Float32
 
 _GRID_STEP_PX = 8
 _BAND_ROWS = 32

@@ -21,9 +21,9 @@ from v2hdm.records import (
     Lane,
     Marking,
 )
-from v2hdm.simulate.port_config import PaintConfig
-from v2hdm.simulate.route import Route
-from v2hdm.simulate.scene import WHITE_PAINT, YELLOW_PAINT, Bgr, Paint
+from v2hdm.simulate.port.config import PaintConfig
+from v2hdm.simulate.port.route import Route
+from v2hdm.simulate.render.scene import WHITE_PAINT, YELLOW_PAINT, Bgr, Paint
 
 _VERTEX_SPACING_M = 0.5
 _PIECE_TURN_RAD = 0.06

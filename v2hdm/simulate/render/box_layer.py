@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.records import FloatArray
-from v2hdm.simulate.scene import Box, Light, box_footprint
-from v2hdm.simulate.textures import Float32, noise_tile, sample
-from v2hdm.simulate.view import View, Window, coverage, in_view, outline, windows
+from v2hdm.simulate.render.scene import Box, Light, box_footprint
+from v2hdm.simulate.render.textures import Float32, noise_tile, sample
+from v2hdm.simulate.render.view import View, Window, coverage, in_view, outline, windows
 
 _CORRUGATION_M = 0.28
 _DIRT_TILE = noise_tile(17, 6.0, 1.2)

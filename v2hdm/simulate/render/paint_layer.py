@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.records import PAINT_CLASSES
-from v2hdm.simulate.ground_layer import MEDIUM_TILE, GroundField, fine_tile
-from v2hdm.simulate.scene import Paint
-from v2hdm.simulate.textures import Float32, Tile, fade, noise_tile, sample
-from v2hdm.simulate.view import View, coverage, in_view, outline, windows
+from v2hdm.simulate.render.ground_layer import MEDIUM_TILE, GroundField, fine_tile
+from v2hdm.simulate.render.scene import Paint
+from v2hdm.simulate.render.textures import Float32, Tile, fade, noise_tile, sample
+from v2hdm.simulate.render.view import View, coverage, in_view, outline, windows
 
 Labels = NDArray[np.uint8]
 

@@ -118,7 +118,7 @@ class PaintConfig:
 
 @dataclass(kw_only=True)
 class SurfaceConfig:
-    """The ground; see :class:`v2hdm.simulate.scene.Ground`. Lengths of 0 for ``slab_m`` mean no joints."""
+    """The ground; see :class:`v2hdm.simulate.render.scene.Ground`. Lengths of 0 for ``slab_m``: no joints."""
 
     texture: str = "concrete"
     albedo: float = 0.3

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from v2hdm.errors import ConfigError
 from v2hdm.records import Camera, FloatArray, GeodeticOrigin, HdMap
-from v2hdm.simulate.calibration import cam_from_vehicle, survey_camera
-from v2hdm.simulate.disturbance import DrivenPoses, drive_along
-from v2hdm.simulate.layout import build_layout
-from v2hdm.simulate.optics import Motion, Optics
-from v2hdm.simulate.port_config import PortConfig
-from v2hdm.simulate.render import Renderer
-from v2hdm.simulate.route import Route, build_route
-from v2hdm.simulate.scene import Box
-from v2hdm.simulate.yard import MovingTruck, build_scene, moving_trucks
+from v2hdm.simulate.port.calibration import cam_from_vehicle, survey_camera
+from v2hdm.simulate.port.config import PortConfig
+from v2hdm.simulate.port.disturbance import DrivenPoses, drive_along
+from v2hdm.simulate.port.layout import build_layout
+from v2hdm.simulate.port.route import Route, build_route
+from v2hdm.simulate.port.yard import MovingTruck, build_scene, moving_trucks
+from v2hdm.simulate.render.optics import Motion, Optics
+from v2hdm.simulate.render.renderer import Renderer
+from v2hdm.simulate.render.scene import Box
 
 ORIGIN = GeodeticOrigin(latitude_deg=29.95, longitude_deg=122.05, altitude_m=12.0, epoch=2026.0)
 

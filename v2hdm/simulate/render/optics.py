@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.simulate.textures import Float32
-from v2hdm.simulate.view import View
+from v2hdm.simulate.render.textures import Float32
+from v2hdm.simulate.render.view import View
 
 _CODE_STEPS = 16384
 _FLOW_STEP_PX = 16

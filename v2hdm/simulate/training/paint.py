@@ -21,7 +21,7 @@ from v2hdm.records import (
     STOP_LINE,
     FloatArray,
 )
-from v2hdm.simulate.scene import WHITE_PAINT, YELLOW_PAINT, Bgr, Paint
+from v2hdm.simulate.render.scene import WHITE_PAINT, YELLOW_PAINT, Bgr, Paint
 
 FAR_M = 50.0
 _DIAMONDS_FAR_M = 32.0

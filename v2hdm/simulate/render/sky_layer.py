@@ -6,9 +6,9 @@ from functools import cache
 
 import numpy as np
 
-from v2hdm.simulate.scene import Backdrop, Light
-from v2hdm.simulate.textures import Float32, noise_tile, sample
-from v2hdm.simulate.view import View
+from v2hdm.simulate.render.scene import Backdrop, Light
+from v2hdm.simulate.render.textures import Float32, noise_tile, sample
+from v2hdm.simulate.render.view import View
 
 _CLOUD_TILE = noise_tile(18, 3.0, 1.5)
 

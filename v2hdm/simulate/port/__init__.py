@@ -1,0 +1,1 @@
+"""A whole port and one drive through it, with ground truth."""

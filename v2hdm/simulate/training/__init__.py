@@ -1,0 +1,1 @@
+"""Random scenes without end, for the detector to learn from."""
