@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from v2hdm.adjust import (
     MODELS,
     Drift,
+    KnownLengths,
     Observations,
     PoseSigma,
     Problem,
@@ -21,10 +22,13 @@ from v2hdm.adjust import (
     with_model,
 )
 from v2hdm.errors import MappingError
-from v2hdm.mapping.association.groups import Association
+from v2hdm.mapping.association.groups import Association, fuse_groups
+from v2hdm.mapping.association.merge import group_kinds
+from v2hdm.mapping.known_sizes import known_lengths
 from v2hdm.mapping.motion import vehicle_twists
-from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.options import MappingOptions, SizeOptions
 from v2hdm.mapping.sightings.backprojection import camera_centres
+from v2hdm.mapping.sightings.location import locate
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.records import BoolArray, Camera, FloatArray, PoseNoise
@@ -47,12 +51,14 @@ class Model:
     """What a solve estimates and how much noise it reckons with beyond that of the corners.
 
     ``floor_px`` is added to every corner in quadrature, px; the sum is multiplied by ``variance_factor``.
+    ``sizes`` are those that the user knows.
     """
 
     pose_sigma: PoseSigma
     floor_px: float
     solver: SolveOptions
     variance_factor: float = 1.0
+    sizes: SizeOptions = field(default_factory=SizeOptions)
 
 
 @dataclass(frozen=True)
@@ -113,7 +119,8 @@ def full_model(
     solver = SolveOptions(
         loss=options.loss, loss_scale=options.loss_scale, coarse=False, device=options.device
     )
-    return Model(pose_sigma, options.model_floor_px, with_model(solver, MODELS[poses]), variance_factor)
+    solver = with_model(solver, MODELS[poses])
+    return Model(pose_sigma, options.model_floor_px, solver, variance_factor, options.known_sizes)
 
 
 def coarse_model(rig: Rig, pose_noise: PoseNoise, options: MappingOptions) -> Model:
@@ -171,7 +178,10 @@ def solve_bundle(
         covariance_px=model.variance_factor * covariance_px,
     )
     names = [sightings.cameras[c] for c in used.cameras]
-    problem = _problem(sightings, rig, used, [cameras[name] for name in names], observations, model)
+    problem = replace(
+        _problem(sightings, rig, used, [cameras[name] for name in names], observations, model),
+        lengths=_known_lengths(sightings, association, usable, rig, corner_index, model.sizes),
+    )
     solution = solve(problem, model.solver)
     return Bundle(
         rig=_adjusted_rig(rig, sightings, used, solution),
@@ -220,6 +230,23 @@ def _problem(
         twist_vehicle=vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s)[used.frames],
         clock_sigma_s=CLOCK_SIGMA_S,
     )
+
+
+def _known_lengths(
+    sightings: Sightings,
+    association: Association,
+    usable: BoolArray,
+    rig: Rig,
+    corner_index: IntArray,
+    sizes: SizeOptions,
+) -> KnownLengths | None:
+    """What the sizes of classes say about the corners; ``rig`` is good enough to tell length from width."""
+    if not sizes.by_class_m:
+        return None
+    located = locate(sightings, rig)
+    located.valid[:] &= usable
+    fused = fuse_groups(association, located, jitter_rad=0.0)
+    return known_lengths(sizes, group_kinds(association, sightings), fused.corners_map, corner_index)
 
 
 def _observed_corners(

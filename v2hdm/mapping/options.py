@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from v2hdm.errors import ConfigError
+from v2hdm.records import CORNERED_CLASSES
 
 BATCH = "batch"
 INCREMENTAL = "incremental"
@@ -77,6 +79,20 @@ class LaneOptions:
 
 
 @dataclass(kw_only=True)
+class SizeOptions:
+    """Sizes of classes that are painted to a standard, as factors of the joint solve.
+
+    ``by_class_m`` holds length and width, m: of diamonds the diagonals, of other classes the sides, as in
+    ``{diamond: [1.0, 0.7]}``. The paint keeps them up to ``sigma_m``; a marking that is off by more than
+    ``tolerance``, as a share of length or width, is none of that size.
+    """
+
+    by_class_m: dict[str, list[float]] = field(default_factory=dict)
+    sigma_m: float = 0.005
+    tolerance: float = 0.15
+
+
+@dataclass(kw_only=True)
 class MappingOptions:
     """Everything about the mapping but the solver's own settings.
 
@@ -102,6 +118,7 @@ class MappingOptions:
     association: AssociationOptions = field(default_factory=AssociationOptions)
     acceptance: AcceptanceOptions = field(default_factory=AcceptanceOptions)
     lanes: LaneOptions = field(default_factory=LaneOptions)
+    known_sizes: SizeOptions = field(default_factory=SizeOptions)
 
 
 def check_options(options: MappingOptions) -> None:
@@ -121,6 +138,8 @@ def check_options(options: MappingOptions) -> None:
         "lanes.node_spacing_m": options.lanes.node_spacing_m,
         "lanes.half_width_m": options.lanes.half_width_m,
         "lanes.half_length_m": options.lanes.half_length_m,
+        "known_sizes.sigma_m": options.known_sizes.sigma_m,
+        "known_sizes.tolerance": options.known_sizes.tolerance,
     }
     if options.mode not in (BATCH, INCREMENTAL):
         raise ConfigError(f"mapping.mode is {options.mode!r}; choose {BATCH} or {INCREMENTAL}.")
@@ -131,3 +150,15 @@ def check_options(options: MappingOptions) -> None:
     for key, value in positive.items():
         if not value > 0:
             raise ConfigError(f"mapping.{key} is {value}; it must be greater than zero.")
+    _check_sizes(options)
+
+
+def _check_sizes(options: MappingOptions) -> None:
+    for kind, size in options.known_sizes.by_class_m.items():
+        key = f"mapping.known_sizes.by_class_m.{kind}"
+        if kind not in CORNERED_CLASSES:
+            raise ConfigError(f"{key}: there is no such class; choose from {', '.join(CORNERED_CLASSES)}.")
+        if len(size) != 2 or not 0 < size[1] <= size[0] < math.inf:
+            raise ConfigError(f"{key} is {list(size)}; give length and width in m, the longer one first.")
+    if options.known_sizes.by_class_m and options.mode == INCREMENTAL:
+        raise ConfigError(f"mapping.known_sizes is of no use in mapping.mode={INCREMENTAL}; leave it out.")
