@@ -110,9 +110,8 @@ def fit_markings(
     if far.any():
         shared = _Far(foreground, blobs, view, blur_px or TYPICAL_BLUR_PX)
         overexposed = _take_quads(found, np.flatnonzero(far), grey, shared, 0.0)
-        if len(overexposed):
+        if options.vague_corners and len(overexposed):
             _take_quads(found, overexposed, grey.at_limit(), shared, _BLOOM_SIGMA_PX)
-            found.valid[overexposed] &= options.vague_corners
     found.covariance = _COVARIANCE_FACTOR * found.covariance + _COVARIANCE_FLOOR_PX**2 * np.eye(8)
     steps = grey_steps(grey, found.px)
     found.valid &= ~steps.runs_on()
@@ -183,6 +182,8 @@ class _Far:
 def _take_quads(found: _Corners, group: np.ndarray, grey: GreyBand, far: _Far, bloom_px: float) -> np.ndarray:
     """Enter whole quadrilaterals fitted to the markings ``group`` (indices), in doubt by ``bloom_px`` more.
 
+    The corners of those that are overexposed are near where they should be, but valid only where flanks tell.
+
     Returns:
         Those of ``group`` that are overexposed and not fitted well.
     """
@@ -194,9 +195,10 @@ def _take_quads(found: _Corners, group: np.ndarray, grey: GreyBand, far: _Far, b
     covariance = fit.covariance + bloom_px**2 * np.eye(8)
     good = fit.settled & (fit.misfit < _MAX_MISFIT) & (fit.amplitude > _MIN_AMPLITUDE)
     good &= np.isfinite(corners).all(axis=(1, 2))
-    good &= ~fit.clipped | (_largest_sigma(covariance).max(axis=1) < _BLOOM_SIGMA_PX)
     found.px[group[good]] = corners[good]
     found.covariance[group[good]] = covariance[good]
+    told = fit.bright & (_largest_sigma(covariance).max(axis=1) < _BLOOM_SIGMA_PX)
+    good &= ~fit.clipped | told
     found.valid[group[good]] = True
     return np.asarray(group[fit.clipped & ~good])
 

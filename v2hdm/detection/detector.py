@@ -40,9 +40,6 @@ _HEADS = (*OUTLINED_CLASSES, OTHER_PAINT, DIAMOND)
 _LEAST_COVER = 0.6
 """A blob that shares less than this with the best quadrilateral around it is none."""
 
-_LEAST_SCORE = 0.2
-"""Blobs of a lower mean class probability are not worth a look; what the image shows decides on others."""
-
 
 @dataclass(frozen=True)
 class _Candidate:
@@ -125,7 +122,7 @@ class Detector:
         candidates = []
         for index, (blob, outline) in enumerate(zip(blobs, np.split(outlines, ends), strict=True)):
             found = plausible_kind(blob, on_ground[index], view)
-            if found is None or found[1] < min(_LEAST_SCORE, self.options.min_score):
+            if found is None or found[1] < self.options.min_score:
                 continue
             if found[0] == LANE_DASH and ends_at_a_head(on_ground[index], heads):
                 continue  # the shaft of an arrow, parted from its head by wear
@@ -136,10 +133,8 @@ class Detector:
         return [
             LanePaint(c.blob, c.kind, c.score)
             for c in candidates
-            if c.kind in LANE_CLASSES
-            and c.score >= self.options.min_score
             # Else it is the shaft of an arrow, the stroke of a letter.
-            and not (c.kind == LANE_DASH and c.blob.touches_symbol)
+            if c.kind in LANE_CLASSES and not (c.kind == LANE_DASH and c.blob.touches_symbol)
         ]
 
     def _starts(self, candidates: list[_Candidate], view: CameraView) -> list[QuadStart]:
@@ -162,7 +157,7 @@ class Detector:
 
     def _symbol(self, candidate: _Candidate, view: CameraView) -> MarkingDetection | None:
         """A marking that has an outline but no four corners, within range."""
-        if candidate.kind not in OUTLINED_CLASSES or candidate.score < self.options.min_score:
+        if candidate.kind not in OUTLINED_CLASSES:
             return None
         ground = candidate.outline_vehicle
         if not np.isfinite(ground).all() or view.range_m(ground.mean(axis=0)) > self.options.max_range_m:

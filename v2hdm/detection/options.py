@@ -18,7 +18,7 @@ class DetectorOptions:
             None measures it on the near markings. It decides the far corners' bias: 0.6 to 1.2 px
             per px of error.
         max_range_m: markings and lane points farther from the camera on the ground are dropped.
-        min_score: least mean class probability of a blob that is lane paint or an outlined symbol.
+        min_score: least mean class probability of a blob.
         min_confidence: least probability, by all evidence, that a quadrilateral is a whole marking.
         max_corner_sigma_px: corners with a larger standard deviation are not valid.
         vague_corners: take corners from the edges of overexposed paint, and from the network's outline, where

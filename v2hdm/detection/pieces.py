@@ -46,15 +46,17 @@ def settle_pieces(level: np.ndarray, contours: list[np.ndarray]) -> tuple[np.nda
         return level, contours
     contours, whole = _completed(level, contours)
     contours, parts = _parted(level, contours)
-    if whole or parts:
-        level = level - _DOUBTFUL * _with_border(level, whole) - _QUITE_SURE * _with_border(level, parts)
+    for found, log_odds in ((whole, _DOUBTFUL), (parts, _QUITE_SURE)):
+        if found:
+            level = np.where(_with_border(level, found), level - np.float32(log_odds), level)
     return level, contours + whole + parts
 
 
 def _completed(level: np.ndarray, contours: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """The contours that stay, and those of doubtful paint that take the place of the others."""
     doubtful = _framed((level > _DOUBTFUL).astype(np.uint8))
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(doubtful)
+    # Labels of 16 bits take a third of the time.
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(doubtful, ltype=cv2.CV_16U)
     at = np.array([contour[0, 0] for contour in contours])
     whole = labels[at[:, 1], at[:, 0]]
     parts = np.bincount(whole, minlength=len(stats))
@@ -99,10 +101,10 @@ def _parted(level: np.ndarray, contours: list[np.ndarray]) -> tuple[list[np.ndar
 
 
 def _with_border(level: np.ndarray, contours: list[np.ndarray]) -> np.ndarray:
-    """Float32 (h, w): 1 inside the contours and on the elements next to them, but for the frame."""
+    """Mask (h, w) of what is inside the contours and of the elements next to them, but for the frame."""
     mask = np.zeros(level.shape, dtype=np.uint8)
     cv2.drawContours(mask, contours, -1, 1, cv2.FILLED)
-    return _framed(cv2.dilate(mask, _AROUND)).astype(np.float32)
+    return _framed(cv2.dilate(mask, _AROUND))
 
 
 def _framed(mask: np.ndarray) -> np.ndarray:

@@ -35,8 +35,8 @@ unless it fits the image so well that its start must have been too small."""
 _GOOD_MISFIT = 0.15
 _MAX_GROWTH = 4.0
 _ENCLOSED_PX = 2.0
-"""Such a fit is repeated from where it got to. It still encloses where it started, but for so many px, and
-is at most so many times as large: the network draws the thin ends of far markings short."""
+"""Such a fit still encloses where it started, but for so many px, and is at most so many times as large: the
+network draws the thin ends of far markings short."""
 
 _NOISE_MISFIT = 0.1
 """Share of the step up to the paint that noise and texture alone leave."""
@@ -76,7 +76,8 @@ class QuadFit:
 
     ``corners_px`` (M, 4, 2), ``covariance`` (M, 8, 8) px^2, ``amplitude`` (M,) step from ground to
     paint, ``misfit`` (M,) residual over amplitude, ``settled`` (M,) whether the fit stayed near its
-    start and convex, ``clipped`` (M,) whether the sensor was at its limit in a notable part of the marking.
+    start, or grew from it, and convex, ``clipped`` (M,) whether the sensor was at its limit in a notable part
+    of the marking, ``bright`` (M,) whether the paint was found to be bright enough for that.
     """
 
     corners_px: FloatArray
@@ -85,6 +86,7 @@ class QuadFit:
     misfit: FloatArray
     settled: BoolArray
     clipped: BoolArray
+    bright: BoolArray
 
 
 def fit_quads(
@@ -105,34 +107,6 @@ def fit_quads(
         corners_px: starting corners, recorded px.
         blur_px: the point spread's standard deviation, pixel aperture included.
     """
-    fit = _fit_near(grey, owner, owner_stride, blobs, corners_px, blur_px)
-    grown = ~fit.settled & (fit.misfit < _GOOD_MISFIT) & _has_grown(corners_px, fit.corners_px)
-    if grown.any():
-        again = _fit_near(grey, owner, owner_stride, blobs[grown], fit.corners_px[grown], blur_px)
-        better = (again.misfit < _GOOD_MISFIT) & _has_grown(corners_px[grown], again.corners_px)
-        again.settled[~better] = False
-        for name, value in vars(fit).items():
-            value[grown] = getattr(again, name)
-    return fit
-
-
-def _has_grown(start: FloatArray, corners: FloatArray) -> BoolArray:
-    """Which quadrilaterals (M, 4, 2) enclose the smaller ones (M, 4, 2) that they come from."""
-    _, normal, _ = side_frames(corners)
-    outside_px = (normal[:, :, None] * (start[:, None] - corners[:, :, None])).sum(axis=-1).max(axis=(1, 2))
-    small = np.abs(signed_area(corners)) < _MAX_GROWTH * np.abs(signed_area(start))
-    return np.asarray(is_convex(corners) & (outside_px < _ENCLOSED_PX) & small)
-
-
-def _fit_near(
-    grey: GreyBand,
-    owner: np.ndarray,
-    owner_stride: int,
-    blobs: np.ndarray,
-    corners_px: FloatArray,
-    blur_px: float,
-) -> QuadFit:
-    """Fit quadrilaterals to what is within a few px of the sides of ``corners_px`` (M, 4, 2)."""
     patches = cut_patches(grey, owner, owner_stride, blobs, corners_px)
     start = corners_px - patches.origin_px[:, None]
     clipped = np.asarray(patches.clipped > _CLIPPED_SHARE)
@@ -145,10 +119,9 @@ def _fit_near(
     system = _iterate(patches, quads, _BLUR_SIGMA_PX, _ITERATIONS)
     most_px = np.maximum(_MAX_MOVE_PX, _MAX_MOVE_SHARE * side_frames(start)[2].max(axis=1))
     settled = (np.abs(quads.corners - start).max(axis=(1, 2)) < most_px) & is_convex(quads.corners)
-    # Pixels at the sensor's limit say that the paint is at least as bright.
-    settled &= ~clipped | (quads.levels[:, [0, 3]].sum(axis=1) > _LEAST_CLIPPED)
     rms = np.sqrt((patches.use * system.residual**2).sum(axis=1) / np.maximum(patches.use.sum(axis=1), 1))
     misfit = rms / system.amplitude
+    settled |= (misfit < _GOOD_MISFIT) & _has_grown(start, quads.corners)
     # Misfit is paint that is missing on one side; a level beyond the sensor's is an extrapolation.
     doubt = (1 + (misfit / _NOISE_MISFIT) ** 2) * np.maximum(system.amplitude, 1.0) ** 2
     return QuadFit(
@@ -158,7 +131,17 @@ def _fit_near(
         misfit,
         settled,
         clipped,
+        # Pixels at the sensor's limit say that the paint is at least as bright.
+        ~clipped | (quads.levels[:, [0, 3]].sum(axis=1) > _LEAST_CLIPPED),
     )
+
+
+def _has_grown(start: FloatArray, corners: FloatArray) -> BoolArray:
+    """Which quadrilaterals (M, 4, 2) enclose the smaller ones (M, 4, 2) that they come from."""
+    _, normal, _ = side_frames(corners)
+    outside_px = (normal[:, :, None] * (start[:, None] - corners[:, :, None])).sum(axis=-1).max(axis=(1, 2))
+    small = np.abs(signed_area(corners)) < _MAX_GROWTH * np.abs(signed_area(start))
+    return np.asarray(is_convex(corners) & (outside_px < _ENCLOSED_PX) & small)
 
 
 def unbow_corners(view: CameraView, corners_px: FloatArray) -> FloatArray:
