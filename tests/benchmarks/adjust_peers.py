@@ -3,7 +3,8 @@
 ``python -m tests.benchmarks.adjust_peers [observations ...] [--threads N]`` prints time (set-up and solve
 apart; wall, and CPU for a machine that is busy otherwise), final cost and memory of each. Ceres runs
 natively, through pyceres with pycolmap's compiled cost functions and the Schur complement that suits few
-cameras; where these are not installed (the extra ``bench``), it is left out and said so.
+cameras; where these are not installed (the extra ``bench``), it is left out and said so. SciPy's trust region
+knows the Jacobian's sparsity, and is left out beyond the size that it can manage.
 
 The model is the paper's, extrinsics and corners, since pycolmap has no frame states: our own per-frame
 states are a row of their own.
@@ -20,6 +21,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.optimize import least_squares
+from scipy.sparse import coo_matrix
 from scipy.spatial.transform import Rotation
 
 from tests.adjust.scene import make_scene
@@ -37,6 +40,9 @@ except ImportError as failure:
     pyceres: Any = None
 else:
     ABSENT = ""
+
+SCIPY_LIMIT = 120_000
+"""Observations above which SciPy takes minutes: its steps solve the whole system iteratively."""
 
 PAPER = SolveOptions(pose_states=(), loss="none", coarse=False)
 
@@ -131,6 +137,52 @@ def _ceres_problem(problem: Problem) -> tuple[Any, dict[str, Any]]:
     return built, keep
 
 
+def scipy_trf(problem: Problem) -> Row:
+    """SciPy's trust region reflective, differences coloured by the Jacobian's sparsity, LSMR steps."""
+    began = time.perf_counter()
+    cameras, seen = len(problem.intrinsic), problem.observations
+    vehicle_from_map = np.linalg.inv(problem.map_from_vehicle)[seen.frame]
+    root = np.linalg.inv(np.linalg.cholesky(seen.covariance_px))
+    intrinsic, start = problem.intrinsic[seen.camera], problem.cam_from_vehicle
+    assert problem.corners_start is not None
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        """Of all observations, then of the priors; x holds turn and centre of each camera, then corners."""
+        turn, centre = x[: 6 * cameras].reshape(-1, 2, 3).transpose(1, 0, 2)
+        corner = x[6 * cameras :].reshape(-1, 2)[seen.corner]
+        ground = np.column_stack([corner, np.zeros(len(corner)), np.ones(len(corner))])
+        vehicle = np.einsum("kab,kb->ka", vehicle_from_map[:, :3], ground) - centre[seen.camera]
+        rotation = Rotation.from_rotvec(turn).as_matrix() @ start[:, :3, :3]
+        point = np.einsum("kab,kb->ka", rotation[seen.camera], vehicle)
+        off = intrinsic[:, :2] * point[:, :2] / point[:, 2:] + intrinsic[:, 2:] - seen.pinhole_px
+        prior = (centre - problem.centre_vehicle) / problem.centre_sigma_m
+        return np.concatenate([np.einsum("kab,kb->ka", root, off).ravel(), prior.ravel()])
+
+    centre = -np.einsum("cba,cb->ca", start[:, :3, :3], start[:, :3, 3])
+    x = np.concatenate(
+        [np.stack([np.zeros_like(centre), centre], axis=1).ravel(), problem.corners_start.ravel()]
+    )
+    ready, cpu = time.perf_counter(), time.process_time()
+    found = least_squares(
+        residuals, x, jac_sparsity=_sparsity(problem), x_scale="jac", ftol=1e-12, xtol=1e-12, gtol=1e-12
+    )
+    took, cpu = time.perf_counter() - ready, time.process_time() - cpu
+    return Row("scipy, trf", ready - began, took, cpu, float(found.cost), f"{found.nfev} steps")
+
+
+def _sparsity(problem: Problem) -> coo_matrix:
+    """Which unknowns each residual of :func:`scipy_trf` depends on."""
+    cameras, seen = len(problem.intrinsic), problem.observations
+    of_camera = 6 * seen.camera[:, None] + np.arange(6)
+    of_corner = 6 * cameras + 2 * seen.corner[:, None] + np.arange(2)
+    columns = np.concatenate([of_camera, of_corner], axis=1).repeat(2, axis=0)
+    rows = np.arange(len(columns))[:, None].repeat(8, axis=1)
+    prior = np.arange(3 * cameras)
+    rows = np.concatenate([rows.ravel(), len(columns) + prior])
+    columns = np.concatenate([columns.ravel(), 6 * (prior // 3) + 3 + prior % 3])
+    return coo_matrix((np.ones(len(rows), dtype=np.int8), (rows, columns)))
+
+
 def main() -> None:
     """Print a table per size."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -147,14 +199,24 @@ def main() -> None:
         rows = [ours(problem, PAPER, "ours"), ours(problem, replace(PAPER, solver="lm"), "ours, lm")]
         if not ABSENT:
             rows.append(ceres(problem, arguments.threads))
+        if len(problem.observations.corner) <= SCIPY_LIMIT:
+            rows.append(scipy_trf(problem))
+        else:
+            print(f"  scipy is left out: beyond {SCIPY_LIMIT} observations it takes minutes to hours")
         states = replace(problem, pose_sigma=PoseSigma())
         rows.append(ours(states, SolveOptions(loss="none", coarse=False), "ours, 6 states a frame"))
         least = min(row.cost for row in rows[:-1])
+        peer = next((row for row in rows if row.name == "ceres"), None)
         for row in rows:
             above = "" if row is rows[-1] else f"above the least {row.cost / least - 1:8.1e}"
+            times = (
+                ""
+                if peer is None
+                else f"{row.solve_s / peer.solve_s:5.2f} x, {row.cpu_s / peer.cpu_s:5.2f} x CPU"
+            )
             print(
                 f"  {row.name:22s} set-up {row.setup_s:6.2f} s  solve {row.solve_s:6.2f} s "
-                f"({row.cpu_s:6.2f} s CPU)  cost {row.cost:.9e} {above}  {row.note}",
+                f"({row.cpu_s:6.2f} s CPU) {times}  cost {row.cost:.9e} {above}  {row.note}",
                 flush=True,
             )
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20

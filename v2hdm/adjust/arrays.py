@@ -144,8 +144,8 @@ class Arrays:
         """(observation, corner) at which each run begins, and the end."""
         corners, begins = self.unit_bounds
         size = _RUN if self.measured.device.type == "cpu" else _RUN_ON_DEVICE
-        wanted = torch.arange(0, len(self.corner), size, device=begins.device)
-        chosen = [*torch.unique(torch.searchsorted(begins, wanted)).tolist(), len(corners) - 1]
+        wanted = torch.arange(0, len(self.corner) + size, size, device=begins.device)
+        chosen = torch.unique(torch.searchsorted(begins, wanted.clamp(max=len(self.corner))))
         return list(zip(begins[chosen].tolist(), corners[chosen].tolist(), strict=True))
 
     def runs(self) -> Iterator[Run]:

@@ -30,9 +30,7 @@ def coarse_extrinsics(arrays: Arrays, cam_from_vehicle: Tensor) -> tuple[Tensor,
     hundred corners fix an extrinsic. The poses are taken as recorded: what they are off is small
     here. The loss is convex, and wide enough for the residuals that are found.
     """
-    subset = _route_blocks(arrays)
-    if not bool(subset.all()):
-        arrays, _ = arrays.take(subset[arrays.corner])
+    arrays = _papers_model(arrays)
     evaluations = 0
     for min_sine in _MIN_DEPRESSION_SINES:
         _, sine = ground_hits(arrays.whole(), ray_table(arrays, cam_from_vehicle))
@@ -49,6 +47,24 @@ def coarse_extrinsics(arrays: Arrays, cam_from_vehicle: Tensor) -> tuple[Tensor,
     return cam_from_vehicle, evaluations
 
 
+def _papers_model(arrays: Arrays) -> Arrays:
+    """The problem of some corners and the frames that saw them, no states and no clocks."""
+    subset = _route_blocks(arrays)
+    if not bool(subset.all()):
+        arrays, _ = arrays.take(subset[arrays.corner.long()])
+    frames, frame = torch.unique(arrays.pair % arrays.frame_count, return_inverse=True)
+    camera, frames = arrays.pair // arrays.frame_count, frames.long()
+    return replace(
+        arrays,
+        pair=camera * len(frames) + frame.to(camera.dtype),
+        vehicle_from_map=arrays.vehicle_from_map[frames],
+        states=(),
+        state_transition=arrays.state_transition[frames, :0, :0],
+        state_information_root=arrays.state_information_root[frames, :0],
+        clock_twist=arrays.clock_twist[frames, :, :0],
+    )
+
+
 def _route_blocks(arrays: Arrays) -> Tensor:
     """Mask (N,) of corners in contiguous blocks spread over the route."""
     count = arrays.corner_count
@@ -61,17 +77,11 @@ def _route_blocks(arrays: Arrays) -> Tensor:
 
 
 def _seen_twice(arrays: Arrays, keep: Tensor) -> Arrays | None:
-    """The paper's model on the corners that ``keep`` leaves at least two observations, if enough."""
+    """The problem of the corners that ``keep`` leaves at least two observations, if these are enough."""
     sightings = torch.bincount(arrays.corner[keep], minlength=arrays.corner_count)
     keep = keep & (sightings >= 2)[arrays.corner]
     camera = arrays.pair[keep] // arrays.frame_count
     if int(torch.bincount(camera, minlength=arrays.camera_count).min()) < _MIN_OBSERVATIONS:
         return None
     part, _ = arrays.take(keep)
-    return replace(
-        part,
-        states=(),
-        state_transition=arrays.state_transition[:, :0, :0],
-        state_information_root=arrays.state_information_root[:, :0],
-        clock_twist=arrays.clock_twist[..., :0],
-    )
+    return part

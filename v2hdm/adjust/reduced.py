@@ -121,11 +121,14 @@ class Spread:
 
 
 class ReducedSystem:
-    """S while it is put together: the corners' part comes off run by run, then U is added."""
+    """S while it is put together: U is summed up and the corners' part comes off, run by run."""
 
     def __init__(self, arrays: Arrays, plan: Plan, spread: Spread) -> None:
         self.arrays, self.plan, self.spread = arrays, plan, spread
         self._state_table = spread.state.reshape(arrays.pair_count, -1).T.contiguous()
+        # U by pair; where no pair moves but with its camera, by camera.
+        self._by_pair = bool(arrays.states) or arrays.camera_unknowns > 6
+        self._own = arrays.centre.new_zeros(21, arrays.pair_count if self._by_pair else arrays.camera_count)
         tip = arrays.camera_count * arrays.camera_unknowns
         size = plan.frames_per_tile * len(arrays.states)
         self.tiles: Tiles = {(TIP, TIP): arrays.centre.new_zeros(tip, tip)}
@@ -133,6 +136,15 @@ class ReducedSystem:
             self.tiles[TIP, column] = arrays.centre.new_zeros(tip, size)
             for row in (column, *below):
                 self.tiles[row, column] = arrays.centre.new_zeros(size, size)
+
+    def add(self, run: Run, blocks: Tensor) -> None:
+        """Add U of a run, ``blocks`` (21, k) by observation."""
+        if self._by_pair:
+            self._own.index_add_(1, run.pair, blocks)
+        else:
+            cameras = torch.arange(self.arrays.camera_count, device=run.pair.device)
+            belongs = run.pair[:, None] // self.arrays.frame_count == cameras
+            self._own.addmm_(blocks, belongs.to(blocks.dtype))
 
     def subtract(self, number: int, run: Run, coupling: Tensor, factor: CornerFactor) -> None:
         """Take B' B of run ``number`` off; ``coupling`` (2, 6, k) is W' by observation."""
@@ -177,14 +189,14 @@ class ReducedSystem:
                 self.tiles[row, column].addmm_(parts[second].mT, parts[first], alpha=-1)
 
     def factorise(
-        self, estimate: Estimate, own: Tensor, damping: float, jitter: float
+        self, estimate: Estimate, damping: float, jitter: float
     ) -> tuple[TiledCholesky, float] | None:
-        """Add U, whose pairs' part is ``own`` (21, P), and factorise; the tiles are used up.
+        """Put it together and factorise; the tiles are used up.
 
         ``damping`` is added to U's diagonal, ``jitter`` to that of the pivots, relative to them. Returns the
         factor and the smallest pivot as a share of U's diagonal; None where S cannot be factorised.
         """
-        diagonal = [*self._add_frames(own), self._add_cameras(estimate, own)]
+        diagonal = [*self._add_frames(), self._add_cameras(estimate)]
         keys = [*((k, k) for k in range(self.plan.tile_count)), (TIP, TIP)]
         for key, values in zip(keys, diagonal, strict=True):
             self.tiles[key].diagonal().add_(values, alpha=damping)
@@ -193,15 +205,13 @@ class ReducedSystem:
             return None
         return factor, float((factor.pivots() / (1 + damping) / torch.cat(diagonal)).min())
 
-    def _add_cameras(self, estimate: Estimate, own: Tensor) -> Tensor:
+    def _add_cameras(self, estimate: Estimate) -> Tensor:
         """Add the cameras' own information and priors; returns its diagonal."""
         arrays, each = self.arrays, self.arrays.camera_unknowns
-        by_pair = own.reshape(21, arrays.camera_count, arrays.frame_count)
-        if each == 6:
-            by_camera = _symmetric(by_pair.sum(2))
-        else:
-            spread = self.spread.camera
-            by_camera = (spread.mT @ _symmetric(by_pair) @ spread).sum(1)
+        by_pair = _symmetric(self._own.reshape(21, arrays.camera_count, -1))
+        if each > 6:
+            by_pair = self.spread.camera.mT @ by_pair @ self.spread.camera
+        by_camera = by_pair.sum(1)
         rotation, root = estimate.cam_from_vehicle[:, :3, :3], arrays.centre_information_root
         by_camera[:, :3, :3] += rotation * root.square()[:, None] @ rotation.mT
         by_camera.diagonal(dim1=1, dim2=2)[:, 6:] += arrays.clock_information_root**2
@@ -209,12 +219,12 @@ class ReducedSystem:
         self.tiles[TIP, TIP] += tip
         return torch.diagonal(tip)
 
-    def _add_frames(self, own: Tensor) -> list[Tensor]:
+    def _add_frames(self) -> list[Tensor]:
         """Add the frames' own information, prior and coupling to the cameras; returns the diagonals."""
         arrays, plan, spread = self.arrays, self.plan, self.spread
         if not arrays.states:
             return []
-        blocks = _symmetric(own.reshape(21, arrays.camera_count, arrays.frame_count))
+        blocks = _symmetric(self._own.reshape(21, arrays.camera_count, -1))
         by_state = blocks @ spread.state
         by_frame = (spread.state.mT @ by_state).sum(0)
         border = (by_state.mT @ spread.camera).permute(1, 2, 0, 3).flatten(2)

@@ -7,10 +7,12 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
+import torch
 
 from v2hdm.adjust.covariance import Covariance
 from v2hdm.adjust.gating import Excluded, Verdict, VerdictArray, excluded
 from v2hdm.adjust.problem import IntArray, Observations
+from v2hdm.adjust.robust import loss
 from v2hdm.records import BoolArray, FloatArray
 
 
@@ -58,8 +60,8 @@ class Solution:
         residual_px: projected minus observed, (K, 2).
         mahalanobis2: squared residual in standard deviations (K,), chi-square with 2 degrees of
             freedom where model and covariances are right.
-        weight: what the robust loss left of each observation (K,), 0 to 1.
         verdict: a :class:`v2hdm.adjust.Verdict` on each observation (K,).
+        loss, loss_scale: the robust loss, as in :class:`v2hdm.adjust.SolveOptions`.
         clock_offset_s: (C,) how much later than stated each camera's images were taken; 0 where that is
             not estimated.
         cost_terms: the parts of the cost by name; they add up to :attr:`cost`.
@@ -78,8 +80,9 @@ class Solution:
     corners_map: FloatArray
     residual_px: FloatArray
     mahalanobis2: FloatArray
-    weight: FloatArray
     verdict: VerdictArray
+    loss: str
+    loss_scale: float
     clock_offset_s: FloatArray
     cost_terms: Mapping[str, float]
     evaluations: int
@@ -93,6 +96,12 @@ class Solution:
     def cost(self) -> float:
         """Half the squared, robustified residuals plus priors."""
         return sum(self.cost_terms.values())
+
+    @property
+    def weight(self) -> FloatArray:
+        """What the robust loss left of each observation (K,), 0 to 1."""
+        _, weight = loss(self.loss, torch.as_tensor(self.mahalanobis2), self.loss_scale)
+        return np.asarray(weight.numpy())
 
     @property
     def accepted(self) -> BoolArray:

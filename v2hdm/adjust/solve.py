@@ -18,13 +18,13 @@ from v2hdm.adjust.descent import Descent, descend
 from v2hdm.adjust.gating import judge, noise_scale
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.problem import Problem, SolveOptions
-from v2hdm.adjust.residuals import Estimate, Loss, cost_and_gradient, frame_tangent, observe, pair_table
-from v2hdm.adjust.robust import loss
+from v2hdm.adjust.residuals import Estimate, Loss, cost_and_gradient, frame_tangent, observe
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.start import back_project
+from v2hdm.adjust.whitening import Whitening
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.camera import NEAR_M
-from v2hdm.geometry.transform import exp, inverse
+from v2hdm.geometry.transform import exp
 from v2hdm.records import BoolArray, FloatArray
 
 # Squared residual that one good observation in a thousand exceeds: chi-square, 2 degrees of freedom.
@@ -90,19 +90,19 @@ def _report(
     estimate, terms = whitening.estimate, whitening.terms
     if whitening.robust != robust:
         terms, _ = cost_and_gradient(arrays, estimate, robust)
-    map_from_vehicle = inverse(arrays.vehicle_from_map) @ exp(frame_tangent(arrays, estimate.frame_state))
-    seen = _seen(problem, arrays, estimate, robust)
+    seen = _seen(problem, whitening)
     scale = noise_scale(seen.mahalanobis2)
     variance = _variance_factors(arrays, terms, seen.mahalanobis2, scale)
     return Solution(
         status=_status(descent, options, bool(seen.behind.any())),
         cam_from_vehicle=estimate.cam_from_vehicle.cpu().numpy(),
-        map_from_vehicle=map_from_vehicle.cpu().numpy(),
+        map_from_vehicle=_adjusted_poses(problem, arrays, estimate),
         corners_map=_unsorted(estimate.corners_map, arrays.corner_order),
         residual_px=seen.residual_px,
         mahalanobis2=seen.mahalanobis2,
         verdict=judge(problem.observations, seen.mahalanobis2, seen.behind, options.gate_probability, scale),
-        weight=seen.weight,
+        loss=options.loss,
+        loss_scale=options.loss_scale,
         clock_offset_s=_clock_offset_s(estimate),
         cost_terms={name: float(value) for name, value in terms.items()},
         evaluations=descent.evaluations + spent,
@@ -120,21 +120,30 @@ class _Seen:
 
     residual_px: FloatArray
     mahalanobis2: FloatArray
-    weight: FloatArray
     behind: BoolArray
 
 
-def _seen(problem: Problem, arrays: Arrays, estimate: Estimate, robust: Loss) -> _Seen:
-    table, count = pair_table(arrays, estimate), len(arrays.pair)
-    out = _Seen(np.empty((count, 2)), np.empty(count), np.empty(count), np.empty(count, dtype=bool))
+def _seen(problem: Problem, whitening: Whitening) -> _Seen:
+    arrays, count = whitening.arrays, len(whitening.arrays.pair)
+    out = _Seen(np.empty((count, 2)), np.empty(count), np.empty(count, dtype=bool))
     for run in arrays.runs():
-        view, rows = observe(run, table, estimate.corners_map), arrays.order[run.observations].cpu().numpy()
+        view = observe(run, whitening.table, whitening.estimate.corners_map)
+        rows = arrays.order[run.observations].cpu().numpy()
         focal = problem.intrinsic[problem.observations.camera[rows], :2]
         out.residual_px[rows] = view.off.T.cpu().numpy() * focal
         out.mahalanobis2[rows] = view.squared.cpu().numpy()
-        out.weight[rows] = loss(robust.name, view.squared, robust.scale)[1].cpu().numpy()
         out.behind[rows] = (view.point[2] <= NEAR_M).cpu().numpy()
     return out
+
+
+def _adjusted_poses(problem: Problem, arrays: Arrays, estimate: Estimate) -> FloatArray:
+    """Poses (J, 4, 4), the recorded ones where no state is estimated."""
+    if not arrays.states:
+        return problem.map_from_vehicle.copy()
+    recorded = torch.as_tensor(
+        problem.map_from_vehicle, dtype=torch.float64, device=estimate.frame_state.device
+    )
+    return np.asarray((recorded @ exp(frame_tangent(arrays, estimate.frame_state))).cpu().numpy())
 
 
 def _clock_offset_s(estimate: Estimate) -> FloatArray:

@@ -171,18 +171,17 @@ def _try_factorise(
     spread = Spread(pair_from_state(arrays, estimate), pair_from_clock(arrays, estimate))
     system, whitener, factors = ReducedSystem(arrays, plan, spread), Whitener(arrays, table), []
     _, by_length = length_residual(arrays, estimate.corners_map)
-    own = table.new_zeros(21, arrays.pair_count)
     for number, run in enumerate(arrays.runs()):
         view = observe(run, table, estimate.corners_map)
         weight = tally.add(run, view, robust).clamp(min=_WEIGHT_FLOOR)
         by_pair, by_corner = (rows * weight.sqrt() for rows in jacobians(run, view))
-        own.index_add_(1, run.pair, pair_blocks(by_pair))
         blocks = run.sum_by_corner(corner_blocks(by_corner)).T
         factors.append(factorise_corners(arrays, run.corners, blocks, by_length, damping))
+        system.add(run, pair_blocks(by_pair))
         system.subtract(number, run, coupling(by_pair, by_corner), factors[-1])
         gradient = tally.by_corner[run.corners] + by_corner_priors(arrays, estimate, run.corners)
         whitener.add(Linear.at(run, view, weight), factors[-1], gradient)
-    factorised = system.factorise(estimate, own, damping, jitter)
+    factorised = system.factorise(estimate, damping, jitter)
     if factorised is None:
         return None
     reduced_factor, smallest_pivot = factorised

@@ -1,0 +1,105 @@
+"""The solver's own tables: small, complete, and the same problem however they are cut."""
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+
+from tests.adjust.scene import make_scene
+from v2hdm.adjust import KnownLengths, PoseSigma, Problem, SolveOptions, arrays, solve
+from v2hdm.adjust.layout import make_arrays
+from v2hdm.adjust.problem import POSE_STATES
+
+
+def street(**changes) -> Problem:
+    """Corners far apart on the route, joined by lengths: 0 to 5 to 40, and 7 to 9."""
+    problem = make_scene(2, frames=40, jitter=PoseSigma(), **changes).problem
+    lengths = KnownLengths(np.array([0, 5, 9]), np.array([5, 40, 7]), np.full(3, 2.0), np.full(3, 9.0))
+    return dataclasses.replace(problem, lengths=lengths)
+
+
+def tensors(record: object) -> Iterator[torch.Tensor]:
+    """All tensors in a record of records, each once."""
+    if isinstance(record, torch.Tensor):
+        yield record
+    elif dataclasses.is_dataclass(record):
+        for field in dataclasses.fields(record):
+            yield from tensors(getattr(record, field.name))
+    elif isinstance(record, dict | tuple):
+        for value in record.values() if isinstance(record, dict) else record:
+            yield from tensors(value)
+
+
+@pytest.mark.parametrize("pose_states", [(), POSE_STATES])
+def test_an_observation_takes_52_bytes_and_the_factorised_hessian_none(pose_states):
+    problem = street()
+    count = len(problem.observations.corner)
+    whitening = solve(problem, SolveOptions(pose_states=pose_states)).covariance.whitening
+    own = [part for part in tensors(whitening.arrays) if part.shape[-1:] == (count,)]
+    assert sum(part.element_size() * part.numel() for part in own) == 52 * count
+    outside = dataclasses.replace(whitening, arrays=None)
+    assert all(part.shape[k] != count for part in tensors(outside) for k in range(part.ndim))
+
+
+def test_runs_hold_every_observation_once_in_order_and_part_no_corners_that_lengths_join(monkeypatch):
+    monkeypatch.setattr(arrays, "_RUN", 50)
+    laid_out = make_arrays(street(), (), "cpu")
+    runs = list(laid_out.runs())
+    assert len(runs) > 20
+    assert all(run.corner_count for run in runs)
+    assert [run.observations.start for run in runs[1:]] == [run.observations.stop for run in runs[:-1]]
+    assert [run.corners.start for run in runs[1:]] == [run.corners.stop for run in runs[:-1]]
+    assert runs[-1].observations.stop == len(laid_out.pair)
+    assert runs[-1].corners.stop == laid_out.corner_count
+    for run in runs:
+        assert torch.equal(run.corner + run.corners.start, laid_out.corner[run.observations].long())
+        assert not laid_out.joined[run.corners.start]
+    rank = torch.argsort(laid_out.corner_order)
+    assert sorted(torch.diff(rank[[0, 5, 40]].sort().values).tolist()) == [1, 1]
+    assert abs(int(rank[7] - rank[9])) == 1
+
+
+@pytest.mark.parametrize("pose_states", [(), POSE_STATES])
+def test_the_optimum_is_the_same_in_short_runs_and_in_one(monkeypatch, pose_states):
+    options = SolveOptions(pose_states=pose_states)
+    whole = solve(street(outliers=0.02), options)
+    monkeypatch.setattr(arrays, "_RUN", 50)
+    parts = solve(street(outliers=0.02), options)
+    assert parts.cost == pytest.approx(whole.cost, rel=1e-12)
+    np.testing.assert_allclose(parts.corners_map, whole.corners_map, atol=1e-9)
+    np.testing.assert_allclose(parts.mahalanobis2, whole.mahalanobis2, atol=1e-6)
+    groups = np.array([[0, 40], [9, 12]])
+    covariance = whole.corner_covariance(groups)
+    np.testing.assert_allclose(parts.corner_covariance(groups), covariance, rtol=1e-6)
+
+
+def test_part_of_a_problem_keeps_the_lengths_whose_corners_it_keeps():
+    whole = make_arrays(street(), (), "cpu")
+    rank = torch.argsort(whole.corner_order)
+    part, corners = whole.take(~torch.isin(whole.corner.long(), rank[[5, 30]]))
+    assert part.corner_count == whole.corner_count - 2
+    assert torch.equal(part.corner_order, whole.corner_order[corners])
+    assert part.corner_order[part.lengths.first].tolist() == [9]
+    assert part.corner_order[part.lengths.second].tolist() == [7]
+    assert bool(part.joined[torch.maximum(part.lengths.first, part.lengths.second)].all())
+
+
+def test_the_covariance_of_corners_that_lengths_join_knows_the_lengths_however_they_are_grouped():
+    problem = make_scene(3, frames=30, cameras=1, start_error_deg=0.0, start_error_m=0.0).problem
+    first, second = np.array([2, 3]), np.array([3, 8])
+    length_m = np.array([0.5, 3.0])
+    lengths = KnownLengths(first, second, length_m, np.array([0.003, 0.004]))
+    solution = solve(dataclasses.replace(problem, lengths=lengths), SolveOptions(pose_states=(), loss="none"))
+    joint = solution.corner_covariance(np.array([2, 3, 8, 20]))
+    part = solution.corner_covariance(np.array([[8, 20], [3, 2]]))
+    np.testing.assert_allclose(part[0], joint[4:, 4:], rtol=1e-9)
+    np.testing.assert_allclose(part[1], joint[[2, 3, 0, 1]][:, [2, 3, 0, 1]], rtol=1e-9)
+    assert np.linalg.eigvalsh(joint).min() > 0
+    for k, sigma_m in enumerate((0.003, 0.004)):
+        apart = solution.corners_map[first[k]] - solution.corners_map[second[k]]
+        direction = apart / np.linalg.norm(apart)
+        along = np.zeros(8)
+        along[2 * k : 2 * k + 4] = np.concatenate([direction, -direction])
+        assert np.sqrt(along @ joint @ along) < sigma_m
