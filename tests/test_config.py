@@ -48,6 +48,8 @@ def run_door(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
         (("+run=port2", "mapping.max_rnge_m=3"), "max_range_m"),
         (("+run=port9",), "port9"),
         (("+run=port2", "workers=many"), "workers"),
+        (("+run=port2", "simulate.route.pieces=[[62.0,0.0],[23,-90.0]]"), "write 23.0"),
+        (("+run=port2", "+mapping.known_sizes.by_class_m={diamond: [1, 0.7]}"), "write 1.0"),
         (("+run=kitti",), "drive.path"),
         (("+run=kitti", "drive.path=nowhere"), "nowhere"),
     ],

@@ -69,8 +69,13 @@ def explain(error: Exception, overrides: list[str]) -> ConfigError:
         near = difflib.get_close_matches(leaf, {k.split(".")[-1] for k in known}, n=1)
         names = [key for key in known if near and key.split(".")[-1] == near[0]]
         hint = f"; did you mean {' or '.join(names[:3])}?" if names else ""
+    whole = re.search(r"Value (-?\d+) \(int\) is incompatible with type hint 'float'", message)
+    if whole:  # OmegaConf turns whole numbers into fractions, but not inside of lists
+        hint = f"; write {whole.group(1)}.0"
+    key = re.search(r"full_key: (\S+)", f"{error}\n{root}")
+    place = f" of {key.group(1)}" if key and key.group(1) not in message else ""
     where = f" (in {' '.join(overrides)})" if overrides else ""
-    return ConfigError(f"configuration{where}: {message}{hint}")
+    return ConfigError(f"configuration{where}: {message}{place}{hint}")
 
 
 _NOISE = re.compile(
