@@ -14,8 +14,8 @@ class DataConfig:
     A render of ``render_width`` x ``render_height`` px is shown ``views_per_render`` times on average, the
     oftener the more paint it shows, each time another crop of ``width`` x ``height`` px in other light. Past
     renders to show again are kept in a ``reservoir``. ``easy_samples`` renders pass until scenes are as hard
-    as they get. ``shadows_on_paint``, ``seams`` and ``overexposed`` are the
-    :class:`~v2hdm.simulate.training.hardships.Hardships` of the renders.
+    as they get. ``shadows_on_paint``, ``seams``, ``pavements``, ``overexposed`` and ``blue_shade``
+    are the :class:`~v2hdm.simulate.training.hardships.Hardships` of the renders.
 
     ``coco`` and ``tusimple`` are files of users' own labels: polygons of markings in COCO's format, lanes in
     TuSimple's. The images' names in them start from ``coco_images`` and ``tusimple_images``, or else from the
@@ -32,7 +32,9 @@ class DataConfig:
     easy_samples: int = 1000
     shadows_on_paint: float = 3.0
     seams: float = 0.25
+    pavements: float = 0.3
     overexposed: float = 0.15
+    blue_shade: float = 0.3
     workers: int = 1
     coco: str | None = None
     coco_images: str | None = None

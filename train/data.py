@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import fields
 
 import cv2
 import numpy as np
@@ -43,9 +44,8 @@ class RenderStream(IterableDataset[Pair]):
         labels: LabelledImages | None = None,
     ) -> None:
         self.config = config
-        self.hardships = Hardships(
-            shadows_on_paint=config.shadows_on_paint, seams=config.seams, overexposed=config.overexposed
-        )
+        names = (field.name for field in fields(Hardships))
+        self.hardships = Hardships(**{name: getattr(config, name) for name in names})
         self.seed = seed
         self.first_render = first_render
         self.part = part

@@ -1,5 +1,7 @@
 """The random scenes: reproducible, varied, and labelled where the paint is."""
 
+from dataclasses import fields, replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,8 @@ from train.config import DataConfig
 from train.data import RenderStream, validation_pairs
 from v2hdm.records import LANE_CLASSES, PAINT_CLASSES
 from v2hdm.simulate.render.optics import Optics
-from v2hdm.simulate.training.hardships import Hardships, overexposed, with_seams
+from v2hdm.simulate.render.scene import Light
+from v2hdm.simulate.training.hardships import Hardships, blue_shade, overexposed, with_pavements, with_seams
 from v2hdm.simulate.training.paint import Bend, rectangle, rhombus
 from v2hdm.simulate.training.scenes import random_scene, training_sample
 from v2hdm.simulate.training.views import looking, random_view
@@ -107,7 +110,7 @@ def test_camera_rotations_are_rotations() -> None:
         assert np.linalg.det(rotation) == pytest.approx(1)
 
 
-@pytest.mark.parametrize("name", ["shadows_on_paint", "seams", "overexposed"])
+@pytest.mark.parametrize("name", [field.name for field in fields(Hardships)])
 def test_hardships_change_what_paint_looks_like_and_not_where_it_is(name: str) -> None:
     hardships = Hardships(**{name: 1.0})
     pairs = [
@@ -129,6 +132,28 @@ def test_seams_lie_beside_their_lines_and_nowhere_else() -> None:
     assert np.abs(y - 2.0).max() < 1.0
     assert np.ptp(x) > 38
     assert with_seams(np.random.default_rng(1), None, [line], share=0.0) is None
+
+
+def test_pavements_change_the_tone_on_one_side_of_an_edge_beside_the_line() -> None:
+    line = np.column_stack([np.arange(0, 40, 0.5), np.full(80, 1.0)])
+    for seed in range(8):
+        marks = with_pavements(np.random.default_rng(seed), None, [line], share=1.0)
+        assert marks is not None
+        at_20_m = marks.factor[:, int((20.0 - marks.origin_map[0]) / marks.resolution_m)]
+        (edges,) = np.nonzero(np.diff(at_20_m.astype(int)))
+        assert len(edges) == 2
+        lateral_m = edges * marks.resolution_m + marks.origin_map[1] - 1.0
+        assert np.abs(lateral_m).min() < 0.8
+        assert np.unique(at_20_m).size == 2
+    assert with_pavements(np.random.default_rng(1), None, [line], share=0.0) is None
+
+
+def test_blue_shade_takes_red_from_the_sky_and_nothing_from_the_sun() -> None:
+    light = Light()
+    bluer = blue_shade(np.random.default_rng(0), light, 1.0)
+    assert bluer.sky_bgr[0] > 1.15 * light.sky_bgr[0]
+    assert bluer.sky_bgr[2] < 0.85 * light.sky_bgr[2]
+    assert replace(bluer, sky_bgr=light.sky_bgr) == light
 
 
 def test_overexposed_optics_expose_longer_within_reason() -> None:

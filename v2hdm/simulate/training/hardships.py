@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from v2hdm.records import CORNERED_CLASSES, FloatArray
 from v2hdm.simulate.render.optics import Optics
-from v2hdm.simulate.render.scene import GroundMarks, Paint, Shadow
+from v2hdm.simulate.render.scene import GroundMarks, Light, Paint, Shadow
 from v2hdm.simulate.training.clutter import plain_marks
 from v2hdm.simulate.training.paint import rectangle
 
 _CROSSED_M = 22.0
 _LONGEST_LEVEL = 0.9
+_SHIFT = 4
+"""Bits of fraction of the coordinates that OpenCV is given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,13 +29,17 @@ class Hardships:
         shadows_on_paint: mean number of shadows that have an edge across a marking.
         seams: share of lane lines that have a seam of the surface beside them, as paving leaves it there:
             dark or bright, and going on where a dash ends.
+        pavements: share of scenes in which the surface changes its tone along a line, beside its paint.
         overexposed: share of images that are exposed several times too long, as the sunlit half of a scene
             is by a camera set for its shade.
+        blue_shade: share of scenes whose shade is lit by a deep blue sky.
     """
 
     shadows_on_paint: float = 0.0
     seams: float = 0.0
+    pavements: float = 0.0
     overexposed: float = 0.0
+    blue_shade: float = 0.0
 
 
 NONE = Hardships()
@@ -68,14 +75,52 @@ def with_seams(
     marks = plain_marks() if marks is None else marks
     factor = marks.factor.copy()
     for line in beside:
-        ahead = np.gradient(line, axis=0)
-        left = np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.linalg.norm(ahead, axis=1, keepdims=True)
-        offset = rng.normal(0, 0.12) + rng.normal(0, 0.01) * np.cumsum(rng.normal(0, 1, len(line)))
-        at = (line + offset[:, None] * left - marks.origin_map) / marks.resolution_m
+        offset_m = rng.normal(0, 0.12) + rng.normal(0, 0.01) * np.cumsum(rng.normal(0, 1, len(line)))
+        at = _sixteenths(_beside(line, offset_m), marks)
         tone = rng.uniform(35, 110) if rng.random() < 0.75 else rng.uniform(145, 200)
-        wide = int(rng.integers(1, 4))
-        cv2.polylines(factor, [np.round(at * 16).astype(np.int32)], False, tone, wide, cv2.LINE_AA, 4)
+        cv2.polylines(factor, [at], False, tone, int(rng.integers(1, 4)), cv2.LINE_AA, _SHIFT)
     return replace(marks, factor=factor)
+
+
+def with_pavements(
+    rng: np.random.Generator, marks: GroundMarks | None, lines_map: Sequence[FloatArray], share: float
+) -> GroundMarks | None:
+    """The marks of a ground, in a ``share`` of cases with a strip of another tone beside a line (N, 2)."""
+    if rng.random() >= share or not lines_map:
+        return marks
+    marks = plain_marks() if marks is None else marks
+    line = lines_map[int(rng.integers(len(lines_map)))]
+    edge_m = rng.choice([-1.0, 1.0]) * rng.uniform(0.0, 0.4)
+    far_m = edge_m + rng.choice([-1.0, 1.0]) * rng.uniform(1.0, 8.0)
+    wavy_m = rng.uniform(0, 0.02) * np.cumsum(rng.normal(0, 1, len(line)))
+    outline = np.vstack([_beside(line, edge_m + wavy_m), _beside(line, np.full(len(line), far_m))[::-1]])
+    inside = np.zeros_like(marks.factor)
+    cv2.fillPoly(inside, [_sixteenths(outline, marks)], 1, cv2.LINE_8, _SHIFT)
+    tone = np.exp(rng.uniform(0.25, 0.7) * rng.choice([-1.0, 1.0]))
+    factor = np.where(inside > 0, np.clip(marks.factor * tone, 0, 255).astype(np.uint8), marks.factor)
+    return replace(marks, factor=factor)
+
+
+def _beside(line: FloatArray, left_m: FloatArray) -> FloatArray:
+    """The points ``left_m`` (N,) to the left of those of a line (N, 2)."""
+    ahead = np.gradient(line, axis=0)
+    left = np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.linalg.norm(ahead, axis=1, keepdims=True)
+    return np.asarray(line + left_m[:, None] * left)
+
+
+def _sixteenths(points_map: FloatArray, marks: GroundMarks) -> NDArray[np.int32]:
+    """Points (N, 2) on the raster of marks as OpenCV draws them with :data:`_SHIFT` bits of fraction."""
+    at = (points_map - marks.origin_map) / marks.resolution_m
+    return np.round(at * (1 << _SHIFT)).astype(np.int32)
+
+
+def blue_shade(rng: np.random.Generator, light: Light, share: float) -> Light:
+    """This light, or in a ``share`` of cases with a sky that is up to twice as blue, and half as red."""
+    if rng.random() >= share:
+        return light
+    tint = rng.uniform(0.2, 0.5)
+    blue, green, red = light.sky_bgr
+    return replace(light, sky_bgr=(blue * (1 + tint), green, red * (1 - tint)))
 
 
 def overexposed(rng: np.random.Generator, optics: Optics, share: float) -> Optics:

@@ -16,7 +16,15 @@ from v2hdm.records import FloatArray
 from v2hdm.simulate.render.renderer import Renderer
 from v2hdm.simulate.render.scene import Backdrop, Bgr, Dapple, Ground, Light, Scene, Shadow
 from v2hdm.simulate.training.clutter import ground_marks, port_boxes, street_boxes
-from v2hdm.simulate.training.hardships import NONE, Hardships, overexposed, shadows_on_paint, with_seams
+from v2hdm.simulate.training.hardships import (
+    NONE,
+    Hardships,
+    blue_shade,
+    overexposed,
+    shadows_on_paint,
+    with_pavements,
+    with_seams,
+)
 from v2hdm.simulate.training.paint import Bend, RoadPaint, port_paint, random_brush, rectangle, street_paint
 from v2hdm.simulate.training.views import TrainingView, random_view
 
@@ -105,15 +113,16 @@ def random_scene(
     else:
         road, boxes = RoadPaint(), street_boxes(rng, road_half_m) if rng.random() < 0.7 else port_boxes(rng)
     ground, shadows = _ground(rng, place == "port", difficulty), _shadows(rng, difficulty)
-    for_shadows, for_seams = rng.spawn(2)
-    marks = with_seams(for_seams, ground.marks, road.lanes, hardships.seams)
+    for_shadows, for_ground, for_light = rng.spawn(3)
+    marks = with_pavements(for_ground, ground.marks, road.lanes, hardships.pavements)
+    marks = with_seams(for_ground, marks, road.lanes, hardships.seams)
     scene = Scene(
         ground=replace(ground, marks=marks),
         paints=tuple(road.paints),
         boxes=boxes,
         shadows=shadows + shadows_on_paint(for_shadows, road.paints, hardships.shadows_on_paint),
         dapples=_dapples(rng, difficulty),
-        light=_light(rng),
+        light=blue_shade(for_light, _light(rng), hardships.blue_shade),
         backdrop=_backdrop(rng),
     )
     return scene, road.lanes
