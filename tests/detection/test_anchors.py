@@ -64,7 +64,7 @@ def test_every_line_is_found_where_it_is_and_numbered_outwards(view):
     for lane in found:
         assert np.abs(off_px(lane, lines[lane.identity])).max() < 0.05
         assert (np.diff(lane.points_px[:, 1]) < 0).all(), "from near to far"
-        assert lane.score > 0.9
+        assert lane.score > 0.85
 
 
 def test_a_bend_stays_one_line(view):

@@ -13,16 +13,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from v2hdm.detection.lane_curves import Horizon, basis
-from v2hdm.detection.lane_groups import NEIGHBOURS, IntArray, Line, LinePoints, find_lines
+from v2hdm.detection.lane_groups import find_lines
+from v2hdm.detection.lane_points import NEIGHBOURS, IntArray, Line, LinePoints
 from v2hdm.detection.sight import AnchorRow
 from v2hdm.detection.view import CameraView
-from v2hdm.records import LANE_BOUNDARY, FloatArray, LaneDetection
+from v2hdm.records import LANE_BOUNDARY, LANE_LINE, FloatArray, LaneDetection
 
 _MIN_CHAIN = 3
 _CHAIN_ODDS = 0.0
 """Chains are made of crossings more likely than not; what is less likely may join a line that is known."""
 
-_LEAST_LOG_ODDS = -0.75
+_LEAST_LOG_ODDS = -1.1
+"""Of every four lines a little surer than this one is right; as many lines are missed as are false."""
 
 _MAX_RANGE_M = 60.0
 """Farther away no line is followed: the network was shown none beyond 50 m."""
@@ -47,7 +49,7 @@ _SMOOTH_PX = 24.0
 _FREEDOM_M = 0.03
 """A line is given every so many px; it follows its points within such a distance, and by so much."""
 
-_EXTENSION_SIGMA = 0.02
+_EXTENSION_SIGMA = 0.03
 """Lines run on towards the vehicle while known within this share of the image's width."""
 
 
@@ -146,7 +148,8 @@ def _with_paint(
     odds = np.repeat([_logit(lane.score) for lane in pieces], length)
     points_px = np.concatenate([lane.points_px for lane in pieces])
     painted = LinePoints.of(view, horizon, points_px, odds, np.full(len(odds), _PAINT_SIGMA_PX))
-    painted = replace(painted, is_paint=np.ones(len(odds), dtype=np.bool_))
+    solid = np.repeat([lane.kind == LANE_LINE for lane in pieces], length)
+    painted = replace(painted, is_paint=np.ones(len(odds), dtype=np.bool_), is_solid=solid)
     ends_at = len(points.odds) + np.cumsum(length)
     groups = [np.arange(end - n, end) for end, n in zip(ends_at, length, strict=True)]
     both = {name: np.concatenate([getattr(points, name), getattr(painted, name)]) for name in vars(points)}
@@ -165,12 +168,20 @@ def _drawn(points: LinePoints, line: Line, view: CameraView, horizon: Horizon) -
     at = np.arange(below.min(), max(lowest, below.max()) + _STEP_PX, _STEP_PX)[::-1]
     along, sigma = _followed(points, line, horizon, at)
     points_px = view.distort(horizon.pinhole_px(along, at))
-    known = (at <= below.max()) | (sigma < _EXTENSION_SIGMA * view.info.width)
+    known = at <= below.max()
+    if not _ends_in_view(points, line):
+        known |= sigma < _EXTENSION_SIGMA * view.info.width
     kept = known & view.inside(points_px, -_STEP_PX)
     if kept.sum() < 2:
         return None
     score = float(1 / (1 + np.exp(-line.log_odds)))
     return LaneDetection(LANE_BOUNDARY, score, points_px[kept], sigma_px=sigma[kept])
+
+
+def _ends_in_view(points: LinePoints, line: Line) -> bool:
+    """Whether a line's nearest paint is solid and so tells where it ends; a dash is one of many."""
+    painted = line.certain[points.is_paint[line.certain]]
+    return len(painted) > 0 and bool(points.is_solid[painted[np.argmax(points.below[painted])]])
 
 
 def _lower_corners(view: CameraView) -> FloatArray:

@@ -1,0 +1,114 @@
+"""The road that an image's lines lie along: what it tells of short ones, and which lines it rules out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.detection.pictures import make_camera, to_image
+from tests.detection.test_anchors import anchors_of, off_px, painted, straight
+from v2hdm.detection.anchors import link_anchors
+from v2hdm.detection.lane_curves import Horizon, Prior
+from v2hdm.detection.lane_points import LinePoints
+from v2hdm.detection.lane_road import find_road
+from v2hdm.detection.sight import AnchorRow
+from v2hdm.detection.view import CameraView
+from v2hdm.records import LANE_LINE, LaneDetection
+
+
+@pytest.fixture
+def view() -> CameraView:
+    return CameraView(make_camera())
+
+
+def evidence_of(view: CameraView, lines_px: list[np.ndarray]):
+    horizon = Horizon(view)
+    points_px = np.concatenate(lines_px)
+    ones = np.ones(len(points_px))
+    points = LinePoints.of(view, horizon, points_px, ones, ones)
+    ends = np.cumsum([len(line) for line in lines_px])
+    groups = [np.arange(end - len(line), end) for end, line in zip(ends, lines_px, strict=True)]
+    return points.evidence(horizon, groups, points.slopes(groups)), horizon
+
+
+def seen(view: CameraView, line_px: np.ndarray) -> np.ndarray:
+    return line_px[view.inside(line_px, 0)]
+
+
+def ahead(view: CameraView, start: tuple[float, float], end: tuple[float, float]) -> np.ndarray:
+    """A straight line on the ground between two points, in the image."""
+    return seen(view, to_image(view.camera, np.linspace(start, end, 60)))
+
+
+def test_the_evidence_is_that_of_a_gaussian(view):
+    evidence, _ = evidence_of(view, [seen(view, straight(view, side)) for side in (1.6, -2.0)])
+    prior = Prior(np.array([5.0, 0.0, 1.0]), np.diag([1e-3, 1e-4, 1e-2]))
+    for k, given in enumerate(evidence.log_evidence(prior)):
+        posterior = evidence.information[k] + prior.information
+        moment = evidence.moment[k] + prior.information @ prior.mean
+        square = evidence.square[k] + prior.mean @ prior.information @ prior.mean
+        misfit = square - moment @ np.linalg.solve(posterior, moment)
+        volume = np.linalg.slogdet(posterior)[1] - np.linalg.slogdet(prior.information)[1]
+        assert given == pytest.approx(-0.5 * (misfit + volume), rel=1e-9)
+
+
+@pytest.mark.parametrize("curvature", [0.0, 0.006, -0.006])
+def test_the_road_is_what_most_lines_agree_on_not_the_longest_other_one(view, curvature):
+    lines = [seen(view, straight(view, side, curvature)) for side in (-5.0, -1.6, 1.8, 5.2)]
+    other = ahead(view, (5.0, -3.0), (30.0, 9.0))
+    evidence, horizon = evidence_of(view, [*lines, other])
+    _, along = find_road(evidence, horizon).judge(evidence)
+    assert along[:4].min() > 2
+    assert along[4] < -10
+
+
+def test_short_dashes_far_away_point_where_the_line_beside_them_does(view):
+    line, beside = straight(view, 1.6), straight(view, -1.8)
+    dashes = [tilted(painted(line, view, *span), 0.7) for span in ((12, 14), (17, 19))]
+    (alone,) = link_anchors([], view, dashes)
+    found = link_anchors(anchors_of(view, [beside]), view, dashes)
+    (lane,) = [lane for lane in found if lane.identity == 1]
+    assert np.abs(off_px(lane, line)).max() < 8
+    assert lane.points_px[0, 1] > alone.points_px[0, 1] + 50, "it is known farther towards the vehicle"
+
+
+def tilted(lane: LaneDetection, by_px: float) -> LaneDetection:
+    turn_px = np.linspace(-by_px, by_px, len(lane.points_px))
+    return replace(lane, points_px=lane.points_px + np.column_stack([turn_px, np.zeros_like(turn_px)]))
+
+
+def test_of_two_lines_that_cross_the_surer_one_stays(view):
+    line = straight(view, 1.6)
+    across = ahead(view, (9.0, 3.2), (20.0, -1.5))
+    rows = anchors_of(view, [line])
+    crossed = link_anchors(rows, view, [LaneDetection(LANE_LINE, 0.9, across[::2])])
+    (lane,) = crossed
+    assert np.abs(off_px(lane, line)).max() < 3
+
+
+def test_a_stroke_across_a_line_does_not_draw_it_to_the_middle(view):
+    line = straight(view, 1.6)
+    stroke = ahead(view, (10.0, 1.3), (12.5, 1.9))
+    paint = [painted(line, view, 5, 20), LaneDetection(LANE_LINE, 0.9, stroke[::4])]
+    (lane,) = link_anchors(anchors_of(view, [line]), view, paint)
+    assert np.abs(off_px(lane, line)).max() < 1
+
+
+@pytest.mark.parametrize(("kind", "runs_on"), [(LANE_LINE, False), ("lane_dash", True)])
+def test_a_solid_line_ends_where_its_paint_does_and_a_dash_is_one_of_many(view, kind, runs_on):
+    line = straight(view, 1.6)
+    ground = view.ground(view.undistort(line))
+    far = anchors_of(view, [line[ground[:, 0] > 12]])
+    dash = painted(line, view, 12, 22)
+    (lane,) = link_anchors(far, view, [LaneDetection(kind, 0.9, dash.points_px)])
+    ends_px = dash.points_px[0, 1]
+    assert (lane.points_px[0, 1] > ends_px + 60) == runs_on
+
+
+def test_a_line_whose_far_half_bends_away_a_little_stays_one(view):
+    near = straight(view, 1.6)
+    rows = anchors_of(view, [near])
+    split = rows[len(rows) // 2].v_px
+    bent = [AnchorRow(r.v_px, r.u_px + (4.0 if r.v_px < split else 0.0), r.odds) for r in rows]
+    (lane,) = link_anchors(bent, view)
+    assert np.ptp(lane.points_px[:, 1]) > 0.9 * (rows[0].v_px - rows[-1].v_px)

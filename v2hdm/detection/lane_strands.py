@@ -1,0 +1,128 @@
+"""From the lines of an image to the boundaries of its lanes: double lines are one, and no two cross."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from v2hdm.detection.lane_curves import Horizon, basis, middle_of
+from v2hdm.detection.lane_points import Line, LinePoints
+from v2hdm.records import BoolArray, FloatArray
+
+_ONE_LINE_M = 0.12
+_DOUBLE_LINE_M = 0.75
+"""Curves nearer than the first are one line; nearer than the second, the two lines of a double one."""
+
+_PARALLEL_M = 0.15
+"""The distance between the two lines of a double one changes by less than this."""
+
+_LEAST_PAINT_M = 1.0
+_LEAST_PAINT_SHARE = 0.3
+"""Each has so much paint, and this share of the better one's."""
+
+_LEAST_OUTSIDE = 0.5
+_CARRIED_ON_M = 0.3
+"""A line that repeats another one but for this share of its rows carries that on, if it is so near."""
+
+_CROSSING_M = 0.3
+"""Lines that lie so far to the left of another one here and so far to its right there cross it."""
+
+_CERTAIN_SIGMA_M = 0.3
+_SAMPLES = 9
+
+
+def boundaries(points: LinePoints, lines: Sequence[Line], horizon: Horizon) -> list[Line]:
+    """The lines, best first, less those that repeat or cross a better one; of a double line, its middle."""
+    kept: list[_Strand] = []
+    for line in lines:
+        if any(_cross(points, line, strand.best, horizon) for strand in kept):
+            continue
+        for strand in kept:
+            offset_m = _offset_m(points, line, strand.best, horizon)
+            if offset_m is not None and np.abs(offset_m).max() <= _DOUBLE_LINE_M:
+                strand.take(points, line, offset_m, horizon)
+                break
+        else:
+            kept.append(_Strand(line))
+    return [strand.line() for strand in kept]
+
+
+class _Strand:
+    """Lines side by side that are one boundary: the ``best``, and the outermost with where they are."""
+
+    def __init__(self, best: Line):
+        self.best = best
+        self._left: tuple[float, Line | None] = 0.0, None
+        self._right: tuple[float, Line | None] = 0.0, None
+
+    def take(self, points: LinePoints, line: Line, offset_m: FloatArray, horizon: Horizon) -> None:
+        """A line so far (N,) to the right of the best: what that goes on as, its double or nothing new."""
+        double = self._left[1] is not None or self._right[1] is not None
+        if not double and _outside(points, line, self.best) > _LEAST_OUTSIDE:
+            if np.abs(offset_m).max() <= _CARRIED_ON_M:
+                self.best = _carried_on(points, self.best, line, horizon)
+            return
+        painted = min(line.paint_m, self.best.paint_m) >= _LEAST_PAINT_M
+        even = line.paint_m >= _LEAST_PAINT_SHARE * self.best.paint_m
+        if not (painted and even and np.ptp(offset_m) < _PARALLEL_M):
+            return
+        beside_m = float(offset_m.mean())
+        if beside_m < self._left[0] and self._right[0] - beside_m <= _DOUBLE_LINE_M:
+            self._left = beside_m, line
+        elif beside_m > self._right[0] and beside_m - self._left[0] <= _DOUBLE_LINE_M:
+            self._right = beside_m, line
+
+    def line(self) -> Line:
+        """The boundary."""
+        if self._right[0] - self._left[0] <= _ONE_LINE_M:
+            return self.best
+        left, right = self._left[1] or self.best, self._right[1] or self.best
+        members = np.unique(np.concatenate([line.certain for line in (self.best, left, right)]))
+        return replace(self.best, curve=middle_of(left.curve, right.curve), certain=members, double=True)
+
+
+def _carried_on(points: LinePoints, line: Line, more: Line, horizon: Horizon) -> Line:
+    """A line and the one that it goes on as, in one."""
+    certain = np.concatenate([line.certain, more.certain])
+    paint_m = line.paint_m + more.paint_m
+    whole = Line.through(points, certain, horizon, line.prior, line.log_odds, paint_m)
+    perhaps, row = np.concatenate([line.perhaps, more.perhaps]), points.points_px[:, 1]
+    return replace(whole, perhaps=perhaps[~np.isin(row[perhaps], row[certain])])
+
+
+def _outside(points: LinePoints, line: Line, other: Line) -> float:
+    """The share of a line's rows that another one does not reach."""
+    own, others = points.below[line.certain], points.below[other.certain]
+    common = min(own.max(), others.max()) - max(own.min(), others.min())
+    return 1 - max(float(common), 0.0) / max(float(np.ptp(own)), 1.0)
+
+
+def _cross(points: LinePoints, first: Line, second: Line, horizon: Horizon) -> bool:
+    """Whether two lines cross where both are known, up to where the nearer one begins."""
+    spans = [points.below[line.certain] for line in (first, second)]
+    low, high = max(span.min() for span in spans), max(span.max() for span in spans)
+    offset_m, known = _apart_m(first, second, np.linspace(low, high, _SAMPLES), horizon)
+    beside_m = offset_m[known.all(axis=0)]
+    return bool((beside_m < -_CROSSING_M).any() and (beside_m > _CROSSING_M).any())
+
+
+def _offset_m(points: LinePoints, first: Line, second: Line, horizon: Horizon) -> FloatArray | None:
+    """How far (N,) a line is to the right of a second one where both are seen, else where the first is.
+
+    None where the second is not known there.
+    """
+    spans = [points.below[line.certain] for line in (first, second)]
+    low, high = max(span.min() for span in spans), min(span.max() for span in spans)
+    if low > high:
+        low, high = spans[0].min(), spans[0].max()
+    offset_m, known = _apart_m(first, second, np.linspace(low, high, _SAMPLES), horizon)
+    return offset_m if known[1].all() else None
+
+
+def _apart_m(first: Line, second: Line, below: FloatArray, horizon: Horizon) -> tuple[FloatArray, BoolArray]:
+    """How far (N,) a line is to the right of another, ``below`` (N,) the horizon, and where each is known."""
+    phi, px_per_m = basis(below), horizon.px_per_m * np.maximum(below, 1.0)
+    sigma_m = np.stack([line.curve.sigma(phi) for line in (first, second)]) / px_per_m
+    return (first.curve.along(phi) - second.curve.along(phi)) / px_per_m, sigma_m < _CERTAIN_SIGMA_M
