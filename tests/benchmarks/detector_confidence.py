@@ -3,10 +3,11 @@
     python -m tests.benchmarks.detector_confidence --images 450 --write
 
 Run it after another network was put in place. Quadrilaterals that the detector proposes on rendered scenes,
-first two thirds of full difficulty, then a third of easy ones, are true if they overlap a marking of their class by half, and false where
-the quality benchmark would say so; a logistic regression with a weak ridge tells them apart. Its seed is
-neither that of the quality benchmark nor one of training. Printed: what each feature adds to the log odds per
-standard deviation, and the log loss on the images of each fifth by weights that were fitted to the others.
+first two thirds of full difficulty, then a third of easy ones, are true if they overlap a marking of their
+class by half, and false where the quality benchmark would say so; a logistic regression with a weak ridge
+tells them apart. Its seed is neither that of the quality benchmark nor one of training. Printed: what each
+feature adds to the log odds per standard deviation, and the log loss on the images of each fifth by weights
+that were fitted to the others.
 """
 
 from __future__ import annotations
