@@ -16,6 +16,7 @@ import argparse
 import os
 import resource
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -57,6 +58,7 @@ class Row:
     cpu_s: float
     cost: float
     note: str
+    same_model: bool = True
 
 
 def street(observations: int) -> Problem:
@@ -195,32 +197,42 @@ def main() -> None:
         print(ABSENT)
     for size in arguments.observations:
         problem = street(size)
-        print(f"{len(problem.observations.corner)} observations, {arguments.threads} threads")
-        rows = [ours(problem, PAPER, "ours"), ours(problem, replace(PAPER, solver="lm"), "ours, lm")]
-        if not ABSENT:
-            rows.append(ceres(problem, arguments.threads))
-        if len(problem.observations.corner) <= SCIPY_LIMIT:
-            rows.append(scipy_trf(problem))
-        else:
-            print(f"  scipy is left out: beyond {SCIPY_LIMIT} observations it takes minutes to hours")
-        states = replace(problem, pose_sigma=PoseSigma())
-        rows.append(ours(states, SolveOptions(loss="none", coarse=False), "ours, 6 states a frame"))
-        least = min(row.cost for row in rows[:-1])
+        print(f"{len(problem.observations.corner)} observations, {arguments.threads} threads", flush=True)
+        rows = [shown(row) for row in solved(problem, arguments.threads)]
+        least = min(row.cost for row in rows if row.same_model)
         peer = next((row for row in rows if row.name == "ceres"), None)
         for row in rows:
-            above = "" if row is rows[-1] else f"above the least {row.cost / least - 1:8.1e}"
-            times = (
-                ""
-                if peer is None
-                else f"{row.solve_s / peer.solve_s:5.2f} x, {row.cpu_s / peer.cpu_s:5.2f} x CPU"
-            )
-            print(
-                f"  {row.name:22s} set-up {row.setup_s:6.2f} s  solve {row.solve_s:6.2f} s "
-                f"({row.cpu_s:6.2f} s CPU) {times}  cost {row.cost:.9e} {above}  {row.note}",
-                flush=True,
-            )
+            above = f"cost above the least {row.cost / least - 1:8.1e}" if row.same_model else "another model"
+            ratio = "" if peer is None else f"{row.solve_s / peer.solve_s:6.2f} x Ceres' time, "
+            ratio += "" if peer is None else f"{row.cpu_s / peer.cpu_s:6.2f} x its CPU time; "
+            print(f"  {row.name:22s} {ratio}{above}")
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
         print(f"  peak memory of all of it {peak:.2f} GB")
+
+
+def solved(problem: Problem, threads: int) -> Iterator[Row]:
+    """All solvers, one after another."""
+    yield ours(problem, PAPER, "ours")
+    states = replace(problem, pose_sigma=PoseSigma())
+    row = ours(states, SolveOptions(loss="none", coarse=False), "ours, 6 states a frame")
+    yield replace(row, same_model=False)
+    if not ABSENT:
+        yield ceres(problem, threads)
+    yield ours(problem, replace(PAPER, solver="lm"), "ours, lm")
+    if len(problem.observations.corner) <= SCIPY_LIMIT:
+        yield scipy_trf(problem)
+    else:
+        print(f"  scipy is left out: beyond {SCIPY_LIMIT} observations it takes minutes to hours")
+
+
+def shown(row: Row) -> Row:
+    """Print a row as soon as it is there."""
+    print(
+        f"  {row.name:22s} set-up {row.setup_s:6.2f} s  solve {row.solve_s:6.2f} s ({row.cpu_s:6.2f} s CPU)  "
+        f"cost {row.cost:.9e}  {row.note}",
+        flush=True,
+    )
+    return row
 
 
 if __name__ == "__main__":
