@@ -92,8 +92,7 @@ def link_anchors(
         paint_step_m: That distance.
     """
     horizon = Horizon(view)
-    rows = _in_reach(rows, view)
-    points = _crossings(rows, view, horizon)
+    rows, points = _in_reach(rows, _crossings(rows, view, horizon), view)
     groups = [np.array(chain.index) for chain in _chains(rows)]
     points, on_paint = _with_paint(points, paint, view, horizon)
     lines = find_lines(points, groups + on_paint, horizon, paint_step_m, _LEAST_LOG_ODDS)
@@ -101,23 +100,18 @@ def link_anchors(
     return _identified(found, view)
 
 
-def _in_reach(rows: Sequence[AnchorRow], view: CameraView) -> list[AnchorRow]:
-    """The rows without crossings at and above the horizon, and just below it, where lines run together."""
-    if not rows:
-        return []
-    points_px = np.column_stack(
-        [
-            np.concatenate([row.u_px for row in rows]),
-            np.repeat([r.v_px for r in rows], [len(r.u_px) for r in rows]),
-        ]
-    )
-    near = view.range_m(view.ground(view.undistort(points_px))) <= _MAX_RANGE_M  # false where it is nan
+def _in_reach(
+    rows: Sequence[AnchorRow], points: LinePoints, view: CameraView
+) -> tuple[list[AnchorRow], LinePoints]:
+    """The rows and their crossings without those at, above and just below the horizon, where lines meet."""
+    near = view.range_m(points.ground) <= _MAX_RANGE_M  # false where it is nan
     parts = np.split(near, np.cumsum([len(row.u_px) for row in rows])[:-1])
-    return [
+    kept = [
         AnchorRow(row.v_px, row.u_px[part], row.odds[part])
-        for row, part in zip(rows, parts, strict=True)
+        for row, part in zip(rows, parts, strict=bool(rows))
         if part.any()
     ]
+    return kept, points.where(near)
 
 
 def _crossings(rows: Sequence[AnchorRow], view: CameraView, horizon: Horizon) -> LinePoints:
@@ -134,14 +128,7 @@ def _with_paint(
     points: LinePoints, paint: Sequence[LaneDetection], view: CameraView, horizon: Horizon
 ) -> tuple[LinePoints, list[IntArray]]:
     """The points with those of pieces of paint after them, and which those are, piece by piece."""
-    pieces = []
-    for lane in paint:
-        ends_px = view.undistort(lane.points_px[[0, -1]])
-        ends = view.ground(ends_px)
-        along, below = np.abs(np.diff(horizon.coordinates(ends_px)))[:, 0]
-        long = np.linalg.norm(ends[1] - ends[0]) >= _LEAST_PAINT_LENGTH_M  # false where it is nan
-        if long and along <= _MAX_PAINT_SLOPE * below:
-            pieces.append(lane)
+    pieces = _along_the_view(paint, view, horizon)
     if not pieces:
         return points, []
     length = [len(lane.points_px) for lane in pieces]
@@ -154,6 +141,20 @@ def _with_paint(
     groups = [np.arange(end - n, end) for end, n in zip(ends_at, length, strict=True)]
     both = {name: np.concatenate([getattr(points, name), getattr(painted, name)]) for name in vars(points)}
     return LinePoints(**both), groups
+
+
+def _along_the_view(
+    paint: Sequence[LaneDetection], view: CameraView, horizon: Horizon
+) -> list[LaneDetection]:
+    """Pieces of paint that are long enough to have a direction, and not one across the view."""
+    if not paint:
+        return []
+    ends_px = view.undistort(np.concatenate([lane.points_px[[0, -1]] for lane in paint]))
+    length_m = np.linalg.norm(np.diff(view.ground(ends_px).reshape(-1, 2, 2), axis=1)[:, 0], axis=1)
+    along, below = (np.abs(np.diff(at.reshape(-1, 2)))[:, 0] for at in horizon.coordinates(ends_px))
+    # False where the length is nan.
+    usable = (length_m >= _LEAST_PAINT_LENGTH_M) & (along <= _MAX_PAINT_SLOPE * below)
+    return [lane for lane, use in zip(paint, usable, strict=True) if use]
 
 
 def _logit(probability: float) -> float:
@@ -247,7 +248,11 @@ def _extend(chains: list[_Chain], row: AnchorRow, likely: list[int], before: int
 
 def _identified(lanes: list[LaneDetection], view: CameraView) -> list[LaneDetection]:
     """Number the lines from the vehicle outwards, by where each is beside the vehicle."""
-    beside_m = np.array([_lateral_m(lane.points_px, view) for lane in lanes])
+    if not lanes:
+        return []
+    ground = view.ground(view.undistort(np.concatenate([lane.points_px for lane in lanes])))
+    parts = np.split(ground, np.cumsum([len(lane.points_px) for lane in lanes])[:-1])
+    beside_m = np.array([_lateral_m(part, view) for part in parts])
     order = np.argsort(beside_m)
     left = [k for k in order if beside_m[k] >= 0]
     right = [k for k in order[::-1] if beside_m[k] < 0]
@@ -257,9 +262,8 @@ def _identified(lanes: list[LaneDetection], view: CameraView) -> list[LaneDetect
     return [replace(lane, identity=identity.get(k)) for k, lane in enumerate(lanes)]
 
 
-def _lateral_m(points_px: FloatArray, view: CameraView) -> float:
-    """How far left of the vehicle a line is, its near half extended to beside the camera; nan if unknown."""
-    ground = view.ground(view.undistort(points_px))
+def _lateral_m(ground: FloatArray, view: CameraView) -> float:
+    """How far left of the vehicle a line (N, 2) is, its near half carried on to there; nan if unknown."""
     ground = ground[np.isfinite(ground).all(axis=1)]
     near = ground[: max(2, len(ground) // 2)]
     if len(near) < 2:

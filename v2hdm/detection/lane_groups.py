@@ -7,13 +7,15 @@ road that they lie along, not how far they are apart.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from v2hdm.detection.lane_curves import Evidence, Horizon
 from v2hdm.detection.lane_points import IntArray, Line, LinePoints
 from v2hdm.detection.lane_road import Road, find_road
 from v2hdm.detection.lane_strands import boundaries
-from v2hdm.records import BoolArray
+from v2hdm.records import BoolArray, FloatArray
 
 _GATE_SIGMAS = 3.0
 _GATE_PX = 16.0
@@ -39,21 +41,24 @@ def find_lines(
     evidence = points.evidence(horizon, groups, points.slopes(groups))
     road = find_road(evidence, horizon)
     groups = _join(evidence, groups, road)
-    _, along = road.judge(points.evidence(horizon, groups, points.slopes(groups)))
+    slopes = points.slopes(groups)
+    evidence = points.evidence(horizon, groups, slopes)
+    _, along = road.judge(evidence)
     believed = []
-    for group, log_ratio in zip(groups, along.tolist(), strict=True):
+    for k, (group, log_ratio) in enumerate(zip(groups, along.tolist(), strict=True)):
         paint_m = paint_step_m * float(points.is_paint[group].sum())
         log_odds = _log_odds(points, group, paint_m, log_ratio)
         if log_odds > least_log_odds - _DOUBTFUL:
-            believed.append((log_odds, paint_m, log_ratio, group))
+            believed.append((log_odds, paint_m, k))
     believed.sort(key=lambda found: -found[0])
     free = ~points.is_paint
-    for *_, group in believed:
-        free[group] = False
+    for *_, k in believed:
+        free[groups[k]] = False
     lines = []
-    for log_odds, paint_m, log_ratio, group in believed:
-        line = Line.through(points, group, horizon, road.drawn_by(log_ratio), log_odds, paint_m)
-        line = _gathered(points, line, free, horizon)
+    for log_odds, paint_m, k in believed:
+        own, slope = evidence[k : k + 1], slopes[k : k + 1]
+        line = Line.through(groups[k], own, horizon, road.drawn_by(along[k]), log_odds, paint_m)
+        line = _gathered(points, line, own, slope, free, horizon)
         free[line.perhaps] = False
         lines.append(line)
     return [line for line in boundaries(points, lines, horizon) if line.log_odds > least_log_odds]
@@ -88,19 +93,24 @@ def _join(evidence: Evidence, groups: list[IntArray], road: Road) -> list[IntArr
     return [groups[k] for k in np.flatnonzero(left)]
 
 
-def _gathered(points: LinePoints, line: Line, free: BoolArray, horizon: Horizon) -> Line:
-    """The line with the free crossings on it, at most one of each row."""
+def _gathered(
+    points: LinePoints, line: Line, own: Evidence, slope: FloatArray, free: BoolArray, horizon: Horizon
+) -> Line:
+    """The line, of such ``own`` evidence, with the free crossings on it, at most one of each row."""
     group, row = line.certain, points.points_px[:, 1]
     candidates = np.flatnonzero(free & ~np.isin(row, row[group[~points.is_paint[group]]]))
     phi = points.phi[candidates]
     off = np.abs(points.along[candidates] - line.curve.along(phi))
     sigma = np.hypot(line.curve.sigma(phi), points.sigma_px[candidates])
-    slope = points.slopes([group])[0]
-    misfit = off / np.minimum(_GATE_SIGMAS * sigma, _GATE_PX * np.hypot(1, slope))
+    misfit = off / np.minimum(_GATE_SIGMAS * sigma, _GATE_PX * np.hypot(1, slope[0]))
     order = np.argsort(misfit)
     order = order[misfit[order] < 1]
     _, nearest = np.unique(row[candidates[order]], return_index=True)
-    return line.joined_by(points, candidates[order[nearest]], horizon)
+    perhaps = candidates[order[nearest]]
+    if not len(perhaps):
+        return line
+    evidence = own + points.evidence(horizon, [perhaps], slope)
+    return replace(line, curve=evidence.curve(line.prior, horizon.centre_px), perhaps=perhaps)
 
 
 def _log_odds(points: LinePoints, group: IntArray, paint_m: float, along_log_ratio: float) -> float:

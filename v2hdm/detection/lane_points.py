@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,10 @@ class LinePoints:
         none = np.zeros(len(odds), dtype=np.bool_)
         return cls(points_px, along, below, basis(below), sigma, odds, view.ground(pinhole_px), none, none)
 
+    def where(self, kept: BoolArray) -> LinePoints:
+        """Some of the points."""
+        return LinePoints(**{name: value[kept] for name, value in vars(self).items()})
+
     def slopes(self, groups: list[IntArray]) -> FloatArray:
         """Px along the horizon per px down (N,) of groups of points that are roughly a line each."""
         members, ends = np.concatenate(groups), np.cumsum([len(group) for group in groups])
@@ -93,22 +97,13 @@ class Line:
     @classmethod
     def through(
         cls,
-        points: LinePoints,
         certain: IntArray,
+        evidence: Evidence,
         horizon: Horizon,
         prior: Prior,
         log_odds: float,
         paint_m: float,
     ) -> Line:
-        """The line that a group of points suggests."""
-        evidence = points.evidence(horizon, [certain], points.slopes([certain]))
+        """The line that a group of points, of such evidence, suggests."""
         none = np.empty(0, dtype=np.int64)
         return cls(evidence.curve(prior, horizon.centre_px), certain, none, log_odds, paint_m, prior)
-
-    def joined_by(self, points: LinePoints, perhaps: IntArray, horizon: Horizon) -> Line:
-        """The line with points that perhaps are on it too."""
-        if not len(perhaps):
-            return self
-        evidence = points.evidence(horizon, [self.certain], slope := points.slopes([self.certain]))
-        evidence = evidence + points.evidence(horizon, [perhaps], slope)
-        return replace(self, curve=evidence.curve(self.prior, horizon.centre_px), perhaps=perhaps)

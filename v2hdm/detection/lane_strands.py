@@ -86,8 +86,9 @@ class _Strand:
 def _carried_on(points: LinePoints, line: Line, more: Line, horizon: Horizon) -> Line:
     """A line and the one that it goes on as, in one."""
     certain = np.concatenate([line.certain, more.certain])
+    evidence = points.evidence(horizon, [certain], points.slopes([certain]))
     paint_m = line.paint_m + more.paint_m
-    whole = Line.through(points, certain, horizon, line.prior, line.log_odds, paint_m)
+    whole = Line.through(certain, evidence, horizon, line.prior, line.log_odds, paint_m)
     perhaps, row = np.concatenate([line.perhaps, more.perhaps]), points.points_px[:, 1]
     return replace(whole, perhaps=perhaps[~np.isin(row[perhaps], row[certain])])
 
