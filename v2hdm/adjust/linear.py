@@ -1,7 +1,7 @@
 """The residuals of a run, linearised: their derivatives, and products with them that store no matrix.
 
-A Jacobian by pair and corner is 16 numbers an observation; computed anew from the pair and the corner it is
-none, and takes no longer than reading it back from memory would.
+A Jacobian by pair and corner is 16 numbers an observation, more than all else that is known of it. What the
+solver asks for is only ever its products with vectors, and these follow from the pair and the corner.
 """
 
 from __future__ import annotations
