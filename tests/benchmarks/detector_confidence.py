@@ -21,9 +21,9 @@ import cv2
 import numpy as np
 
 from tests.benchmarks.detector_quality import Example, example, polygon_overlap
-from v2hdm.detection.confidence import CONFIDENCE_FILE, confidence
+from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, confidence
+from v2hdm.detection.corners.evidence import FEATURES
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.evidence import FEATURES
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import BoolArray, FloatArray, MarkingDetection
 
@@ -49,7 +49,7 @@ class Gathered:
             rows.extend(evidence)
             return np.ones(len(evidence))
 
-        with patch("v2hdm.detection.corners.confidence", spy):
+        with patch("v2hdm.detection.corners.refine.confidence", spy):
             markings, _ = detector.detect(shown.image, shown.camera)
         for row, marking in zip(rows, markings, strict=False):  # the outlined symbols come last
             true = is_true(shown, marking)

@@ -20,9 +20,9 @@ import cv2
 import numpy as np
 
 from tests.benchmarks.tusimple import TuSimple, judge
+from v2hdm.detection.camera.ground import apply_homography, ipm_from_extrinsic
+from v2hdm.detection.camera.lens import distort_points
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.ground import apply_homography, ipm_from_extrinsic
-from v2hdm.detection.lens import distort_points
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.mapping.shapes import signed_area
 from v2hdm.planar import clip_convex, clip_half

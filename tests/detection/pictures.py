@@ -15,8 +15,8 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from v2hdm.detection.ground import apply_homography, ipm_from_extrinsic
-from v2hdm.detection.lens import distort_points, undistort_points
+from v2hdm.detection.camera.ground import apply_homography, ipm_from_extrinsic
+from v2hdm.detection.camera.lens import distort_points, undistort_points
 from v2hdm.records import PAINT_CLASSES, Camera, CameraInfo
 
 HEIGHT, WIDTH = 360, 640

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import bar, brightness_model, diamond, make_camera, picture, to_image
+from v2hdm.detection.corners.quad import signed_area
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.quad import signed_area
 from v2hdm.errors import ConfigError
 
 NEAR = [diamond(5.4, y, 1.2, 0.7, yaw) for y, yaw in ((-1.1, 12.0), (0.1, -7.0), (1.2, 20.0))]

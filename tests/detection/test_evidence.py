@@ -8,12 +8,12 @@ import pytest
 
 from tests.benchmarks.detector_confidence import fit
 from tests.detection.pictures import bar, brightness_model, diamond, make_camera, picture, to_image
-from v2hdm.detection.confidence import CONFIDENCE_FILE, confidence
+from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, confidence
+from v2hdm.detection.corners.evidence import FEATURES, Steps, grey_steps
+from v2hdm.detection.corners.grey import linear_grey
+from v2hdm.detection.corners.quad import order_corners
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.evidence import FEATURES, Steps, grey_steps
-from v2hdm.detection.grey import linear_grey
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.quad import order_corners
 
 
 def steps_of(image: np.ndarray, corners_px: np.ndarray) -> Steps:

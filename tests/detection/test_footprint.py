@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from tests.detection.pictures import extrinsic, make_camera, to_image
-from v2hdm.detection.footprint import Footprint
-from v2hdm.detection.ground import ipm_from_extrinsic
-from v2hdm.detection.mounting import camera_from_calibration, rough_calibration
-from v2hdm.detection.view import CameraView
+from v2hdm.detection.camera.footprint import Footprint
+from v2hdm.detection.camera.ground import ipm_from_extrinsic
+from v2hdm.detection.camera.mounting import camera_from_calibration, rough_calibration
+from v2hdm.detection.camera.view import CameraView
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.transform import exp
 from v2hdm.records import Calibration, Camera, CameraInfo

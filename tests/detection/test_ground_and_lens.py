@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import LENSES, extrinsic, make_camera
-from v2hdm.detection.ground import (
+from v2hdm.detection.camera.ground import (
     apply_homography,
     extrinsic_from_ipm,
     homography_jacobian,
     ipm_from_extrinsic,
 )
-from v2hdm.detection.lens import distort_points, undistort_points
-from v2hdm.detection.view import CameraView
+from v2hdm.detection.camera.lens import distort_points, undistort_points
+from v2hdm.detection.camera.view import CameraView
 
 GRID_PX = np.stack(np.meshgrid(np.linspace(0, 639, 17), np.linspace(0, 359, 11)), axis=-1).reshape(-1, 2)
 

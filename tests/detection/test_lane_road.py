@@ -7,12 +7,12 @@ import pytest
 
 from tests.detection.pictures import make_camera, to_image
 from tests.detection.test_anchors import anchors_of, off_px, painted, straight
-from v2hdm.detection.anchors import link_anchors
-from v2hdm.detection.lane_curves import Horizon, Prior
-from v2hdm.detection.lane_points import LinePoints
-from v2hdm.detection.lane_road import find_road
+from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.lanes.anchors import link_anchors
+from v2hdm.detection.lanes.curves import Horizon, Prior
+from v2hdm.detection.lanes.points import LinePoints
+from v2hdm.detection.lanes.road import find_road
 from v2hdm.detection.sight import AnchorRow
-from v2hdm.detection.view import CameraView
 from v2hdm.records import LANE_LINE, LaneDetection
 
 

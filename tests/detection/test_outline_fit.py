@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import diamond, make_camera, to_image
-from v2hdm.detection.corners import QuadStart, fit_markings
-from v2hdm.detection.evidence import Claim
-from v2hdm.detection.foreground import Foreground
+from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.corners.evidence import Claim
+from v2hdm.detection.corners.foreground import Foreground
+from v2hdm.detection.corners.outline_fit import fit_outlines
+from v2hdm.detection.corners.quad import order_corners
+from v2hdm.detection.corners.refine import QuadStart, fit_markings
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.outline_fit import fit_outlines
-from v2hdm.detection.quad import order_corners
-from v2hdm.detection.view import CameraView
 from v2hdm.records import MarkingDetection
 
 DIAMOND = order_corners(np.array([[300.0, 200.0], [360.0, 180.0], [415.0, 206.0], [350.0, 232.0]]))

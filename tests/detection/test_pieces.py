@@ -3,7 +3,7 @@
 import numpy as np
 
 from tests.detection.test_shapes import sight_of
-from v2hdm.detection.blobs import Blob, find_blobs
+from v2hdm.detection.paint.blobs import Blob, find_blobs
 from v2hdm.detection.sight import Sight
 from v2hdm.records import PAINT_CLASSES
 

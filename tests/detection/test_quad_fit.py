@@ -5,13 +5,13 @@ import pytest
 
 from tests.detection.pictures import brightness_model, diamond, make_camera, picture, to_image
 from tests.detection.test_corners import errors_px, normalised
-from v2hdm.detection.correlation import variance_inflation
+from v2hdm.detection.corners.correlation import variance_inflation
+from v2hdm.detection.corners.covariance import corner_covariance
+from v2hdm.detection.corners.grey import linear_grey
+from v2hdm.detection.corners.quad import intersect_sides, order_corners, side_frames
+from v2hdm.detection.corners.quad_fit import fit_quads
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.grey import linear_grey
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.quad import intersect_sides, order_corners, side_frames
-from v2hdm.detection.quad_covariance import corner_covariance
-from v2hdm.detection.quad_fit import fit_quads
 
 SHAPES = [diamond(x, y, 1.2, 0.7, 9.0 * y) for x in (6.0, 8.0, 10.0) for y in (-1.9, -0.3, 1.4)]
 

@@ -4,11 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from v2hdm.detection.blobs import find_blobs, outline_polygon, zero_crossings
-from v2hdm.detection.coverage import blurred_coverage
-from v2hdm.detection.normal import normal_pdf_cdf
-from v2hdm.detection.plausible import Heads, ends_at_a_head
-from v2hdm.detection.quad import (
+from v2hdm.detection.corners.coverage import blurred_coverage
+from v2hdm.detection.corners.normal import normal_pdf_cdf
+from v2hdm.detection.corners.quad import (
     interior_angles,
     intersect_sides,
     is_convex,
@@ -18,6 +16,8 @@ from v2hdm.detection.quad import (
     signed_area,
     width,
 )
+from v2hdm.detection.paint.blobs import find_blobs, outline_polygon, zero_crossings
+from v2hdm.detection.paint.plausible import Heads, ends_at_a_head
 from v2hdm.detection.sight import Sight
 from v2hdm.records import PAINT_CLASSES
 

@@ -5,10 +5,10 @@ import pytest
 
 from tests.detection.pictures import brightness_model, diamond, extrinsic, picture
 from v2hdm.detection import sight as sight_module
-from v2hdm.detection.ground import ipm_from_extrinsic
+from v2hdm.detection.camera.ground import ipm_from_extrinsic
+from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.network import Network, NetworkOutput
 from v2hdm.detection.sight import look
-from v2hdm.detection.view import CameraView
 from v2hdm.records import Camera, CameraInfo
 
 

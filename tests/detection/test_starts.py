@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import bar, diamond, make_camera, to_image
-from v2hdm.detection.starts import starting_corners
-from v2hdm.detection.view import CameraView
+from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.paint.starts import starting_corners
 from v2hdm.records import DIAMOND, LANE_DASH, STOP_LINE
 
 VIEW = CameraView(make_camera("pinhole"))

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.drive.example import ORIGIN, camera_info, looking_forward, make_map
-from v2hdm.detection.ground import ipm_from_extrinsic
+from v2hdm.detection.camera.ground import ipm_from_extrinsic
 from v2hdm.errors import MapFileError
 from v2hdm.hdmap import read_calibration, read_geojson, write_calibration, write_geojson
 from v2hdm.hdmap.geodetic import enu_from_geodetic, geodetic_from_enu

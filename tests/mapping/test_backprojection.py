@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tests.mapping.scene import MOUNTS, SceneOptions, extrinsic, make_scene
-from v2hdm.detection.ground import ipm_from_extrinsic
+from v2hdm.detection.camera.ground import ipm_from_extrinsic
 from v2hdm.mapping.sightings.backprojection import (
     apply_homographies,
     direction_covariance,

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from tests.simulate.conftest import FRONT, tiny_port
-from v2hdm.detection.ground import apply_homography, ipm_from_extrinsic
-from v2hdm.detection.lens import distort_points
+from v2hdm.detection.camera.ground import apply_homography, ipm_from_extrinsic
+from v2hdm.detection.camera.lens import distort_points
 from v2hdm.drive.trajectory import interpolate
 from v2hdm.errors import ConfigError
 from v2hdm.records import DIAMOND, LANE_DASH, CameraInfo

@@ -7,20 +7,20 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.detection.anchors import link_anchors
-from v2hdm.detection.blobs import Blob, find_blobs, outline_polygon
-from v2hdm.detection.corners import QuadStart, fit_markings
-from v2hdm.detection.evidence import Claim
-from v2hdm.detection.foreground import Foreground
-from v2hdm.detection.lanes import LanePaint, trace_lanes
+from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.corners.evidence import Claim
+from v2hdm.detection.corners.foreground import Foreground
+from v2hdm.detection.corners.quad import is_convex
+from v2hdm.detection.corners.refine import QuadStart, fit_markings
+from v2hdm.detection.lanes.anchors import link_anchors
+from v2hdm.detection.lanes.centre_lines import LanePaint, trace_lanes
 from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.plausible import Heads, cornered_kind, ends_at_a_head, plausible_kind
-from v2hdm.detection.quad import is_convex
+from v2hdm.detection.paint.blobs import Blob, find_blobs, outline_polygon
+from v2hdm.detection.paint.plausible import Heads, cornered_kind, ends_at_a_head, plausible_kind
+from v2hdm.detection.paint.starts import starting_corners
 from v2hdm.detection.sight import look
-from v2hdm.detection.starts import starting_corners
 from v2hdm.detection.stopwatch import lap
-from v2hdm.detection.view import CameraView
 from v2hdm.errors import DetectorError
 from v2hdm.records import (
     DIAMOND,

@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
+from v2hdm.detection.camera.footprint import Footprint, GroundPoints
+from v2hdm.detection.camera.mounting import camera_from_calibration
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.footprint import Footprint, GroundPoints
-from v2hdm.detection.mounting import camera_from_calibration
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.stopwatch import lap
 from v2hdm.errors import MapFileError

@@ -12,8 +12,8 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.network import Network
-from v2hdm.detection.view import CameraView
 from v2hdm.records import FloatArray
 
 _OVERLAP_PX = 64

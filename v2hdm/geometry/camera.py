@@ -1,4 +1,4 @@
-"""The pinhole camera, without lens distortion (see :mod:`v2hdm.detection.lens` for that)."""
+"""The pinhole camera, without lens distortion (see :mod:`v2hdm.detection.camera.lens` for that)."""
 
 from __future__ import annotations
 

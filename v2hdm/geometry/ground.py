@@ -2,7 +2,7 @@
 
 ``vehicle_from_pinhole_px`` (3 x 3) is the paper's H; its inverse has the columns K [r1 r2 t] of
 ``cam_from_vehicle`` (Hartley and Zisserman, Multiple View Geometry, 2nd ed., eq. 8.1).
-:mod:`v2hdm.detection.ground` does the same in numpy on the vehicle.
+:mod:`v2hdm.detection.camera.ground` does the same in numpy on the vehicle.
 """
 
 from __future__ import annotations

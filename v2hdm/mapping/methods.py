@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from v2hdm.adjust import Status, observability
-from v2hdm.detection.ground import ipm_from_extrinsic
+from v2hdm.detection.camera.ground import ipm_from_extrinsic
 from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.growth import grow_map

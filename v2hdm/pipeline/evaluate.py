@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.detection.ground import ipm_from_extrinsic
+from v2hdm.detection.camera.ground import ipm_from_extrinsic
 from v2hdm.drive.truth import read_truth
 from v2hdm.mapping.methods import run_naive
 from v2hdm.mapping.optimise import Optimiser, nearest_extrinsic

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm.detection.batch import read_image
-from v2hdm.detection.ground import ipm_from_extrinsic
+from v2hdm.detection.camera.ground import ipm_from_extrinsic
 from v2hdm.hdmap.calibration import write_calibration
 from v2hdm.hdmap.geojson import write_geojson
 from v2hdm.mapping.results import MethodResult

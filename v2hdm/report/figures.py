@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 
-from v2hdm.detection.ground import apply_homography
-from v2hdm.detection.lens import distort_points
+from v2hdm.detection.camera.ground import apply_homography
+from v2hdm.detection.camera.lens import distort_points
 from v2hdm.planar import ground_in_vehicle
 from v2hdm.records import CameraInfo, FloatArray, HdMap, Truth
 from v2hdm.report import metrics, style

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.detection.lens import undistort_points
+from v2hdm.detection.camera.lens import undistort_points
 from v2hdm.mapping.sightings.backprojection import (
     apply_homographies,
     camera_centres,

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.detection.lens import undistort_points
+from v2hdm.detection.camera.lens import undistort_points
 from v2hdm.mapping.sightings.backprojection import apply_homographies, posed_homographies
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.records import OUTLINED_CLASSES, Drive, FloatArray, ImageDetections

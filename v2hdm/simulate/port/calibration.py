@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from v2hdm.detection.lens import distort_points, undistort_points
+from v2hdm.detection.camera.lens import distort_points, undistort_points
 from v2hdm.drive.rotation import rotation_from_euler
 from v2hdm.errors import ConfigError
 from v2hdm.records import Camera, CameraInfo, CentrePrior, FloatArray

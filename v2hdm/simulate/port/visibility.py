@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from v2hdm.detection.lens import distort_points
+from v2hdm.detection.camera.lens import distort_points
 from v2hdm.records import BoolArray, CameraInfo, FloatArray
 from v2hdm.simulate.render.scene import Box
 

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.detection.lens import distort_points, undistort_points
+from v2hdm.detection.camera.lens import distort_points, undistort_points
 from v2hdm.records import CameraInfo, FloatArray
 from v2hdm.simulate.render.textures import Float32
 

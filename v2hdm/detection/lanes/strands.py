@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2hdm.detection.lane_curves import Horizon, basis, middle_of
-from v2hdm.detection.lane_points import Line, LinePoints
+from v2hdm.detection.lanes.curves import Horizon, basis, middle_of
+from v2hdm.detection.lanes.points import Line, LinePoints
 from v2hdm.records import BoolArray, FloatArray
 
 _ONE_LINE_M = 0.12

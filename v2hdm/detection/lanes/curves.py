@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from v2hdm.detection.view import CameraView
+from v2hdm.detection.camera.view import CameraView
 from v2hdm.records import FloatArray
 
 _LEAST_BELOW_PX = 4.0

@@ -1,6 +1,6 @@
 """What the lines of one road have in common: where they meet in the image, and how they bend.
 
-Lines painted along a road are parallel. Of u = a + b v + c / v (:mod:`v2hdm.detection.lane_curves`) they
+Lines painted along a road are parallel. Of u = a + b v + c / v (:mod:`v2hdm.detection.lanes.curves`) they
 share a, their vanishing point, and c; only b, the place beside the camera, is each one's own. A short dash
 far away, which by itself could point anywhere, is thereby known as well as the line beside it.
 """
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.detection.lane_curves import Evidence, Horizon, Prior
+from v2hdm.detection.lanes.curves import Evidence, Horizon, Prior
 from v2hdm.records import FloatArray
 
 _FREE_SIGMAS = (0.5, 8.0, 0.008)

@@ -13,12 +13,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.detection.correlation import variance_inflation
-from v2hdm.detection.coverage import blurred_coverage
-from v2hdm.detection.grey import GreyBand
-from v2hdm.detection.patches import Patches, cut_patches
-from v2hdm.detection.quad import following, intersect_sides, is_convex, preceding, side_frames, signed_area
-from v2hdm.detection.view import CameraView
+from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.corners.correlation import variance_inflation
+from v2hdm.detection.corners.coverage import blurred_coverage
+from v2hdm.detection.corners.grey import GreyBand
+from v2hdm.detection.corners.patches import Patches, cut_patches
+from v2hdm.detection.corners.quad import (
+    following,
+    intersect_sides,
+    is_convex,
+    preceding,
+    side_frames,
+    signed_area,
+)
 from v2hdm.records import BoolArray, FloatArray
 
 _WIDER_BLUR_PX = 0.8

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from v2hdm.detection.blobs import Blob
-from v2hdm.detection.view import CameraView
+from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.paint.blobs import Blob
 from v2hdm.records import (
     ARROW,
     CHEVRON,

@@ -12,10 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.detection.correlation import variance_inflation
-from v2hdm.detection.grey import GreyBand
-from v2hdm.detection.normal import normal_pdf_cdf
-from v2hdm.detection.quad import (
+from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.corners.correlation import variance_inflation
+from v2hdm.detection.corners.covariance import corner_covariance
+from v2hdm.detection.corners.grey import GreyBand
+from v2hdm.detection.corners.normal import normal_pdf_cdf
+from v2hdm.detection.corners.quad import (
     following,
     interior_angles,
     intersect_sides,
@@ -23,8 +25,6 @@ from v2hdm.detection.quad import (
     side_frames,
     width,
 )
-from v2hdm.detection.quad_covariance import corner_covariance
-from v2hdm.detection.view import CameraView
 from v2hdm.records import BoolArray, FloatArray
 
 _SEARCH_PX = 6.0

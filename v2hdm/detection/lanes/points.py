@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.detection.lane_curves import Curve, Evidence, Horizon, Prior, basis
-from v2hdm.detection.view import CameraView
+from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.lanes.curves import Curve, Evidence, Horizon, Prior, basis
 from v2hdm.records import BoolArray, FloatArray
 
 IntArray = NDArray[np.int64]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from v2hdm.detection.pieces import settle_pieces
+from v2hdm.detection.paint.pieces import settle_pieces
 from v2hdm.detection.sight import Sight
 from v2hdm.records import (
     ARROW,

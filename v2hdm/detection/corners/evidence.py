@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.detection.foreground import Foreground
-from v2hdm.detection.grey import GreyBand
-from v2hdm.detection.quad import preceding, side_frames, width
-from v2hdm.detection.view import CameraView
+from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.corners.foreground import Foreground
+from v2hdm.detection.corners.grey import GreyBand
+from v2hdm.detection.corners.quad import preceding, side_frames, width
 from v2hdm.records import DIAMOND, LANE_DASH, BoolArray, FloatArray
 
 FEATURES = (

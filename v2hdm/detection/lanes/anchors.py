@@ -2,7 +2,7 @@
 
 Crossings are linked from row to row into chains, near ones first: near the vehicle lines are far apart, so
 that each is known by the time they run together. Chains and the centre lines of paint that one curve explains
-are one line (:mod:`v2hdm.detection.lane_groups`), which then runs on through the gaps between its dashes.
+are one line (:mod:`v2hdm.detection.lanes.groups`), which then runs on through the gaps between its dashes.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from v2hdm.detection.lane_curves import Horizon, basis
-from v2hdm.detection.lane_groups import find_lines
-from v2hdm.detection.lane_points import NEIGHBOURS, IntArray, Line, LinePoints
+from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.lanes.curves import Horizon, basis
+from v2hdm.detection.lanes.groups import find_lines
+from v2hdm.detection.lanes.points import NEIGHBOURS, IntArray, Line, LinePoints
 from v2hdm.detection.sight import AnchorRow
-from v2hdm.detection.view import CameraView
 from v2hdm.records import LANE_BOUNDARY, LANE_LINE, FloatArray, LaneDetection
 
 _MIN_CHAIN = 3

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.detection.view import CameraView
+from v2hdm.detection.camera.view import CameraView
 from v2hdm.records import Calibration, FloatArray
 
 

@@ -11,10 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2hdm.detection.lane_curves import Evidence, Horizon
-from v2hdm.detection.lane_points import IntArray, Line, LinePoints
-from v2hdm.detection.lane_road import Road, find_road
-from v2hdm.detection.lane_strands import boundaries
+from v2hdm.detection.lanes.curves import Evidence, Horizon
+from v2hdm.detection.lanes.points import IntArray, Line, LinePoints
+from v2hdm.detection.lanes.road import Road, find_road
+from v2hdm.detection.lanes.strands import boundaries
 from v2hdm.records import BoolArray, FloatArray
 
 _GATE_SIGMAS = 3.0

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.detection.ground import apply_homography, extrinsic_from_ipm
-from v2hdm.detection.lens import distort_points, has_distortion, undistort_points
+from v2hdm.detection.camera.ground import apply_homography, extrinsic_from_ipm
+from v2hdm.detection.camera.lens import distort_points, has_distortion, undistort_points
 from v2hdm.records import BoolArray, Camera, FloatArray
 
 _LUT_STEP_PX = 4

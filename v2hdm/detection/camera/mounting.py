@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.detection.ground import apply_homography, ipm_from_extrinsic
+from v2hdm.detection.camera.ground import apply_homography, ipm_from_extrinsic
 from v2hdm.errors import MapFileError
 from v2hdm.records import DISTORTION_COEFFICIENTS, Calibration, Camera, CameraInfo, FloatArray
 

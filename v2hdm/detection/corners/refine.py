@@ -10,16 +10,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.detection.confidence import confidence
-from v2hdm.detection.edge_fit import EdgeFit, fit_edges
-from v2hdm.detection.evidence import Claim, gather, grey_steps
-from v2hdm.detection.foreground import Foreground
-from v2hdm.detection.grey import GreyBand, linear_grey
+from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.corners.confidence import confidence
+from v2hdm.detection.corners.edge_fit import EdgeFit, fit_edges
+from v2hdm.detection.corners.evidence import Claim, gather, grey_steps
+from v2hdm.detection.corners.foreground import Foreground
+from v2hdm.detection.corners.grey import GreyBand, linear_grey
+from v2hdm.detection.corners.outline_fit import fit_outlines
+from v2hdm.detection.corners.quad import is_convex, side_frames, width
+from v2hdm.detection.corners.quad_fit import fit_quads, unbow_corners
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.outline_fit import fit_outlines
-from v2hdm.detection.quad import is_convex, side_frames, width
-from v2hdm.detection.quad_fit import fit_quads, unbow_corners
-from v2hdm.detection.view import CameraView
 from v2hdm.records import BoolArray, FloatArray, MarkingDetection
 
 TYPICAL_BLUR_PX = 0.75

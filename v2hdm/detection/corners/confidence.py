@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.detection.evidence import FEATURES
+from v2hdm.detection.corners.evidence import FEATURES
 from v2hdm.records import FloatArray
 
-CONFIDENCE_FILE = Path(__file__).with_name("confidence.json")
+CONFIDENCE_FILE = Path(__file__).parents[1] / "confidence.json"
 
 
 def confidence(evidence: FloatArray) -> FloatArray:
-    """Probability (M,) from evidence (M, F), whose columns are :data:`~v2hdm.detection.evidence.FEATURES`."""
+    """Probability (M,) from evidence (M, F), in the order of :data:`~evidence.FEATURES`."""
     weights, bias = _fitted(CONFIDENCE_FILE)
     return np.asarray(1 / (1 + np.exp(-np.clip(evidence @ weights + bias, -30, 30))))
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.detection.grey import GreyBand
-from v2hdm.detection.quad import side_frames, signed_area
+from v2hdm.detection.corners.grey import GreyBand
+from v2hdm.detection.corners.quad import side_frames, signed_area
 from v2hdm.records import BoolArray, FloatArray
 
 _OUTSIDE_PX = 3.0

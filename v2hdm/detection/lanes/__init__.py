@@ -1,0 +1,1 @@
+"""From crossings of row anchors and lane paint to whole lines of lanes."""
