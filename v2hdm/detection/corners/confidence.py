@@ -19,7 +19,7 @@ CONFIDENCE_FILE = Path(__file__).parents[1] / "confidence.json"
 
 
 def confidence(evidence: FloatArray) -> FloatArray:
-    """Probability (M,) from evidence (M, F), in the order of :data:`~evidence.FEATURES`."""
+    """Probability (M,) from evidence (M, F), in the order of :data:`FEATURES`."""
     weights, bias = _fitted(CONFIDENCE_FILE)
     return np.asarray(1 / (1 + np.exp(-np.clip(evidence @ weights + bias, -30, 30))))
 
