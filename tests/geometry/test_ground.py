@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tests.adjust.scene import mounted
-from v2hdm.detection import ground as on_vehicle
+from v2hdm.detection.camera import ground as on_vehicle
 from v2hdm.geometry import ground, transform
 from v2hdm.records import CameraInfo
 

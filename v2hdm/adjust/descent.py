@@ -127,7 +127,7 @@ def descend(
     max_evaluations: int,
 ) -> Descent:
     """Minimise the cost from ``estimate``, narrowing the robust loss on the way."""
-    evaluations, refreshes, damping, progressing = 0, 0, 0.0, True
+    evaluations, refreshes, damping, progressing, slow = 0, 0, 0.0, True, False
     scale = robust.scale if robust.name == "none" else float("inf")
     plan = make_plan(arrays)
     while True:
@@ -151,8 +151,9 @@ def descend(
             whitened, reached, damping = _newton_step(objective, cost, gradient, damping)
         else:
             inner = tolerance if final else _ANNEALING_TOLERANCE
-            whitened, reached, gradient = minimise(
-                objective, cost, gradient, inner, _ITERATIONS_PER_WHITENING
+            # One that follows a slow one was made near enough: what slows it is the loss, not the distance.
+            whitened, reached, gradient, slow = minimise(
+                objective, cost, gradient, inner, _ITERATIONS_PER_WHITENING, patient=slow
             )
         evaluations += objective.evaluations
         estimate = objective.moved(whitened)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,13 +28,23 @@ def predicted_gap(cost: Tensor, gradient: Tensor) -> float:
     return float(gradient.square().sum() / cost.clamp(min=1.0))
 
 
+class Minimum(NamedTuple):
+    """Where a minimisation ended: y, its cost and its gradient, and whether its whitening was too slow."""
+
+    whitened: Tensor
+    cost: Tensor
+    gradient: Tensor
+    slow: bool
+
+
 def minimise(
     objective: Objective,
     cost: Tensor,
     gradient: Tensor,
     tolerance: float,
     max_iterations: int,
-) -> tuple[Tensor, Tensor, Tensor]:
+    patient: bool = False,
+) -> Minimum:
     """Minimise from y = 0, whose cost and gradient are given.
 
     torch's first step is ``-min(1, 1 / |g|_1) g``. On u = y / a with the objective scaled by 1 / a^2 and
@@ -46,9 +57,7 @@ def minimise(
         gradient: at 0, (n,).
         tolerance: stop when :func:`predicted_gap` is below this.
         max_iterations: after these the whitening is better renewed.
-
-    Returns:
-        y, its cost and its gradient.
+        patient: whether to go on where the whitening is slow.
     """
     scale = gradient.abs().sum()
     u = torch.zeros_like(gradient, requires_grad=True)
@@ -83,8 +92,8 @@ def minimise(
         if progress <= _NO_PROGRESS * float(best):
             break
         before, gap = gap, predicted_gap(best, best_gradient)
-        slow = iteration > 0 and gap > _SLOW * before
-    return u.detach() * scale, best, best_gradient
+        slow = not patient and iteration > 0 and gap > _SLOW * before
+    return Minimum(u.detach() * scale, best, best_gradient, slow)
 
 
 def _one_step_optimizer(u: Tensor) -> torch.optim.LBFGS:

@@ -20,7 +20,9 @@ from v2hdm.records import FloatArray
 IntArray = NDArray[np.int64]
 
 _LEAST_SEEN = 6
-"""Sightings of the corners that a shape is laid on, all together: one image may err."""
+_LEAST_SEEN_OF_TWO = 8
+"""Sightings of the corners that a shape is laid on, all together: one image may err, and two corners can be
+those of anything, such as the head of an arrow, so that more images must agree on what it is."""
 
 _MAX_VAGUE_SHARE = 0.35
 """How far corners that may not be used as points may be off, as a share of the longer diagonal."""
@@ -83,7 +85,7 @@ def fit_shape(
     longest_m = float(_diagonals(shape).max())
     limit_m = miss_limit_m(longest_m)
     for used in _subsets(seen):
-        if times[used].sum() < _LEAST_SEEN:
+        if times[used].sum() < (_LEAST_SEEN if len(used) > 2 else _LEAST_SEEN_OF_TWO):
             continue
         fits = [
             fit
