@@ -85,3 +85,14 @@ def test_a_shape_is_not_laid_on_what_one_image_shows() -> None:
     seen = placed()
     seen[1] = np.nan
     assert fit_shape(DIAMOND, seen, SIGMA, np.array([2, 0, 1, 1]), placed()) is None
+
+
+@pytest.mark.parametrize(("times", "placed_by_two"), [(3, False), (4, True)])
+def test_two_corners_must_have_been_seen_oftener_than_three(times: int, placed_by_two: bool) -> None:
+    seen = placed()
+    seen[[2, 3]] = np.nan
+    fit = fit_shape(DIAMOND, seen, SIGMA, np.full(4, times), placed())
+    assert (fit is not None) == placed_by_two
+    seen = placed()
+    seen[3] = np.nan
+    assert fit_shape(DIAMOND, seen, SIGMA, np.full(4, 3), placed()) is not None
