@@ -7,6 +7,7 @@ import pytest
 
 from train.config import DataConfig
 from train.data import RenderStream, validation_pairs
+from v2hdm.detection.camera.lens import undistort_points
 from v2hdm.records import LANE_CLASSES, PAINT_CLASSES
 from v2hdm.simulate.render.optics import Optics
 from v2hdm.simulate.render.scene import Light
@@ -108,6 +109,16 @@ def test_camera_rotations_are_rotations() -> None:
         rotation = random_view(np.random.default_rng(index), 64, 32).cam_from_map[:3, :3]
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(rotation) == pytest.approx(1)
+
+
+def test_no_lens_folds_an_image_over_itself() -> None:
+    u, v = np.meshgrid(np.linspace(0, 1279, 33), np.linspace(0, 719, 19))
+    for index in range(200):
+        info = random_view(np.random.default_rng(index), 1280, 720).info
+        rays = undistort_points(info, np.column_stack([u.ravel(), v.ravel()])).reshape(*u.shape, 2)
+        right, down = np.diff(rays, axis=1)[:-1], np.diff(rays, axis=0)[:, :-1]
+        turn = right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]
+        assert (turn > 0).all(), f"view {index}: neighbouring pixels change sides"
 
 
 @pytest.mark.parametrize("name", [field.name for field in fields(Hardships)])

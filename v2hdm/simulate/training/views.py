@@ -10,8 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from v2hdm.detection.camera.lens import distort_points, undistort_points
 from v2hdm.records import CameraInfo, FloatArray
 from v2hdm.simulate.render.optics import Motion, Optics
+
+_LENS_TOLERANCE_PX = 0.1
+_BORDER_POINTS = 17
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,8 @@ def random_view(rng: np.random.Generator, width: int, height: int) -> TrainingVi
     yaw = np.deg2rad(rng.normal(0, 4) if rng.random() < 0.75 else rng.uniform(-60, 60))
     roll = np.deg2rad(rng.normal(0, 1.2))
     info = _crop_camera(rng, width, height, focal_px, pitch)
+    while not _sees_all(info):
+        info = _crop_camera(rng, width, height, focal_px, pitch)
     cam_from_map = looking(np.array([0.0, rng.normal(0, 0.6), height_m]), yaw, float(pitch), roll)
     return TrainingView(info, cam_from_map, _random_optics(rng), _random_motion(rng))
 
@@ -84,6 +90,19 @@ def _crop_camera(
     return CameraInfo(
         "training", width, height, intrinsic, "equidistant", (*rng.normal(0, 0.01, 2), 0.0, 0.0)
     )
+
+
+def _sees_all(info: CameraInfo) -> bool:
+    """Whether every pixel has a ray of its own before the camera.
+
+    Beyond some radius the polynomial of a lens may turn back, and a fisheye's rays lie behind the image
+    plane: no maker sells such an image, and a ray that is looked up there is any.
+    """
+    u = np.linspace(-0.5, info.width - 0.5, _BORDER_POINTS)
+    v = np.linspace(-0.5, info.height - 0.5, _BORDER_POINTS)
+    points = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    there_and_back = distort_points(info, undistort_points(info, points))
+    return bool(np.all(np.abs(there_and_back - points) < _LENS_TOLERANCE_PX))
 
 
 def _random_optics(rng: np.random.Generator) -> Optics:
