@@ -1,4 +1,6 @@
-"""Small editions of tests/benchmarks/adjust_accuracy.py: the same figures over few drives."""
+"""Small editions of the benchmarks of accuracy and convergence: the same figures over few drives."""
+
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,13 +11,13 @@ from tests.benchmarks.adjust_accuracy import (
     PLAIN,
     ROBUST,
     WHITE,
-    convergence,
     honesty,
     root_ratio,
     squared_bound_m2,
     squared_error_m2,
     street,
 )
+from tests.benchmarks.adjust_convergence import by_us, reaches_the_optimum
 
 SHORT = {"frames": 40, "every_m": 3.0}
 SEEDS = range(6)
@@ -47,4 +49,5 @@ def test_wrong_associations_cost_little():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_start_ten_degrees_away_ends_in_the_optimum(seed):
-    assert convergence(seed, **SHORT)
+    scene = street(seed, WHITE, **{**SHORT, "start_error_deg": 10.0})
+    assert reaches_the_optimum(scene, partial(by_us, options=ROBUST))

@@ -5,10 +5,10 @@
 - ``honesty``: normalised estimation error squared (NEES) and coverage of the 95 % regions,
 - ``efficiency``: RMSE against the Cramer-Rao bound, disturbances marginalised,
 - ``disturbances``: corner RMSE beside that of undisturbed poses and of the paper's model,
-- ``remedies``: what would lower the bound where RTK errors drift: other routes, more passes, a survey,
-- ``convergence``: starts ten degrees away.
+- ``remedies``: what would lower the bound where RTK errors drift: other routes, more passes, a survey.
 
-tests/adjust/test_accuracy.py runs the same functions on few drives.
+tests/adjust/test_accuracy.py runs the same functions on few drives. Convergence from far away is measured by
+:mod:`tests.benchmarks.adjust_convergence`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from tests.adjust.scene import Scene, make_scene
-from v2hdm.adjust import ControlPoints, Drift, Observations, PoseSigma, SolveOptions, Status, solve
+from v2hdm.adjust import ControlPoints, Drift, Observations, PoseSigma, SolveOptions, solve
 from v2hdm.adjust.covariance import Covariance
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.problem import POSE_STATES
@@ -140,14 +140,6 @@ def street(seed: int, jitter: PoseSigma | None = None, outliers: float = 0.0, **
     )
 
 
-def convergence(seed: int, start_error_deg: float = 10.0, **changes: float) -> bool:
-    """Whether a start that far away ends in the optimum that a start at the truth ends in."""
-    scene = street(seed, WHITE, start_error_deg=start_error_deg, **changes)
-    at_truth = replace(scene.problem, cam_from_vehicle=scene.cam_from_vehicle)
-    found, best = solve(scene.problem, ROBUST), solve(at_truth, replace(ROBUST, coarse=False))
-    return found.status is Status.CONVERGED and abs(found.cost - best.cost) <= 1e-6 * best.cost
-
-
 def print_honesty(drives: int) -> None:
     """The table of :func:`honesty`."""
     for name, jitter in (("white", WHITE), ("drifting", ALL_DRIFTING)):
@@ -257,18 +249,11 @@ def print_remedies(drives: int) -> None:
         )
 
 
-def print_convergence(drives: int) -> None:
-    """How many starts ten degrees away end in the optimum."""
-    reached = sum(convergence(seed) for seed in range(drives))
-    print(f"  from 10 degrees: asked all, measured {reached} of {drives}")
-
-
 SECTIONS = {
     "honesty": (print_honesty, 100),
     "efficiency": (print_efficiency, 50),
     "disturbances": (print_disturbances, 20),
     "remedies": (print_remedies, 20),
-    "convergence": (print_convergence, 100),
 }
 
 

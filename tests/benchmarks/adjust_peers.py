@@ -6,8 +6,8 @@ natively, through pyceres with pycolmap's compiled cost functions and the Schur 
 cameras; where these are not installed (the extra ``bench``), it is left out and said so. SciPy's trust region
 knows the Jacobian's sparsity, and is left out beyond the size that it can manage.
 
-The model is the paper's, extrinsics and corners, since pycolmap has no frame states: our own per-frame
-states are a row of their own.
+The model is the paper's, extrinsics and corners. Our six states a frame are a row of their own, and beside
+it Ceres with a pose a frame under the same prior.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ import resource
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -27,20 +26,11 @@ from scipy.sparse import coo_matrix
 from scipy.spatial.transform import Rotation
 
 from tests.adjust.scene import make_scene
+from tests.benchmarks.adjust_ceres import ABSENT, CeresOptions, solve_ceres
 from tests.benchmarks.adjust_scaling import driven_on
 from v2hdm.adjust import PoseSigma, Problem, SolveOptions, solve
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.start import back_project
-
-try:
-    import pyceres
-    import pycolmap
-    from pycolmap import cost_functions
-except ImportError as failure:
-    ABSENT = f"Ceres is left out: {failure}; pip install 'v2hdm[bench]'"
-    pyceres: Any = None
-else:
-    ABSENT = ""
 
 SCIPY_LIMIT = 120_000
 """Observations above which SciPy takes minutes: its steps solve the whole system iteratively."""
@@ -81,62 +71,10 @@ def ours(problem: Problem, options: SolveOptions, name: str) -> Row:
     return Row(name, 0.0, took, cpu, solution.cost, note)
 
 
-def ceres(problem: Problem, threads: int) -> Row:
-    """Native Ceres: Levenberg-Marquardt on the dense Schur complement of the cameras."""
-    began = time.perf_counter()
-    built, keep = _ceres_problem(problem)
-    options = pyceres.SolverOptions()
-    options.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR
-    options.num_threads = threads
-    options.max_num_iterations = 100
-    options.function_tolerance = 1e-14
-    options.gradient_tolerance = 1e-14
-    options.parameter_tolerance = 1e-14
-    summary = pyceres.SolverSummary()
-    ready, cpu = time.perf_counter(), time.process_time()
-    pyceres.solve(options, built, summary)
-    took, cpu = time.perf_counter() - ready, time.process_time() - cpu
-    note = f"{summary.num_successful_steps} steps, {len(keep['points'])} points"
-    return Row("ceres", ready - began, took, cpu, summary.final_cost, note)
-
-
-def _ceres_problem(problem: Problem) -> tuple[Any, dict[str, Any]]:
-    """The problem, and the arrays that it points into."""
-    seen = problem.observations
-    quaternions = Rotation.from_matrix(problem.cam_from_vehicle[:, :3, :3]).as_quat()
-    shifts = problem.cam_from_vehicle[:, :3, 3].copy()
-    vehicle_from_map = np.linalg.inv(problem.map_from_vehicle)
-    frame_quaternions = Rotation.from_matrix(vehicle_from_map[:, :3, :3]).as_quat()
-    frame_shifts = vehicle_from_map[:, :3, 3].copy()
-    points = np.column_stack([problem.corners_start, np.zeros(problem.corner_count)])
-    intrinsic = problem.intrinsic.copy()
-    built = pyceres.Problem()
-    model = pycolmap.CameraModelId.PINHOLE
-    for k in range(len(seen.corner)):
-        c, j, n = seen.camera[k], seen.frame[k], seen.corner[k]
-        cost = cost_functions.RigReprojErrorCost(model, seen.covariance_px[k], seen.pinhole_px[k])
-        blocks = [quaternions[c], shifts[c], frame_quaternions[j], frame_shifts[j], points[n], intrinsic[c]]
-        built.add_residual_block(cost, None, blocks)
-    for c in range(len(intrinsic)):
-        assert problem.centre_vehicle is not None
-        assert problem.centre_sigma_m is not None
-        covariance = np.diag(problem.centre_sigma_m[c] ** 2)
-        prior = cost_functions.AbsolutePosePositionPriorCost(covariance, problem.centre_vehicle[c])
-        built.add_residual_block(prior, None, [quaternions[c], shifts[c]])
-        built.set_manifold(quaternions[c], pyceres.EigenQuaternionManifold())
-        built.set_parameter_block_constant(intrinsic[c])
-    for j in np.unique(seen.frame):
-        built.set_parameter_block_constant(frame_quaternions[j])
-        built.set_parameter_block_constant(frame_shifts[j])
-    on_the_ground = pyceres.SubsetManifold(3, [2])
-    for point in points:
-        built.set_manifold(point, on_the_ground)
-    keep = {
-        "cameras": (quaternions, shifts, intrinsic),
-        "frames": (frame_quaternions, frame_shifts),
-        "points": points,
-    }
-    return built, keep
+def ceres(problem: Problem, options: CeresOptions, name: str) -> Row:
+    """Native Ceres: Levenberg-Marquardt on the Schur complement."""
+    found = solve_ceres(problem, options)
+    return Row(name, found.setup_s, found.solve_s, found.cpu_s, found.cost, f"{found.steps} steps")
 
 
 def scipy_trf(problem: Problem) -> Row:
@@ -217,7 +155,9 @@ def solved(problem: Problem, threads: int) -> Iterator[Row]:
     row = ours(states, SolveOptions(loss="none", coarse=False), "ours, 6 states a frame")
     yield replace(row, same_model=False)
     if not ABSENT:
-        yield ceres(problem, threads)
+        yield ceres(problem, CeresOptions(threads=threads), "ceres")
+        row = ceres(states, CeresOptions(frame_poses=True, threads=threads), "ceres, a pose a frame")
+        yield replace(row, same_model=False)
     yield ours(problem, replace(PAPER, solver="lm"), "ours, lm")
     if len(problem.observations.corner) <= SCIPY_LIMIT:
         yield scipy_trf(problem)
