@@ -123,16 +123,17 @@ def make_scene(
     """A street whose recorded poses are off by ``jitter`` and whose start is off as stated.
 
     Corners seen fewer than ``min_views`` times are left out. ``noise_seed`` draws other noise on the same
-    street.
+    street; that of pixels and survey is then the same whether poses are disturbed or not.
     """
     rng = np.random.default_rng(seed)
     truth = np.stack([mounted(1.5, 2.4, 18), mounted(-1.0, 2.6, 22, rear=True, y=0.2)])[:cameras]
     truth = exp(np.concatenate([np.zeros((cameras, 3)), rng.normal(0, 0.02, (cameras, 3))], 1)) @ truth
     recorded = route(frames, step_m, turn_deg_per_m, straight_m)
     corners = diamonds(recorded, every_m, rng)
+    pose_rng = rng
     if noise_seed is not None:
-        rng = np.random.default_rng(noise_seed)
-    state = np.zeros((frames, 6)) if jitter is None else pose_errors(recorded, jitter, step_m, rng)
+        rng, pose_rng = np.random.default_rng(noise_seed), np.random.default_rng([noise_seed, 2])
+    state = np.zeros((frames, 6)) if jitter is None else pose_errors(recorded, jitter, step_m, pose_rng)
     map_from_vehicle = recorded @ exp(state)
     camera, frame, corner, _ = observe(truth, recorded, corners, max_range_m)
     often = np.bincount(corner, minlength=len(corners)) >= min_views
