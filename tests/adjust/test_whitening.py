@@ -1,5 +1,6 @@
 """The whitened problem is round, its factor is the dense one, its inverse is the covariance."""
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.problem import POSE_STATES
 from v2hdm.adjust.reduced import make_plan
 from v2hdm.adjust.residuals import Estimate, Loss
-from v2hdm.adjust.tiles import TIP, factorise_tiles, find_pattern
+from v2hdm.adjust.tiles import TIP, TiledMatrix, factorise_tiles, find_pattern
 from v2hdm.adjust.whitening import factorise
 
 POSES = PoseSigma(position_drift=Drift(0.01, 10.0), roll_pitch_drift=Drift(0.003, 2.0))
@@ -83,12 +84,12 @@ def test_the_tiled_factor_is_that_of_the_dense_matrix(cliques):
     size, tip, count = 5, 4, 6
     generator = torch.Generator().manual_seed(1)
     pattern = find_pattern(count, cliques)
-    tiles = {(TIP, TIP): 50 * torch.eye(tip, dtype=torch.float64)}
-    for column, below in enumerate(pattern.below):
-        tiles[column, column] = 50 * torch.eye(size, dtype=torch.float64)
-        for row in below:
-            tiles[row, column] = torch.zeros(size, size, dtype=torch.float64)
-        tiles[TIP, column] = torch.randn(tip, size, generator=generator, dtype=torch.float64)
+    arrow = TiledMatrix.zeros(pattern, size, tip, torch.zeros((), dtype=torch.float64))
+    tiles = arrow.tiles
+    for tile in (*arrow.diagonal, arrow.tip):
+        tile += 50 * torch.eye(len(tile), dtype=torch.float64)
+    for column in range(count):
+        tiles[TIP, column].normal_(generator=generator)
     for clique in cliques:
         places = sorted(pattern.position[tile] for tile in clique)
         for n, column in enumerate(places):
@@ -96,9 +97,10 @@ def test_the_tiled_factor_is_that_of_the_dense_matrix(cliques):
                 tiles[row, column] += torch.randn(size, size, generator=generator, dtype=torch.float64)
     matrix = dense(tiles, pattern, size, tip)
     lower = torch.linalg.cholesky(matrix)
-    indefinite = {key: -tile if key == (TIP, TIP) else tile.clone() for key, tile in tiles.items()}
-    assert factorise_tiles(indefinite, pattern) is None
-    factor = factorise_tiles(tiles, pattern)
+    indefinite = copy.deepcopy(arrow)
+    indefinite.tip.neg_()
+    assert factorise_tiles(indefinite) is None
+    factor = factorise_tiles(arrow)
     assert factor is not None
     right = torch.randn(len(matrix), 3, generator=generator, dtype=torch.float64)
     torch.testing.assert_close(factor.solve(right), torch.linalg.solve_triangular(lower, right, upper=False))

@@ -16,7 +16,7 @@ from v2hdm.adjust.arrays import Arrays, Run
 from v2hdm.adjust.corner_factor import CornerFactor
 from v2hdm.adjust.linear import PAIR_BLOCK
 from v2hdm.adjust.residuals import Estimate, of_each
-from v2hdm.adjust.tiles import TIP, Pattern, TiledCholesky, Tiles, factorise_tiles, find_pattern
+from v2hdm.adjust.tiles import TIP, Pattern, TiledCholesky, TiledMatrix, factorise_tiles, find_pattern
 
 # Rows of a tile, about: large enough for fast products, small against a corner's span of frames.
 _TILE_ROWS = 96
@@ -131,11 +131,8 @@ class ReducedSystem:
         self._own = arrays.centre.new_zeros(21, arrays.pair_count if self._by_pair else arrays.camera_count)
         tip = arrays.camera_count * arrays.camera_unknowns
         size = plan.frames_per_tile * len(arrays.states)
-        self.tiles: Tiles = {(TIP, TIP): arrays.centre.new_zeros(tip, tip)}
-        for column, below in enumerate(plan.pattern.below):
-            self.tiles[TIP, column] = arrays.centre.new_zeros(tip, size)
-            for row in (column, *below):
-                self.tiles[row, column] = arrays.centre.new_zeros(size, size)
+        self._matrix = TiledMatrix.zeros(plan.pattern, size, tip, arrays.centre)
+        self._tiles = self._matrix.tiles
 
     def add(self, run: Run, blocks: Tensor) -> None:
         """Add U of a run, ``blocks`` (21, k) by observation."""
@@ -150,7 +147,7 @@ class ReducedSystem:
         """Take B' B of run ``number`` off; ``coupling`` (2, 6, k) is W' by observation."""
         by_camera = factor.solve(coupling_by_camera(self.arrays, self.spread, run, coupling))
         tip = by_camera.flatten(0, 1)
-        self.tiles[TIP, TIP].addmm_(tip.mT, tip, alpha=-1)
+        self._tiles[TIP, TIP].addmm_(tip.mT, tip, alpha=-1)
         blocks = self.plan.blocks[number]
         by_state = self._by_state(run, coupling) if blocks else coupling
         for block in blocks:
@@ -184,14 +181,14 @@ class ReducedSystem:
         parts = columns.chunk(len(block.tiles), dim=1)
         placed = sorted((self.plan.pattern.position[tile], part) for part, tile in enumerate(block.tiles))
         for n, (column, first) in enumerate(placed):
-            self.tiles[TIP, column].addmm_(tip.mT, parts[first], alpha=-1)
+            self._tiles[TIP, column].addmm_(tip.mT, parts[first], alpha=-1)
             for row, second in placed[n:]:
-                self.tiles[row, column].addmm_(parts[second].mT, parts[first], alpha=-1)
+                self._tiles[row, column].addmm_(parts[second].mT, parts[first], alpha=-1)
 
     def factorise(
         self, estimate: Estimate, damping: float, jitter: float
     ) -> tuple[TiledCholesky, float] | None:
-        """Put it together and factorise; the tiles are used up.
+        """Put it together and factorise; the factor takes its place.
 
         ``damping`` is added to U's diagonal, ``jitter`` to that of the pivots, relative to them. Returns the
         factor and the smallest pivot as a share of U's diagonal; None where S cannot be factorised.
@@ -199,8 +196,8 @@ class ReducedSystem:
         diagonal = [*self._add_frames(), self._add_cameras(estimate)]
         keys = [*((k, k) for k in range(self.plan.tile_count)), (TIP, TIP)]
         for key, values in zip(keys, diagonal, strict=True):
-            self.tiles[key].diagonal().add_(values, alpha=damping)
-        factor = factorise_tiles(self.tiles, self.plan.pattern, jitter)
+            self._tiles[key].diagonal().add_(values, alpha=damping)
+        factor = factorise_tiles(self._matrix, jitter)
         if factor is None:
             return None
         return factor, float((factor.pivots() / (1 + damping) / torch.cat(diagonal)).min())
@@ -216,7 +213,7 @@ class ReducedSystem:
         by_camera[:, :3, :3] += rotation * root.square()[:, None] @ rotation.mT
         by_camera.diagonal(dim1=1, dim2=2)[:, 6:] += arrays.clock_information_root**2
         tip = torch.block_diag(*by_camera)  # type: ignore[no-untyped-call]
-        self.tiles[TIP, TIP] += tip
+        self._tiles[TIP, TIP] += tip
         return torch.diagonal(tip)
 
     def _add_frames(self) -> list[Tensor]:
@@ -229,7 +226,7 @@ class ReducedSystem:
         by_frame = (spread.state.mT @ by_state).sum(0)
         border = (by_state.mT @ spread.camera).permute(1, 2, 0, 3).flatten(2)
         for column, part in enumerate(to_tiles(plan, border).chunk(plan.tile_count)):
-            self.tiles[TIP, column] += part.mT
+            self._tiles[TIP, column] += part.mT
         root, transition = arrays.state_information_root, arrays.state_transition
         carried = root[..., None] * transition
         by_frame += torch.diag_embed(root.square())
@@ -240,7 +237,7 @@ class ReducedSystem:
             frames = slice(begin, begin + plan.frames_per_tile)
             place = plan.pattern.position[tile]
             matrix = _along_route(by_frame[frames], across[frames], plan.frames_per_tile)
-            self.tiles[place, place] += matrix
+            self._tiles[place, place] += matrix
             diagonal[place] = matrix.diagonal()
             if tile and bool(across[begin].any()):
                 self._add_between(place, plan.pattern.position[tile - 1], across[begin])
@@ -250,9 +247,9 @@ class ReducedSystem:
         """Couple the first frame of one tile with the last of the one before it on the route."""
         states = len(coupling)
         if later > earlier:
-            self.tiles[later, earlier][:states, -states:] += coupling
+            self._tiles[later, earlier][:states, -states:] += coupling
         else:
-            self.tiles[earlier, later][-states:, :states] += coupling.mT
+            self._tiles[earlier, later][-states:, :states] += coupling.mT
 
 
 def coupling_by_camera(arrays: Arrays, spread: Spread, run: Run, coupling: Tensor) -> Tensor:

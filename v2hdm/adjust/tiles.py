@@ -9,7 +9,7 @@ so time and memory grow with the length of the route. Everything inside a tile i
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -19,10 +19,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from torch import Tensor
 
-Tiles = dict[tuple[int, int], Tensor]
-"""Lower tiles by (row, column) in elimination order; row :data:`TIP` holds the border."""
-
 TIP = -1
+"""The row of the tiles that border the others, and row and column of the last one."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +54,39 @@ def find_pattern(tile_count: int, cliques: Iterable[list[int]]) -> Pattern:
             parent = min(rows)
             below[parent] |= rows - {parent}
     return Pattern(tuple(position.tolist()), tuple(tuple(sorted(rows)) for rows in below))
+
+
+@dataclass(frozen=True)
+class TiledMatrix:
+    """The lower tiles of a symmetric matrix, laid out as those of its factor, which takes their place.
+
+    Attributes:
+        pattern: which there are.
+        diagonal: tiles on the diagonal, in elimination order, without the tip.
+        panels: what stands below each, stacked, the tip's rows last.
+        tip: the last tile on the diagonal.
+        tiles: views of all of them by (row, column) in elimination order, or :data:`TIP`.
+    """
+
+    pattern: Pattern
+    diagonal: tuple[Tensor, ...]
+    panels: tuple[Tensor, ...]
+    tip: Tensor
+    tiles: Mapping[tuple[int, int], Tensor]
+
+    @classmethod
+    def zeros(cls, pattern: Pattern, size: int, tip: int, like: Tensor) -> TiledMatrix:
+        """Tiles of ``size`` rows and columns and a tip of ``tip``; numbers are of the kind of ``like``."""
+        diagonal = tuple(like.new_zeros(size, size) for _ in pattern.below)
+        panels = tuple(like.new_zeros(len(below) * size + tip, size) for below in pattern.below)
+        last = like.new_zeros(tip, tip)
+        tiles = {(TIP, TIP): last}
+        for column, below in enumerate(pattern.below):
+            heights = [size] * len(below) + [tip]
+            for row, tile in zip((*below, TIP), torch.split(panels[column], heights), strict=True):
+                tiles[row, column] = tile
+            tiles[column, column] = diagonal[column]
+        return cls(pattern, diagonal, panels, last, tiles)
 
 
 @dataclass(frozen=True)
@@ -110,40 +141,36 @@ class TiledCholesky:
         return out
 
 
-def factorise_tiles(tiles: Tiles, pattern: Pattern, damping: float = 0.0) -> TiledCholesky | None:
-    """Factorise, using the tiles up; None where the matrix is not positive definite.
+def factorise_tiles(matrix: TiledMatrix, damping: float = 0.0) -> TiledCholesky | None:
+    """Factorise, overwriting the matrix; None where it is not positive definite.
 
     ``damping`` is added to the pivots' diagonal, relative to it. Right-looking: each column, once factorised,
     is subtracted from those it couples to.
     """
-    diagonal, panels, rows = [], [], []
-    for column, below in enumerate(pattern.below):
-        factor = _factorise_tile(tiles.pop((column, column)), damping)
-        if factor is None:
+    rows = []
+    for column, below in enumerate(matrix.pattern.below):
+        own, panel = matrix.diagonal[column], matrix.panels[column]
+        if not _factorise_tile(own, damping):
             return None
+        panel.copy_(torch.linalg.solve_triangular(own, panel.mT, upper=False).mT)
         keys = (*below, TIP)
-        stacked = torch.cat([tiles.pop((row, column)) for row in keys])
-        panel = torch.linalg.solve_triangular(factor, stacked.mT, upper=False).mT
-        parts = dict(zip(keys, panel.split([len(factor)] * len(below) + [len(tiles[TIP, TIP])]), strict=True))
-        for first, second in _lower_pairs(keys):
-            tiles[second, first].addmm_(parts[second], parts[first].mT, alpha=-1)
-        diagonal.append(factor)
-        panels.append(panel)
-        rows.append(_row_index(below, len(factor), len(pattern.below), len(tiles[TIP, TIP]), panel))
-    tip = _factorise_tile(tiles.pop((TIP, TIP)), damping)
-    return None if tip is None else TiledCholesky(tuple(diagonal), tuple(panels), tuple(rows), tip, damping)
+        for n, first in enumerate(keys):
+            for second in keys[n:]:
+                left, right = matrix.tiles[second, column], matrix.tiles[first, column]
+                matrix.tiles[second, first].addmm_(left, right.mT, alpha=-1)
+        rows.append(_row_index(below, len(own), len(matrix.diagonal), len(matrix.tip), panel))
+    if not _factorise_tile(matrix.tip, damping):
+        return None
+    return TiledCholesky(matrix.diagonal, matrix.panels, tuple(rows), matrix.tip, damping)
 
 
-def _lower_pairs(keys: tuple[int, ...]) -> Iterable[tuple[int, int]]:
-    """Pairs (column, row) of the tiles that a panel over ``keys`` updates."""
-    return ((keys[a], keys[b]) for a in range(len(keys)) for b in range(a, len(keys)))
-
-
-def _factorise_tile(tile: Tensor, damping: float) -> Tensor | None:
+def _factorise_tile(tile: Tensor, damping: float) -> bool:
+    """Put a tile's lower factor in its place; whether there is one."""
     if damping:
-        tile = tile + torch.diag(damping * tile.diagonal().abs())
+        tile += torch.diag(damping * tile.diagonal().abs())
     factor, info = torch.linalg.cholesky_ex(tile)
-    return factor if int(info) == 0 else None
+    tile.copy_(factor)
+    return int(info) == 0
 
 
 def _row_index(below: tuple[int, ...], size: int, count: int, tip: int, like: Tensor) -> Tensor:
