@@ -3,14 +3,15 @@
 Most of the time of a segmentation network goes into its finest layers, so there are none at full
 resolution: a space-to-depth stem starts at a quarter of it, keeping every pixel as a channel, and a
 depth-to-space head ends at half of it (Shi et al., CVPR 2016), which places edges nearly as well as full
-resolution. Only the outline needs that: the class of a piece of paint is read off at a quarter, the lanes
-at an eighth. Skips are added rather than concatenated (LinkNet, Chaurasia and Culurciello, 2017), and
-dilated convolutions at the coarsest level see far enough to tell a dash from a solid line.
+resolution. Only the outline needs that: the class of a piece of paint is read off at a quarter, helped by
+what its whole shape says at an eighth, the lanes at an eighth. Skips are added rather than concatenated
+(LinkNet, Chaurasia and Culurciello, 2017), and dilated convolutions at the coarsest level see far enough to
+tell a dash from a solid line.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -40,14 +41,17 @@ class NetConfig:
     """Channel counts of :class:`MarkingNet` at 1/4, 1/8 and 1/16 of the image and at the bottom.
 
     ``separable`` takes depthwise separable convolutions (Howard et al., "MobileNets", 2017) where the image
-    is large; ``lanes`` adds the head of row anchors. Both are switches to measure what they cost and bring.
+    is large; ``lanes`` adds the head of row anchors; ``wide_kinds`` lets the features at 1/8, which know a
+    marking's whole shape and its surroundings, speak on its class. They are switches to measure what each
+    costs and brings.
     """
 
     widths: list[int] = field(default_factory=lambda: [32, 48, 64, 96])
-    dilations: list[int] = field(default_factory=lambda: [1, 2, 4])
+    dilations: list[int] = field(default_factory=lambda: [1, 2, 4, 8])
     head_width: int = 8
     separable: bool = True
     lanes: bool = True
+    wide_kinds: bool = True
 
 
 class Prediction(NamedTuple):
@@ -115,7 +119,8 @@ class MarkingNet(nn.Module):
         self.expand = ConvNormRelu(quarter, config.head_width * PAINT_UPSCALE**2, kernel=1)
         self.paint = nn.Conv2d(config.head_width, 1, 3, padding=1)
         self.kinds = nn.Conv2d(quarter, len(PAINT_CLASSES), 1)
-        self.lanes = nn.Sequential(refine(eighth, eighth), nn.Conv2d(eighth, 2, 1)) if config.lanes else None
+        self.wide_kinds = _head(refine, eighth, len(PAINT_CLASSES)) if config.wide_kinds else None
+        self.lanes = _head(refine, eighth, 2) if config.lanes else None
 
     def forward(self, image: Tensor) -> Prediction:
         """Look at images (B, H, W, 3) uint8, BGR as OpenCV decodes them; H and W multiples of 16."""
@@ -127,8 +132,11 @@ class MarkingNet(nn.Module):
         y8 = self.decode8(_double(self.lateral16(self.context(self.encode16(x8)))) + x8)
         y4 = self.decode4(_double(self.lateral8(y8)) + x4)
         paint = self.paint(_depth_to_space(self.expand(y4)))
+        kinds = self.kinds(y4)
+        if self.wide_kinds is not None:
+            kinds = kinds + _double(self.wide_kinds(y8))
         lanes = self.lanes(y8) if self.lanes is not None else y8.new_full((len(y8), 2, *y8.shape[2:]), -9.0)
-        return Prediction(paint, self.kinds(y4), lanes)
+        return Prediction(paint, kinds, lanes)
 
     def fold(self) -> MarkingNet:
         """Merge every batch normalisation into its convolution, in place; for inference only."""
@@ -144,6 +152,11 @@ def _separable(inputs: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(
         ConvNormRelu(inputs, inputs, groups=inputs, relu=False), ConvNormRelu(inputs, outputs, kernel=1)
     )
+
+
+def _head(refine: Callable[[int, int], nn.Module], inputs: int, outputs: int) -> nn.Sequential:
+    """Features refined once more, then read off."""
+    return nn.Sequential(refine(inputs, inputs), nn.Conv2d(inputs, outputs, 1))
 
 
 def _blocks(widths: Sequence[int], inputs: int, dilations: Sequence[int]) -> nn.Sequential:

@@ -10,10 +10,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from models import MarkingNet, NetConfig
+from models import MarkingNet
 from train.config import TrainConfig
 from train.data import validation_pairs
-from train.exported import Exported, read_exported, unfold
+from train.exported import read_exported, unfold
+from train.growth import can_grow, grow, recorded_net
 from v2hdm.errors import ConfigError
 
 # What may differ between the parts of a resumed run without making it another experiment.
@@ -51,7 +52,7 @@ class Checkpoint:
 
     def network(self) -> MarkingNet:
         """The network with the averaged weights, in eval mode."""
-        net = MarkingNet(NetConfig(**self.config["net"]))
+        net = MarkingNet(recorded_net(self.config["net"]))
         net.load_state_dict(self.averaged)
         return net.eval()
 
@@ -67,18 +68,19 @@ def fresh_checkpoint(config: TrainConfig) -> Checkpoint:
         return state
     path = Path(config.start)
     earlier = read_exported(path) if path.suffix == ".onnx" else load_checkpoint(path)
-    now = asdict(config.net)
-    then = _completed(earlier.config["net"], asdict(NetConfig()))
-    if then != now:
+    then = recorded_net(earlier.config["net"])
+    if not can_grow(then, config.net):
         raise ConfigError(
-            f"start={config.start} holds the network {then}, not {now}: give its `net` settings"
+            f"start={config.start} holds the network {asdict(then)}, not {asdict(config.net)}: "
+            "give its `net` settings"
         )
-    if isinstance(earlier, Exported):
+    if isinstance(earlier, Checkpoint) and then == config.net:
+        state.averaged = earlier.averaged
+    else:
+        folded = earlier.network().fold().state_dict() if isinstance(earlier, Checkpoint) else earlier.weights
         pairs = validation_pairs(config.data, config.seed, _VIEWS_TO_UNFOLD)
         views = (image[None] for image, _ in pairs)
-        state.averaged = unfold(earlier.weights, config.net, views)
-    else:
-        state.averaged = earlier.averaged
+        state.averaged = unfold(grow(folded, then, config.net), config.net, views)
     state.model = state.averaged
     state.renders = earlier.renders
     return state

@@ -14,7 +14,7 @@ from train.targets import IGNORE, Targets
 def total_loss(prediction: Prediction, targets: Targets, config: LossConfig) -> Tensor:
     """The weighted sum of the terms, a scalar."""
     loss = paint_loss(prediction.paint[:, 0], targets.paint, config.paint_weight, config.dice)
-    loss = loss + config.kinds * kind_loss(prediction.kinds, targets.kinds)
+    loss = loss + config.kinds * kind_loss(prediction.kinds, targets.kinds, targets.kind_weight)
     if config.lanes:
         loss = loss + config.lanes * lane_loss(prediction.lanes, targets, config.lane_weight)
     return loss
@@ -44,18 +44,21 @@ def dice_loss(logits: Tensor, labels: Tensor) -> Tensor:
     return 1 - (2 * (probability * target).sum() + 1) / (probability.square().sum() + target.sum() + 1)
 
 
-def kind_loss(logits: Tensor, labels: Tensor) -> Tensor:
+def kind_loss(logits: Tensor, labels: Tensor, weight: Tensor) -> Tensor:
     """Cross entropy of the paint's class: logits (B, K, H, W), labels (B, H, W); no paint carries no loss.
 
-    Each class has the same weight as all its cells together have in a batch, to the power of a half:
-    arrows are few, lines are many.
+    Cells weigh ``weight`` (B, H, W), and the more the rarer their class is: by the root of how many times its
+    cells' weights go into those of all classes. Arrows are few, lines are many.
     """
-    labels = labels.long()
-    counts = torch.bincount(labels[labels != IGNORE], minlength=logits.shape[1]).to(logits.dtype)
-    if not counts.sum():
+    known = labels != IGNORE
+    if not known.any():
         return logits.sum() * 0
-    weight = (counts.sum() / counts.clamp(min=1)).sqrt().clamp(max=6.0)
-    return cross_entropy(logits, labels, weight=weight, ignore_index=IGNORE)
+    cells, weight = labels[known].long(), weight[known]
+    total = torch.zeros(logits.shape[1], dtype=weight.dtype, device=weight.device).index_add(0, cells, weight)
+    rarity = (total.sum() / total.clamp(min=1e-6)).sqrt().clamp(max=6.0)
+    weight = weight * rarity[cells]
+    each = cross_entropy(logits.movedim(1, -1)[known], cells, reduction="none")
+    return (weight * each).sum() / weight.sum()
 
 
 def lane_loss(logits: Tensor, targets: Targets, positive_weight: float) -> Tensor:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from skimage.measure import label
 from torch import Tensor
 
 from models.marking_net import KIND_STRIDE, LANE_STRIDE, PAINT_STRIDE
@@ -32,7 +33,8 @@ Bytes = NDArray[np.uint8]
 class Targets(NamedTuple):
     """The answers for images (B, H, W); the batch dimension is missing for a single one.
 
-    ``paint`` (B, H/2, W/2) uint8: 1 for paint. ``kinds`` (B, H/4, W/4) uint8: index into ``PAINT_CLASSES``.
+    ``paint`` (B, H/2, W/2) uint8: 1 for paint. ``kinds`` (B, H/4, W/4) uint8: index into ``PAINT_CLASSES``,
+    and ``kind_weight`` (B, H/4, W/4) float32: what each is worth, see :func:`kind_weight`.
     ``lane_there`` (B, H/8, W/8) uint8: 1 where a lane's line crosses the row anchor in that cell, and
     ``lane_offset`` (B, H/8, W/8) float32: where in it, in cells from its centre. :data:`IGNORE` carries no
     loss.
@@ -40,6 +42,7 @@ class Targets(NamedTuple):
 
     paint: Tensor
     kinds: Tensor
+    kind_weight: Tensor
     lane_there: Tensor
     lane_offset: Tensor
 
@@ -48,7 +51,8 @@ def targets(sample: TrainingSample) -> Targets:
     """The answers for one image. Where a box stands before a lane's line, either answer will do."""
     there, offset = lane_targets(sample.lanes_px, *sample.labels.shape)
     there[_blocks(sample.hidden, LANE_STRIDE).any(axis=2) & (there == 1)] = IGNORE
-    answers = paint_target(sample.labels), kind_target(sample.labels), there, offset
+    kinds = kind_target(sample.labels)
+    answers = paint_target(sample.labels), kinds, kind_weight(kinds), there, offset
     return Targets(*(torch.from_numpy(answer) for answer in answers))
 
 
@@ -68,6 +72,18 @@ def kind_target(labels: Bytes) -> Bytes:
     counts = np.stack([(blocks == 1 + c).sum(axis=2) for c in range(len(PAINT_CLASSES))], axis=2)
     painted = counts.sum(axis=2) >= _LEAST_PAINT * KIND_STRIDE**2
     return np.where(painted, counts.argmax(axis=2), IGNORE).astype(np.uint8)
+
+
+def kind_weight(kinds: Bytes) -> NDArray[np.float32]:
+    """Weights (H/4, W/4) of a target of classes: a piece of paint of n cells counts as much as sqrt(n) ones.
+
+    A map asks for each marking alike, and a far one has a hundredth of the cells that a near one has.
+    """
+    pieces, count = label(kinds, background=IGNORE, return_num=True)
+    size = np.bincount(pieces.ravel(), minlength=count + 1)
+    weight = 1 / np.sqrt(np.maximum(size, 1))
+    weight[0] = 0.0
+    return weight[pieces].astype(np.float32)
 
 
 def lane_targets(

@@ -11,7 +11,7 @@ import torch
 from export.onnx_file import export_checkpoint, to_onnx
 from models import MarkingNet, NetConfig
 from tests.train.test_training import tiny
-from train.checkpoint import Checkpoint, fresh_checkpoint, load_checkpoint
+from train.checkpoint import Checkpoint, fresh_checkpoint, load_checkpoint, save_checkpoint
 from train.exported import unfold
 from train.loop import Trainer
 from v2hdm.errors import ConfigError
@@ -76,6 +76,34 @@ def test_a_training_starts_from_an_exported_file(net: MarkingNet, images: Images
         assert max(float((a - b).abs().max()) for a, b in pairs) < 1e-3
     assert trainer.run().step == 3
     assert load_checkpoint(tmp_path / "run" / "last.pt").step == 3
+
+
+def test_a_training_grows_a_smaller_network_that_goes_on_saying_the_same(
+    net: MarkingNet, images: Images, tmp_path: Path
+) -> None:
+    config = tiny(tmp_path / "run")
+    larger = replace(config.net, dilations=[1, 2, 4], wide_kinds=True)
+    taught = Checkpoint(config=asdict(config), renders=70, averaged=net.state_dict())
+    export_checkpoint(taught, tmp_path / "net.onnx", opset=18, tolerance=1e-3)
+    save_checkpoint(taught, tmp_path / "net.pt")
+    for start in ("net.onnx", "net.pt"):
+        state = fresh_checkpoint(replace(config, net=larger, start=str(tmp_path / start)))
+        grown = MarkingNet(larger)
+        grown.load_state_dict(state.averaged)
+        with torch.inference_mode():
+            pairs = zip(grown.eval()(images[0]), net(images[0]), strict=True)
+            assert max(float((a - b).abs().max()) for a, b in pairs) < 1e-3
+        assert Trainer(
+            replace(config, net=larger, start=str(tmp_path / start), output=str(tmp_path / f"from {start}")),
+            lambda share, line: None,
+        ).run()
+
+
+def test_a_file_older_than_a_switch_holds_a_network_without_it(net: MarkingNet) -> None:
+    settings = asdict(tiny(Path()).net)
+    del settings["wide_kinds"]
+    checkpoint = Checkpoint(config={"net": settings}, averaged=net.state_dict())
+    assert checkpoint.network().wide_kinds is None
 
 
 def test_the_shipped_file_can_learn_on(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ def example() -> tuple[Prediction, Targets]:
     prediction = Prediction(
         sure(paint)[:, None], sure_kinds(kinds), torch.stack([sure(there), offset], dim=1)
     )
-    return prediction, Targets(paint, kinds, there, offset)
+    return prediction, Targets(paint, kinds, torch.ones(kinds.shape), there, offset)
 
 
 def test_certain_and_right_costs_nothing() -> None:
@@ -71,10 +71,25 @@ def test_ignored_elements_get_no_gradient() -> None:
 
 def test_a_batch_without_paint_or_lanes_has_a_finite_loss() -> None:
     kinds = torch.full((1, 2, 2), IGNORE, dtype=torch.uint8)
-    assert float(kind_loss(torch.randn(1, KINDS, 2, 2), kinds)) == 0
+    assert float(kind_loss(torch.randn(1, KINDS, 2, 2), kinds, torch.ones(1, 2, 2))) == 0
     none = torch.zeros((1, 2, 2), dtype=torch.uint8)
-    targets = Targets(none, kinds, none, torch.zeros(1, 2, 2))
+    targets = Targets(none, kinds, torch.zeros(1, 2, 2), none, torch.zeros(1, 2, 2))
     assert torch.isfinite(lane_loss(torch.randn(1, 2, 2, 2), targets, 3.0))
+
+
+def test_cells_of_no_weight_leave_the_loss_of_kinds_as_it_is() -> None:
+    labels = torch.tensor([[[0, 1, 1, IGNORE]]], dtype=torch.uint8)
+    logits = torch.randn(1, KINDS, 1, 4)
+    without = torch.tensor([[[1.0, 1.0, 0.0, 0.0]]])
+    half = kind_loss(logits, labels, without)
+    wrong = logits.clone()
+    wrong[..., 2] += 5 * torch.randn(KINDS)[None, :, None]
+    assert torch.equal(half, kind_loss(wrong, labels, without))
+    whole = kind_loss(logits, labels, torch.ones(1, 1, 4))
+    first, second, third = (-logits[0, :, 0, k].log_softmax(0)[label] for k, label in enumerate((0, 1, 1)))
+    rare, common = 3**0.5, 1.5**0.5
+    expected = (rare * first + common * (second + third)) / (rare + 2 * common)
+    assert float(whole) == pytest.approx(float(expected), rel=1e-5)
 
 
 def test_the_score_counts_by_hand() -> None:
@@ -102,6 +117,6 @@ def test_a_crossing_two_cells_off_is_neither_found_nor_right() -> None:
             Prediction(
                 sure(paint)[:, None], sure_kinds(kinds), torch.stack([sure(given), sure(given)], dim=1)
             ),
-            Targets(paint, kinds, there, torch.zeros((1, 1, 8))),
+            Targets(paint, kinds, torch.zeros(kinds.shape), there, torch.zeros((1, 1, 8))),
         )
         assert (tally.score().lane_recall, tally.score().lane_precision) == (right, right)

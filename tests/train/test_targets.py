@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from train.targets import IGNORE, kind_target, lane_targets, paint_target, targets
+from train.targets import IGNORE, kind_target, kind_weight, lane_targets, paint_target, targets
 from v2hdm.records import PAINT_CLASSES
 from v2hdm.simulate.training.scenes import TrainingSample
 
@@ -26,6 +26,19 @@ def test_a_cell_has_the_class_of_most_of_its_paint() -> None:
     labels[4:, 4] = 2  # a quarter of the cell is too little paint to be asked for its class
     assert kind_target(labels).tolist() == [[2, IGNORE], [IGNORE, IGNORE]]
     assert kind_target(labels).max(initial=0, where=kind_target(labels) != IGNORE) < len(PAINT_CLASSES)
+
+
+def test_a_piece_of_paint_counts_as_the_root_of_its_cells() -> None:
+    kinds = np.full((8, 12), IGNORE, dtype=np.uint8)
+    kinds[1:5, 1:5] = 3
+    kinds[1:5, 5] = 0  # of another class, though it touches
+    kinds[7, 10] = 3
+    weight = kind_weight(kinds)
+    assert weight[kinds == IGNORE].max() == 0
+    assert weight[1:5, 1:5].sum() == pytest.approx(4)
+    assert weight[1:5, 5].sum() == pytest.approx(2)
+    assert weight[7, 10] == 1
+    assert not kind_weight(np.full((4, 4), IGNORE, dtype=np.uint8)).any()
 
 
 def test_a_line_crosses_each_row_anchor_in_one_cell() -> None:

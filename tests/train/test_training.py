@@ -31,7 +31,7 @@ def tiny(output: Path, steps: int = 3) -> TrainConfig:
         output=str(output),
         steps=steps,
         batch=2,
-        net=NetConfig(widths=[16, 16, 16, 16], dilations=[1]),
+        net=NetConfig(widths=[16, 16, 16, 16], dilations=[1], wide_kinds=False),
         data=DataConfig(
             width=64, height=32, render_width=80, render_height=48, views_per_render=2, reservoir=4, workers=0
         ),
