@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
@@ -37,8 +38,14 @@ from v2hdm.records import (
 _HEADS = (*OUTLINED_CLASSES, OTHER_PAINT, DIAMOND)
 """What the head of an arrow may be taken for where it is seen apart from the shaft."""
 
+_LEAST_SCORE = 0.3
+"""A blob of a lesser score is nothing. What may be a quadrilateral is then judged by all evidence; of lanes
+and symbols there is no more, so they need ``DetectorOptions.min_score``."""
+
 _LEAST_COVER = 0.6
-"""A blob that shares less than this with the best quadrilateral around it is none."""
+_LEAST_COVER_OF_SYMBOL = 0.8
+"""A blob that shares less than this with the best quadrilateral around it is none, the more so if the network
+takes it for an arrow or a chevron."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +107,8 @@ class Detector:
             starts = self._starts(candidates, view)
             foreground = Foreground(sight.paint, owner, info.paint_stride, view.top)
             markings = fit_markings(image_bgr, view, starts, foreground, self.options)
-            markings += [symbol for c in candidates if (symbol := self._symbol(c, view)) is not None]
+            symbols = [self._symbol(c, view) for c in candidates]
+            markings += [s for s in symbols if s is not None and not _is_among(s, markings)]
         return tuple(markings), tuple(lanes)
 
     def view(self, camera: Camera) -> CameraView:
@@ -122,7 +130,7 @@ class Detector:
         candidates = []
         for index, (blob, outline) in enumerate(zip(blobs, np.split(outlines, ends), strict=True)):
             found = plausible_kind(blob, on_ground[index], view)
-            if found is None or found[1] < self.options.min_score:
+            if found is None or found[1] < _LEAST_SCORE:
                 continue
             if found[0] == LANE_DASH and ends_at_a_head(on_ground[index], heads):
                 continue  # the shaft of an arrow, parted from its head by wear
@@ -134,7 +142,9 @@ class Detector:
             LanePaint(c.blob, c.kind, c.score)
             for c in candidates
             # Else it is the shaft of an arrow, the stroke of a letter.
-            if c.kind in LANE_CLASSES and not (c.kind == LANE_DASH and c.blob.touches_symbol)
+            if c.kind in LANE_CLASSES
+            and c.score >= self.options.min_score
+            and not (c.kind == LANE_DASH and c.blob.touches_symbol)
         ]
 
     def _starts(self, candidates: list[_Candidate], view: CameraView) -> list[QuadStart]:
@@ -145,7 +155,8 @@ class Detector:
             if kind is None:
                 continue
             start = starting_corners(kind, c.outline_pinhole_px, c.outline_vehicle, view)
-            if start is not None and start[1] >= _LEAST_COVER:
+            least = _LEAST_COVER if c.kind not in OUTLINED_CLASSES else _LEAST_COVER_OF_SYMBOL
+            if start is not None and start[1] >= least:
                 starts.append(QuadStart(kind, _claim(c.blob, kind), start[0], c.index, c.outline_pinhole_px))
         if not starts:
             return []
@@ -157,13 +168,20 @@ class Detector:
 
     def _symbol(self, candidate: _Candidate, view: CameraView) -> MarkingDetection | None:
         """A marking that has an outline but no four corners, within range."""
-        if candidate.kind not in OUTLINED_CLASSES:
+        if candidate.kind not in OUTLINED_CLASSES or candidate.score < self.options.min_score:
             return None
         ground = candidate.outline_vehicle
         if not np.isfinite(ground).all() or view.range_m(ground.mean(axis=0)) > self.options.max_range_m:
             return None
         nothing = np.full((4, 2), np.nan), np.full((8, 8), np.nan), np.zeros(4, dtype=np.bool_)
         return MarkingDetection(candidate.kind, candidate.score, *nothing, outline_polygon(candidate.blob))
+
+
+def _is_among(symbol: MarkingDetection, quads: list[MarkingDetection]) -> bool:
+    """Whether a symbol is the same paint as one of the quadrilaterals."""
+    centres = [quad.corners_px.mean(axis=0) for quad in quads]
+    polygon = symbol.outline_px.astype(np.float32)
+    return any(cv2.pointPolygonTest(polygon, centre.tolist(), False) > 0 for centre in centres)
 
 
 def _claim(blob: Blob, kind: str) -> Claim:

@@ -21,6 +21,7 @@ from v2hdm.records import (
     LANE_CLASSES,
     LANE_DASH,
     LANE_LINE,
+    OUTLINED_CLASSES,
     STOP_LINE,
     FloatArray,
 )
@@ -45,6 +46,9 @@ gives only this share of its lane score to dashes: seen locally, dash and line a
 
 _LEAST_DASH_SHARE = 0.08
 """With this share a whole piece of that length is tried as a dash: its four sides must show it to be one."""
+
+_LEAST_SECOND_SHARE = 0.12
+"""What the network takes for a symbol is tried as a quadrilateral if it leaves that class this share."""
 
 _LEAST_ELONGATION = 3.0
 """Lane paint is at least this many times as long as wide; far diamonds look like dashes, but are not."""
@@ -80,11 +84,14 @@ def cornered_kind(blob: Blob, outline_vehicle: FloatArray, kind: str, view: Came
     """The class as which a blob, taken for ``kind``, is tried as a quadrilateral; None for none.
 
     Short lane paint that ends at both sides may be a dash although the network says line, or, if shorter than
-    any dash, a slim diamond: seen locally they are alike.
+    any dash, a slim diamond: seen locally they are alike. What the network takes for an arrow or a chevron may
+    be what it thinks next likely: its shape and the image will tell.
     """
-    if kind != LANE_LINE:
-        return kind if kind in CORNERED_CLASSES else None
+    if kind in CORNERED_CLASSES:
+        return kind
     length_m, width_m = _ground_size(outline_vehicle)
+    if kind in OUTLINED_CLASSES:
+        return _second_choice(blob, length_m, width_m) if is_whole(blob, view) else None
     if not is_whole(blob, view) or not length_m <= _DASH_LENGTH_M:
         return None
     if length_m < _SIZE_LIMITS_M[LANE_DASH][0][0]:
@@ -93,6 +100,20 @@ def cornered_kind(blob: Blob, outline_vehicle: FloatArray, kind: str, view: Came
     lane_score = sum(blob.class_score.get(name, 0.0) for name in LANE_CLASSES)
     dash = blob.class_score.get(LANE_DASH, 0.0) >= _LEAST_DASH_SHARE * lane_score
     return LANE_DASH if dash and _fits(LANE_DASH, length_m, width_m) else None
+
+
+def _second_choice(blob: Blob, length_m: float, width_m: float) -> str | None:
+    """The likeliest class with four corners, if a blob that is not taken for it may well be of it."""
+    slim = length_m >= _LEAST_ELONGATION * width_m
+    share = {
+        name: score
+        for name, score in blob.class_score.items()
+        if name in CORNERED_CLASSES and (name == LANE_DASH) == slim and _fits(name, length_m, width_m)
+    }
+    best = max(share, key=share.__getitem__, default=None)
+    if best is None or blob.touches_symbol:
+        return None
+    return best if share[best] >= _LEAST_SECOND_SHARE * sum(blob.class_score.values()) else None
 
 
 def is_whole(blob: Blob, view: CameraView) -> bool:

@@ -1,0 +1,53 @@
+"""What a blob is tried as: by its class scores and its size on the ground."""
+
+import numpy as np
+import pytest
+
+from tests.detection.pictures import bar, diamond, make_camera, to_image
+from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.paint.blobs import Blob
+from v2hdm.detection.paint.plausible import cornered_kind, plausible_kind
+from v2hdm.records import ARROW, CHEVRON, DIAMOND, LANE_DASH, LANE_LINE, OTHER_PAINT
+
+VIEW = CameraView(make_camera("plumb_bob"), 16)
+RHOMBUS = diamond(8.0, 0.0)
+STRIP = bar(8.0, 0.0, 3.0, 0.15)
+
+
+def tried_as(
+    outline_vehicle: np.ndarray, scores: dict[str, float], touches_symbol: bool = False
+) -> str | None:
+    """The class as which a blob is fitted with four corners."""
+    outline_px = to_image(VIEW.camera, outline_vehicle)
+    blob = Blob(scores, np.ones((3, 3)), np.zeros(2), 2, outline_px, touches_symbol)
+    found = plausible_kind(blob, outline_vehicle, VIEW)
+    return None if found is None else cornered_kind(blob, outline_vehicle, found[0], VIEW)
+
+
+@pytest.mark.parametrize("symbol", [ARROW, CHEVRON])
+def test_a_symbol_that_may_be_a_diamond_or_a_dash_is_tried_as_one(symbol: str) -> None:
+    assert tried_as(RHOMBUS, {symbol: 0.6, DIAMOND: 0.3}) == DIAMOND
+    assert tried_as(STRIP, {symbol: 0.6, LANE_DASH: 0.3}) == LANE_DASH
+
+
+def test_a_symbol_is_not_tried_as_what_its_shape_or_the_network_rules_out() -> None:
+    assert tried_as(RHOMBUS, {ARROW: 0.9, DIAMOND: 0.05}) is None, "the network is sure"
+    assert tried_as(RHOMBUS, {ARROW: 0.6, LANE_DASH: 0.3}) is None, "no dash is so wide"
+    assert tried_as(STRIP, {ARROW: 0.6, DIAMOND: 0.3}) is None, "no diamond is so slim"
+    assert tried_as(RHOMBUS, {ARROW: 0.6, DIAMOND: 0.3}, touches_symbol=True) is None, "a part of a symbol"
+    assert tried_as(RHOMBUS, {OTHER_PAINT: 0.6, DIAMOND: 0.3}) is None, "letters have strokes like diamonds"
+
+
+def test_a_symbol_cut_by_the_border_is_not_tried_as_anything_else() -> None:
+    cut = to_image(VIEW.camera, RHOMBUS)
+    cut[:, 0] -= cut[:, 0].min() - 1
+    on_ground = VIEW.ground(VIEW.undistort(cut))
+    blob = Blob({ARROW: 0.6, DIAMOND: 0.3}, np.ones((3, 3)), np.zeros(2), 2, cut)
+    assert cornered_kind(blob, on_ground, ARROW, VIEW) is None
+
+
+def test_short_lane_paint_is_tried_as_a_dash_and_shorter_paint_as_a_diamond() -> None:
+    scores = {LANE_LINE: 0.8, LANE_DASH: 0.12, DIAMOND: 0.05}
+    assert tried_as(STRIP, scores) == LANE_DASH
+    assert tried_as(bar(8.0, 0.0, 0.6, 0.15), scores) == DIAMOND
+    assert tried_as(STRIP, {LANE_LINE: 0.9, LANE_DASH: 0.02}) is None
