@@ -84,8 +84,8 @@ def cornered_kind(blob: Blob, outline_vehicle: FloatArray, kind: str, view: Came
     """The class as which a blob, taken for ``kind``, is tried as a quadrilateral; None for none.
 
     Short lane paint that ends at both sides may be a dash although the network says line, or, if shorter than
-    any dash, a slim diamond: seen locally they are alike. What the network takes for an arrow or a chevron may
-    be what it thinks next likely: its shape and the image will tell.
+    any dash, a slim diamond: seen locally they are alike. What the network takes for an arrow or a chevron
+    may be what it thinks next likely: its shape and the image will tell.
     """
     if kind in CORNERED_CLASSES:
         return kind
