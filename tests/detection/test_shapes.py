@@ -172,6 +172,15 @@ def test_a_whole_quadrilateral_is_one_marking_whatever_the_network_takes_its_end
     assert not blobs[0].touches_symbol
 
 
+def test_a_slim_dash_is_one_marking_whatever_the_network_takes_its_middle_for():
+    labels = np.zeros((24, 80), dtype=np.uint8)
+    for column in range(8, 72):
+        labels[8 + column // 10 : 10 + column // 10, column] = 1 + PAINT_CLASSES.index("lane_dash")
+    labels[:, 30:50] = np.where(labels[:, 30:50], 1 + PAINT_CLASSES.index("arrow"), 0)
+    blobs, _ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
+    assert [blob.kind for blob in blobs] == ["lane_dash"]
+
+
 def test_a_shaft_is_split_from_its_head_and_knows_it():
     labels = np.zeros((60, 60), dtype=int)
     labels[20:50, 28:32] = 1 + PAINT_CLASSES.index("lane_dash")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from v2hdm.detection.paint.pieces import settle_pieces
+from v2hdm.detection.paint.pieces import fills_a_quadrilateral, settle_pieces
 from v2hdm.detection.sight import Sight
 from v2hdm.records import (
     ARROW,
@@ -42,8 +42,7 @@ _LEAST_SHARE = np.array([0.25 if group == _SYMBOLS else 0.15 for group in _GROUP
 """Where two groups of classes hold this much of a blob, two markings touch. The head is more of an arrow."""
 
 _LEAST_QUAD_CELLS = 30
-_LEAST_CONVEXITY = 0.82
-"""What a quadrilateral's contour fills of its hull, and its hull of four straight sides."""
+"""A smaller piece of paint shows no shape; it is split where the network says so."""
 
 _OUTLINE_SCALE = 4
 
@@ -104,7 +103,8 @@ def find_blobs(
         box = (slice(y - 1, y + h + 1), slice(x - 1, x + w + 1))
         origin_px = corner_px + stride * np.array([x - 1.0, y - 1.0])
         inside = piece[box] == index + 1
-        if said.groups[index] < 2 or _is_quadrilateral(contour):
+        one = said.cells[index] >= _LEAST_QUAD_CELLS and fills_a_quadrilateral(contour)
+        if said.groups[index] < 2 or one:
             scores = dict(zip(classes, said.score[:, index].tolist(), strict=True))
             outline_px = corner_px + stride * outlines[index]
             blobs.append(Blob(scores, _signed(inside, level[box]), origin_px, stride, outline_px))
@@ -211,16 +211,6 @@ def _split(
             parts.append(Blob(class_score, signed, origin_px, stride, outline_px))
     touches = any(part.kind in _SYMBOLS for part in parts)
     return [replace(part, touches_symbol=touches) for part in parts]
-
-
-def _is_quadrilateral(contour: np.ndarray) -> bool:
-    """Whether a contour (N, 1, 2) has four straight sides: such a shape is one marking, not two."""
-    hull = cv2.convexHull(contour)
-    area = cv2.contourArea(hull)
-    if len(hull) < 4 or area < _LEAST_QUAD_CELLS or cv2.contourArea(contour) < _LEAST_CONVEXITY * area:
-        return False
-    quad = cv2.approxPolyN(hull, 4)
-    return len(quad.reshape(-1, 2)) == 4 and cv2.contourArea(quad) < area / _LEAST_CONVEXITY
 
 
 def _class_probability(sight: Sight, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:

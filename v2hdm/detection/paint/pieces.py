@@ -70,7 +70,7 @@ def _completed(level: np.ndarray, contours: list[np.ndarray]) -> tuple[list[np.n
     for label in np.flatnonzero(asked).tolist():
         x, y, w, h = stats[label, : cv2.CC_STAT_AREA].tolist()
         contour = _outermost(labels[y : y + h, x : x + w] == label, x, y)
-        if _fills_a_quadrilateral(contour):
+        if fills_a_quadrilateral(contour):
             taken[label] = contour
     kept = [c for c, label in zip(contours, whole.tolist(), strict=True) if label not in taken]
     return kept, list(taken.values())
@@ -81,7 +81,7 @@ def _parted(level: np.ndarray, contours: list[np.ndarray]) -> tuple[list[np.ndar
     kept: list[np.ndarray] = []
     parts: list[np.ndarray] = []
     for contour in contours:
-        if _cells(contour) < 2 * _LEAST_PARTED_CELLS or _fills_a_quadrilateral(contour):
+        if _cells(contour) < 2 * _LEAST_PARTED_CELLS or fills_a_quadrilateral(contour):
             kept.append(contour)
             continue
         x, y, w, h = cv2.boundingRect(contour)
@@ -89,7 +89,7 @@ def _parted(level: np.ndarray, contours: list[np.ndarray]) -> tuple[list[np.ndar
         cv2.drawContours(own, [contour - (x, y)], -1, 1, cv2.FILLED)
         sure = own & (level[y : y + h, x : x + w] > _QUITE_SURE)
         found = [c for c in _outer(sure) if _cells(c) >= _LEAST_PARTED_CELLS]
-        whole = [c for c in found if _fills_a_quadrilateral(c)] if len(found) > 1 else []
+        whole = [c for c in found if fills_a_quadrilateral(c)] if len(found) > 1 else []
         if not whole:
             kept.append(contour)
             continue
@@ -129,7 +129,8 @@ def _cells(contour: np.ndarray) -> float:
     return float(cv2.contourArea(contour) + len(contour) / 2 + 1)
 
 
-def _fills_a_quadrilateral(contour: np.ndarray) -> bool:
+def fills_a_quadrilateral(contour: np.ndarray) -> bool:
+    """Whether a contour (N, 1, 2) of every border element has four straight sides, as one marking has."""
     hull = cv2.convexHull(contour)
     area = cv2.contourArea(hull)
     _, size, _ = cv2.minAreaRect(hull)
