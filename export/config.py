@@ -2,17 +2,57 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from enum import Enum
+
+
+class Precision(Enum):
+    """What the exported network computes with."""
+
+    float32 = "float32"
+    int8 = "int8"
+
+
+@dataclass(kw_only=True)
+class BoundsConfig:
+    """How far an int8 file may be from its network on renders before it is refused.
+
+    The names are those of :class:`export.parity.Parity`, which says what they mean; of ``kinds_agree`` and
+    ``lanes_agree`` these are the least, of the others the most.
+    """
+
+    paint_changed: float = 0.06
+    outline_px: float = 0.12
+    outline_bias_px: float = 0.05
+    kinds_agree: float = 0.97
+    lanes_agree: float = 0.95
+    lane_offset_px: float = 0.15
+
+
+@dataclass(kw_only=True)
+class Int8Config:
+    """How a network becomes int8: on ``frames`` renders that ``seed`` stands for.
+
+    The file is then held against the network on ``parity_frames`` other renders.
+    """
+
+    frames: int = 24
+    parity_frames: int = 12
+    seed: int = 1_618_033
+    bounds: BoundsConfig = field(default_factory=BoundsConfig)
 
 
 @dataclass(kw_only=True)
 class ExportConfig:
     """One export, of the averaged weights in ``checkpoint`` to the file ``output``.
 
-    ``tolerance`` is how far any logit of the ONNX file may be from the network's before it is refused.
+    ``checkpoint`` may also be an exported file of float32. ``tolerance`` is how far any logit of a float32
+    file may be from the network's before it is refused; an int8 file has bounds of its own.
     """
 
     checkpoint: str
     output: str
+    precision: Precision = Precision.float32
     opset: int = 18
     tolerance: float = 1e-3
+    int8: Int8Config = field(default_factory=Int8Config)

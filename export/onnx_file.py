@@ -4,63 +4,100 @@ from __future__ import annotations
 
 import json
 import logging
-import subprocess
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
-import onnxruntime
 import torch
+from numpy.typing import NDArray
 
+from export.calibration import looks
+from export.config import Int8Config
+from export.int8 import to_int8
+from export.parity import Parity, int8_parity, largest_difference
+from export.source import STRIDES, Source, of_checkpoint, weights_not_finite
 from models import MarkingNet, Prediction
-from models.marking_net import KIND_STRIDE, LANE_STRIDE, MULTIPLE, PAINT_STRIDE
+from models.marking_net import MULTIPLE
 from train.checkpoint import Checkpoint
 from v2hdm.detection.network import METADATA_KEY
 from v2hdm.errors import DetectorError
-from v2hdm.records import PAINT_CLASSES
 
-_STRIDES = dict(zip(Prediction._fields, (PAINT_STRIDE, KIND_STRIDE, LANE_STRIDE), strict=True))
+Tell = Callable[[float, str], None]
+"""Is told what share of the work is done, and what is being done."""
 
-PARITY_SIZES = ((16, 16), (48, 112), (256, 448), (192, 1248), (544, 960))
-"""Image heights and widths at which file and network are compared."""
+_PARITY_SEED_OFFSET = 1_000_003
+_FITTING = 0.15
+"""Share of the time of an int8 export that does not go into its renders, about."""
 
 
 def export_checkpoint(checkpoint: Checkpoint, path: Path, opset: int, tolerance: float) -> float:
-    """Write the averaged weights of a checkpoint to an ONNX file.
+    """:func:`export_float` of the averaged weights of a checkpoint."""
+    return export_float(of_checkpoint(checkpoint), path, opset, tolerance)
+
+
+def export_float(source: Source, path: Path, opset: int, tolerance: float) -> float:
+    """Write a network to an ONNX file that computes in float32.
 
     The graph takes ``image`` (1, H, W, 3) uint8 BGR, H and W multiples of 16, and gives the outputs of
     :class:`models.Prediction` by their names. The file appears whole and checked, or not at all.
 
     Returns:
-        The largest difference of an output between file and network over :data:`PARITY_SIZES`.
+        The largest difference of an output between file and network over
+        :data:`export.parity.PARITY_SIZES`.
 
     Raises:
         DetectorError: The difference exceeds ``tolerance``, or weights are not finite.
     """
-    net = checkpoint.network()
-    broken = [name for name, value in net.state_dict().items() if not torch.isfinite(value).all()]
-    if broken:
-        raise DetectorError(
-            f"{path} was not written: {broken[0]} of the checkpoint holds values that are not finite; "
-            "export an earlier checkpoint"
-        )
-    model = to_onnx(checkpoint.network().fold(), opset)
-    onnx.helper.set_model_props(model, {METADATA_KEY: json.dumps(label(checkpoint))})
-    content = model.SerializeToString()
-    difference = parity(net, content)
+    model = _checked(source, path, opset)
+    difference = largest_difference(source.net, model.SerializeToString())
     if not difference <= tolerance:
         raise DetectorError(
             f"{path} was not written: its outputs would differ from the network's by {difference:.2g}, "
             f"more than tolerance={tolerance:g}; try another opset"
         )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    partial.write_bytes(content)
-    partial.replace(path)
+    _write(model, source.label | {"precision": "float32", "parity": {"difference": difference}}, path)
     return difference
+
+
+def export_int8(source: Source, path: Path, opset: int, config: Int8Config, tell: Tell) -> Parity:
+    """Write a network to an ONNX file that computes with bytes; see :mod:`export.int8`.
+
+    Inputs, outputs and label are those of :func:`export_float`.
+
+    Returns:
+        How near it is to the network, on renders that it was not fitted to.
+
+    Raises:
+        DetectorError: A figure of that is beyond its bound, weights are not finite, or there are no renders.
+    """
+    model = _checked(source, path, opset)
+    if config.frames < 1 or config.parity_frames < 1:
+        raise DetectorError("int8.frames and int8.parity_frames must be 1 or more: int8 is fitted to renders")
+    total = config.frames + config.parity_frames
+    share = (1 - _FITTING) / total
+    fitted = _images(config.seed, config.frames, tell, 0.0, share)
+    unseen = _images(
+        config.seed + _PARITY_SEED_OFFSET, config.parity_frames, tell, share * config.frames, share
+    )
+    tell(1 - _FITTING, "fitting ranges and weights")
+    model = to_int8(model, fitted)
+    parity = int8_parity(source.net, model.SerializeToString(), unseen)
+    beyond = parity.beyond(asdict(config.bounds))
+    if beyond:
+        raise DetectorError(
+            f"{path} was not written: on renders, int8 changes what the network says too much: "
+            f"{', '.join(beyond)}; give more int8.frames, or export with precision=float32"
+        )
+    figures = {name: round(value, 4) for name, value in asdict(parity).items()}
+    fitting = {"frames": config.frames, "seed": config.seed, "parity_frames": config.parity_frames}
+    _write(model, source.label | {"precision": "int8", "parity": figures, "int8": fitting}, path)
+    tell(1.0, "written")
+    return parity
 
 
 def to_onnx(net: MarkingNet, opset: int) -> onnx.ModelProto:
@@ -89,42 +126,38 @@ def to_onnx(net: MarkingNet, opset: int) -> onnx.ModelProto:
     return model
 
 
-def label(checkpoint: Checkpoint) -> dict[str, Any]:
-    """What a reader of the file needs to know to run it, and where it comes from."""
-    return {
-        "classes": list(PAINT_CLASSES),
-        "multiple": MULTIPLE,
-        "strides": _STRIDES,
-        "input": "uint8 BGR, NHWC",
-        "commit": _commit(),
-        "steps": checkpoint.step,
-        "renders": checkpoint.renders,
-        "training_minutes": round(checkpoint.elapsed_s / 60, 1),
-        "metrics": {name: round(value, 4) for name, value in checkpoint.metrics.items()},
-        "training": _without_paths(checkpoint.config),
-    }
+def _checked(source: Source, path: Path, opset: int) -> onnx.ModelProto:
+    """The float32 graph of a network whose weights are all finite."""
+    broken = weights_not_finite(source.net)
+    if broken:
+        raise DetectorError(
+            f"{path} was not written: {broken[0]} of the checkpoint holds values that are not finite; "
+            "export an earlier checkpoint"
+        )
+    return to_onnx(deepcopy(source.net).fold(), opset)
 
 
-def parity(net: MarkingNet, content: bytes) -> float:
-    """Largest difference of any output between a network and the ONNX file made of it."""
-    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    generator = np.random.default_rng(0)
-    worst = 0.0
-    for height, width in PARITY_SIZES:
-        image = generator.integers(0, 256, (1, height, width, 3), dtype=np.uint8)
-        with torch.inference_mode():
-            prediction = net(torch.from_numpy(image))
-        outputs = session.run(list(Prediction._fields), {"image": image})
-        for output, expected in zip(outputs, prediction, strict=True):
-            if output.shape != tuple(expected.shape):
-                return float("inf")
-            worst = max(worst, float(np.abs(output - expected.numpy()).max()))
-    return worst
+def _images(seed: int, frames: int, tell: Tell, start: float, share: float) -> list[NDArray[np.uint8]]:
+    """All that the detector shows its network of some renders."""
+    images: list[NDArray[np.uint8]] = []
+    for index, seen in enumerate(looks(seed, frames)):
+        images += seen
+        tell(start + (index + 1) * share, "rendering what the detector looks at")
+    return images
+
+
+def _write(model: onnx.ModelProto, label: dict[str, Any], path: Path) -> None:
+    """Write a model with its label; a kill leaves the file before it."""
+    onnx.helper.set_model_props(model, {METADATA_KEY: json.dumps(label)})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial")
+    partial.write_bytes(model.SerializeToString())
+    partial.replace(path)
 
 
 def _name_sizes(model: onnx.ModelProto) -> None:
     """Call the open sizes of input and output what they are, where the exporter leaves formulas."""
-    names = {output: {2: f"height / {stride}", 3: f"width / {stride}"} for output, stride in _STRIDES.items()}
+    names = {output: {2: f"height / {stride}", 3: f"width / {stride}"} for output, stride in STRIDES.items()}
     names["image"] = {1: "height", 2: "width"}
     for value in (*model.graph.input, *model.graph.output):
         for axis, name in names[value.name].items():
@@ -136,28 +169,3 @@ def _forget_source(model: onnx.ModelProto) -> None:
     for part in (*model.graph.node, *model.graph.value_info, *model.graph.initializer):
         del part.metadata_props[:]
         part.doc_string = ""
-
-
-def _without_paths(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a training less what says something of the machine that it ran on."""
-    kept = {key: value for key, value in config.items() if key not in ("output", "device", "resume")}
-    kept["start"] = kept.get("start") and Path(kept["start"]).name
-    labels = {key: bool(kept["data"].get(key)) for key in ("coco", "tusimple")}
-    paths = ("coco", "coco_images", "tusimple", "tusimple_images")
-    kept["data"] = {k: v for k, v in kept["data"].items() if k not in paths} | {"own_labels": labels}
-    return kept
-
-
-def _commit() -> str:
-    """The commit of this checkout, or ``unknown`` outside of one."""
-    try:
-        answer = subprocess.run(
-            ["git", "rev-parse", "HEAD"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return answer.stdout.strip()

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import onnx
 import torch
 from onnx import numpy_helper
@@ -27,12 +28,15 @@ that no normalisation follows)."""
 class Exported:
     """What an exported file says of its training, and its weights by their names in the folded network.
 
-    ``config`` are the training's settings, ``renders`` how many renders had taught it, as in a checkpoint.
+    ``config`` are the training's settings, ``renders`` how many renders had taught it, as in a checkpoint;
+    ``label`` is all that the file says. The weights of an int8 file are multiples of the steps that they were
+    rounded to.
     """
 
     config: dict[str, Any]
     renders: int
     weights: dict[str, Tensor]
+    label: dict[str, Any]
 
 
 def read_exported(path: Path) -> Exported:
@@ -48,11 +52,25 @@ def read_exported(path: Path) -> Exported:
         label = json.loads({entry.key: entry.value for entry in model.metadata_props}[METADATA_KEY])
         config, renders = dict(label["training"]), int(label.get("renders", 0))
         NetConfig(**config["net"])
-        arrays = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
+        arrays = _constants(model.graph)
     except Exception as error:
         reason = f"{type(error).__name__}: {error!s:.120}".replace("\n", " ")
         raise ConfigError(f"{path} was not written by `python -m export` ({reason})") from error
-    return Exported(config, renders, {name: torch.from_numpy(a.copy()) for name, a in arrays.items()})
+    weights = {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
+    return Exported(config, renders, weights, label)
+
+
+def _constants(graph: onnx.GraphProto) -> dict[str, np.ndarray]:
+    """What a graph holds by the names that its nodes read: as stored, or as integers with a scale each."""
+    arrays = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
+    for node in graph.node:
+        if node.op_type == "DequantizeLinear" and node.input[0] in arrays:
+            whole, scale = arrays[node.input[0]], arrays[node.input[1]]
+            zero = arrays[node.input[2]].astype(np.int64) if len(node.input) > 2 else np.zeros_like(scale)
+            along = (-1, *[1] * (whole.ndim - 1))  # an export scales each output, its first axis
+            steps = whole.astype(np.float64) - zero.reshape(along)
+            arrays[node.output[0]] = (steps * scale.reshape(along)).astype(np.float32)
+    return arrays
 
 
 @torch.no_grad()

@@ -13,11 +13,13 @@ from hydra import compose, initialize_config_dir
 
 from export import __main__ as door
 from export import onnx_file
-from export.onnx_file import METADATA_KEY, PARITY_SIZES, export_checkpoint
+from export.onnx_file import export_checkpoint
+from export.parity import PARITY_SIZES
 from models import MarkingNet, NetConfig, Prediction
 from train.checkpoint import Checkpoint
 from train.config import DataConfig, TrainConfig
 from train.targets import IGNORE, paint_target
+from v2hdm.detection.network import METADATA_KEY
 from v2hdm.errors import ConfigError, DetectorError
 from v2hdm.records import PAINT_CLASSES
 from v2hdm.simulate.training.scenes import training_sample
@@ -74,6 +76,8 @@ def test_the_label_says_how_to_run_it_and_where_it_comes_from(exported: Path) ->
         5,
     )
     assert label["metrics"] == {"mean_iou": 0.25}
+    assert label["precision"] == "float32"
+    assert 0 <= label["parity"]["difference"] < 1e-3
     assert label["training"]["batch"] == TrainConfig().batch
     assert "private" not in properties[METADATA_KEY]
     assert label["training"]["data"]["own_labels"] == {"coco": True, "tusimple": False}
@@ -105,6 +109,7 @@ def test_weights_that_are_no_numbers_are_not_written(checkpoint: Checkpoint, tmp
     ("overrides", "line"),
     [
         (["checkpoint=nowhere.pt", "output=net.onnx"], "no checkpoint at nowhere.pt"),
+        (["checkpoint=nowhere.onnx", "output=net.onnx"], "no file nowhere.onnx"),
         (["output=net.onnx"], "checkpoint is missing"),
     ],
 )
