@@ -17,6 +17,7 @@ from v2hdm.adjust.covariance import Covariance
 from v2hdm.adjust.descent import Descent, descend
 from v2hdm.adjust.gating import judge, noise_scale
 from v2hdm.adjust.layout import make_arrays
+from v2hdm.adjust.origin import nearby_origin, shifted
 from v2hdm.adjust.problem import Problem, SolveOptions
 from v2hdm.adjust.residuals import Estimate, Loss, cost_and_gradient, frame_tangent, observe
 from v2hdm.adjust.solution import Solution, Status
@@ -48,8 +49,11 @@ def solve(problem: Problem, options: SolveOptions | None = None) -> Solution:
     check_options(options)
     check_problem(problem)
     check_model(problem, options)
-    arrays = make_arrays(problem, tuple(options.pose_states), options.device, options.clock_offset)
-    start, spent = _start(problem, arrays, options)
+    origin_map = nearby_origin(problem)
+    near = shifted(problem, -origin_map)
+    arrays = make_arrays(near, tuple(options.pose_states), options.device, options.clock_offset)
+    start, spent = _start(near, arrays, options)
+    del near
     robust = Loss(options.loss, options.loss_scale)
     descent = descend(
         arrays,
@@ -60,7 +64,7 @@ def solve(problem: Problem, options: SolveOptions | None = None) -> Solution:
         options.max_refreshes,
         options.max_evaluations,
     )
-    return _report(problem, arrays, options, descent, spent, began)
+    return _report(problem, origin_map, options, descent, spent, began)
 
 
 def _start(problem: Problem, arrays: Arrays, options: SolveOptions) -> tuple[Estimate, int]:
@@ -84,10 +88,16 @@ def _start(problem: Problem, arrays: Arrays, options: SolveOptions) -> tuple[Est
 
 
 def _report(
-    problem: Problem, arrays: Arrays, options: SolveOptions, descent: Descent, spent: int, began: float
+    problem: Problem,
+    origin_map: FloatArray,
+    options: SolveOptions,
+    descent: Descent,
+    spent: int,
+    began: float,
 ) -> Solution:
+    """What came of it, on the map of ``problem``, whose point ``origin_map`` is the origin of the arrays."""
     whitening, robust = descent.whitening, Loss(options.loss, options.loss_scale)
-    estimate, terms = whitening.estimate, whitening.terms
+    arrays, estimate, terms = whitening.arrays, whitening.estimate, whitening.terms
     if whitening.robust != robust:
         terms, _ = cost_and_gradient(arrays, estimate, robust)
     seen = _seen(problem, whitening)
@@ -97,7 +107,7 @@ def _report(
         status=_status(descent, options, bool(seen.behind.any())),
         cam_from_vehicle=estimate.cam_from_vehicle.cpu().numpy(),
         map_from_vehicle=_adjusted_poses(problem, arrays, estimate),
-        corners_map=_unsorted(estimate.corners_map, arrays.corner_order),
+        corners_map=_unsorted(estimate.corners_map, arrays.corner_order) + origin_map,
         residual_px=seen.residual_px,
         mahalanobis2=seen.mahalanobis2,
         verdict=judge(problem.observations, seen.mahalanobis2, seen.behind, options.gate_probability, scale),

@@ -1,0 +1,29 @@
+"""An origin near the drive: in UTM coordinates a solver would lose seven digits to the distance of theirs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from v2hdm.adjust.problem import Problem
+from v2hdm.records import FloatArray
+
+
+def nearby_origin(problem: Problem) -> FloatArray:
+    """A point (2,) of the map in the middle of the recorded poses; whole metres, so that shifts are exact."""
+    position = problem.map_from_vehicle[:, :2, 3]
+    return np.asarray(np.round((position.min(0) + position.max(0)) / 2))
+
+
+def shifted(problem: Problem, by_m: FloatArray) -> Problem:
+    """``problem`` on a map whose points all are moved by ``by_m`` (2,)."""
+    poses = problem.map_from_vehicle.copy()
+    poses[:, :2, 3] += by_m
+    start, control = problem.corners_start, problem.control
+    return replace(
+        problem,
+        map_from_vehicle=poses,
+        corners_start=None if start is None else start + by_m,
+        control=None if control is None else replace(control, points_map=control.points_map + by_m),
+    )
