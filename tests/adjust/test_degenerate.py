@@ -91,6 +91,17 @@ def bad_problems():
             problem, corner_count=problem.corner_count + 1
         ),
         "cam_from_vehicle 1 is no rigid transform": replace(problem, cam_from_vehicle=mirrored),
+        "map_from_vehicle 2 is no rigid transform: its last row": replace(
+            problem, map_from_vehicle=changed(problem.map_from_vehicle, (2, 3, 0), 1.0)
+        ),
+        "covariance_px of observation 6 is not symmetric": with_observations(
+            problem, covariance_px=changed(seen.covariance_px, 6, np.array([[1.0, 0.5], [-0.5, 1.0]]))
+        ),
+        "pinhole_px of observation 3 lies 1.11e.06 focal lengths": with_observations(
+            problem, pinhole_px=changed(seen.pinhole_px, (3, 0), 1e9)
+        ),
+        "observations.corner holds float64": with_observations(problem, corner=seen.corner.astype(float)),
+        "observations.pinhole_px is a list": with_observations(problem, pinhole_px=seen.pinhole_px.tolist()),
         "intrinsic of camera 0 has a focal length": replace(
             problem, intrinsic=changed(problem.intrinsic, (0, 1), 0.0)
         ),
@@ -146,6 +157,8 @@ def test_a_known_length_that_cannot_be_is_refused_by_name(message):
         ({"solver": "ceres"}, "unknown solver 'ceres'"),
         ({"loss_scale": 0.0}, "loss_scale is 0.0"),
         ({"gate_probability": 1.0}, "gate_probability is 1.0"),
+        ({"gap_tolerance": 0.0}, "gap_tolerance is 0.0"),
+        ({"max_evaluations": 0}, "max_evaluations is 0"),
         ({"clock_offset": True}, "a clock offset needs twist_vehicle"),
     ],
 )
@@ -188,6 +201,75 @@ def test_a_corner_seen_once_is_mapped_and_says_so_by_its_covariance():
     assert finite(solution)
     once, often = solution.corner_covariance(np.array([[10], [11]]))
     assert np.trace(once) > 2 * np.trace(often)
+
+
+def seen_in(problem: Problem, keep: np.ndarray) -> Problem:
+    """Only the observations ``keep``, all of them of camera 0, and the corners that these are of."""
+    seen = problem.observations
+    corners, corner = np.unique(seen.corner[keep], return_inverse=True)
+    parts = (seen.camera, seen.frame, corner, seen.pinhole_px, seen.covariance_px)
+    return replace(
+        problem,
+        observations=Observations(*(part if part is corner else part[keep] for part in parts)),
+        corner_count=len(corners),
+    )
+
+
+@pytest.mark.parametrize("options", [PAPER, SolveOptions(), SolveOptions(solver="lm")])
+@pytest.mark.parametrize("which", ["one observation", "one frame", "every corner once"])
+def test_too_few_observations_leave_the_solution_undetermined(which, options):
+    problem = street(cameras=1)
+    seen = problem.observations
+    rows = {
+        "one observation": np.arange(1),
+        "one frame": np.flatnonzero(seen.frame == 10),
+        "every corner once": np.unique(seen.corner, return_index=True)[1],
+    }
+    solution = solve(seen_in(problem, rows[which]), options)
+    assert solution.status is Status.UNDETERMINED
+    assert finite(solution)
+
+
+def test_a_vehicle_that_never_moves_is_no_error():
+    problem = street(cameras=1)
+    one = seen_in(problem, problem.observations.frame == 10)
+    seen, frames = one.observations, len(problem.map_from_vehicle)
+    pixel = np.tile(seen.pinhole_px, (frames, 1))
+    again = Observations(
+        np.tile(seen.camera, frames),
+        np.repeat(np.arange(frames), len(seen.corner)),
+        np.tile(seen.corner, frames),
+        pixel + np.random.default_rng(0).normal(0, 0.7, pixel.shape),
+        np.tile(seen.covariance_px, (frames, 1, 1)),
+    )
+    still = np.tile(problem.map_from_vehicle[10], (frames, 1, 1))
+    solution = solve(replace(one, map_from_vehicle=still, observations=again), PAPER)
+    assert solution.status is Status.UNDETERMINED
+    assert finite(solution)
+
+
+@pytest.mark.parametrize("options", [PAPER, SolveOptions(), SolveOptions(solver="lm")])
+def test_in_utm_coordinates_the_solution_is_the_same(options):
+    """Half a million metres east and five millions north: what is left of doubles there is a nanometre."""
+    scene = make_scene(3, frames=40, jitter=PoseSigma(), start_error_deg=3.0)
+    utm = np.array([500_000.0, 5_500_000.0])
+    control = ControlPoints(np.array([2]), scene.corners_map[2:3], np.array([0.01]))
+    here = replace(scene.problem, control=control)
+    poses = here.map_from_vehicle.copy()
+    poses[:, :2, 3] += utm
+    there = replace(
+        here, map_from_vehicle=poses, control=replace(control, points_map=control.points_map + utm)
+    )
+    near, far = solve(here, options), solve(there, options)
+    assert far.status is near.status is Status.CONVERGED
+    assert far.evaluations == near.evaluations
+    np.testing.assert_allclose(far.corners_map - utm, near.corners_map, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(far.cam_from_vehicle, near.cam_from_vehicle, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(
+        far.map_from_vehicle[:, :2, 3] - utm, near.map_from_vehicle[:, :2, 3], rtol=0, atol=1e-7
+    )
+    groups = np.arange(here.corner_count)[:, None]
+    np.testing.assert_allclose(far.corner_covariance(groups), near.corner_covariance(groups), rtol=1e-4)
 
 
 def test_an_observation_behind_the_camera_is_reported():

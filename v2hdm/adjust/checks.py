@@ -8,8 +8,12 @@ from v2hdm.adjust.problem import LOSSES, POSE_STATES, SOLVERS, IntArray, Problem
 from v2hdm.errors import AdjustError
 from v2hdm.records import FloatArray
 
-# Observations whose covariances are checked at once.
+# Observations that are checked at once.
 _ROWS = 1 << 18
+# How symmetric a covariance must be, as a share of its diagonal: float32 is.
+_SYMMETRIC_TO = 1e-5
+# Tangent of the angle from a camera's axis beyond which nothing is seen on its plane: 89.9 degrees.
+_MAX_SLOPE = 573.0
 
 
 def check_problem(problem: Problem) -> None:
@@ -90,6 +94,9 @@ def check_options(options: SolveOptions) -> None:
         raise AdjustError(f"unknown solver {options.solver!r}: choose from {', '.join(SOLVERS)}")
     if not 0 < options.gate_probability < 1:
         raise AdjustError(f"gate_probability is {options.gate_probability}: give a share between 0 and 1")
+    for name in ("gap_tolerance", "max_refreshes", "max_evaluations"):
+        if not getattr(options, name) > 0:
+            raise AdjustError(f"{name} is {getattr(options, name)}: give a number above 0")
     if not options.loss_scale > 0:
         raise AdjustError(f"loss_scale is {options.loss_scale}: give a number of standard deviations above 0")
 
@@ -106,12 +113,15 @@ def _check_shapes(problem: Problem) -> None:
         ("centre_sigma_m", problem.centre_sigma_m, (cameras, 3)),
         ("corners_start", problem.corners_start, (problem.corner_count, 2)),
         ("twist_vehicle", problem.twist_vehicle, (frames, 6)),
+        ("observations.camera", seen.camera, (count,)),
         ("observations.frame", seen.frame, (count,)),
         ("observations.corner", seen.corner, (count,)),
         ("observations.pinhole_px", seen.pinhole_px, (count, 2)),
         ("observations.covariance_px", seen.covariance_px, (count, 2, 2)),
     ]
     for name, values, shape in expected:
+        if values is not None and not isinstance(values, np.ndarray):
+            raise AdjustError(f"{name} is a {type(values).__name__}: give a numpy array")
         if values is not None and np.shape(values) != shape:
             raise AdjustError(f"{name} has shape {np.shape(values)}, expected {shape}")
     if count == 0:
@@ -121,6 +131,8 @@ def _check_shapes(problem: Problem) -> None:
         ("frame", seen.frame, frames),
         ("corner", seen.corner, problem.corner_count),
     ):
+        if not np.issubdtype(index.dtype, np.integer):
+            raise AdjustError(f"observations.{name} holds {index.dtype}: give whole numbers")
         wrong = np.flatnonzero((index < 0) | (index >= size))
         if len(wrong):
             raise AdjustError(
@@ -153,10 +165,13 @@ def _check_finite(problem: Problem) -> None:
 
 def _check_rigid(name: str, transforms: FloatArray) -> None:
     rotation = transforms[:, :3, :3]
-    off = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
+    off = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max((1, 2), initial=0.0)
     wrong = np.flatnonzero((off > 1e-6) | (np.linalg.det(rotation) < 0))
     if len(wrong):
         raise AdjustError(f"{name} {wrong[0]} is no rigid transform: its rotation is not orthonormal")
+    wrong = np.flatnonzero((transforms[:, 3] != [0, 0, 0, 1]).any(1))
+    if len(wrong):
+        raise AdjustError(f"{name} {wrong[0]} is no rigid transform: its last row is not 0, 0, 0, 1")
 
 
 def _check_observations(problem: Problem) -> None:
@@ -169,11 +184,24 @@ def _check_observations(problem: Problem) -> None:
         if len(unseen):
             raise AdjustError(f"{name} {unseen[0]} has no observation: leave it out of the problem")
     for begin in range(0, len(seen.corner), _ROWS):
-        covariance = seen.covariance_px[begin : begin + _ROWS]
+        part = slice(begin, begin + _ROWS)
+        covariance = seen.covariance_px[part]
         own, across = np.diagonal(covariance, axis1=1, axis2=2), covariance[:, 1, 0]
         wrong = np.flatnonzero(~((own[:, 0] > 0) & (own.prod(axis=1) > across**2)))
         if len(wrong):
             raise AdjustError(f"covariance_px of observation {begin + wrong[0]} is not positive definite")
+        uneven = np.abs(covariance[:, 0, 1] - across)
+        wrong = np.flatnonzero(uneven > _SYMMETRIC_TO * np.sqrt(own.prod(axis=1)))
+        if len(wrong):
+            raise AdjustError(f"covariance_px of observation {begin + wrong[0]} is not symmetric")
+        intrinsic = problem.intrinsic[seen.camera[part]]
+        aside = np.abs((seen.pinhole_px[part] - intrinsic[:, 2:]) / intrinsic[:, :2]).max(axis=1)
+        wrong = np.flatnonzero(aside > _MAX_SLOPE)
+        if len(wrong):
+            raise AdjustError(
+                f"pinhole_px of observation {begin + wrong[0]} lies {aside[wrong[0]]:.3g} focal lengths "
+                "from the principal point, where no camera looks: leave it out"
+            )
 
 
 def _check_priors(problem: Problem) -> None:

@@ -142,7 +142,8 @@ def descend(
         refreshes += 1
         done = (
             (final and gap <= tolerance and damping == 0)
-            or refreshes > max_refreshes
+            # Each step of Levenberg-Marquardt has a whitening of its own.
+            or (refreshes > max_refreshes and solver != "lm")
             or evaluations >= max_evaluations
         )
         if done or not progressing:

@@ -86,6 +86,10 @@ def minimise(
             break
         optimizer.step(closure)  # type: ignore[no-untyped-call]
         reached, reached_gradient = evaluate(u.detach())
+        if not bool(reached.isfinite()):
+            # A line search over a singular direction has run off; the point before it still stands.
+            u.data.copy_(recent[0][0])
+            break
         recent[:] = [(u.detach().clone(), reached, reached_gradient)]
         progress = float(best - reached)
         best, best_gradient = reached, reached_gradient

@@ -158,7 +158,8 @@ class SolveOptions:
         solver: ``lbfgs``, or ``lm`` (Schur-complement Levenberg-Marquardt) to cross-check.
         coarse: first solve a subset of steep rays, which converges from ten degrees away.
         gap_tolerance: stop when the predicted remaining decrease is this fraction of the cost.
-        max_refreshes: how often the problem is whitened anew at most.
+        max_refreshes: how often the problem is whitened anew at most; ``lm`` does so at each step, and is
+            limited by its evaluations alone.
         max_evaluations: of cost and gradient, over all refreshes.
         device: torch device to compute on.
     """

@@ -185,19 +185,17 @@ class ReducedSystem:
             for row, second in placed[n:]:
                 self._tiles[row, column].addmm_(parts[second].mT, parts[first], alpha=-1)
 
-    def factorise(
-        self, estimate: Estimate, damping: float, jitter: float
-    ) -> tuple[TiledCholesky, float] | None:
+    def factorise(self, estimate: Estimate, damping: float) -> tuple[TiledCholesky, float] | None:
         """Put it together and factorise; the factor takes its place.
 
-        ``damping`` is added to U's diagonal, ``jitter`` to that of the pivots, relative to them. Returns the
-        factor and the smallest pivot as a share of U's diagonal; None where S cannot be factorised.
+        ``damping`` is added to U's diagonal, relative to it. Returns the factor and the smallest pivot as a
+        share of U's diagonal; None where S cannot be factorised.
         """
         diagonal = [*self._add_frames(), self._add_cameras(estimate)]
         keys = [*((k, k) for k in range(self.plan.tile_count)), (TIP, TIP)]
         for key, values in zip(keys, diagonal, strict=True):
             self._tiles[key].diagonal().add_(values, alpha=damping)
-        factor = factorise_tiles(self._matrix, jitter)
+        factor = factorise_tiles(self._matrix)
         if factor is None:
             return None
         return factor, float((factor.pivots() / (1 + damping) / torch.cat(diagonal)).min())

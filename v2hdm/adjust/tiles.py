@@ -98,14 +98,12 @@ class TiledCholesky:
         panels: what stands below each, stacked, the tip's rows last.
         rows: which rows of the vector each panel acts on.
         tip: lower factor of the tip.
-        damping: relative diagonal that had to be added; above 0 the matrix was singular.
     """
 
     diagonal: tuple[Tensor, ...]
     panels: tuple[Tensor, ...]
     rows: tuple[Tensor, ...]
     tip: Tensor
-    damping: float
 
     @property
     def size(self) -> int:
@@ -141,16 +139,15 @@ class TiledCholesky:
         return out
 
 
-def factorise_tiles(matrix: TiledMatrix, damping: float = 0.0) -> TiledCholesky | None:
+def factorise_tiles(matrix: TiledMatrix) -> TiledCholesky | None:
     """Factorise, overwriting the matrix; None where it is not positive definite.
 
-    ``damping`` is added to the pivots' diagonal, relative to it. Right-looking: each column, once factorised,
-    is subtracted from those it couples to.
+    Right-looking: each column, once factorised, is subtracted from those it couples to.
     """
     rows = []
     for column, below in enumerate(matrix.pattern.below):
         own, panel = matrix.diagonal[column], matrix.panels[column]
-        if not _factorise_tile(own, damping):
+        if not _factorise_tile(own):
             return None
         panel.copy_(torch.linalg.solve_triangular(own, panel.mT, upper=False).mT)
         keys = (*below, TIP)
@@ -159,15 +156,13 @@ def factorise_tiles(matrix: TiledMatrix, damping: float = 0.0) -> TiledCholesky 
                 left, right = matrix.tiles[second, column], matrix.tiles[first, column]
                 matrix.tiles[second, first].addmm_(left, right.mT, alpha=-1)
         rows.append(_row_index(below, len(own), len(matrix.diagonal), len(matrix.tip), panel))
-    if not _factorise_tile(matrix.tip, damping):
+    if not _factorise_tile(matrix.tip):
         return None
-    return TiledCholesky(matrix.diagonal, matrix.panels, tuple(rows), matrix.tip, damping)
+    return TiledCholesky(matrix.diagonal, matrix.panels, tuple(rows), matrix.tip)
 
 
-def _factorise_tile(tile: Tensor, damping: float) -> bool:
+def _factorise_tile(tile: Tensor) -> bool:
     """Put a tile's lower factor in its place; whether there is one."""
-    if damping:
-        tile += torch.diag(damping * tile.diagonal().abs())
     factor, info = torch.linalg.cholesky_ex(tile)
     tile.copy_(factor)
     return int(info) == 0

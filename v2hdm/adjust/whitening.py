@@ -50,6 +50,7 @@ _WEIGHT_FLOOR = 1e-6
 # Below this a pivot is what rounding left of zero.
 _SINGULAR_PIVOT = 1e-13
 # What is added to a diagonal, relative to it, until it can be factorised; only a singular problem needs any.
+# A pivot is what elimination has left of it, and where that is rounding it says nothing of the size needed.
 _JITTER_STEPS = (0.0, 1e-12, 1e-9, 1e-6, 1e-3)
 
 
@@ -67,6 +68,7 @@ class Whitening:
         spread: how the pairs move with frames and cameras.
         reduced_factor: L_S.
         smallest_pivot: least share of an unknown's own information that the others leave it.
+        jitter: what had to be added to U's diagonal, relative to it, for there to be an L_S.
     """
 
     arrays: Arrays
@@ -80,11 +82,12 @@ class Whitening:
     spread: Spread
     reduced_factor: TiledCholesky
     smallest_pivot: float
+    jitter: float
 
     @property
     def is_singular(self) -> bool:
         """Whether the observations and priors leave a direction of the reduced unknowns free."""
-        return self.reduced_factor.damping > 0 or self.smallest_pivot < _SINGULAR_PIVOT
+        return self.jitter > 0 or self.smallest_pivot < _SINGULAR_PIVOT
 
     @property
     def size(self) -> int:
@@ -166,7 +169,7 @@ def factorise(
 def _try_factorise(
     arrays: Arrays, plan: Plan, estimate: Estimate, robust: Loss, damping: float, jitter: float
 ) -> Whitening | None:
-    """The whitening, if the diagonal with ``jitter`` added to it can be factorised."""
+    """The whitening, if the diagonal of the reduced part with ``jitter`` added to it can be factorised."""
     table, tally = pair_table(arrays, estimate), Tally(arrays)
     spread = Spread(pair_from_state(arrays, estimate), pair_from_clock(arrays, estimate))
     system, whitener, factors = ReducedSystem(arrays, plan, spread), Whitener(arrays, table), []
@@ -181,7 +184,7 @@ def _try_factorise(
         system.subtract(number, run, coupling(by_pair, by_corner), factors[-1])
         gradient = tally.by_corner[run.corners] + by_corner_priors(arrays, estimate, run.corners)
         whitener.add(Linear.at(run, view, weight), factors[-1], gradient)
-    factorised = system.factorise(estimate, damping, jitter)
+    factorised = system.factorise(estimate, damping + jitter)
     if factorised is None:
         return None
     reduced_factor, smallest_pivot = factorised
@@ -198,4 +201,5 @@ def _try_factorise(
         spread=spread,
         reduced_factor=reduced_factor,
         smallest_pivot=smallest_pivot,
+        jitter=jitter,
     )
