@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from v2hdm.adjust import (
     MODELS,
+    ControlPoints,
     Drift,
     KnownLengths,
     Observations,
@@ -26,11 +27,12 @@ from v2hdm.mapping.association.groups import Association, fuse_groups
 from v2hdm.mapping.association.merge import group_kinds
 from v2hdm.mapping.known_sizes import known_lengths
 from v2hdm.mapping.motion import vehicle_twists
-from v2hdm.mapping.options import MappingOptions, SizeOptions
+from v2hdm.mapping.options import MappingOptions, SizeOptions, SurveyOptions
 from v2hdm.mapping.sightings.backprojection import camera_centres
 from v2hdm.mapping.sightings.location import locate
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import Sightings
+from v2hdm.mapping.survey import control_points
 from v2hdm.records import BoolArray, Camera, FloatArray, PoseNoise
 
 IntArray = NDArray[np.int64]
@@ -51,7 +53,7 @@ class Model:
     """What a solve estimates and how much noise it reckons with beyond that of the corners.
 
     ``floor_px`` is added to every corner in quadrature, px; the sum is multiplied by ``variance_factor``.
-    ``sizes`` are those that the user knows.
+    ``sizes`` are those that the user knows, ``survey`` the corners.
     """
 
     pose_sigma: PoseSigma
@@ -59,6 +61,7 @@ class Model:
     solver: SolveOptions
     variance_factor: float = 1.0
     sizes: SizeOptions = field(default_factory=SizeOptions)
+    survey: SurveyOptions = field(default_factory=SurveyOptions)
 
 
 @dataclass(frozen=True)
@@ -120,7 +123,9 @@ def full_model(
         loss=options.loss, loss_scale=options.loss_scale, coarse=False, device=options.device
     )
     solver = with_model(solver, MODELS[poses])
-    return Model(pose_sigma, options.model_floor_px, solver, variance_factor, options.known_sizes)
+    return Model(
+        pose_sigma, options.model_floor_px, solver, variance_factor, options.known_sizes, options.survey
+    )
 
 
 def coarse_model(rig: Rig, pose_noise: PoseNoise, options: MappingOptions) -> Model:
@@ -178,9 +183,11 @@ def solve_bundle(
         covariance_px=model.variance_factor * covariance_px,
     )
     names = [sightings.cameras[c] for c in used.cameras]
+    lengths, control = _known(sightings, association, usable, rig, corner_index, model)
     problem = replace(
         _problem(sightings, rig, used, [cameras[name] for name in names], observations, model),
-        lengths=_known_lengths(sightings, association, usable, rig, corner_index, model.sizes),
+        lengths=lengths,
+        control=control,
     )
     solution = solve(problem, model.solver)
     return Bundle(
@@ -232,21 +239,28 @@ def _problem(
     )
 
 
-def _known_lengths(
+def _known(
     sightings: Sightings,
     association: Association,
     usable: BoolArray,
     rig: Rig,
     corner_index: IntArray,
-    sizes: SizeOptions,
-) -> KnownLengths | None:
-    """What the sizes of classes say about the corners; ``rig`` is good enough to tell length from width."""
-    if not sizes.by_class_m:
-        return None
+    model: Model,
+) -> tuple[KnownLengths | None, ControlPoints | None]:
+    """What sizes of classes and a survey say about the corners.
+
+    ``rig`` is good enough to tell length from width, and one corner from the next.
+    """
+    if not model.sizes.by_class_m and not model.survey.points_map:
+        return None, None
     located = locate(sightings, rig)
     located.valid[:] &= usable
     fused = fuse_groups(association, located, jitter_rad=0.0)
-    return known_lengths(sizes, group_kinds(association, sightings), fused.corners_map, corner_index)
+    kinds = group_kinds(association, sightings)
+    return (
+        known_lengths(model.sizes, kinds, fused.corners_map, corner_index),
+        control_points(model.survey, fused.corners_map, corner_index),
+    )
 
 
 def _observed_corners(

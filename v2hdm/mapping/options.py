@@ -93,6 +93,20 @@ class SizeOptions:
 
 
 @dataclass(kw_only=True)
+class SurveyOptions:
+    """Corners of markings that a survey has measured, as factors of the joint solve.
+
+    ``points_map`` are their x and y, m, in the frame of the recorded poses, as in ``[[3.21, 4.05]]``, known
+    up to ``sigma_m``. Each ties down the nearest corner of the map within ``reach_m``. Nothing else can tell
+    the drift of a receiver from the ground: no camera sees what moves the vehicle and its map alike.
+    """
+
+    points_map: list[list[float]] = field(default_factory=list)
+    sigma_m: float = 0.01
+    reach_m: float = 0.25
+
+
+@dataclass(kw_only=True)
 class MappingOptions:
     """Everything about the mapping but the solver's own settings.
 
@@ -119,6 +133,7 @@ class MappingOptions:
     acceptance: AcceptanceOptions = field(default_factory=AcceptanceOptions)
     lanes: LaneOptions = field(default_factory=LaneOptions)
     known_sizes: SizeOptions = field(default_factory=SizeOptions)
+    survey: SurveyOptions = field(default_factory=SurveyOptions)
 
 
 def check_options(options: MappingOptions) -> None:
@@ -140,6 +155,8 @@ def check_options(options: MappingOptions) -> None:
         "lanes.half_length_m": options.lanes.half_length_m,
         "known_sizes.sigma_m": options.known_sizes.sigma_m,
         "known_sizes.tolerance": options.known_sizes.tolerance,
+        "survey.sigma_m": options.survey.sigma_m,
+        "survey.reach_m": options.survey.reach_m,
     }
     if options.mode not in (BATCH, INCREMENTAL):
         raise ConfigError(f"mapping.mode is {options.mode!r}; choose {BATCH} or {INCREMENTAL}.")
@@ -151,6 +168,15 @@ def check_options(options: MappingOptions) -> None:
         if not value > 0:
             raise ConfigError(f"mapping.{key} is {value}; it must be greater than zero.")
     _check_sizes(options)
+    _check_survey(options)
+
+
+def _check_survey(options: MappingOptions) -> None:
+    for number, point in enumerate(options.survey.points_map):
+        if len(point) != 2 or not all(math.isfinite(value) for value in point):
+            raise ConfigError(f"mapping.survey.points_map[{number}] is {list(point)}; give x and y in m.")
+    if options.survey.points_map and options.mode == INCREMENTAL:
+        raise ConfigError(f"mapping.survey is of no use in mapping.mode={INCREMENTAL}; leave it out.")
 
 
 def _check_sizes(options: MappingOptions) -> None:

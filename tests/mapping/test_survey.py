@@ -1,0 +1,89 @@
+"""Corners that the user has surveyed: found in the map, and the map found by them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.mapping.scene import Scene, SceneOptions, make_scene
+from v2hdm.errors import ConfigError
+from v2hdm.mapping.methods import run_methods
+from v2hdm.mapping.optimise import Optimiser
+from v2hdm.mapping.options import MappingOptions, SurveyOptions
+from v2hdm.mapping.sightings.table import collect_sightings
+from v2hdm.mapping.sightings.views import views_of
+from v2hdm.mapping.survey import control_points
+from v2hdm.records import FloatArray
+
+SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+INDEX = np.array([[7, 8, -1, 9]])
+
+
+def found(points: list[list[float]]) -> dict[int, tuple[float, float]]:
+    control = control_points(SurveyOptions(points_map=points, reach_m=0.25), SQUARE[None], INDEX)
+    if control is None:
+        return {}
+    return {int(c): (x, y) for c, (x, y) in zip(control.corner, control.points_map.tolist(), strict=True)}
+
+
+def test_a_surveyed_point_is_of_the_nearest_corner_within_reach() -> None:
+    assert found([[0.1, 0.1], [0.9, 0.0]]) == {7: (0.1, 0.1), 8: (0.9, 0.0)}
+    assert found([[0.1, 0.1], [0.0, 0.05]]) == {7: (0.0, 0.05)}
+    assert found([[0.5, 0.5]]) == {}
+    assert found([[1.0, 1.0]]) == {}, "that corner is not part of the adjustment"
+    assert found([]) == {}
+
+
+def adjusted(scene: Scene, survey: SurveyOptions) -> FloatArray:
+    sightings = collect_sightings(scene.drive, scene.detections, ("front",))
+    options = MappingOptions(pose_model="full", survey=survey)
+    views, drive = views_of(scene.drive, ("front",)), scene.drive
+    optimiser = Optimiser(sightings, views, drive.cameras, drive.pose_noise, options)
+    corners = optimiser.run(optimiser.initial_tracks()).bundle.corners_map.reshape(-1, 2)
+    return corners[np.isfinite(corners).all(axis=1)]
+
+
+def mean_offset_m(corners_map: FloatArray, truth: FloatArray) -> float:
+    """How far the corners as a whole are off those of the truth that are nearest to them."""
+    apart = np.linalg.norm(corners_map[:, None] - truth[None], axis=-1)
+    off = corners_map - truth[apart.argmin(axis=1)]
+    return float(np.linalg.norm(np.median(off[apart.min(axis=1) < 0.2], axis=0)))
+
+
+def test_two_surveyed_corners_take_the_drift_of_the_receiver_out_of_the_map() -> None:
+    scene = make_scene(SceneOptions(seed=31, length_m=60.0, wild_rate=0.0, false_rate=0.0))
+    drifted = np.eye(4)
+    drifted[:2, 3] = 0.06, -0.05
+    images = [
+        replace(image, map_from_vehicle=drifted @ image.map_from_vehicle) for image in scene.drive.images
+    ]
+    noise = replace(
+        scene.drive.pose_noise, position_m=0.08, position_drift_m=0.078, position_drift_over_m=500.0
+    )
+    scene = replace(scene, drive=replace(scene.drive, images=images, pose_noise=noise))
+    truth = np.concatenate([marking.corners_map for marking in scene.markings])
+    alone = adjusted(scene, SurveyOptions())
+    assert mean_offset_m(alone, truth) > 0.06
+    middle = alone[np.argsort(alone[:, 0])[[len(alone) // 3, 2 * len(alone) // 3]]]
+    nearest = np.linalg.norm(middle[:, None] - truth[None], axis=-1).argmin(axis=1)
+    surveyed = adjusted(scene, SurveyOptions(points_map=truth[nearest].tolist(), sigma_m=0.005))
+    assert mean_offset_m(surveyed, truth) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("survey", "mode", "message"),
+    [
+        ({"points_map": [[1.0, 2.0, 3.0]]}, "batch", r"survey\.points_map\[0\]"),
+        ({"points_map": [[1.0, 2.0], [1.0, float("nan")]]}, "batch", r"survey\.points_map\[1\]"),
+        ({"sigma_m": 0.0}, "batch", r"survey\.sigma_m"),
+        ({"reach_m": -1.0}, "batch", r"survey\.reach_m"),
+        ({"points_map": [[1.0, 2.0]]}, "incremental", "incremental"),
+    ],
+)
+def test_a_survey_that_cannot_be_used_is_refused(survey: dict[str, object], mode: str, message: str) -> None:
+    scene = make_scene(SceneOptions(length_m=20.0))
+    options = MappingOptions(mode=mode, survey=SurveyOptions(**survey))  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=message):
+        run_methods(scene.drive, scene.detections, ("front",), options)
