@@ -23,7 +23,7 @@ _MIN_CHAIN = 3
 _CHAIN_ODDS = 0.0
 """Chains are made of crossings more likely than not; what is less likely may join a line that is known."""
 
-_LEAST_LOG_ODDS = -1.1
+LEAST_LOG_ODDS = -1.1
 """Of every four lines a little surer than this one is right; as many lines are missed as are false."""
 
 _MAX_RANGE_M = 60.0
@@ -95,7 +95,7 @@ def link_anchors(
     rows, points = _in_reach(rows, _crossings(rows, view, horizon), view)
     groups = [np.array(chain.index) for chain in _chains(rows)]
     points, on_paint = _with_paint(points, paint, view, horizon)
-    lines = find_lines(points, groups + on_paint, horizon, paint_step_m, _LEAST_LOG_ODDS)
+    lines = find_lines(points, groups + on_paint, view, horizon, paint_step_m, LEAST_LOG_ODDS)
     found = [lane for line in lines if (lane := _drawn(points, line, view, horizon)) is not None]
     return _identified(found, view)
 

@@ -11,9 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.lanes.curves import Evidence, Horizon
 from v2hdm.detection.lanes.points import IntArray, Line, LinePoints
 from v2hdm.detection.lanes.road import Road, find_road
+from v2hdm.detection.lanes.score import log_odds
 from v2hdm.detection.lanes.strands import boundaries
 from v2hdm.records import BoolArray, FloatArray
 
@@ -24,16 +26,14 @@ _GATE_PX = 16.0
 _DOUBTFUL = 1.0
 """Lines by so much in log odds less sure than is asked for may yet be a part of a better one."""
 
-_WEIGHTS = (0.436, 0.303, 0.349, 0.172)
-_OFFSET = -2.42
-_MOST_LOG_RATIO = 6.0
-"""Log odds of a line: by its best crossings' odds, log (1 + paint) and log length, m, and how much likelier
-it is along the road, a log ratio within that limit. A logistic regression on the lines of 310 renders; of the
-lines of others whose score is about 0.6, 0.8 and 0.9, so many are right too."""
-
 
 def find_lines(
-    points: LinePoints, groups: list[IntArray], horizon: Horizon, paint_step_m: float, least_log_odds: float
+    points: LinePoints,
+    groups: list[IntArray],
+    view: CameraView,
+    horizon: Horizon,
+    paint_step_m: float,
+    least_log_odds: float,
 ) -> list[Line]:
     """The lines through ``groups`` of points, best first, each with the stray crossings that lie on it."""
     if not groups:
@@ -44,24 +44,29 @@ def find_lines(
     slopes = points.slopes(groups)
     evidence = points.evidence(horizon, groups, slopes)
     _, along = road.judge(evidence)
-    believed = []
+    candidates = []
     for k, (group, log_ratio) in enumerate(zip(groups, along.tolist(), strict=True)):
         paint_m = paint_step_m * float(points.is_paint[group].sum())
-        log_odds = _log_odds(points, group, paint_m, log_ratio)
-        if log_odds > least_log_odds - _DOUBTFUL:
-            believed.append((log_odds, paint_m, k))
-    believed.sort(key=lambda found: -found[0])
+        own, prior = evidence[k : k + 1], road.drawn_by(log_ratio)
+        candidates.append(Line.through(group, own, horizon, prior, paint_m, log_ratio))
+    odds = log_odds(candidates, points, view)
+    believed = [k for k in np.argsort(-odds).tolist() if odds[k] > least_log_odds - _DOUBTFUL]
     free = ~points.is_paint
-    for *_, k in believed:
+    for k in believed:
         free[groups[k]] = False
     lines = []
-    for log_odds, paint_m, k in believed:
-        own, slope = evidence[k : k + 1], slopes[k : k + 1]
-        line = Line.through(groups[k], own, horizon, road.drawn_by(along[k]), log_odds, paint_m)
-        line = _gathered(points, line, own, slope, free, horizon)
+    for k in believed:
+        line = _gathered(points, candidates[k], evidence[k : k + 1], slopes[k : k + 1], free, horizon)
         free[line.perhaps] = False
         lines.append(line)
-    return [line for line in boundaries(points, lines, horizon) if line.log_odds > least_log_odds]
+    found = boundaries(points, lines, horizon)
+    # What was joined on the way, and that a line is two, tells of it too.
+    sure = [
+        replace(line, log_odds=odds)
+        for line, odds in zip(found, log_odds(found, points, view).tolist(), strict=True)
+        if odds > least_log_odds
+    ]
+    return sorted(sure, key=lambda line: -line.log_odds)
 
 
 def _join(evidence: Evidence, groups: list[IntArray], road: Road) -> list[IntArray]:
@@ -111,12 +116,3 @@ def _gathered(
         return line
     evidence = own + points.evidence(horizon, [perhaps], slope)
     return replace(line, curve=evidence.curve(line.prior, horizon.centre_px), perhaps=perhaps)
-
-
-def _log_odds(points: LinePoints, group: IntArray, paint_m: float, along_log_ratio: float) -> float:
-    """How sure it is that a group of points is a lane's line."""
-    crossings = np.sort(points.odds[group[~points.is_paint[group]]])
-    best = float(crossings[-3:].mean()) if len(crossings) else 0.0
-    length_m = float(np.linalg.norm(np.ptp(points.ground[group], axis=0)))
-    along = min(max(along_log_ratio, -_MOST_LOG_RATIO), _MOST_LOG_RATIO)
-    return float(np.dot(_WEIGHTS, (best, np.log1p(paint_m), np.log(length_m + 0.1), along)) + _OFFSET)

@@ -78,15 +78,17 @@ class LinePoints:
 class Line:
     """A line: its curve and the indices of the points that ``certain``ly and ``perhaps`` are on it.
 
-    ``prior`` is what the curve was drawn with; ``double`` lines are the middle of two.
+    ``prior`` is what the curve was drawn with, ``log_ratio`` how much likelier the line is along the road
+    than anyhow; there is ``paint_m`` of paint on it. ``double`` lines are the middle of two.
     """
 
     curve: Curve
     certain: IntArray
     perhaps: IntArray
-    log_odds: float
     paint_m: float
     prior: Prior
+    log_ratio: float
+    log_odds: float = 0.0
     double: bool = False
 
     @property
@@ -101,9 +103,9 @@ class Line:
         evidence: Evidence,
         horizon: Horizon,
         prior: Prior,
-        log_odds: float,
         paint_m: float,
+        log_ratio: float,
     ) -> Line:
         """The line that a group of points, of such evidence, suggests."""
         none = np.empty(0, dtype=np.int64)
-        return cls(evidence.curve(prior, horizon.centre_px), certain, none, log_odds, paint_m, prior)
+        return cls(evidence.curve(prior, horizon.centre_px), certain, none, paint_m, prior, log_ratio)

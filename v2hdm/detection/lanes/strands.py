@@ -12,7 +12,7 @@ from v2hdm.detection.lanes.points import Line, LinePoints
 from v2hdm.records import BoolArray, FloatArray
 
 _ONE_LINE_M = 0.12
-_DOUBLE_LINE_M = 0.75
+_DOUBLE_LINE_M = 0.6
 """Curves nearer than the first are one line; nearer than the second, the two lines of a double one."""
 
 _PARALLEL_M = 0.15
@@ -23,7 +23,7 @@ _LEAST_PAINT_SHARE = 0.3
 """Each has so much paint, and this share of the better one's."""
 
 _LEAST_OUTSIDE = 0.5
-_CARRIED_ON_M = 0.3
+_CARRIED_ON_M = 0.5
 """A line that repeats another one but for this share of its rows carries that on, if it is so near."""
 
 _CROSSING_M = 0.3
@@ -88,7 +88,7 @@ def _carried_on(points: LinePoints, line: Line, more: Line, horizon: Horizon) ->
     certain = np.concatenate([line.certain, more.certain])
     evidence = points.evidence(horizon, [certain], points.slopes([certain]))
     paint_m = line.paint_m + more.paint_m
-    whole = Line.through(certain, evidence, horizon, line.prior, line.log_odds, paint_m)
+    whole = Line.through(certain, evidence, horizon, line.prior, paint_m, line.log_ratio)
     perhaps, row = np.concatenate([line.perhaps, more.perhaps]), points.points_px[:, 1]
     return replace(whole, perhaps=perhaps[~np.isin(row[perhaps], row[certain])])
 
