@@ -5,9 +5,9 @@
 Run it after another network was put in place. Quadrilaterals that the detector proposes on rendered scenes,
 first two thirds of full difficulty, then a third of easy ones, are true if they overlap a marking of their
 class by half, and false where the quality benchmark would say so; a logistic regression with a weak ridge
-tells them apart. Its seed is neither that of the quality benchmark nor one of training. Printed: what each
-feature adds to the log odds per standard deviation, and the log loss on the images of each fifth by weights
-that were fitted to the others.
+tells them apart, one for each shape. Its seed is neither that of the quality benchmark nor one of training.
+Printed: what each feature adds to the log odds per standard deviation, and the log loss on the images of each
+fifth by weights that were fitted to the others.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from tests.benchmarks.detector_quality import Example, example, polygon_overlap
-from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, confidence
+from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, SHAPES, confidence, shape_of
 from v2hdm.detection.corners.evidence import FEATURES
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
@@ -35,9 +35,10 @@ FOLDS = 5
 
 @dataclass
 class Gathered:
-    """Evidence of N quadrilaterals, which of them are true, and the images that they are from."""
+    """Evidence of N quadrilaterals, their classes, which of them are true, and the images they are from."""
 
     evidence: list[FloatArray] = field(default_factory=list)
+    kind: list[str] = field(default_factory=list)
     true: list[bool] = field(default_factory=list)
     image: list[int] = field(default_factory=list)
 
@@ -45,7 +46,7 @@ class Gathered:
         """What the detector proposes in one image."""
         rows: list[FloatArray] = []
 
-        def spy(evidence: FloatArray) -> FloatArray:
+        def spy(evidence: FloatArray, _kinds: list[str]) -> FloatArray:
             rows.extend(evidence)
             return np.ones(len(evidence))
 
@@ -55,6 +56,7 @@ class Gathered:
             true = is_true(shown, marking)
             if true is not None:
                 self.evidence.append(row)
+                self.kind.append(marking.kind)
                 self.true.append(true)
                 self.image.append(index)
 
@@ -85,10 +87,9 @@ def fit(evidence: FloatArray, true: BoolArray) -> tuple[FloatArray, float]:
     return weights, float(solution[-1] - mean @ weights)
 
 
-def log_loss(evidence: FloatArray, true: BoolArray, weights: FloatArray, bias: float) -> float:
-    """Mean of minus the log probability of what is the case."""
-    odds = np.where(true, 1.0, -1.0) * (evidence @ weights + bias)
-    return float(np.log1p(np.exp(-odds)).mean())
+def log_loss(odds: FloatArray, true: BoolArray) -> float:
+    """Mean of minus the log probability of what is the case, from log odds (N,)."""
+    return float(np.log1p(np.exp(-np.where(true, 1.0, -1.0) * odds)).mean())
 
 
 def main() -> None:
@@ -106,21 +107,35 @@ def main() -> None:
     for count, difficulty in ((parsed.images - easy, 1.0), (easy, EASY)):
         for index in range(count):
             gathered.add(index, example(index, difficulty, SEED), detector)
-    evidence, true = np.array(gathered.evidence), np.array(gathered.true)
-    weights, bias = fit(evidence, true)
-    fold = np.array(gathered.image) % FOLDS
-    losses = [
-        log_loss(evidence[fold == k], true[fold == k], *fit(evidence[fold != k], true[fold != k]))
-        for k in range(FOLDS)
-    ]
-    print(f"{true.sum()} true, {(~true).sum()} false in {parsed.images} images")
-    for name, weight, deviation in zip(FEATURES, weights, evidence.std(axis=0), strict=True):
-        print(f"{name:16s} {weight * deviation:+.2f}")
-    old = -np.log(np.where(true, confidence(evidence), 1 - confidence(evidence))).mean()
-    print(f"log loss of images left out {np.mean(losses):.3f}; of the weights so far {old:.3f}")
+    print(f"{sum(gathered.true)} of {len(gathered.true)} true, in {parsed.images} images")
+    fitted = fit_shapes(gathered)
     if parsed.write:
-        fitted = dict(zip(FEATURES, weights.round(4).tolist(), strict=True))
-        CONFIDENCE_FILE.write_text(json.dumps({"bias": round(bias, 4), "weights": fitted}, indent=1) + "\n")
+        CONFIDENCE_FILE.write_text(json.dumps(fitted, indent=1) + "\n")
+
+
+def fit_shapes(gathered: Gathered) -> dict[str, object]:
+    """What ``confidence.json`` is to hold; prints weights and losses."""
+    evidence, true = np.array(gathered.evidence), np.array(gathered.true)
+    shape, fold = np.array([shape_of(kind) for kind in gathered.kind]), np.array(gathered.image) % FOLDS
+    fitted: dict[str, object] = {}
+    effect, left_out = {}, np.zeros(len(true))
+    for name in SHAPES:
+        mine = shape == name
+        weights, bias = fit(evidence[mine], true[mine])
+        effect[name] = weights * evidence[mine].std(axis=0)
+        named = dict(zip(FEATURES, weights.round(4).tolist(), strict=True))
+        fitted[name] = {"bias": round(bias, 4), "weights": named}
+        for k in range(FOLDS):
+            others, these = mine & (fold != k), mine & (fold == k)
+            weights, bias = fit(evidence[others], true[others])
+            left_out[these] = evidence[these] @ weights + bias
+    print(f"{'':16s} " + " ".join(f"{name:>9s}" for name in SHAPES))
+    for row, name in enumerate(FEATURES):
+        print(f"{name:16s} " + " ".join(f"{effect[shape][row]:+9.2f}" for shape in SHAPES))
+    so_far = confidence(evidence, gathered.kind)
+    print(f"log loss of images left out {log_loss(left_out, true):.3f}; ", end="")
+    print(f"of the weights so far {log_loss(np.log(so_far / (1 - so_far)), true):.3f}")
+    return fitted
 
 
 if __name__ == "__main__":

@@ -8,12 +8,13 @@ import pytest
 
 from tests.benchmarks.detector_confidence import fit
 from tests.detection.pictures import bar, brightness_model, diamond, make_camera, picture, to_image
-from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, confidence
+from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, SHAPES, confidence
 from v2hdm.detection.corners.evidence import FEATURES, Steps, grey_steps
 from v2hdm.detection.corners.grey import linear_grey
 from v2hdm.detection.corners.quad import order_corners
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, STOP_LINE
 
 
 def steps_of(image: np.ndarray, corners_px: np.ndarray) -> Steps:
@@ -79,11 +80,17 @@ def test_a_round_soft_fleck_is_improbable_where_a_diamond_is_not(tmp_path, x):
 
 def test_the_fitted_weights_are_those_of_the_features_and_prefer_evidence():
     fitted = json.loads(CONFIDENCE_FILE.read_text())
-    assert set(fitted["weights"]) == set(FEATURES)
-    none, all_around = np.zeros((2, 1, len(FEATURES)))
-    all_around[0, FEATURES.index("support")] = 1.0
-    all_around[0, FEATURES.index("odds_inside")] = 5.0
-    assert 0 <= confidence(none)[0] < confidence(all_around)[0] <= 1
+    assert set(fitted) == set(SHAPES)
+    kinds = [DIAMOND, LANE_DASH, STOP_LINE, CROSSWALK_BAR]
+    none, all_around = np.zeros((2, len(kinds), len(FEATURES)))
+    all_around[:, FEATURES.index("odds_inside")] = 5.0
+    for name in ("certainty", "share", "four_corners", "support", "weakest_side", "sharpness"):
+        all_around[:, FEATURES.index(name)] = 1.0
+    for shape in SHAPES:
+        assert set(fitted[shape]["weights"]) == set(FEATURES)
+    assert (confidence(none, kinds) < confidence(all_around, kinds)).all()
+    first, second = confidence(all_around, kinds)[2:]
+    assert first == second, "bars of any class are judged alike"
 
 
 def test_the_fit_of_the_weights_finds_those_that_made_the_data():

@@ -27,6 +27,7 @@ from v2hdm.records import (
     DIAMOND,
     LANE_CLASSES,
     LANE_DASH,
+    LANE_LINE,
     OTHER_PAINT,
     OUTLINED_CLASSES,
     Camera,
@@ -186,7 +187,9 @@ def _is_among(symbol: MarkingDetection, quads: list[MarkingDetection]) -> bool:
 
 def _claim(blob: Blob, kind: str) -> Claim:
     certainty = sum(blob.class_score.values())
-    return Claim(certainty, blob.class_score.get(kind, 0.0) / max(certainty, 1e-9), blob.touches_symbol)
+    share = {name: score / max(certainty, 1e-9) for name, score in blob.class_score.items()}
+    symbols = sum(share.get(name, 0.0) for name in (*OUTLINED_CLASSES, OTHER_PAINT))
+    return Claim(certainty, share.get(kind, 0.0), share.get(LANE_LINE, 0.0), symbols, blob.touches_symbol)
 
 
 def _check_image(image_bgr: np.ndarray, camera: Camera) -> None:

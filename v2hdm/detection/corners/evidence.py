@@ -14,35 +14,37 @@ from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.corners.grey import GreyBand
 from v2hdm.detection.corners.quad import preceding, side_frames, width
-from v2hdm.records import DIAMOND, LANE_DASH, BoolArray, FloatArray
+from v2hdm.records import BoolArray, FloatArray
 
 FEATURES = (
     "odds_inside",
     "certainty",
     "share",
+    "line_share",
+    "symbol_share",
     "touches_symbol",
     "four_corners",
     "support",
     "contrast",
+    "weakest_side",
     "sharpness",
     "goes_on",
+    "goes_furthest_on",
+    "at_border",
     "log_width_px",
     "log_length",
     "log_width",
-    "dash",
-    "bar",
-    "dash_share",
-    "dash_log_width",
-    "dash_at_border",
-    "diamond_skew",
+    "skew",
 )
 """Names of the columns of :func:`gather`, in order.
 
-From the network: mean log odds of paint inside, mean probability of paint over the blob, the class's share
-of it, and whether the blob was split off an arrow or a letter. From the image: whether it gave four corners,
-the share of profiles across the sides that show paint inside, the log of the typical step, how much of that
-is within a px of the side, how far the steps go on beyond the corners, the log of the width in px. On the
-ground, in metres: log of length and width, and what differs between classes."""
+From the network: mean log odds of paint inside, mean probability of paint over the blob, the shares in it of
+the class, of lane lines and of symbols, and whether the blob was split off an arrow or a letter. From the
+image: whether it gave four corners, the share of profiles across the sides that show paint inside, the log of
+the typical step, the step of the weakest side in parts of that, how much of it is within a px of the side,
+how far the steps go on beyond the corners, on the whole and where they do so furthest, whether a corner is at
+the image's border, the log of the width in px. On the ground, in metres: log of length and width, and of how
+much longer the longest side is than the shortest."""
 
 _PROFILES = 12
 _FAR_PX = 2.0
@@ -70,10 +72,16 @@ _BORDER_PX = 6.0
 
 @dataclass(frozen=True)
 class Claim:
-    """What the network claims of a blob: ``certainty`` that it is paint, ``share`` of its class in that."""
+    """What the network claims of a blob: ``certainty`` that it is paint, and what classes share in that.
+
+    ``share`` is the class's own, ``line_share`` that of lane lines, ``symbol_share`` that of arrows, chevrons
+    and other paint.
+    """
 
     certainty: float
     share: float
+    line_share: float
+    symbol_share: float
     touches_symbol: bool
 
 
@@ -136,18 +144,16 @@ def gather(
     foreground: Foreground,
     view: CameraView,
     corners_px: FloatArray,
-    kinds: list[str],
     claims: list[Claim],
     valid: BoolArray,
 ) -> FloatArray:
-    """The :data:`FEATURES` (M, F) of quadrilaterals ``corners_px`` (M, 4, 2) of classes ``kinds``.
+    """The :data:`FEATURES` (M, F) of quadrilaterals ``corners_px`` (M, 4, 2).
 
     Args:
         steps: what the image shows across their sides.
         foreground: what the network says of the image.
         view: the camera.
         corners_px: recorded px.
-        kinds: class of each.
         claims: what the network claims of each one's blob.
         valid: (M, 4) which corners the image gave.
     """
@@ -156,31 +162,31 @@ def gather(
     log_sides = np.log(np.clip(np.nan_to_num(sides, nan=1.0), 0.01, 100.0))
     log_width = np.log(np.clip(sides[:, :2].mean(axis=1), 0.01, 100.0))
     log_length = np.log(np.clip(sides[:, 2:].mean(axis=1), 0.01, 100.0))
-    dash, diamond = (np.array([kind == name for kind in kinds]) for name in (LANE_DASH, DIAMOND))
     typical = np.maximum(steps.typical, _LEAST_STEP)
-    share = np.array([claim.share for claim in claims])
     good = steps.along > np.maximum(_SUPPORT_SHARE * typical, _LEAST_STEP)[:, None, None]
+    by_side = np.median(steps.along, axis=2) / typical[:, None]
     near = np.median(steps.near.reshape(len(corners_px), -1), axis=1)
+    going_on = np.median(steps.going_on(), axis=3)
     at_border = ~view.inside(corners_px.reshape(-1, 2), _BORDER_PX).reshape(-1, 4).all(axis=1)
     columns = {
         "odds_inside": foreground.odds_at(_inner_grid(corners_px)).mean(axis=1),
         "certainty": np.array([claim.certainty for claim in claims]),
-        "share": share,
+        "share": np.array([claim.share for claim in claims]),
+        "line_share": np.array([claim.line_share for claim in claims]),
+        "symbol_share": np.array([claim.symbol_share for claim in claims]),
         "touches_symbol": np.array([claim.touches_symbol for claim in claims]),
         "four_corners": valid.all(axis=1),
         "support": good.mean(axis=(1, 2)),
         "contrast": np.log(typical),
+        "weakest_side": np.clip(by_side.min(axis=1), -1.0, 1.5),
         "sharpness": np.clip(near / typical, 0.0, 1.2),
-        "goes_on": np.median(steps.going_on(), axis=3).mean(axis=(1, 2)),
+        "goes_on": going_on.mean(axis=(1, 2)),
+        "goes_furthest_on": going_on.max(axis=(1, 2)),
+        "at_border": at_border,
         "log_width_px": np.log(np.maximum(width(corners_px), 0.3)),
         "log_length": log_length,
         "log_width": log_width,
-        "dash": dash,
-        "bar": ~dash & ~diamond,
-        "dash_share": dash * share,
-        "dash_log_width": np.where(dash, log_width, 0.0),
-        "dash_at_border": dash & at_border,
-        "diamond_skew": diamond * np.minimum(log_sides[:, 3] - log_sides[:, 0], 2.0),
+        "skew": np.minimum(log_sides[:, 3] - log_sides[:, 0], 2.0),
     }
     return np.nan_to_num(np.column_stack([columns[name] for name in FEATURES]).astype(np.float64))
 
