@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.lanes.points import Line, LinePoints
-from v2hdm.records import FloatArray
+from v2hdm.detection.lanes.points import IntArray, Line, LinePoints
+from v2hdm.records import BoolArray, FloatArray
 
 SCORE_FILE = Path(__file__).with_name("score.json")
 
@@ -50,35 +50,58 @@ def log_odds(lines: Sequence[Line], points: LinePoints, view: CameraView) -> Flo
 
 def evidence(lines: Sequence[Line], points: LinePoints, view: CameraView) -> FloatArray:
     """What speaks for N lines (N, F), in the order of :data:`FEATURES`."""
-    rows = points.points_px[:, 1]
-    likely = np.sort(rows[~points.is_paint & (points.odds > 0)])
-    return np.array([_evidence(line, points, likely, view) for line in lines]).reshape(-1, len(FEATURES))
-
-
-def _evidence(line: Line, points: LinePoints, likely_rows: FloatArray, view: CameraView) -> list[float]:
-    """One line's; ``likely_rows`` are those of the image's likely crossings, ascending."""
-    members = line.certain
+    if not lines:
+        return np.empty((0, len(FEATURES)))
+    members = np.concatenate([line.certain for line in lines])
+    count = np.array([len(line.certain) for line in lines])
+    begins = np.cumsum(count) - count
     is_paint, odds = points.is_paint[members], points.odds[members]
-    crossings, paint = np.sort(odds[~is_paint]), odds[is_paint]
-    at_px = points.points_px[members]
-    low, high = at_px.min(axis=0), at_px.max(axis=0)
-    size_px = high - low
-    between = np.searchsorted(likely_rows, high[1], side="right") - np.searchsorted(likely_rows, low[1])
-    others = max(int(between) - int((crossings > 0).sum()), 0)
-    ground = points.ground[members]
-    return [
-        float(crossings[-_BEST:].mean()) if len(crossings) else 0.0,
-        float(np.log(np.hypot(*np.ptp(ground, axis=0)) + 0.1)),
-        float(np.log(np.hypot(*size_px) / view.info.width + 0.005)),
-        float(np.log(size_px[1] / view.info.width + 0.005)),
-        min(max(line.log_ratio, -_MOST_LOG_RATIO), _MOST_LOG_RATIO),
-        float(np.log(view.range_m(ground).min() + 0.1)),
-        float(len(paint) > 0),
-        float(paint.max()) if len(paint) else 0.0,
-        float(points.is_solid[members][is_paint].mean()) if len(paint) else 0.0,
-        float(np.log1p(others / (size_px[1] / _ROW_STEP_PX + 1))),
-        float(line.double),
-    ]
+    at_px, ground = points.points_px[members], points.ground[members]
+    low_px, high_px = np.minimum.reduceat(at_px, begins), np.maximum.reduceat(at_px, begins)
+    size_m = np.maximum.reduceat(ground, begins) - np.minimum.reduceat(ground, begins)
+    size = (high_px - low_px) / view.info.width
+    paint = np.add.reduceat(is_paint.astype(np.float64), begins)
+    solid = np.add.reduceat(points.is_solid[members].astype(np.float64), begins)
+    paint_odds = np.maximum.reduceat(np.where(is_paint, odds, -np.inf), begins)
+    ratio = np.array([line.log_ratio for line in lines])
+    columns = (
+        _best_crossings(np.where(is_paint, -np.inf, odds), begins, count),
+        np.log(np.hypot(*size_m.T) + 0.1),
+        np.log(np.hypot(*size.T) + 0.005),
+        np.log(size[:, 1] + 0.005),
+        np.clip(ratio, -_MOST_LOG_RATIO, _MOST_LOG_RATIO),
+        np.log(np.minimum.reduceat(view.range_m(ground), begins) + 0.1),
+        paint > 0,
+        np.where(paint > 0, paint_odds, 0.0),
+        solid / np.maximum(paint, 1),
+        np.log1p(_beside(points, is_paint, odds, begins, low_px[:, 1], high_px[:, 1])),
+        np.array([line.double for line in lines]),
+    )
+    return np.column_stack(columns).astype(np.float64)
+
+
+def _best_crossings(odds: FloatArray, begins: IntArray, count: IntArray) -> FloatArray:
+    """Mean log odds (N,) of the surest crossings of each line, 0 where it has none; paint's are -inf."""
+    order = np.lexsort((-odds, np.repeat(np.arange(len(count)), count)))
+    first = begins[:, None] + np.minimum(np.arange(_BEST), count[:, None] - 1)
+    best = odds[order[first]]
+    there = np.isfinite(best) & (np.arange(_BEST) < count[:, None])
+    return np.asarray(np.where(there, best, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1))
+
+
+def _beside(
+    points: LinePoints,
+    is_paint: BoolArray,
+    odds: FloatArray,
+    begins: IntArray,
+    low: FloatArray,
+    high: FloatArray,
+) -> FloatArray:
+    """Likely crossings a row (N,) that lie beside each line, on rows from ``low`` to ``high`` (N,) px."""
+    rows = np.sort(points.points_px[~points.is_paint & (points.odds > 0), 1])
+    between = np.searchsorted(rows, high, side="right") - np.searchsorted(rows, low)
+    own = np.add.reduceat((~is_paint & (odds > 0)).astype(np.float64), begins)
+    return np.asarray(np.maximum(between - own, 0) / ((high - low) / _ROW_STEP_PX + 1))
 
 
 @cache
