@@ -119,16 +119,22 @@ def make_scene(
     max_range_m: float = 15.0,
     min_views: int = 2,
     noise_seed: int | None = None,
+    driven: np.ndarray | None = None,
+    mounts: np.ndarray | None = None,
 ) -> Scene:
     """A street whose recorded poses are off by ``jitter`` and whose start is off as stated.
 
     Corners seen fewer than ``min_views`` times are left out. ``noise_seed`` draws other noise on the same
-    street; that of pixels and survey is then the same whether poses are disturbed or not.
+    street; that of pixels and survey is then the same whether poses are disturbed or not. ``driven``
+    (J, 4, 4), ``map_from_vehicle``, takes the place of the route, ``mounts`` (C, 4, 4) that of the cameras.
     """
     rng = np.random.default_rng(seed)
-    truth = np.stack([mounted(1.5, 2.4, 18), mounted(-1.0, 2.6, 22, rear=True, y=0.2)])[:cameras]
-    truth = exp(np.concatenate([np.zeros((cameras, 3)), rng.normal(0, 0.02, (cameras, 3))], 1)) @ truth
-    recorded = route(frames, step_m, turn_deg_per_m, straight_m)
+    if mounts is None:
+        mounts = np.stack([mounted(1.5, 2.4, 18), mounted(-1.0, 2.6, 22, rear=True, y=0.2)])[:cameras]
+    cameras = len(mounts)
+    truth = exp(np.concatenate([np.zeros((cameras, 3)), rng.normal(0, 0.02, (cameras, 3))], 1)) @ mounts
+    recorded = route(frames, step_m, turn_deg_per_m, straight_m) if driven is None else driven
+    frames = len(recorded)
     corners = diamonds(recorded, every_m, rng)
     pose_rng = rng
     if noise_seed is not None:
