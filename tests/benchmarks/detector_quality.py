@@ -38,7 +38,7 @@ from v2hdm.records import (
 )
 from v2hdm.simulate.render.renderer import Rendered, Renderer
 from v2hdm.simulate.render.scene import Scene
-from v2hdm.simulate.training.scenes import image_points, random_scene
+from v2hdm.simulate.training.scenes import image_line, image_points, random_scene
 from v2hdm.simulate.training.views import TrainingView, random_view
 
 SEED = 771_000_003
@@ -98,8 +98,9 @@ def example(index: int, difficulty: float = 1.0, seed: int = SEED) -> Example:
     view = random_view(rng, WIDTH, HEIGHT)
     rendered = Renderer(scene).render(view.info, view.cam_from_map, rng, view.optics, view.motion)
     camera = _camera(view)
-    seen = [lane for lane in lanes if len(image_points(view, lane)) > 1]
-    lanes_px = [image_points(view, lane) for lane in seen]
+    lines_px = [image_line(view, lane) for lane in lanes]
+    seen = [lane for lane, line_px in zip(lanes, lines_px, strict=True) if len(line_px) > 1]
+    lanes_px = [line_px for line_px in lines_px if len(line_px) > 1]
     lanes_shown = [_shows(lane, view, rendered) for lane in seen]
     return Example(rendered.image, camera, _markings(scene, view, rendered), lanes_px, lanes_shown)
 

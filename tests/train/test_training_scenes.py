@@ -8,13 +8,13 @@ import pytest
 from train.config import DataConfig
 from train.data import RenderStream, validation_pairs
 from v2hdm.detection.camera.lens import undistort_points
-from v2hdm.records import LANE_CLASSES, PAINT_CLASSES
-from v2hdm.simulate.render.optics import Optics
+from v2hdm.records import LANE_CLASSES, PAINT_CLASSES, CameraInfo
+from v2hdm.simulate.render.optics import Motion, Optics
 from v2hdm.simulate.render.scene import Light
 from v2hdm.simulate.training.hardships import Hardships, blue_shade, overexposed, with_pavements, with_seams
 from v2hdm.simulate.training.paint import Bend, rectangle, rhombus
-from v2hdm.simulate.training.scenes import random_scene, training_sample
-from v2hdm.simulate.training.views import looking, random_view
+from v2hdm.simulate.training.scenes import image_line, image_points, random_scene, training_sample
+from v2hdm.simulate.training.views import TrainingView, looking, random_view
 
 TINY = DataConfig(width=64, height=32, render_width=80, render_height=48, views_per_render=2, reservoir=3)
 
@@ -173,3 +173,37 @@ def test_overexposed_optics_expose_longer_within_reason() -> None:
     assert min(levels) == 0.2
     assert 0.6 < max(levels) <= 0.9
     assert 15 < sum(level > 0.2 for level in levels) < 45
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients"),
+    [("plumb_bob", (-0.16, 0.024, 0.0, 0.0, 0.0)), ("plumb_bob", (0.0,) * 5), ("equidistant", (0.0,) * 4)],
+)
+def test_a_line_is_followed_to_the_borders_of_the_image(model: str, coefficients: tuple[float, ...]) -> None:
+    """Points of a strong lens's image that a pinhole would see far outside of it belong to it, too."""
+    intrinsic = np.array([[500.0, 0.0, 640.0], [0.0, 500.0, 260.0], [0.0, 0.0, 1.0]])
+    info = CameraInfo("wide", 1280, 720, intrinsic, model, coefficients)
+    cam_from_map = looking(np.array([0.0, 0.0, 1.4]), 0.0, 0.1, 0.0)
+    view = TrainingView(info, cam_from_map, Optics(), Motion())
+    along = np.arange(-4.0, 50.0, 0.5)
+    for left in (-1.2, 0.0, 0.9):
+        line = image_line(view, np.column_stack([along, np.full(len(along), left)]))
+        assert line[:, 1].max() > 719
+        inside = line[line[:, 1] < 720]
+        assert np.abs(np.diff(inside, axis=0)).max() < 110, (
+            "a step of half a metre would be most of the image"
+        )
+        u, v = (undistort_points(info, line) - intrinsic[:2, 2]).T / 500
+        on_ground = np.column_stack([u, v, np.ones(len(u))]) @ cam_from_map[:3, :3]
+        on_ground *= 1.4 / -on_ground[:, 2:]
+        np.testing.assert_allclose(on_ground[:, 1], left, atol=0.02)
+
+
+def test_what_a_folding_lens_would_show_twice_is_not_in_the_image() -> None:
+    intrinsic = np.array([[300.0, 0.0, 320.0], [0.0, 300.0, 100.0], [0.0, 0.0, 1.0]])
+    info = CameraInfo("folding", 640, 360, intrinsic, "plumb_bob", (-0.3, 0.0, 0.0, 0.0, 0.0))
+    view = TrainingView(info, looking(np.array([0.0, 0.0, 1.4]), 0.0, 0.0, 0.0), Optics(), Motion())
+    points = np.column_stack([np.linspace(0.4, 30, 200), np.full(200, 0.3)])
+    pixels = image_points(view, points)
+    assert 0 < len(pixels) < 200
+    assert (np.diff(pixels[:, 1]) < 0).all(), "farther along a line is farther up"

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.detection.camera.lens import distort_points
+from v2hdm.detection.camera.lens import distort_points, undistort_points
 from v2hdm.records import FloatArray
 from v2hdm.simulate.render.renderer import Renderer
 from v2hdm.simulate.render.scene import Backdrop, Bgr, Dapple, Ground, Light, Scene, Shadow
@@ -30,6 +30,8 @@ from v2hdm.simulate.training.views import TrainingView, random_view
 
 # The renderer keeps one tile per fleck size, so sizes come from a short list.
 _NEAR_M = 0.3
+_STEPS_BETWEEN = 5
+_LENS_TOLERANCE_PX = 1.0
 _FLECK_SIZES_M = tuple(float(s) for s in np.geomspace(0.12, 2.5, 10))
 
 
@@ -73,20 +75,43 @@ def training_sample(
     scene = _without_hidden_boxes(scene, view)
     optics = overexposed(rng.spawn(1)[0], view.optics, hardships.overexposed)
     rendered = Renderer(scene).render(view.info, view.cam_from_map, rng, optics, view.motion)
-    seen = (image_points(view, lane) for lane in lanes)
+    seen = (image_line(view, lane) for lane in lanes)
     lanes_px = tuple(lane for lane in seen if len(lane) > 1)
     return TrainingSample(rendered.image, rendered.labels, rendered.hidden, lanes_px)
 
 
 def image_points(view: TrainingView, points_map: FloatArray) -> FloatArray:
-    """Recorded pixels (M, 2), in order, of those ground points (N, 2, map) that lie before the camera."""
+    """Recorded pixels (M, 2), in order, of the ground points (N, 2, map) in and about the image."""
+    return _in_image(view, points_map)[0]
+
+
+def image_line(view: TrainingView, line_map: FloatArray) -> FloatArray:
+    """Recorded pixels (M, 2) of a line (N, 2, map), from near to far, as far as it is in and about the image.
+
+    Its corners are half a metre apart, which may be half an image near the camera, so it is followed in
+    shorter steps. Of a line that leaves and comes back it is the longest part.
+    """
+    corners = np.arange(len(line_map))
+    steps = np.linspace(0, len(line_map) - 1, (len(line_map) - 1) * _STEPS_BETWEEN + 1)
+    fine = np.column_stack([np.interp(steps, corners, line_map[:, axis]) for axis in (0, 1)])
+    pixels, index = _in_image(view, fine)
+    parts = np.split(pixels, np.flatnonzero(np.diff(index) > 1) + 1)
+    return max(parts, key=len)
+
+
+def _in_image(view: TrainingView, points_map: FloatArray) -> tuple[FloatArray, NDArray[np.intp]]:
+    """Recorded pixels (M, 2) of the points (N, 2, map) in and about the image, and which they are."""
     cam = points_map @ view.cam_from_map[:3, :2].T + view.cam_from_map[:3, 3]
-    cam = cam[cam[:, 2] > _NEAR_M]
-    pinhole = (cam @ view.info.intrinsic.T)[:, :2] / cam[:, 2:]
-    # Far outside the image the lens polynomial folds back.
+    index = np.flatnonzero(cam[:, 2] > _NEAR_M)
+    pinhole = (cam[index] @ view.info.intrinsic.T)[:, :2] / cam[index, 2:]
+    pixels = distort_points(view.info, pinhole)
     reach = np.array([view.info.width, view.info.height])
-    near = ((pinhole > -0.5 * reach) & (pinhole < 1.5 * reach)).all(axis=1)
-    return distort_points(view.info, pinhole[near])
+    about = ((pixels > -0.5 * reach) & (pixels < 1.5 * reach)).all(axis=1)
+    index, pinhole, pixels = index[about], pinhole[about], pixels[about]
+    # Far outside the image the lens polynomial folds back into it.
+    back = undistort_points(view.info, pixels)
+    told = np.linalg.norm(back - pinhole, axis=1) < _LENS_TOLERANCE_PX
+    return pixels[told], index[told]
 
 
 def random_scene(
