@@ -103,11 +103,13 @@ def _report(
     seen = _seen(problem, whitening)
     scale = noise_scale(seen.mahalanobis2)
     variance = _variance_factors(arrays, terms, seen.mahalanobis2, scale)
+    corners_map = _unsorted(estimate.corners_map, arrays.corner_order)
+    corners_map += origin_map
     return Solution(
         status=_status(descent, options, bool(seen.behind.any())),
         cam_from_vehicle=estimate.cam_from_vehicle.cpu().numpy(),
         map_from_vehicle=_adjusted_poses(problem, arrays, estimate),
-        corners_map=_unsorted(estimate.corners_map, arrays.corner_order) + origin_map,
+        corners_map=corners_map,
         residual_px=seen.residual_px,
         mahalanobis2=seen.mahalanobis2,
         verdict=judge(problem.observations, seen.mahalanobis2, seen.behind, options.gate_probability, scale),
