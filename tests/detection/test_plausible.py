@@ -51,3 +51,9 @@ def test_short_lane_paint_is_tried_as_a_dash_and_shorter_paint_as_a_diamond() ->
     assert tried_as(STRIP, scores) == LANE_DASH
     assert tried_as(bar(8.0, 0.0, 0.6, 0.15), scores) == DIAMOND
     assert tried_as(STRIP, {LANE_LINE: 0.9, LANE_DASH: 0.02}) is None
+
+
+def test_what_is_too_long_for_a_dash_is_tried_as_several_if_the_network_says_dash() -> None:
+    long = bar(14.0, 0.0, 16.0, 0.15)
+    assert tried_as(long, {LANE_DASH: 0.9, LANE_LINE: 0.05}) == LANE_DASH
+    assert tried_as(long, {LANE_DASH: 0.3, LANE_LINE: 0.6}) is None

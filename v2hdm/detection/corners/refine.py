@@ -6,11 +6,12 @@ undisturbed profiles; far ones are fitted as a whole, which still works when the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.corners.both_sides import painted_parts
 from v2hdm.detection.corners.confidence import confidence
 from v2hdm.detection.corners.edge_fit import EdgeFit, fit_edges
 from v2hdm.detection.corners.evidence import Claim, gather, grey_steps
@@ -20,7 +21,7 @@ from v2hdm.detection.corners.outline_fit import fit_outlines
 from v2hdm.detection.corners.quad import is_convex, side_frames, width
 from v2hdm.detection.corners.quad_fit import fit_quads, unbow_corners
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.records import BoolArray, FloatArray, MarkingDetection
+from v2hdm.records import LANE_DASH, BoolArray, FloatArray, MarkingDetection
 
 TYPICAL_BLUR_PX = 0.75
 """Point spread of a focused camera, pixel aperture included: what is assumed until it is measured."""
@@ -42,6 +43,9 @@ _BLOOM_SIGMA_PX = 0.5
 _MAX_OUTLINE_SIGMA_PX = 2.0
 _MAX_OUTLINE_GAP_PX = 4.0
 """Corners of the outline are this far from those of the image at most where it is the marking's."""
+_OWN_END_PX = 3.0
+"""The stretch of a piece that ends this near to the piece's own end has not been cut there."""
+
 _CLOSURE_TOLERANCE = 0.02
 _MAX_CLOSURE_CHI2 = 9.0
 _U = np.arange(0, 8, 2)
@@ -90,10 +94,13 @@ def fit_markings(
     """
     if not starts:
         return []
-    start = np.stack([s.corners_pinhole_px for s in starts])
-    blobs = np.array([s.blob for s in starts])
-    start_px = view.distort(start.reshape(-1, 2)).reshape(start.shape)
+    start, start_px = _stacked(starts, view)
     grey = _grey_around(image_bgr, view, start_px, foreground)
+    starts = _without_tails(starts, grey, foreground, view, options.max_range_m)
+    if not starts:
+        return []
+    start, start_px = _stacked(starts, view)
+    blobs = np.array([s.blob for s in starts])
     near = _is_near(start)
     found = _Corners(
         start_px,
@@ -126,6 +133,48 @@ def fit_markings(
         for m, kind in enumerate(kinds)
         if score[m] >= options.min_confidence
     ]
+
+
+def _stacked(starts: list[QuadStart], view: CameraView) -> tuple[FloatArray, FloatArray]:
+    """Corners (M, 4, 2) of all starts, pinhole and recorded px."""
+    start = np.stack([s.corners_pinhole_px for s in starts])
+    return start, view.distort(start.reshape(-1, 2)).reshape(start.shape)
+
+
+def _without_tails(
+    starts: list[QuadStart], grey: GreyBand, foreground: Foreground, view: CameraView, max_range_m: float
+) -> list[QuadStart]:
+    """The starts, where dashes run on without paint in the grey with what is paint of them, and in range."""
+    dashes = [m for m, start in enumerate(starts) if start.kind == LANE_DASH]
+    if not dashes:
+        return starts
+    corners = np.stack([starts[m].corners_pinhole_px for m in dashes])
+    parts = painted_parts(grey, foreground, view, corners)
+    if not parts:
+        return starts
+    stay = set(range(len(starts))) - {dashes[d] for d in parts}
+    found = [starts[m] for m in sorted(stay)]
+    for d, quads in parts.items():
+        near = [q for q in quads if is_convex(q) and view.range_m(view.ground(q).mean(axis=0)) <= max_range_m]
+        found += [_cut(starts[dashes[d]], quad) for quad in near]
+    return found
+
+
+def _cut(start: QuadStart, corners: FloatArray) -> QuadStart:
+    """The stretch ``corners`` (4, 2) of a start; of its outline what lies beside that.
+
+    Where it is cut there is no outline, so that only the image can give its corners.
+    """
+    first, last = corners[[0, 3]].mean(axis=0), corners[[1, 2]].mean(axis=0)
+    length_px = max(float(np.linalg.norm(last - first)), 1e-9)
+    along_px, own_px = (
+        (points - first) @ (last - first) / length_px
+        for points in (start.outline_pinhole_px, start.corners_pinhole_px)
+    )
+    low_px, high_px = np.sort(own_px).reshape(2, 2).mean(axis=1)
+    keep = (along_px > 0) | (low_px > -_OWN_END_PX)
+    keep &= (along_px < length_px) | (high_px < length_px + _OWN_END_PX)
+    return replace(start, corners_pinhole_px=corners, outline_pinhole_px=start.outline_pinhole_px[keep])
 
 
 def _is_near(corners: FloatArray) -> BoolArray:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.corners.both_sides import LONGEST_DASH_M
 from v2hdm.detection.paint.blobs import Blob
 from v2hdm.records import (
     ARROW,
@@ -28,7 +29,7 @@ from v2hdm.records import (
 
 _SIZE_LIMITS_M: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     DIAMOND: ((0.25, 5.0), (0.1, 3.0)),
-    LANE_DASH: ((0.7, 12.0), (0.03, 0.8)),
+    LANE_DASH: ((0.7, LONGEST_DASH_M), (0.03, 0.8)),
     LANE_LINE: ((0.3, np.inf), (0.03, np.inf)),
     STOP_LINE: ((0.8, 25.0), (0.12, 1.2)),
     CROSSWALK_BAR: ((0.8, 10.0), (0.15, 1.2)),
@@ -43,6 +44,9 @@ _DASH_LENGTH_M = 7.5
 _DASH_SHARE = 0.25
 """A piece of lane paint that ends at both sides, no longer than that, is a dash even if the network
 gives only this share of its lane score to dashes: seen locally, dash and line are the same paint."""
+
+_SURE_DASH_SHARE = 0.5
+"""With more than this share what is too long for one dash is tried as several."""
 
 _LEAST_DASH_SHARE = 0.08
 """With this share a whole piece of that length is tried as a dash: its four sides must show it to be one."""
@@ -84,20 +88,23 @@ def cornered_kind(blob: Blob, outline_vehicle: FloatArray, kind: str, view: Came
     """The class as which a blob, taken for ``kind``, is tried as a quadrilateral; None for none.
 
     Short lane paint that ends at both sides may be a dash although the network says line, or, if shorter than
-    any dash, a slim diamond: seen locally they are alike. What the network takes for an arrow or a chevron
-    may be what it thinks next likely: its shape and the image will tell.
+    any dash, a slim diamond: seen locally they are alike. What the network takes for a dash but is too long
+    is several, or one that runs on along something else, and what it takes for an arrow or a chevron may be
+    what it thinks next likely: its shape and the image will tell.
     """
     if kind in CORNERED_CLASSES:
         return kind
     length_m, width_m = _ground_size(outline_vehicle)
     if kind in OUTLINED_CLASSES:
         return _second_choice(blob, length_m, width_m) if is_whole(blob, view) else None
+    lane_score = sum(blob.class_score.get(name, 0.0) for name in LANE_CLASSES)
+    if length_m > LONGEST_DASH_M and blob.class_score.get(LANE_DASH, 0.0) > _SURE_DASH_SHARE * lane_score:
+        return LANE_DASH
     if not is_whole(blob, view) or not length_m <= _DASH_LENGTH_M:
         return None
     if length_m < _SIZE_LIMITS_M[LANE_DASH][0][0]:
         kind, _ = _likeliest_compact(blob.class_score)
         return kind if kind in CORNERED_CLASSES and _fits(kind, length_m, width_m) else None
-    lane_score = sum(blob.class_score.get(name, 0.0) for name in LANE_CLASSES)
     dash = blob.class_score.get(LANE_DASH, 0.0) >= _LEAST_DASH_SHARE * lane_score
     return LANE_DASH if dash and _fits(LANE_DASH, length_m, width_m) else None
 
@@ -172,7 +179,7 @@ def _likeliest(class_score: dict[str, float], short: bool) -> tuple[str, float]:
     if best_other and others[best_other] >= lane_score:
         return best_other, others[best_other]
     dash_share = class_score.get(LANE_DASH, 0.0) / max(lane_score, 1e-9)
-    return (LANE_DASH if dash_share > (_DASH_SHARE if short else 0.5) else LANE_LINE), lane_score
+    return (LANE_DASH if dash_share > (_DASH_SHARE if short else _SURE_DASH_SHARE) else LANE_LINE), lane_score
 
 
 def _likeliest_compact(class_score: dict[str, float]) -> tuple[str, float]:
