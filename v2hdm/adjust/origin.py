@@ -10,14 +10,24 @@ from v2hdm.adjust.problem import Problem
 from v2hdm.records import FloatArray
 
 
+_NEAR_M = 10_000.0
+"""Coordinates of this size are known to a picometre, and moving them would cost memory for nothing."""
+
+
 def nearby_origin(problem: Problem) -> FloatArray:
-    """A point (2,) of the map in the middle of the recorded poses; whole metres, so that shifts are exact."""
+    """A point (2,) of the map by the recorded poses: its origin, or their middle where that is far from it.
+
+    It is in whole metres, so that shifts are exact.
+    """
     position = problem.map_from_vehicle[:, :2, 3]
-    return np.asarray(np.round((position.min(0) + position.max(0)) / 2))
+    middle = np.round((position.min(0) + position.max(0)) / 2)
+    return np.asarray(middle if np.abs(middle).max() > _NEAR_M else np.zeros(2))
 
 
 def shifted(problem: Problem, by_m: FloatArray) -> Problem:
     """``problem`` on a map whose points all are moved by ``by_m`` (2,)."""
+    if not by_m.any():
+        return problem
     poses = problem.map_from_vehicle.copy()
     poses[:, :2, 3] += by_m
     start, control = problem.corners_start, problem.control
