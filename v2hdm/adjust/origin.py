@@ -9,7 +9,6 @@ import numpy as np
 from v2hdm.adjust.problem import Problem
 from v2hdm.records import FloatArray
 
-
 _NEAR_M = 10_000.0
 """Coordinates of this size are known to a picometre, and moving them would cost memory for nothing."""
 
