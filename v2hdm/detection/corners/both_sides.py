@@ -106,6 +106,7 @@ def painted_parts(
         and 3 are one end. What is longer than any dash and holds no shorter one has none. Those that are
         missing show paint all over, or nothing that is surely none.
     """
+    grey = grey.at_limit()
     across = _look_across(grey, foreground, view, corners_pinhole_px)
     good, bad = _judge(across)
     step_m = across.step_m
@@ -170,7 +171,7 @@ def _look_across(grey: GreyBand, foreground: Foreground, view: CameraView, corne
     inside = np.broadcast_to(_INSIDE, (*reach.shape, len(_INSIDE)))
     place = np.concatenate([-beside[..., ::-1], inside, 1 + beside], axis=-1)
     points = first[:, :, None] + place[..., None] * step[:, :, None]
-    values = grey.at_limit().sample(points.reshape(-1, place.shape[-1], 2)).reshape(place.shape)
+    values = grey.sample(points.reshape(-1, place.shape[-1], 2)).reshape(place.shape)
     logs = np.log(np.maximum(values, 0) + np.float32(_DARK))
     odds = foreground.odds_at(first + step / 2)
     step_px = long_px / _STATIONS
