@@ -16,7 +16,7 @@ from v2hdm.detection.corners.quad import (
     signed_area,
     width,
 )
-from v2hdm.detection.paint.blobs import find_blobs, outline_polygon, zero_crossings
+from v2hdm.detection.paint.blobs import Blob, find_blobs, outline_polygon, zero_crossings
 from v2hdm.detection.paint.plausible import Heads, ends_at_a_head
 from v2hdm.detection.sight import Sight
 from v2hdm.records import PAINT_CLASSES
@@ -127,6 +127,14 @@ def test_the_outline_polygon_of_an_arrow_encloses_its_cells():
     area_px = cv2.contourArea(polygon.astype(np.float32))
     assert area_px == pytest.approx(4 * np.count_nonzero(labels), rel=0.06)
     np.testing.assert_allclose(polygon.min(axis=0), [2 * 13.5 + 0.5, 50 + 2 * 9.5 + 0.5], atol=0.6)
+
+
+def test_paint_that_is_hardly_any_has_an_outline_too():
+    level = np.full((5, 9), -6.0, dtype=np.float32)
+    level[2, 2:7] = 1e-3
+    polygon = outline_polygon(Blob({"arrow": 0.6}, level, np.array([10.0, 20.0]), 2, np.zeros((0, 2))))
+    np.testing.assert_allclose(np.ptp(polygon, axis=0), [10.0, 2.0], atol=0.6)
+    np.testing.assert_allclose((polygon.min(axis=0) + polygon.max(axis=0)) / 2, [18.0, 24.0], atol=0.3)
 
 
 def test_a_diamond_that_touches_a_line_is_split_from_it():

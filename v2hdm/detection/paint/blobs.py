@@ -259,6 +259,10 @@ def zero_crossings(level: np.ndarray) -> FloatArray:
 def outline_polygon(blob: Blob) -> FloatArray:
     """The soft outline as a closed polygon (N, 2) in recorded px, to a fifth of an element."""
     fine = cv2.resize(blob.level, None, fx=_OUTLINE_SCALE, fy=_OUTLINE_SCALE, interpolation=cv2.INTER_LINEAR)
+    if np.count_nonzero(fine > 0) < _OUTLINE_SCALE**2:  # hardly paint, and none between the cells' centres
+        fine = cv2.resize(
+            blob.level, None, fx=_OUTLINE_SCALE, fy=_OUTLINE_SCALE, interpolation=cv2.INTER_NEAREST
+        )
     contours, _ = cv2.findContours((fine > 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     longest = max(contours, key=len)
     polygon = cv2.approxPolyDP(longest, 0.2 * _OUTLINE_SCALE, closed=True).reshape(-1, 2)
