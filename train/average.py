@@ -1,0 +1,74 @@
+"""The door: `python -m train.average runs/b/last.pt runs/a/last.pt --output runs/mean.pt`.
+
+The mean of the weights of runs that went on from each other often does better than any of them: what each
+learnt is kept, what each came to by chance is averaged out (Izmailov et al., "Averaging Weights Leads to
+Wider Optima and Better Generalization", UAI 2018; Wortsman et al., "Model soups", ICML 2022). Of runs that
+started apart the mean is nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from train.checkpoint import Checkpoint, fresh_checkpoint, load_checkpoint, save_checkpoint
+from train.config import DataConfig, TrainConfig
+from train.growth import recorded_net
+from v2hdm.errors import ConfigError, V2hdmError
+
+
+def mean_checkpoint(
+    first: Path, others: Sequence[Path], weights: Sequence[float] | None = None
+) -> Checkpoint:
+    """A checkpoint with the mean of the averaged weights of several.
+
+    Args:
+        first: The checkpoint whose settings the mean has.
+        others: Checkpoints or exported files of the same network, or of one that can grow into it.
+        weights: What each counts, first to last; all alike by default.
+
+    Raises:
+        ConfigError: A file cannot be read, holds another network, or the weights are not one for each.
+    """
+    shares = list(weights) if weights is not None else [1.0] * (1 + len(others))
+    if len(shares) != 1 + len(others) or min(shares) < 0 or not sum(shares) > 0:
+        raise ConfigError(
+            f"{len(shares)} weights for {1 + len(others)} files: give one for each, none below 0"
+        )
+    mean = load_checkpoint(first)
+    asked = TrainConfig(net=recorded_net(mean.config["net"]), data=DataConfig(**mean.config["data"]))
+    states = [mean.averaged] + [fresh_checkpoint(replace(asked, start=str(path))).averaged for path in others]
+    mean.averaged = {
+        name: sum(s * state[name].double() for s, state in zip(shares, states, strict=True))
+        .div(sum(shares))
+        .to(value.dtype)
+        if value.is_floating_point()
+        else value
+        for name, value in mean.averaged.items()
+    }
+    mean.model, mean.optimizer, mean.metrics = mean.averaged, {}, {}
+    return mean
+
+
+def main() -> None:
+    """Write the mean of checkpoints."""
+    about = "Average the weights of runs that went on from each other."
+    parser = argparse.ArgumentParser(prog="python -m train.average", description=about)
+    parser.add_argument("checkpoint", nargs="+", type=Path, help="the first gives the settings")
+    parser.add_argument("--weights", type=float, nargs="+", help="what each counts; all alike by default")
+    parser.add_argument("--output", type=Path, required=True)
+    parsed = parser.parse_args()
+    try:
+        mean = mean_checkpoint(parsed.checkpoint[0], parsed.checkpoint[1:], parsed.weights)
+    except V2hdmError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    save_checkpoint(mean, parsed.output)
+    print(f"{parsed.output}: the mean of {len(parsed.checkpoint)}")
+
+
+if __name__ == "__main__":
+    main()
