@@ -14,9 +14,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+
 from train.checkpoint import Checkpoint, fresh_checkpoint, load_checkpoint, save_checkpoint
 from train.config import DataConfig, TrainConfig
+from train.data import validation_pairs
 from train.growth import recorded_net
+from train.loop import metrics
+from train.metrics import Tally
+from train.targets import Targets
 from v2hdm.errors import ConfigError, V2hdmError
 
 
@@ -40,7 +46,10 @@ def mean_checkpoint(
         )
     mean = load_checkpoint(first)
     asked = TrainConfig(net=recorded_net(mean.config["net"]), data=DataConfig(**mean.config["data"]))
-    states = [mean.averaged] + [fresh_checkpoint(replace(asked, start=str(path))).averaged for path in others]
+    states = [mean.averaged]
+    for path in others:
+        torch.manual_seed(mean.config["seed"])  # what a smaller network grows by is drawn as that run drew it
+        states.append(fresh_checkpoint(replace(asked, start=str(path))).averaged)
     mean.averaged = {
         name: sum(s * state[name].double() for s, state in zip(shares, states, strict=True))
         .div(sum(shares))
@@ -51,6 +60,16 @@ def mean_checkpoint(
     }
     mean.model, mean.optimizer, mean.metrics = mean.averaged, {}, {}
     return mean
+
+
+@torch.inference_mode()
+def scored(checkpoint: Checkpoint) -> dict[str, float]:
+    """What a checkpoint's averaged weights score on the validation renders of its own settings."""
+    config, net, tally = checkpoint.config, checkpoint.network(), Tally()
+    images = config["validation"]["images"]
+    for image, targets in validation_pairs(DataConfig(**config["data"]), config["seed"], images):
+        tally.add(net(image[None]), Targets(*(target[None] for target in targets)))
+    return metrics(tally.score())
 
 
 def main() -> None:
@@ -66,8 +85,9 @@ def main() -> None:
     except V2hdmError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
+    mean.metrics = scored(mean)
     save_checkpoint(mean, parsed.output)
-    print(f"{parsed.output}: the mean of {len(parsed.checkpoint)}")
+    print(f"{parsed.output}: the mean of {len(parsed.checkpoint)}, mean IoU {mean.metrics['mean_iou']:.3f}")
 
 
 if __name__ == "__main__":
