@@ -5,16 +5,17 @@
 Run it after another network was put in place. Quadrilaterals that the detector proposes on rendered scenes,
 first two thirds of full difficulty, then a third of easy ones, are true if they overlap a marking of their
 class by half, and false where the quality benchmark would say so; a logistic regression with a weak ridge
-tells them apart, one for each shape. Its seed is neither that of the quality benchmark nor one of training.
-Printed: what each feature adds to the log odds per standard deviation, and the log loss on the images of each
-fifth by weights that were fitted to the others.
+tells them apart, one for each shape. Each scene is looked at as on the vehicle and as in the mapping. Its
+seed is neither that of the quality benchmark nor one of training. Printed: what each feature adds to the log
+odds per standard deviation, and the log loss on the images of each fifth by weights that were fitted to the
+others.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from unittest.mock import patch
 
 import cv2
@@ -101,12 +102,14 @@ def main() -> None:
     parsed = parser.parse_args()
     cv2.setNumThreads(1)
     options = DetectorOptions(model=parsed.model, max_range_m=24.0, min_confidence=0.0)
-    detector = Detector.load(options=options)
+    detectors = [Detector.load(options=replace(options, mirrored=twice)) for twice in (False, True)]
     gathered = Gathered()
     easy = parsed.images // 3
     for count, difficulty in ((parsed.images - easy, 1.0), (easy, EASY)):
         for index in range(count):
-            gathered.add(index, example(index, difficulty, SEED), detector)
+            shown = example(index, difficulty, SEED)
+            for detector in detectors:
+                gathered.add(index, shown, detector)
     print(f"{sum(gathered.true)} of {len(gathered.true)} true, in {parsed.images} images")
     fitted = fit_shapes(gathered)
     if parsed.write:

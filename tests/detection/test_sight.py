@@ -8,7 +8,7 @@ from v2hdm.detection import sight as sight_module
 from v2hdm.detection.camera.ground import ipm_from_extrinsic
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.network import Network, NetworkOutput
-from v2hdm.detection.sight import look
+from v2hdm.detection.sight import Sight, look
 from v2hdm.records import Camera, CameraInfo
 
 
@@ -75,3 +75,34 @@ def test_the_parts_cover_the_band_whatever_the_image_size(tmp_path, width, heigh
     sight = look(Network(brightness_model(tmp_path)), np.zeros((height, width, 3), dtype=np.uint8), view)
     assert sight.paint.shape == (-(-view.height // 2), -(-width // 2))
     assert sight.kinds.shape[1:] == (-(-view.height // 4), -(-width // 4))
+
+
+def looked_at(image: np.ndarray, mirrored: bool) -> Sight:
+    """What the shipped network says of an image, looked at whole."""
+    view = CameraView(large_camera(image.shape[1], image.shape[0]))
+    view.fine_row = None
+    return look(Network(), image, view, mirrored)
+
+
+def test_with_its_mirror_image_the_network_says_the_same_of_both_sides():
+    """A law that no network has by itself: the answer to a mirror image is the mirrored answer."""
+    image = picture(large_camera(), [diamond(6.0, 1.0), diamond(8.0, -1.5)])
+    direct, mirrored = looked_at(image, True), looked_at(image[:, ::-1].copy(), True)
+    np.testing.assert_allclose(mirrored.paint[:, ::-1], direct.paint, atol=1e-4)
+    np.testing.assert_allclose(mirrored.kinds[..., ::-1], direct.kinds, atol=1e-4)
+    columns = [[np.sort(row.u_px) for row in sight.anchors] for sight in (direct, mirrored)]
+    for there, here in zip(*columns, strict=True):
+        np.testing.assert_allclose(np.sort(image.shape[1] - 1 - here), there, atol=1e-3)
+    once = looked_at(image, False)
+    assert np.abs(looked_at(image[:, ::-1].copy(), False).paint[:, ::-1] - once.paint).max() > 0.1
+
+
+@pytest.mark.parametrize("width", [1280, 1242, 1271])
+def test_the_mirror_image_moves_nothing_whatever_the_width(width):
+    image = picture(large_camera(width, 720), [diamond(6.0, 1.0), diamond(8.0, -1.5)])
+    once, twice = looked_at(image, False), looked_at(image, True)
+    assert (twice.paint.shape, twice.kinds.shape) == (once.paint.shape, once.kinds.shape)
+    both, either = ((once.paint > 0) & (twice.paint > 0)).sum(), ((once.paint > 0) | (twice.paint > 0)).sum()
+    assert both / either > 0.93
+    centres = [np.argwhere(sight.paint > 0).mean(axis=0) for sight in (once, twice)]
+    np.testing.assert_allclose(*centres, atol=0.3)

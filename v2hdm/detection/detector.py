@@ -94,7 +94,7 @@ class Detector:
         _check_image(image_bgr, camera)
         info = self.network.info
         with lap("net"):
-            sight = look(self.network, image_bgr, view)
+            sight = look(self.network, image_bgr, view, self.options.mirrored)
         reach_px = self._reach_px[camera.info.name]
         with lap("blobs"):
             blobs, owner = find_blobs(sight, info.classes, info.paint_stride, view.top, reach_px)

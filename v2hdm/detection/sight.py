@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.network import Network
+from v2hdm.detection.network import Network, NetworkOutput
 from v2hdm.records import FloatArray
 
 _OVERLAP_PX = 64
@@ -21,6 +21,9 @@ _OVERLAP_PX = 64
 
 _GRID_PX = 16
 """Where the parts are joined is on the grid of all outputs; the network's own multiple may be larger."""
+
+_MIRRORED = np.array([1.0, -1.0], dtype=np.float32)[:, None, None]
+"""What a lane's answer (2, h, w), log odds and offset, becomes in the mirror."""
 
 _LEAST_LOG_ODDS = -3.0
 """Crossings of lanes' lines less likely than this are left out; unlikely ones help to follow a known line."""
@@ -52,17 +55,21 @@ class Sight:
         return float(self.paint.shape[1] / self.kinds.shape[2])
 
 
-def look(network: Network, image_bgr: np.ndarray, view: CameraView) -> Sight:
-    """Run the network on the rows of an image (H, W, 3) that show ground in reach."""
+def look(network: Network, image_bgr: np.ndarray, view: CameraView, mirrored: bool = False) -> Sight:
+    """Run the network on the rows of an image (H, W, 3) that show ground in reach.
+
+    ``mirrored`` asks it of the mirror image, too, and takes the mean of both answers.
+    """
     band = image_bgr[view.top : view.top + view.height]
+    ask = _answer_twice if mirrored else _answer
     seam = _seam_row(network, view)
     if seam is None:
-        output = network.run(band)
+        output = ask(network, band)
         return Sight(output.paint, output.kinds, _anchor_rows(output.lanes, network, view.top, 1))
-    far = network.run(band[: seam + _OVERLAP_PX])
+    far = ask(network, band[: seam + _OVERLAP_PX])
     near_top = seam - _OVERLAP_PX
     half = cv2.resize(band[near_top:], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    near = network.run(half)
+    near = ask(network, half)
     far_rows = [row for row in _anchor_rows(far.lanes, network, view.top, 1) if row.v_px < view.top + seam]
     near_rows = _anchor_rows(near.lanes, network, view.top + near_top, 2)
     near_rows = [row for row in near_rows if row.v_px >= view.top + seam]
@@ -71,6 +78,26 @@ def look(network: Network, image_bgr: np.ndarray, view: CameraView) -> Sight:
         for name, stride in (("paint", network.info.paint_stride), ("kinds", network.info.kind_stride))
     )
     return Sight(paint, kinds, near_rows + far_rows)
+
+
+def _answer(network: Network, image_bgr: np.ndarray) -> NetworkOutput:
+    return network.run(image_bgr)
+
+
+def _answer_twice(network: Network, image_bgr: np.ndarray) -> NetworkOutput:
+    """The mean of what the network says of an image (H, W, 3) and of its mirror image."""
+    width, info = image_bgr.shape[1], network.info
+    # Only whole elements have mirror images on the same grid.
+    padded = cv2.copyMakeBorder(image_bgr, 0, 0, 0, -width % info.multiple, cv2.BORDER_REPLICATE)
+    one, other = network.run(padded), network.run(np.ascontiguousarray(padded[:, ::-1]))
+    paint = (one.paint + other.paint[:, ::-1]) / 2
+    kinds = (one.kinds + other.kinds[..., ::-1]) / 2
+    (odds, offset), (odds_too, offset_too) = one.lanes, other.lanes[..., ::-1] * _MIRRORED
+    # Where a line crosses a cell only that answer knows that sees it cross.
+    weight = 1 / (1 + np.exp(np.clip(odds_too - odds, -30, 30)))
+    lanes = np.stack([(odds + odds_too) / 2, weight * offset + (1 - weight) * offset_too])
+    columns = [-(-width // stride) for stride in (info.paint_stride, info.kind_stride, info.lane_stride)]
+    return NetworkOutput(*(a[..., :n] for a, n in zip((paint, kinds, lanes), columns, strict=True)))
 
 
 def _seam_row(network: Network, view: CameraView) -> int | None:
