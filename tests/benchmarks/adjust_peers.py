@@ -33,6 +33,9 @@ from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.start import back_project
 
 SCIPY_LIMIT = 120_000
+CERES_POSES_LIMIT = 400_000
+"""Of a million observations' frame poses CHOLMOD finds the matrix not positive, over and over for minutes."""
+
 """Observations above which SciPy takes minutes: its steps solve the whole system iteratively."""
 
 PAPER = SolveOptions(pose_states=(), loss="none", coarse=False)
@@ -156,6 +159,7 @@ def solved(problem: Problem, threads: int) -> Iterator[Row]:
     yield replace(row, same_model=False)
     if not ABSENT:
         yield ceres(problem, CeresOptions(threads=threads), "ceres")
+    if not ABSENT and len(problem.observations.corner) <= CERES_POSES_LIMIT:
         row = ceres(states, CeresOptions(frame_poses=True, threads=threads), "ceres, a pose a frame")
         yield replace(row, same_model=False)
     yield ours(problem, replace(PAPER, solver="lm"), "ours, lm")
