@@ -33,10 +33,10 @@ from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.start import back_project
 
 SCIPY_LIMIT = 120_000
+"""Observations above which SciPy takes minutes: its steps solve the whole system iteratively."""
+
 CERES_POSES_LIMIT = 400_000
 """Of a million observations' frame poses CHOLMOD finds the matrix not positive, over and over for minutes."""
-
-"""Observations above which SciPy takes minutes: its steps solve the whole system iteratively."""
 
 PAPER = SolveOptions(pose_states=(), loss="none", coarse=False)
 

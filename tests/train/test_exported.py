@@ -12,11 +12,13 @@ from export.onnx_file import export_checkpoint, to_onnx
 from models import MarkingNet, NetConfig
 from tests.train.test_training import tiny
 from train.checkpoint import Checkpoint, fresh_checkpoint, load_checkpoint, save_checkpoint
-from train.exported import unfold
+from train.exported import read_exported, unfold
 from train.loop import Trainer
 from v2hdm.errors import ConfigError
 
-SHIPPED = Path(__file__).resolve().parents[2] / "v2hdm" / "detection" / "default.onnx"
+ROOT = Path(__file__).resolve().parents[2]
+SHIPPED = ROOT / "v2hdm" / "detection" / "default.onnx"
+SHIPPED_FLOAT = ROOT / "models" / "marking_net.onnx"
 
 Images = list[torch.Tensor]
 
@@ -106,9 +108,17 @@ def test_a_file_older_than_a_switch_holds_a_network_without_it(net: MarkingNet) 
     assert checkpoint.network().wide_kinds is None
 
 
-def test_the_shipped_file_can_learn_on(tmp_path: Path) -> None:
-    config = replace(tiny(tmp_path), start=str(SHIPPED), net=NetConfig())
+@pytest.mark.parametrize("path", [SHIPPED, SHIPPED_FLOAT], ids=lambda path: path.name)
+def test_the_shipped_files_can_learn_on(tmp_path: Path, path: Path) -> None:
+    config = replace(tiny(tmp_path), start=str(path), net=NetConfig())
     assert set(fresh_checkpoint(config).averaged) == set(MarkingNet().state_dict())
+
+
+def test_the_shipped_files_are_of_one_training() -> None:
+    int8, float32 = read_exported(SHIPPED), read_exported(SHIPPED_FLOAT)
+    assert (int8.label["precision"], float32.label["precision"]) == ("int8", "float32")
+    for key in ("commit", "steps", "renders", "metrics", "training"):
+        assert int8.label[key] == float32.label[key]
 
 
 def _no_onnx(path: Path) -> None:
