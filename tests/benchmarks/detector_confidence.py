@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from unittest.mock import patch
 
@@ -73,6 +74,14 @@ def is_true(shown: Example, marking: MarkingDetection) -> bool | None:
     return None
 
 
+def renders_to_fit(images: int, seed: int) -> Iterator[tuple[int, Example]]:
+    """Scenes and their numbers: two thirds of full difficulty, then a third of easy ones."""
+    easy = images // 3
+    for count, difficulty in ((images - easy, 1.0), (easy, EASY)):
+        for index in range(count):
+            yield index, example(index, difficulty, seed)
+
+
 def fit(evidence: FloatArray, true: BoolArray) -> tuple[FloatArray, float]:
     """Weights (F,) and bias of a logistic regression, by Newton's method on standardised features."""
     mean, deviation = evidence.mean(axis=0), np.maximum(evidence.std(axis=0), 1e-6)
@@ -104,12 +113,9 @@ def main() -> None:
     options = DetectorOptions(model=parsed.model, max_range_m=24.0, min_confidence=0.0)
     detectors = [Detector.load(options=replace(options, mirrored=twice)) for twice in (False, True)]
     gathered = Gathered()
-    easy = parsed.images // 3
-    for count, difficulty in ((parsed.images - easy, 1.0), (easy, EASY)):
-        for index in range(count):
-            shown = example(index, difficulty, SEED)
-            for detector in detectors:
-                gathered.add(index, shown, detector)
+    for index, shown in renders_to_fit(parsed.images, SEED):
+        for detector in detectors:
+            gathered.add(index, shown, detector)
     print(f"{sum(gathered.true)} of {len(gathered.true)} true, in {parsed.images} images")
     fitted = fit_shapes(gathered)
     if parsed.write:

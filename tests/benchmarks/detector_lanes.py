@@ -23,8 +23,8 @@ from unittest.mock import patch
 import cv2
 import numpy as np
 
-from tests.benchmarks.detector_confidence import EASY, FOLDS, fit
-from tests.benchmarks.detector_quality import LANE_TOLERANCE_PX, Example, example
+from tests.benchmarks.detector_confidence import FOLDS, fit, log_loss, renders_to_fit
+from tests.benchmarks.detector_quality import LANE_TOLERANCE_PX, Example
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.lanes import anchors, score
@@ -109,8 +109,7 @@ class Gathered:
 
     def log_loss(self, weights: FloatArray, bias: float) -> float:
         """Mean of minus the log probability of what is the case."""
-        odds = np.where(self.true, 1.0, -1.0) * (self.evidence @ weights + bias)
-        return float(np.log1p(np.exp(-odds)).mean())
+        return log_loss(self.evidence @ weights + bias, self.true)
 
     def left_out(self) -> float:
         """Log loss on the images of each fifth of weights that were fitted to the others."""
@@ -132,12 +131,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     options = DetectorOptions(model=parsed.model, max_range_m=24.0)
     detector = Detector.load(options=options)
-    easy = parsed.images // 3
-    images = [
-        seen(example(index, difficulty, SEED), detector)
-        for count, difficulty in ((parsed.images - easy, 1.0), (easy, EASY))
-        for index in range(count)
-    ]
+    images = [seen(shown, detector) for _, shown in renders_to_fit(parsed.images, SEED)]
     gathered = Gathered.of(images, options.lane_step_m)
     weights, bias = score.fitted()
     print(f"{gathered.true.sum()} true, {(~gathered.true).sum()} false lines in {parsed.images} images")
