@@ -16,7 +16,7 @@ import numpy as np
 from v2hdm.detection.camera.ground import apply_homography
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.foreground import Foreground
-from v2hdm.detection.corners.grey import GreyBand
+from v2hdm.detection.corners.grey import GreyBand, log_grey
 from v2hdm.detection.corners.quad import following
 from v2hdm.records import BoolArray, FloatArray
 
@@ -32,9 +32,6 @@ _BESIDE_SHARE, _BESIDE_LIMITS_PX = 0.5, (2.0, 12.0)
 side, which may be off by that, over this share of its width, within limits: the grey is known no farther."""
 
 _IN = slice(len(_BESIDE), -len(_BESIDE))
-_DARK = 0.01
-"""Added to grey values before taking logarithms: in shade a step is as large as in the sun, noise is not."""
-
 _STEP_QUANTILE = 0.8
 _LEAST_STEP = 0.25
 _STEP_SHARE = 0.4
@@ -172,7 +169,7 @@ def _look_across(grey: GreyBand, foreground: Foreground, view: CameraView, corne
     place = np.concatenate([-beside[..., ::-1], inside, 1 + beside], axis=-1)
     points = first[:, :, None] + place[..., None] * step[:, :, None]
     values = grey.sample(points.reshape(-1, place.shape[-1], 2)).reshape(place.shape)
-    logs = np.log(np.maximum(values, 0) + np.float32(_DARK))
+    logs = log_grey(values)
     odds = foreground.odds_at(first + step / 2)
     step_px = long_px / _STATIONS
     return _Across(axes, ends_m, along_m, beside_m, step_px, place, logs, odds)

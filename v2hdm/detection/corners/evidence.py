@@ -12,7 +12,7 @@ import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.foreground import Foreground
-from v2hdm.detection.corners.grey import GreyBand
+from v2hdm.detection.corners.grey import GreyBand, log_grey
 from v2hdm.detection.corners.quad import preceding, side_frames, width
 from v2hdm.records import BoolArray, FloatArray
 
@@ -58,9 +58,6 @@ _BEYOND_PX = np.array([3.0, 4.5, 6.0])
 _RUNS_ON = 0.6
 """A step of this share of the side's own is the side's continuation: half the corners where there is one all
 the way are off by half a px and more, of the others one in eight."""
-
-_DARK = 0.01
-"""Added to grey values before taking logarithms: in shade a step is as large as in the sun, noise is not."""
 
 _LEAST_STEP = 0.05
 _SUPPORT_SHARE = 0.4
@@ -131,7 +128,7 @@ def grey_steps(grey: GreyBand, corners_px: FloatArray) -> Steps:
     foot = corners_px[:, :, None] + place[..., None] * tangent[:, :, None]
     across = np.stack([-inside_px, outside_px])[..., None] * normal[:, :, None]
     values = grey.at_limit().sample((foot + across).reshape(2, -1, 2)).reshape(2, *place.shape)
-    logs = np.log(np.maximum(values, 0) + np.float32(_DARK))
+    logs = log_grey(values)
     steps = np.nan_to_num(logs[0] - logs[1]).astype(np.float64)
     first, second = _PROFILES, _PROFILES + beyond.shape[-1]
     return Steps(

@@ -12,9 +12,17 @@ _GREY_WEIGHTS_BGR = (0.114, 0.587, 0.299)
 _CLIPPED = 250
 """Codes from here on are those of a sensor at its limit, noise and white balance allowed for."""
 
+_DARK = 0.01
+"""Added to grey values before taking logarithms: in shade a step is as large as in the sun, noise is not."""
+
 _SUM = np.ones((1, 3), dtype=np.float32)
 _CODED = np.arange(256) / 255
 _LINEAR_FROM_SRGB = np.where(_CODED <= 0.04045, _CODED / 12.92, ((_CODED + 0.055) / 1.055) ** 2.4)
+
+
+def log_grey(values: np.ndarray) -> np.ndarray:
+    """Logarithms of linear grey values, float32, in which light and shade differ by a constant."""
+    return np.asarray(np.log(np.maximum(values, 0) + np.float32(_DARK)))
 
 
 @dataclass(frozen=True)
