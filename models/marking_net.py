@@ -46,10 +46,10 @@ class NetConfig:
     costs and brings.
     """
 
-    widths: list[int] = field(default_factory=lambda: [32, 48, 64, 96])
+    widths: list[int] = field(default_factory=lambda: [32, 64, 96, 128])
     dilations: list[int] = field(default_factory=lambda: [1, 2, 4, 8])
     head_width: int = 8
-    separable: bool = True
+    separable: bool = False
     lanes: bool = True
     wide_kinds: bool = True
 
@@ -124,9 +124,7 @@ class MarkingNet(nn.Module):
 
     def forward(self, image: Tensor) -> Prediction:
         """Look at images (B, H, W, 3) uint8, BGR as OpenCV decodes them; H and W multiples of 16."""
-        tiles = _space_to_depth(image)
-        if self.training:
-            tiles = tiles.contiguous(memory_format=torch.channels_last)  # a sixth faster on a CPU
+        tiles = _channels_last_tiles(image) if self.training else _space_to_depth(image)
         x4 = self.encode4(self.stem(tiles))
         x8 = self.encode8(x4)
         y8 = self.decode8(_double(self.lateral16(self.context(self.encode16(x8)))) + x8)
@@ -185,6 +183,15 @@ def _space_to_depth(image: Tensor) -> Tensor:
     return (channels.reshape(batch, 3 * s * s, rows, columns).to(torch.float32) - _GREY_MEAN) * (
         1.0 / _GREY_SCALE
     )
+
+
+def _channels_last_tiles(image: Tensor) -> Tensor:
+    """The same tiles, each one's channels side by side in memory: what training is faster with."""
+    batch, height, width, _ = image.shape
+    s = _STEM_STRIDE
+    tiles = image.reshape(batch, height // s, s, width // s, s * 3).permute(0, 1, 3, 2, 4)
+    grey = tiles.reshape(batch, height // s, width // s, 3 * s * s).to(torch.float32)
+    return grey.sub_(_GREY_MEAN).mul_(1.0 / _GREY_SCALE).permute(0, 3, 1, 2)
 
 
 def _depth_to_space(x: Tensor) -> Tensor:

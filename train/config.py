@@ -27,8 +27,8 @@ class DataConfig:
     height: int = 256
     render_width: int = 512
     render_height: int = 288
-    views_per_render: int = 6
-    reservoir: int = 256
+    views_per_render: int = 8
+    reservoir: int = 512
     easy_samples: int = 1000
     shadows_on_paint: float = 3.0
     seams: float = 0.25
@@ -54,7 +54,7 @@ class LossConfig:
     paint_weight: float = 2.0
     dice: float = 0.5
     kinds: float = 1.0
-    lanes: float = 0.4
+    lanes: float = 0.6
     lane_weight: float = 3.0
 
 
@@ -72,7 +72,8 @@ class TrainConfig:
 
     The learning rate rises to ``learning_rate`` over the first ``warmup`` of the run, then falls to
     nothing as a half cosine, by the share of the run that has passed. The weights that are validated, kept
-    and exported are averages over about ``ema_updates`` updates. ``resume`` goes on with what ``output``
+    and exported are averages over about ``ema_updates`` updates. ``bfloat16`` has convolutions computed in
+    that where the device is faster so. ``resume`` goes on with what ``output``
     holds. ``start`` is a checkpoint of another run, or an exported file, whose averaged weights and place
     in the sequence of renders this one starts from: to learn on, or to learn users' own labels.
     """
@@ -83,12 +84,13 @@ class TrainConfig:
     device: str = "auto"
     minutes: float | None = None
     steps: int | None = None
-    batch: int = 4
+    batch: int = 8
     learning_rate: float = 2e-3
     weight_decay: float = 0.01
     warmup: float = 0.03
-    ema_updates: int = 400
+    ema_updates: int = 1000
     threads: int = 1
+    bfloat16: bool = True
     checkpoint_minutes: float = 2.0
     resume: bool = True
     net: NetConfig = field(default_factory=NetConfig)

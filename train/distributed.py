@@ -142,3 +142,11 @@ def choose_device(name: str, local_rank: int | None = None) -> torch.device:
             "start one a GPU, or set device=cpu"
         )
     return torch.device("cuda", local_rank)
+
+
+def has_bfloat16(device: torch.device) -> bool:
+    """Whether a device has instructions for products of bfloat16; without them it is slower than float32."""
+    if device.type != "cpu":
+        return device.type == "cuda"
+    capabilities = torch.cpu.get_capabilities()
+    return any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16"))

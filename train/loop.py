@@ -25,7 +25,7 @@ from train.checkpoint import (
 )
 from train.config import TrainConfig
 from train.data import Pair, training_batches, validation_pairs
-from train.distributed import Team, choose_device
+from train.distributed import Team, choose_device, has_bfloat16
 from train.losses import total_loss
 from train.metrics import Score, Tally
 from train.targets import Targets
@@ -56,6 +56,7 @@ class Trainer:
         torch.set_num_threads(config.threads)
         self._team = self.team or Team(choose_device(config.device))
         self.device = self._team.device
+        self._halves = config.bfloat16 and has_bfloat16(self.device)
         self.output = Path(config.output)
         self.state = self._team.from_leader(self._open)
         self._resumed_at = self.state.step, self.state.renders
@@ -131,7 +132,7 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = self._learning_rate()
         self.net.train()
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._halves):
             prediction = self.net(image)
         prediction = Prediction(*(output.float() for output in prediction))
         loss = total_loss(prediction, targets, self.config.loss)

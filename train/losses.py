@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, smooth_l1_loss
+from torch.nn.functional import (
+    binary_cross_entropy_with_logits,
+    cross_entropy,
+    interpolate,
+    smooth_l1_loss,
+)
 
 from models import Prediction
 from train.config import LossConfig
@@ -13,23 +18,27 @@ from train.targets import IGNORE, Targets
 
 def total_loss(prediction: Prediction, targets: Targets, config: LossConfig) -> Tensor:
     """The weighted sum of the terms, a scalar."""
-    loss = paint_loss(prediction.paint[:, 0], targets.paint, config.paint_weight, config.dice)
+    worth = interpolate(targets.paint_weight[:, None], scale_factor=2.0, mode="nearest")[:, 0]
+    loss = paint_loss(prediction.paint[:, 0], targets.paint, worth, config.paint_weight, config.dice)
     loss = loss + config.kinds * kind_loss(prediction.kinds, targets.kinds, targets.kind_weight)
     if config.lanes:
         loss = loss + config.lanes * lane_loss(prediction.lanes, targets, config.lane_weight)
     return loss
 
 
-def paint_loss(logits: Tensor, labels: Tensor, positive_weight: float, dice_weight: float) -> Tensor:
-    """Binary cross entropy plus soft Dice of paint, logits and labels (B, H, W).
+def paint_loss(
+    logits: Tensor, labels: Tensor, worth: Tensor, positive_weight: float, dice_weight: float
+) -> Tensor:
+    """Binary cross entropy plus soft Dice of paint; logits, labels and worth (B, H, W).
 
     Args:
         logits: Log odds of paint.
         labels: 0, 1 or :data:`IGNORE`.
+        worth: What each element weighs in the cross entropy.
         positive_weight: What an element of paint weighs, one of background weighing 1.
         dice_weight: 0 leaves the Dice term out.
     """
-    loss = _balanced_cross_entropy(logits, labels, positive_weight)
+    loss = _balanced_cross_entropy(logits, labels, positive_weight, worth)
     return loss + dice_weight * dice_loss(logits, labels) if dice_weight else loss
 
 
@@ -70,10 +79,12 @@ def lane_loss(logits: Tensor, targets: Targets, positive_weight: float) -> Tenso
     return loss + smooth_l1_loss(logits[:, 1][crossed], targets.lane_offset[crossed], beta=0.1)
 
 
-def _balanced_cross_entropy(logits: Tensor, labels: Tensor, positive_weight: float) -> Tensor:
+def _balanced_cross_entropy(
+    logits: Tensor, labels: Tensor, positive_weight: float, worth: Tensor | float = 1.0
+) -> Tensor:
     """Mean binary cross entropy of the elements that are known, positive ones weighing more."""
     known = labels != IGNORE
     target = (labels == 1).to(logits.dtype)
-    weight = known * (1 + (positive_weight - 1) * target)
+    weight = known * worth * (1 + (positive_weight - 1) * target)
     total = binary_cross_entropy_with_logits(logits, target, weight, reduction="sum")
     return total / weight.sum().clamp(min=1)

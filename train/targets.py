@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -17,6 +18,12 @@ from v2hdm.simulate.training.scenes import TrainingSample
 
 IGNORE = 255
 """Marks elements that carry no loss."""
+
+_FULL_SIZE = 64
+"""A piece of paint of so many cells of 4 px is a near marking."""
+
+_MOST_WEIGHT = 4.0
+"""What the paint of the smallest pieces weighs, that of near ones weighing 1."""
 
 _LEAST_PAINT = 0.4
 """A cell shows the class of its paint where that covers at least this share of it."""
@@ -33,14 +40,16 @@ Bytes = NDArray[np.uint8]
 class Targets(NamedTuple):
     """The answers for images (B, H, W); the batch dimension is missing for a single one.
 
-    ``paint`` (B, H/2, W/2) uint8: 1 for paint. ``kinds`` (B, H/4, W/4) uint8: index into ``PAINT_CLASSES``,
-    and ``kind_weight`` (B, H/4, W/4) float32: what each is worth, see :func:`kind_weight`.
+    ``paint`` (B, H/2, W/2) uint8: 1 for paint, and ``paint_weight`` (B, H/4, W/4) float32: what the 2 x 2
+    elements there are worth, see :func:`paint_weight`. ``kinds`` (B, H/4, W/4) uint8: index into
+    ``PAINT_CLASSES``, and ``kind_weight`` (B, H/4, W/4) float32: what each is worth, see :func:`kind_weight`.
     ``lane_there`` (B, H/8, W/8) uint8: 1 where a lane's line crosses the row anchor in that cell, and
     ``lane_offset`` (B, H/8, W/8) float32: where in it, in cells from its centre. :data:`IGNORE` carries no
     loss.
     """
 
     paint: Tensor
+    paint_weight: Tensor
     kinds: Tensor
     kind_weight: Tensor
     lane_there: Tensor
@@ -52,7 +61,9 @@ def targets(sample: TrainingSample) -> Targets:
     there, offset = lane_targets(sample.lanes_px, *sample.labels.shape)
     there[_blocks(sample.hidden, LANE_STRIDE).any(axis=2) & (there == 1)] = IGNORE
     kinds = kind_target(sample.labels)
-    answers = paint_target(sample.labels), kinds, kind_weight(kinds), there, offset
+    size = piece_size(kinds)
+    paint = paint_target(sample.labels), paint_weight(size)
+    answers = *paint, kinds, kind_weight(size), there, offset
     return Targets(*(torch.from_numpy(answer) for answer in answers))
 
 
@@ -74,16 +85,32 @@ def kind_target(labels: Bytes) -> Bytes:
     return np.where(painted, counts.argmax(axis=2), IGNORE).astype(np.uint8)
 
 
-def kind_weight(kinds: Bytes) -> NDArray[np.float32]:
-    """Weights (H/4, W/4) of a target of classes: a piece of paint of n cells counts as much as sqrt(n) ones.
+def piece_size(kinds: Bytes) -> NDArray[np.float32]:
+    """How many cells the piece of paint has that a cell is of, for all (H/4, W/4) of a target of classes.
 
-    A map asks for each marking alike, and a far one has a hundredth of the cells that a near one has.
+    0 where there is none.
     """
     pieces, count = label(kinds, background=IGNORE, return_num=True)
     size = np.bincount(pieces.ravel(), minlength=count + 1)
-    weight = 1 / np.sqrt(np.maximum(size, 1))
-    weight[0] = 0.0
-    return weight[pieces].astype(np.float32)
+    size[0] = 0
+    return size[pieces].astype(np.float32)
+
+
+def kind_weight(size: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What the class of each cell weighs: a piece of paint of n cells counts as much as sqrt(n) ones.
+
+    A map asks for each marking alike, and a far one has a hundredth of the cells that a near one has.
+    """
+    return np.where(size > 0, 1 / np.sqrt(np.maximum(size, 1)), 0).astype(np.float32)
+
+
+def paint_weight(size: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What it weighs whether there is paint: more for the same reason in and around small pieces.
+
+    Around them too: if paint weighed more than what lies beside it, its learnt edge would move outwards.
+    """
+    weight = np.where(size > 0, np.sqrt(_FULL_SIZE / np.maximum(size, 1)), 1).clip(1, _MOST_WEIGHT)
+    return np.asarray(cv2.dilate(weight.astype(np.float32), np.ones((5, 5), np.uint8)))
 
 
 def lane_targets(

@@ -34,7 +34,7 @@ from v2hdm.detection.network import METADATA_KEY, Network
 from v2hdm.errors import ConfigError, DetectorError
 
 CONF = str(Path(__file__).resolve().parents[2] / "conf")
-SMALL = NetConfig(widths=[16, 16, 16, 16], dilations=[1, 2])
+SMALL = NetConfig(widths=[16, 16, 16, 16], dilations=[1, 2], separable=True)
 ANY = BoundsConfig(
     paint_changed=9.0,
     outline_px=9.0,

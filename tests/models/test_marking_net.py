@@ -6,7 +6,7 @@ import torch
 from torch import nn
 
 from models import MarkingNet, NetConfig
-from models.marking_net import _depth_to_space, _space_to_depth
+from models.marking_net import _channels_last_tiles, _depth_to_space, _space_to_depth
 from v2hdm.records import PAINT_CLASSES
 
 
@@ -38,7 +38,7 @@ def test_every_output_covers_the_image_at_its_stride(
     assert paint.dtype == torch.float32
 
 
-@pytest.mark.parametrize("config", [NetConfig(separable=False), NetConfig(lanes=False)])
+@pytest.mark.parametrize("config", [NetConfig(separable=True), NetConfig(lanes=False)])
 def test_the_switches_leave_the_outputs_as_they_are_shaped(config: NetConfig) -> None:
     with torch.inference_mode():
         prediction = MarkingNet(config).eval()(random_images(1, 32, 48))
@@ -70,6 +70,13 @@ def test_the_stem_keeps_every_pixel_of_a_tile_as_a_channel() -> None:
         np.testing.assert_allclose(
             channels[:, channel], image[:, row::4, column::4, colour].float(), atol=1e-4
         )
+
+
+def test_the_tiles_of_a_training_are_those_of_the_vehicle() -> None:
+    image = random_images(2, 8, 12)
+    tiles = _channels_last_tiles(image)
+    torch.testing.assert_close(tiles, _space_to_depth(image))
+    assert tiles.is_contiguous(memory_format=torch.channels_last)
 
 
 def test_depth_to_space_is_pixel_shuffle() -> None:

@@ -80,11 +80,12 @@ def test_a_training_starts_from_an_exported_file(net: MarkingNet, images: Images
     assert load_checkpoint(tmp_path / "run" / "last.pt").step == 3
 
 
+@pytest.mark.parametrize("separable", [True, False])
 def test_a_training_grows_a_smaller_network_that_goes_on_saying_the_same(
-    net: MarkingNet, images: Images, tmp_path: Path
+    net: MarkingNet, images: Images, tmp_path: Path, separable: bool
 ) -> None:
     config = tiny(tmp_path / "run")
-    larger = replace(config.net, dilations=[1, 2, 4], wide_kinds=True)
+    larger = NetConfig(widths=[16, 24, 32, 48], dilations=[1, 2, 4], separable=separable, wide_kinds=True)
     taught = Checkpoint(config=asdict(config), renders=70, averaged=net.state_dict())
     export_checkpoint(taught, tmp_path / "net.onnx", opset=18, tolerance=1e-3)
     save_checkpoint(taught, tmp_path / "net.pt")

@@ -35,7 +35,8 @@ def example() -> tuple[Prediction, Targets]:
     prediction = Prediction(
         sure(paint)[:, None], sure_kinds(kinds), torch.stack([sure(there), offset], dim=1)
     )
-    return prediction, Targets(paint, kinds, torch.ones(kinds.shape), there, offset)
+    worth = torch.ones(kinds.shape)
+    return prediction, Targets(paint, worth, kinds, worth, there, offset)
 
 
 def test_certain_and_right_costs_nothing() -> None:
@@ -63,17 +64,21 @@ def test_dice_of_a_picture_without_paint_is_zero() -> None:
 def test_ignored_elements_get_no_gradient() -> None:
     labels = torch.tensor([[[0, 1, IGNORE, 1]]], dtype=torch.uint8)
     logits = torch.randn(1, 1, 4, requires_grad=True)
-    paint_loss(logits, labels, 2.0, 1.0).backward()
+    worth = torch.tensor([[[1.0, 1.0, 1.0, 3.0]]])
+    paint_loss(logits, labels, worth, 2.0, 0.0).backward()
     assert logits.grad is not None
     assert float(logits.grad[..., 2].abs().max()) == 0
-    assert float(logits.grad[..., 1].abs().max()) > 0
+    pull = logits.grad[0, 0] / (logits[0, 0].sigmoid() - labels[0, 0]).detach()
+    assert float(pull[1]) > 0
+    assert float(pull[3] / pull[1]) == pytest.approx(3, rel=1e-4), "an element is not worth what it should be"
 
 
 def test_a_batch_without_paint_or_lanes_has_a_finite_loss() -> None:
     kinds = torch.full((1, 2, 2), IGNORE, dtype=torch.uint8)
     assert float(kind_loss(torch.randn(1, KINDS, 2, 2), kinds, torch.ones(1, 2, 2))) == 0
     none = torch.zeros((1, 2, 2), dtype=torch.uint8)
-    targets = Targets(none, kinds, torch.zeros(1, 2, 2), none, torch.zeros(1, 2, 2))
+    nothing = torch.zeros(1, 2, 2)
+    targets = Targets(none, nothing, kinds, nothing, none, nothing)
     assert torch.isfinite(lane_loss(torch.randn(1, 2, 2, 2), targets, 3.0))
 
 
@@ -112,11 +117,12 @@ def test_a_crossing_two_cells_off_is_neither_found_nor_right() -> None:
         given[..., found] = 1
         paint = torch.zeros((1, 4, 32), dtype=torch.uint8)
         kinds = torch.full((1, 2, 16), IGNORE, dtype=torch.uint8)
+        nothing = torch.zeros(kinds.shape)
         tally = Tally()
         tally.add(
             Prediction(
                 sure(paint)[:, None], sure_kinds(kinds), torch.stack([sure(given), sure(given)], dim=1)
             ),
-            Targets(paint, kinds, torch.zeros(kinds.shape), there, torch.zeros((1, 1, 8))),
+            Targets(paint, nothing, kinds, nothing, there, torch.zeros((1, 1, 8))),
         )
         assert (tally.score().lane_recall, tally.score().lane_precision) == (right, right)

@@ -3,7 +3,16 @@
 import numpy as np
 import pytest
 
-from train.targets import IGNORE, kind_target, kind_weight, lane_targets, paint_target, targets
+from train.targets import (
+    IGNORE,
+    kind_target,
+    kind_weight,
+    lane_targets,
+    paint_target,
+    paint_weight,
+    piece_size,
+    targets,
+)
 from v2hdm.records import PAINT_CLASSES
 from v2hdm.simulate.training.scenes import TrainingSample
 
@@ -33,12 +42,24 @@ def test_a_piece_of_paint_counts_as_the_root_of_its_cells() -> None:
     kinds[1:5, 1:5] = 3
     kinds[1:5, 5] = 0  # of another class, though it touches
     kinds[7, 10] = 3
-    weight = kind_weight(kinds)
+    weight = kind_weight(piece_size(kinds))
     assert weight[kinds == IGNORE].max() == 0
     assert weight[1:5, 1:5].sum() == pytest.approx(4)
     assert weight[1:5, 5].sum() == pytest.approx(2)
     assert weight[7, 10] == 1
-    assert not kind_weight(np.full((4, 4), IGNORE, dtype=np.uint8)).any()
+    assert not kind_weight(piece_size(np.full((4, 4), IGNORE, dtype=np.uint8))).any()
+
+
+def test_small_pieces_and_what_is_around_them_weigh_more() -> None:
+    kinds = np.full((40, 40), IGNORE, dtype=np.uint8)
+    kinds[4:8, 4:8] = 0
+    kinds[30, 10] = 2
+    kinds[20:30, 20:30] = 1
+    weight = paint_weight(piece_size(kinds))
+    assert weight[5, 5] == weight[4, 2] == 2  # the root of 64 / 16
+    assert weight[4, 1] == weight[25, 25] == 1, "far from paint, or in the paint of a near marking"
+    assert weight[30, 10] == weight[32, 12] == 4, "no piece weighs more"
+    assert (paint_weight(piece_size(np.full((4, 4), IGNORE, dtype=np.uint8))) == 1).all()
 
 
 def test_a_line_crosses_each_row_anchor_in_one_cell() -> None:

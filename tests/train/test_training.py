@@ -31,7 +31,7 @@ def tiny(output: Path, steps: int = 3) -> TrainConfig:
         output=str(output),
         steps=steps,
         batch=2,
-        net=NetConfig(widths=[16, 16, 16, 16], dilations=[1], wide_kinds=False),
+        net=NetConfig(widths=[16, 16, 16, 16], dilations=[1], separable=True, wide_kinds=False),
         data=DataConfig(
             width=64, height=32, render_width=80, render_height=48, views_per_render=2, reservoir=4, workers=0
         ),
@@ -158,6 +158,8 @@ def test_a_run_starts_from_the_weights_of_another(tmp_path: Path) -> None:
 
 def test_a_start_of_another_network_is_refused(tmp_path: Path) -> None:
     train(tiny(tmp_path / "first"))
-    config = replace(tiny(tmp_path / "second"), start=str(tmp_path / "first" / "last.pt"), net=NetConfig())
+    config = tiny(tmp_path / "second")
+    narrower = replace(config.net, widths=[16, 16, 16, 8])
+    config = replace(config, start=str(tmp_path / "first" / "last.pt"), net=narrower)
     with pytest.raises(ConfigError, match=r"start=.*holds the network"):
         Trainer(config, lambda share, line: None)
