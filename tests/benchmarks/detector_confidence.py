@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from unittest.mock import patch
 
@@ -23,7 +23,8 @@ import cv2
 import numpy as np
 
 from tests.benchmarks.detector_quality import Example, example, polygon_overlap
-from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, SHAPES, confidence, shape_of
+from v2hdm.detection.corners.company import COMPANY, company
+from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, SHAPES, as_probability, shape_of
 from v2hdm.detection.corners.evidence import FEATURES
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
@@ -33,34 +34,41 @@ SEED = 917
 EASY = 0.2
 RIDGE = 2.0
 FOLDS = 5
+COUNTS = (10, 20, 40, 80)
+"""Of false ones, at which those true are counted."""
 
 
 @dataclass
 class Gathered:
-    """Evidence of N quadrilaterals, their classes, which of them are true, and the images they are from."""
+    """N quadrilaterals, those of one look at an image together.
+
+    Their evidence, corners on the ground, classes, whether they are true (None where either will do), the
+    numbers of the images they are from and of the looks.
+    """
 
     evidence: list[FloatArray] = field(default_factory=list)
+    ground: list[FloatArray] = field(default_factory=list)
     kind: list[str] = field(default_factory=list)
-    true: list[bool] = field(default_factory=list)
+    true: list[bool | None] = field(default_factory=list)
     image: list[int] = field(default_factory=list)
+    look: list[int] = field(default_factory=list)
 
     def add(self, index: int, shown: Example, detector: Detector) -> None:
         """What the detector proposes in one image."""
-        rows: list[FloatArray] = []
 
-        def spy(evidence: FloatArray, _kinds: list[str]) -> FloatArray:
-            rows.extend(evidence)
+        def spy(evidence: FloatArray, _kinds: list[str], ground: FloatArray) -> FloatArray:
+            self.evidence.extend(evidence)
+            self.ground.extend(ground)
             return np.ones(len(evidence))
 
         with patch("v2hdm.detection.corners.refine.confidence", spy):
             markings, _ = detector.detect(shown.image, shown.camera)
-        for row, marking in zip(rows, markings, strict=False):  # the outlined symbols come last
-            true = is_true(shown, marking)
-            if true is not None:
-                self.evidence.append(row)
-                self.kind.append(marking.kind)
-                self.true.append(true)
-                self.image.append(index)
+        look = 1 + max(self.look, default=-1)
+        for marking in markings[: len(self.evidence) - len(self.kind)]:  # the outlined symbols come last
+            self.kind.append(marking.kind)
+            self.true.append(is_true(shown, marking))
+            self.image.append(index)
+            self.look.append(look)
 
 
 def is_true(shown: Example, marking: MarkingDetection) -> bool | None:
@@ -116,35 +124,55 @@ def main() -> None:
     for index, shown in renders_to_fit(parsed.images, SEED):
         for detector in detectors:
             gathered.add(index, shown, detector)
-    print(f"{sum(gathered.true)} of {len(gathered.true)} true, in {parsed.images} images")
+    known = [true for true in gathered.true if true is not None]
+    print(f"{sum(known)} of {len(known)} true, in {parsed.images} images")
     fitted = fit_shapes(gathered)
     if parsed.write:
         CONFIDENCE_FILE.write_text(json.dumps(fitted, indent=1) + "\n")
 
 
-def fit_shapes(gathered: Gathered) -> dict[str, object]:
+def fit_shapes(gathered: Gathered) -> dict[str, dict[str, object]]:
     """What ``confidence.json`` is to hold; prints weights and losses."""
-    evidence, true = np.array(gathered.evidence), np.array(gathered.true)
+    evidence = np.array(gathered.evidence)
+    alone, odds = _fit_each(gathered, evidence, FEATURES)
+    # Each look is told of by odds that its own image had no part in.
+    told, look = np.zeros((len(odds), len(COMPANY))), np.array(gathered.look)
+    for number in range(1 + look.max()):
+        mine = np.flatnonzero(look == number)
+        kinds = [gathered.kind[m] for m in mine]
+        told[mine] = company(np.array(gathered.ground)[mine], kinds, as_probability(odds[mine]))
+    among, _ = _fit_each(gathered, np.column_stack([evidence, told]), (*FEATURES, *COMPANY))
+    return {shape: {"alone": alone[shape], "among": among[shape]} for shape in SHAPES}
+
+
+def _fit_each(
+    gathered: Gathered, features: FloatArray, names: Sequence[str]
+) -> tuple[dict[str, object], FloatArray]:
+    """The fit of each shape to features (N, F), and log odds (N,) by fits to other images."""
+    known = np.array([true is not None for true in gathered.true])
+    true = np.array([true is True for true in gathered.true])
     shape, fold = np.array([shape_of(kind) for kind in gathered.kind]), np.array(gathered.image) % FOLDS
     fitted: dict[str, object] = {}
     effect, left_out = {}, np.zeros(len(true))
     for name in SHAPES:
-        mine = shape == name
-        weights, bias = fit(evidence[mine], true[mine])
-        effect[name] = weights * evidence[mine].std(axis=0)
-        named = dict(zip(FEATURES, weights.round(4).tolist(), strict=True))
+        mine = known & (shape == name)
+        weights, bias = fit(features[mine], true[mine])
+        effect[name] = weights * features[mine].std(axis=0)
+        named = dict(zip(names, weights.round(4).tolist(), strict=True))
         fitted[name] = {"bias": round(bias, 4), "weights": named}
         for k in range(FOLDS):
-            others, these = mine & (fold != k), mine & (fold == k)
-            weights, bias = fit(evidence[others], true[others])
-            left_out[these] = evidence[these] @ weights + bias
+            others, these = mine & (fold != k), (shape == name) & (fold == k)
+            weights, bias = fit(features[others], true[others])
+            left_out[these] = features[these] @ weights + bias
     print(f"{'':16s} " + " ".join(f"{name:>9s}" for name in SHAPES))
-    for row, name in enumerate(FEATURES):
+    for row, name in enumerate(names):
         print(f"{name:16s} " + " ".join(f"{effect[shape][row]:+9.2f}" for shape in SHAPES))
-    so_far = confidence(evidence, gathered.kind)
-    print(f"log loss of images left out {log_loss(left_out, true):.3f}; ", end="")
-    print(f"of the weights so far {log_loss(np.log(so_far / (1 - so_far)), true):.3f}")
-    return fitted
+    print(f"log loss of images left out {log_loss(left_out[known], true[known]):.3f}; true ones at ", end="")
+    order = np.argsort(-left_out[known])
+    false, found = np.cumsum(~true[known][order]), np.cumsum(true[known][order])
+    ranks = [np.searchsorted(false, count, side="right") for count in COUNTS]
+    print(", ".join(f"{count} false {found[rank - 1]}" for count, rank in zip(COUNTS, ranks, strict=True)))
+    return fitted, left_out
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import pytest
 
 from tests.benchmarks.detector_confidence import fit
 from tests.detection.pictures import bar, brightness_model, diamond, make_camera, picture, to_image
+from v2hdm.detection.corners.company import COMPANY
 from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, SHAPES, confidence
 from v2hdm.detection.corners.evidence import FEATURES, Steps, grey_steps
 from v2hdm.detection.corners.grey import linear_grey
@@ -87,9 +88,11 @@ def test_the_fitted_weights_are_those_of_the_features_and_prefer_evidence():
     for name in ("certainty", "share", "four_corners", "support", "weakest_side", "sharpness"):
         all_around[:, FEATURES.index(name)] = 1.0
     for shape in SHAPES:
-        assert set(fitted[shape]["weights"]) == set(FEATURES)
-    assert (confidence(none, kinds) < confidence(all_around, kinds)).all()
-    first, second = confidence(all_around, kinds)[2:]
+        assert set(fitted[shape]["alone"]["weights"]) == set(FEATURES)
+        assert set(fitted[shape]["among"]["weights"]) == {*FEATURES, *COMPANY}
+    ground = 100.0 * np.arange(len(kinds))[:, None, None] + np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    assert (confidence(none, kinds, ground) < confidence(all_around, kinds, ground)).all()
+    first, second = confidence(all_around, kinds, ground)[2:]
     assert first == second, "bars of any class are judged alike"
 
 

@@ -1,6 +1,7 @@
 """How probable it is that a quadrilateral is a whole marking of its class: a logistic function of evidence.
 
-Its weights, in ``confidence.json`` beside the network that they belong to, are those that
+It is asked twice: first what speaks for each one alone, then with what the others, as probable as they were
+alone, say of it. The weights, in ``confidence.json`` beside the network that they belong to, are those that
 ``python -m tests.benchmarks.detector_confidence`` fits to renders which no benchmark shows. What speaks for a
 diamond does not speak for a dash, so each of the :data:`SHAPES` has its own.
 """
@@ -14,10 +15,14 @@ from pathlib import Path
 
 import numpy as np
 
+from v2hdm.detection.corners.company import COMPANY, company
 from v2hdm.detection.corners.evidence import FEATURES
 from v2hdm.records import DIAMOND, LANE_DASH, FloatArray
 
 CONFIDENCE_FILE = Path(__file__).parents[1] / "confidence.json"
+
+_Fit = tuple[FloatArray, float]
+"""Weights (F,) and bias of a logistic function."""
 
 SHAPES = (DIAMOND, LANE_DASH, "bar")
 """Diamonds, lane dashes, and whatever else has four corners."""
@@ -28,19 +33,43 @@ def shape_of(kind: str) -> str:
     return kind if kind in SHAPES else SHAPES[-1]
 
 
-def confidence(evidence: FloatArray, kinds: Sequence[str]) -> FloatArray:
-    """Probability (M,) from evidence (M, F), in the order of :data:`FEATURES`, of each one's class."""
-    fitted = _fitted(CONFIDENCE_FILE)
-    weights, bias = zip(*(fitted[shape_of(kind)] for kind in kinds), strict=True)
-    odds = (evidence * np.array(weights)).sum(axis=1) + np.array(bias)
+def confidence(evidence: FloatArray, kinds: Sequence[str], ground: FloatArray) -> FloatArray:
+    """Probability (M,) of each one's class.
+
+    Args:
+        evidence: (M, F), in the order of :data:`FEATURES`.
+        kinds: the classes.
+        ground: corners (M, 4, 2) on the ground, m.
+    """
+    alone, among = _fitted(CONFIDENCE_FILE)
+    shapes = [shape_of(kind) for kind in kinds]
+    probability = as_probability(_odds(evidence, [alone[shape] for shape in shapes]))
+    told = np.column_stack([evidence, company(ground, kinds, probability)])
+    return as_probability(_odds(told, [among[shape] for shape in shapes]))
+
+
+def as_probability(odds: FloatArray) -> FloatArray:
+    """Of log odds, of which more than 30 either way are too many."""
     return np.asarray(1 / (1 + np.exp(-np.clip(odds, -30, 30))))
 
 
+def _odds(features: FloatArray, fits: Sequence[_Fit]) -> FloatArray:
+    """Log odds (M,) of features (M, F) by the fit that belongs to each."""
+    weights, bias = zip(*fits, strict=True)
+    return np.asarray((features * np.array(weights)).sum(axis=1) + np.array(bias))
+
+
 @cache
-def _fitted(path: Path) -> dict[str, tuple[FloatArray, float]]:
-    """Weights (F,) and bias of each shape."""
+def _fitted(path: Path) -> tuple[dict[str, _Fit], dict[str, _Fit]]:
+    """Weights and bias of each shape, alone and among others."""
     fitted = json.loads(path.read_text(encoding="utf-8"))
-    return {
-        shape: (np.array([fitted[shape]["weights"][name] for name in FEATURES]), float(fitted[shape]["bias"]))
-        for shape in SHAPES
-    }
+    names = {"alone": FEATURES, "among": (*FEATURES, *COMPANY)}
+    alone, among = (
+        {
+            shape: (np.array([part["weights"][name] for name in names[asked]]), float(part["bias"]))
+            for shape in SHAPES
+            for part in (fitted[shape][asked],)
+        }
+        for asked in ("alone", "among")
+    )
+    return alone, among

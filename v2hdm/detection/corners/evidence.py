@@ -141,6 +141,7 @@ def gather(
     foreground: Foreground,
     view: CameraView,
     corners_px: FloatArray,
+    ground: FloatArray,
     claims: list[Claim],
     valid: BoolArray,
 ) -> FloatArray:
@@ -151,10 +152,10 @@ def gather(
         foreground: what the network says of the image.
         view: the camera.
         corners_px: recorded px.
+        ground: the same on the ground (M, 4, 2), m; NaN above the horizon.
         claims: what the network claims of each one's blob.
         valid: (M, 4) which corners the image gave.
     """
-    ground = view.ground(view.undistort(corners_px.reshape(-1, 2))).reshape(corners_px.shape)
     sides = np.sort(side_frames(ground)[2], axis=1)
     log_sides = np.log(np.clip(np.nan_to_num(sides, nan=1.0), 0.01, 100.0))
     log_width = np.log(np.clip(sides[:, :2].mean(axis=1), 0.01, 100.0))

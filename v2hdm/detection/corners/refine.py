@@ -124,7 +124,9 @@ def fit_markings(
     found.valid &= ~steps.runs_on()
     _reject(found, view, options)
     kinds, claims = [s.kind for s in starts], [s.claim for s in starts]
-    score = confidence(gather(steps, foreground, view, found.px, claims, found.valid), kinds)
+    ground = view.ground(view.undistort(found.px.reshape(-1, 2))).reshape(found.px.shape)
+    evidence = gather(steps, foreground, view, found.px, ground, claims, found.valid)
+    score = confidence(evidence, kinds, ground)
     if options.vague_corners:
         _take_outlines(found, start, [s.outline_pinhole_px for s in starts], view, options)
         found.valid[_is_cut(found, view)] = False
