@@ -23,8 +23,7 @@ import cv2
 import numpy as np
 
 from tests.benchmarks.detector_quality import Example, example, polygon_overlap
-from v2hdm.detection.corners.company import COMPANY, company
-from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, SHAPES, as_probability, shape_of
+from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, SHAPES, TOLD, shape_of, told
 from v2hdm.detection.corners.evidence import FEATURES
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
@@ -133,15 +132,14 @@ def main() -> None:
 
 def fit_shapes(gathered: Gathered) -> dict[str, dict[str, object]]:
     """What ``confidence.json`` is to hold; prints weights and losses."""
-    evidence = np.array(gathered.evidence)
-    alone, odds = _fit_each(gathered, evidence, FEATURES)
+    alone, odds = _fit_each(gathered, np.array(gathered.evidence), FEATURES)
     # Each look is told of by odds that its own image had no part in.
-    told, look = np.zeros((len(odds), len(COMPANY))), np.array(gathered.look)
+    features, look = np.zeros((len(odds), len(TOLD))), np.array(gathered.look)
     for number in range(1 + look.max()):
         mine = np.flatnonzero(look == number)
         kinds = [gathered.kind[m] for m in mine]
-        told[mine] = company(np.array(gathered.ground)[mine], kinds, as_probability(odds[mine]))
-    among, _ = _fit_each(gathered, np.column_stack([evidence, told]), (*FEATURES, *COMPANY))
+        features[mine] = told(odds[mine], np.array(gathered.ground)[mine], kinds)
+    among, _ = _fit_each(gathered, features, TOLD)
     return {shape: {"alone": alone[shape], "among": among[shape]} for shape in SHAPES}
 
 

@@ -8,8 +8,7 @@ import pytest
 
 from tests.benchmarks.detector_confidence import fit
 from tests.detection.pictures import bar, brightness_model, diamond, make_camera, picture, to_image
-from v2hdm.detection.corners.company import COMPANY
-from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, SHAPES, confidence
+from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, SHAPES, TOLD, confidence
 from v2hdm.detection.corners.evidence import FEATURES, Steps, grey_steps
 from v2hdm.detection.corners.grey import linear_grey
 from v2hdm.detection.corners.quad import order_corners
@@ -89,7 +88,7 @@ def test_the_fitted_weights_are_those_of_the_features_and_prefer_evidence():
         all_around[:, FEATURES.index(name)] = 1.0
     for shape in SHAPES:
         assert set(fitted[shape]["alone"]["weights"]) == set(FEATURES)
-        assert set(fitted[shape]["among"]["weights"]) == {*FEATURES, *COMPANY}
+        assert set(fitted[shape]["among"]["weights"]) == set(TOLD)
     ground = 100.0 * np.arange(len(kinds))[:, None, None] + np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     assert (confidence(none, kinds, ground) < confidence(all_around, kinds, ground)).all()
     first, second = confidence(all_around, kinds, ground)[2:]

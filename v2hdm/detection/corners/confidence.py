@@ -24,6 +24,9 @@ CONFIDENCE_FILE = Path(__file__).parents[1] / "confidence.json"
 _Fit = tuple[FloatArray, float]
 """Weights (F,) and bias of a logistic function."""
 
+TOLD = ("alone", *COMPANY)
+"""What a quadrilateral is judged by among others: its own log odds, and what the others say."""
+
 SHAPES = (DIAMOND, LANE_DASH, "bar")
 """Diamonds, lane dashes, and whatever else has four corners."""
 
@@ -43,9 +46,13 @@ def confidence(evidence: FloatArray, kinds: Sequence[str], ground: FloatArray) -
     """
     alone, among = _fitted(CONFIDENCE_FILE)
     shapes = [shape_of(kind) for kind in kinds]
-    probability = as_probability(_odds(evidence, [alone[shape] for shape in shapes]))
-    told = np.column_stack([evidence, company(ground, kinds, probability)])
-    return as_probability(_odds(told, [among[shape] for shape in shapes]))
+    odds = _odds(evidence, [alone[shape] for shape in shapes])
+    return as_probability(_odds(told(odds, ground, kinds), [among[shape] for shape in shapes]))
+
+
+def told(odds: FloatArray, ground: FloatArray, kinds: Sequence[str]) -> FloatArray:
+    """The features (M, 6) :data:`TOLD` of quadrilaterals, of the log odds (M,) that each has alone."""
+    return np.column_stack([odds, company(ground, kinds, as_probability(odds))])
 
 
 def as_probability(odds: FloatArray) -> FloatArray:
@@ -63,7 +70,7 @@ def _odds(features: FloatArray, fits: Sequence[_Fit]) -> FloatArray:
 def _fitted(path: Path) -> tuple[dict[str, _Fit], dict[str, _Fit]]:
     """Weights and bias of each shape, alone and among others."""
     fitted = json.loads(path.read_text(encoding="utf-8"))
-    names = {"alone": FEATURES, "among": (*FEATURES, *COMPANY)}
+    names = {"alone": FEATURES, "among": TOLD}
     alone, among = (
         {
             shape: (np.array([part["weights"][name] for name in names[asked]]), float(part["bias"]))
