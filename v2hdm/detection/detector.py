@@ -57,6 +57,8 @@ class _Candidate:
     score: float
     outline_pinhole_px: FloatArray
     outline_vehicle: FloatArray
+    at_head: bool
+    """Whether it may be the shaft of an arrow, parted from its head by wear."""
 
 
 class Detector:
@@ -133,9 +135,8 @@ class Detector:
             found = plausible_kind(blob, on_ground[index], view)
             if found is None or found[1] < _LEAST_SCORE:
                 continue
-            if found[0] == LANE_DASH and ends_at_a_head(on_ground[index], heads):
-                continue  # the shaft of an arrow, parted from its head by wear
-            candidates.append(_Candidate(blob, index, *found, outline, on_ground[index]))
+            at_head = found[0] == LANE_DASH and ends_at_a_head(on_ground[index], heads)
+            candidates.append(_Candidate(blob, index, *found, outline, on_ground[index], at_head))
         return candidates
 
     def _lane_paint(self, candidates: list[_Candidate]) -> list[LanePaint]:
@@ -145,7 +146,7 @@ class Detector:
             # Else it is the shaft of an arrow, the stroke of a letter.
             if c.kind in LANE_CLASSES
             and c.score >= self.options.min_score
-            and not (c.kind == LANE_DASH and c.blob.touches_symbol)
+            and not (c.kind == LANE_DASH and (c.blob.touches_symbol or c.at_head))
         ]
 
     def _starts(self, candidates: list[_Candidate], view: CameraView) -> list[QuadStart]:
@@ -158,7 +159,7 @@ class Detector:
             start = starting_corners(kind, c.outline_pinhole_px, c.outline_vehicle, view)
             least = _LEAST_COVER if c.kind not in OUTLINED_CLASSES else _LEAST_COVER_OF_SYMBOL
             if start is not None and start[1] >= least:
-                starts.append(QuadStart(kind, _claim(c.blob, kind), start[0], c.index, c.outline_pinhole_px))
+                starts.append(QuadStart(kind, _claim(c, kind), start[0], c.index, c.outline_pinhole_px))
         if not starts:
             return []
         corners = np.stack([start.corners_pinhole_px for start in starts])
@@ -185,11 +186,12 @@ def _is_among(symbol: MarkingDetection, quads: list[MarkingDetection]) -> bool:
     return any(cv2.pointPolygonTest(polygon, centre.tolist(), False) > 0 for centre in centres)
 
 
-def _claim(blob: Blob, kind: str) -> Claim:
+def _claim(candidate: _Candidate, kind: str) -> Claim:
+    blob = candidate.blob
     certainty = sum(blob.class_score.values())
     share = {name: score / max(certainty, 1e-9) for name, score in blob.class_score.items()}
     symbols = sum(share.get(name, 0.0) for name in (*OUTLINED_CLASSES, OTHER_PAINT))
-    return Claim(certainty, share.get(kind, 0.0), share.get(LANE_LINE, 0.0), symbols, blob.touches_symbol)
+    return Claim(certainty, share.get(kind, 0.0), share.get(LANE_LINE, 0.0), symbols, blob.touches_symbol, candidate.at_head)
 
 
 def _check_image(image_bgr: np.ndarray, camera: Camera) -> None:

@@ -23,6 +23,7 @@ FEATURES = (
     "line_share",
     "symbol_share",
     "touches_symbol",
+    "at_head",
     "four_corners",
     "support",
     "contrast",
@@ -39,8 +40,8 @@ FEATURES = (
 """Names of the columns of :func:`gather`, in order.
 
 From the network: mean log odds of paint inside, mean probability of paint over the blob, the shares in it of
-the class, of lane lines and of symbols, and whether the blob was split off an arrow or a letter. From the
-image: whether it gave four corners, the share of profiles across the sides that show paint inside, the log of
+the class, of lane lines and of symbols, whether the blob was split off an arrow or a letter, and whether it
+ends where what may be the head of an arrow begins. From the image: whether it gave four corners, the share of profiles across the sides that show paint inside, the log of
 the typical step, the step of the weakest side in parts of that, how much of it is within a px of the side,
 how far the steps go on beyond the corners, on the whole and where they do so furthest, whether a corner is at
 the image's border, the log of the width in px. On the ground, in metres: log of length and width, and of how
@@ -80,6 +81,7 @@ class Claim:
     line_share: float
     symbol_share: float
     touches_symbol: bool
+    at_head: bool
 
 
 @dataclass(frozen=True)
@@ -173,6 +175,7 @@ def gather(
         "line_share": np.array([claim.line_share for claim in claims]),
         "symbol_share": np.array([claim.symbol_share for claim in claims]),
         "touches_symbol": np.array([claim.touches_symbol for claim in claims]),
+        "at_head": np.array([claim.at_head for claim in claims]),
         "four_corners": valid.all(axis=1),
         "support": good.mean(axis=(1, 2)),
         "contrast": np.log(typical),

@@ -103,8 +103,8 @@ def cornered_kind(blob: Blob, outline_vehicle: FloatArray, kind: str, view: Came
     if not is_whole(blob, view) or not length_m <= _DASH_LENGTH_M:
         return None
     if length_m < _SIZE_LIMITS_M[LANE_DASH][0][0]:
-        kind, _ = _likeliest_compact(blob.class_score)
-        return kind if kind in CORNERED_CLASSES and _fits(kind, length_m, width_m) else None
+        fitting = [name for name in CORNERED_CLASSES if _fits(name, length_m, width_m)]
+        return max(fitting, key=lambda name: blob.class_score.get(name, 0.0), default=None)
     dash = blob.class_score.get(LANE_DASH, 0.0) >= _LEAST_DASH_SHARE * lane_score
     return LANE_DASH if dash and _fits(LANE_DASH, length_m, width_m) else None
 
