@@ -17,6 +17,7 @@ import argparse
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 from unittest.mock import patch
 
 import cv2
@@ -24,12 +25,13 @@ import numpy as np
 
 from tests.benchmarks.detector_quality import Example, example, polygon_overlap
 from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, SHAPES, TOLD, shape_of, told
-from v2hdm.detection.corners.evidence import FEATURES
+from v2hdm.detection.corners.evidence import FEATURES, gather
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.records import BoolArray, FloatArray, MarkingDetection
+from v2hdm.records import BoolArray, FloatArray
 
 SEED = 917
+REFINE = "v2hdm.detection.corners.refine"
 EASY = 0.2
 RIDGE = 2.0
 FOLDS = 5
@@ -39,7 +41,7 @@ COUNTS = (10, 20, 40, 80)
 
 @dataclass
 class Gathered:
-    """N quadrilaterals, those of one look at an image together.
+    """N readings of quadrilaterals as one class, those of one look at an image together.
 
     Their evidence, corners on the ground, classes, whether they are true (None where either will do), the
     numbers of the images they are from and of the looks.
@@ -54,29 +56,34 @@ class Gathered:
 
     def add(self, index: int, shown: Example, detector: Detector) -> None:
         """What the detector proposes in one image."""
+        corners_px: list[FloatArray] = []
 
-        def spy(evidence: FloatArray, _kinds: list[str], ground: FloatArray) -> FloatArray:
+        def gather_spy(*given: Any) -> FloatArray:
+            corners_px.extend(given[3])
+            return gather(*given)
+
+        def spy(evidence: FloatArray, kinds: list[str], ground: FloatArray) -> FloatArray:
             self.evidence.extend(evidence)
+            self.kind.extend(kinds)
             self.ground.extend(ground)
             return np.ones(len(evidence))
 
-        with patch("v2hdm.detection.corners.refine.confidence", spy):
-            markings, _ = detector.detect(shown.image, shown.camera)
-        look = 1 + max(self.look, default=-1)
-        for marking in markings[: len(self.evidence) - len(self.kind)]:  # the outlined symbols come last
-            self.kind.append(marking.kind)
-            self.true.append(is_true(shown, marking))
+        look, first = 1 + max(self.look, default=-1), len(self.kind)
+        with patch(f"{REFINE}.gather", gather_spy), patch(f"{REFINE}.confidence", spy):
+            detector.detect(shown.image, shown.camera)
+        for kind, corners in zip(self.kind[first:], corners_px, strict=True):
+            self.true.append(is_true(shown, kind, corners))
             self.image.append(index)
             self.look.append(look)
 
 
-def is_true(shown: Example, marking: MarkingDetection) -> bool | None:
-    """Whether a quadrilateral is a marking; None where the quality benchmark lets it be."""
-    overlaps = [(polygon_overlap(marking.corners_px, true.polygon_px), true) for true in shown.markings]
-    if any(share >= 0.5 and true.kind == marking.kind for share, true in overlaps):
+def is_true(shown: Example, kind: str, corners_px: FloatArray) -> bool | None:
+    """Whether a quadrilateral (4, 2) is a marking; None where the quality benchmark lets it be."""
+    overlaps = [(polygon_overlap(corners_px, true.polygon_px), true) for true in shown.markings]
+    if any(share >= 0.5 and true.kind == kind for share, true in overlaps):
         return True
     share, nearest = max(overlaps, key=lambda pair: pair[0], default=(0.0, None))
-    if share <= 0.05 or (nearest is not None and nearest.fair and nearest.kind != marking.kind):
+    if share <= 0.05 or (nearest is not None and nearest.fair and nearest.kind != kind):
         return False
     return None
 

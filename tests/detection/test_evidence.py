@@ -74,8 +74,8 @@ def test_a_round_soft_fleck_is_improbable_where_a_diamond_is_not(tmp_path, x):
     fleck = np.repeat(np.round(soft)[..., None], 3, axis=2).astype(np.uint8)
     found = confidences(fleck, tmp_path)
     assert found, "the network takes it for paint"
-    assert painted > DetectorOptions().min_confidence
-    assert 1 - max(found) > 10 * (1 - painted)
+    assert painted > DetectorOptions().min_confidence > max(found)
+    assert painted / (1 - painted) > 10 * max(found) / (1 - max(found))
 
 
 def test_the_fitted_weights_are_those_of_the_features_and_prefer_evidence():

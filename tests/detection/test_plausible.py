@@ -6,8 +6,17 @@ import pytest
 from tests.detection.pictures import bar, diamond, make_camera, to_image
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.paint.blobs import Blob
-from v2hdm.detection.paint.plausible import cornered_kind, plausible_kind
-from v2hdm.records import ARROW, CHEVRON, DIAMOND, LANE_DASH, LANE_LINE, OTHER_PAINT
+from v2hdm.detection.paint.plausible import cornered_kind, plausible_kind, rival_kinds
+from v2hdm.records import (
+    ARROW,
+    CHEVRON,
+    CROSSWALK_BAR,
+    DIAMOND,
+    LANE_DASH,
+    LANE_LINE,
+    OTHER_PAINT,
+    STOP_LINE,
+)
 
 VIEW = CameraView(make_camera("plumb_bob"), 16)
 RHOMBUS = diamond(8.0, 0.0)
@@ -50,10 +59,31 @@ def test_short_lane_paint_is_tried_as_a_dash_and_shorter_paint_as_a_diamond() ->
     scores = {LANE_LINE: 0.8, LANE_DASH: 0.12, DIAMOND: 0.05}
     assert tried_as(STRIP, scores) == LANE_DASH
     assert tried_as(bar(8.0, 0.0, 0.6, 0.15), scores) == DIAMOND
-    assert tried_as(STRIP, {LANE_LINE: 0.9, LANE_DASH: 0.02}) is None
+    assert tried_as(STRIP, {LANE_LINE: 0.9, LANE_DASH: 0.02}) == LANE_DASH, "it ends at both sides"
 
 
 def test_what_is_too_long_for_a_dash_is_tried_as_several_if_the_network_says_dash() -> None:
     long = bar(14.0, 0.0, 16.0, 0.15)
     assert tried_as(long, {LANE_DASH: 0.9, LANE_LINE: 0.05}) == LANE_DASH
     assert tried_as(long, {LANE_DASH: 0.3, LANE_LINE: 0.6}) is None
+
+
+def test_what_is_too_small_for_its_class_is_tried_as_what_it_may_be() -> None:
+    small = diamond(6.0, 0.0, 0.7, 0.5)
+    assert tried_as(small, {CROSSWALK_BAR: 0.7, DIAMOND: 0.2}) == DIAMOND
+    assert tried_as(small, {OTHER_PAINT: 0.7, DIAMOND: 0.2}) is None, "letters have strokes like diamonds"
+
+
+def test_a_quadrilateral_is_read_as_every_class_that_it_may_be() -> None:
+    def rivals(outline_vehicle: np.ndarray, scores: dict[str, float], kind: str) -> list[str]:
+        outline_px = to_image(VIEW.camera, outline_vehicle)
+        return rival_kinds(
+            Blob(scores, np.ones((3, 3)), np.zeros(2), 2, outline_px), outline_vehicle, kind, VIEW
+        )
+
+    wide = bar(8.0, 0.0, 3.0, 0.3)
+    scores = {CROSSWALK_BAR: 0.5, LANE_DASH: 0.3, STOP_LINE: 0.1, DIAMOND: 0.01}
+    assert rivals(wide, scores, CROSSWALK_BAR) == [LANE_DASH, STOP_LINE]
+    assert rivals(RHOMBUS, {DIAMOND: 0.5, LANE_DASH: 0.4}, DIAMOND) == [], "no dash is so wide"
+    cut = wide - np.array([0.0, np.ptp(wide[:, 1]) + 8.0])
+    assert rivals(cut, scores, CROSSWALK_BAR) == [], "what the border cuts may be anything"

@@ -18,7 +18,13 @@ from v2hdm.detection.lanes.centre_lines import LanePaint, trace_lanes
 from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.paint.blobs import Blob, find_blobs, outline_polygon
-from v2hdm.detection.paint.plausible import Heads, cornered_kind, ends_at_a_head, plausible_kind
+from v2hdm.detection.paint.plausible import (
+    Heads,
+    cornered_kind,
+    ends_at_a_head,
+    plausible_kind,
+    rival_kinds,
+)
 from v2hdm.detection.paint.starts import starting_corners
 from v2hdm.detection.sight import look
 from v2hdm.detection.stopwatch import lap
@@ -159,7 +165,9 @@ class Detector:
             start = starting_corners(kind, c.outline_pinhole_px, c.outline_vehicle, view)
             least = _LEAST_COVER if c.kind not in OUTLINED_CLASSES else _LEAST_COVER_OF_SYMBOL
             if start is not None and start[1] >= least:
-                starts.append(QuadStart(kind, _claim(c, kind), start[0], c.index, c.outline_pinhole_px))
+                kinds = [kind, *rival_kinds(c.blob, c.outline_vehicle, kind, view)]
+                claims = {name: _claim(c, name) for name in kinds}
+                starts.append(QuadStart(claims, start[0], c.index, c.outline_pinhole_px))
         if not starts:
             return []
         corners = np.stack([start.corners_pinhole_px for start in starts])
@@ -187,11 +195,18 @@ def _is_among(symbol: MarkingDetection, quads: list[MarkingDetection]) -> bool:
 
 
 def _claim(candidate: _Candidate, kind: str) -> Claim:
-    blob = candidate.blob
-    certainty = sum(blob.class_score.values())
-    share = {name: score / max(certainty, 1e-9) for name, score in blob.class_score.items()}
-    symbols = sum(share.get(name, 0.0) for name in (*OUTLINED_CLASSES, OTHER_PAINT))
-    return Claim(certainty, share.get(kind, 0.0), share.get(LANE_LINE, 0.0), symbols, blob.touches_symbol, candidate.at_head)
+    """What the network says of a candidate's being of a class."""
+    scores = candidate.blob.class_score
+    certainty = sum(scores.values())
+    share = {name: score / max(certainty, 1e-9) for name, score in scores.items()}
+    return Claim(
+        certainty,
+        share.get(kind, 0.0),
+        line_share=share.get(LANE_LINE, 0.0),
+        symbol_share=sum(share.get(name, 0.0) for name in (*OUTLINED_CLASSES, OTHER_PAINT)),
+        touches_symbol=candidate.blob.touches_symbol,
+        at_head=candidate.at_head,
+    )
 
 
 def _check_image(image_bgr: np.ndarray, camera: Camera) -> None:

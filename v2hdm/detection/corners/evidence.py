@@ -41,11 +41,11 @@ FEATURES = (
 
 From the network: mean log odds of paint inside, mean probability of paint over the blob, the shares in it of
 the class, of lane lines and of symbols, whether the blob was split off an arrow or a letter, and whether it
-ends where what may be the head of an arrow begins. From the image: whether it gave four corners, the share of profiles across the sides that show paint inside, the log of
-the typical step, the step of the weakest side in parts of that, how much of it is within a px of the side,
-how far the steps go on beyond the corners, on the whole and where they do so furthest, whether a corner is at
-the image's border, the log of the width in px. On the ground, in metres: log of length and width, and of how
-much longer the longest side is than the shortest."""
+ends where what may be the head of an arrow begins. From the image: whether it gave four corners, the share of
+profiles across the sides that show paint inside, the log of the typical step, the step of the weakest side in
+parts of that, how much of it is within a px of the side, how far the steps go on beyond the corners, on the
+whole and where they do so furthest, whether a corner is at the image's border, the log of the width in px. On
+the ground, m: log of length and width, and of how much longer the longest side is than the shortest."""
 
 _PROFILES = 12
 _FAR_PX = 2.0
@@ -95,6 +95,10 @@ class Steps:
     along: FloatArray
     near: FloatArray
     beyond: FloatArray
+
+    def take(self, rows: np.ndarray) -> Steps:
+        """Those of some of the quadrilaterals."""
+        return Steps(self.along[rows], self.near[rows], self.beyond[rows])
 
     @property
     def typical(self) -> FloatArray:

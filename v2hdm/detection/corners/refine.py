@@ -14,7 +14,7 @@ from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.both_sides import painted_parts
 from v2hdm.detection.corners.confidence import confidence
 from v2hdm.detection.corners.edge_fit import EdgeFit, fit_edges
-from v2hdm.detection.corners.evidence import Claim, gather, grey_steps
+from v2hdm.detection.corners.evidence import Claim, Steps, gather, grey_steps
 from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.corners.grey import GreyBand, linear_grey
 from v2hdm.detection.corners.outline_fit import fit_outlines
@@ -58,14 +58,19 @@ _CLOSURE = np.array([1.0, -1.0, 1.0, -1.0])
 class QuadStart:
     """A blob's quadrilateral ``corners_pinhole_px`` (4, 2) before refinement.
 
-    ``claim`` is the network's, ``blob`` the blob's index, ``outline_pinhole_px`` (N, 2) its outline.
+    ``claims`` are what the network says for each class that it may be of, the likeliest first; ``blob`` is
+    the blob's index, ``outline_pinhole_px`` (N, 2) its outline.
     """
 
-    kind: str
-    claim: Claim
+    claims: dict[str, Claim]
     corners_pinhole_px: FloatArray
     blob: int
     outline_pinhole_px: FloatArray
+
+    @property
+    def kind(self) -> str:
+        """The likeliest class."""
+        return next(iter(self.claims))
 
 
 @dataclass
@@ -123,10 +128,7 @@ def fit_markings(
     steps = grey_steps(grey, found.px)
     found.valid &= ~steps.runs_on()
     _reject(found, view, options)
-    kinds, claims = [s.kind for s in starts], [s.claim for s in starts]
-    ground = view.ground(view.undistort(found.px.reshape(-1, 2))).reshape(found.px.shape)
-    evidence = gather(steps, foreground, view, found.px, ground, claims, found.valid)
-    score = confidence(evidence, kinds, ground)
+    kinds, score = _judged(starts, found, steps, foreground, view)
     if options.vague_corners:
         _take_outlines(found, start, [s.outline_pinhole_px for s in starts], view, options)
         found.valid[_is_cut(found, view)] = False
@@ -135,6 +137,25 @@ def fit_markings(
         for m, kind in enumerate(kinds)
         if score[m] >= options.min_confidence
     ]
+
+
+def _judged(
+    starts: list[QuadStart], found: _Corners, steps: Steps, foreground: Foreground, view: CameraView
+) -> tuple[list[str], FloatArray]:
+    """The class (M,) for which there is most evidence of those that each may be of, and its confidence."""
+    start = np.repeat(np.arange(len(starts)), [len(s.claims) for s in starts])
+    kinds = [kind for s in starts for kind in s.claims]
+    claims = [claim for s in starts for claim in s.claims.values()]
+    ground = view.ground(view.undistort(found.px.reshape(-1, 2))).reshape(found.px.shape)[start]
+    evidence = gather(
+        steps.take(start), foreground, view, found.px[start], ground, claims, found.valid[start]
+    )
+    score = confidence(evidence, kinds, ground)
+    # Stable, so that the likeliest by the network comes first among equals.
+    best = np.lexsort((-np.arange(len(start)), score))
+    chosen = dict(zip(start[best].tolist(), best.tolist(), strict=True))
+    rows = [chosen[m] for m in range(len(starts))]
+    return [kinds[row] for row in rows], score[rows]
 
 
 def _stacked(starts: list[QuadStart], view: CameraView) -> tuple[FloatArray, FloatArray]:

@@ -22,6 +22,7 @@ from v2hdm.records import (
     LANE_CLASSES,
     LANE_DASH,
     LANE_LINE,
+    OTHER_PAINT,
     OUTLINED_CLASSES,
     STOP_LINE,
     FloatArray,
@@ -48,8 +49,8 @@ gives only this share of its lane score to dashes: seen locally, dash and line a
 _SURE_DASH_SHARE = 0.5
 """With more than this share what is too long for one dash is tried as several."""
 
-_LEAST_DASH_SHARE = 0.08
-"""With this share a whole piece of that length is tried as a dash: its four sides must show it to be one."""
+_LEAST_RIVAL_SHARE = 0.05
+"""With this share another class is tried, too: all evidence decides between them."""
 
 _LEAST_SECOND_SHARE = 0.12
 """What the network takes for a symbol is tried as a quadrilateral if it leaves that class this share."""
@@ -68,6 +69,9 @@ _BORDER_PX = 4.0
 def plausible_kind(blob: Blob, outline_vehicle: FloatArray, view: CameraView) -> tuple[str, float] | None:
     """The likeliest class that the blob's size on the ground allows, with its score; None for none.
 
+    Where it does not allow the likeliest of all, that is the likeliest with four corners; but letters, whose
+    strokes are like other markings, stay letters.
+
     Args:
         blob: the blob.
         outline_vehicle: its outline on the ground (N, 2), m.
@@ -81,7 +85,10 @@ def plausible_kind(blob: Blob, outline_vehicle: FloatArray, view: CameraView) ->
         kind, score = _likeliest(blob.class_score, whole and length_m <= _DASH_LENGTH_M)
     if kind == LANE_DASH and not _fits(LANE_DASH, length_m, width_m):
         kind = LANE_LINE
-    return (kind, score) if _fits(kind, length_m, width_m) else None
+    if _fits(kind, length_m, width_m):
+        return kind, score
+    fitting = _fitting(blob, length_m, width_m) if whole and kind != OTHER_PAINT else []
+    return (fitting[0], score) if fitting else None
 
 
 def cornered_kind(blob: Blob, outline_vehicle: FloatArray, kind: str, view: CameraView) -> str | None:
@@ -103,10 +110,28 @@ def cornered_kind(blob: Blob, outline_vehicle: FloatArray, kind: str, view: Came
     if not is_whole(blob, view) or not length_m <= _DASH_LENGTH_M:
         return None
     if length_m < _SIZE_LIMITS_M[LANE_DASH][0][0]:
-        fitting = [name for name in CORNERED_CLASSES if _fits(name, length_m, width_m)]
-        return max(fitting, key=lambda name: blob.class_score.get(name, 0.0), default=None)
-    dash = blob.class_score.get(LANE_DASH, 0.0) >= _LEAST_DASH_SHARE * lane_score
-    return LANE_DASH if dash and _fits(LANE_DASH, length_m, width_m) else None
+        return next(iter(_fitting(blob, length_m, width_m)), None)
+    return LANE_DASH if _fits(LANE_DASH, length_m, width_m) else None
+
+
+def rival_kinds(blob: Blob, outline_vehicle: FloatArray, kind: str, view: CameraView) -> list[str]:
+    """The other classes with four corners that a quadrilateral, tried as ``kind``, may well be of."""
+    if not is_whole(blob, view):
+        return []
+    least = _LEAST_RIVAL_SHARE * sum(blob.class_score.values())
+    fitting = _fitting(blob, *_ground_size(outline_vehicle))
+    return [name for name in fitting if name != kind and blob.class_score.get(name, 0.0) >= least]
+
+
+def _fitting(blob: Blob, length_m: float, width_m: float) -> list[str]:
+    """Classes with four corners that are of such a size and shape, the likeliest first."""
+    slim = length_m >= _LEAST_ELONGATION * width_m
+    fitting = [
+        name
+        for name in CORNERED_CLASSES
+        if _fits(name, length_m, width_m) and (slim or name not in (LANE_DASH, STOP_LINE))
+    ]
+    return sorted(fitting, key=lambda name: -blob.class_score.get(name, 0.0))
 
 
 def _second_choice(blob: Blob, length_m: float, width_m: float) -> str | None:
