@@ -75,7 +75,24 @@ def test_a_round_soft_fleck_is_improbable_where_a_diamond_is_not(tmp_path, x):
     found = confidences(fleck, tmp_path)
     assert found, "the network takes it for paint"
     assert painted > DetectorOptions().min_confidence > max(found)
-    assert painted / (1 - painted) > 10 * max(found) / (1 - max(found))
+
+
+def test_a_fleck_among_painted_diamonds_is_none_of_them(tmp_path):
+    camera = make_camera("pinhole")
+    field = [diamond(x, y, 1.2, 0.7) for x in (5.5, 8.5) for y in (-1.5, 1.5)]
+    image = picture(camera, field)
+    box_px = to_image(camera, diamond(7.0, 0.0, 0.8, 1.6))
+    centre, size = box_px.mean(axis=0).astype(int).tolist(), (np.ptp(box_px, axis=0) / 2).astype(int)
+    light = np.zeros(image.shape, dtype=np.float32)
+    cv2.ellipse(light, centre, size.tolist(), 0, 0, 360, (95.0, 95.0, 95.0), cv2.FILLED)
+    image = np.clip(image + cv2.GaussianBlur(light, (0, 0), 4.0), 0, 255).astype(np.uint8)
+    detector = Detector.load(brightness_model(tmp_path), DetectorOptions(min_confidence=0.0))
+    markings = sorted(detector.detect(image, camera)[0], key=lambda marking: marking.score)
+    assert len(markings) == 5
+    assert np.abs(markings[0].corners_px.mean(axis=0) - centre).max() < 5
+    fleck, faintest = (marking.score for marking in markings[:2])
+    assert fleck < DetectorOptions().min_confidence
+    assert faintest / (1 - faintest) > 10 * fleck / (1 - fleck)
 
 
 def test_the_fitted_weights_are_those_of_the_features_and_prefer_evidence():
