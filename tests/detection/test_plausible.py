@@ -1,10 +1,13 @@
 """What a blob is tried as: by its class scores and its size on the ground."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from tests.detection.pictures import bar, diamond, make_camera, to_image
+from tests.detection.pictures import bar, brightness_model, diamond, make_camera, to_image
 from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.detector import Detector
 from v2hdm.detection.paint.blobs import Blob
 from v2hdm.detection.paint.plausible import cornered_kind, plausible_kind, rival_kinds
 from v2hdm.records import (
@@ -87,3 +90,18 @@ def test_a_quadrilateral_is_read_as_every_class_that_it_may_be() -> None:
     assert rivals(RHOMBUS, {DIAMOND: 0.5, LANE_DASH: 0.4}, DIAMOND) == [], "no dash is so wide"
     cut = wide - np.array([0.0, np.ptp(wide[:, 1]) + 8.0])
     assert rivals(cut, scores, CROSSWALK_BAR) == [], "what the border cuts may be anything"
+
+
+def test_a_diamond_that_has_a_shaft_is_the_head_of_an_arrow(tmp_path: Path) -> None:
+    detector = Detector.load(brightness_model(tmp_path))
+
+    def kinds(*shaft: np.ndarray) -> list[str]:
+        blobs = [
+            Blob({kind: 0.9}, np.ones((3, 3)), np.zeros(2), 2, to_image(VIEW.camera, outline))
+            for kind, outline in ((DIAMOND, RHOMBUS), *((LANE_DASH, strip) for strip in shaft))
+        ]
+        return [candidate.kind for candidate in detector._candidates(blobs, VIEW)]
+
+    assert kinds() == [DIAMOND]
+    assert kinds(bar(6.2, 0.0, 2.0, 0.15)) == [LANE_DASH]
+    assert kinds(bar(6.2, 1.5, 2.0, 0.15)) == [DIAMOND, LANE_DASH], "it ends beside the diamond"

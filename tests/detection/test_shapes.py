@@ -17,7 +17,7 @@ from v2hdm.detection.corners.quad import (
     width,
 )
 from v2hdm.detection.paint.blobs import Blob, find_blobs, outline_polygon, zero_crossings
-from v2hdm.detection.paint.plausible import Heads, ends_at_a_head
+from v2hdm.detection.paint.plausible import Heads, head_of
 from v2hdm.detection.sight import Sight
 from v2hdm.records import PAINT_CLASSES
 
@@ -219,15 +219,15 @@ SHAFT = np.array([[4.0, 0.9], [6.0, 0.9], [6.0, 1.06], [4.0, 1.06]])
 
 def test_a_dash_that_ends_at_something_wide_astride_its_axis_is_a_shaft():
     head = np.array([[6.2, 0.7], [7.1, 1.0], [6.2, 1.3]])
-    assert ends_at_a_head(SHAFT, Heads([head]))
-    assert not ends_at_a_head(SHAFT, Heads([head + np.array([1.0, 0.0])]))
-    assert not ends_at_a_head(SHAFT, Heads([head + np.array([-1.2, 1.0])])), (
+    assert head_of(SHAFT, Heads({7: head})) == 7
+    assert head_of(SHAFT, Heads({0: head + np.array([1.0, 0.0])})) is None
+    assert head_of(SHAFT, Heads({0: head + np.array([-1.2, 1.0])})) is None, (
         "beside its middle, not at its end"
     )
-    assert not ends_at_a_head(SHAFT, Heads([]))
+    assert head_of(SHAFT, Heads({})) is None
 
 
 def test_specks_and_neighbours_at_the_end_of_a_dash_are_no_head():
     speck = np.array([[6.2, 0.95], [6.3, 0.9], [6.3, 1.05]])
     letter = np.array([[6.1, 1.2], [6.6, 1.2], [6.6, 1.6]])
-    assert not ends_at_a_head(SHAFT, Heads([speck, letter]))
+    assert head_of(SHAFT, Heads({0: speck, 1: letter})) is None

@@ -21,7 +21,7 @@ from v2hdm.detection.paint.blobs import Blob, find_blobs, outline_polygon
 from v2hdm.detection.paint.plausible import (
     Heads,
     cornered_kind,
-    ends_at_a_head,
+    head_of,
     plausible_kind,
     rival_kinds,
 )
@@ -135,15 +135,18 @@ class Detector:
         outlines = view.undistort(np.concatenate([blob.outline_px for blob in blobs]))
         ends = np.cumsum([len(blob.outline_px) for blob in blobs])[:-1]
         on_ground = np.split(view.ground(outlines), ends)
-        heads = Heads([g for blob, g in zip(blobs, on_ground, strict=True) if blob.kind in _HEADS])
+        heads = Heads({k: on_ground[k] for k, blob in enumerate(blobs) if blob.kind in _HEADS})
+        have_shafts = set()
         candidates = []
         for index, (blob, outline) in enumerate(zip(blobs, np.split(outlines, ends), strict=True)):
             found = plausible_kind(blob, on_ground[index], view)
             if found is None or found[1] < _LEAST_SCORE:
                 continue
-            at_head = found[0] == LANE_DASH and ends_at_a_head(on_ground[index], heads)
-            candidates.append(_Candidate(blob, index, *found, outline, on_ground[index], at_head))
-        return candidates
+            head = head_of(on_ground[index], heads) if found[0] == LANE_DASH else None
+            have_shafts.add(head)
+            candidates.append(_Candidate(blob, index, *found, outline, on_ground[index], head is not None))
+        # With a shaft it is the head of an arrow, however much it looks like the diamonds around.
+        return [c for c in candidates if c.kind != DIAMOND or c.index not in have_shafts]
 
     def _lane_paint(self, candidates: list[_Candidate]) -> list[LanePaint]:
         return [

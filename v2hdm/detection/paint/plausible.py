@@ -5,7 +5,7 @@ The initial IPM may be decimetres wrong, so sizes only rule out what is far off.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 
 import cv2
 import numpy as np
@@ -154,22 +154,23 @@ def is_whole(blob: Blob, view: CameraView) -> bool:
 
 
 class Heads:
-    """What may be the heads of arrows, by their outlines (N, 2) on the ground, m."""
+    """What may be the heads of arrows: numbers of blobs, with their outlines (N, 2) on the ground, m."""
 
-    def __init__(self, outlines_vehicle: Sequence[FloatArray]):
-        known = [outline[np.isfinite(outline[:, 0])] for outline in outlines_vehicle]
-        self._outlines = [outline for outline in known if len(outline) >= 3]
+    def __init__(self, outlines_vehicle: Mapping[int, FloatArray]):
+        known = {blob: outline[np.isfinite(outline[:, 0])] for blob, outline in outlines_vehicle.items()}
+        self._blobs = [blob for blob, outline in known.items() if len(outline) >= 3]
+        self._outlines = [known[blob] for blob in self._blobs]
         self._low = np.array([outline.min(axis=0) for outline in self._outlines]).reshape(-1, 2)
         self._high = np.array([outline.max(axis=0) for outline in self._outlines]).reshape(-1, 2)
 
-    def within(self, centre: FloatArray, reach_m: float) -> list[FloatArray]:
+    def within(self, centre: FloatArray, reach_m: float) -> list[tuple[int, FloatArray]]:
         """Those whose bounding box comes within a square of half the side ``reach_m``."""
         near = ((self._low < centre + reach_m) & (self._high > centre - reach_m)).all(axis=1)
-        return [self._outlines[k] for k in np.flatnonzero(near)]
+        return [(self._blobs[k], self._outlines[k]) for k in np.flatnonzero(near)]
 
 
-def ends_at_a_head(outline_vehicle: FloatArray, heads_vehicle: Heads) -> bool:
-    """Whether a dash is the shaft of an arrow whose head was parted from it by wear.
+def head_of(outline_vehicle: FloatArray, heads_vehicle: Heads) -> int | None:
+    """The blob that may be the head of an arrow of which a dash is the shaft; None for none.
 
     A head begins where the shaft ends, astride its axis, and is much wider.
 
@@ -179,7 +180,7 @@ def ends_at_a_head(outline_vehicle: FloatArray, heads_vehicle: Heads) -> bool:
     """
     points = outline_vehicle[np.isfinite(outline_vehicle).all(axis=1)]
     if len(points) < 3:
-        return False
+        return None
     centre, size, _ = box = cv2.minAreaRect(points.astype(np.float32))
     corners = cv2.boxPoints(box).astype(np.float64)
     sides = np.roll(corners, -1, axis=0) - corners
@@ -187,13 +188,13 @@ def ends_at_a_head(outline_vehicle: FloatArray, heads_vehicle: Heads) -> bool:
     axis = axis / np.linalg.norm(axis)
     half_m, width_m = max(size) / 2, min(size)
     across = np.array([-axis[1], axis[0]])
-    for head in heads_vehicle.within(np.array(centre), half_m + width_m + _HEAD_REACH_M):
+    for blob, head in heads_vehicle.within(np.array(centre), half_m + width_m + _HEAD_REACH_M):
         offset = head - np.array(centre)
         along, beside = np.abs(offset @ axis) - half_m, offset @ across
         begins = -_HEAD_OVERLAP_M < along.min() < _HEAD_REACH_M
         if begins and beside.min() < 0 < beside.max() and np.ptp(beside) > _HEAD_WIDENING * width_m:
-            return True
-    return False
+            return blob
+    return None
 
 
 def _likeliest(class_score: dict[str, float], short: bool) -> tuple[str, float]:
