@@ -1,5 +1,6 @@
 """Looking at near ground at half the resolution moves nothing."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -104,5 +105,9 @@ def test_the_mirror_image_moves_nothing_whatever_the_width(width):
     assert (twice.paint.shape, twice.kinds.shape) == (once.paint.shape, once.kinds.shape)
     both, either = ((once.paint > 0) & (twice.paint > 0)).sum(), ((once.paint > 0) | (twice.paint > 0)).sum()
     assert both / either > 0.93
-    centres = [np.argwhere(sight.paint > 0).mean(axis=0) for sight in (once, twice)]
-    np.testing.assert_allclose(*centres, atol=0.3)
+    # Each marking's own centre: that of both together would also move with how large each comes out.
+    centres = [
+        cv2.connectedComponentsWithStats((sight.paint > 0).astype(np.uint8))[3][1:] for sight in (once, twice)
+    ]
+    assert len(centres[0]) == 2
+    np.testing.assert_allclose(*centres, atol=0.25)
