@@ -75,6 +75,7 @@ def test_a_round_soft_fleck_is_improbable_where_a_diamond_is_not(tmp_path, x):
     found = confidences(fleck, tmp_path)
     assert found, "the network takes it for paint"
     assert painted > DetectorOptions().min_confidence > max(found)
+    assert painted / (1 - painted) > 5 * max(found) / (1 - max(found))
 
 
 def test_a_fleck_among_painted_diamonds_is_believed_far_less_than_they_are(tmp_path):
