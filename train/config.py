@@ -31,6 +31,8 @@ class DataConfig:
     reservoir: int = 512
     easy_samples: int = 1000
     shadows_on_paint: float = 3.0
+    things_beside: float = 0.8
+    faint: float = 0.25
     seams: float = 0.25
     pavements: float = 0.3
     overexposed: float = 0.15

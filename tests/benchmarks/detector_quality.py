@@ -99,9 +99,15 @@ def example(index: int, difficulty: float = 1.0, seed: int = SEED) -> Example:
     scene, lanes = random_scene(rng, difficulty)
     view = random_view(rng, WIDTH, HEIGHT)
     rendered = Renderer(scene).render(view.info, view.cam_from_map, rng, view.optics, view.motion)
-    camera = _camera(view)
-    lines_px = [image_line(view, lane) for lane in lanes]
-    seen = [lane for lane, line_px in zip(lanes, lines_px, strict=True) if len(line_px) > 1]
+    return example_of(scene, lanes, view, rendered, _camera(view))
+
+
+def example_of(
+    scene: Scene, lanes_map: list[FloatArray], view: TrainingView, rendered: Rendered, camera: Camera
+) -> Example:
+    """What there is to be found in an image of a scene, whose lines (N, 2) have a point every half metre."""
+    lines_px = [image_line(view, lane) for lane in lanes_map]
+    seen = [lane for lane, line_px in zip(lanes_map, lines_px, strict=True) if len(line_px) > 1]
     lanes_px = [line_px for line_px in lines_px if len(line_px) > 1]
     lanes_shown = [_shows(lane, view, rendered) for lane in seen]
     return Example(rendered.image, camera, _markings(scene, view, rendered), lanes_px, lanes_shown)
@@ -311,16 +317,21 @@ def main() -> None:
     parser.add_argument("--difficulty", type=float, default=1.0)
     parsed = parser.parse_args()
     cv2.setNumThreads(1)
-    options = DetectorOptions(model=parsed.model, max_range_m=24.0, min_confidence=ANY_CONFIDENCE)
+    shown = (example(index, parsed.difficulty) for index in range(parsed.images))
+    print(summary(counted(shown, parsed.model), parsed.images))
+
+
+def counted(examples: Iterable[Example], model: str | None) -> Tally:
+    """What a detector with a network (None: the shipped one) makes of examples."""
+    options = DetectorOptions(model=model, max_range_m=24.0, min_confidence=ANY_CONFIDENCE)
     detector = Detector.load(options=options)
     tally = Tally()
-    for index in range(parsed.images):
-        shown = example(index, parsed.difficulty)
+    for shown in examples:
         markings, lanes = detector.detect(shown.image, shown.camera)
         tally.add_markings(shown.markings, markings)
         curves = [lane.points_px for lane in lanes if lane.kind == LANE_BOUNDARY]
         tally.add_lanes(shown.lanes_px, shown.lanes_shown, curves, detector.view(shown.camera).top)
-    print(summary(tally, parsed.images))
+    return tally
 
 
 def summary(tally: Tally, images: int) -> str:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from v2hdm.errors import ConfigError
 from v2hdm.records import Camera, FloatArray, GeodeticOrigin, HdMap
@@ -17,7 +16,7 @@ from v2hdm.simulate.port.layout import build_layout
 from v2hdm.simulate.port.route import Route, build_route
 from v2hdm.simulate.port.yard import MovingTruck, build_scene, moving_trucks
 from v2hdm.simulate.render.optics import Motion, Optics
-from v2hdm.simulate.render.renderer import Renderer
+from v2hdm.simulate.render.renderer import Rendered, Renderer
 from v2hdm.simulate.render.scene import Box
 
 ORIGIN = GeodeticOrigin(latitude_deg=29.95, longitude_deg=122.05, altitude_m=12.0, epoch=2026.0)
@@ -48,8 +47,8 @@ class Port:
         stamp = float(self.driven.stamp_s[frame])
         return tuple(box for truck in self.trucks for box in truck.boxes(self.route, stamp))
 
-    def picture(self, camera: str, frame: int) -> NDArray[np.uint8]:
-        """Render one image (H, W, 3): a function of the configuration, the camera and the frame alone."""
+    def picture(self, camera: str, frame: int) -> Rendered:
+        """Render an image and its labels: a function of the configuration, the camera and the frame alone."""
         number = sorted(self.cameras).index(camera)
         rng = np.random.default_rng([self.config.seed, _IMAGES, number, frame])
         exposure, lens = self.config.exposure, self.config.cameras[camera]
@@ -60,7 +59,7 @@ class Port:
             full_well_electrons=exposure.full_well_electrons,
             read_noise=exposure.read_noise,
         )
-        rendered = self.renderer.render(
+        return self.renderer.render(
             self.cameras[camera].info,
             self.cam_from_map(camera, frame),
             rng,
@@ -68,7 +67,6 @@ class Port:
             self._motion(camera, frame),
             self.moving_boxes(frame),
         )
-        return rendered.image
 
     def _motion(self, camera: str, frame: int) -> Motion:
         """The camera's motion on its way along the route, in its own frame."""

@@ -150,7 +150,7 @@ def _work(job: _Job) -> None:
 def _write_picture(port: Port, job: _Job) -> None:
     camera, frame, target = job
     quality = [cv2.IMWRITE_JPEG_QUALITY, port.config.exposure.jpeg_quality]
-    encoded, data = cv2.imencode(".jpg", port.picture(camera, frame), quality)
+    encoded, data = cv2.imencode(".jpg", port.picture(camera, frame).image, quality)
     if not encoded:
         raise DriveError(f"{target}: the image could not be coded as JPEG; check the OpenCV installation")
     path = Path(target)

@@ -56,6 +56,27 @@ def port_boxes(rng: np.random.Generator) -> tuple[Box, ...]:
     return tuple(out)
 
 
+def thing_to_stand_beside(rng: np.random.Generator) -> tuple[tuple[float, float, float], Bgr, bool]:
+    """Size (length, depth, height in m), colour, and whether it is corrugated: of something on the ground."""
+    kind = int(rng.choice(4, p=[0.4, 0.25, 0.2, 0.15]))
+    if kind == 0:
+        return (float(rng.choice([6.1, 12.2])), 2.44, 2.59), _albedo(rng, 0.05, 0.7, 0.5), True
+    colour = _white(rng) if rng.random() < 0.5 else _albedo(rng)
+    if kind == 1:
+        return (
+            (float(rng.uniform(0.8, 4.0)), float(rng.uniform(0.15, 0.6)), float(rng.uniform(0.5, 1.1))),
+            colour,
+            False,
+        )
+    if kind == 2:
+        return (
+            (float(rng.uniform(0.3, 1.2)), float(rng.uniform(0.2, 0.8)), float(rng.uniform(0.8, 2.5))),
+            colour,
+            False,
+        )
+    return (float(rng.uniform(4.0, 7.0)), 2.0, float(rng.uniform(1.4, 2.6))), colour, False
+
+
 def ground_marks(rng: np.random.Generator) -> GroundMarks:
     """Tyre marks, cracks, repairs, rails, covers and spills: unlabelled, dark and up to twice as bright."""
     marks = plain_marks()

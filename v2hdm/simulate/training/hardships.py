@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from v2hdm.records import CORNERED_CLASSES, FloatArray
 from v2hdm.simulate.render.optics import Optics
-from v2hdm.simulate.render.scene import GroundMarks, Light, Paint, Shadow
-from v2hdm.simulate.training.clutter import plain_marks
+from v2hdm.simulate.render.scene import Box, GroundMarks, Light, Paint, Shadow, box_footprint
+from v2hdm.simulate.training.clutter import plain_marks, thing_to_stand_beside
 from v2hdm.simulate.training.paint import rectangle
 
 _CROSSED_M = 22.0
 _LONGEST_LEVEL = 0.9
+_CAMERA_CLEARANCE_M = 3.5
 _SHIFT = 4
 """Bits of fraction of the coordinates that OpenCV is given."""
 
@@ -27,6 +28,9 @@ class Hardships:
 
     Attributes:
         shadows_on_paint: mean number of shadows that have an edge across a marking.
+        things_beside: mean number of containers, barriers, cabinets and vehicles that stand right beside a
+            marking: what is bright, has corners and touches such a thing is a part of it in most scenes.
+        faint: share of scenes half of whose markings are so dirty that the ground is nearly as bright.
         seams: share of lane lines that have a seam of the surface beside them, as paving leaves it there:
             dark or bright, and going on where a dash ends.
         pavements: share of scenes in which the surface changes its tone along a line, beside its paint.
@@ -36,6 +40,8 @@ class Hardships:
     """
 
     shadows_on_paint: float = 0.0
+    things_beside: float = 0.0
+    faint: float = 0.0
     seams: float = 0.0
     pavements: float = 0.0
     overexposed: float = 0.0
@@ -47,11 +53,8 @@ NONE = Hardships()
 
 def shadows_on_paint(rng: np.random.Generator, paints: list[Paint], mean: float) -> tuple[Shadow, ...]:
     """Shadows laid so that an edge of each crosses a marking within sight, often nearly along its sides."""
-    near = [p for p in paints if p.kind in CORNERED_CLASSES and 1 < p.polygon_map[:, 0].mean() < _CROSSED_M]
-    count = int(rng.poisson(mean)) if near else 0
     out = []
-    for number in rng.integers(len(near), size=count) if near else ():
-        polygon = near[int(number)].polygon_map
+    for polygon in _some_within_sight(rng, paints, mean):
         side = polygon[1] - polygon[0]
         along = np.arctan2(side[1], side[0]) + rng.normal(0, 0.15)
         yaw = float(along if rng.random() < 0.5 else rng.uniform(0, np.pi))
@@ -63,6 +66,46 @@ def shadows_on_paint(rng: np.random.Generator, paints: list[Paint], mean: float)
         softness = float(np.exp(rng.uniform(np.log(0.02), np.log(0.3))))
         out.append(Shadow(polygon_map=shape, transmission=float(rng.beta(1, 5)), softness_m=softness))
     return tuple(out)
+
+
+def things_beside(rng: np.random.Generator, paints: Sequence[Paint], mean: float) -> tuple[Box, ...]:
+    """Things that stand beside markings within sight, oftenest behind them as the camera sees it."""
+    out = []
+    for polygon in _some_within_sight(rng, paints, mean):
+        centre = polygon.mean(axis=0)
+        size_m, albedo_bgr, corrugated = thing_to_stand_beside(rng)
+        bearing = float(np.arctan2(centre[1], centre[0]) + rng.normal(0, 0.9))
+        away = np.array([np.cos(bearing), np.sin(bearing)])
+        gap_m = float(rng.uniform(0.02, 0.7))
+        reach_m = float(((polygon - centre) @ away).max()) + gap_m + size_m[1] / 2
+        along_m = float(rng.uniform(-0.4, 0.4)) * size_m[0]
+        x, y = centre + reach_m * away + along_m * np.array([away[1], -away[0]])
+        box = Box(
+            centre_map=(float(x), float(y)),
+            size_m=size_m,
+            yaw_rad=bearing + np.pi / 2,
+            albedo_bgr=albedo_bgr,
+            corrugated=corrugated,
+            seed=int(rng.integers(1 << 20)),
+        )
+        if float(box_footprint(box)[:, 0].min()) > _CAMERA_CLEARANCE_M:
+            out.append(box)
+    return tuple(out)
+
+
+def faint(rng: np.random.Generator, paints: Sequence[Paint], share: float) -> tuple[Paint, ...]:
+    """These paints, or in a ``share`` of cases half of the markings among them nearly hidden by dirt."""
+    if rng.random() >= share:
+        return tuple(paints)
+    dirt = {seed: rng.uniform(0.4, 0.8) for seed in {p.seed: None for p in paints} if rng.random() < 0.5}
+    return tuple(replace(p, dirt=max(p.dirt, float(dirt.get(p.seed, 0.0)))) for p in paints)
+
+
+def _some_within_sight(rng: np.random.Generator, paints: Sequence[Paint], mean: float) -> list[FloatArray]:
+    """The polygons (N, 2) of some markings with corners that are near, ``mean`` of them on average."""
+    near = [p for p in paints if p.kind in CORNERED_CLASSES and 1 < p.polygon_map[:, 0].mean() < _CROSSED_M]
+    count = int(rng.poisson(mean)) if near else 0
+    return [near[int(k)].polygon_map for k in rng.integers(len(near), size=count)] if near else []
 
 
 def with_seams(

@@ -20,8 +20,10 @@ from v2hdm.simulate.training.hardships import (
     NONE,
     Hardships,
     blue_shade,
+    faint,
     overexposed,
     shadows_on_paint,
+    things_beside,
     with_pavements,
     with_seams,
 )
@@ -138,13 +140,13 @@ def random_scene(
     else:
         road, boxes = RoadPaint(), street_boxes(rng, road_half_m) if rng.random() < 0.7 else port_boxes(rng)
     ground, shadows = _ground(rng, place == "port", difficulty), _shadows(rng, difficulty)
-    for_shadows, for_ground, for_light = rng.spawn(3)
+    for_shadows, for_ground, for_light, for_things, for_paint = rng.spawn(5)
     marks = with_pavements(for_ground, ground.marks, road.lanes, hardships.pavements)
     marks = with_seams(for_ground, marks, road.lanes, hardships.seams)
     scene = Scene(
         ground=replace(ground, marks=marks),
-        paints=tuple(road.paints),
-        boxes=boxes,
+        paints=faint(for_paint, road.paints, hardships.faint),
+        boxes=boxes + things_beside(for_things, road.paints, hardships.things_beside),
         shadows=shadows + shadows_on_paint(for_shadows, road.paints, hardships.shadows_on_paint),
         dapples=_dapples(rng, difficulty),
         light=blue_shade(for_light, _light(rng), hardships.blue_shade),
