@@ -8,11 +8,20 @@ import pytest
 from train.config import DataConfig
 from train.data import RenderStream, validation_pairs
 from v2hdm.detection.camera.lens import undistort_points
-from v2hdm.records import LANE_CLASSES, PAINT_CLASSES, CameraInfo
+from v2hdm.planar import clip_convex
+from v2hdm.records import DIAMOND, LANE_CLASSES, PAINT_CLASSES, CameraInfo
 from v2hdm.simulate.render.optics import Motion, Optics
-from v2hdm.simulate.render.scene import Light
-from v2hdm.simulate.training.hardships import Hardships, blue_shade, overexposed, with_pavements, with_seams
-from v2hdm.simulate.training.paint import Bend, rectangle, rhombus
+from v2hdm.simulate.render.scene import Light, box_footprint
+from v2hdm.simulate.training.hardships import (
+    Hardships,
+    blue_shade,
+    faint,
+    overexposed,
+    things_beside,
+    with_pavements,
+    with_seams,
+)
+from v2hdm.simulate.training.paint import Bend, random_brush, rectangle, rhombus, street_paint
 from v2hdm.simulate.training.scenes import image_line, image_points, random_scene, training_sample
 from v2hdm.simulate.training.views import TrainingView, looking, random_view
 
@@ -121,7 +130,7 @@ def test_no_lens_folds_an_image_over_itself() -> None:
         assert (turn > 0).all(), f"view {index}: neighbouring pixels change sides"
 
 
-@pytest.mark.parametrize("name", [field.name for field in fields(Hardships)])
+@pytest.mark.parametrize("name", [field.name for field in fields(Hardships) if field.name != "things_beside"])
 def test_hardships_change_what_paint_looks_like_and_not_where_it_is(name: str) -> None:
     hardships = Hardships(**{name: 1.0})
     pairs = [
@@ -132,6 +141,53 @@ def test_hardships_change_what_paint_looks_like_and_not_where_it_is(name: str) -
         np.testing.assert_array_equal(plain.labels, hard.labels)
         np.testing.assert_array_equal(plain.hidden, hard.hidden)
     assert any((plain.image != hard.image).any() for plain, hard in pairs)
+
+
+def test_things_beside_markings_hide_paint_and_add_none() -> None:
+    hard = Hardships(things_beside=4.0)
+    pairs = [
+        (training_sample(5, index, 160, 96), training_sample(5, index, 160, 96, hardships=hard))
+        for index in range(12)
+    ]
+    for plain, crowded in pairs:
+        changed = plain.labels != crowded.labels
+        assert (crowded.labels[changed] == 0).all()
+        assert crowded.hidden[plain.hidden].all()
+    assert any((plain.hidden != crowded.hidden).any() for plain, crowded in pairs)
+
+
+def test_things_stand_beside_their_marking_and_not_on_it_or_on_the_camera() -> None:
+    paint = random_brush(np.random.default_rng(0), 0.5).paint(
+        np.random.default_rng(1), DIAMOND, rhombus(np.array([9.0, 1.0]), 1.2, 0.6)
+    )
+    boxes = [box for seed in range(40) for box in things_beside(np.random.default_rng(seed), [paint], 3.0)]
+    assert len(boxes) > 40
+    for box in boxes:
+        outline = box_footprint(box)
+        assert outline[:, 0].min() > 3
+        assert len(clip_convex(paint.polygon_map, outline)) == 0
+        between = (
+            outline[:, None] * (1 - np.linspace(0, 1, 41)[:, None])
+            + np.roll(outline, -1, 0)[:, None] * (np.linspace(0, 1, 41)[:, None])
+        )
+        gaps = np.linalg.norm(between.reshape(-1, 1, 2) - paint.polygon_map, axis=-1)
+        assert gaps.min() < 1.5
+    assert things_beside(np.random.default_rng(0), [], 5.0) == ()
+
+
+def test_faint_paint_is_dirtier_and_pieces_of_a_marking_stay_alike() -> None:
+    road = street_paint(np.random.default_rng(4), random_brush(np.random.default_rng(2), 0.3), Bend(0.01))
+    dirty = faint(np.random.default_rng(0), road.paints, 1.0)
+    assert [
+        replace(after, dirt=before.dirt) for before, after in zip(road.paints, dirty, strict=True)
+    ] == road.paints
+    changed = [after.dirt > before.dirt for before, after in zip(road.paints, dirty, strict=True)]
+    assert 0.2 < np.mean(changed) < 0.8
+    of_marking: dict[int, set[float]] = {}
+    for paint in dirty:
+        of_marking.setdefault(paint.seed, set()).add(paint.dirt)
+    assert all(len(dirt) == 1 for dirt in of_marking.values())
+    assert faint(np.random.default_rng(0), road.paints, 0.0) == tuple(road.paints)
 
 
 def test_seams_lie_beside_their_lines_and_nowhere_else() -> None:
