@@ -37,6 +37,7 @@ class DataConfig:
     pavements: float = 0.3
     overexposed: float = 0.15
     blue_shade: float = 0.3
+    tight_bends: float = 0.15
     workers: int = 1
     coco: str | None = None
     coco_images: str | None = None

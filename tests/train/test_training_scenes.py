@@ -8,7 +8,7 @@ import pytest
 from train.config import DataConfig
 from train.data import RenderStream, validation_pairs
 from v2hdm.detection.camera.lens import undistort_points
-from v2hdm.planar import clip_convex
+from v2hdm.planar import clip_convex, inside_convex
 from v2hdm.records import DIAMOND, LANE_CLASSES, PAINT_CLASSES, CameraInfo
 from v2hdm.simulate.render.optics import Motion, Optics
 from v2hdm.simulate.render.scene import Light, box_footprint
@@ -18,6 +18,7 @@ from v2hdm.simulate.training.hardships import (
     faint,
     overexposed,
     things_beside,
+    tight_bend,
     with_pavements,
     with_seams,
 )
@@ -106,6 +107,38 @@ def test_a_bend_keeps_lengths_along_its_centre_and_turns_left_for_positive_curva
     np.testing.assert_allclose(Bend(0.0).to_map(np.array([[7.0, -2.0]])), [[7.0, -2.0]])
 
 
+def test_a_bend_between_straights_is_an_arc_that_they_touch() -> None:
+    quarter = Bend(1 / 15, 5.0, 5.0 + 7.5 * np.pi)
+    along = np.array([-3.0, 5.0, 5.0 + 7.5 * np.pi, 15.0 + 7.5 * np.pi])
+    points = quarter.to_map(np.column_stack([along, [0.0, 0.0, 0.0, 2.0]]))
+    np.testing.assert_allclose(points, [[-3, 0], [5, 0], [20, 15], [18, 25]], atol=1e-9)
+    np.testing.assert_allclose(quarter.heading(along), [0, 0, np.pi / 2, np.pi / 2])
+    on_it = Bend(-0.05, -8.0, 6.0)
+    fine = on_it.to_map(np.column_stack([np.linspace(-20, 20, 4001), np.zeros(4001)]))
+    steps = np.diff(fine, axis=0)
+    np.testing.assert_allclose(np.linalg.norm(steps, axis=1), 0.01, rtol=1e-5)
+    np.testing.assert_allclose(fine[2000], 0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        np.arctan2(steps[:, 1], steps[:, 0]),
+        on_it.heading(np.linspace(-20, 20, 4001)[:-1] + 0.005),
+        atol=1e-6,
+    )
+
+
+def test_tight_bends_turn_the_lines_and_keep_the_way_clear() -> None:
+    scenes = [random_scene(np.random.default_rng(k), 1.0, Hardships(tight_bends=1.0)) for k in range(20)]
+    turned = []
+    for scene, lanes in scenes:
+        middles = np.array([paint.polygon_map.mean(axis=0) for paint in scene.paints]).reshape(-1, 2)
+        assert not any(inside_convex(box_footprint(box), middles).any() for box in scene.boxes)
+        for lane in lanes:
+            ahead = np.diff(lane, axis=0)
+            turned.append(np.ptp(np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))))
+    assert len(turned) > 20
+    assert 0.25 < np.median(turned) < 2.2
+    assert tight_bend(np.random.default_rng(0), 0.0) is None
+
+
 def test_a_camera_that_looks_along_x_sees_the_road_ahead_below_its_axis() -> None:
     cam_from_map = looking(np.array([0.0, 0.0, 2.0]), 0.0, 0.0, 0.0)
     np.testing.assert_allclose(cam_from_map @ [10.0, 3.0, 0.0, 1.0], [-3.0, 2.0, 10.0, 1.0], atol=1e-12)
@@ -130,7 +163,9 @@ def test_no_lens_folds_an_image_over_itself() -> None:
         assert (turn > 0).all(), f"view {index}: neighbouring pixels change sides"
 
 
-@pytest.mark.parametrize("name", [field.name for field in fields(Hardships) if field.name != "things_beside"])
+@pytest.mark.parametrize(
+    "name", [field.name for field in fields(Hardships) if field.name not in ("things_beside", "tight_bends")]
+)
 def test_hardships_change_what_paint_looks_like_and_not_where_it_is(name: str) -> None:
     hardships = Hardships(**{name: 1.0})
     pairs = [

@@ -9,11 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from v2hdm.planar import inside_convex
 from v2hdm.records import CORNERED_CLASSES, FloatArray
 from v2hdm.simulate.render.optics import Optics
 from v2hdm.simulate.render.scene import Box, GroundMarks, Light, Paint, Shadow, box_footprint
 from v2hdm.simulate.training.clutter import plain_marks, thing_to_stand_beside
-from v2hdm.simulate.training.paint import rectangle
+from v2hdm.simulate.training.paint import Bend, rectangle
 
 _CROSSED_M = 22.0
 _LONGEST_LEVEL = 0.9
@@ -37,6 +38,8 @@ class Hardships:
         overexposed: share of images that are exposed several times too long, as the sunlit half of a scene
             is by a camera set for its shade.
         blue_shade: share of scenes whose shade is lit by a deep blue sky.
+        tight_bends: share of scenes whose way, and all paint with it, turns as sharply as in yards and
+            roundabouts; what would stand on the paint is left out.
     """
 
     shadows_on_paint: float = 0.0
@@ -46,6 +49,7 @@ class Hardships:
     pavements: float = 0.0
     overexposed: float = 0.0
     blue_shade: float = 0.0
+    tight_bends: float = 0.0
 
 
 NONE = Hardships()
@@ -99,6 +103,27 @@ def faint(rng: np.random.Generator, paints: Sequence[Paint], share: float) -> tu
         return tuple(paints)
     dirt = {seed: rng.uniform(0.4, 0.8) for seed in {p.seed: None for p in paints} if rng.random() < 0.5}
     return tuple(replace(p, dirt=max(p.dirt, float(dirt.get(p.seed, 0.0)))) for p in paints)
+
+
+def tight_bend(rng: np.random.Generator, share: float) -> Bend | None:
+    """In a ``share`` of cases a bend of up to 120 degrees and a radius of 14 to 60 m that begins near by."""
+    if rng.random() >= share:
+        return None
+    radius_m = float(np.exp(rng.uniform(np.log(14.0), np.log(60.0))))
+    begins_m = float(rng.uniform(-10.0, 15.0))
+    return Bend(
+        float(rng.choice([-1.0, 1.0])) / radius_m,
+        begins_m,
+        begins_m + radius_m * float(rng.uniform(0.4, 2.1)),
+    )
+
+
+def clear_of(boxes: Iterable[Box], paints: Sequence[Paint]) -> tuple[Box, ...]:
+    """The boxes that do not stand on the middle of a paint."""
+    if not paints:
+        return tuple(boxes)
+    middles = np.array([paint.polygon_map.mean(axis=0) for paint in paints])
+    return tuple(box for box in boxes if not inside_convex(box_footprint(box), middles).any())
 
 
 def _some_within_sight(rng: np.random.Generator, paints: Sequence[Paint], mean: float) -> list[FloatArray]:

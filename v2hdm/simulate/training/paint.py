@@ -27,21 +27,42 @@ FAR_M = 50.0
 _DIAMONDS_FAR_M = 32.0
 _NEAR_M = -4.0
 _LANE_STEP_M = 0.5
+_PIECE_M = 2.5
+_PIECE_BESIDE_M = 0.02
 
 
 @dataclass(frozen=True)
 class Bend:
-    """A circular arc through the origin along +x, ``curvature`` in 1/m, positive to the left."""
+    """A way through the origin along +x that bends by ``curvature``, in 1/m, positive to the left.
+
+    It is a circular arc, or one from ``begins_m`` to ``ends_m`` along the way and straight before and after.
+    """
 
     curvature: float
+    begins_m: float = -np.inf
+    ends_m: float = np.inf
+
+    def heading(self, along: FloatArray | float) -> FloatArray:
+        """Direction of the way (...), rad to the left of +x, at distances along it."""
+        return np.asarray(self.curvature * self._on_arc(along))
 
     def to_map(self, points: FloatArray) -> FloatArray:
-        """Points (..., 2) as (distance along the arc, offset to the left of it) in the map."""
+        """Points (..., 2) as (distance along the way, offset to the left of it) in the map."""
         along, left = points[..., 0], points[..., 1]
-        angle = along * self.curvature
-        x = along * np.sinc(angle / np.pi) - left * np.sin(angle)
-        y = along * np.sinc(angle / (2 * np.pi)) * np.sin(angle / 2) + left * np.cos(angle)
-        return np.stack([x, y], axis=-1)
+        on_arc, angle = self._on_arc(along), self.heading(along)
+        straight = along - on_arc - self._first_m
+        x = self._first_m + on_arc * np.sinc(angle / np.pi) + straight * np.cos(angle) - left * np.sin(angle)
+        y = on_arc * np.sinc(angle / (2 * np.pi)) * np.sin(angle / 2) + straight * np.sin(angle)
+        return np.stack([x, y + left * np.cos(angle)], axis=-1)
+
+    @property
+    def _first_m(self) -> float:
+        """Where along the way the arc begins as seen from the origin, which may lie on it."""
+        return max(self.begins_m, 0.0)
+
+    def _on_arc(self, along: FloatArray | float) -> FloatArray:
+        """How much of the way from where the arc begins is arc, m; negative behind the origin."""
+        return np.asarray(np.clip(along, self.begins_m, self.ends_m) - self._first_m)
 
 
 @dataclass(frozen=True)
@@ -137,7 +158,7 @@ def port_paint(rng: np.random.Generator, brush: Brush, bend: Bend) -> RoadPaint:
         left = (column - (columns - 1) / 2) * across_m + rng.normal(0, 0.4)
         for along in np.arange(_NEAR_M + rng.uniform(0, pitch_m), _DIAMONDS_FAR_M, pitch_m):
             centre = bend.to_map(np.array([along, left]) + rng.normal(0, jitter, 2))
-            shape = rhombus(centre, length_m, width_m, yaw + along * bend.curvature)
+            shape = rhombus(centre, length_m, width_m, yaw + float(bend.heading(along)))
             paints.append(brush.paint(rng, DIAMOND, shape))
     dash = _dash_pattern(rng)
     road = RoadPaint()
@@ -203,7 +224,7 @@ def _solid(
 ) -> list[Paint]:
     """A solid line, in short pieces where the way bends."""
     start, end = extent
-    piece = 2.5 if bend.curvature else end - start
+    piece = _piece_m(bend.curvature) if bend.curvature else end - start
     edges = np.arange(start, end - 0.1, piece)
     seed = int(rng.integers(1 << 30))
     first = brush.paint(rng, LANE_LINE, _strip(bend, start, end, left, width_m))
@@ -218,6 +239,11 @@ def _solid(
         )
         for a in edges
     ]
+
+
+def _piece_m(curvature: float) -> float:
+    """Length of a straight piece of a bent line, which is at most 2 cm beside it."""
+    return min(_PIECE_M, float(np.sqrt(8 * _PIECE_BESIDE_M / abs(curvature))))
 
 
 def _strip(bend: Bend, start: float, end: float, left: float, width_m: float) -> FloatArray:

@@ -20,10 +20,12 @@ from v2hdm.simulate.training.hardships import (
     NONE,
     Hardships,
     blue_shade,
+    clear_of,
     faint,
     overexposed,
     shadows_on_paint,
     things_beside,
+    tight_bend,
     with_pavements,
     with_seams,
 )
@@ -131,6 +133,9 @@ def random_scene(
     """
     place = rng.choice(["port", "street", "bare"], p=[0.4, 0.5, 0.1])
     bend = Bend(float(rng.normal(0, 0.006)) if rng.random() < 0.4 else 0.0)
+    for_shadows, for_ground, for_light, for_things, for_paint, for_bend = rng.spawn(6)
+    tight = tight_bend(for_bend, hardships.tight_bends)
+    bend = tight or bend
     brush = random_brush(rng, difficulty)
     road_half_m = float(rng.uniform(2, 9))
     if place == "port":
@@ -139,8 +144,8 @@ def random_scene(
         road, boxes = street_paint(rng, brush, bend), street_boxes(rng, road_half_m)
     else:
         road, boxes = RoadPaint(), street_boxes(rng, road_half_m) if rng.random() < 0.7 else port_boxes(rng)
+    boxes = clear_of(boxes, road.paints) if tight else boxes
     ground, shadows = _ground(rng, place == "port", difficulty), _shadows(rng, difficulty)
-    for_shadows, for_ground, for_light, for_things, for_paint = rng.spawn(5)
     marks = with_pavements(for_ground, ground.marks, road.lanes, hardships.pavements)
     marks = with_seams(for_ground, marks, road.lanes, hardships.seams)
     scene = Scene(
