@@ -50,6 +50,33 @@ def test_a_dash_has_others_in_its_line_after_a_gap_only() -> None:
     assert not told([diamond(4, 0), diamond(9, 0)], [DIAMOND] * 2, [0.5, 0.9])["in_line"].any()
 
 
+def test_a_row_of_dashes_may_be_an_arc() -> None:
+    def on_circle(metres: float, turned: float = 0.0) -> FloatArray:
+        angle = metres / 15
+        return dash(15 * np.sin(angle), 15 - 15 * np.cos(angle), 3.0, angle + turned)
+
+    for other, in_line in (
+        (on_circle(6), 0.9),
+        (on_circle(-6), 0.9),
+        (on_circle(6, np.pi), 0.9),  # axes have no sense of direction
+        (on_circle(6, 0.3), 0.0),
+        (on_circle(6, -0.4), 0.0),
+        (on_circle(4), 0.0),
+    ):
+        assert told([on_circle(0), other], [LANE_DASH] * 2, [0.5, 0.9])["in_line"][0] == in_line
+
+
+def test_diamonds_far_apart_may_be_turned_by_a_bend() -> None:
+    def turned(x: float, angle: float) -> FloatArray:
+        around = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        return (diamond(0, 0) @ around) + (x, 0)
+
+    near = told([diamond(4, 0), turned(6, 0.5)], [DIAMOND] * 2, [0.5, 0.9])["most_alike"][0]
+    far = told([diamond(4, 0), turned(16, 0.5)], [DIAMOND] * 2, [0.5, 0.9])["most_alike"][0]
+    assert near < 0.05
+    assert far > 0.6
+
+
 def test_one_that_is_alone_or_above_the_horizon_has_no_company() -> None:
     assert not company(diamond(4, 0)[None], [DIAMOND], np.array([0.9])).any()
     above = np.full((4, 2), np.nan)

@@ -1,7 +1,8 @@
 """What the other quadrilaterals of an image say of one.
 
 A site's markings are painted from few stencils: the diamonds of a field are of one size and lie one way, the
-dashes of a line are as long as each other and follow one another in a row. Flecks of sun do nothing of the
+dashes of a line are as long as each other and follow one another in a row. Where the way bends, directions
+turn with it, by an angle that grows with the distance, and a row is an arc. Flecks of sun do nothing of the
 kind.
 """
 
@@ -26,6 +27,9 @@ _LOG_SIZE_SIGMA = 0.2
 _DIRECTION_SIGMA = 0.15
 """Markings of one stencil, as a single image shows them, differ by so much in log size and by so many rad."""
 
+_BEND_RADIUS_M = 20.0
+"""And by the angle that a bend of this radius turns by between them."""
+
 _MOST = 3.0
 """More company than this adds nothing."""
 
@@ -38,8 +42,12 @@ _LONGEST_GAP_M = 15.0
 
 _BESIDE_M = 0.3
 _BESIDE_SHARE = 0.02
-_BESIDE_RAD = 0.15
-"""A line's dashes are so far beside its axis at most, and so much of their distance along it."""
+"""A line's dashes are so far at most beside an arc between them, and so much of their distance."""
+
+_TURNED_RAD = 0.15
+_SHARPEST_RADIUS_M = 12.0
+_MOST_TURNED_RAD = 0.9
+"""They differ by so much in direction at most, where the way is straight, where it bends, and altogether."""
 
 
 def company(ground: FloatArray, kinds: Sequence[str], probability: FloatArray) -> FloatArray:
@@ -58,7 +66,8 @@ def company(ground: FloatArray, kinds: Sequence[str], probability: FloatArray) -
     log_size = np.log(size)
     misfit = ((log_size[:, None] - log_size) ** 2).sum(axis=2) / _LOG_SIZE_SIGMA**2
     turned = _turned(axis)
-    alike = weight * np.exp(-0.5 * (misfit + (turned / _DIRECTION_SIGMA) ** 2))
+    may_turn = np.hypot(_DIRECTION_SIGMA, np.hypot(apart[..., 0], apart[..., 1]) / _BEND_RADIUS_M)
+    alike = weight * np.exp(-0.5 * (misfit + (turned / may_turn) ** 2))
     in_line = (kind == LANE_DASH)[:, None] & _follows(apart, axis, size[:, 1], turned)
     columns = (
         np.minimum(alike.sum(axis=1), _MOST),
@@ -92,9 +101,20 @@ def _turned(axis: FloatArray) -> FloatArray:
 
 
 def _follows(apart: FloatArray, axis: FloatArray, length: FloatArray, turned: FloatArray) -> np.ndarray:
-    """Which (M, M) others lie on the axis of each after a gap."""
-    along = np.abs((apart * axis[:, None]).sum(axis=2))
-    beside = np.abs(apart[..., 0] * axis[:, None, 1] - apart[..., 1] * axis[:, None, 0])
-    gap = along - (length[:, None] + length) / 2
-    on_axis = (beside < _BESIDE_M + _BESIDE_SHARE * along) & (turned < _BESIDE_RAD)
-    return np.asarray(on_axis & (gap >= _LEAST_GAP * length[:, None]) & (gap < _LONGEST_GAP_M))
+    """Which (M, M) others follow each along an arc, after a gap.
+
+    The chord between two points of a circle makes equal and opposite angles with the tangents there.
+    """
+    distance = np.hypot(apart[..., 0], apart[..., 1])
+    beside = 0.5 * distance * np.abs(_angle(axis[:, None], apart) + _angle(axis[None], apart))
+    gap = distance - (length[:, None] + length) / 2
+    sharpest = np.minimum(_TURNED_RAD + distance / _SHARPEST_RADIUS_M, _MOST_TURNED_RAD)
+    on_arc = (beside < _BESIDE_M + _BESIDE_SHARE * distance) & (turned < sharpest)
+    return np.asarray(on_arc & (gap >= _LEAST_GAP * length[:, None]) & (gap < _LONGEST_GAP_M))
+
+
+def _angle(axis: FloatArray, chord: FloatArray) -> FloatArray:
+    """From axes of no sense of direction to chords (..., 2), rad, at most a right angle either way."""
+    across = axis[..., 0] * chord[..., 1] - axis[..., 1] * chord[..., 0]
+    along = (axis * chord).sum(axis=-1)
+    return np.asarray(np.arctan2(across * np.where(along < 0, -1.0, 1.0), np.abs(along)))
