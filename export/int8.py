@@ -20,6 +20,7 @@ import onnx
 from numpy.typing import NDArray
 from onnx import helper, numpy_helper
 
+from export.arrange import arrange
 from export.equalise import equalise
 from export.graph import Convolution, FloatTensor, Graph
 from export.rounding import Moments, input_moments, round_weights
@@ -86,6 +87,7 @@ def to_int8(model: onnx.ModelProto, images: Sequence[NDArray[np.uint8]]) -> onnx
     _read_bytes(graph, image)
     del codings[image.output]
     _through_bytes(graph, codings)
+    arrange(graph)
     result = graph.stored()
     onnx.checker.check_model(result)
     return result
