@@ -9,7 +9,7 @@ from tests.detection.pictures import bar, brightness_model, diamond, make_camera
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.paint.blobs import Blob
-from v2hdm.detection.paint.plausible import cornered_kind, plausible_kind, rival_kinds
+from v2hdm.detection.paint.plausible import Piece, cornered_kind, plausible_kind, rival_kinds
 from v2hdm.records import (
     ARROW,
     CHEVRON,
@@ -32,8 +32,9 @@ def tried_as(
     """The class as which a blob is fitted with four corners."""
     outline_px = to_image(VIEW.camera, outline_vehicle)
     blob = Blob(scores, np.ones((3, 3)), np.zeros(2), 2, outline_px, touches_symbol)
-    found = plausible_kind(blob, outline_vehicle, VIEW)
-    return None if found is None else cornered_kind(blob, outline_vehicle, found[0], VIEW)
+    piece = Piece.of(blob, outline_vehicle, VIEW)
+    found = plausible_kind(piece)
+    return None if found is None else cornered_kind(piece, found[0])
 
 
 @pytest.mark.parametrize("symbol", [ARROW, CHEVRON])
@@ -55,7 +56,7 @@ def test_a_symbol_cut_by_the_border_is_not_tried_as_anything_else() -> None:
     cut[:, 0] -= cut[:, 0].min() - 1
     on_ground = VIEW.ground(VIEW.undistort(cut))
     blob = Blob({ARROW: 0.6, DIAMOND: 0.3}, np.ones((3, 3)), np.zeros(2), 2, cut)
-    assert cornered_kind(blob, on_ground, ARROW, VIEW) is None
+    assert cornered_kind(Piece.of(blob, on_ground, VIEW), ARROW) is None
 
 
 def test_short_lane_paint_is_tried_as_a_dash_and_shorter_paint_as_a_diamond() -> None:
@@ -80,9 +81,8 @@ def test_what_is_too_small_for_its_class_is_tried_as_what_it_may_be() -> None:
 def test_a_quadrilateral_is_read_as_every_class_that_it_may_be() -> None:
     def rivals(outline_vehicle: np.ndarray, scores: dict[str, float], kind: str) -> list[str]:
         outline_px = to_image(VIEW.camera, outline_vehicle)
-        return rival_kinds(
-            Blob(scores, np.ones((3, 3)), np.zeros(2), 2, outline_px), outline_vehicle, kind, VIEW
-        )
+        blob = Blob(scores, np.ones((3, 3)), np.zeros(2), 2, outline_px)
+        return rival_kinds(Piece.of(blob, outline_vehicle, VIEW), kind)
 
     wide = bar(8.0, 0.0, 3.0, 0.3)
     scores = {CROSSWALK_BAR: 0.5, LANE_DASH: 0.3, STOP_LINE: 0.1, DIAMOND: 0.01}

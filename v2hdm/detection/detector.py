@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -20,6 +21,7 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.paint.blobs import Blob, find_blobs, outline_polygon
 from v2hdm.detection.paint.plausible import (
     Heads,
+    Piece,
     cornered_kind,
     head_of,
     plausible_kind,
@@ -58,6 +60,7 @@ takes it for an arrow or a chevron."""
 @dataclass(frozen=True)
 class _Candidate:
     blob: Blob
+    piece: Piece
     index: int
     kind: str
     score: float
@@ -133,18 +136,22 @@ class Detector:
         if not blobs:
             return []
         outlines = view.undistort(np.concatenate([blob.outline_px for blob in blobs]))
-        ends = np.cumsum([len(blob.outline_px) for blob in blobs])[:-1]
-        on_ground = np.split(view.ground(outlines), ends)
-        heads = Heads({k: on_ground[k] for k, blob in enumerate(blobs) if blob.kind in _HEADS})
+        on_ground = view.ground(outlines)
+        ends = np.cumsum([0, *(len(blob.outline_px) for blob in blobs)]).tolist()
+        parts = [slice(begin, end) for begin, end in pairwise(ends)]
+        heads = Heads({k: on_ground[parts[k]] for k, blob in enumerate(blobs) if blob.kind in _HEADS})
         have_shafts = set()
         candidates = []
-        for index, (blob, outline) in enumerate(zip(blobs, np.split(outlines, ends), strict=True)):
-            found = plausible_kind(blob, on_ground[index], view)
+        for index, (blob, part) in enumerate(zip(blobs, parts, strict=True)):
+            piece = Piece.of(blob, on_ground[part], view)
+            found = plausible_kind(piece)
             if found is None or found[1] < _LEAST_SCORE:
                 continue
-            head = head_of(on_ground[index], heads) if found[0] == LANE_DASH else None
+            head = head_of(on_ground[part], heads) if found[0] == LANE_DASH else None
             have_shafts.add(head)
-            candidates.append(_Candidate(blob, index, *found, outline, on_ground[index], head is not None))
+            candidates.append(
+                _Candidate(blob, piece, index, *found, outlines[part], on_ground[part], head is not None)
+            )
         # With a shaft it is the head of an arrow, however much it looks like the diamonds around.
         return [c for c in candidates if c.kind != DIAMOND or c.index not in have_shafts]
 
@@ -162,13 +169,13 @@ class Detector:
         """The quadrilaterals to start the corner fit from, of the blobs that are one within range."""
         starts = []
         for c in candidates:
-            kind = cornered_kind(c.blob, c.outline_vehicle, c.kind, view)
+            kind = cornered_kind(c.piece, c.kind)
             if kind is None:
                 continue
             start = starting_corners(kind, c.outline_pinhole_px, c.outline_vehicle, view)
             least = _LEAST_COVER if c.kind not in OUTLINED_CLASSES else _LEAST_COVER_OF_SYMBOL
             if start is not None and start[1] >= least:
-                kinds = [kind, *rival_kinds(c.blob, c.outline_vehicle, kind, view)]
+                kinds = [kind, *rival_kinds(c.piece, kind)]
                 claims = {name: _claim(c, name) for name in kinds}
                 starts.append(QuadStart(claims, start[0], c.index, c.outline_pinhole_px))
         if not starts:

@@ -73,11 +73,9 @@ def look(network: Network, image_bgr: np.ndarray, view: CameraView, mirrored: bo
     far_rows = [row for row in _anchor_rows(far.lanes, network, view.top, 1) if row.v_px < view.top + seam]
     near_rows = _anchor_rows(near.lanes, network, view.top + near_top, 2)
     near_rows = [row for row in near_rows if row.v_px >= view.top + seam]
-    paint, kinds = (
-        _joined(getattr(far, name), getattr(near, name), seam // stride, near_top // stride)
-        for name, stride in (("paint", network.info.paint_stride), ("kinds", network.info.kind_stride))
-    )
-    return Sight(paint, kinds, near_rows + far_rows)
+    paint = _joined(far.paint[None], near.paint[None], seam, near_top, network.info.paint_stride)
+    kinds = _joined(far.kinds, near.kinds, seam, near_top, network.info.kind_stride)
+    return Sight(paint[0], kinds, near_rows + far_rows)
 
 
 def _answer(network: Network, image_bgr: np.ndarray) -> NetworkOutput:
@@ -111,19 +109,25 @@ def _seam_row(network: Network, view: CameraView) -> int | None:
     return seam if worth and seam >= _OVERLAP_PX else None
 
 
-def _joined(far: np.ndarray, near: np.ndarray, seam: int, near_top: int) -> np.ndarray:
-    """Far rows above the seam, near ones, doubled, below it; planes (h, w) or stacks of them (K, h, w)."""
-    if far.ndim == 3:
-        return np.stack([_joined(f, n, seam, near_top) for f, n in zip(far, near, strict=True)])
-    doubled = cv2.resize(near, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
-    return np.concatenate([far[:seam], doubled[seam - near_top :]])
+def _joined(far: np.ndarray, near: np.ndarray, seam: int, near_top: int, stride: int) -> np.ndarray:
+    """Planes (K, h, w), ``stride`` px per element: far ones above the seam, near ones, doubled, below it."""
+    first, overlap = seam // stride, (seam - near_top) // stride
+    height = first - overlap + 2 * near.shape[1]
+    joined = np.empty((len(far), height, 2 * near.shape[2]), dtype=np.float32)
+    joined[:, :first] = far[:, :first]
+    for whole, plane in zip(joined, near, strict=True):
+        doubled = cv2.resize(plane, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
+        whole[first:] = doubled[overlap:]
+    return joined
 
 
 def _anchor_rows(lanes: np.ndarray, network: Network, top_px: int, scale: int) -> list[AnchorRow]:
     """Peaks along each row of ``lanes`` (2, h, w), near to far, of an image reduced by ``scale``."""
     odds, offset = lanes
-    padded = np.pad(odds, ((0, 0), (1, 1)), constant_values=-np.inf)
-    i, j = np.nonzero((odds > _LEAST_LOG_ODDS) & (odds >= padded[:, :-2]) & (odds > padded[:, 2:]))
+    peak = odds > _LEAST_LOG_ODDS
+    peak[:, 1:] &= odds[:, 1:] >= odds[:, :-1]
+    peak[:, :-1] &= odds[:, :-1] > odds[:, 1:]
+    i, j = np.nonzero(peak)
     stride = network.info.lane_stride
     u = stride * (j + np.clip(offset[i, j], -0.5, 0.5) + 0.5) - 0.5
     v = stride * np.arange(len(odds)) + (stride - 1) / 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -88,12 +89,11 @@ def find_blobs(
         ``paint``, 0 for none.
     """
     # A frame of no paint around it lets every outline close.
-    level = np.pad(sight.paint, 1, constant_values=-1.0)
+    level = cv2.copyMakeBorder(sight.paint, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-1.0)
     corner_px = np.array([(stride - 1) / 2 - stride, (stride - 1) / 2 - stride + top_px])
     level, contours, piece = _connected(level, (reach_px - top_px) / stride + 1)
     said = _hearsay(sight, classes, piece, level, len(contours))
     outlines = _outlines(level, piece, len(contours))
-    number = np.zeros(len(contours) + 1, dtype=np.int16)
     owner = np.zeros_like(piece)
     blobs: list[Blob] = []
     for index, contour in enumerate(contours):
@@ -103,17 +103,16 @@ def find_blobs(
         box = (slice(y - 1, y + h + 1), slice(x - 1, x + w + 1))
         origin_px = corner_px + stride * np.array([x - 1.0, y - 1.0])
         inside = piece[box] == index + 1
-        one = said.cells[index] >= _LEAST_QUAD_CELLS and fills_a_quadrilateral(contour)
-        if said.groups[index] < 2 or one:
+        large = said.cells[index] >= _LEAST_QUAD_CELLS
+        if said.groups[index] < 2 or (large and fills_a_quadrilateral(contour)):
             scores = dict(zip(classes, said.score[:, index].tolist(), strict=True))
             outline_px = corner_px + stride * outlines[index]
             blobs.append(Blob(scores, _signed(inside, level[box]), origin_px, stride, outline_px))
-            number[index + 1] = len(blobs)
+            owner[box][inside] = len(blobs)
             continue
         for part in _split(inside, level[box], sight, box, classes, origin_px, stride):
             blobs.append(part)
             owner[box][part.level > 0] = len(blobs)
-    owner += number[piece]
     return blobs, owner[1:-1, 1:-1]
 
 
@@ -122,13 +121,19 @@ def _connected(level: np.ndarray, least_row: float) -> tuple[np.ndarray, list[np
 
     They are zero crossings of the level that comes first.
     """
-    contours, _ = cv2.findContours((level > 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    kept = [c for c in contours if len(c) >= 4 and c[:, 0, 1].max() + 1 >= least_row]
+    contours, _ = cv2.findContours((level > 0).view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    kept = [c for c in contours if len(c) >= 4 and _end_row(c) >= least_row]
     level, kept = settle_pieces(level, kept)
     piece = np.zeros(level.shape, dtype=np.int16)
     for index, contour in enumerate(kept):
         cv2.drawContours(piece, [contour], -1, index + 1, cv2.FILLED)
     return level, kept, piece
+
+
+def _end_row(contour: np.ndarray) -> int:
+    """The row below the last one that a contour reaches."""
+    _, y, _, height = cv2.boundingRect(contour)
+    return int(y + height)
 
 
 @dataclass(frozen=True)
@@ -147,7 +152,7 @@ class _Hearsay:
 def _hearsay(
     sight: Sight, classes: Sequence[str], piece: np.ndarray, level: np.ndarray, count: int
 ) -> _Hearsay:
-    at = np.flatnonzero(piece.ravel())
+    at = np.flatnonzero(piece > 0)
     own = piece.ravel()[at] - 1
     cells = np.bincount(own, minlength=count)
     share = 1 / np.maximum(cells, 1)
@@ -175,8 +180,9 @@ def _outlines(level: np.ndarray, piece: np.ndarray, count: int) -> list[FloatArr
         owners.append(np.maximum(pieces[here], pieces[here + step]))
     owner = np.concatenate(owners)
     order = np.argsort(owner, kind="stable")
-    ends = np.searchsorted(owner[order], np.arange(2, count + 1))
-    return np.split(np.concatenate(points).astype(np.float64)[order], ends)
+    ends = np.searchsorted(owner[order], np.arange(1, count + 2)).tolist()
+    ordered = np.concatenate(points).astype(np.float64)[order]
+    return [ordered[begin:end] for begin, end in pairwise(ends)]
 
 
 def _split(
@@ -199,26 +205,31 @@ def _split(
         mine = kinds[group_of == group].max(axis=0)
         rest = kinds[group_of != group].max(axis=0)
         own_level = np.minimum(level, mine - rest)
-        count, labels = cv2.connectedComponents(((own_level > 0) & inside).astype(np.uint8))
-        for label in range(1, count):
-            mask = labels == label
-            if np.count_nonzero(mask) < _MIN_CELLS:
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(((own_level > 0) & inside).view(np.uint8))
+        for label, (x, y, w, h, cells) in enumerate(stats.tolist()):
+            if label == 0 or cells < _MIN_CELLS:
                 continue
-            scores = _sigmoid(level[mask]).mean() * probability[:, mask[rows, columns]].mean(axis=1)
+            mask = labels == label
+            scores = probability.take(np.flatnonzero(mask[rows, columns]), axis=1).mean(axis=1)
+            scores *= _sigmoid(level[mask]).mean()
             signed = _signed(mask, own_level)
-            outline_px = origin_px + stride * zero_crossings(signed)
+            left, top = max(x - 1, 0), max(y - 1, 0)
+            outline = zero_crossings(signed[top : y + h + 1, left : x + w + 1]) + [left, top]
             class_score = dict(zip(classes, scores.tolist(), strict=True))
-            parts.append(Blob(class_score, signed, origin_px, stride, outline_px))
+            parts.append(Blob(class_score, signed, origin_px, stride, origin_px + stride * outline))
     touches = any(part.kind in _SYMBOLS for part in parts)
     return [replace(part, touches_symbol=touches) for part in parts]
 
 
 def _class_probability(sight: Sight, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Probability (K, N) of each class at elements of ``paint``."""
-    scale = sight.kind_scale
-    logits = sight.kinds[:, (rows / scale).astype(np.intp), (columns / scale).astype(np.intp)]
-    odds = np.exp(logits - logits.max(axis=0))
-    return np.asarray(odds / odds.sum(axis=0))
+    scale, width = sight.kind_scale, sight.kinds.shape[2]
+    place = (rows / scale).astype(np.intp) * width + (columns / scale).astype(np.intp)
+    odds = sight.kinds.reshape(len(sight.kinds), -1).take(place, axis=1)
+    odds -= odds.max(axis=0)
+    np.exp(odds, out=odds)
+    odds /= odds.sum(axis=0)
+    return odds
 
 
 def _sigmoid(level: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ The initial IPM may be decimetres wrong, so sizes only rule out what is far off.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -66,32 +67,71 @@ _HEAD_WIDENING = 1.7
 _BORDER_PX = 4.0
 
 
-def plausible_kind(blob: Blob, outline_vehicle: FloatArray, view: CameraView) -> tuple[str, float] | None:
-    """The likeliest class that the blob's size on the ground allows, with its score; None for none.
+@dataclass(frozen=True)
+class Piece:
+    """A blob of which is known how large it is on the ground, m, and whether it keeps off the image's border.
+
+    Its length and width are those of the smallest rectangle around it; nan where it shows no ground.
+    """
+
+    class_score: dict[str, float]
+    touches_symbol: bool
+    length_m: float
+    width_m: float
+    whole: bool
+
+    @classmethod
+    def of(cls, blob: Blob, outline_vehicle: FloatArray, view: CameraView) -> Piece:
+        """That of a blob with that outline on the ground (N, 2), m, as its camera sees it."""
+        whole = bool(view.inside(blob.outline_px, _BORDER_PX).all())
+        return cls(blob.class_score, blob.touches_symbol, *_ground_size(outline_vehicle), whole)
+
+    @property
+    def slim(self) -> bool:
+        """Whether it is as long for its width as lane paint."""
+        return self.length_m >= _LEAST_ELONGATION * self.width_m
+
+    @property
+    def lane_score(self) -> float:
+        """The score of the classes of lanes together."""
+        return sum(self.class_score.get(name, 0.0) for name in LANE_CLASSES)
+
+    def fits(self, kind: str) -> bool:
+        """Whether its size is that of a class."""
+        if kind not in _SIZE_LIMITS_M:
+            return False
+        length, width = _SIZE_LIMITS_M[kind]
+        return length[0] <= self.length_m <= length[1] and width[0] <= self.width_m <= width[1]
+
+    def fitting(self) -> list[str]:
+        """Classes with four corners that are of its size and shape, the likeliest first."""
+        fitting = [
+            name
+            for name in CORNERED_CLASSES
+            if self.fits(name) and (self.slim or name not in (LANE_DASH, STOP_LINE))
+        ]
+        return sorted(fitting, key=lambda name: -self.class_score.get(name, 0.0))
+
+
+def plausible_kind(piece: Piece) -> tuple[str, float] | None:
+    """The likeliest class that a blob's size on the ground allows, with its score; None for none.
 
     Where it does not allow the likeliest of all, that is the likeliest with four corners; but letters, whose
     strokes are like other markings, stay letters.
-
-    Args:
-        blob: the blob.
-        outline_vehicle: its outline on the ground (N, 2), m.
-        view: its camera.
     """
-    length_m, width_m = _ground_size(outline_vehicle)
-    whole = is_whole(blob, view)
-    if whole and length_m < _LEAST_ELONGATION * width_m:
-        kind, score = _likeliest_compact(blob.class_score)
+    if piece.whole and piece.length_m < _LEAST_ELONGATION * piece.width_m:
+        kind, score = _likeliest_compact(piece)
     else:
-        kind, score = _likeliest(blob.class_score, whole and length_m <= _DASH_LENGTH_M)
-    if kind == LANE_DASH and not _fits(LANE_DASH, length_m, width_m):
+        kind, score = _likeliest(piece, piece.whole and piece.length_m <= _DASH_LENGTH_M)
+    if kind == LANE_DASH and not piece.fits(LANE_DASH):
         kind = LANE_LINE
-    if _fits(kind, length_m, width_m):
+    if piece.fits(kind):
         return kind, score
-    fitting = _fitting(blob, length_m, width_m) if whole and kind != OTHER_PAINT else []
+    fitting = piece.fitting() if piece.whole and kind != OTHER_PAINT else []
     return (fitting[0], score) if fitting else None
 
 
-def cornered_kind(blob: Blob, outline_vehicle: FloatArray, kind: str, view: CameraView) -> str | None:
+def cornered_kind(piece: Piece, kind: str) -> str | None:
     """The class as which a blob, taken for ``kind``, is tried as a quadrilateral; None for none.
 
     Short lane paint that ends at both sides may be a dash although the network says line, or, if shorter than
@@ -101,56 +141,37 @@ def cornered_kind(blob: Blob, outline_vehicle: FloatArray, kind: str, view: Came
     """
     if kind in CORNERED_CLASSES:
         return kind
-    length_m, width_m = _ground_size(outline_vehicle)
     if kind in OUTLINED_CLASSES:
-        return _second_choice(blob, length_m, width_m) if is_whole(blob, view) else None
-    lane_score = sum(blob.class_score.get(name, 0.0) for name in LANE_CLASSES)
-    if length_m > LONGEST_DASH_M and blob.class_score.get(LANE_DASH, 0.0) > _SURE_DASH_SHARE * lane_score:
+        return _second_choice(piece) if piece.whole else None
+    dash_score = piece.class_score.get(LANE_DASH, 0.0)
+    if piece.length_m > LONGEST_DASH_M and dash_score > _SURE_DASH_SHARE * piece.lane_score:
         return LANE_DASH
-    if not is_whole(blob, view) or not length_m <= _DASH_LENGTH_M:
+    if not piece.whole or not piece.length_m <= _DASH_LENGTH_M:
         return None
-    if length_m < _SIZE_LIMITS_M[LANE_DASH][0][0]:
-        return next(iter(_fitting(blob, length_m, width_m)), None)
-    return LANE_DASH if _fits(LANE_DASH, length_m, width_m) else None
+    if piece.length_m < _SIZE_LIMITS_M[LANE_DASH][0][0]:
+        return next(iter(piece.fitting()), None)
+    return LANE_DASH if piece.fits(LANE_DASH) else None
 
 
-def rival_kinds(blob: Blob, outline_vehicle: FloatArray, kind: str, view: CameraView) -> list[str]:
+def rival_kinds(piece: Piece, kind: str) -> list[str]:
     """The other classes with four corners that a quadrilateral, tried as ``kind``, may well be of."""
-    if not is_whole(blob, view):
+    if not piece.whole:
         return []
-    least = _LEAST_RIVAL_SHARE * sum(blob.class_score.values())
-    fitting = _fitting(blob, *_ground_size(outline_vehicle))
-    return [name for name in fitting if name != kind and blob.class_score.get(name, 0.0) >= least]
+    least = _LEAST_RIVAL_SHARE * sum(piece.class_score.values())
+    return [n for n in piece.fitting() if n != kind and piece.class_score.get(n, 0.0) >= least]
 
 
-def _fitting(blob: Blob, length_m: float, width_m: float) -> list[str]:
-    """Classes with four corners that are of such a size and shape, the likeliest first."""
-    slim = length_m >= _LEAST_ELONGATION * width_m
-    fitting = [
-        name
-        for name in CORNERED_CLASSES
-        if _fits(name, length_m, width_m) and (slim or name not in (LANE_DASH, STOP_LINE))
-    ]
-    return sorted(fitting, key=lambda name: -blob.class_score.get(name, 0.0))
-
-
-def _second_choice(blob: Blob, length_m: float, width_m: float) -> str | None:
+def _second_choice(piece: Piece) -> str | None:
     """The likeliest class with four corners, if a blob that is not taken for it may well be of it."""
-    slim = length_m >= _LEAST_ELONGATION * width_m
     share = {
         name: score
-        for name, score in blob.class_score.items()
-        if name in CORNERED_CLASSES and (name == LANE_DASH) == slim and _fits(name, length_m, width_m)
+        for name, score in piece.class_score.items()
+        if name in CORNERED_CLASSES and (name == LANE_DASH) == piece.slim and piece.fits(name)
     }
     best = max(share, key=share.__getitem__, default=None)
-    if best is None or blob.touches_symbol:
+    if best is None or piece.touches_symbol:
         return None
-    return best if share[best] >= _LEAST_SECOND_SHARE * sum(blob.class_score.values()) else None
-
-
-def is_whole(blob: Blob, view: CameraView) -> bool:
-    """Whether a blob keeps off the image's border."""
-    return bool(view.inside(blob.outline_px, _BORDER_PX).all())
+    return best if share[best] >= _LEAST_SECOND_SHARE * sum(piece.class_score.values()) else None
 
 
 class Heads:
@@ -197,30 +218,22 @@ def head_of(outline_vehicle: FloatArray, heads_vehicle: Heads) -> int | None:
     return None
 
 
-def _likeliest(class_score: dict[str, float], short: bool) -> tuple[str, float]:
+def _likeliest(piece: Piece, short: bool) -> tuple[str, float]:
     """The best class, lane classes taken together first; ``short`` paint is rather a dash than a line."""
-    lane_score = sum(class_score.get(name, 0.0) for name in LANE_CLASSES)
-    others = {name: score for name, score in class_score.items() if name not in LANE_CLASSES}
+    others = {name: score for name, score in piece.class_score.items() if name not in LANE_CLASSES}
     best_other = max(others, key=others.__getitem__, default="")
+    lane_score = piece.lane_score
     if best_other and others[best_other] >= lane_score:
         return best_other, others[best_other]
-    dash_share = class_score.get(LANE_DASH, 0.0) / max(lane_score, 1e-9)
+    dash_share = piece.class_score.get(LANE_DASH, 0.0) / max(lane_score, 1e-9)
     return (LANE_DASH if dash_share > (_DASH_SHARE if short else _SURE_DASH_SHARE) else LANE_LINE), lane_score
 
 
-def _likeliest_compact(class_score: dict[str, float]) -> tuple[str, float]:
+def _likeliest_compact(piece: Piece) -> tuple[str, float]:
     """The best class but lanes, which its shape rules out; their score is paint, so the best takes it."""
-    lane_score = sum(class_score.get(name, 0.0) for name in LANE_CLASSES)
-    others = {name: score for name, score in class_score.items() if name not in LANE_CLASSES}
+    others = {name: score for name, score in piece.class_score.items() if name not in LANE_CLASSES}
     best = max(others, key=others.__getitem__, default=LANE_LINE)
-    return best, others.get(best, 0.0) + lane_score
-
-
-def _fits(kind: str, length_m: float, width_m: float) -> bool:
-    if kind not in _SIZE_LIMITS_M:
-        return False
-    length, width = _SIZE_LIMITS_M[kind]
-    return bool(length[0] <= length_m <= length[1] and width[0] <= width_m <= width[1])
+    return best, others.get(best, 0.0) + piece.lane_score
 
 
 def _ground_size(outline_vehicle: FloatArray) -> tuple[float, float]:
