@@ -28,7 +28,7 @@ def test_the_steps_of_a_marking_are_those_of_its_paint_and_end_at_its_corners():
     corners_px = np.stack([order_corners(to_image(camera, shape)) for shape in shapes])
     steps = steps_of(picture(camera, shapes, ground=0.1, paint=0.5), corners_px)
     np.testing.assert_allclose(steps.typical, np.log(0.51 / 0.11), atol=0.1)
-    assert np.abs(steps.beyond).max() < 0.4
+    assert np.abs(steps.going_on).max() < 0.26
     assert not steps.runs_on().any()
 
 

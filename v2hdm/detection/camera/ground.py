@@ -21,7 +21,7 @@ def ipm_from_extrinsic(info: CameraInfo, cam_from_vehicle: FloatArray) -> FloatA
 
 def apply_homography(dst_from_src: FloatArray, points_src: FloatArray) -> FloatArray:
     """Map points (N, 2) by a homography (3 x 3); points at infinity come out as inf or nan."""
-    homogeneous = np.column_stack([points_src, np.ones(len(points_src))]) @ dst_from_src.T
+    homogeneous = points_src @ dst_from_src.T[:2] + dst_from_src.T[2]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(homogeneous[:, :2] / homogeneous[:, 2:])
 

@@ -45,13 +45,14 @@ class CameraView:
             return points.copy()
         rows, columns = self._pinhole_lut.shape[:2]
         cell = points / _LUT_STEP_PX
-        j = np.clip(np.floor(cell[:, 0]).astype(np.intp), 0, columns - 2)
-        i = np.clip(np.floor(cell[:, 1]).astype(np.intp), 0, rows - 2)
-        a, b = (cell[:, 0] - j)[:, None], (cell[:, 1] - i)[:, None]
-        lut = self._pinhole_lut
-        upper = lut[i, j] * (1 - a) + lut[i, j + 1] * a
-        lower = lut[i + 1, j] * (1 - a) + lut[i + 1, j + 1] * a
-        return np.asarray(upper * (1 - b) + lower * b)
+        first = np.minimum(np.maximum(np.floor(cell).astype(np.intp), 0), (columns - 2, rows - 2))
+        right, down = np.hsplit(cell - first, 2)
+        at = first[:, 0] + columns * first[:, 1]
+        lut = self._pinhole_lut.reshape(-1, 2)
+        upper = lut.take(at, axis=0) * (1 - right) + lut.take(at + 1, axis=0) * right
+        at += columns
+        lower = lut.take(at, axis=0) * (1 - right) + lut.take(at + 1, axis=0) * right
+        return np.asarray(upper * (1 - down) + lower * down)
 
     def distort(self, points_pinhole_px: FloatArray) -> FloatArray:
         """Pinhole pixels (N, 2) to recorded pixels."""
@@ -69,9 +70,10 @@ class CameraView:
     def ground(self, points_pinhole_px: FloatArray) -> FloatArray:
         """Where pinhole pixels (N, 2) meet the ground, vehicle frame, m; NaN at and above the horizon."""
         points = np.asarray(points_pinhole_px, dtype=np.float64).reshape(-1, 2)
-        ground = apply_homography(self.vehicle_from_pinhole_px, points)
-        ground[self._ground_depth(points) * self._ground_sign <= 0] = np.nan
-        return ground
+        homography = self.vehicle_from_pinhole_px
+        homogeneous = points @ homography.T[:2] + homography.T[2]
+        depth = homogeneous[:, 2:]
+        return np.asarray(homogeneous[:, :2] / np.where(depth * self._ground_sign > 0, depth, np.nan))
 
     def ground_jacobian(self, points_pinhole_px: FloatArray) -> FloatArray:
         """Derivative (N, 2, 2) of :meth:`ground`, m per px; NaN where that is NaN."""
@@ -86,8 +88,9 @@ class CameraView:
 
     def inside(self, points_px: FloatArray, border_px: float) -> BoolArray:
         """Which recorded points (N, 2) lie at least ``border_px`` inside the image."""
-        limit = np.array([self.info.width - 1, self.info.height - 1], dtype=np.float64)
-        return np.asarray(((points_px >= border_px) & (points_px <= limit - border_px)).all(axis=-1))
+        u, v = points_px[..., 0], points_px[..., 1]
+        across = (u >= border_px) & (u <= self.info.width - 1 - border_px)
+        return np.asarray(across & (v >= border_px) & (v <= self.info.height - 1 - border_px))
 
     def _ground_depth(self, points_pinhole_px: FloatArray) -> FloatArray:
         row = self.vehicle_from_pinhole_px[2]

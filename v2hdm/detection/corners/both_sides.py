@@ -103,7 +103,7 @@ def painted_parts(
         and 3 are one end. What is longer than any dash and holds no shorter one has none. Those that are
         missing show paint all over, or nothing that is surely none.
     """
-    grey = grey.at_limit()
+    grey = grey.at_limit
     across = _look_across(grey, foreground, view, corners_pinhole_px)
     good, bad = _judge(across)
     step_m = across.step_m

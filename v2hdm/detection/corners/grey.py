@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
@@ -29,15 +29,20 @@ def log_grey(values: np.ndarray) -> np.ndarray:
 class GreyBand:
     """Linear grey ``values`` (h, w) float32 of the image rows from ``top`` on.
 
-    NaN where it was not looked at, +inf where the sensor was at its limit and the true value is unknown.
+    NaN where it was not looked at, +inf where the sensor was at its limit and the true value is unknown;
+    ``clipped`` says whether there is any of that.
     """
 
     values: np.ndarray
     top: int
+    clipped: bool
 
+    @cached_property
     def at_limit(self) -> GreyBand:
         """The same with the sensor's limit where it was reached, so that edges seem farther outside."""
-        return GreyBand(np.minimum(self.values, np.float32(1)), self.top)
+        if not self.clipped:
+            return self
+        return GreyBand(np.minimum(self.values, np.float32(1)), self.top, False)
 
     def sample(self, points_px: np.ndarray) -> np.ndarray:
         """Bilinear look-up at recorded pixels (n, m, 2); not finite where one of the four pixels is not.
@@ -65,11 +70,13 @@ def linear_grey(
     values = np.full((bottom - top, image_bgr.shape[1]), np.nan, dtype=np.float32)
     low = np.maximum(boxes[:, :2], [0, top])
     high = np.minimum(boxes[:, 2:], [image_bgr.shape[1], bottom])
+    clipped = False
     for (left, first), (right, last) in zip(low.tolist(), high.tolist(), strict=True):
         if left < right and first < last:
-            channels = cv2.LUT(image_bgr[first:last, left:right], table)
-            values[first - top : last - top, left:right] = cv2.transform(channels, _SUM)
-    return GreyBand(values, top)
+            grey = cv2.transform(cv2.LUT(image_bgr[first:last, left:right], table), _SUM)
+            values[first - top : last - top, left:right] = grey
+            clipped |= bool(grey.max() > 1)
+    return GreyBand(values, top, clipped)
 
 
 @cache

@@ -123,7 +123,7 @@ def fit_markings(
         shared = _Far(foreground, blobs, view, blur_px or TYPICAL_BLUR_PX)
         overexposed = _take_quads(found, np.flatnonzero(far), grey, shared, 0.0)
         if options.vague_corners and len(overexposed):
-            _take_quads(found, overexposed, grey.at_limit(), shared, _BLOOM_SIGMA_PX)
+            _take_quads(found, overexposed, grey.at_limit, shared, _BLOOM_SIGMA_PX)
     found.covariance = _COVARIANCE_FACTOR * found.covariance + _COVARIANCE_FLOOR_PX**2 * np.eye(8)
     steps = grey_steps(grey, found.px)
     found.valid &= ~steps.runs_on()

@@ -213,8 +213,8 @@ def _split(
             scores = probability.take(np.flatnonzero(mask[rows, columns]), axis=1).mean(axis=1)
             scores *= _sigmoid(level[mask]).mean()
             signed = _signed(mask, own_level)
-            left, top = max(x - 1, 0), max(y - 1, 0)
-            outline = zero_crossings(signed[top : y + h + 1, left : x + w + 1]) + [left, top]
+            first = np.array([max(x - 1, 0), max(y - 1, 0)])
+            outline = first + zero_crossings(signed[first[1] : y + h + 1, first[0] : x + w + 1])
             class_score = dict(zip(classes, scores.tolist(), strict=True))
             parts.append(Blob(class_score, signed, origin_px, stride, origin_px + stride * outline))
     touches = any(part.kind in _SYMBOLS for part in parts)
