@@ -18,7 +18,7 @@ from functools import cache
 import cv2
 import numpy as np
 
-from v2hdm.detection.corners.normal import normal_pdf, normal_pdf_cdf
+from v2hdm.detection.corners.normal import normal_cdf, normal_pdf
 from v2hdm.detection.corners.quad import side_frames
 
 _CELLS_PER_BLUR = 32
@@ -42,7 +42,7 @@ def blurred_coverage(
         0 to 3) or end (4 to 7) moves along the side's outward normal or (8) the blur grows, both float32.
     """
     tangent, normal, length = side_frames(corners)
-    per_blur = np.broadcast_to(1 / np.asarray(blur_px), (len(corners),))[:, None, None]
+    per_blur = 1 / np.reshape(blur_px, (-1, 1, 1))
     # Rows of a matrix that takes (u, v, 1) to the outward distance, and to the side's start and end.
     rows = np.empty((3, len(corners), 4, 3))
     rows[0, ..., :2], rows[0, ..., 2] = normal, -(normal * corners).sum(axis=-1)
@@ -52,12 +52,12 @@ def blurred_coverage(
     rows *= per_blur
     placed = rows.astype(np.float32) @ points
     across, start = placed[:2]
-    (pdf_start, pdf_end), (cdf_start, cdf_end) = normal_pdf_cdf(placed[1:])
+    density, pdf_start, pdf_end = densities = normal_pdf(placed)
+    cdf_start, cdf_end = normal_cdf(placed[1:], densities[1:])
     share = np.subtract(cdf_end, cdf_start, out=cdf_end)
     by_end = np.subtract(pdf_start, pdf_end, out=pdf_start)
     by_end -= np.multiply(start, share, out=pdf_end)
     by_end *= (1 / np.maximum(length[..., None] * per_blur, 1e-3)).astype(np.float32)
-    density = normal_pdf(across)
     density *= per_blur.astype(np.float32)
     derivative = np.empty((len(corners), 9, points.shape[2]), dtype=np.float32)
     sides = np.multiply(density, share, out=derivative[:, :4])

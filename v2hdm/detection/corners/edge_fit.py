@@ -16,7 +16,7 @@ from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.correlation import variance_inflation
 from v2hdm.detection.corners.covariance import corner_covariance
 from v2hdm.detection.corners.grey import GreyBand
-from v2hdm.detection.corners.normal import normal_pdf_cdf
+from v2hdm.detection.corners.normal import normal_cdf, normal_pdf
 from v2hdm.detection.corners.quad import (
     following,
     interior_angles,
@@ -207,7 +207,8 @@ def _fit_profiles(values: np.ndarray, t: np.ndarray) -> _ProfileFit:
     blur = np.full((*finite.shape[:2], 1), _START_BLUR_PX, dtype=np.float32)
     for _ in range(_FIT_ITERATIONS):
         x = (offset - t) / blur
-        slope, shape = normal_pdf_cdf(x)
+        slope = normal_pdf(x)
+        shape = normal_cdf(x, slope)
         mean_shape = shape.sum(axis=0) / len(t)
         shape -= mean_shape
         power = np.maximum((shape * shape).sum(axis=0), 1e-9)
@@ -249,7 +250,7 @@ def _robust_lines(sides: _Sides, offset: FloatArray, good: BoolArray, iterations
     terms = np.stack([np.ones_like(along), along, along * along, offset, along * offset], axis=-1)
     middle = np.maximum(good.sum(axis=-1) - 1, 0) // 2
     for iteration in range(iterations):
-        constant, slope, normal_matrix = _weighted_line(weight, terms)
+        constant, slope, sums = _weighted_line(weight, terms)
         residual = offset - constant[..., None] - slope[..., None] * along
         if iteration < _SCATTER_ITERATIONS:
             ordered = np.sort(np.where(good, np.abs(residual), np.inf), axis=-1)
@@ -262,7 +263,7 @@ def _robust_lines(sides: _Sides, offset: FloatArray, good: BoolArray, iterations
     variance = np.maximum(variance, _MIN_SCATTER_PX**2)
     neighbours = weight[..., 1:] * weight[..., :-1]
     variance *= variance_inflation(residual[..., 1:], residual[..., :-1], neighbours, _MAX_CORRELATION)
-    covariance = variance[..., None, None] * _inverse(normal_matrix)
+    covariance = variance[..., None, None] * _line_covariance(*sums)
     frayed = _frayed_px(residual, good)
     covariance[..., 0, 0] += frayed**2
     covariance[..., 1, 1] += (frayed / np.maximum(np.abs(along).max(axis=-1), 1.0)) ** 2
@@ -280,21 +281,22 @@ def _frayed_px(residual: FloatArray, good: BoolArray) -> FloatArray:
     return np.asarray(_FRAYED_SHARE * np.maximum(scatter - _SHARP_SCATTER_PX, 0.0))
 
 
-def _weighted_line(weight: FloatArray, terms: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Constant, slope and normal matrix of lines from ``terms`` (..., n, 5): 1, x, x^2, y, x y."""
+_Sums = tuple[FloatArray, FloatArray, FloatArray]
+"""Weighted sums (...) of 1, x and x^2."""
+
+
+def _weighted_line(weight: FloatArray, terms: FloatArray) -> tuple[FloatArray, FloatArray, _Sums]:
+    """Constant, slope and sums of lines from ``terms`` (..., n, 5): 1, x, x^2, y, x y."""
     s0, s1, s2, t0, t1 = np.moveaxis((weight[..., None, :] @ terms)[..., 0, :], -1, 0)
     s0, s2 = s0 + 1e-9, s2 + 1e-9
     determinant = np.maximum(s0 * s2 - s1 * s1, 1e-12)
-    constant, slope = (s2 * t0 - s1 * t1) / determinant, (s0 * t1 - s1 * t0) / determinant
-    normal_matrix = np.stack([s0, s1, s1, s2], axis=-1).reshape(*s0.shape, 2, 2)
-    return constant, slope, normal_matrix
+    return (s2 * t0 - s1 * t1) / determinant, (s0 * t1 - s1 * t0) / determinant, (s0, s1, s2)
 
 
-def _inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of symmetric positive matrices (..., 2, 2)."""
-    a, b, c = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]
-    inverse = np.stack([c, -b, -b, a], axis=-1) / np.maximum(a * c - b * b, 1e-12)[..., None]
-    return np.asarray(inverse.reshape(matrix.shape))
+def _line_covariance(s0: FloatArray, s1: FloatArray, s2: FloatArray) -> FloatArray:
+    """Covariance (..., 2, 2) of constant and slope for a variance of 1, from their sums."""
+    inverse = np.stack([s2, -s1, -s1, s0], axis=-1) / np.maximum(s0 * s2 - s1 * s1, 1e-12)[..., None]
+    return np.asarray(inverse.reshape(*s0.shape, 2, 2))
 
 
 def _masked_median(values: np.ndarray, mask: BoolArray) -> np.ndarray:

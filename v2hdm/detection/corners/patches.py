@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -59,11 +60,16 @@ class Patches:
 
     def median_used(self, values: np.ndarray) -> np.ndarray:
         """Median (M,) of every few values of (M, N) over the pixels that take part; 0 where there is none."""
+        unused, place, known = self._of_median
+        ordered = np.sort(values[:, ::_MEDIAN_STRIDE] + unused, axis=1)
+        return np.where(known, ordered[np.arange(len(values)), place], np.float32(0))
+
+    @cached_property
+    def _of_median(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What puts pixels that take no part behind the others, and where the median is, if there is one."""
         use = self.use[:, ::_MEDIAN_STRIDE] > 0
-        ordered = np.sort(np.where(use, values[:, ::_MEDIAN_STRIDE], np.float32(np.inf)), axis=1)
-        count = np.count_nonzero(use, axis=1)
-        median = ordered[np.arange(len(values)), np.maximum(count // 2 - 1, 0)]
-        return np.where(count > 0, median, np.float32(0))
+        count = use.sum(axis=1)
+        return np.where(use, np.float32(0), np.float32(np.inf)), np.maximum(count // 2 - 1, 0), count > 0
 
 
 def cut_patches(

@@ -229,7 +229,7 @@ def _class_probability(sight: Sight, rows: np.ndarray, columns: np.ndarray) -> n
     odds -= odds.max(axis=0)
     np.exp(odds, out=odds)
     odds /= odds.sum(axis=0)
-    return odds
+    return np.asarray(odds)
 
 
 def _sigmoid(level: np.ndarray) -> np.ndarray:
