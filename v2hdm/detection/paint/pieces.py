@@ -48,7 +48,8 @@ def settle_pieces(level: np.ndarray, contours: list[np.ndarray]) -> tuple[np.nda
     contours, parts = _parted(level, contours)
     for found, log_odds in ((whole, _DOUBTFUL), (parts, _QUITE_SURE)):
         if found:
-            level = np.where(_with_border(level, found), level - np.float32(log_odds), level)
+            around = _with_border(level, found) > 0
+            level = np.subtract(level, np.float32(log_odds), out=level.copy(), where=around)
     return level, contours + whole + parts
 
 
