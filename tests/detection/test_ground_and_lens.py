@@ -11,7 +11,7 @@ from v2hdm.detection.camera.ground import (
     ipm_from_extrinsic,
 )
 from v2hdm.detection.camera.lens import distort_points, undistort_points
-from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.camera.view import FARTHEST_M, CameraView
 
 GRID_PX = np.stack(np.meshgrid(np.linspace(0, 639, 17), np.linspace(0, 359, 11)), axis=-1).reshape(-1, 2)
 
@@ -84,6 +84,13 @@ def test_the_band_begins_just_above_the_horizon_and_ends_with_the_image():
     assert view.top + view.height == camera.info.height
     assert view.height % 16 == 0
     assert horizon - 16 - 16 <= view.top <= horizon
+
+
+def test_looking_begins_a_little_above_the_farthest_ground_of_use():
+    view = CameraView(make_camera("pinhole"))
+    (ahead_px,) = apply_homography(view.pinhole_px_from_vehicle, view.foot_vehicle[None] + [FARTHEST_M, 0.0])
+    assert (view.far_row - view.top) % 16 == 0
+    assert ahead_px[1] - 24 - 16 <= view.far_row <= ahead_px[1] - 24
 
 
 def test_a_rear_camera_sees_the_ground_behind_the_vehicle():

@@ -74,8 +74,9 @@ def test_the_parts_cover_the_band_whatever_the_image_size(tmp_path, width, heigh
     camera = large_camera(width, height)
     view = CameraView(camera)
     sight = look(Network(brightness_model(tmp_path)), np.zeros((height, width, 3), dtype=np.uint8), view)
-    assert sight.paint.shape == (-(-view.height // 2), -(-width // 2))
-    assert sight.kinds.shape[1:] == (-(-view.height // 4), -(-width // 4))
+    rows = height - view.far_row
+    assert sight.paint.shape == (-(-rows // 2), -(-width // 2))
+    assert sight.kinds.shape[1:] == (-(-rows // 4), -(-width // 4))
 
 
 def looked_at(image: np.ndarray, mirrored: bool) -> Sight:

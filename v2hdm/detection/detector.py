@@ -108,7 +108,7 @@ class Detector:
             sight = look(self.network, image_bgr, view, self.options.mirrored)
         reach_px = self._reach_px[camera.info.name]
         with lap("blobs"):
-            blobs, owner = find_blobs(sight, info.classes, info.paint_stride, view.top, reach_px)
+            blobs, owner = find_blobs(sight, info.classes, info.paint_stride, view.far_row, reach_px)
             candidates = self._candidates(blobs, view)
         with lap("lanes"):
             lanes = trace_lanes(
@@ -117,7 +117,7 @@ class Detector:
             lanes += link_anchors(sight.anchors, view, lanes, self.options.lane_step_m)
         with lap("corners"):
             starts = self._starts(candidates, view)
-            foreground = Foreground(sight.paint, owner, info.paint_stride, view.top)
+            foreground = Foreground(sight.paint, owner, info.paint_stride, view.far_row)
             markings = fit_markings(image_bgr, view, starts, foreground, self.options)
             symbols = [self._symbol(c, view) for c in candidates]
             markings += [s for s in symbols if s is not None and not _is_among(s, markings)]

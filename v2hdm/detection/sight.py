@@ -60,19 +60,20 @@ def look(network: Network, image_bgr: np.ndarray, view: CameraView, mirrored: bo
 
     ``mirrored`` asks it of the mirror image, too, and takes the mean of both answers.
     """
-    band = image_bgr[view.top : view.top + view.height]
+    top = view.far_row
+    band = image_bgr[top:]
     ask = _answer_twice if mirrored else _answer
     seam = _seam_row(network, view)
     if seam is None:
         output = ask(network, band)
-        return Sight(output.paint, output.kinds, _anchor_rows(output.lanes, network, view.top, 1))
+        return Sight(output.paint, output.kinds, _anchor_rows(output.lanes, network, top, 1))
     far = ask(network, band[: seam + _OVERLAP_PX])
     near_top = seam - _OVERLAP_PX
     half = cv2.resize(band[near_top:], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     near = ask(network, half)
-    far_rows = [row for row in _anchor_rows(far.lanes, network, view.top, 1) if row.v_px < view.top + seam]
-    near_rows = _anchor_rows(near.lanes, network, view.top + near_top, 2)
-    near_rows = [row for row in near_rows if row.v_px >= view.top + seam]
+    far_rows = [row for row in _anchor_rows(far.lanes, network, top, 1) if row.v_px < top + seam]
+    near_rows = _anchor_rows(near.lanes, network, top + near_top, 2)
+    near_rows = [row for row in near_rows if row.v_px >= top + seam]
     paint = _joined(far.paint[None], near.paint[None], seam, near_top, network.info.paint_stride)
     kinds = _joined(far.kinds, near.kinds, seam, near_top, network.info.kind_stride)
     return Sight(paint[0], kinds, near_rows + far_rows)
@@ -101,11 +102,12 @@ def _answer_twice(network: Network, image_bgr: np.ndarray) -> NetworkOutput:
 def _seam_row(network: Network, view: CameraView) -> int | None:
     """Row of the band from which half the resolution will do; None if that saves nothing."""
     grid = max(_GRID_PX, network.info.multiple)
-    if view.fine_row is None or view.info.width % (2 * grid) or view.height % grid:
+    height = view.info.height - view.far_row
+    if view.fine_row is None or view.info.width % (2 * grid) or height % grid:
         return None
-    seam = -(-(view.fine_row - view.top) // grid) * grid
-    seam += (view.height - seam) % (2 * grid)
-    worth = view.height - seam >= 3 * _OVERLAP_PX
+    seam = -(-max(view.fine_row - view.far_row, 0) // grid) * grid
+    seam += (height - seam) % (2 * grid)
+    worth = height - seam >= 3 * _OVERLAP_PX
     return seam if worth and seam >= _OVERLAP_PX else None
 
 

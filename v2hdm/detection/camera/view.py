@@ -11,6 +11,12 @@ from v2hdm.records import BoolArray, Camera, FloatArray
 _LUT_STEP_PX = 4
 _HORIZON_MARGIN_PX = 16
 
+FARTHEST_M = 60.0
+"""Neither markings nor lines are looked for beyond this: networks are shown none beyond 50 m."""
+
+_SURROUNDINGS_PX = 24
+"""So far above the farthest ground what is there helps to tell what lies on it."""
+
 FINE_ENOUGH_M = 0.007
 """Ground per pixel, across the view, of which half the resolution shows enough: a dash stays 10 px wide."""
 
@@ -20,8 +26,10 @@ class CameraView:
 
     ``top`` and ``height`` are the band of image rows below the horizon of the camera's initial IPM
     (with a margin, since that IPM is coarse); ``height`` is a multiple of ``multiple`` where the
-    image is tall enough. From ``fine_row`` on (None if there is no such row) a pixel is less than
-    :data:`FINE_ENOUGH_M` of ground wide. Points far from any lens singularity are assumed.
+    image is tall enough. ``far_row``, by a multiple of ``multiple`` below ``top``, is the one from which on
+    it is worth looking at for ground within :data:`FARTHEST_M`. From ``fine_row`` on (None if there is no
+    such row) a pixel is less than :data:`FINE_ENOUGH_M` of ground wide. Points far from any lens singularity
+    are assumed.
     """
 
     def __init__(self, camera: Camera, multiple: int = 16):
@@ -36,6 +44,8 @@ class CameraView:
         seen_px = apply_homography(self.pinhole_px_from_vehicle, seen_vehicle[None])
         self._ground_sign = np.sign(self._ground_depth(seen_px))[0]
         self.top, self.height = self._band_rows(multiple)
+        spare = max(self.first_row_within(FARTHEST_M) - _SURROUNDINGS_PX - self.top, 0)
+        self.far_row = self.top + spare // multiple * multiple
         self.fine_row = self._fine_row()
 
     def undistort(self, points_px: FloatArray) -> FloatArray:
