@@ -199,12 +199,9 @@ def _split(
     probability = _class_probability(sight, rows + box[0].start - 1, columns + box[1].start - 1)
     group_of = np.array([_group_index(name) for name in classes])
     votes = np.bincount(group_of[probability.argmax(axis=0)], minlength=len(_GROUPS)) / len(rows)
-    kinds = _kinds_at_full(sight, box)
     parts = []
     for group in np.flatnonzero(votes >= _LEAST_SHARE):
-        mine = kinds[group_of == group].max(axis=0)
-        rest = kinds[group_of != group].max(axis=0)
-        own_level = np.minimum(level, mine - rest)
+        own_level = np.minimum(level, _lead(sight, group_of == group, box))
         _, labels, stats, _ = cv2.connectedComponentsWithStats(((own_level > 0) & inside).view(np.uint8))
         for label, (x, y, w, h, cells) in enumerate(stats.tolist()):
             if label == 0 or cells < _MIN_CELLS:
@@ -236,14 +233,20 @@ def _sigmoid(level: np.ndarray) -> np.ndarray:
     return np.asarray(1 / (1 + np.exp(-np.clip(level, -30, 30))))
 
 
-def _kinds_at_full(sight: Sight, box: tuple[slice, slice]) -> np.ndarray:
-    """Class logits (K, h, w), interpolated to the elements of the framed ``paint`` in a box."""
-    rows, columns = (np.arange(part.start, part.stop, dtype=np.float32) - 1 for part in box)
-    scale = np.float32(sight.kind_scale)
-    u, v = np.meshgrid((columns + 0.5) / scale - 0.5, (rows + 0.5) / scale - 0.5)
-    return np.stack(
-        [cv2.remap(plane, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for plane in sight.kinds]
+def _lead(sight: Sight, mine: BoolArray, box: tuple[slice, slice]) -> np.ndarray:
+    """By how much the best class of ``mine`` (K,) leads the best of the rest, in logits.
+
+    It is interpolated to the elements of the framed ``paint`` in a box, (h, w).
+    """
+    scale = sight.kind_scale
+    near = tuple(slice(max(int((p.start - 2) / scale) - 1, 0), int(p.stop / scale) + 2) for p in box)
+    kinds = sight.kinds[:, *near]
+    lead = kinds[mine].max(axis=0) - kinds[~mine].max(axis=0)
+    v, u = (
+        (np.arange(part.start, part.stop, dtype=np.float32) - 0.5) / np.float32(scale) - (0.5 + first.start)
+        for part, first in zip(box, near, strict=True)
     )
+    return cv2.remap(lead, *np.meshgrid(u, v), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def _group_index(name: str) -> int:
