@@ -53,6 +53,10 @@ _SURE_DASH_SHARE = 0.5
 _LEAST_RIVAL_SHARE = 0.05
 """With this share another class is tried, too: all evidence decides between them."""
 
+_LEAST_SHARE_OF_LINE = 0.02
+"""What the network takes for a line is tried if it leaves any class with four corners this share: all that had
+less came to nothing."""
+
 _LEAST_SECOND_SHARE = 0.12
 """What the network takes for a symbol is tried as a quadrilateral if it leaves that class this share."""
 
@@ -103,12 +107,15 @@ class Piece:
         length, width = _SIZE_LIMITS_M[kind]
         return length[0] <= self.length_m <= length[1] and width[0] <= self.width_m <= width[1]
 
-    def fitting(self) -> list[str]:
-        """Classes with four corners that are of its size and shape, the likeliest first."""
+    def fitting(self, least_share: float = 0.0) -> list[str]:
+        """Classes with four corners that are of its size and shape and have that share, the likeliest first."""
+        least = least_share * sum(self.class_score.values())
         fitting = [
             name
             for name in CORNERED_CLASSES
-            if self.fits(name) and (self.slim or name not in (LANE_DASH, STOP_LINE))
+            if self.class_score.get(name, 0.0) >= least
+            and self.fits(name)
+            and (self.slim or name not in (LANE_DASH, STOP_LINE))
         ]
         return sorted(fitting, key=lambda name: -self.class_score.get(name, 0.0))
 
@@ -148,6 +155,8 @@ def cornered_kind(piece: Piece, kind: str) -> str | None:
         return LANE_DASH
     if not piece.whole or not piece.length_m <= _DASH_LENGTH_M:
         return None
+    if not piece.fitting(_LEAST_SHARE_OF_LINE):
+        return None
     if piece.length_m < _SIZE_LIMITS_M[LANE_DASH][0][0]:
         return next(iter(piece.fitting()), None)
     return LANE_DASH if piece.fits(LANE_DASH) else None
@@ -157,8 +166,7 @@ def rival_kinds(piece: Piece, kind: str) -> list[str]:
     """The other classes with four corners that a quadrilateral, tried as ``kind``, may well be of."""
     if not piece.whole:
         return []
-    least = _LEAST_RIVAL_SHARE * sum(piece.class_score.values())
-    return [n for n in piece.fitting() if n != kind and piece.class_score.get(n, 0.0) >= least]
+    return [name for name in piece.fitting(_LEAST_RIVAL_SHARE) if name != kind]
 
 
 def _second_choice(piece: Piece) -> str | None:
