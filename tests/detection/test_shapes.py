@@ -11,7 +11,7 @@ from v2hdm.detection.corners.quad import (
     intersect_sides,
     is_convex,
     order_corners,
-    quad_from_outline,
+    quad_from_hull,
     side_frames,
     signed_area,
     width,
@@ -61,7 +61,7 @@ def test_the_width_of_a_bar_is_its_breadth():
 def test_a_quadrilateral_is_found_again_from_points_on_its_outline():
     along = np.linspace(0, 1, 40, endpoint=False)[:, None]
     outline = np.concatenate([KITE[e] * (1 - along) + KITE[(e + 1) % 4] * along for e in range(4)])
-    found = quad_from_outline(outline)
+    found = quad_from_hull(cv2.convexHull(outline.astype(np.float32)))
     assert found is not None
     distance = np.linalg.norm(found[:, None] - KITE, axis=-1).min(axis=1)
     assert distance.max() < 0.05
@@ -69,7 +69,7 @@ def test_a_quadrilateral_is_found_again_from_points_on_its_outline():
 
 @pytest.mark.parametrize("outline", [np.zeros((3, 2)), np.zeros((9, 2)), np.arange(18.0).reshape(9, 2)])
 def test_points_that_enclose_nothing_give_no_quadrilateral(outline):
-    assert quad_from_outline(outline) is None
+    assert quad_from_hull(cv2.convexHull(outline.astype(np.float32))) is None
 
 
 def test_the_normal_distribution_is_right_to_four_digits():

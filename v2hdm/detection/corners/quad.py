@@ -16,22 +16,18 @@ _NEXT, _LAST = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])
 _TURN = np.array([-1.0, 1.0])
 
 
-def quad_from_outline(outline: FloatArray) -> FloatArray | None:
-    """The quadrilateral (4, 2) that encloses an outline (N, 2) most tightly; None where there is none.
+def quad_from_hull(hull: np.ndarray) -> FloatArray | None:
+    """The quadrilateral (4, 2) that encloses a convex hull (N, 1, 2) most tightly; None where there is none.
 
-    Sides of the convex hull are merged until four are left (Low and Ilie, Computer Vision and
-    Graphics, 2003, in OpenCV's approxPolyN).
+    Sides of the hull are merged until four are left (Low and Ilie, Computer Vision and Graphics, 2003, in
+    OpenCV's approxPolyN).
     """
-    if len(outline) < 4:
-        return None
-    centre = outline.mean(axis=0)
-    hull = cv2.convexHull((outline - centre).astype(np.float32))
     if len(hull) < 4 or cv2.contourArea(hull) < 1.0:
         return None
     quad = np.asarray(cv2.approxPolyN(hull, 4), dtype=np.float64).reshape(-1, 2)
     if len(quad) != 4 or not np.isfinite(quad).all():
         return None
-    return order_corners(quad + centre)
+    return order_corners(quad)
 
 
 def order_corners(corners: FloatArray) -> FloatArray:

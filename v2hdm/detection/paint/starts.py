@@ -7,7 +7,7 @@ import numpy as np
 
 from v2hdm.detection.camera.ground import apply_homography
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.corners.quad import order_corners, quad_from_outline
+from v2hdm.detection.corners.quad import order_corners, quad_from_hull
 from v2hdm.records import CROSSWALK_BAR, LANE_DASH, STOP_LINE, FloatArray
 
 _RECTANGLES = (LANE_DASH, STOP_LINE, CROSSWALK_BAR)
@@ -25,10 +25,15 @@ def starting_corners(
         with the share of it that the hull fills; None where there is neither. It need not be convex where
         a rectangle reaches behind the camera.
     """
-    hull = cv2.convexHull((outline_pinhole_px - outline_pinhole_px[0]).astype(np.float32))
-    candidates = [quad_from_outline(outline_pinhole_px)]
-    if kind in _RECTANGLES:
-        candidates.append(_ground_rectangle(outline_vehicle, view))
+    first = outline_pinhole_px[0]
+    points = (outline_pinhole_px - first).astype(np.float32)
+    outermost = cv2.convexHull(points, returnPoints=False)[:, 0]
+    hull = points[outermost, None]
+    quad = quad_from_hull(hull)
+    candidates = [None if quad is None else quad + first]
+    if kind in _RECTANGLES and np.isfinite(outline_vehicle).all():
+        # All before the camera, so that what is outermost in the image is so on the ground.
+        candidates.append(_ground_rectangle(outline_vehicle[outermost], view))
     best: tuple[FloatArray, float] | None = None
     for corners in candidates:
         if corners is None:
@@ -41,7 +46,7 @@ def starting_corners(
 
 def _ground_rectangle(outline_vehicle: FloatArray, view: CameraView) -> FloatArray | None:
     """The smallest rectangle on the ground around an outline (N, 2), m, as corners (4, 2) in pinhole px."""
-    if len(outline_vehicle) < 3 or not np.isfinite(outline_vehicle).all():
+    if len(outline_vehicle) < 3:
         return None
     centre = outline_vehicle.mean(axis=0)
     box = cv2.boxPoints(cv2.minAreaRect((outline_vehicle - centre).astype(np.float32)))
