@@ -54,8 +54,8 @@ _LEAST_RIVAL_SHARE = 0.05
 """With this share another class is tried, too: all evidence decides between them."""
 
 _LEAST_SHARE_OF_LINE = 0.02
-"""What the network takes for a line is tried if it leaves any class with four corners this share: all that had
-less came to nothing."""
+"""What the network takes for a line is tried if it leaves any class with four corners this share: all that
+had less came to nothing."""
 
 _LEAST_SECOND_SHARE = 0.12
 """What the network takes for a symbol is tried as a quadrilateral if it leaves that class this share."""
@@ -108,7 +108,7 @@ class Piece:
         return length[0] <= self.length_m <= length[1] and width[0] <= self.width_m <= width[1]
 
     def fitting(self, least_share: float = 0.0) -> list[str]:
-        """Classes with four corners that are of its size and shape and have that share, the likeliest first."""
+        """Classes with four corners that are of its size and shape, of that share at least, by likelihood."""
         least = least_share * sum(self.class_score.values())
         fitting = [
             name
