@@ -186,16 +186,20 @@ class Heads:
     """What may be the heads of arrows: numbers of blobs, with their outlines (N, 2) on the ground, m."""
 
     def __init__(self, outlines_vehicle: Mapping[int, FloatArray]):
-        known = {blob: outline[np.isfinite(outline[:, 0])] for blob, outline in outlines_vehicle.items()}
-        self._blobs = [blob for blob, outline in known.items() if len(outline) >= 3]
-        self._outlines = [known[blob] for blob in self._blobs]
-        self._low = np.array([outline.min(axis=0) for outline in self._outlines]).reshape(-1, 2)
-        self._high = np.array([outline.max(axis=0) for outline in self._outlines]).reshape(-1, 2)
+        self._outlines = list(outlines_vehicle.items())
+        count = [len(outline) for _, outline in self._outlines]
+        points, first = np.concatenate([np.empty((0, 2)), *outlines_vehicle.values()]), np.cumsum([0, *count])
+        # Of those without any ground the box is nan and near nothing.
+        self._low, self._high = (
+            extreme.reduceat(points, first[:-1]) if len(points) else points for extreme in (np.fmin, np.fmax)
+        )
 
     def within(self, centre: FloatArray, reach_m: float) -> list[tuple[int, FloatArray]]:
         """Those whose bounding box comes within a square of half the side ``reach_m``."""
         near = ((self._low < centre + reach_m) & (self._high > centre - reach_m)).all(axis=1)
-        return [(self._blobs[k], self._outlines[k]) for k in np.flatnonzero(near)]
+        found = [self._outlines[k] for k in np.flatnonzero(near)]
+        known = [(blob, outline[np.isfinite(outline[:, 0])]) for blob, outline in found]
+        return [(blob, outline) for blob, outline in known if len(outline) >= 3]
 
 
 def head_of(outline_vehicle: FloatArray, heads_vehicle: Heads) -> int | None:
@@ -246,7 +250,8 @@ def _likeliest_compact(piece: Piece) -> tuple[str, float]:
 
 def _ground_size(outline_vehicle: FloatArray) -> tuple[float, float]:
     """Length and width (m) of the smallest rectangle around the points on the ground (N, 2)."""
-    points = outline_vehicle[np.isfinite(outline_vehicle).all(axis=1)]
+    seen = np.isfinite(outline_vehicle[:, 0])
+    points = outline_vehicle if seen.all() else outline_vehicle[seen]
     if len(points) < 3:
         return np.nan, np.nan
     _, size, _ = cv2.minAreaRect(points.astype(np.float32))
