@@ -4,20 +4,21 @@
 
 Run it after another network was put in place. The lines that the detector proposes on rendered scenes,
 sure or not, two thirds of them of full difficulty and a third easy ones, are true if four fifths of the
-points that they were made of lie on one true line, by the tolerance of the quality benchmark; how far a line
-was drawn on from there does not count. A logistic regression with a weak ridge tells them apart. Which lines
-are proposed depends a little on the score itself, so that the fit is made twice. Its seed is neither that of
-the quality benchmark nor one of training. Printed: what each feature adds to the log odds per standard
-deviation, the log loss on the images of each fifth by weights that were fitted to the others, and how many
-lines given are true and false.
+rows that they were seen on lie on one true line, by the tolerance of the quality benchmark; how far a line
+was drawn on from there does not count. A logistic regression with a weak ridge tells them apart by what
+speaks for each alone; a second one tells each from its log odds, by weights that its own image had no part
+in, and from the others. Which lines are proposed depends a little on the score itself, so that the fit is
+made twice. Its seed is neither that of the quality benchmark nor one of training. Printed: what each feature
+adds to the log odds per standard deviation, the log loss on the images of each fifth by weights that were
+fitted to the others, alone and among the others, and how many lines given are true and false.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from unittest.mock import patch
 
 import cv2
@@ -28,6 +29,7 @@ from tests.benchmarks.detector_quality import LANE_TOLERANCE_PX, Example
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.lanes import anchors, score
+from v2hdm.detection.lanes.curves import Horizon, basis
 from v2hdm.detection.lanes.points import Line, LinePoints
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.sight import AnchorRow
@@ -36,7 +38,11 @@ from v2hdm.records import BoolArray, FloatArray, LaneDetection
 SEED = 921
 ROUNDS = 2
 LEAST_SHARE = 0.8
+_ROWS = 30
 _MOST_SLOPE = 10.0
+
+Weights = dict[str, tuple[FloatArray, float]]
+"""Those of :func:`v2hdm.detection.lanes.score.fitted`."""
 
 
 @dataclass(frozen=True)
@@ -64,22 +70,47 @@ def seen(shown: Example, detector: Detector) -> Seen:
     return kept[0]
 
 
-def proposed(image: Seen, paint_step_m: float) -> Iterator[tuple[FloatArray, bool]]:
-    """Evidence (F,) of each line that is proposed, and whether it is true."""
-    lines: list[tuple[LinePoints, Line]] = []
+@dataclass
+class Proposed:
+    """The lines that are proposed in one image, their evidence (N, F), and which of them are true."""
+
+    image: Seen
+    points: LinePoints
+    lines: list[Line]
+    horizon: Horizon
+    evidence: FloatArray = field(init=False)
+    true: BoolArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.evidence = score.evidence(self.lines, self.points, self.image.view)
+        self.true = np.array([self._is_true(line) for line in self.lines], dtype=np.bool_)
+
+    def told(self, alone: FloatArray) -> FloatArray:
+        """What tells of the lines (N, T), which have such log odds (N,) by themselves."""
+        return score.told(self.lines, self.points, self.horizon, alone)
+
+    def _is_true(self, line: Line) -> bool:
+        below = self.points.below[line.certain]
+        at = np.linspace(below.min(), below.max(), _ROWS)
+        line_px = self.image.view.distort(self.horizon.pinhole_px(line.curve.along(basis(at)), at))
+        return max((share_on(lane, line_px) for lane in self.image.lanes_px), default=0.0) >= LEAST_SHARE
+
+
+def proposed(image: Seen, paint_step_m: float) -> Proposed | None:
+    """The lines that are proposed in an image; None where there is nothing to make any of."""
+    found: list[Proposed] = []
     find_lines = anchors.find_lines
 
-    def spy(points: LinePoints, *rest: object) -> list[Line]:
-        found = find_lines(points, *rest[:-1], -np.inf)
-        lines.extend((points, line) for line in found)
-        return found
+    def spy(
+        points: LinePoints, groups: list[np.ndarray], view: CameraView, horizon: Horizon, *_: float
+    ) -> list[Line]:
+        lines = find_lines(points, groups, view, horizon, paint_step_m, -np.inf)
+        found.append(Proposed(image, points, lines, horizon))
+        return []
 
     with patch.object(anchors, "find_lines", spy):
         anchors.link_anchors(image.rows, image.view, image.paint, paint_step_m)
-    for points, line in lines:
-        at_px = points.points_px[line.certain]
-        share = max((share_on(lane, at_px) for lane in image.lanes_px), default=0.0)
-        yield score.evidence([line], points, image.view)[0], share >= LEAST_SHARE
+    return found[0] if found and found[0].lines else None
 
 
 def share_on(lane_px: FloatArray, points_px: FloatArray) -> float:
@@ -92,33 +123,46 @@ def share_on(lane_px: FloatArray, points_px: FloatArray) -> float:
     return float((off < LANE_TOLERANCE_PX * np.hypot(1, np.interp(at, v, slope))).mean())
 
 
-@dataclass(frozen=True)
 class Gathered:
-    """Evidence (N, F) of proposed lines, which of them are true (N,), and their images (N,)."""
+    """The lines proposed in all images, by the weights that there are."""
 
-    evidence: FloatArray
-    true: BoolArray
-    image: np.ndarray
+    def __init__(self, images: Sequence[Seen], paint_step_m: float):
+        self._images = [found for image in images if (found := proposed(image, paint_step_m)) is not None]
+        self._evidence = np.concatenate([image.evidence for image in self._images])
+        self._count = [len(image.lines) for image in self._images]
+        self._fold = np.repeat(np.arange(len(self._count)) % FOLDS, self._count)
+        self.true = np.concatenate([image.true for image in self._images])
 
-    @classmethod
-    def of(cls, images: list[Seen], paint_step_m: float) -> Gathered:
-        """Those of all images, by the weights that there are."""
-        found = [(k, *line) for k, image in enumerate(images) for line in proposed(image, paint_step_m)]
-        index, evidence, true = (np.array(column) for column in zip(*found, strict=True))
-        return cls(evidence, true, index)
+    def odds(self, weights: Weights) -> FloatArray:
+        """Log odds (N,) by such weights, among the others."""
+        told = self._told(self._evidence @ weights["alone"][0] + weights["alone"][1])
+        return np.asarray(told @ weights["among"][0] + weights["among"][1])
 
-    def log_loss(self, weights: FloatArray, bias: float) -> float:
-        """Mean of minus the log probability of what is the case."""
-        return log_loss(self.evidence @ weights + bias, self.true)
+    def fit(self) -> tuple[Weights, FloatArray, FloatArray]:
+        """Weights, and the log odds (N,) alone and among others by those of the other images."""
+        alone = self._left_out(self._evidence)
+        told = self._told(alone)
+        weights = {"alone": fit(self._evidence, self.true), "among": fit(told, self.true)}
+        return weights, alone, self._left_out(told)
 
-    def left_out(self) -> float:
-        """Log loss on the images of each fifth of weights that were fitted to the others."""
-        fold = self.image % FOLDS
-        parts = [(self._where(fold == k), self._where(fold != k)) for k in range(FOLDS)]
-        return float(np.mean([out.log_loss(*fit(kept.evidence, kept.true)) for out, kept in parts]))
+    def effects(self, weights: Weights) -> Weights:
+        """What each feature adds to the log odds per standard deviation."""
+        told = self._told(self._evidence @ weights["alone"][0] + weights["alone"][1])
+        columns = {"alone": self._evidence, "among": told}
+        return {name: (weights[name][0] * columns[name].std(axis=0), 0.0) for name in weights}
 
-    def _where(self, kept: BoolArray) -> Gathered:
-        return Gathered(self.evidence[kept], self.true[kept], self.image[kept])
+    def _told(self, alone: FloatArray) -> FloatArray:
+        parts = np.split(alone, np.cumsum(self._count)[:-1])
+        return np.concatenate([image.told(part) for image, part in zip(self._images, parts, strict=True)])
+
+    def _left_out(self, features: FloatArray) -> FloatArray:
+        """Log odds (N,) of the lines of each fifth of the images, by a fit to the others."""
+        odds = np.empty(len(features))
+        for k in range(FOLDS):
+            out = self._fold == k
+            weights, bias = fit(features[~out], self.true[~out])
+            odds[out] = features[out] @ weights + bias
+        return odds
 
 
 def main() -> None:
@@ -132,22 +176,39 @@ def main() -> None:
     options = DetectorOptions(model=parsed.model, max_range_m=24.0)
     detector = Detector.load(options=options)
     images = [seen(shown, detector) for _, shown in renders_to_fit(parsed.images, SEED)]
-    gathered = Gathered.of(images, options.lane_step_m)
-    weights, bias = score.fitted()
-    print(f"{gathered.true.sum()} true, {(~gathered.true).sum()} false lines in {parsed.images} images")
-    print(f"log loss of the weights so far {gathered.log_loss(weights, bias):.3f}")
-    for _ in range(ROUNDS):
-        weights, bias = fit(gathered.evidence, gathered.true)
-        with patch.object(score, "fitted", lambda fitted=(weights, bias): fitted):
-            gathered = Gathered.of(images, options.lane_step_m)
-    for name, weight, deviation in zip(score.FEATURES, weights, gathered.evidence.std(axis=0), strict=True):
-        print(f"{name:16s} {weight * deviation:+.2f}")
-    print(f"log loss of images left out {gathered.left_out():.3f}")
-    given = gathered.evidence @ weights + bias > anchors.LEAST_LOG_ODDS
-    print(f"given: {(given & gathered.true).sum()} true, {(given & ~gathered.true).sum()} false")
+    weights = fit_to(images, options.lane_step_m)
     if parsed.write:
-        written = dict(zip(score.FEATURES, weights.round(4).tolist(), strict=True))
-        score.SCORE_FILE.write_text(json.dumps({"bias": round(bias, 4), "weights": written}, indent=1) + "\n")
+        SCORE = {name: _named(*weights[name], keys) for name, keys in _KEYS.items()}
+        score.SCORE_FILE.write_text(json.dumps(SCORE, indent=1) + "\n")
+
+
+_KEYS = {"alone": score.FEATURES, "among": score.TOLD}
+
+
+def fit_to(images: Sequence[Seen], paint_step_m: float) -> Weights:
+    """The weights fitted to images; prints what they do."""
+    gathered = Gathered(images, paint_step_m)
+    print(f"{gathered.true.sum()} true, {(~gathered.true).sum()} false lines in {len(images)} images")
+    before = gathered.odds(score.fitted())
+    print(f"log loss of the weights so far {log_loss(before, gathered.true):.3f}")
+    for _ in range(ROUNDS):
+        weights, _, _ = gathered.fit()
+        with patch.object(score, "fitted", lambda fitted=weights: fitted):
+            gathered = Gathered(images, paint_step_m)
+    for name, (effect, _) in gathered.effects(weights).items():
+        for key, value in zip(_KEYS[name], effect, strict=True):
+            print(f"{name:6s} {key:16s} {value:+.2f}")
+    _, alone, among = gathered.fit()
+    losses = [log_loss(odds, gathered.true) for odds in (alone, among)]
+    print(f"log loss of images left out: alone {losses[0]:.3f}, among the others {losses[1]:.3f}")
+    given = gathered.odds(weights) > anchors.LEAST_LOG_ODDS
+    print(f"given: {(given & gathered.true).sum()} true, {(given & ~gathered.true).sum()} false")
+    return weights
+
+
+def _named(weights: FloatArray, bias: float, keys: Sequence[str]) -> dict[str, object]:
+    """Weights and bias as ``score.json`` holds them."""
+    return {"bias": round(bias, 4), "weights": dict(zip(keys, weights.round(4).tolist(), strict=True))}
 
 
 if __name__ == "__main__":

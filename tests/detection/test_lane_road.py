@@ -105,6 +105,29 @@ def test_a_solid_line_ends_where_its_paint_does_and_a_dash_is_one_of_many(view, 
     assert (lane.points_px[0, 1] > ends_px + 60) == runs_on
 
 
+def test_a_few_doubtful_crossings_far_beyond_its_paint_do_not_carry_a_solid_line_on(view):
+    line = straight(view, 1.6)
+    ground = view.ground(view.undistort(line))
+    rows = anchors_of(view, [line[ground[:, 0] > 12]])
+    strays = [AnchorRow(r.v_px, r.u_px, np.array([-2.0])) for r in anchors_of(view, [line])[4:40:12]]
+    solid = LaneDetection(LANE_LINE, 0.9, painted(line, view, 12, 22).points_px)
+    near = [row for row in strays if row.v_px > rows[0].v_px + 40]
+    assert near
+    (lane,) = link_anchors([*near, *rows], view, [solid])
+    assert lane.points_px[0, 1] < rows[0].v_px + 20
+
+
+def test_doubtful_crossings_row_by_row_carry_a_solid_line_on(view):
+    line = straight(view, 1.6)
+    ground = view.ground(view.undistort(line))
+    solid = LaneDetection(LANE_LINE, 0.9, painted(line, view, 12, 22).points_px)
+    sure = anchors_of(view, [line[ground[:, 0] > 12]])
+    faint = [AnchorRow(r.v_px, r.u_px, np.array([-0.5])) for r in anchors_of(view, [line])]
+    near = [row for row in faint if row.v_px > sure[0].v_px]
+    (lane,) = link_anchors([*near, *sure], view, [solid])
+    assert lane.points_px[0, 1] > near[0].v_px - 20
+
+
 def test_a_line_whose_far_half_bends_away_a_little_stays_one(view):
     near = straight(view, 1.6)
     rows = anchors_of(view, [near])

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from tests.detection.pictures import make_camera
-from tests.detection.test_anchors import anchors_of, painted, straight
+from tests.detection.pictures import make_camera, to_image
+from tests.detection.test_anchors import anchors_of, off_px, painted, straight
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.lanes import score
 from v2hdm.detection.lanes.anchors import link_anchors
@@ -25,8 +25,10 @@ def score_of(view, rows, paint=()):
 
 def test_the_file_holds_a_weight_for_each_feature_and_no_other():
     content = json.loads(score.SCORE_FILE.read_text(encoding="utf-8"))
-    assert tuple(content["weights"]) == score.FEATURES
-    assert np.isfinite(list(content["weights"].values())).all()
+    assert tuple(content) == ("alone", "among")
+    for part, names in (("alone", score.FEATURES), ("among", score.TOLD)):
+        assert tuple(content[part]["weights"]) == names
+        assert np.isfinite([content[part]["bias"], *content[part]["weights"].values()]).all()
 
 
 def test_paint_speaks_for_a_line(view):
@@ -41,17 +43,51 @@ def test_doubtful_crossings_make_a_doubtful_line(view):
     assert score_of(view, doubtful) < score_of(view, rows) - 0.1
 
 
-def test_crossings_all_over_the_ground_make_no_line_surer(view):
-    rows = anchors_of(view, [straight(view, 1.6)])
-    rng = np.random.default_rng(3)
-    clutter = [
+def cluttered(view, rows, seed, odds):
+    """The rows with eight crossings of such log odds on each, anywhere."""
+    rng = np.random.default_rng(seed)
+    return [
         AnchorRow(
-            row.v_px, np.append(row.u_px, rng.uniform(0, view.info.width, 8)), np.append(row.odds, [0.1] * 8)
+            row.v_px, np.append(row.u_px, rng.uniform(0, view.info.width, 8)), np.append(row.odds, [odds] * 8)
         )
         for row in rows
     ]
-    surest = max(lane.score for lane in link_anchors(clutter, view))
-    assert surest < score_of(view, rows) + 0.02
+
+
+def test_crossings_all_over_the_ground_make_lines_less_sure(view):
+    rows = anchors_of(view, [straight(view, 1.6)])
+    alone = score_of(view, rows)
+    surest = [
+        [
+            max(lane.score for lane in link_anchors(cluttered(view, rows, seed, odds), view))
+            for seed in range(8)
+        ]
+        for odds in (0.1, 1.0)
+    ]
+    assert np.mean(surest, axis=1).max() < alone - 0.05
+    assert np.max(surest) < alone + 0.03, "by chance some are on the line and make it longer"
+
+
+def test_a_line_a_lane_away_makes_one_surer_and_one_too_near_does_not(view):
+    line = straight(view, 1.6)
+    alone = score_of(view, anchors_of(view, [line]))
+    scores = {
+        apart_m: min(
+            lane.score for lane in link_anchors(anchors_of(view, [line, straight(view, 1.6 - apart_m)]), view)
+        )
+        for apart_m in (1.0, 3.3)
+    }
+    assert scores[3.3] > alone + 0.05
+    assert scores[1.0] < alone - 0.05
+
+
+def test_a_line_a_lane_away_that_runs_another_way_tells_nothing(view):
+    line = straight(view, 1.6)
+    other = to_image(view.camera, np.linspace((6.0, -1.0), (30.0, -9.0), 100))
+    found = link_anchors(anchors_of(view, [line, other]), view)
+    assert len(found) == 2
+    mine = min(found, key=lambda lane: np.abs(off_px(lane, line)).max())
+    assert mine.score == pytest.approx(score_of(view, anchors_of(view, [line])), abs=0.05)
 
 
 def test_half_the_row_anchors_make_a_line_as_sure(view):

@@ -14,6 +14,7 @@ import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.lanes.curves import Horizon, basis
+from v2hdm.detection.lanes.ends import near_end, nearest_paint
 from v2hdm.detection.lanes.groups import find_lines
 from v2hdm.detection.lanes.points import NEIGHBOURS, IntArray, Line, LinePoints
 from v2hdm.detection.sight import AnchorRow
@@ -23,7 +24,7 @@ _MIN_CHAIN = 3
 _CHAIN_ODDS = 0.0
 """Chains are made of crossings more likely than not; what is less likely may join a line that is known."""
 
-LEAST_LOG_ODDS = -1.1
+LEAST_LOG_ODDS = -1.3
 """Of every four lines a little surer than this one is right; as many lines are missed as are false."""
 
 _MAX_RANGE_M = 60.0
@@ -164,25 +165,21 @@ def _logit(probability: float) -> float:
 
 def _drawn(points: LinePoints, line: Line, view: CameraView, horizon: Horizon) -> LaneDetection | None:
     """A line's points in the image, near to far, with their standard deviations."""
-    below = points.below[line.members]
+    nearest = near_end(points, line, view)
     lowest = horizon.coordinates(view.undistort(_lower_corners(view)))[1].max()
-    at = np.arange(below.min(), max(lowest, below.max()) + _STEP_PX, _STEP_PX)[::-1]
+    farthest = points.below[line.members].min()
+    at = np.arange(farthest, max(lowest, nearest) + _STEP_PX, _STEP_PX)[::-1]
     along, sigma = _followed(points, line, horizon, at)
     points_px = view.distort(horizon.pinhole_px(along, at))
-    known = at <= below.max()
-    if not _ends_in_view(points, line):
+    known = at <= nearest
+    paint = nearest_paint(points, line)
+    if paint is None or not points.is_solid[paint]:  # a dash is one of many
         known |= sigma < _EXTENSION_SIGMA * view.info.width
     kept = known & view.inside(points_px, -_STEP_PX)
     if kept.sum() < 2:
         return None
     score = float(1 / (1 + np.exp(-line.log_odds)))
     return LaneDetection(LANE_BOUNDARY, score, points_px[kept], sigma_px=sigma[kept])
-
-
-def _ends_in_view(points: LinePoints, line: Line) -> bool:
-    """Whether a line's nearest paint is solid and so tells where it ends; a dash is one of many."""
-    painted = line.certain[points.is_paint[line.certain]]
-    return len(painted) > 0 and bool(points.is_solid[painted[np.argmax(points.below[painted])]])
 
 
 def _lower_corners(view: CameraView) -> FloatArray:

@@ -15,7 +15,7 @@ from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.lanes.curves import Evidence, Horizon
 from v2hdm.detection.lanes.points import IntArray, Line, LinePoints
 from v2hdm.detection.lanes.road import Road, find_road
-from v2hdm.detection.lanes.score import log_odds
+from v2hdm.detection.lanes.score import log_odds, log_odds_alone
 from v2hdm.detection.lanes.strands import boundaries
 from v2hdm.records import BoolArray, FloatArray
 
@@ -49,7 +49,7 @@ def find_lines(
         paint_m = paint_step_m * float(points.is_paint[group].sum())
         own, prior = evidence[k : k + 1], road.drawn_by(log_ratio)
         candidates.append(Line.through(group, own, horizon, prior, paint_m, log_ratio))
-    odds = log_odds(candidates, points, view)
+    odds = log_odds_alone(candidates, points, view)
     believed = [k for k in np.argsort(-odds).tolist() if odds[k] > least_log_odds - _DOUBTFUL]
     free = ~points.is_paint
     for k in believed:
@@ -60,10 +60,10 @@ def find_lines(
         free[line.perhaps] = False
         lines.append(line)
     found = boundaries(points, lines, horizon)
-    # What was joined on the way, and that a line is two, tells of it too.
+    # What was joined on the way tells of it too, and so do the others.
     sure = [
         replace(line, log_odds=odds)
-        for line, odds in zip(found, log_odds(found, points, view).tolist(), strict=True)
+        for line, odds in zip(found, log_odds(found, points, view, horizon).tolist(), strict=True)
         if odds > least_log_odds
     ]
     return sorted(sure, key=lambda line: -line.log_odds)

@@ -12,7 +12,7 @@ from v2hdm.detection.lanes.points import Line, LinePoints
 from v2hdm.records import BoolArray, FloatArray
 
 _ONE_LINE_M = 0.12
-_DOUBLE_LINE_M = 0.6
+_DOUBLE_LINE_M = 0.75
 """Curves nearer than the first are one line; nearer than the second, the two lines of a double one."""
 
 _PARALLEL_M = 0.15
