@@ -8,7 +8,7 @@ are one line (:mod:`v2hdm.detection.lanes.groups`), which then runs on through t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -58,24 +58,26 @@ _EXTENSION_SIGMA = 0.03
 class _Chain:
     """A line so far: rows and columns, px, and indices of its crossings, from near to far."""
 
-    v_px: list[float] = field(default_factory=list)
-    u_px: list[float] = field(default_factory=list)
-    index: list[int] = field(default_factory=list)
+    v_px: list[float]
+    u_px: list[float]
+    index: list[int]
+    slope: float | None = None
+    """Columns per row over the last points; None as long as there is one only."""
 
     def add(self, v_px: float, u_px: float, index: int) -> None:
         self.v_px.append(v_px)
         self.u_px.append(u_px)
         self.index.append(index)
+        first = max(-len(self.v_px), -_SLOPE_POINTS)
+        self.slope = (u_px - self.u_px[first]) / (self.v_px[first] - v_px)
 
     def expected(self, v_px: float) -> tuple[float, float]:
         """Where the line should cross a row farther on, px, and how far off it may be."""
         ahead = self.v_px[-1] - v_px
-        if len(self.v_px) == 1:
+        if self.slope is None:
             return self.u_px[-1], _MAX_SLOPE * ahead
-        first = max(-len(self.v_px), -_SLOPE_POINTS)
-        slope = (self.u_px[-1] - self.u_px[first]) / (self.v_px[first] - self.v_px[-1])
         young = 1.5 if len(self.v_px) < _SLOPE_POINTS else 1.0
-        return self.u_px[-1] + slope * ahead, _GATE_PX * young * (1 + 0.04 * (ahead - 8))
+        return self.u_px[-1] + self.slope * ahead, _GATE_PX * young * (1 + 0.04 * (ahead - 8))
 
 
 def link_anchors(
@@ -93,26 +95,14 @@ def link_anchors(
         paint_step_m: That distance.
     """
     horizon = Horizon(view)
-    rows, points = _in_reach(rows, _crossings(rows, view, horizon), view)
-    groups = [np.array(chain.index) for chain in _chains(rows)]
+    points = _crossings(rows, view, horizon)
+    # At, above and just below the horizon lines meet; a comparison with nan is false.
+    points = points.where(view.range_m(points.ground) <= _MAX_RANGE_M)
+    groups = [np.array(chain.index) for chain in _chains(points)]
     points, on_paint = _with_paint(points, paint, view, horizon)
     lines = find_lines(points, groups + on_paint, view, horizon, paint_step_m, LEAST_LOG_ODDS)
     found = [lane for line in lines if (lane := _drawn(points, line, view, horizon)) is not None]
     return _identified(found, view)
-
-
-def _in_reach(
-    rows: Sequence[AnchorRow], points: LinePoints, view: CameraView
-) -> tuple[list[AnchorRow], LinePoints]:
-    """The rows and their crossings without those at, above and just below the horizon, where lines meet."""
-    near = view.range_m(points.ground) <= _MAX_RANGE_M  # false where it is nan
-    parts = np.split(near, np.cumsum([len(row.u_px) for row in rows])[:-1])
-    kept = [
-        AnchorRow(row.v_px, row.u_px[part], row.odds[part])
-        for row, part in zip(rows, parts, strict=bool(rows))
-        if part.any()
-    ]
-    return kept, points.where(near)
 
 
 def _crossings(rows: Sequence[AnchorRow], view: CameraView, horizon: Horizon) -> LinePoints:
@@ -207,40 +197,39 @@ def _followed(
     return along + weight @ off / total, np.sqrt(1 / total)
 
 
-def _chains(rows: Sequence[AnchorRow]) -> list[_Chain]:
+def _chains(points: LinePoints) -> list[_Chain]:
+    """Likely crossings, in order from near to far, linked from row to row."""
+    likely = np.flatnonzero(points.odds > _CHAIN_ODDS)
+    u_px, v_px = points.points_px[likely].T
+    if not len(likely):
+        return []
+    begins = np.flatnonzero(np.diff(v_px, prepend=np.nan)).tolist()  # nan differs from any row
+    columns, indices, row_px = u_px.tolist(), likely.tolist(), v_px[begins].tolist()
     open_chains: list[_Chain] = []
     done: list[_Chain] = []
-    before = 0
-    for row in rows:
-        done += [chain for chain in open_chains if chain.v_px[-1] - row.v_px > _MAX_GAP_PX]
-        open_chains = [chain for chain in open_chains if chain.v_px[-1] - row.v_px <= _MAX_GAP_PX]
-        likely = np.flatnonzero(row.odds > _CHAIN_ODDS).tolist()
-        if likely:
-            open_chains += _extend(open_chains, row, likely, before)
-        before += len(row.u_px)
+    for begin, end, row in zip(begins, [*begins[1:], len(likely)], row_px, strict=True):
+        done += [chain for chain in open_chains if chain.v_px[-1] - row > _MAX_GAP_PX]
+        open_chains = [chain for chain in open_chains if chain.v_px[-1] - row <= _MAX_GAP_PX]
+        open_chains += _extend(open_chains, row, columns[begin:end], indices[begin:end])
     return [chain for chain in done + open_chains if len(chain.v_px) >= _MIN_CHAIN]
 
 
-def _extend(chains: list[_Chain], row: AnchorRow, likely: list[int], before: int) -> list[_Chain]:
-    """Give each likely crossing of a row to the chain that it suits best; what is left over starts chains.
-
-    ``before`` is the number of crossings of the rows before this one.
-    """
-    columns = row.u_px.tolist()
+def _extend(chains: list[_Chain], row_px: float, columns: list[float], indices: list[int]) -> list[_Chain]:
+    """Give each crossing of a row to the chain that it suits best; what is left over starts chains."""
     pairs = []
     for c, chain in enumerate(chains):
-        expected, gate = chain.expected(row.v_px)
+        expected, gate = chain.expected(row_px)
         pairs += [
-            (abs(columns[p] - expected) / gate, c, p) for p in likely if abs(columns[p] - expected) <= gate
+            (off / gate, c, p) for p, u_px in enumerate(columns) if (off := abs(u_px - expected)) <= gate
         ]
     taken: set[int] = set()
     extended: set[int] = set()
     for _, c, p in sorted(pairs):
         if c not in extended and p not in taken:
-            chains[c].add(row.v_px, columns[p], before + p)
+            chains[c].add(row_px, columns[p], indices[p])
             extended.add(c)
             taken.add(p)
-    return [_Chain([row.v_px], [columns[p]], [before + p]) for p in likely if p not in taken]
+    return [_Chain([row_px], [columns[p]], [indices[p]]) for p in range(len(columns)) if p not in taken]
 
 
 def _identified(lanes: list[LaneDetection], view: CameraView) -> list[LaneDetection]:

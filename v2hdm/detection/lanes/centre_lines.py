@@ -108,7 +108,8 @@ def _branching_chains(cuts: list[FloatArray]) -> list[FloatArray]:
                 following.append([run])
             else:
                 taken.add(match)
-                following.append([*open_chains[match], run])
+                open_chains[match].append(run)
+                following.append(open_chains[match])
         closed += [chain for c, chain in enumerate(open_chains) if c not in taken]
         open_chains = following
     return [np.array(chain) for chain in closed + open_chains if len(chain) >= _MIN_POINTS]

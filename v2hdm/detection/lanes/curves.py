@@ -78,16 +78,23 @@ class Horizon:
 class Prior:
     """What is known of a line before it is seen: ``mean`` (3,) and ``information`` (3, 3) of a, b and c.
 
-    Here and in :class:`Evidence` a counts from the horizon's ``centre_px``.
+    Here and in :class:`Evidence` a counts from the horizon's ``centre_px``. Several at once are (P, 1, 3) and
+    (P, 1, 3, 3).
     """
 
     mean: FloatArray
     information: FloatArray
 
+    @classmethod
+    def several(cls, priors: Sequence[Prior]) -> Prior:
+        """P of them at once."""
+        mean, information = (np.array([getattr(p, name) for p in priors]) for name in ("mean", "information"))
+        return cls(mean[:, None], information[:, None])
+
     @cached_property
-    def log_determinant(self) -> float:
-        """That of the information."""
-        return float(np.linalg.slogdet(self.information)[1])
+    def log_determinant(self) -> FloatArray:
+        """That of the information: (), of several (P, 1)."""
+        return np.asarray(np.linalg.slogdet(self.information)[1])
 
 
 @dataclass(frozen=True)
@@ -128,17 +135,27 @@ class Evidence:
         )
 
     def log_evidence(self, prior: Prior) -> FloatArray:
-        """Log probability (N,) of each group as one line of that prior, up to a constant per point."""
-        moment = self.moment - self.information @ prior.mean
-        square = self.square - (self.moment + moment) @ prior.mean
+        """Log probability (N,) of each group as one line of that prior, up to a constant per point.
+
+        Of several priors it is (P, N).
+        """
+        moment = self.moment - (self.information @ prior.mean[..., None])[..., 0]
+        square = self.square - ((self.moment + moment) * prior.mean).sum(axis=-1)
         gain, log_determinant = _completed_square(self.information + prior.information, moment)
         return np.asarray(-0.5 * (square - gain + log_determinant - prior.log_determinant))
 
     def curve(self, prior: Prior, centre_px: float) -> Curve:
         """The line that the first group's points and the prior suggest."""
-        covariance = np.linalg.inv(self.information[0] + prior.information)
-        mean = covariance @ (self.moment[0] + prior.information @ prior.mean)
-        return Curve(mean + np.array([centre_px, 0.0, 0.0]), covariance)
+        return self[:1].curves([prior], centre_px)[0]
+
+    def curves(self, priors: Sequence[Prior], centre_px: float) -> list[Curve]:
+        """The lines that each of N groups of points and its prior suggest."""
+        information = np.array([prior.information for prior in priors])
+        expected = np.array([prior.mean for prior in priors])
+        covariance = np.linalg.inv(self.information + information)
+        moment = self.moment + (information @ expected[..., None])[..., 0]
+        mean = (covariance @ moment[..., None])[..., 0] + (centre_px, 0.0, 0.0)
+        return [Curve(*curve) for curve in zip(mean, covariance, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -171,16 +188,16 @@ def basis(below: FloatArray) -> FloatArray:
 
 
 def _completed_square(information: FloatArray, moment: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """For positive matrices A (N, 3, 3) and vectors m (N, 3): m' inv(A) m (N,) and log det A (N,).
+    """For positive matrices A (..., 3, 3) and vectors m (..., 3): m' inv(A) m (...) and log det A (...).
 
     By Cholesky written out: LAPACK takes ten times as long for as many small matrices.
     """
-    pivot0 = information[:, 0, 0]
-    l10, l20 = information[:, 1, 0] / pivot0, information[:, 2, 0] / pivot0
-    pivot1 = information[:, 1, 1] - l10 * information[:, 1, 0]
-    l21 = (information[:, 2, 1] - l20 * information[:, 1, 0]) / pivot1
-    pivot2 = information[:, 2, 2] - l20 * information[:, 2, 0] - l21**2 * pivot1
-    m0 = moment[:, 0]
-    m1 = moment[:, 1] - l10 * m0
-    m2 = moment[:, 2] - l20 * m0 - l21 * m1
+    pivot0, below10, below20 = (information[..., k, 0] for k in range(3))
+    l10, l20 = below10 / pivot0, below20 / pivot0
+    pivot1 = information[..., 1, 1] - l10 * below10
+    l21 = (information[..., 2, 1] - l20 * below10) / pivot1
+    pivot2 = information[..., 2, 2] - l20 * below20 - l21**2 * pivot1
+    m0 = moment[..., 0]
+    m1 = moment[..., 1] - l10 * m0
+    m2 = moment[..., 2] - l20 * m0 - l21 * m1
     return m0**2 / pivot0 + m1**2 / pivot1 + m2**2 / pivot2, np.log(pivot0 * pivot1 * pivot2)

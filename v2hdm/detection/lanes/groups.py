@@ -23,6 +23,8 @@ _GATE_SIGMAS = 3.0
 _GATE_PX = 16.0
 """Crossings on no line yet join one that passes so near."""
 
+_NONE = np.empty(0, dtype=np.int64)
+
 _DOUBTFUL = 1.0
 """Lines by so much in log odds less sure than is asked for may yet be a part of a better one."""
 
@@ -44,11 +46,13 @@ def find_lines(
     slopes = points.slopes(groups)
     evidence = points.evidence(horizon, groups, slopes)
     _, along = road.judge(evidence)
-    candidates = []
-    for k, (group, log_ratio) in enumerate(zip(groups, along.tolist(), strict=True)):
-        paint_m = paint_step_m * float(points.is_paint[group].sum())
-        own, prior = evidence[k : k + 1], road.drawn_by(log_ratio)
-        candidates.append(Line.through(group, own, horizon, prior, paint_m, log_ratio))
+    paint_m = [paint_step_m * float(points.is_paint[group].sum()) for group in groups]
+    priors = [road.drawn_by(log_ratio) for log_ratio in along.tolist()]
+    curves = evidence.curves(priors, horizon.centre_px)
+    candidates = [
+        Line(curve, group, _NONE, *rest)
+        for curve, group, *rest in zip(curves, groups, paint_m, priors, along.tolist(), strict=True)
+    ]
     odds = log_odds_alone(candidates, points, view)
     believed = [k for k in np.argsort(-odds).tolist() if odds[k] > least_log_odds - _DOUBTFUL]
     free = ~points.is_paint
@@ -103,7 +107,10 @@ def _gathered(
 ) -> Line:
     """The line, of such ``own`` evidence, with the free crossings on it, at most one of each row."""
     group, row = line.certain, points.points_px[:, 1]
-    candidates = np.flatnonzero(free & ~np.isin(row, row[group[~points.is_paint[group]]]))
+    rows = row.astype(np.intp)  # they are some px apart
+    has_one = np.zeros(rows.max() + 1, dtype=np.bool_)
+    has_one[rows[group[~points.is_paint[group]]]] = True
+    candidates = np.flatnonzero(free & ~has_one[rows])
     phi = points.phi[candidates]
     off = np.abs(points.along[candidates] - line.curve.along(phi))
     sigma = np.hypot(line.curve.sigma(phi), points.sigma_px[candidates])

@@ -8,6 +8,7 @@ far away, which by itself could point anywhere, is thereby known as well as the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -44,12 +45,16 @@ class Road:
     along: Prior
     free: Prior
 
+    @cached_property
+    def _both(self) -> Prior:
+        return Prior.several([self.along, self.free])
+
     def judge(self, evidence: Evidence) -> tuple[FloatArray, FloatArray]:
         """Log probability (N,) of each group as one line, and how much likelier (N,) it is along the road.
 
         The first is up to a constant per point, the second a log ratio that leaves out how common each is.
         """
-        along, free = evidence.log_evidence(self.along), evidence.log_evidence(self.free)
+        along, free = evidence.log_evidence(self._both)
         return np.logaddexp(along + np.log(_SHARE), free + np.log1p(-_SHARE)), along - free
 
     def drawn_by(self, log_ratio: float) -> Prior:
@@ -67,17 +72,12 @@ def find_road(evidence: Evidence, horizon: Horizon) -> Road:
     spread = np.diag(horizon.parameters(*_PARALLEL_SIGMAS)[_SHARED] ** 2)
     # By how much the road may differ from what each line says.
     doubt = covariance[:, [[0], [2]], _SHARED] + spread
-    alone = evidence.log_evidence(free)
-
-    def gain(prior: Prior) -> FloatArray:
-        """Log ratio (N,) of each line along that road to one that is free."""
-        return np.asarray(evidence.log_evidence(prior) - alone)
-
     certain = np.argsort((np.diagonal(doubt, axis1=1, axis2=2) / np.diag(spread)).sum(axis=1))[:_CANDIDATES]
     candidates = [_along(mean[k], doubt[k], free) for k in certain]
-    along = max(candidates, key=lambda road: _agreement(gain(road)))
+    *along, alone = evidence.log_evidence(Prior.several([*candidates, free]))
+    best = max((ratio - alone for ratio in along), key=_agreement)
     # The mean of what all say of the road, each as far as it keeps to it.
-    weight = 1 / (1 + (1 - _SHARE) / _SHARE * np.exp(-np.clip(gain(along), -50, 50)))
+    weight = 1 / (1 + (1 - _SHARE) / _SHARE * np.exp(-np.clip(best, -50, 50)))
     each = np.linalg.inv(doubt) * weight[:, None, None]
     shared = np.linalg.inv(each.sum(axis=0) + free.information[_SHARED_BLOCK])
     return Road(_along(shared @ np.einsum("nij,nj->i", each, mean), shared + spread, free), free)
