@@ -41,6 +41,8 @@ LEAST_SHARE = 0.8
 _ROWS = 30
 _MOST_SLOPE = 10.0
 
+KEYS = {"alone": score.FEATURES, "among": score.TOLD}
+
 Weights = dict[str, tuple[FloatArray, float]]
 """Those of :func:`v2hdm.detection.lanes.score.fitted`."""
 
@@ -178,11 +180,8 @@ def main() -> None:
     images = [seen(shown, detector) for _, shown in renders_to_fit(parsed.images, SEED)]
     weights = fit_to(images, options.lane_step_m)
     if parsed.write:
-        SCORE = {name: _named(*weights[name], keys) for name, keys in _KEYS.items()}
-        score.SCORE_FILE.write_text(json.dumps(SCORE, indent=1) + "\n")
-
-
-_KEYS = {"alone": score.FEATURES, "among": score.TOLD}
+        named = {name: _named(*weights[name], keys) for name, keys in KEYS.items()}
+        score.SCORE_FILE.write_text(json.dumps(named, indent=1) + "\n")
 
 
 def fit_to(images: Sequence[Seen], paint_step_m: float) -> Weights:
@@ -196,7 +195,7 @@ def fit_to(images: Sequence[Seen], paint_step_m: float) -> Weights:
         with patch.object(score, "fitted", lambda fitted=weights: fitted):
             gathered = Gathered(images, paint_step_m)
     for name, (effect, _) in gathered.effects(weights).items():
-        for key, value in zip(_KEYS[name], effect, strict=True):
+        for key, value in zip(KEYS[name], effect, strict=True):
             print(f"{name:6s} {key:16s} {value:+.2f}")
     _, alone, among = gathered.fit()
     losses = [log_loss(odds, gathered.true) for odds in (alone, among)]

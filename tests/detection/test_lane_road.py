@@ -52,6 +52,21 @@ def test_the_evidence_is_that_of_a_gaussian(view):
         assert given == pytest.approx(-0.5 * (misfit + volume), rel=1e-9)
 
 
+def test_several_priors_at_once_tell_what_each_does_alone(view):
+    evidence, _ = evidence_of(view, [seen(view, straight(view, side)) for side in (1.6, -2.0)])
+    priors = [
+        Prior(np.array([5.0, 0.0, 1.0]), np.diag([1e-3, 1e-4, 1e-2])),
+        Prior(np.array([-40.0, 3.0, 0.0]), np.diag([1e-2, 1e-3, 1e-3])),
+    ]
+    at_once = evidence.log_evidence(Prior.several(priors))
+    np.testing.assert_allclose(at_once, [evidence.log_evidence(prior) for prior in priors], rtol=1e-12)
+    curves = evidence.curves(priors, 640.0)
+    alone = [evidence[k : k + 1].curve(prior, 640.0) for k, prior in enumerate(priors)]
+    for one, other in zip(curves, alone, strict=True):
+        np.testing.assert_allclose(one.parameters, other.parameters, rtol=1e-9)
+        np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-9)
+
+
 @pytest.mark.parametrize("curvature", [0.0, 0.006, -0.006])
 def test_the_road_is_what_most_lines_agree_on_not_the_longest_other_one(view, curvature):
     lines = [seen(view, straight(view, side, curvature)) for side in (-5.0, -1.6, 1.8, 5.2)]

@@ -25,7 +25,7 @@ _CHAIN_ODDS = 0.0
 """Chains are made of crossings more likely than not; what is less likely may join a line that is known."""
 
 LEAST_LOG_ODDS = -1.3
-"""Of every four lines a little surer than this one is right; as many lines are missed as are false."""
+"""Of every nine lines a little surer than this two are right; as many lines are missed as are false."""
 
 _MAX_RANGE_M = 60.0
 """Farther away no line is followed: the network was shown none beyond 50 m."""
