@@ -13,12 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.lanes.bends import Seen, beside_guide
 from v2hdm.detection.lanes.curves import Horizon, basis
 from v2hdm.detection.lanes.ends import near_end, nearest_paint
 from v2hdm.detection.lanes.groups import find_lines
 from v2hdm.detection.lanes.points import NEIGHBOURS, IntArray, Line, LinePoints
 from v2hdm.detection.sight import AnchorRow
-from v2hdm.records import LANE_BOUNDARY, LANE_LINE, FloatArray, LaneDetection
+from v2hdm.records import LANE_BOUNDARY, LANE_LINE, BoolArray, FloatArray, LaneDetection
 
 _MIN_CHAIN = 3
 _CHAIN_ODDS = 0.0
@@ -102,7 +103,7 @@ def link_anchors(
     points, on_paint = _with_paint(points, paint, view, horizon)
     lines = find_lines(points, groups + on_paint, view, horizon, paint_step_m, LEAST_LOG_ODDS)
     found = [lane for line in lines if (lane := _drawn(points, line, view, horizon)) is not None]
-    return _identified(found, view)
+    return _identified(beside_guide(found, view), view)
 
 
 def _crossings(rows: Sequence[AnchorRow], view: CameraView, horizon: Horizon) -> LinePoints:
@@ -153,7 +154,7 @@ def _logit(probability: float) -> float:
     return float(np.log(clipped / (1 - clipped)))
 
 
-def _drawn(points: LinePoints, line: Line, view: CameraView, horizon: Horizon) -> LaneDetection | None:
+def _drawn(points: LinePoints, line: Line, view: CameraView, horizon: Horizon) -> Seen | None:
     """A line's points in the image, near to far, with their standard deviations."""
     nearest = near_end(points, line, view)
     lowest = horizon.coordinates(view.undistort(_lower_corners(view)))[1].max()
@@ -169,7 +170,16 @@ def _drawn(points: LinePoints, line: Line, view: CameraView, horizon: Horizon) -
     if kept.sum() < 2:
         return None
     score = float(1 / (1 + np.exp(-line.log_odds)))
-    return LaneDetection(LANE_BOUNDARY, score, points_px[kept], sigma_px=sigma[kept])
+    lane = LaneDetection(LANE_BOUNDARY, score, points_px[kept], sigma_px=sigma[kept])
+    return Seen(lane, _is_seen(points.below[line.certain], at[kept]))
+
+
+def _is_seen(own: FloatArray, at: FloatArray) -> BoolArray:
+    """Which places (N,), px below the horizon, lie between a line's points, at ``own`` (M,), and near one."""
+    own = np.sort(own)
+    after = np.minimum(np.searchsorted(own, at), len(own) - 1)
+    off = np.minimum(np.abs(own[after] - at), np.abs(own[np.maximum(after - 1, 0)] - at))
+    return np.asarray((at >= own[0]) & (at <= own[-1]) & (off <= _SMOOTH_PX))
 
 
 def _lower_corners(view: CameraView) -> FloatArray:
