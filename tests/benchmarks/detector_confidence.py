@@ -3,12 +3,12 @@
     python -m tests.benchmarks.detector_confidence --images 450 --write
 
 Run it after another network was put in place. Quadrilaterals that the detector proposes on rendered scenes,
-half of them of full difficulty, a quarter easy ones and a quarter images of the ports, are true if they
-overlap a marking of their class by half, and false where the quality benchmark would say so; a logistic
-regression with a weak ridge tells them apart, one for each shape. Each scene is looked at as on the vehicle
-and as in the mapping. Its seed is neither that of a benchmark or a shipped run nor one of training. Printed:
-what each feature adds to the log odds per standard deviation, and the log loss on the images of each fifth by
-weights that were fitted to the others.
+first two thirds of full difficulty, then a third of easy ones, are true if they overlap a marking of their
+class by half, and false where the quality benchmark would say so; a logistic regression with a weak ridge
+tells them apart, one for each shape. Each scene is looked at as on the vehicle and as in the mapping. Its
+seed is neither that of the quality benchmark nor one of training. Printed: what each feature adds to the log
+odds per standard deviation, and the log loss on the images of each fifth by weights that were fitted to the
+others.
 """
 
 from __future__ import annotations
@@ -23,20 +23,16 @@ from unittest.mock import patch
 import cv2
 import numpy as np
 
-from tests.benchmarks.adjust_ports import port_config
-from tests.benchmarks.detector_ports import examples as port_examples
 from tests.benchmarks.detector_quality import Example, example, polygon_overlap
 from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, SHAPES, TOLD, shape_of, told
 from v2hdm.detection.corners.evidence import FEATURES, gather
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import BoolArray, FloatArray
-from v2hdm.simulate.port.build import build_port
 
 SEED = 917
 REFINE = "v2hdm.detection.corners.refine"
 EASY = 0.2
-PORTS = ("port1", "port2")
 RIDGE = 2.0
 FOLDS = 5
 COUNTS = (10, 20, 40, 80)
@@ -93,19 +89,11 @@ def is_true(shown: Example, kind: str, corners_px: FloatArray) -> bool | None:
 
 
 def renders_to_fit(images: int, seed: int) -> Iterator[tuple[int, Example]]:
-    """Scenes and their numbers: half of full difficulty, a quarter easy ones, a quarter of the ports.
-
-    Images of a port that show the same markings, which are neighbours, have a number in common.
-    """
-    easy = images // 4
-    of_port = images // (4 * len(PORTS))
-    plain = images - easy - of_port * len(PORTS)
-    for count, difficulty in ((plain, 1.0), (easy, EASY)):
+    """Scenes and their numbers: two thirds of full difficulty, then a third of easy ones."""
+    easy = images // 3
+    for count, difficulty in ((images - easy, 1.0), (easy, EASY)):
         for index in range(count):
             yield index, example(index, difficulty, seed)
-    for run in PORTS:
-        shown = port_examples(build_port(replace(port_config(run), seed=seed)), of_port)
-        yield from ((FOLDS * k // of_port, image) for k, image in enumerate(shown))
 
 
 def fit(evidence: FloatArray, true: BoolArray) -> tuple[FloatArray, float]:
