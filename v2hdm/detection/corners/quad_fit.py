@@ -31,7 +31,7 @@ from v2hdm.records import BoolArray, FloatArray
 _WIDER_BLUR_PX = 0.8
 _ITERATIONS = 4
 _COARSE_STRIDE = 2
-_ENOUGH_PX = 0.2
+_ENOUGH_PX = 0.1
 _MAX_SIDE_STEP_PX = 1.0
 _MAX_CORNER_STEP_PX = 4.0
 _MAX_MOVE_PX = 6.0
