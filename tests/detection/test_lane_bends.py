@@ -5,10 +5,12 @@ import pytest
 
 from tests.detection.pictures import make_camera, to_image
 from tests.detection.test_anchors import anchors_of
+from v2hdm.detection.camera.ground import ipm_from_extrinsic
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.lanes.anchors import link_anchors
 from v2hdm.detection.lanes.bends import Seen, beside_guide
-from v2hdm.records import LANE_BOUNDARY, LANE_LINE, LaneDetection
+from v2hdm.records import LANE_BOUNDARY, LANE_LINE, Camera, LaneDetection
+from v2hdm.simulate.training.views import random_view
 
 
 @pytest.fixture
@@ -87,3 +89,43 @@ def test_the_lines_of_an_image_follow_its_bend(view):
     assert len(lanes) == 2
     true = [goes_on(view, left_m, 30.0) for left_m in (2.0, -1.5)]
     assert all(min(error_px(lane, line).max() for line in true) < 8 for lane in lanes)
+
+
+def wild_lines(rng: np.random.Generator, view: CameraView) -> list[Seen]:
+    """Lines that no road has, parts of them seen."""
+    lines = []
+    for _ in range(rng.integers(2, 6)):
+        count = rng.integers(4, 60)
+        rows = np.sort(rng.uniform(max(view.top, 0) + 5, view.info.height, count))[::-1]
+        kind = rng.integers(4)
+        if kind == 0:
+            u = np.cumsum(rng.normal(0, 30, count)) + rng.uniform(0, 1280)
+        elif kind == 1:
+            off = rows - rows[0]
+            u = rng.uniform(0, 1280) + rng.normal(0, 3) * off + rng.normal(0, 0.01) * off**2
+        elif kind == 2:
+            u = np.full(count, rng.uniform(0, 1280))
+        else:
+            u = 640 + 400 * np.sin(rows / rng.uniform(20, 200))
+        seen = rng.random(count) < rng.uniform(0.1, 1)
+        if seen.sum() < 2:
+            seen[:2] = True
+        line = LaneDetection(LANE_BOUNDARY, 0.5, np.column_stack([u, rows]), sigma_px=np.ones(count))
+        lines.append(Seen(line, seen))
+    return lines
+
+
+@pytest.mark.parametrize("camera", [0, 13, 20])
+def test_lines_that_no_road_has_are_drawn_finite(camera):
+    mounted = random_view(np.random.default_rng(camera), 1280, 720)
+    ipm = ipm_from_extrinsic(mounted.info, mounted.cam_from_map)
+    view = CameraView(Camera(mounted.info, {"true": ipm}, "true", make_camera().roi_vehicle))
+    drawn = 0
+    for seed in (916, *range(40)):
+        given = wild_lines(np.random.default_rng(seed), view)
+        lines = beside_guide(given, view)
+        drawn += any(line is not before.lane for line, before in zip(lines, given, strict=False))
+        for line in lines:
+            assert np.isfinite(line.points_px).all()
+            assert np.isfinite(line.sigma_px).all()
+    assert drawn > 0

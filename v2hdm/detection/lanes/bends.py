@@ -168,7 +168,7 @@ def _arc_on(points: FloatArray) -> FloatArray:
     normal = np.array([-axis[1], axis[0]])
     x, y = (last - last[-1]) @ axis, (last - last[-1]) @ normal
     basis = np.column_stack([x * x, x, np.ones(len(x))])
-    bend, slope, _ = np.linalg.solve(basis.T @ basis, basis.T @ y)
+    bend, slope, _ = np.linalg.lstsq(basis, y, rcond=None)[0]
     curvature = np.clip(2 * bend / (1 + slope**2) ** 1.5, -1 / _LEAST_RADIUS_M, 1 / _LEAST_RADIUS_M)
     heading = np.arctan(slope) + curvature * _STEP_M * (np.arange(round(_CARRIED_M / _STEP_M)) + 0.5)
     steps = _STEP_M * (np.cos(heading)[:, None] * axis + np.sin(heading)[:, None] * normal)
@@ -212,7 +212,7 @@ def _redrawn(
     ground = guide.points + offset_m[:, None] * guide.normals
     sigma_m = np.hypot(_SIGMA_M, _SIGMA_SHARE * away_m)
     run = _seen_run(ground, int(np.median(at)), view)
-    if run is None:
+    if run is None or run.stop - run.start < 2:
         return lane
     sigma_m = sigma_m[run]
     px = view.distort(apply_homography(view.pinhole_px_from_vehicle, ground[run]))
