@@ -96,6 +96,11 @@ class CameraView:
         """Distance on the ground from below the camera; NaN stays NaN."""
         return np.asarray(np.linalg.norm(points_vehicle - self.foot_vehicle, axis=-1))
 
+    def coarse(self, rows_px: FloatArray) -> BoolArray:
+        """Which rows (N,) lie so near that they are looked at in half the resolution."""
+        first = np.inf if self.fine_row is None else self.fine_row
+        return np.asarray(rows_px >= first)
+
     def inside(self, points_px: FloatArray, border_px: float) -> BoolArray:
         """Which recorded points (N, 2) lie at least ``border_px`` inside the image."""
         u, v = points_px[..., 0], points_px[..., 1]

@@ -110,8 +110,7 @@ def _crossings(rows: Sequence[AnchorRow], view: CameraView, horizon: Horizon) ->
     u = np.concatenate([np.empty(0), *(row.u_px for row in rows)])
     v = np.repeat([row.v_px for row in rows], [len(row.u_px) for row in rows]) if rows else np.empty(0)
     odds = np.concatenate([np.empty(0), *(row.odds for row in rows)])
-    # Rows so near are looked at in half the resolution.
-    scale = np.where(v >= (np.inf if view.fine_row is None else view.fine_row), 2.0, 1.0)
+    scale = np.where(view.coarse(v), 2.0, 1.0)
     sigma_px = scale * (_SIGMA_PX[0] + _SIGMA_PX[1] * np.exp(-odds))
     return LinePoints.of(view, horizon, np.column_stack([u, v]), odds, sigma_px)
 

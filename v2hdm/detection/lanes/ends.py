@@ -38,8 +38,7 @@ def near_end(points: LinePoints, line: Line, view: CameraView) -> float:
     if not len(beyond):
         return nearest
     rows_px = row[beyond]
-    coarse = rows_px >= (np.inf if view.fine_row is None else view.fine_row)
-    step_px = np.where(coarse, 2 * _ROW_STEP_PX, _ROW_STEP_PX)
+    step_px = np.where(view.coarse(rows_px), 2 * _ROW_STEP_PX, _ROW_STEP_PX)
     empty = np.maximum(np.round(np.diff(rows_px, prepend=row[paint]) / step_px) - 1, 0)
     total = np.cumsum(points.odds[beyond] - _EVEN_LOG_ODDS + _EMPTY * empty)
     if max(total.max(), 0.0) - total[-1] < _LEAST_AGAINST:

@@ -19,6 +19,12 @@ Thing = Callable[[np.random.Generator, float, float], list[Box]]
 
 _MARKS_M = (56.0, 28.0)
 _MARKS_RESOLUTION_M = 0.04
+_BESIDE_M = (
+    ((0.8, 0.15, 0.5), (4.0, 0.6, 1.1)),
+    ((0.3, 0.2, 0.8), (1.2, 0.8, 2.5)),
+    ((4.0, 2.0, 1.4), (7.0, 2.0, 2.6)),
+)
+"""The least and the largest size of barriers, cabinets and vans."""
 
 
 def street_boxes(rng: np.random.Generator, road_half_m: float) -> tuple[Box, ...]:
@@ -62,19 +68,8 @@ def thing_to_stand_beside(rng: np.random.Generator) -> tuple[tuple[float, float,
     if kind == 0:
         return (float(rng.choice([6.1, 12.2])), 2.44, 2.59), _albedo(rng, 0.05, 0.7, 0.5), True
     colour = _white(rng) if rng.random() < 0.5 else _albedo(rng)
-    if kind == 1:
-        return (
-            (float(rng.uniform(0.8, 4.0)), float(rng.uniform(0.15, 0.6)), float(rng.uniform(0.5, 1.1))),
-            colour,
-            False,
-        )
-    if kind == 2:
-        return (
-            (float(rng.uniform(0.3, 1.2)), float(rng.uniform(0.2, 0.8)), float(rng.uniform(0.8, 2.5))),
-            colour,
-            False,
-        )
-    return (float(rng.uniform(4.0, 7.0)), 2.0, float(rng.uniform(1.4, 2.6))), colour, False
+    length, depth, height = (float(m) for m in rng.uniform(*_BESIDE_M[kind - 1]))
+    return (length, depth, height), colour, False
 
 
 def ground_marks(rng: np.random.Generator) -> GroundMarks:
