@@ -38,6 +38,7 @@ class DataConfig:
     overexposed: float = 0.15
     blue_shade: float = 0.3
     tight_bends: float = 0.15
+    kerbs: float = 0.2
     workers: int = 1
     coco: str | None = None
     coco_images: str | None = None

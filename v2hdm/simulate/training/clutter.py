@@ -72,6 +72,13 @@ def thing_to_stand_beside(rng: np.random.Generator) -> tuple[tuple[float, float,
     return (length, depth, height), colour, False
 
 
+def kerb_colours(rng: np.random.Generator) -> tuple[Bgr, Bgr]:
+    """Of bright stones, and of the paving or grass behind them."""
+    stone = _albedo(rng, 0.3, 0.8, 0.04)
+    paving = rng.random() < 0.4
+    return stone, _albedo(rng, 0.08, 0.4, 0.08) if paving else (0.05, float(rng.uniform(0.08, 0.2)), 0.1)
+
+
 def ground_marks(rng: np.random.Generator) -> GroundMarks:
     """Tyre marks, cracks, repairs, rails, covers and spills: unlabelled, dark and up to twice as bright."""
     marks = plain_marks()

@@ -13,12 +13,13 @@ from v2hdm.planar import inside_convex
 from v2hdm.records import CORNERED_CLASSES, FloatArray
 from v2hdm.simulate.render.optics import Optics
 from v2hdm.simulate.render.scene import Box, GroundMarks, Light, Paint, Shadow, box_footprint
-from v2hdm.simulate.training.clutter import plain_marks, thing_to_stand_beside
+from v2hdm.simulate.training.clutter import kerb_colours, plain_marks, thing_to_stand_beside
 from v2hdm.simulate.training.paint import Bend, rectangle
 
 _CROSSED_M = 22.0
 _LONGEST_LEVEL = 0.9
 _CAMERA_CLEARANCE_M = 3.5
+_KERB_M = 45.0
 _SHIFT = 4
 """Bits of fraction of the coordinates that OpenCV is given."""
 
@@ -40,6 +41,8 @@ class Hardships:
         blue_shade: share of scenes whose shade is lit by a deep blue sky.
         tight_bends: share of scenes whose way, and all paint with it, turns as sharply as in yards and
             roundabouts; what would stand on the paint is left out.
+        kerbs: share of scenes with a bright kerb along a line of a lane, no wider than paint, that lies open
+            in stretches as long as dashes.
     """
 
     shadows_on_paint: float = 0.0
@@ -50,6 +53,7 @@ class Hardships:
     overexposed: float = 0.0
     blue_shade: float = 0.0
     tight_bends: float = 0.0
+    kerbs: float = 0.0
 
 
 NONE = Hardships()
@@ -124,6 +128,55 @@ def clear_of(boxes: Iterable[Box], paints: Sequence[Paint]) -> tuple[Box, ...]:
         return tuple(boxes)
     middles = np.array([paint.polygon_map.mean(axis=0) for paint in paints])
     return tuple(box for box in boxes if not inside_convex(box_footprint(box), middles).any())
+
+
+def kerbs(rng: np.random.Generator, lines_map: Sequence[FloatArray], share: float) -> tuple[Box, ...]:
+    """In a ``share`` of cases a kerb along one of the lines (N, 2, map), and the grass or paving behind it.
+
+    Its stones are bright and where the grass has not grown over them or a driveway lowered them, they make a
+    row of stretches that differ from dashes in nothing but their height.
+    """
+    if rng.random() >= share or not lines_map:
+        return ()
+    side = rng.choice([-1.0, 1.0])
+    line = lines_map[int(rng.integers(len(lines_map)))]
+    offset_m = side * (rng.uniform(0.2, 1.2) if rng.random() < 0.5 else rng.uniform(1.2, 4.5))
+    wide_m, tall_m, behind_m = rng.uniform(0.06, 0.3), rng.uniform(0.06, 0.2), rng.uniform(1.0, 4.0)
+    stone, behind = kerb_colours(rng)
+    edge = _beside(line, np.full(len(line), offset_m))
+    middle = _beside(line, np.full(len(line), offset_m + side * (wide_m + behind_m) / 2))
+    out = [
+        *_along(rng, middle, (4.0, 4.0), (0.0, 0.0), (behind_m, tall_m), behind),
+        *_along(rng, edge, (0.8, 7.0), (0.02, 3.0), (wide_m, tall_m + 0.01), stone),
+    ]
+    return tuple(box for box in out if float(box_footprint(box)[:, 0].min()) > _CAMERA_CLEARANCE_M)
+
+
+def _along(
+    rng: np.random.Generator,
+    line: FloatArray,
+    lengths_m: tuple[float, float],
+    gaps_m: tuple[float, float],
+    section_m: tuple[float, float],
+    albedo_bgr: Bgr,
+) -> list[Box]:
+    """Boxes along a line (N, 2), of a width and height, of lengths and at gaps between these bounds."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    out: list[Box] = []
+    at = float(rng.uniform(0, 1))
+    while at + lengths_m[1] < min(along[-1], _KERB_M):
+        length = float(rng.uniform(*lengths_m))
+        (x0, x1), (y0, y1) = (np.interp([at, at + length], along, line[:, axis]) for axis in (0, 1))
+        box = Box(
+            centre_map=(float(x0 + x1) / 2, float(y0 + y1) / 2),
+            size_m=(float(np.hypot(x1 - x0, y1 - y0)), *section_m),
+            yaw_rad=float(np.arctan2(y1 - y0, x1 - x0)),
+            albedo_bgr=albedo_bgr,
+            seed=int(rng.integers(1 << 20)),
+        )
+        out.append(box)
+        at += length + float(rng.uniform(*gaps_m))
+    return out
 
 
 def _some_within_sight(rng: np.random.Generator, paints: Sequence[Paint], mean: float) -> list[FloatArray]:

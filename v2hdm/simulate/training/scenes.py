@@ -22,6 +22,7 @@ from v2hdm.simulate.training.hardships import (
     blue_shade,
     clear_of,
     faint,
+    kerbs,
     overexposed,
     shadows_on_paint,
     things_beside,
@@ -133,7 +134,7 @@ def random_scene(
     """
     place = rng.choice(["port", "street", "bare"], p=[0.4, 0.5, 0.1])
     bend = Bend(float(rng.normal(0, 0.006)) if rng.random() < 0.4 else 0.0)
-    for_shadows, for_ground, for_light, for_things, for_paint, for_bend = rng.spawn(6)
+    for_shadows, for_ground, for_light, for_things, for_paint, for_bend, for_kerbs = rng.spawn(7)
     tight = tight_bend(for_bend, hardships.tight_bends)
     bend = tight or bend
     brush = random_brush(rng, difficulty)
@@ -151,7 +152,11 @@ def random_scene(
     scene = Scene(
         ground=replace(ground, marks=marks),
         paints=faint(for_paint, road.paints, hardships.faint),
-        boxes=boxes + things_beside(for_things, road.paints, hardships.things_beside),
+        boxes=(
+            *boxes,
+            *things_beside(for_things, road.paints, hardships.things_beside),
+            *clear_of(kerbs(for_kerbs, road.lanes, hardships.kerbs), road.paints),
+        ),
         shadows=shadows + shadows_on_paint(for_shadows, road.paints, hardships.shadows_on_paint),
         dapples=_dapples(rng, difficulty),
         light=blue_shade(for_light, _light(rng), hardships.blue_shade),
