@@ -33,3 +33,19 @@ def test_an_unknown_mode_is_refused() -> None:
     scene = make_scene(SceneOptions(length_m=20.0, seed=1))
     with pytest.raises(ConfigError, match=r"mapping.mode is 'online'; choose batch or incremental"):
         run_methods(scene.drive, scene.detections, ("front",), replace(INCREMENTAL, mode="online"))
+
+
+def test_a_pose_model_that_the_mode_would_not_use_is_refused() -> None:
+    scene = make_scene(SceneOptions(length_m=20.0, seed=1))
+    with pytest.raises(ConfigError, match=r"mapping.pose_model is 'heave', of no use in mapping.mode="):
+        run_methods(scene.drive, scene.detections, ("front",), replace(INCREMENTAL, pose_model="heave"))
+
+
+def test_how_large_the_map_is_is_told_as_it_grows() -> None:
+    scene = make_scene(SceneOptions(length_m=80.0, seed=2))
+    told: list[str] = []
+    run_methods(scene.drive, scene.detections, ("front",), INCREMENTAL, told.append)
+    growing = [int(text.split()[3]) for text in told if text.startswith("linking anew with")]
+    assert len(growing) >= 2
+    assert growing == sorted(growing)
+    assert growing[0] >= 12

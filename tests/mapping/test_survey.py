@@ -14,7 +14,7 @@ from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions, SurveyOptions
 from v2hdm.mapping.sightings.table import collect_sightings
 from v2hdm.mapping.sightings.views import views_of
-from v2hdm.mapping.survey import control_points
+from v2hdm.mapping.survey import control_points, without_corner
 from v2hdm.records import FloatArray
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
@@ -34,6 +34,23 @@ def test_a_surveyed_point_is_of_the_nearest_corner_within_reach() -> None:
     assert found([[0.5, 0.5]]) == {}
     assert found([[1.0, 1.0]]) == {}, "that corner is not part of the adjustment"
     assert found([]) == {}
+
+
+def test_surveyed_points_that_no_corner_is_nearest_to_are_told() -> None:
+    survey = SurveyOptions(points_map=[[0.1, 0.1], [5.0, 5.0], [0.0, 0.05], [1.0, 1.0]], reach_m=0.25)
+    control = control_points(survey, SQUARE[None], INDEX)
+    np.testing.assert_array_equal(without_corner(survey, control), [[0.1, 0.1], [5.0, 5.0], [1.0, 1.0]])
+    assert len(without_corner(survey, None)) == 4
+    assert without_corner(SurveyOptions(), None).shape == (0, 2)
+
+
+def test_a_surveyed_point_far_from_the_map_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    scene = make_scene(SceneOptions(seed=31, length_m=30.0, wild_rate=0.0, false_rate=0.0))
+    options = MappingOptions(pose_model="full", survey=SurveyOptions(points_map=[[500.0, 3.0]]))
+    run_methods(scene.drive, scene.detections, ("front",), options)
+    (warning,) = [r.getMessage() for r in caplog.records if "surveyed" in r.getMessage()]
+    assert "1 of 1" in warning
+    assert "(500.00, 3.00)" in warning
 
 
 def adjusted(scene: Scene, survey: SurveyOptions) -> FloatArray:

@@ -128,8 +128,12 @@ class IncrementalMapper:
         self._vehicle_from_map: FloatArray = np.asarray(np.linalg.inv(rig.map_from_vehicle), np.float64)
         self._begin(None, 0)
 
-    def run(self, views: Views) -> Grown:
+    def run(self, views: Views, progress: Callable[[str], None]) -> Grown:
         """Take up all tracks in the order in which they end, then judge the markings.
+
+        Args:
+            views: What the images show.
+            progress: Told in words how large the map is whenever the drive is linked anew.
 
         Raises:
             MappingError: No marking is accepted.
@@ -138,6 +142,7 @@ class IncrementalMapper:
         due, ended = _FIRST_LINK_MARKINGS, False
         while not ended:
             ended = self._take_up_safely(tracks, usable, due)[1]
+            progress(f"linking anew with {len(self._places)} markings mapped")
             tracks, usable = self._link(self._present_rig(), False)
             self._begin(self.grown, len(self._places))
             due *= 2

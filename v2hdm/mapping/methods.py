@@ -26,6 +26,7 @@ from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.sightings.table import Sightings, camera_of, collect_sightings
 from v2hdm.mapping.sightings.views import views_of
+from v2hdm.mapping.survey import without_corner
 from v2hdm.records import Calibration, Drive, FloatArray, HdMap, ImageDetections, Lane
 
 Progress = Callable[[str], None]
@@ -77,8 +78,7 @@ def run_methods(
             results[name] = run_naive(name, drive, detections, sightings, tracks, known, options)
     begin_s = time.perf_counter()
     if options.mode == INCREMENTAL:
-        tell("marking by marking")
-        grown = optimiser.run_incrementally()
+        grown = optimiser.run_incrementally(tell)
         optimal = _incremental_result(drive, detections, cameras, grown, options, begin_s)
     else:
         optimised = optimiser.run(tracks, tell)
@@ -131,6 +131,15 @@ def _optimised_result(
     if solution.status is not Status.CONVERGED:
         _log.warning(
             "the joint optimisation ended early (%s): %s", solution.status.value, solution.status.advice
+        )
+    lost = without_corner(options.survey, optimised.bundle.problem.control)
+    if len(lost):
+        _log.warning(
+            "%d of %d surveyed points are of no use, no corner of the map is nearest to them within %g m: %s",
+            len(lost),
+            len(options.survey.points_map),
+            options.survey.reach_m,
+            ", ".join(f"({x:.2f}, {y:.2f})" for x, y in lost),
         )
     lanes = _lanes(drive, detections, ground_by_rig(drive, cameras, optimised.bundle.rig), options)
     return MethodResult(

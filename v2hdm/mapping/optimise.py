@@ -107,8 +107,8 @@ class Optimiser:
             self._options.acceptance,
         )
 
-    def run_incrementally(self) -> Grown:
-        """Map one track after the other, as the vehicle would while it drives."""
+    def run_incrementally(self, progress: Callable[[str], None] | None = None) -> Grown:
+        """Map one track after the other, as the vehicle would; ``progress`` is told how large the map is."""
 
         def link(rig: Rig, coarse: bool) -> tuple[Association, BoolArray]:
             located, options = self._locate(rig), self._options.association
@@ -118,7 +118,7 @@ class Optimiser:
         mapper = IncrementalMapper(
             self._sightings, self.initial_rig, self._cameras, self._pose_noise, self._options, link
         )
-        return mapper.run(self._views)
+        return mapper.run(self._views, progress or _silent)
 
     def solve_groups(self, optimised: Optimised, groups: IntArray) -> Bundle:
         """Solve with only some ``groups`` of a finished optimisation, from the initial extrinsics."""

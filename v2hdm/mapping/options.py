@@ -116,7 +116,8 @@ class MappingOptions:
     ``roll_pitch``; ``full``, heading and position too; ``heave``, the height too; ``clock``, each camera's
     clock offset too; ``auto``, the one of them that predicts held-out observations best. ``loss`` and
     ``loss_scale`` are the robust loss of the solver.
-    ``mode`` is ``batch``, or ``incremental``: the drive as the vehicle would map it, marking by marking.
+    ``mode`` is ``batch``, or ``incremental``: the drive as the vehicle would map it, marking by marking, each
+    frame's whole pose estimated with every few dozen.
     ``rounds`` counts association under the optimised extrinsic followed by a joint solve.
     ``device`` is the torch device that the joint solves run on, ``cpu`` or ``cuda``.
     """
@@ -163,6 +164,11 @@ def check_options(options: MappingOptions) -> None:
     if options.pose_model not in POSE_MODELS:
         raise ConfigError(
             f"mapping.pose_model is {options.pose_model!r}; choose from {', '.join(POSE_MODELS)}."
+        )
+    if options.mode == INCREMENTAL and options.pose_model != AUTO:
+        raise ConfigError(
+            f"mapping.pose_model is {options.pose_model!r}, of no use in mapping.mode={INCREMENTAL}, which "
+            "estimates each frame's whole pose; leave it out."
         )
     for key, value in positive.items():
         if not value > 0:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
@@ -13,7 +11,6 @@ from v2hdm.mapping.options import SurveyOptions
 from v2hdm.records import FloatArray
 
 IntArray = NDArray[np.int64]
-_log = logging.getLogger(__name__)
 
 
 def control_points(
@@ -34,11 +31,16 @@ def control_points(
     if not len(points) or not known.any():
         return None
     off_m, nearest = KDTree(corners_map[known]).query(points, distance_upper_bound=survey.reach_m)
-    for point in points[~np.isfinite(off_m)]:
-        _log.debug("no corner of the map lies within %g m of the surveyed %s", survey.reach_m, point)
     # The nearest first, so that of two points of one corner the nearer one is kept.
     order = np.argsort(off_m)[: np.count_nonzero(np.isfinite(off_m))]
     corner, first = np.unique(corner_index[known][nearest[order]], return_index=True)
     if not len(corner):
         return None
     return ControlPoints(corner, points[order[first]], np.full(len(corner), survey.sigma_m))
+
+
+def without_corner(survey: SurveyOptions, control: ControlPoints | None) -> FloatArray:
+    """The surveyed points (N, 2) that ``control`` makes no use of."""
+    points = np.array(survey.points_map, dtype=np.float64).reshape(-1, 2)
+    used = np.zeros((0, 2)) if control is None else control.points_map
+    return points[~(points[:, None] == used).all(axis=-1).any(axis=-1)]

@@ -165,7 +165,10 @@ def _map_camera_sets(
         progress("map", done, len(sets))
         # The picture of the growing map is drawn for the whole rig, which comes last, and needs truth.
         growth_steps = GROWTH_STEPS if drive.truth_dir and done == len(sets) - 1 else 0
-        found[name] = run_methods(drive, detections, cameras, config.mapping, growth_steps=growth_steps)
+        tell, begin_s = partial(log.debug, "%s: %s", name), time.perf_counter()
+        found[name] = run_methods(drive, detections, cameras, config.mapping, tell, growth_steps)
+        took_s = time.perf_counter() - begin_s
+        log.info("mapped with %s: %d markings, %.1f s", name, len(found[name]["Opt"].hd_map.markings), took_s)
         for exclusion in found[name]["Opt"].excluded:
             where = ", ".join(f"{value:.2f}" for value in exclusion.position_map)
             log.debug("%s: left out a %s at (%s): %s", name, exclusion.kind, where, exclusion.reason)

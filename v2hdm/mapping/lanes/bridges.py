@@ -7,8 +7,6 @@ are one lane, and those lines say where it runs between them.
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -22,6 +20,7 @@ _PASSES_M = 0.4
 """A line that comes so near the end of a piece passes it."""
 
 _LEAST_COSINE = np.cos(np.deg2rad(30.0))
+_FIRST, _LAST = 0, 1
 _END_LENGTH_M = 5.0
 """A bridge leaves a piece in about the direction of so much of its end."""
 
@@ -31,41 +30,54 @@ def bridge_paths(paths: list[Path], guides: Guides, options: LaneOptions) -> lis
     if not len(guides.points_map):
         return paths
     tree = cKDTree(guides.points_map)
-    paths = list(paths)
-    while (joined := _shortest_bridge(paths, guides, tree, options)) is not None:
+    ended = [(path, _ends(path)) for path in paths]
+    while (joined := _shortest_bridge(ended, guides, tree, options)) is not None:
         a, b, path = joined
-        paths = [p for k, p in enumerate(paths) if k not in (a, b)] + [path]
-    return paths
+        ended = [of for k, of in enumerate(ended) if k not in (a, b)] + [(path, _ends(path))]
+    return [path for path, _ in ended]
 
 
 def _shortest_bridge(
-    paths: list[Path], guides: Guides, tree: cKDTree, options: LaneOptions
+    ended: list[tuple[Path, FloatArray]], guides: Guides, tree: cKDTree, options: LaneOptions
 ) -> tuple[int, int, Path] | None:
-    """Two paths and what they are together, the shortest gap that can be bridged."""
-    pairs = []
-    for a, b in itertools.combinations(range(len(paths)), 2):
-        for flip_a, flip_b in itertools.product((False, True), repeat=2):
-            before, after = _turned(paths[a], flip_a), _turned(paths[b], flip_b)
-            gap_m = float(np.linalg.norm(after.points_map[0] - before.points_map[-1]))
-            if gap_m <= _MAX_BRIDGE_M and _continues(before.points_map, after.points_map):
-                pairs.append((gap_m, a, b, before, after))
-    for _, a, b, before, after in sorted(pairs, key=lambda pair: pair[0]):
+    """Two of the paths, each with its ends, and what they are together: the shortest gap to be bridged."""
+    if len(ended) < 2:
+        return None
+    for a, end_a, b, end_b in _gaps(np.stack([ends for _, ends in ended])):
+        before = _turned(ended[a][0], end_a == _FIRST)
+        after = _turned(ended[b][0], end_b == _LAST)
         between = _bridge(before.points_map[-1], after.points_map[0], guides, tree, options)
         if between is not None:
             return a, b, _joined(before, between, after)
     return None
 
 
+def _gaps(ends: FloatArray) -> list[list[int]]:
+    """Path, end, path, end of all gaps whose way is roughly that of both paths, the shortest first.
+
+    ``ends`` (P, 2, 2, 2) are position and outward direction of both ends of every path.
+    """
+    place, outward = ends.reshape(-1, 2, 2).swapaxes(0, 1)
+    gap = place[None] - place[:, None]
+    gap_m = np.linalg.norm(gap, axis=2)
+    # From i to j one leaves i outwards and arrives at j against what is outwards there.
+    leaving = np.einsum("ijk,ik->ij", gap, outward)
+    straight = np.minimum(leaving, leaving.T) >= _LEAST_COSINE * gap_m
+    path = np.arange(len(place)) // 2
+    able = straight & (gap_m > 0) & (gap_m <= _MAX_BRIDGE_M) & (path[:, None] < path)
+    i, j = np.nonzero(able)
+    order = np.argsort(gap_m[i, j], kind="stable")
+    return np.column_stack([path[i], i % 2, path[j], j % 2])[order].tolist()
+
+
 def _turned(path: Path, flip: bool) -> Path:
     return Path(path.points_map[::-1], path.dash, path.images) if flip else path
 
 
-def _continues(before: FloatArray, after: FloatArray) -> bool:
-    """Whether the way from one polyline to the next is roughly that of both."""
-    gap = after[0] - before[-1]
-    gap_m = float(np.linalg.norm(gap))
-    leaving, arriving = _outward(before), -_outward(after[::-1])
-    return gap_m > 0 and min(float(gap @ leaving), float(gap @ arriving)) >= _LEAST_COSINE * gap_m
+def _ends(path: Path) -> FloatArray:
+    """Position and outward direction (2, 2, 2) of the first and the last end of a path."""
+    points = path.points_map
+    return np.array([[points[0], _outward(points[::-1])], [points[-1], _outward(points)]])
 
 
 def _outward(points: FloatArray) -> FloatArray:
