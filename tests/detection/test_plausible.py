@@ -92,16 +92,23 @@ def test_a_quadrilateral_is_read_as_every_class_that_it_may_be() -> None:
     assert rivals(cut, scores, CROSSWALK_BAR) == [], "what the border cuts may be anything"
 
 
-def test_a_diamond_that_has_a_shaft_is_the_head_of_an_arrow(tmp_path: Path) -> None:
+def test_a_diamond_that_has_a_shaft_and_something_of_a_symbol_is_the_head_of_an_arrow(tmp_path: Path) -> None:
     detector = Detector.load(brightness_model(tmp_path))
 
-    def kinds(*shaft: np.ndarray) -> list[str]:
+    def kinds(scores: dict[str, float], *shaft: np.ndarray) -> list[str]:
         blobs = [
-            Blob({kind: 0.9}, np.ones((3, 3)), np.zeros(2), 2, to_image(VIEW.camera, outline))
-            for kind, outline in ((DIAMOND, RHOMBUS), *((LANE_DASH, strip) for strip in shaft))
+            Blob(classes, np.ones((3, 3)), np.zeros(2), 2, to_image(VIEW.camera, outline))
+            for classes, outline in ((scores, RHOMBUS), *(({LANE_DASH: 0.9}, strip) for strip in shaft))
         ]
         return [candidate.kind for candidate in detector._candidates(blobs, VIEW)]
 
-    assert kinds() == [DIAMOND]
-    assert kinds(bar(6.2, 0.0, 2.0, 0.15)) == [LANE_DASH]
-    assert kinds(bar(6.2, 1.5, 2.0, 0.15)) == [DIAMOND, LANE_DASH], "it ends beside the diamond"
+    for worn in (
+        {DIAMOND: 0.75, ARROW: 0.15},
+        {DIAMOND: 0.5, OTHER_PAINT: 0.3},
+        {DIAMOND: 0.6, CHEVRON: 0.1},
+    ):
+        assert kinds(worn) == [DIAMOND]
+        assert kinds(worn, bar(6.2, 0.0, 2.0, 0.15)) == [LANE_DASH]
+        assert kinds(worn, bar(6.2, 1.5, 2.0, 0.15)) == [DIAMOND, LANE_DASH], "it ends beside the diamond"
+    for sure in ({DIAMOND: 0.9}, {DIAMOND: 0.85, ARROW: 0.05}):
+        assert kinds(sure, bar(6.2, 0.0, 2.0, 0.15)) == [DIAMOND, LANE_DASH], "dashes end at diamonds, too"

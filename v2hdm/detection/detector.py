@@ -20,10 +20,12 @@ from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.paint.blobs import Blob, find_blobs, outline_polygon
 from v2hdm.detection.paint.plausible import (
+    SYMBOLS,
     Heads,
     Piece,
     cornered_kind,
     head_of,
+    may_be_head,
     plausible_kind,
     rival_kinds,
 )
@@ -36,16 +38,12 @@ from v2hdm.records import (
     LANE_CLASSES,
     LANE_DASH,
     LANE_LINE,
-    OTHER_PAINT,
     OUTLINED_CLASSES,
     Camera,
     FloatArray,
     LaneDetection,
     MarkingDetection,
 )
-
-_HEADS = (*OUTLINED_CLASSES, OTHER_PAINT, DIAMOND)
-"""What the head of an arrow may be taken for where it is seen apart from the shaft."""
 
 _LEAST_SCORE = 0.3
 """A blob of a lesser score is nothing. What may be a quadrilateral is then judged by all evidence; of lanes
@@ -139,7 +137,7 @@ class Detector:
         on_ground = view.ground(outlines)
         ends = np.cumsum([0, *(len(blob.outline_px) for blob in blobs)]).tolist()
         parts = [slice(begin, end) for begin, end in pairwise(ends)]
-        heads = Heads({k: on_ground[parts[k]] for k, blob in enumerate(blobs) if blob.kind in _HEADS})
+        heads = Heads({k: on_ground[parts[k]] for k, blob in enumerate(blobs) if may_be_head(blob)})
         have_shafts = set()
         candidates = []
         for index, (blob, part) in enumerate(zip(blobs, parts, strict=True)):
@@ -152,7 +150,7 @@ class Detector:
             candidates.append(
                 _Candidate(blob, piece, index, *found, outlines[part], on_ground[part], head is not None)
             )
-        # With a shaft it is the head of an arrow, however much it looks like the diamonds around.
+        # With a shaft it is the head of an arrow, even if it looks more like the diamonds around.
         return [c for c in candidates if c.kind != DIAMOND or c.index not in have_shafts]
 
     def _lane_paint(self, candidates: list[_Candidate]) -> list[LanePaint]:
@@ -213,7 +211,7 @@ def _claim(candidate: _Candidate, kind: str) -> Claim:
         certainty,
         share.get(kind, 0.0),
         line_share=share.get(LANE_LINE, 0.0),
-        symbol_share=sum(share.get(name, 0.0) for name in (*OUTLINED_CLASSES, OTHER_PAINT)),
+        symbol_share=sum(share.get(name, 0.0) for name in SYMBOLS),
         touches_symbol=candidate.blob.touches_symbol,
         at_head=candidate.at_head,
     )

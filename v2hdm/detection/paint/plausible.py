@@ -29,6 +29,9 @@ from v2hdm.records import (
     FloatArray,
 )
 
+SYMBOLS = (*OUTLINED_CLASSES, OTHER_PAINT)
+"""Paint without four corners that is no lane: arrows, chevrons, writing."""
+
 _SIZE_LIMITS_M: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     DIAMOND: ((0.25, 5.0), (0.1, 3.0)),
     LANE_DASH: ((0.7, LONGEST_DASH_M), (0.03, 0.8)),
@@ -62,6 +65,10 @@ _LEAST_SECOND_SHARE = 0.12
 
 _LEAST_ELONGATION = 3.0
 """Lane paint is at least this many times as long as wide; far diamonds look like dashes, but are not."""
+
+_LEAST_SYMBOL_IN_HEAD = 0.12
+"""What looks like a diamond may be the head of an arrow if the network sees this share of a symbol in it:
+diamonds lie at the ends of dashes, too."""
 
 _HEAD_REACH_M = 0.4
 _HEAD_OVERLAP_M = 0.3
@@ -180,6 +187,14 @@ def _second_choice(piece: Piece) -> str | None:
     if best is None or piece.touches_symbol:
         return None
     return best if share[best] >= _LEAST_SECOND_SHARE * sum(piece.class_score.values()) else None
+
+
+def may_be_head(blob: Blob) -> bool:
+    """Whether a blob may be the head of an arrow that wear has parted from its shaft."""
+    if blob.kind != DIAMOND:
+        return blob.kind in SYMBOLS
+    symbol = sum(blob.class_score.get(name, 0.0) for name in SYMBOLS)
+    return symbol >= _LEAST_SYMBOL_IN_HEAD * sum(blob.class_score.values())
 
 
 class Heads:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from v2hdm.planar import inside_convex
 from v2hdm.records import CORNERED_CLASSES, FloatArray
 from v2hdm.simulate.render.optics import Optics
-from v2hdm.simulate.render.scene import Box, GroundMarks, Light, Paint, Shadow, box_footprint
+from v2hdm.simulate.render.scene import Bgr, Box, GroundMarks, Light, Paint, Shadow, box_footprint
 from v2hdm.simulate.training.clutter import kerb_colours, plain_marks, thing_to_stand_beside
 from v2hdm.simulate.training.paint import Bend, rectangle
 
