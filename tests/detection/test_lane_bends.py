@@ -88,7 +88,11 @@ def test_the_lines_of_an_image_follow_its_bend(view):
     lanes = link_anchors(anchors_of(view, [guide, line[60:110]]), view, paint)
     assert len(lanes) == 2
     true = [goes_on(view, left_m, 30.0) for left_m in (2.0, -1.5)]
-    assert all(min(error_px(lane, line).max() for line in true) < 8 for lane in lanes)
+    for lane in lanes:
+        error = min((error_px(lane, line) for line in true), key=np.max)
+        # Lines are drawn a little beyond the image, the true ones are not.
+        assert error[view.inside(lane.points_px, 0)].max() < 8
+        assert lane.points_px[0, 1] > view.info.height - 30 or lane.points_px[0, 0] < 30
 
 
 def wild_lines(rng: np.random.Generator, view: CameraView) -> list[Seen]:

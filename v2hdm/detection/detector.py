@@ -108,14 +108,14 @@ class Detector:
         with lap("blobs"):
             blobs, owner = find_blobs(sight, info.classes, info.paint_stride, view.far_row, reach_px)
             candidates = self._candidates(blobs, view)
+        foreground = Foreground(sight.paint, owner, info.paint_stride, view.far_row)
         with lap("lanes"):
             lanes = trace_lanes(
                 self._lane_paint(candidates), view, self.options.lane_step_m, self.options.max_range_m
             )
-            lanes += link_anchors(sight.anchors, view, lanes, self.options.lane_step_m)
+            lanes += link_anchors(sight.anchors, view, lanes, self.options.lane_step_m, foreground)
         with lap("corners"):
             starts = self._starts(candidates, view)
-            foreground = Foreground(sight.paint, owner, info.paint_stride, view.far_row)
             markings = fit_markings(image_bgr, view, starts, foreground, self.options)
             symbols = [self._symbol(c, view) for c in candidates]
             markings += [s for s in symbols if s is not None and not _is_among(s, markings)]

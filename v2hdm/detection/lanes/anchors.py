@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.lanes.bends import Seen, beside_guide
 from v2hdm.detection.lanes.curves import Horizon, basis
-from v2hdm.detection.lanes.ends import near_end, nearest_paint
+from v2hdm.detection.lanes.ends import solid_end
 from v2hdm.detection.lanes.groups import find_lines
 from v2hdm.detection.lanes.points import NEIGHBOURS, IntArray, Line, LinePoints
 from v2hdm.detection.sight import AnchorRow
@@ -86,6 +87,7 @@ def link_anchors(
     view: CameraView,
     paint: Sequence[LaneDetection] = (),
     paint_step_m: float = 0.5,
+    foreground: Foreground | None = None,
 ) -> list[LaneDetection]:
     """The whole lines of one image.
 
@@ -94,6 +96,7 @@ def link_anchors(
         view: Its camera.
         paint: The centre lines of its lane paint, points ``paint_step_m`` apart.
         paint_step_m: That distance.
+        foreground: What the network says of paint, if that is known: it tells where solid lines end.
     """
     horizon = Horizon(view)
     points = _crossings(rows, view, horizon)
@@ -102,7 +105,8 @@ def link_anchors(
     groups = [np.array(chain.index) for chain in _chains(points)]
     points, on_paint = _with_paint(points, paint, view, horizon)
     lines = find_lines(points, groups + on_paint, view, horizon, paint_step_m, LEAST_LOG_ODDS)
-    found = [lane for line in lines if (lane := _drawn(points, line, view, horizon)) is not None]
+    drawn = [_drawn(points, line, view, horizon, foreground) for line in lines]
+    found = [lane for lane in drawn if lane is not None]
     return _identified(beside_guide(found, view), view)
 
 
@@ -153,18 +157,18 @@ def _logit(probability: float) -> float:
     return float(np.log(clipped / (1 - clipped)))
 
 
-def _drawn(points: LinePoints, line: Line, view: CameraView, horizon: Horizon) -> Seen | None:
+def _drawn(
+    points: LinePoints, line: Line, view: CameraView, horizon: Horizon, foreground: Foreground | None
+) -> Seen | None:
     """A line's points in the image, near to far, with their standard deviations."""
-    nearest = near_end(points, line, view)
+    nearest = float(points.below[line.members].max())
     lowest = horizon.coordinates(view.undistort(_lower_corners(view)))[1].max()
     farthest = points.below[line.members].min()
     at = np.arange(farthest, max(lowest, nearest) + _STEP_PX, _STEP_PX)[::-1]
     along, sigma = _followed(points, line, horizon, at)
     points_px = view.distort(horizon.pinhole_px(along, at))
-    known = at <= nearest
-    paint = nearest_paint(points, line)
-    if paint is None or not points.is_solid[paint]:  # a dash is one of many
-        known |= sigma < _EXTENSION_SIGMA * view.info.width
+    ends = solid_end(points, line, at, points_px, view, horizon, foreground)
+    known = (at <= nearest) | (sigma < _EXTENSION_SIGMA * view.info.width) if ends is None else at <= ends
     kept = known & view.inside(points_px, -_STEP_PX)
     if kept.sum() < 2:
         return None
