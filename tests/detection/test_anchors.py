@@ -151,6 +151,14 @@ def test_a_double_line_is_one_boundary_along_its_middle(view):
     assert np.abs(off_px(lane, straight(view, 1.7))[near]).max() < 2
 
 
+def test_a_single_dash_beside_a_long_solid_line_makes_a_double_one(view):
+    pair = [straight(view, 1.5), straight(view, 1.9)]
+    paint = [painted(pair[0], view, 5, 20), painted(pair[1], view, 7, 9.5)]
+    (lane,) = link_anchors(anchors_of(view, pair), view, paint)
+    near = lane.points_px[:, 1] > 200
+    assert np.abs(off_px(lane, straight(view, 1.7))[near]).max() < 2
+
+
 def test_what_a_point_errs_by_is_within_its_stated_sigma(view):
     rng = np.random.default_rng(5)
     line = straight(view, 1.6)

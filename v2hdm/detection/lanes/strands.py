@@ -19,8 +19,8 @@ _PARALLEL_M = 0.15
 """The distance between the two lines of a double one changes by less than this."""
 
 _LEAST_PAINT_M = 1.0
-_LEAST_PAINT_SHARE = 0.3
-"""Each has so much paint, and this share of the better one's."""
+_LEAST_PAINT_SHARE = 0.12
+"""Each has so much paint, and this share of the better one's: one dash may be all beside a solid line."""
 
 _LEAST_OUTSIDE = 0.5
 _CARRIED_ON_M = 0.5
