@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 
 from tests.benchmarks.detector_quality import Example, example, polygon_overlap
-from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, SHAPES, TOLD, shape_of, told
+from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, SHAPES, TOLD, confidence, shape_of, told
 from v2hdm.detection.corners.evidence import FEATURES, gather
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
@@ -57,20 +57,24 @@ class Gathered:
     def add(self, index: int, shown: Example, detector: Detector) -> None:
         """What the detector proposes in one image."""
         corners_px: list[FloatArray] = []
+        last: list[tuple[FloatArray, list[str], FloatArray]] = []
 
         def gather_spy(*given: Any) -> FloatArray:
             corners_px.extend(given[3])
             return gather(*given)
 
         def spy(evidence: FloatArray, kinds: list[str], ground: FloatArray) -> FloatArray:
-            self.evidence.extend(evidence)
-            self.kind.extend(kinds)
-            self.ground.extend(ground)
-            return np.ones(len(evidence))
+            # What is in doubt is read further, and all readings are judged together, last of all.
+            last[:] = [(evidence, kinds, ground)]
+            return confidence(evidence, kinds, ground)
 
         look, first = 1 + max(self.look, default=-1), len(self.kind)
         with patch(f"{REFINE}.gather", gather_spy), patch(f"{REFINE}.confidence", spy):
             detector.detect(shown.image, shown.camera)
+        for evidence, kinds, ground in last:
+            self.evidence.extend(evidence)
+            self.kind.extend(kinds)
+            self.ground.extend(ground)
         for kind, corners in zip(self.kind[first:], corners_px, strict=True):
             self.true.append(is_true(shown, kind, corners))
             self.image.append(index)

@@ -49,6 +49,11 @@ _LEAST_SCORE = 0.3
 """A blob of a lesser score is nothing. What may be a quadrilateral is then judged by all evidence; of lanes
 and symbols there is no more, so they need ``DetectorOptions.min_score``."""
 
+_FURTHER_ODDS = (1.0, -1.0)
+"""Log odds of paint at which it is read anew: what runs together at 0 often comes apart at the first, what
+shadow, wear or blur parts at 0 is often whole at the second, asked for where time is no matter. All evidence
+tells which reading of a place is right."""
+
 _LEAST_COVER = 0.6
 _LEAST_COVER_OF_SYMBOL = 0.8
 """A blob that shares less than this with the best quadrilateral around it is none, the more so if the network
@@ -104,18 +109,24 @@ class Detector:
         info = self.network.info
         with lap("net"):
             sight = look(self.network, image_bgr, view, self.options.mirrored)
-        reach_px = self._reach_px[camera.info.name]
         with lap("blobs"):
-            blobs, owner = find_blobs(sight, info.classes, info.paint_stride, view.far_row, reach_px)
+            band = info.classes, info.paint_stride, view.far_row, self._reach_px[camera.info.name]
+            blobs, owner = find_blobs(sight, *band)
             candidates = self._candidates(blobs, view)
-        foreground = Foreground(sight.paint, owner, info.paint_stride, view.far_row)
+            odds = _FURTHER_ODDS if self.options.mirrored else _FURTHER_ODDS[:1]
+            further = [find_blobs(sight, *band, least, owner) for least in odds]
+        owners = np.stack([owner, *(other for _, other in further)])
+        foreground = Foreground(sight.paint, owners, info.paint_stride, view.far_row)
         with lap("lanes"):
             lanes = trace_lanes(
                 self._lane_paint(candidates), view, self.options.lane_step_m, self.options.max_range_m
             )
             lanes += link_anchors(sight.anchors, view, lanes, self.options.lane_step_m, foreground)
         with lap("corners"):
-            starts = self._starts(candidates, view)
+            readings = [self._candidates(others, view) for others, _ in further]
+            starts = [
+                s for plane, of in enumerate([candidates, *readings]) for s in self._starts(of, view, plane)
+            ]
             markings = fit_markings(image_bgr, view, starts, foreground, self.options)
             symbols = [self._symbol(c, view) for c in candidates]
             markings += [s for s in symbols if s is not None and not _is_among(s, markings)]
@@ -163,8 +174,8 @@ class Detector:
             and not (c.kind == LANE_DASH and (c.blob.touches_symbol or c.at_head))
         ]
 
-    def _starts(self, candidates: list[_Candidate], view: CameraView) -> list[QuadStart]:
-        """The quadrilaterals to start the corner fit from, of the blobs that are one within range."""
+    def _starts(self, candidates: list[_Candidate], view: CameraView, plane: int = 0) -> list[QuadStart]:
+        """The quadrilaterals to start the corner fit from, of a reading's blobs that are one within range."""
         starts = []
         for c in candidates:
             kind = cornered_kind(c.piece, c.kind)
@@ -175,7 +186,7 @@ class Detector:
             if start is not None and start[1] >= least:
                 kinds = [kind, *rival_kinds(c.piece, kind)]
                 claims = {name: _claim(c, name) for name in kinds}
-                starts.append(QuadStart(claims, start[0], c.index, c.outline_pinhole_px))
+                starts.append(QuadStart(claims, start[0], c.index, c.outline_pinhole_px, plane))
         if not starts:
             return []
         corners = np.stack([start.corners_pinhole_px for start in starts])

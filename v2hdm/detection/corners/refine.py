@@ -14,12 +14,14 @@ from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.both_sides import painted_parts
 from v2hdm.detection.corners.confidence import confidence
 from v2hdm.detection.corners.edge_fit import EdgeFit, fit_edges
-from v2hdm.detection.corners.evidence import Claim, Steps, gather, grey_steps
+from v2hdm.detection.corners.evidence import Claim, gather, grey_steps
 from v2hdm.detection.corners.foreground import Foreground
+from v2hdm.detection.corners.found import Corners, block_diagonal, is_cut, largest_sigma
 from v2hdm.detection.corners.grey import GreyBand, linear_grey
 from v2hdm.detection.corners.outline_fit import fit_outlines
 from v2hdm.detection.corners.quad import is_convex, side_frames, width
 from v2hdm.detection.corners.quad_fit import fit_quads, unbow_corners
+from v2hdm.detection.corners.rivals import surest_readings
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import LANE_DASH, BoolArray, FloatArray, MarkingDetection
 
@@ -46,26 +48,20 @@ _MAX_OUTLINE_GAP_PX = 4.0
 _OWN_END_PX = 3.0
 """The stretch of a piece that ends this near to the piece's own end has not been cut there."""
 
-_CLOSURE_TOLERANCE = 0.02
-_MAX_CLOSURE_CHI2 = 9.0
-_U = np.arange(0, 8, 2)
-"""Places of the corners' u in their covariance."""
-
-_CLOSURE = np.array([1.0, -1.0, 1.0, -1.0])
-
 
 @dataclass(frozen=True)
 class QuadStart:
     """A blob's quadrilateral ``corners_pinhole_px`` (4, 2) before refinement.
 
     ``claims`` are what the network says for each class that it may be of, the likeliest first; ``blob`` is
-    the blob's index, ``outline_pinhole_px`` (N, 2) its outline.
+    the blob's index in the reading ``plane`` of the paint, ``outline_pinhole_px`` (N, 2) its outline.
     """
 
     claims: dict[str, Claim]
     corners_pinhole_px: FloatArray
     blob: int
     outline_pinhole_px: FloatArray
+    plane: int = 0
 
     @property
     def kind(self) -> str:
@@ -74,16 +70,28 @@ class QuadStart:
 
 
 @dataclass
-class _Corners:
-    """Refined corners of M markings: ``px`` (M, 4, 2), ``covariance`` (M, 8, 8), ``valid`` (M, 4).
+class _Fitted:
+    """M starts, the corners ``found``, and each in every class that it may be of, R rows in all.
 
-    ``occluded`` (M,) are those of which a side was found to be the edge of something before the ground.
+    ``row_start`` (R,) is the start of a row, ``kinds`` its class, ``ground`` (R, 4, 2) its corners on the
+    ground, ``evidence`` (R, F) what there is for it.
     """
 
-    px: FloatArray
-    covariance: FloatArray
-    valid: BoolArray
-    occluded: BoolArray
+    starts: list[QuadStart]
+    found: Corners
+    row_start: np.ndarray
+    kinds: list[str]
+    ground: FloatArray
+    evidence: FloatArray
+
+    def judged(self) -> tuple[list[str], FloatArray]:
+        """The class (M,) of each for which there is most evidence, and its confidence."""
+        score = confidence(self.evidence, self.kinds, self.ground)
+        # Stable, so that the likeliest by the network comes first among equals.
+        best = np.lexsort((-np.arange(len(score)), score))
+        chosen = dict(zip(self.row_start[best].tolist(), best.tolist(), strict=True))
+        rows = [chosen[m] for m in range(len(self.starts))]
+        return [self.kinds[row] for row in rows], score[rows]
 
 
 def fit_markings(
@@ -95,25 +103,44 @@ def fit_markings(
 ) -> list[MarkingDetection]:
     """Refine the corners of one image's markings; where that fails they are those of the start, not valid.
 
-    Markings are kept if the evidence for them reaches ``options.min_confidence``.
+    Markings are kept if the evidence for them reaches ``options.min_confidence``, and, of several readings of
+    one place, the one that has most.
     """
-    if not starts:
+    fitted = _fitted(image_bgr, view, starts, foreground, options)
+    if not fitted:
         return []
+    kinds, score = fitted.judged()
+    found = fitted.found
+    if options.vague_corners:
+        _take_outlines(found, fitted.starts, view, options)
+        found.valid[is_cut(found, view)] = False
+    plane = np.array([start.plane for start in fitted.starts])
+    believed = surest_readings(found.px, plane, score) & (score >= options.min_confidence)
+    return [
+        MarkingDetection(kinds[m], float(score[m]), found.px[m], found.covariance[m], found.valid[m])
+        for m in np.flatnonzero(believed).tolist()
+    ]
+
+
+def _fitted(
+    image_bgr: np.ndarray,
+    view: CameraView,
+    starts: list[QuadStart],
+    foreground: Foreground,
+    options: DetectorOptions,
+) -> _Fitted | None:
+    """The starts fitted to the image, and the evidence for each; None for none."""
+    if not starts:
+        return None
     start, start_px = _stacked(starts, view)
     grey = _grey_around(image_bgr, view, start_px, foreground)
     starts = _without_tails(starts, grey, foreground, view, options.max_range_m)
     if not starts:
-        return []
+        return None
     start, start_px = _stacked(starts, view)
-    blobs = np.array([s.blob for s in starts])
+    blobs = np.array([(s.plane, s.blob) for s in starts])
     near = _is_near(start)
-    found = _Corners(
-        start_px,
-        np.tile(np.eye(8), (len(starts), 1, 1)),
-        np.zeros((len(starts), 4), dtype=np.bool_),
-        np.zeros(len(starts), dtype=np.bool_),
-    )
-    blur_px = options.blur_px
+    found, blur_px = Corners.at(start_px), options.blur_px
     if near.any():
         edges = fit_edges(grey, view, start[near])
         _take_edges(found, near, edges, view)
@@ -128,34 +155,14 @@ def fit_markings(
     steps = grey_steps(grey, found.px)
     found.valid &= ~steps.runs_on()
     _reject(found, view, options)
-    kinds, score = _judged(starts, found, steps, foreground, view)
-    if options.vague_corners:
-        _take_outlines(found, start, [s.outline_pinhole_px for s in starts], view, options)
-        found.valid[_is_cut(found, view)] = False
-    return [
-        MarkingDetection(kind, float(score[m]), found.px[m], found.covariance[m], found.valid[m])
-        for m, kind in enumerate(kinds)
-        if score[m] >= options.min_confidence
-    ]
-
-
-def _judged(
-    starts: list[QuadStart], found: _Corners, steps: Steps, foreground: Foreground, view: CameraView
-) -> tuple[list[str], FloatArray]:
-    """The class (M,) for which there is most evidence of those that each may be of, and its confidence."""
-    start = np.repeat(np.arange(len(starts)), [len(s.claims) for s in starts])
-    kinds = [kind for s in starts for kind in s.claims]
+    row_start = np.repeat(np.arange(len(starts)), [len(s.claims) for s in starts])
     claims = [claim for s in starts for claim in s.claims.values()]
-    ground = view.ground(view.undistort(found.px.reshape(-1, 2))).reshape(found.px.shape)[start]
+    ground = view.ground(view.undistort(found.px.reshape(-1, 2))).reshape(found.px.shape)[row_start]
     evidence = gather(
-        steps.take(start), foreground, view, found.px[start], ground, claims, found.valid[start]
+        steps.take(row_start), foreground, view, found.px[row_start], ground, claims, found.valid[row_start]
     )
-    score = confidence(evidence, kinds, ground)
-    # Stable, so that the likeliest by the network comes first among equals.
-    best = np.lexsort((-np.arange(len(start)), score))
-    chosen = dict(zip(start[best].tolist(), best.tolist(), strict=True))
-    rows = [chosen[m] for m in range(len(starts))]
-    return [kinds[row] for row in rows], score[rows]
+    kinds = [kind for s in starts for kind in s.claims]
+    return _Fitted(starts, found, row_start, kinds, ground, evidence)
 
 
 def _stacked(starts: list[QuadStart], view: CameraView) -> tuple[FloatArray, FloatArray]:
@@ -217,12 +224,12 @@ def _grey_around(
     return linear_grey(image_bgr, top, bottom, np.hstack([low, high]), view.camera.linear_response)
 
 
-def _take_edges(found: _Corners, near: BoolArray, edges: EdgeFit, view: CameraView) -> None:
+def _take_edges(found: Corners, near: BoolArray, edges: EdgeFit, view: CameraView) -> None:
     """Enter the fitted sides: a corner is valid where both its sides were found and look alike."""
     corners = edges.corners_pinhole_px
     flat = corners.reshape(-1, 2)
     found.px[near] = view.distort(flat).reshape(corners.shape)
-    jacobian = _block_diagonal(view.distort_jacobian(flat).reshape(-1, 4, 2, 2))
+    jacobian = block_diagonal(view.distort_jacobian(flat).reshape(-1, 4, 2, 2))
     found.covariance[near] = jacobian @ edges.covariance @ np.swapaxes(jacobian, 1, 2)
     alike = _consistent_levels(edges)
     good = edges.side_found & alike
@@ -243,7 +250,7 @@ def _consistent_levels(edges: EdgeFit) -> BoolArray:
 
 @dataclass(frozen=True)
 class _Far:
-    """What fits to far markings share: ``blobs`` (M,) of all markings, and the point spread ``blur_px``."""
+    """What fits to far markings share: plane and index of all ``blobs`` (M, 2), and the point spread."""
 
     foreground: Foreground
     blobs: np.ndarray
@@ -251,7 +258,7 @@ class _Far:
     blur_px: float
 
 
-def _take_quads(found: _Corners, group: np.ndarray, grey: GreyBand, far: _Far, bloom_px: float) -> np.ndarray:
+def _take_quads(found: Corners, group: np.ndarray, grey: GreyBand, far: _Far, bloom_px: float) -> np.ndarray:
     """Enter whole quadrilaterals fitted to the markings ``group`` (indices), in doubt by ``bloom_px`` more.
 
     The corners of those that are overexposed are near where they should be, but valid only where flanks tell.
@@ -260,7 +267,7 @@ def _take_quads(found: _Corners, group: np.ndarray, grey: GreyBand, far: _Far, b
         Those of ``group`` that are overexposed and not fitted well.
     """
     foreground = far.foreground
-    owner = foreground.owner[(grey.top - foreground.top) // foreground.stride :]
+    owner = foreground.owner[:, (grey.top - foreground.top) // foreground.stride :]
     fit = fit_quads(grey, owner, foreground.stride, far.blobs[group], found.px[group], far.blur_px)
     pinhole = unbow_corners(far.view, fit.corners_px)
     corners = far.view.distort(pinhole.reshape(-1, 2)).reshape(-1, 4, 2)
@@ -269,18 +276,14 @@ def _take_quads(found: _Corners, group: np.ndarray, grey: GreyBand, far: _Far, b
     good &= np.isfinite(corners).all(axis=(1, 2))
     found.px[group[good]] = corners[good]
     found.covariance[group[good]] = covariance[good]
-    told = fit.bright & (_largest_sigma(covariance).max(axis=1) < _BLOOM_SIGMA_PX)
+    told = fit.bright & (largest_sigma(covariance).max(axis=1) < _BLOOM_SIGMA_PX)
     good &= ~fit.clipped | told
     found.valid[group[good]] = True
     return np.asarray(group[fit.clipped & ~good])
 
 
 def _take_outlines(
-    found: _Corners,
-    start: FloatArray,
-    outlines: list[FloatArray],
-    view: CameraView,
-    options: DetectorOptions,
+    found: Corners, starts: list[QuadStart], view: CameraView, options: DetectorOptions
 ) -> None:
     """Enter corners of the network's outline where the image gave none.
 
@@ -290,16 +293,17 @@ def _take_outlines(
     asked = np.flatnonzero(~found.occluded & ~found.valid.all(axis=1))
     if not len(asked):
         return
-    fit = fit_outlines([outlines[m] for m in asked], start[asked])
-    corners = np.where(fit.found[..., None], fit.corners_pinhole_px, start[asked])
+    start = np.stack([starts[m].corners_pinhole_px for m in asked])
+    fit = fit_outlines([starts[m].outline_pinhole_px for m in asked], start)
+    corners = np.where(fit.found[..., None], fit.corners_pinhole_px, start)
     flat = corners.reshape(-1, 2)
     px = view.distort(flat).reshape(corners.shape)
-    jacobian = _block_diagonal(view.distort_jacobian(flat).reshape(-1, 4, 2, 2))
+    jacobian = block_diagonal(view.distort_jacobian(flat).reshape(-1, 4, 2, 2))
     covariance = jacobian @ fit.covariance @ np.swapaxes(jacobian, 1, 2)
     apart = np.linalg.norm(px - found.px[asked], axis=2)
     agrees = (~(found.valid[asked] & fit.found) | (apart < _MAX_OUTLINE_GAP_PX)).all(axis=1)
     usable = fit.found & agrees[:, None] & view.inside(px, options.border_px)
-    usable &= _largest_sigma(covariance) <= _MAX_OUTLINE_SIGMA_PX
+    usable &= largest_sigma(covariance) <= _MAX_OUTLINE_SIGMA_PX
     for m, at, matrix, use in zip(asked, px, covariance, usable & ~found.valid[asked], strict=True):
         corner = np.flatnonzero(use)
         columns = (2 * corner[:, None] + np.arange(2)).ravel()
@@ -322,47 +326,9 @@ def _measured_blur(edges: EdgeFit) -> float | None:
     return float(np.clip(blur_px, *_BLUR_LIMITS_PX))
 
 
-def _reject(found: _Corners, view: CameraView, options: DetectorOptions) -> None:
+def _reject(found: Corners, view: CameraView, options: DetectorOptions) -> None:
     """Mark the corners that are too uncertain or too near the border as not valid."""
-    found.valid &= _largest_sigma(found.covariance) <= options.max_corner_sigma_px
+    found.valid &= largest_sigma(found.covariance) <= options.max_corner_sigma_px
     found.valid &= view.inside(found.px, options.border_px)
-    found.occluded |= _is_cut(found, view)
+    found.occluded |= is_cut(found, view)
     found.valid[found.occluded & found.valid.all(axis=1)] = False
-
-
-def _is_cut(found: _Corners, view: CameraView) -> BoolArray:
-    """Markings (M,) whose four valid corners are no parallelogram on the ground, as all are painted.
-
-    An occluder's straight edge or a lost piece of paint gives corners as clean as the true ones; which of
-    the four they are cannot be told, so none is used. The tolerance, in parts of the marking's size,
-    covers an initial IPM that is some degrees off.
-    """
-    cut = np.zeros(len(found.px), dtype=np.bool_)
-    whole = np.flatnonzero(found.valid.all(axis=1))
-    pinhole = view.undistort(found.px[whole].reshape(-1, 2))
-    ground = view.ground(pinhole).reshape(-1, 4, 2)
-    size_m = np.linalg.norm(ground[:, :2] - ground[:, 2:], axis=-1).mean(axis=1)
-    by_corner = _CLOSURE[:, None, None] * view.ground_jacobian(pinhole).reshape(-1, 4, 2, 2)
-    jacobian = by_corner.transpose(0, 2, 1, 3).reshape(-1, 2, 8)
-    covariance = jacobian @ found.covariance[whole] @ np.swapaxes(jacobian, 1, 2)
-    covariance += ((_CLOSURE_TOLERANCE * size_m) ** 2)[:, None, None] * np.eye(2)
-    usable = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
-    gap = np.where(usable[:, None], _CLOSURE @ ground, 0.0)[..., None]
-    solved = np.linalg.solve(np.where(usable[:, None, None], covariance, np.eye(2)), gap)
-    cut[whole] = (gap * solved).sum(axis=(1, 2)) > _MAX_CLOSURE_CHI2
-    return cut
-
-
-def _largest_sigma(covariance: FloatArray) -> FloatArray:
-    """Standard deviation (M, 4) of each corner in its least certain direction, from (M, 8, 8)."""
-    u, v, uv = (covariance[:, _U + row, _U + column] for row, column in ((0, 0), (1, 1), (0, 1)))
-    largest = (u + v) / 2 + np.hypot((u - v) / 2, uv)
-    return np.asarray(np.sqrt(np.maximum(np.nan_to_num(largest, nan=1e6, posinf=1e6), 0)))
-
-
-def _block_diagonal(blocks: FloatArray) -> FloatArray:
-    """(M, 4, 2, 2) blocks to (M, 8, 8)."""
-    full = np.zeros((len(blocks), 4, 2, 4, 2))
-    for corner in range(4):
-        full[:, corner, :, corner] = blocks[:, corner]
-    return full.reshape(-1, 8, 8)

@@ -45,6 +45,7 @@ _LEAST_SHARE = np.array([0.25 if group == _SYMBOLS else 0.15 for group in _GROUP
 _LEAST_QUAD_CELLS = 30
 """A smaller piece of paint shows no shape; it is split where the network says so."""
 
+_SAME = 0.75
 _OUTLINE_SCALE = 4
 
 
@@ -73,9 +74,17 @@ class Blob:
 
 
 def find_blobs(
-    sight: Sight, classes: Sequence[str], stride: int, top_px: int, reach_px: int = 0
+    sight: Sight,
+    classes: Sequence[str],
+    stride: int,
+    top_px: int,
+    reach_px: int = 0,
+    least_odds: float = 0.0,
+    known: np.ndarray | None = None,
 ) -> tuple[list[Blob], np.ndarray]:
     """Split the paint of one image into blobs.
+
+    At other log odds paint runs together, or falls apart, otherwise: that is a further reading of it.
 
     Args:
         sight: what the network says of a band of the image.
@@ -83,15 +92,18 @@ def find_blobs(
         stride: recorded pixels per element of its ``paint``.
         top_px: image row at which the band starts.
         reach_px: image row; blobs that lie above it as a whole are too far away to be of use.
+        least_odds: log odds above which there is paint.
+        known: such a map as is returned; blobs that are about the same as one of its are left out.
 
     Returns:
         The blobs, and a map (h, w) int16 with 1 + the index of the blob that covers each element of
         ``paint``, 0 for none.
     """
     # A frame of no paint around it lets every outline close.
-    level = cv2.copyMakeBorder(sight.paint, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-1.0)
+    paint = sight.paint - np.float32(least_odds) if least_odds else sight.paint
+    level = cv2.copyMakeBorder(paint, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-1.0)
     corner_px = np.array([(stride - 1) / 2 - stride, (stride - 1) / 2 - stride + top_px])
-    level, contours, piece = _connected(level, (reach_px - top_px) / stride + 1)
+    level, contours, piece = _connected(level, (reach_px - top_px) / stride + 1, known)
     said = _hearsay(sight, classes, piece, level, len(contours))
     outlines = _outlines(level, piece, len(contours))
     owner = np.zeros_like(piece)
@@ -116,18 +128,40 @@ def find_blobs(
     return blobs, owner[1:-1, 1:-1]
 
 
-def _connected(level: np.ndarray, least_row: float) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
+def _connected(
+    level: np.ndarray, least_row: float, known: np.ndarray | None
+) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
     """Contours of paint that reaches ``least_row``, and a map of 1 + the number of each, holes filled.
 
-    They are zero crossings of the level that comes first.
+    They are zero crossings of the level that comes first. Where blobs are ``known``, (h - 2, w - 2), contours
+    are those of other pieces of paint as they are; else they are settled.
     """
     contours, _ = cv2.findContours((level > 0).view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     kept = [c for c in contours if len(c) >= 4 and _end_row(c) >= least_row]
-    level, kept = settle_pieces(level, kept)
+    if known is None:
+        level, kept = settle_pieces(level, kept)
     piece = np.zeros(level.shape, dtype=np.int16)
     for index, contour in enumerate(kept):
         cv2.drawContours(piece, [contour], -1, index + 1, cv2.FILLED)
+    if known is not None and kept:
+        other = ~_same_as_known(piece, known, len(kept))
+        number = np.concatenate([[0], other * np.cumsum(other)]).astype(np.int16)
+        kept, piece = [c for c, o in zip(kept, other.tolist(), strict=True) if o], number[piece]
     return level, kept, piece
+
+
+def _same_as_known(piece: np.ndarray, known: np.ndarray, count: int) -> BoolArray:
+    """Which (B,) pieces share :data:`_SAME` of all that they and one known blob are together."""
+    at = np.flatnonzero(piece)
+    i, j = np.divmod(at, piece.shape[1])
+    own, blob = piece.ravel()[at].astype(np.int64) - 1, known[i - 1, j - 1]
+    blobs = int(known.max(initial=0)) + 1
+    shared = np.bincount(own * blobs + blob, minlength=count * blobs).reshape(count, blobs)
+    cells, own_cells = np.bincount(known.ravel(), minlength=blobs), shared.sum(axis=1)
+    shared[:, 0] = 0
+    best = shared.argmax(axis=1)
+    common = shared[np.arange(count), best]
+    return np.asarray(common >= _SAME * (own_cells + cells[best] - common))
 
 
 def _end_row(contour: np.ndarray) -> int:
