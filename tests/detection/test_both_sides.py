@@ -105,7 +105,7 @@ def test_the_corners_of_a_dash_with_a_tail_are_those_of_its_paint(vague):
     corners = piece(5.5, 12.0)
     share = np.linspace(0, 1, 50, endpoint=False)[:, None]
     outline = np.concatenate([corners[e] * (1 - share) + corners[(e + 1) % 4] * share for e in range(4)])
-    start = QuadStart({LANE_DASH: Claim(0.9, 1.0, 0.0, 0.0, False, False)}, corners, 0, outline)
+    start = QuadStart({LANE_DASH: Claim(0.9, 1.0, 0.0, 0.0, False, False, 1.0)}, corners, 0, outline)
     options = DetectorOptions(min_confidence=0.0, vague_corners=vague)
     (found,) = fit_markings(lit("one"), VIEW, [start], foreground((7.0,)), options)
     true_px = to_image(VIEW.camera, bar(7.0, 0.0, 3.0, WIDE_M))

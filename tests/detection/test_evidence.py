@@ -55,6 +55,15 @@ def test_corners_on_the_border_of_a_shadow_are_not_valid(tmp_path):
         assert not marking.corner_valid[on_border].any()
 
 
+def test_steps_tell_what_is_overexposed():
+    camera = make_camera()
+    shapes = [diamond(6.0, 0.0)]
+    corners_px = np.stack([order_corners(to_image(camera, shape)) for shape in shapes])
+    shares = [steps_of(picture(camera, shapes, paint=paint), corners_px).overexposed for paint in (0.5, 1.5)]
+    assert shares[0] == pytest.approx(0.0)
+    assert shares[1] > 0.8
+
+
 def confidences(image: np.ndarray, folder) -> list[float]:
     options = DetectorOptions(min_confidence=0.0)
     detector = Detector.load(brightness_model(folder), options)
@@ -101,8 +110,17 @@ def test_the_fitted_weights_are_those_of_the_features_and_prefer_evidence():
     assert set(fitted) == set(SHAPES)
     kinds = [DIAMOND, LANE_DASH, STOP_LINE, CROSSWALK_BAR]
     none, all_around = np.zeros((2, len(kinds), len(FEATURES)))
-    all_around[:, FEATURES.index("odds_inside")] = 5.0
-    for name in ("certainty", "share", "four_corners", "support", "weakest_side", "sharpness"):
+    for name in ("odds_inside", "surest_inside"):
+        all_around[:, FEATURES.index(name)] = 5.0
+    for name in (
+        "certainty",
+        "share",
+        "possible_share",
+        "four_corners",
+        "support",
+        "weakest_side",
+        "sharpness",
+    ):
         all_around[:, FEATURES.index(name)] = 1.0
     for shape in SHAPES:
         assert set(fitted[shape]["alone"]["weights"]) == set(FEATURES)

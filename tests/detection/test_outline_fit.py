@@ -69,7 +69,9 @@ def fitted_on_a_blank_image(quad_vehicle: np.ndarray) -> tuple[np.ndarray, list[
     view = CameraView(camera)
     corners_px = to_image(camera, quad_vehicle)
     quad = order_corners(view.undistort(corners_px))
-    start = QuadStart({"diamond": Claim(0.9, 1.0, 0.0, 0.0, False, False)}, quad, 0, outline_of(quad, 0.1))
+    start = QuadStart(
+        {"diamond": Claim(0.9, 1.0, 0.0, 0.0, False, False, 1.0)}, quad, 0, outline_of(quad, 0.1)
+    )
     blank = np.full((camera.info.height, camera.info.width, 3), 90, dtype=np.uint8)
     owner = np.zeros((view.height // 2, camera.info.width // 2), dtype=np.int16)
     foreground = Foreground(np.zeros(owner.shape, np.float32), owner[None], 2, view.top)

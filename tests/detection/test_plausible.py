@@ -9,7 +9,13 @@ from tests.detection.pictures import bar, brightness_model, diamond, make_camera
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.paint.blobs import Blob
-from v2hdm.detection.paint.plausible import Piece, cornered_kind, plausible_kind, rival_kinds
+from v2hdm.detection.paint.plausible import (
+    Piece,
+    cornered_kind,
+    plausible_kind,
+    rival_kinds,
+    unlikely_kinds,
+)
 from v2hdm.records import (
     ARROW,
     CHEVRON,
@@ -90,6 +96,41 @@ def test_a_quadrilateral_is_read_as_every_class_that_it_may_be() -> None:
     assert rivals(RHOMBUS, {DIAMOND: 0.5, LANE_DASH: 0.4}, DIAMOND) == [], "no dash is so wide"
     cut = wide - np.array([0.0, np.ptp(wide[:, 1]) + 8.0])
     assert rivals(cut, scores, CROSSWALK_BAR) == [], "what the border cuts may be anything"
+
+
+def piece_of(outline_vehicle: np.ndarray, scores: dict[str, float]) -> Piece:
+    """A blob of that outline on the ground, as the test camera sees it."""
+    outline_px = to_image(VIEW.camera, outline_vehicle)
+    return Piece.of(Blob(scores, np.ones((3, 3)), np.zeros(2), 2, outline_px), outline_vehicle, VIEW)
+
+
+def test_what_the_network_rules_out_is_tried_where_its_size_and_shape_allow_it() -> None:
+    small = diamond(6.0, 0.0, 0.6, 0.25)
+    assert unlikely_kinds(piece_of(small, {LANE_DASH: 0.9})) == [DIAMOND], "no dash is so short"
+    assert unlikely_kinds(piece_of(small, {OTHER_PAINT: 0.9})) == [], "letters have strokes like diamonds"
+    assert unlikely_kinds(piece_of(STRIP, {LANE_LINE: 0.9})) == [], "no diamond is so slim"
+    assert unlikely_kinds(piece_of(STRIP, {ARROW: 0.9, LANE_DASH: 0.05})) == [LANE_DASH]
+
+
+def test_what_the_border_only_comes_near_to_is_tried_and_what_it_cuts_is_not() -> None:
+    near, cut = (to_image(VIEW.camera, RHOMBUS) for _ in range(2))
+    near[:, 0] -= near[:, 0].min() - 3
+    cut[:, 0] -= cut[:, 0].min() - 1
+    tried = []
+    for outline_px in (near, cut):
+        blob = Blob({ARROW: 0.6, DIAMOND: 0.3}, np.ones((3, 3)), np.zeros(2), 2, outline_px)
+        piece = Piece.of(blob, VIEW.ground(VIEW.undistort(outline_px)), VIEW)
+        assert cornered_kind(piece, ARROW) is None
+        tried.append(unlikely_kinds(piece))
+    assert tried == [[DIAMOND], []]
+
+
+def test_a_class_that_size_and_shape_rule_out_takes_no_share_from_the_others() -> None:
+    sworn = piece_of(RHOMBUS, {LANE_DASH: 0.95})
+    assert sworn.share_among_possible(DIAMOND) == pytest.approx(1.0), "no lane paint is so wide"
+    assert piece_of(RHOMBUS, {ARROW: 0.95}).share_among_possible(DIAMOND) < 0.06, "an arrow may be"
+    split = piece_of(STRIP, {LANE_DASH: 0.45, LANE_LINE: 0.45})
+    assert split.share_among_possible(LANE_DASH) == pytest.approx(0.5, abs=0.03)
 
 
 def test_a_diamond_that_has_a_shaft_and_something_of_a_symbol_is_the_head_of_an_arrow(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from v2hdm.detection.paint.plausible import (
     may_be_head,
     plausible_kind,
     rival_kinds,
+    unlikely_kinds,
 )
 from v2hdm.detection.paint.starts import starting_corners
 from v2hdm.detection.sight import look
@@ -38,6 +39,7 @@ from v2hdm.records import (
     LANE_CLASSES,
     LANE_DASH,
     LANE_LINE,
+    OTHER_PAINT,
     OUTLINED_CLASSES,
     Camera,
     FloatArray,
@@ -56,8 +58,9 @@ tells which reading of a place is right."""
 
 _LEAST_COVER = 0.6
 _LEAST_COVER_OF_SYMBOL = 0.8
+_LEAST_COVER_OF_UNLIKELY = 0.9
 """A blob that shares less than this with the best quadrilateral around it is none, the more so if the network
-takes it for an arrow or a chevron."""
+takes it for an arrow or a chevron, and most of all if it is tried against what the network says."""
 
 
 @dataclass(frozen=True)
@@ -153,8 +156,9 @@ class Detector:
         candidates = []
         for index, (blob, part) in enumerate(zip(blobs, parts, strict=True)):
             piece = Piece.of(blob, on_ground[part], view)
-            found = plausible_kind(piece)
-            if found is None or found[1] < _LEAST_SCORE:
+            # What is of no class's size may be a quadrilateral all the same.
+            found = plausible_kind(piece) or (OTHER_PAINT, sum(blob.class_score.values()))
+            if found[1] < _LEAST_SCORE:
                 continue
             head = head_of(on_ground[part], heads) if found[0] == LANE_DASH else None
             have_shafts.add(head)
@@ -178,13 +182,11 @@ class Detector:
         """The quadrilaterals to start the corner fit from, of a reading's blobs that are one within range."""
         starts = []
         for c in candidates:
-            kind = cornered_kind(c.piece, c.kind)
-            if kind is None:
+            kinds, least = _tried_as(c)
+            if not kinds:
                 continue
-            start = starting_corners(kind, c.outline_pinhole_px, c.outline_vehicle, view)
-            least = _LEAST_COVER if c.kind not in OUTLINED_CLASSES else _LEAST_COVER_OF_SYMBOL
+            start = starting_corners(kinds[0], c.outline_pinhole_px, c.outline_vehicle, view)
             if start is not None and start[1] >= least:
-                kinds = [kind, *rival_kinds(c.piece, kind)]
                 claims = {name: _claim(c, name) for name in kinds}
                 starts.append(QuadStart(claims, start[0], c.index, c.outline_pinhole_px, plane))
         if not starts:
@@ -206,6 +208,15 @@ class Detector:
         return MarkingDetection(candidate.kind, candidate.score, *nothing, outline_polygon(candidate.blob))
 
 
+def _tried_as(candidate: _Candidate) -> tuple[list[str], float]:
+    """The classes as which a candidate is tried as a quadrilateral, and how much of that it has to fill."""
+    kind = cornered_kind(candidate.piece, candidate.kind)
+    if kind is None:
+        return unlikely_kinds(candidate.piece), _LEAST_COVER_OF_UNLIKELY
+    least = _LEAST_COVER if candidate.kind not in OUTLINED_CLASSES else _LEAST_COVER_OF_SYMBOL
+    return [kind, *rival_kinds(candidate.piece, kind)], least
+
+
 def _is_among(symbol: MarkingDetection, quads: list[MarkingDetection]) -> bool:
     """Whether a symbol is the same paint as one of the quadrilaterals."""
     centres = [quad.corners_px.mean(axis=0) for quad in quads]
@@ -225,6 +236,7 @@ def _claim(candidate: _Candidate, kind: str) -> Claim:
         symbol_share=sum(share.get(name, 0.0) for name in SYMBOLS),
         touches_symbol=candidate.blob.touches_symbol,
         at_head=candidate.at_head,
+        possible_share=candidate.piece.share_among_possible(kind),
     )
 
 

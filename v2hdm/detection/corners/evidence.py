@@ -18,8 +18,11 @@ from v2hdm.records import BoolArray, FloatArray
 
 FEATURES = (
     "odds_inside",
+    "surest_inside",
+    "paint_beside",
     "certainty",
     "share",
+    "possible_share",
     "line_share",
     "symbol_share",
     "touches_symbol",
@@ -29,6 +32,7 @@ FEATURES = (
     "contrast",
     "weakest_side",
     "sharpness",
+    "overexposed",
     "goes_on",
     "goes_furthest_on",
     "at_border",
@@ -39,13 +43,15 @@ FEATURES = (
 )
 """Names of the columns of :func:`gather`, in order.
 
-From the network: mean log odds of paint inside, mean probability of paint over the blob, the shares in it of
-the class, of lane lines and of symbols, whether the blob was split off an arrow or a letter, and whether it
-ends where what may be the head of an arrow begins. From the image: whether it gave four corners, the share of
-profiles across the sides that show paint inside, the log of the typical step, the step of the weakest side in
-parts of that, how much of it is within a px of the side, how far the steps go on beyond the corners, on the
-whole and where they do so furthest, whether a corner is at the image's border, the log of the width in px. On
-the ground, m: log of length and width, and of how much longer the longest side is than the shortest."""
+From the network: log odds of paint inside, their mean and their ninth decile, and their mean beside that
+side where they are highest; mean probability of paint over the blob, the share in it of the class, its share
+among the classes that the blob's size leaves possible, the shares of lane lines and of symbols, whether the
+blob was split off an arrow or a letter, and whether it ends where what may be the head of an arrow begins.
+From the image: whether it gave four corners, the share of profiles across the sides that show paint inside,
+the log of the typical step, the step of the weakest side in parts of that, how much of it is within a px of
+the side, how much of the inside is overexposed, how far the steps go on beyond the corners, on the whole and
+where they do so furthest, whether a corner is at the image's border, the log of the width in px. On the
+ground, m: log of length and width, and of how much longer the longest side is than the shortest."""
 
 _PROFILES = 12
 _FAR_PX = 2.0
@@ -60,11 +66,18 @@ _RUNS_ON = 0.6
 """A step of this share of the side's own is the side's continuation: half the corners where there is one all
 the way are off by half a px and more, of the others one in eight."""
 
+_OVEREXPOSED = 0.99
+"""Grey values that are not at the sensor's limit are below this."""
+
 _LEAST_STEP = 0.05
 _SUPPORT_SHARE = 0.4
 """A profile supports its side with a step above noise, and above this share of the typical one."""
 
 _GRID = (np.arange(6) + 0.5) / 6
+_SUREST = -4
+"""Place of the ninth decile of what is found on that grid, in order."""
+
+_BESIDE_PX = 2.5
 _BORDER_PX = 6.0
 
 
@@ -73,7 +86,7 @@ class Claim:
     """What the network claims of a blob: ``certainty`` that it is paint, and what classes share in that.
 
     ``share`` is the class's own, ``line_share`` that of lane lines, ``symbol_share`` that of arrows, chevrons
-    and other paint.
+    and other paint; ``possible_share`` is the class's among those that the blob's size leaves possible.
     """
 
     certainty: float
@@ -82,6 +95,7 @@ class Claim:
     symbol_share: float
     touches_symbol: bool
     at_head: bool
+    possible_share: float
 
 
 @dataclass(frozen=True)
@@ -91,7 +105,8 @@ class Steps:
     ``along`` (M, 4, n) at profiles of each side, of which ``typical`` (M,) is the median; ``near`` (M,) that
     of the part of them within a px of the sides; ``by_side`` (M, 4) the median of each side; ``going_on``
     (M, 4, 2, k) how much of a side's step is still there, from -1 to 2, on its line's continuation beyond
-    its start and its end. A step is 0 where it is unknown.
+    its start and its end. A step is 0 where it is unknown. ``overexposed`` (M,) is the share of the profiles'
+    inner ends where the sensor was at its limit.
     """
 
     along: FloatArray
@@ -99,6 +114,7 @@ class Steps:
     near: FloatArray
     by_side: FloatArray
     going_on: FloatArray
+    overexposed: FloatArray
 
     def take(self, rows: np.ndarray) -> Steps:
         """Those of some of the quadrilaterals."""
@@ -135,7 +151,8 @@ def grey_steps(grey: GreyBand, corners_px: FloatArray) -> Steps:
     whole = np.maximum(np.maximum(by_side, typical[:, None]), _LEAST_STEP)
     ratio = steps[..., first:second] / whole[..., None]
     going_on = np.minimum(np.maximum(ratio, -1.0), 2.0).reshape(*length.shape, 2, -1)
-    return Steps(along, typical, median(near.reshape(len(steps), -1)), by_side, going_on)
+    overexposed = (values[0, ..., :first] > _OVEREXPOSED).mean(axis=(1, 2))
+    return Steps(along, typical, median(near.reshape(len(steps), -1)), by_side, going_on, overexposed)
 
 
 def median(values: FloatArray) -> FloatArray:
@@ -172,10 +189,16 @@ def gather(
     good = steps.along > np.maximum(_SUPPORT_SHARE * typical, _LEAST_STEP)[:, None, None]
     going_on = median(steps.going_on)
     at_border = ~view.inside(corners_px.reshape(-1, 2), _BORDER_PX).reshape(-1, 4).all(axis=1)
+    inside, beside = _paint_odds(foreground, corners_px)
+    sharpness = np.clip(steps.near / typical, 0.0, 1.2)
+    log_width_px = np.log(np.maximum(width(corners_px), 0.3))
     columns = {
-        "odds_inside": foreground.odds_at(_inner_grid(corners_px)).mean(axis=1),
+        "odds_inside": inside.mean(axis=1),
+        "surest_inside": np.sort(inside, axis=1)[:, _SUREST],
+        "paint_beside": beside.mean(axis=2).max(axis=1),
         "certainty": np.array([claim.certainty for claim in claims]),
         "share": np.array([claim.share for claim in claims]),
+        "possible_share": np.array([claim.possible_share for claim in claims]),
         "line_share": np.array([claim.line_share for claim in claims]),
         "symbol_share": np.array([claim.symbol_share for claim in claims]),
         "touches_symbol": np.array([claim.touches_symbol for claim in claims]),
@@ -184,16 +207,27 @@ def gather(
         "support": good.mean(axis=(1, 2)),
         "contrast": np.log(typical),
         "weakest_side": np.clip(steps.by_side.min(axis=1) / typical, -1.0, 1.5),
-        "sharpness": np.clip(steps.near / typical, 0.0, 1.2),
+        "sharpness": sharpness,
+        "overexposed": steps.overexposed,
         "goes_on": going_on.mean(axis=(1, 2)),
         "goes_furthest_on": going_on.max(axis=(1, 2)),
         "at_border": at_border,
-        "log_width_px": np.log(np.maximum(width(corners_px), 0.3)),
+        "log_width_px": log_width_px,
         "log_length": log_length,
         "log_width": log_width,
         "skew": np.minimum(log_sides[:, 3] - log_sides[:, 0], 2.0),
     }
     return np.nan_to_num(np.column_stack([columns[name] for name in FEATURES]).astype(np.float64))
+
+
+def _paint_odds(foreground: Foreground, corners_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Log odds of paint all over the inside (M, 36) of quadrilaterals, and beside each side (M, 4, 6)."""
+    tangent, normal, length = side_frames(corners_px)
+    along = (_GRID * length[..., None])[..., None] * tangent[:, :, None]
+    beside = corners_px[:, :, None] + along + _BESIDE_PX * normal[:, :, None]
+    inner = _inner_grid(corners_px)
+    odds = foreground.odds_at(np.concatenate([inner, beside.reshape(len(beside), -1, 2)], axis=1))
+    return odds[:, : inner.shape[1]], odds[:, inner.shape[1] :].reshape(beside.shape[:-1])
 
 
 def _inner_grid(corners_px: FloatArray) -> FloatArray:

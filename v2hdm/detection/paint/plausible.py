@@ -53,12 +53,20 @@ gives only this share of its lane score to dashes: seen locally, dash and line a
 _SURE_DASH_SHARE = 0.5
 """With more than this share what is too long for one dash is tried as several."""
 
-_LEAST_RIVAL_SHARE = 0.05
+_LEAST_RIVAL_SHARE = 0.02
 """With this share another class is tried, too: all evidence decides between them."""
+
+_DOUBT_ABOUT_CLASS = 0.05
+"""So much of what the network gives all classes it may give the wrong ones."""
 
 _LEAST_SHARE_OF_LINE = 0.02
 """What the network takes for a line is tried if it leaves any class with four corners this share: all that
 had less came to nothing."""
+
+_MOST_SHARE_OF_OTHERS = 0.5
+_MOST_ELONGATED_DIAMOND = 5.0
+"""Compact paint may be a diamond whatever the network takes it for, if lines and symbols have no more than
+this share each and it is at most so many times as long as wide."""
 
 _LEAST_SECOND_SHARE = 0.12
 """What the network takes for a symbol is tried as a quadrilateral if it leaves that class this share."""
@@ -76,13 +84,16 @@ _HEAD_WIDENING = 1.7
 """The head of an arrow begins so far from the end of the shaft at most, and is so many times as wide."""
 
 _BORDER_PX = 4.0
+_TOUCHED_PX = 2.0
+"""What comes this near to the image's border may go on beyond it, what comes so near does."""
 
 
 @dataclass(frozen=True)
 class Piece:
     """A blob of which is known how large it is on the ground, m, and whether it keeps off the image's border.
 
-    Its length and width are those of the smallest rectangle around it; nan where it shows no ground.
+    Its length and width are those of the smallest rectangle around it; nan where it shows no ground. It is
+    ``whole`` if the border can have no part in its shape, ``clear`` if it is not seen to touch it.
     """
 
     class_score: dict[str, float]
@@ -90,12 +101,14 @@ class Piece:
     length_m: float
     width_m: float
     whole: bool
+    clear: bool
 
     @classmethod
     def of(cls, blob: Blob, outline_vehicle: FloatArray, view: CameraView) -> Piece:
         """That of a blob with that outline on the ground (N, 2), m, as its camera sees it."""
         whole = bool(view.inside(blob.outline_px, _BORDER_PX).all())
-        return cls(blob.class_score, blob.touches_symbol, *_ground_size(outline_vehicle), whole)
+        clear = whole or bool(view.inside(blob.outline_px, _TOUCHED_PX).all())
+        return cls(blob.class_score, blob.touches_symbol, *_ground_size(outline_vehicle), whole, clear)
 
     @property
     def slim(self) -> bool:
@@ -113,6 +126,22 @@ class Piece:
             return False
         length, width = _SIZE_LIMITS_M[kind]
         return length[0] <= self.length_m <= length[1] and width[0] <= self.width_m <= width[1]
+
+    def share_among_possible(self, kind: str) -> float:
+        """The share that the network gives a class in those that its size and shape leave possible.
+
+        Where it gives all of those next to nothing it knows nothing against any, and the share is nearly one.
+        """
+        possible = [name for name in self.class_score if name == kind or self._may_be(name)]
+        doubt = _DOUBT_ABOUT_CLASS * sum(self.class_score.values())
+        score = self.class_score.get(kind, 0.0) + doubt
+        return score / max(sum(self.class_score[name] for name in possible) + doubt, 1e-9)
+
+    def _may_be(self, kind: str) -> bool:
+        """Whether its size and shape leave a class possible; symbols have no shape of their own."""
+        if kind in LANE_CLASSES:
+            return not self.whole or (self.slim and self.fits(kind))
+        return kind not in CORNERED_CLASSES or self.fits(kind)
 
     def fitting(self, least_share: float = 0.0) -> list[str]:
         """Classes with four corners that are of its size and shape, of that share at least, by likelihood."""
@@ -174,6 +203,25 @@ def rival_kinds(piece: Piece, kind: str) -> list[str]:
     if not piece.whole:
         return []
     return [name for name in piece.fitting(_LEAST_RIVAL_SHARE) if name != kind]
+
+
+def unlikely_kinds(piece: Piece) -> list[str]:
+    """The classes as which a blob that :func:`cornered_kind` rules out is tried if it fills a quadrilateral.
+
+    Beside the classes that may well be, that is a diamond: the network takes many for short dashes.
+    """
+    if not piece.clear:
+        return []
+    found = piece.fitting(_LEAST_RIVAL_SHARE)
+    whole_score = sum(piece.class_score.values())
+    others = max(
+        piece.class_score.get(LANE_LINE, 0.0),
+        sum(piece.class_score.get(name, 0.0) for name in SYMBOLS),
+    )
+    compact = piece.fits(DIAMOND) and piece.length_m <= _MOST_ELONGATED_DIAMOND * piece.width_m
+    if DIAMOND not in found and compact and others <= _MOST_SHARE_OF_OTHERS * whole_score:
+        found.append(DIAMOND)
+    return found
 
 
 def _second_choice(piece: Piece) -> str | None:
