@@ -43,4 +43,4 @@ def without_corner(survey: SurveyOptions, control: ControlPoints | None) -> Floa
     """The surveyed points (N, 2) that ``control`` makes no use of."""
     points = np.array(survey.points_map, dtype=np.float64).reshape(-1, 2)
     used = np.zeros((0, 2)) if control is None else control.points_map
-    return points[~(points[:, None] == used).all(axis=-1).any(axis=-1)]
+    return np.asarray(points[~(points[:, None] == used).all(axis=-1).any(axis=-1)])

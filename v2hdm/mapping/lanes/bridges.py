@@ -8,6 +8,7 @@ are one lane, and those lines say where it runs between them.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from v2hdm.mapping.lanes.paths import Path
@@ -43,7 +44,7 @@ def _shortest_bridge(
     """Two of the paths, each with its ends, and what they are together: the shortest gap to be bridged."""
     if len(ended) < 2:
         return None
-    for a, end_a, b, end_b in _gaps(np.stack([ends for _, ends in ended])):
+    for a, end_a, b, end_b in _gaps(np.stack([ends for _, ends in ended])).tolist():
         before = _turned(ended[a][0], end_a == _FIRST)
         after = _turned(ended[b][0], end_b == _LAST)
         between = _bridge(before.points_map[-1], after.points_map[0], guides, tree, options)
@@ -52,8 +53,8 @@ def _shortest_bridge(
     return None
 
 
-def _gaps(ends: FloatArray) -> list[list[int]]:
-    """Path, end, path, end of all gaps whose way is roughly that of both paths, the shortest first.
+def _gaps(ends: FloatArray) -> NDArray[np.int64]:
+    """Path, end, path, end (G, 4) of all gaps whose way is roughly that of both paths, the shortest first.
 
     ``ends`` (P, 2, 2, 2) are position and outward direction of both ends of every path.
     """
@@ -67,7 +68,7 @@ def _gaps(ends: FloatArray) -> list[list[int]]:
     able = straight & (gap_m > 0) & (gap_m <= _MAX_BRIDGE_M) & (path[:, None] < path)
     i, j = np.nonzero(able)
     order = np.argsort(gap_m[i, j], kind="stable")
-    return np.column_stack([path[i], i % 2, path[j], j % 2])[order].tolist()
+    return np.asarray(np.column_stack([path[i], i % 2, path[j], j % 2])[order])
 
 
 def _turned(path: Path, flip: bool) -> Path:
