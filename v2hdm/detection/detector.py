@@ -114,11 +114,11 @@ class Detector:
             sight = look(self.network, image_bgr, view, self.options.mirrored)
         with lap("blobs"):
             band = info.classes, info.paint_stride, view.far_row, self._reach_px[camera.info.name]
-            blobs, owner = find_blobs(sight, *band)
-            candidates = self._candidates(blobs, view)
+            first = find_blobs(sight, *band)
+            candidates = self._candidates(first.blobs, view)
             odds = _FURTHER_ODDS if self.options.mirrored else _FURTHER_ODDS[:1]
-            further = [find_blobs(sight, *band, least, owner) for least in odds]
-        owners = np.stack([owner, *(other for _, other in further)])
+            further = [find_blobs(sight, *band, least, first) for least in odds]
+        owners = np.stack([reading.owner for reading in (first, *further)])
         foreground = Foreground(sight.paint, owners, info.paint_stride, view.far_row)
         with lap("lanes"):
             lanes = trace_lanes(
@@ -126,10 +126,8 @@ class Detector:
             )
             lanes += link_anchors(sight.anchors, view, lanes, self.options.lane_step_m, foreground)
         with lap("corners"):
-            readings = [self._candidates(others, view) for others, _ in further]
-            starts = [
-                s for plane, of in enumerate([candidates, *readings]) for s in self._starts(of, view, plane)
-            ]
+            readings = [candidates, *(self._candidates(reading.blobs, view) for reading in further)]
+            starts = [s for plane, of in enumerate(readings) for s in self._starts(of, view, plane)]
             markings = fit_markings(image_bgr, view, starts, foreground, self.options)
             symbols = [self._symbol(c, view) for c in candidates]
             markings += [s for s in symbols if s is not None and not _is_among(s, markings)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -73,6 +74,19 @@ class Blob:
         return max(self.class_score, key=self.class_score.__getitem__)
 
 
+class Reading(NamedTuple):
+    """The paint of an image at some log odds.
+
+    ``owner`` (h, w) int16 holds 1 + the index of the blob that covers each element of the network's paint, 0
+    for none; ``pieces`` (h, w) int16 is one number on each connected, settled piece of paint, before
+    any is split by its classes.
+    """
+
+    blobs: list[Blob]
+    owner: np.ndarray
+    pieces: np.ndarray
+
+
 def find_blobs(
     sight: Sight,
     classes: Sequence[str],
@@ -80,8 +94,8 @@ def find_blobs(
     top_px: int,
     reach_px: int = 0,
     least_odds: float = 0.0,
-    known: np.ndarray | None = None,
-) -> tuple[list[Blob], np.ndarray]:
+    known: Reading | None = None,
+) -> Reading:
     """Split the paint of one image into blobs.
 
     At other log odds paint runs together, or falls apart, otherwise: that is a further reading of it.
@@ -93,11 +107,7 @@ def find_blobs(
         top_px: image row at which the band starts.
         reach_px: image row; blobs that lie above it as a whole are too far away to be of use.
         least_odds: log odds above which there is paint.
-        known: such a map as is returned; blobs that are about the same as one of its are left out.
-
-    Returns:
-        The blobs, and a map (h, w) int16 with 1 + the index of the blob that covers each element of
-        ``paint``, 0 for none.
+        known: another reading; pieces of paint that are about the same in it are left out.
     """
     # A frame of no paint around it lets every outline close.
     paint = sight.paint - np.float32(least_odds) if least_odds else sight.paint
@@ -125,16 +135,16 @@ def find_blobs(
         for part in _split(inside, level[box], sight, box, classes, origin_px, stride):
             blobs.append(part)
             owner[box][part.level > 0] = len(blobs)
-    return blobs, owner[1:-1, 1:-1]
+    return Reading(blobs, owner[1:-1, 1:-1], piece[1:-1, 1:-1])
 
 
 def _connected(
-    level: np.ndarray, least_row: float, known: np.ndarray | None
+    level: np.ndarray, least_row: float, known: Reading | None
 ) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
     """Contours of paint that reaches ``least_row``, and a map of 1 + the number of each, holes filled.
 
-    They are zero crossings of the level that comes first. Where blobs are ``known``, (h - 2, w - 2), contours
-    are those of other pieces of paint as they are; else they are settled.
+    They are zero crossings of the level that comes first. Beside a ``known`` reading contours are
+    those of other pieces of paint, as they are; else they are settled.
     """
     contours, _ = cv2.findContours((level > 0).view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     kept = [c for c in contours if len(c) >= 4 and _end_row(c) >= least_row]
@@ -144,20 +154,20 @@ def _connected(
     for index, contour in enumerate(kept):
         cv2.drawContours(piece, [contour], -1, index + 1, cv2.FILLED)
     if known is not None and kept:
-        other = ~_same_as_known(piece, known, len(kept))
+        other = ~_same_as_known(piece, known.pieces, len(kept))
         number = np.concatenate([[0], other * np.cumsum(other)]).astype(np.int16)
         kept, piece = [c for c, o in zip(kept, other.tolist(), strict=True) if o], number[piece]
     return level, kept, piece
 
 
 def _same_as_known(piece: np.ndarray, known: np.ndarray, count: int) -> BoolArray:
-    """Which (B,) pieces share :data:`_SAME` of all that they and one known blob are together."""
+    """Which (B,) pieces share :data:`_SAME` of all that they and one known piece are together."""
     at = np.flatnonzero(piece)
     i, j = np.divmod(at, piece.shape[1])
-    own, blob = piece.ravel()[at].astype(np.int64) - 1, known[i - 1, j - 1]
-    blobs = int(known.max(initial=0)) + 1
-    shared = np.bincount(own * blobs + blob, minlength=count * blobs).reshape(count, blobs)
-    cells, own_cells = np.bincount(known.ravel(), minlength=blobs), shared.sum(axis=1)
+    own, other = piece.ravel()[at].astype(np.int64) - 1, known[i - 1, j - 1]
+    others = int(known.max(initial=0)) + 1
+    shared = np.bincount(own * others + other, minlength=count * others).reshape(count, others)
+    cells, own_cells = np.bincount(known.ravel(), minlength=others), shared.sum(axis=1)
     shared[:, 0] = 0
     best = shared.argmax(axis=1)
     common = shared[np.arange(count), best]
