@@ -16,6 +16,7 @@ from v2hdm.simulate.training.hardships import (
     Hardships,
     blue_shade,
     faint,
+    kerbs,
     overexposed,
     things_beside,
     tight_bend,
@@ -164,7 +165,12 @@ def test_no_lens_folds_an_image_over_itself() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", [field.name for field in fields(Hardships) if field.name not in ("things_beside", "tight_bends")]
+    "name",
+    [
+        field.name
+        for field in fields(Hardships)
+        if field.name not in ("things_beside", "tight_bends", "kerbs")
+    ],
 )
 def test_hardships_change_what_paint_looks_like_and_not_where_it_is(name: str) -> None:
     hardships = Hardships(**{name: 1.0})
@@ -178,8 +184,8 @@ def test_hardships_change_what_paint_looks_like_and_not_where_it_is(name: str) -
     assert any((plain.image != hard.image).any() for plain, hard in pairs)
 
 
-def test_things_beside_markings_hide_paint_and_add_none() -> None:
-    hard = Hardships(things_beside=4.0)
+@pytest.mark.parametrize("hard", [Hardships(things_beside=4.0), Hardships(kerbs=1.0)])
+def test_things_beside_markings_hide_paint_and_add_none(hard: Hardships) -> None:
     pairs = [
         (training_sample(5, index, 160, 96), training_sample(5, index, 160, 96, hardships=hard))
         for index in range(12)
@@ -189,6 +195,30 @@ def test_things_beside_markings_hide_paint_and_add_none() -> None:
         assert (crowded.labels[changed] == 0).all()
         assert crowded.hidden[plain.hidden].all()
     assert any((plain.hidden != crowded.hidden).any() for plain, crowded in pairs)
+
+
+def test_kerbs_lie_along_a_line_as_narrow_as_paint_and_leave_gaps() -> None:
+    along = np.arange(0, 60, 0.5)
+    line = np.column_stack([along, 1.5 + 0.004 * along**2])
+    narrow, lengths = 0, []
+    for seed in range(20):
+        boxes = kerbs(np.random.default_rng(seed), [line], 1.0)
+        assert len(boxes) > 4
+        for box in boxes:
+            centre = np.array(box.centre_map)
+            away_m = np.linalg.norm(line - centre, axis=1)
+            nearest = int(away_m.argmin())
+            assert away_m[nearest] < 7.0
+            ahead = line[min(nearest + 1, len(line) - 1)] - line[max(nearest - 1, 0)]
+            assert abs(np.arctan2(ahead[1], ahead[0]) - box.yaw_rad) < 0.1
+            assert box_footprint(box)[:, 0].min() > 3
+            narrow += box.size_m[1] <= 0.3
+            lengths += [box.size_m[0]] if box.size_m[1] <= 0.3 else []
+    assert narrow > 80
+    assert 0.5 < min(lengths) < 2
+    assert 5 < max(lengths) < 8
+    assert kerbs(np.random.default_rng(0), [line], 0.0) == ()
+    assert kerbs(np.random.default_rng(0), [], 1.0) == ()
 
 
 def test_things_stand_beside_their_marking_and_not_on_it_or_on_the_camera() -> None:
