@@ -128,8 +128,10 @@ def main() -> None:
     parser.add_argument("--write", action="store_true")
     parsed = parser.parse_args()
     cv2.setNumThreads(1)
-    options = DetectorOptions(model=parsed.model, max_range_m=24.0, min_confidence=0.0)
-    detectors = [Detector.load(options=replace(options, mirrored=twice)) for twice in (False, True)]
+    vehicle = DetectorOptions(model=parsed.model, max_range_m=24.0, min_confidence=0.0)
+    further_odds = DetectorOptions.for_mapping().further_odds
+    looks = vehicle, replace(vehicle, mirrored=True, further_odds=further_odds)
+    detectors = [Detector.load(options=look) for look in looks]
     gathered = Gathered()
     for index, shown in renders_to_fit(parsed.images, SEED):
         for detector in detectors:

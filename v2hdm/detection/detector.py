@@ -51,11 +51,6 @@ _LEAST_SCORE = 0.3
 """A blob of a lesser score is nothing. What may be a quadrilateral is then judged by all evidence; of lanes
 and symbols there is no more, so they need ``DetectorOptions.min_score``."""
 
-_FURTHER_ODDS = (1.0, -1.0)
-"""Log odds of paint at which it is read anew: what runs together at 0 often comes apart at the first, what
-shadow, wear or blur parts at 0 is often whole at the second, asked for where time is no matter. All evidence
-tells which reading of a place is right."""
-
 _LEAST_COVER = 0.6
 _LEAST_COVER_OF_SYMBOL = 0.8
 _LEAST_COVER_OF_UNLIKELY = 0.9
@@ -116,8 +111,7 @@ class Detector:
             band = info.classes, info.paint_stride, view.far_row, self._reach_px[camera.info.name]
             first = find_blobs(sight, *band)
             candidates = self._candidates(first.blobs, view)
-            odds = _FURTHER_ODDS if self.options.mirrored else _FURTHER_ODDS[:1]
-            further = [find_blobs(sight, *band, least, first) for least in odds]
+            further = [find_blobs(sight, *band, odds, first) for odds in self.options.further_odds]
         owners = np.stack([reading.owner for reading in (first, *further)])
         foreground = Foreground(sight.paint, owners, info.paint_stride, view.far_row)
         with lap("lanes"):
