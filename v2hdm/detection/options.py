@@ -40,7 +40,7 @@ class DetectorOptions:
     min_confidence: float = 0.7
     max_corner_sigma_px: float = 0.8
     vague_corners: bool = False
-    further_odds: tuple[float, ...] = (1.0,)
+    further_odds: tuple[float, ...] = ()
     mirrored: bool = False
     border_px: float = 4.0
     lane_step_m: float = 0.5
