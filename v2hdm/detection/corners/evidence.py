@@ -69,6 +69,10 @@ the way are off by half a px and more, of the others one in eight."""
 _OVEREXPOSED = 0.99
 """Grey values that are not at the sensor's limit are below this."""
 
+_RUNS_ON_AT_BOTH = 0.3
+_LEAST_RATIO, _MOST_RATIO = 0.7, 1.5
+"""Of sides outside these a tenth of the corners are off by 3 px and more, elsewhere one in two hundred."""
+
 _LEAST_STEP = 0.05
 _SUPPORT_SHARE = 0.4
 """A profile supports its side with a step above noise, and above this share of the typical one."""
@@ -128,6 +132,19 @@ class Steps:
         """
         start, end = np.moveaxis(self.going_on.min(axis=3) > _RUNS_ON, 2, 0)
         return np.asarray(start | preceding(end, -1))
+
+
+    def uneven(self) -> BoolArray:
+        """Corners (M, 4) of a side whose step is not that of the others, or runs on at both of its ends.
+
+        Paint and ground differ by the same factor all around, in sun and in shade. A side where they differ
+        less is that of worn paint, where they differ more, or the same beyond both corners, that of a shadow
+        across the marking: in every image it is as sharp as the paint's own, and in the same wrong place.
+        """
+        ratio = self.by_side / np.maximum(self.typical, _LEAST_STEP)[:, None]
+        both = self.going_on.min(axis=(2, 3)) > _RUNS_ON_AT_BOTH
+        side = (ratio < _LEAST_RATIO) | (ratio > _MOST_RATIO) | both
+        return np.asarray(side | preceding(side, -1))
 
 
 def grey_steps(grey: GreyBand, corners_px: FloatArray) -> Steps:

@@ -23,7 +23,7 @@ from v2hdm.detection.corners.quad import is_convex, side_frames, width
 from v2hdm.detection.corners.quad_fit import fit_quads, unbow_corners
 from v2hdm.detection.corners.rivals import surest_readings
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.records import LANE_DASH, BoolArray, FloatArray, MarkingDetection
+from v2hdm.records import DIAMOND, LANE_DASH, BoolArray, FloatArray, MarkingDetection
 
 TYPICAL_BLUR_PX = 0.75
 """Point spread of a focused camera, pixel aperture included: what is assumed until it is measured."""
@@ -42,6 +42,9 @@ _BLUR_LIMITS_PX = (0.45, 1.5)
 _AROUND_PX = 16
 _BLOOM_SIGMA_PX = 0.5
 """Where the sensor was at its limit, edges are this far from where they seem to be."""
+_UNEVEN_SIGMA_PX = 2.0
+"""RMS error of corners at worn and shaded sides."""
+
 _MAX_OUTLINE_SIGMA_PX = 2.0
 _MAX_OUTLINE_GAP_PX = 4.0
 """Corners of the outline are this far from those of the image at most where it is the marking's."""
@@ -74,7 +77,7 @@ class _Fitted:
     """M starts, the corners ``found``, and each in every class that it may be of, R rows in all.
 
     ``row_start`` (R,) is the start of a row, ``kinds`` its class, ``ground`` (R, 4, 2) its corners on the
-    ground, ``evidence`` (R, F) what there is for it.
+    ground, ``evidence`` (R, F) what there is for it. ``uneven`` (M, 4) are corners of doubtful sides.
     """
 
     starts: list[QuadStart]
@@ -83,6 +86,7 @@ class _Fitted:
     kinds: list[str]
     ground: FloatArray
     evidence: FloatArray
+    uneven: BoolArray
 
     def judged(self) -> tuple[list[str], FloatArray]:
         """The class (M,) of each for which there is most evidence, and its confidence."""
@@ -114,6 +118,7 @@ def fit_markings(
     if options.vague_corners:
         _take_outlines(found, fitted.starts, view, options)
         found.valid[is_cut(found, view)] = False
+    _doubt_uneven(found, fitted.uneven, kinds, options.vague_corners)
     plane = np.array([start.plane for start in fitted.starts])
     believed = surest_readings(found.px, plane, score) & (score >= options.min_confidence)
     return [
@@ -162,7 +167,7 @@ def _fitted(
         steps.take(row_start), foreground, view, found.px[row_start], ground, claims, found.valid[row_start]
     )
     kinds = [kind for s in starts for kind in s.claims]
-    return _Fitted(starts, found, row_start, kinds, ground, evidence)
+    return _Fitted(starts, found, row_start, kinds, ground, evidence, steps.uneven())
 
 
 def _stacked(starts: list[QuadStart], view: CameraView) -> tuple[FloatArray, FloatArray]:
@@ -311,6 +316,18 @@ def _take_outlines(
         found.covariance[m, columns], found.covariance[m, :, columns] = 0.0, 0.0
         found.covariance[m][np.ix_(columns, columns)] = matrix[np.ix_(columns, columns)]
         found.valid[m, corner] = True
+
+
+def _doubt_uneven(found: Corners, uneven: BoolArray, kinds: list[str], vague: bool) -> None:
+    """Corners (M, 4) of doubtful sides are not valid.
+
+    Those of diamonds are vague: wear and shadow shorten a diamond by little, a dash by as much as they like.
+    """
+    kept = uneven & found.valid & vague & (np.array(kinds) == DIAMOND)[:, None]
+    marking, corner = np.nonzero(kept)
+    for place in (2 * corner, 2 * corner + 1):
+        found.covariance[marking, place, place] += _UNEVEN_SIGMA_PX**2
+    found.valid &= ~uneven | kept
 
 
 def _measured_blur(edges: EdgeFit) -> float | None:
