@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 
 from tests.benchmarks.detector_quality import Example, example, polygon_overlap
-from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, SHAPES, TOLD, confidence, shape_of, told
+from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, SHAPES, TOLD, shape_of, told
 from v2hdm.detection.corners.evidence import FEATURES, gather
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
@@ -57,24 +57,20 @@ class Gathered:
     def add(self, index: int, shown: Example, detector: Detector) -> None:
         """What the detector proposes in one image."""
         corners_px: list[FloatArray] = []
-        last: list[tuple[FloatArray, list[str], FloatArray]] = []
 
         def gather_spy(*given: Any) -> FloatArray:
             corners_px.extend(given[3])
             return gather(*given)
 
         def spy(evidence: FloatArray, kinds: list[str], ground: FloatArray) -> FloatArray:
-            # What is in doubt is read further, and all readings are judged together, last of all.
-            last[:] = [(evidence, kinds, ground)]
-            return confidence(evidence, kinds, ground)
+            self.evidence.extend(evidence)
+            self.kind.extend(kinds)
+            self.ground.extend(ground)
+            return np.ones(len(evidence))
 
         look, first = 1 + max(self.look, default=-1), len(self.kind)
         with patch(f"{REFINE}.gather", gather_spy), patch(f"{REFINE}.confidence", spy):
             detector.detect(shown.image, shown.camera)
-        for evidence, kinds, ground in last:
-            self.evidence.extend(evidence)
-            self.kind.extend(kinds)
-            self.ground.extend(ground)
         for kind, corners in zip(self.kind[first:], corners_px, strict=True):
             self.true.append(is_true(shown, kind, corners))
             self.image.append(index)
@@ -128,10 +124,8 @@ def main() -> None:
     parser.add_argument("--write", action="store_true")
     parsed = parser.parse_args()
     cv2.setNumThreads(1)
-    vehicle = DetectorOptions(model=parsed.model, max_range_m=24.0, min_confidence=0.0)
-    further_odds = DetectorOptions.for_mapping().further_odds
-    looks = vehicle, replace(vehicle, mirrored=True, further_odds=further_odds)
-    detectors = [Detector.load(options=look) for look in looks]
+    options = DetectorOptions(model=parsed.model, max_range_m=24.0, min_confidence=0.0)
+    detectors = [Detector.load(options=replace(options, mirrored=twice)) for twice in (False, True)]
     gathered = Gathered()
     for index, shown in renders_to_fit(parsed.images, SEED):
         for detector in detectors:

@@ -140,7 +140,7 @@ def test_crossings_too_unlikely_by_themselves_carry_a_known_line_on(view):
     rows = anchors_of(view, [line])
     faint = [AnchorRow(r.v_px, r.u_px, r.odds - 5.0) if r.v_px < 200 else r for r in rows]
     assert link_anchors([r for r in faint if r.odds[0] < 0], view) == []
-    (lane,) = link_anchors(faint, view)
+    (lane,) = link_anchors(faint, view, [painted(line, view, 5, 8)])
     assert lane.points_px[-1, 1] < 130
 
 

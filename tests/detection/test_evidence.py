@@ -10,8 +10,10 @@ from tests.benchmarks.detector_confidence import fit
 from tests.detection.pictures import bar, brightness_model, diamond, make_camera, picture, to_image
 from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, SHAPES, TOLD, confidence
 from v2hdm.detection.corners.evidence import FEATURES, Steps, grey_steps
+from v2hdm.detection.corners.found import Corners
 from v2hdm.detection.corners.grey import linear_grey
 from v2hdm.detection.corners.quad import order_corners
+from v2hdm.detection.corners.refine import doubt_uneven
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, STOP_LINE
@@ -40,6 +42,48 @@ def test_a_side_that_runs_on_spoils_the_corner_that_it_passes():
     runs_on = steps_of(image, part_px[None]).runs_on()[0]
     upper = part_px[:, 1] < part_px[:, 1].mean()
     np.testing.assert_array_equal(runs_on, upper)
+
+
+def test_all_sides_of_paint_are_even_in_sun_and_in_shade_and_half_in_each():
+    camera = make_camera("pinhole")
+    shapes = [diamond(6.0, 0.0), bar(6.0, 1.6, 1.5, 0.4)]
+    corners_px = np.stack([order_corners(to_image(camera, shape)) for shape in shapes])
+    image = picture(camera, shapes, ground=0.2, paint=0.6, linear=True).astype(np.float64)
+    shaded = image.copy()
+    shaded[: int(corners_px[0, :, 1].mean())] *= 0.4
+    for lit in (image, shaded, 0.4 * image):
+        whole = np.array([[0, 0, image.shape[1], image.shape[0]]])
+        grey = linear_grey(lit.astype(np.uint8), 0, len(image), whole, True)
+        assert not grey_steps(grey, corners_px).uneven().any()
+
+
+@pytest.mark.parametrize("beyond", [0.3, 0.05])
+def test_a_worn_end_and_one_that_a_shadow_makes_are_uneven(beyond):
+    """What lies beyond the far end is paint half gone, or ground and paint in shade alike."""
+    camera = make_camera("pinhole")
+    seen = bar(6.0, 0.0, 2.0, 0.3)
+    corners_px = order_corners(to_image(camera, seen))
+    image = picture(camera, [seen], ground=0.15, paint=0.5, noise=0.0, linear=True).astype(np.float64) / 255
+    rest = to_image(camera, bar(7.5, 0.0, 1.0, 0.3 if beyond > 0.15 else 4.0))
+    cv2.fillConvexPoly(image, np.round(rest * 16).astype(np.int32), (beyond,) * 3, cv2.LINE_AA, 4)
+    whole = np.array([[0, 0, image.shape[1], image.shape[0]]])
+    grey = linear_grey(np.round(255 * image).astype(np.uint8), 0, len(image), whole, True)
+    uneven = grey_steps(grey, corners_px[None]).uneven()[0]
+    np.testing.assert_array_equal(uneven, corners_px[:, 1] < corners_px[:, 1].mean())
+
+
+@pytest.mark.parametrize(("kind", "vague"), [(DIAMOND, False), (DIAMOND, True), (LANE_DASH, True)])
+def test_uneven_corners_are_not_valid_but_vague_ones_of_diamonds_where_those_are_asked_for(kind, vague):
+    found = Corners.at(np.zeros((1, 4, 2)))
+    found.covariance *= 0.01
+    found.valid[0] = True, True, True, False
+    doubt_uneven(found, np.array([[True, False, False, True]]), [kind], vague)
+    kept = kind == DIAMOND and vague
+    assert found.valid[0].tolist() == [kept, True, True, False]
+    sigma = np.sqrt(np.diagonal(found.covariance[0]))
+    np.testing.assert_allclose(sigma[2:6], 0.1)
+    if kept:
+        np.testing.assert_allclose(sigma[:2], 2.0, atol=0.01)
 
 
 def test_corners_on_the_border_of_a_shadow_are_not_valid(tmp_path):

@@ -74,7 +74,7 @@ def fitted_on_a_blank_image(quad_vehicle: np.ndarray) -> tuple[np.ndarray, list[
     )
     blank = np.full((camera.info.height, camera.info.width, 3), 90, dtype=np.uint8)
     owner = np.zeros((view.height // 2, camera.info.width // 2), dtype=np.int16)
-    foreground = Foreground(np.zeros(owner.shape, np.float32), owner[None], 2, view.top)
+    foreground = Foreground(np.zeros(owner.shape, np.float32), owner, 2, view.top)
     options = replace(DetectorOptions.for_mapping(), min_confidence=0.0)
     return view.distort(quad), fit_markings(blank, view, [start], foreground, options)
 

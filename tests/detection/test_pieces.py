@@ -62,6 +62,6 @@ def test_sure_pieces_are_left_as_they_are():
     labels = np.zeros((40, 60), dtype=int)
     labels[10:30, 5:25] = labels[10:30, 35:55] = DIAMOND
     sight = sight_of(labels)
-    blobs, owner, _ = find_blobs(sight, PAINT_CLASSES, 2, 0)
+    blobs, owner = find_blobs(sight, PAINT_CLASSES, 2, 0)
     assert len(blobs) == 2
     np.testing.assert_array_equal(owner > 0, labels > 0)

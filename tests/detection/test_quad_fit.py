@@ -78,7 +78,7 @@ def fitted_from(shape, start):
     box = np.array([[0, 0, camera.info.width, camera.info.height]])
     grey = linear_grey(picture(camera, [shape]), 0, camera.info.height, box, False)
     owner = np.zeros((camera.info.height // 2, camera.info.width // 2), dtype=np.int16)
-    fit = fit_quads(grey, owner[None], 2, np.array([[0, 0]]), start_px[None], 0.75)
+    fit = fit_quads(grey, owner, 2, np.array([0]), start_px[None], 0.75)
     return true_px, fit, np.abs(true_px - start_px).max()
 
 

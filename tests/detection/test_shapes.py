@@ -121,7 +121,7 @@ def test_zero_crossings_are_interpolated_between_neighbours():
 def test_the_outline_polygon_of_an_arrow_encloses_its_cells():
     labels = np.zeros((40, 60), dtype=int)
     labels[10:30, 20:24] = labels[10:16, 14:30] = 1 + PAINT_CLASSES.index("arrow")
-    blobs, *_ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 50)
+    blobs, _ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 50)
     (arrow,) = blobs
     assert arrow.kind == "arrow"
     polygon = outline_polygon(arrow)
@@ -142,7 +142,7 @@ def test_a_diamond_that_touches_a_line_is_split_from_it():
     labels = np.zeros((40, 60), dtype=int)
     labels[10:30, 20:40] = 1 + PAINT_CLASSES.index("diamond")
     labels[:, 40:44] = 1 + PAINT_CLASSES.index("lane_line")
-    blobs, owner, _ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
+    blobs, owner = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
     assert sorted(blob.kind for blob in blobs) == ["diamond", "lane_line"]
     square = next(blob for blob in blobs if blob.kind == "diamond")
     assert square.outline_px[:, 0].max() == pytest.approx(2 * 39.5 + 0.5, abs=0.1)
@@ -153,7 +153,7 @@ def test_a_dash_that_looks_like_a_line_here_and_there_stays_one_blob():
     labels = np.zeros((40, 60), dtype=int)
     labels[5:35, 20:24] = 1 + PAINT_CLASSES.index("lane_dash")
     labels[5:14, 20:24] = 1 + PAINT_CLASSES.index("lane_line")
-    blobs, *_ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
+    blobs, _ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
     assert [blob.kind for blob in blobs] == ["lane_dash"]
 
 
@@ -161,13 +161,13 @@ def test_worn_holes_do_not_add_to_the_outline():
     labels = np.zeros((40, 60), dtype=int)
     labels[10:30, 20:40] = 1
     labels[18:22, 28:32] = 0
-    blobs, *_ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, top_px=100)
+    blobs, _ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, top_px=100)
     inner = np.abs(blobs[0].outline_px - [2 * 29.5 + 0.5, 100 + 2 * 19.5 + 0.5]).max(axis=1)
     assert inner.min() > 15
 
 
 def test_an_empty_picture_has_no_blobs():
-    blobs, owner, _ = find_blobs(sight_of(np.zeros((8, 8), dtype=int)), PAINT_CLASSES, 2, 0)
+    blobs, owner = find_blobs(sight_of(np.zeros((8, 8), dtype=int)), PAINT_CLASSES, 2, 0)
     assert blobs == []
     assert not owner.any()
 
@@ -176,7 +176,7 @@ def test_a_whole_quadrilateral_is_one_marking_whatever_the_network_takes_its_end
     labels = np.zeros((40, 60), dtype=int)
     labels[10:30, 10:50] = 1 + PAINT_CLASSES.index("diamond")
     labels[10:30, 38:50] = 1 + PAINT_CLASSES.index("arrow")
-    blobs, *_ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
+    blobs, _ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
     assert [blob.kind for blob in blobs] == ["diamond"]
     assert not blobs[0].touches_symbol
 
@@ -186,7 +186,7 @@ def test_a_slim_dash_is_one_marking_whatever_the_network_takes_its_middle_for():
     for column in range(8, 72):
         labels[8 + column // 10 : 10 + column // 10, column] = 1 + PAINT_CLASSES.index("lane_dash")
     labels[:, 30:50] = np.where(labels[:, 30:50], 1 + PAINT_CLASSES.index("arrow"), 0)
-    blobs, *_ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
+    blobs, _ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
     assert [blob.kind for blob in blobs] == ["lane_dash"]
 
 
@@ -194,7 +194,7 @@ def test_a_shaft_is_split_from_its_head_and_knows_it():
     labels = np.zeros((60, 60), dtype=int)
     labels[20:50, 28:32] = 1 + PAINT_CLASSES.index("lane_dash")
     labels[8:20, 20:40] = 1 + PAINT_CLASSES.index("arrow")
-    blobs, owner, _ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
+    blobs, owner = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
     assert sorted(blob.kind for blob in blobs) == ["arrow", "lane_dash"]
     assert all(blob.touches_symbol for blob in blobs)
     assert owner[40, 30] != owner[12, 30]
@@ -205,7 +205,7 @@ def test_blobs_in_each_others_boxes_keep_to_themselves():
     for k in range(10, 50):
         labels[k, k : k + 4] = 1
     labels[15:20, 40:46] = labels[40:45, 12:18] = 1
-    blobs, owner, _ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
+    blobs, owner = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
     assert len(blobs) == 3
     for index, blob in enumerate(blobs):
         mine = np.argwhere(owner == index + 1)

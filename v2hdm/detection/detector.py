@@ -108,20 +108,17 @@ class Detector:
         with lap("net"):
             sight = look(self.network, image_bgr, view, self.options.mirrored)
         with lap("blobs"):
-            band = info.classes, info.paint_stride, view.far_row, self._reach_px[camera.info.name]
-            first = find_blobs(sight, *band)
-            candidates = self._candidates(first.blobs, view)
-            further = [find_blobs(sight, *band, odds, first) for odds in self.options.further_odds]
-        owners = np.stack([reading.owner for reading in (first, *further)])
-        foreground = Foreground(sight.paint, owners, info.paint_stride, view.far_row)
+            reach_px = self._reach_px[camera.info.name]
+            blobs, owner = find_blobs(sight, info.classes, info.paint_stride, view.far_row, reach_px)
+            candidates = self._candidates(blobs, view)
+        foreground = Foreground(sight.paint, owner, info.paint_stride, view.far_row)
         with lap("lanes"):
             lanes = trace_lanes(
                 self._lane_paint(candidates), view, self.options.lane_step_m, self.options.max_range_m
             )
             lanes += link_anchors(sight.anchors, view, lanes, self.options.lane_step_m, foreground)
         with lap("corners"):
-            readings = [candidates, *(self._candidates(reading.blobs, view) for reading in further)]
-            starts = [s for plane, of in enumerate(readings) for s in self._starts(of, view, plane)]
+            starts = self._starts(candidates, view)
             markings = fit_markings(image_bgr, view, starts, foreground, self.options)
             symbols = [self._symbol(c, view) for c in candidates]
             markings += [s for s in symbols if s is not None and not _is_among(s, markings)]
@@ -170,8 +167,8 @@ class Detector:
             and not (c.kind == LANE_DASH and (c.blob.touches_symbol or c.at_head))
         ]
 
-    def _starts(self, candidates: list[_Candidate], view: CameraView, plane: int = 0) -> list[QuadStart]:
-        """The quadrilaterals to start the corner fit from, of a reading's blobs that are one within range."""
+    def _starts(self, candidates: list[_Candidate], view: CameraView) -> list[QuadStart]:
+        """The quadrilaterals to start the corner fit from, of the blobs that are one within range."""
         starts = []
         for c in candidates:
             kinds, least = _tried_as(c)
@@ -180,7 +177,7 @@ class Detector:
             start = starting_corners(kinds[0], c.outline_pinhole_px, c.outline_vehicle, view)
             if start is not None and start[1] >= least:
                 claims = {name: _claim(c, name) for name in kinds}
-                starts.append(QuadStart(claims, start[0], c.index, c.outline_pinhole_px, plane))
+                starts.append(QuadStart(claims, start[0], c.index, c.outline_pinhole_px))
         if not starts:
             return []
         corners = np.stack([start.corners_pinhole_px for start in starts])

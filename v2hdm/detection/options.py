@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from v2hdm.errors import ConfigError
@@ -24,9 +23,6 @@ class DetectorOptions:
         max_corner_sigma_px: corners with a larger standard deviation are not valid.
         vague_corners: take corners from the edges of overexposed paint, and from the network's outline, where
             the image shows nothing better; they are worth having where many images are averaged.
-        further_odds: log odds of paint, besides 0, at which it is read: what runs together at 0 often comes
-            apart at 1, what shadow, wear or blur parts at 0 is often whole at -1. Of all readings of a place
-            the one for which there is most evidence counts. Each takes about 3 ms.
         mirrored: ask the network of the mirror image, too, and take the mean: fewer errors for more time.
         border_px: corners nearer to the image border are not valid.
         lane_step_m: spacing of lane points on the ground.
@@ -40,7 +36,6 @@ class DetectorOptions:
     min_confidence: float = 0.7
     max_corner_sigma_px: float = 0.8
     vague_corners: bool = False
-    further_odds: tuple[float, ...] = ()
     mirrored: bool = False
     border_px: float = 4.0
     lane_step_m: float = 0.5
@@ -48,13 +43,7 @@ class DetectorOptions:
     @classmethod
     def for_mapping(cls) -> DetectorOptions:
         """Defaults of the mapping, which weighs corners by their covariance and sees each many times."""
-        return cls(
-            min_confidence=0.3,
-            max_corner_sigma_px=1.5,
-            vague_corners=True,
-            further_odds=(1.0, -1.0),
-            mirrored=True,
-        )
+        return cls(min_confidence=0.3, max_corner_sigma_px=1.5, vague_corners=True, mirrored=True)
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work.
@@ -69,10 +58,6 @@ class DetectorOptions:
         for name in ("max_range_m", "max_corner_sigma_px", "lane_step_m"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"detector.{name} is {getattr(self, name)}: set a positive number")
-        if not all(math.isfinite(odds) and odds for odds in self.further_odds):
-            raise ConfigError(
-                f"detector.further_odds is {list(self.further_odds)}: set log odds other than 0, as [1, -1]"
-            )
         for name in ("min_score", "min_confidence"):
             if not 0 <= getattr(self, name) < 1:
                 raise ConfigError(f"detector.{name} is {getattr(self, name)}: set a probability in [0, 1)")

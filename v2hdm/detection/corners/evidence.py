@@ -133,7 +133,6 @@ class Steps:
         start, end = np.moveaxis(self.going_on.min(axis=3) > _RUNS_ON, 2, 0)
         return np.asarray(start | preceding(end, -1))
 
-
     def uneven(self) -> BoolArray:
         """Corners (M, 4) of a side whose step is not that of the others, or runs on at both of its ends.
 

@@ -15,10 +15,9 @@ _MOST_ODDS = 6.0
 
 @dataclass(frozen=True)
 class Foreground:
-    """Log odds of paint, ``odds`` (h, w), and which blob owns each: ``owner`` (P, h, w) 1 + index or 0.
+    """Log odds of paint, ``odds`` (h, w), and which blob owns each: ``owner`` (h, w) 1 + index or 0.
 
-    Each of the P readings of the paint has its own blobs. Odds are ``stride`` px apart, from image row
-    ``top`` on; element (0, 0) covers stride x stride px.
+    They are ``stride`` px apart, from image row ``top`` on; element (0, 0) covers stride x stride px.
     """
 
     odds: np.ndarray

@@ -79,9 +79,9 @@ def cut_patches(
 
     Args:
         grey: the image's grey values.
-        owner: (P, h, w) 1 + index of the blob on each logit of the same band, by each reading of the paint.
+        owner: (h, w) 1 + index of the blob on each logit of the same band.
         owner_stride: pixels per logit.
-        blobs: (M, 2) reading and index of each marking's own blob.
+        blobs: (M,) index of each marking's own blob.
         corners_px: starting corners, recorded px.
     """
     low = np.floor(corners_px.min(axis=1)).astype(np.intp) - int(_OUTSIDE_PX)
@@ -98,9 +98,8 @@ def cut_patches(
     u, v = low[marking, 0] + columns[marking, j], low[marking, 1] + rows[marking, i] - grey.top
     use = (u >= 0) & (u < grey.values.shape[1]) & (v >= 0) & (v < grey.values.shape[0])
     u[~use] = v[~use] = 0
-    plane, blob = blobs.T
-    cell_owner = owner[plane[marking], v // owner_stride, u // owner_stride]
-    use &= (cell_owner == 0) | (cell_owner == blob[marking] + 1)
+    cell_owner = owner[v // owner_stride, u // owner_stride]
+    use &= (cell_owner == 0) | (cell_owner == blobs[marking] + 1)
     count = np.bincount(marking, minlength=len(low))
     place = np.arange(len(cell)) - np.repeat(np.cumsum(count) - count, count)
     patches = _empty(low + size // 2, max(1, int(count.max())))

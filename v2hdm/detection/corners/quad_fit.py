@@ -108,10 +108,9 @@ def fit_quads(
 
     Args:
         grey: the image's grey values.
-        owner: (P, h, w) 1 + index of the blob on each logit of the same band, by each reading of the paint;
-            other blobs' pixels are ignored.
+        owner: (h, w) 1 + index of the blob on each logit of the same band; other blobs' pixels are ignored.
         owner_stride: pixels per logit.
-        blobs: (M, 2) reading and index of each marking's own blob.
+        blobs: (M,) index of each marking's own blob.
         corners_px: starting corners, recorded px.
         blur_px: the point spread's standard deviation, pixel aperture included.
     """

@@ -21,7 +21,6 @@ from v2hdm.detection.corners.grey import GreyBand, linear_grey
 from v2hdm.detection.corners.outline_fit import fit_outlines
 from v2hdm.detection.corners.quad import is_convex, side_frames, width
 from v2hdm.detection.corners.quad_fit import fit_quads, unbow_corners
-from v2hdm.detection.corners.rivals import surest_readings
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import DIAMOND, LANE_DASH, BoolArray, FloatArray, MarkingDetection
 
@@ -57,14 +56,13 @@ class QuadStart:
     """A blob's quadrilateral ``corners_pinhole_px`` (4, 2) before refinement.
 
     ``claims`` are what the network says for each class that it may be of, the likeliest first; ``blob`` is
-    the blob's index in the reading ``plane`` of the paint, ``outline_pinhole_px`` (N, 2) its outline.
+    the blob's index, ``outline_pinhole_px`` (N, 2) its outline.
     """
 
     claims: dict[str, Claim]
     corners_pinhole_px: FloatArray
     blob: int
     outline_pinhole_px: FloatArray
-    plane: int = 0
 
     @property
     def kind(self) -> str:
@@ -107,8 +105,7 @@ def fit_markings(
 ) -> list[MarkingDetection]:
     """Refine the corners of one image's markings; where that fails they are those of the start, not valid.
 
-    Markings are kept if the evidence for them reaches ``options.min_confidence``, and, of several readings of
-    one place, the one that has most.
+    Markings are kept if the evidence for them reaches ``options.min_confidence``.
     """
     fitted = _fitted(image_bgr, view, starts, foreground, options)
     if not fitted:
@@ -118,12 +115,11 @@ def fit_markings(
     if options.vague_corners:
         _take_outlines(found, fitted.starts, view, options)
         found.valid[is_cut(found, view)] = False
-    _doubt_uneven(found, fitted.uneven, kinds, options.vague_corners)
-    plane = np.array([start.plane for start in fitted.starts])
-    believed = surest_readings(found.px, plane, score) & (score >= options.min_confidence)
+    doubt_uneven(found, fitted.uneven, kinds, options.vague_corners)
     return [
-        MarkingDetection(kinds[m], float(score[m]), found.px[m], found.covariance[m], found.valid[m])
-        for m in np.flatnonzero(believed).tolist()
+        MarkingDetection(kind, float(score[m]), found.px[m], found.covariance[m], found.valid[m])
+        for m, kind in enumerate(kinds)
+        if score[m] >= options.min_confidence
     ]
 
 
@@ -143,7 +139,7 @@ def _fitted(
     if not starts:
         return None
     start, start_px = _stacked(starts, view)
-    blobs = np.array([(s.plane, s.blob) for s in starts])
+    blobs = np.array([s.blob for s in starts])
     near = _is_near(start)
     found, blur_px = Corners.at(start_px), options.blur_px
     if near.any():
@@ -255,7 +251,7 @@ def _consistent_levels(edges: EdgeFit) -> BoolArray:
 
 @dataclass(frozen=True)
 class _Far:
-    """What fits to far markings share: plane and index of all ``blobs`` (M, 2), and the point spread."""
+    """What fits to far markings share: ``blobs`` (M,) of all markings, and the point spread ``blur_px``."""
 
     foreground: Foreground
     blobs: np.ndarray
@@ -272,7 +268,7 @@ def _take_quads(found: Corners, group: np.ndarray, grey: GreyBand, far: _Far, bl
         Those of ``group`` that are overexposed and not fitted well.
     """
     foreground = far.foreground
-    owner = foreground.owner[:, (grey.top - foreground.top) // foreground.stride :]
+    owner = foreground.owner[(grey.top - foreground.top) // foreground.stride :]
     fit = fit_quads(grey, owner, foreground.stride, far.blobs[group], found.px[group], far.blur_px)
     pinhole = unbow_corners(far.view, fit.corners_px)
     corners = far.view.distort(pinhole.reshape(-1, 2)).reshape(-1, 4, 2)
@@ -318,7 +314,7 @@ def _take_outlines(
         found.valid[m, corner] = True
 
 
-def _doubt_uneven(found: Corners, uneven: BoolArray, kinds: list[str], vague: bool) -> None:
+def doubt_uneven(found: Corners, uneven: BoolArray, kinds: list[str], vague: bool) -> None:
     """Corners (M, 4) of doubtful sides are not valid.
 
     Those of diamonds are vague: wear and shadow shorten a diamond by little, a dash by as much as they like.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -46,7 +45,6 @@ _LEAST_SHARE = np.array([0.25 if group == _SYMBOLS else 0.15 for group in _GROUP
 _LEAST_QUAD_CELLS = 30
 """A smaller piece of paint shows no shape; it is split where the network says so."""
 
-_SAME = 0.75
 _OUTLINE_SCALE = 4
 
 
@@ -74,31 +72,10 @@ class Blob:
         return max(self.class_score, key=self.class_score.__getitem__)
 
 
-class Reading(NamedTuple):
-    """The paint of an image at some log odds.
-
-    ``owner`` (h, w) int16 holds 1 + the index of the blob that covers each element of the network's paint, 0
-    for none; ``pieces`` (h, w) int16 is one number on each connected, settled piece of paint, before
-    any is split by its classes.
-    """
-
-    blobs: list[Blob]
-    owner: np.ndarray
-    pieces: np.ndarray
-
-
 def find_blobs(
-    sight: Sight,
-    classes: Sequence[str],
-    stride: int,
-    top_px: int,
-    reach_px: int = 0,
-    least_odds: float = 0.0,
-    known: Reading | None = None,
-) -> Reading:
+    sight: Sight, classes: Sequence[str], stride: int, top_px: int, reach_px: int = 0
+) -> tuple[list[Blob], np.ndarray]:
     """Split the paint of one image into blobs.
-
-    At other log odds paint runs together, or falls apart, otherwise: that is a further reading of it.
 
     Args:
         sight: what the network says of a band of the image.
@@ -106,14 +83,15 @@ def find_blobs(
         stride: recorded pixels per element of its ``paint``.
         top_px: image row at which the band starts.
         reach_px: image row; blobs that lie above it as a whole are too far away to be of use.
-        least_odds: log odds above which there is paint.
-        known: another reading; pieces of paint that are about the same in it are left out.
+
+    Returns:
+        The blobs, and a map (h, w) int16 with 1 + the index of the blob that covers each element of
+        ``paint``, 0 for none.
     """
     # A frame of no paint around it lets every outline close.
-    paint = sight.paint - np.float32(least_odds) if least_odds else sight.paint
-    level = cv2.copyMakeBorder(paint, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-1.0)
+    level = cv2.copyMakeBorder(sight.paint, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-1.0)
     corner_px = np.array([(stride - 1) / 2 - stride, (stride - 1) / 2 - stride + top_px])
-    level, contours, piece = _connected(level, (reach_px - top_px) / stride + 1, known)
+    level, contours, piece = _connected(level, (reach_px - top_px) / stride + 1)
     said = _hearsay(sight, classes, piece, level, len(contours))
     outlines = _outlines(level, piece, len(contours))
     owner = np.zeros_like(piece)
@@ -135,43 +113,21 @@ def find_blobs(
         for part in _split(inside, level[box], sight, box, classes, origin_px, stride):
             blobs.append(part)
             owner[box][part.level > 0] = len(blobs)
-    return Reading(blobs, owner[1:-1, 1:-1], piece[1:-1, 1:-1])
+    return blobs, owner[1:-1, 1:-1]
 
 
-def _connected(
-    level: np.ndarray, least_row: float, known: Reading | None
-) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
+def _connected(level: np.ndarray, least_row: float) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
     """Contours of paint that reaches ``least_row``, and a map of 1 + the number of each, holes filled.
 
-    They are zero crossings of the level that comes first. Beside a ``known`` reading contours are
-    those of other pieces of paint, as they are; else they are settled.
+    They are zero crossings of the level that comes first.
     """
     contours, _ = cv2.findContours((level > 0).view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     kept = [c for c in contours if len(c) >= 4 and _end_row(c) >= least_row]
-    if known is None:
-        level, kept = settle_pieces(level, kept)
+    level, kept = settle_pieces(level, kept)
     piece = np.zeros(level.shape, dtype=np.int16)
     for index, contour in enumerate(kept):
         cv2.drawContours(piece, [contour], -1, index + 1, cv2.FILLED)
-    if known is not None and kept:
-        other = ~_same_as_known(piece, known.pieces, len(kept))
-        number = np.concatenate([[0], other * np.cumsum(other)]).astype(np.int16)
-        kept, piece = [c for c, o in zip(kept, other.tolist(), strict=True) if o], number[piece]
     return level, kept, piece
-
-
-def _same_as_known(piece: np.ndarray, known: np.ndarray, count: int) -> BoolArray:
-    """Which (B,) pieces share :data:`_SAME` of all that they and one known piece are together."""
-    at = np.flatnonzero(piece)
-    i, j = np.divmod(at, piece.shape[1])
-    own, other = piece.ravel()[at].astype(np.int64) - 1, known[i - 1, j - 1]
-    others = int(known.max(initial=0)) + 1
-    shared = np.bincount(own * others + other, minlength=count * others).reshape(count, others)
-    cells, own_cells = np.bincount(known.ravel(), minlength=others), shared.sum(axis=1)
-    shared[:, 0] = 0
-    best = shared.argmax(axis=1)
-    common = shared[np.arange(count), best]
-    return np.asarray(common >= _SAME * (own_cells + cells[best] - common))
 
 
 def _end_row(contour: np.ndarray) -> int:
