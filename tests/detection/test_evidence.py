@@ -72,6 +72,25 @@ def test_a_worn_end_and_one_that_a_shadow_makes_are_uneven(beyond):
     np.testing.assert_array_equal(uneven, corners_px[:, 1] < corners_px[:, 1].mean())
 
 
+def test_what_spoils_one_corner_of_an_end_spoils_the_other():
+    """Side 1 runs on beyond corner 2; which corner shares an end with that is for the lengths to say."""
+    going_on = np.zeros((1, 4, 2, 3))
+    going_on[0, 1, 1] = 0.9
+    steps = Steps(
+        along=np.ones((1, 4, 12)),
+        typical=np.ones(1),
+        near=np.ones(1),
+        by_side=np.ones((1, 4)),
+        going_on=going_on,
+        overexposed=np.zeros(1),
+    )
+    assert steps.runs_on()[0].tolist() == [False, False, True, False]
+    assert not steps.uneven().any()
+    across, along = np.array([[1.0, 9.0, 1.0, 9.0]]), np.array([[9.0, 1.0, 9.0, 1.0]])
+    assert steps.spoilt_ends(across)[0].tolist() == [False, False, True, True]
+    assert steps.spoilt_ends(along)[0].tolist() == [False, True, True, False]
+
+
 @pytest.mark.parametrize(("kind", "vague"), [(DIAMOND, False), (DIAMOND, True), (LANE_DASH, True)])
 def test_uneven_corners_are_not_valid_but_vague_ones_of_diamonds_where_those_are_asked_for(kind, vague):
     found = Corners.at(np.zeros((1, 4, 2)))

@@ -75,7 +75,8 @@ class _Fitted:
     """M starts, the corners ``found``, and each in every class that it may be of, R rows in all.
 
     ``row_start`` (R,) is the start of a row, ``kinds`` its class, ``ground`` (R, 4, 2) its corners on the
-    ground, ``evidence`` (R, F) what there is for it. ``uneven`` (M, 4) are corners of doubtful sides.
+    ground, ``evidence`` (R, F) what there is for it. ``uneven`` (M, 4) are corners of doubtful
+    sides, ``spoilt_ends`` (M, 4) those of ends, were it a dash.
     """
 
     starts: list[QuadStart]
@@ -85,6 +86,7 @@ class _Fitted:
     ground: FloatArray
     evidence: FloatArray
     uneven: BoolArray
+    spoilt_ends: BoolArray
 
     def judged(self) -> tuple[list[str], FloatArray]:
         """The class (M,) of each for which there is most evidence, and its confidence."""
@@ -115,7 +117,9 @@ def fit_markings(
     if options.vague_corners:
         _take_outlines(found, fitted.starts, view, options)
         found.valid[is_cut(found, view)] = False
-    doubt_uneven(found, fitted.uneven, kinds, options.vague_corners)
+    elongated = (np.array(kinds) != DIAMOND)[:, None]
+    doubtful = np.where(elongated, fitted.spoilt_ends, fitted.uneven)
+    doubt_uneven(found, doubtful, kinds, options.vague_corners)
     return [
         MarkingDetection(kind, float(score[m]), found.px[m], found.covariance[m], found.valid[m])
         for m, kind in enumerate(kinds)
@@ -163,7 +167,8 @@ def _fitted(
         steps.take(row_start), foreground, view, found.px[row_start], ground, claims, found.valid[row_start]
     )
     kinds = [kind for s in starts for kind in s.claims]
-    return _Fitted(starts, found, row_start, kinds, ground, evidence, steps.uneven())
+    ends = steps.spoilt_ends(side_frames(found.px)[2])
+    return _Fitted(starts, found, row_start, kinds, ground, evidence, steps.uneven(), ends)
 
 
 def _stacked(starts: list[QuadStart], view: CameraView) -> tuple[FloatArray, FloatArray]:
