@@ -36,11 +36,6 @@ class Corners:
         nowhere, none = np.zeros((count, 4), dtype=np.bool_), np.zeros(count, dtype=np.bool_)
         return cls(px, np.tile(np.eye(8), (count, 1, 1)), nowhere, none)
 
-    def joined(self, more: Corners) -> Corners:
-        """These and ``more``."""
-        parts = zip(vars(self).values(), vars(more).values(), strict=True)
-        return Corners(*(np.concatenate(pair) for pair in parts))
-
 
 def is_cut(found: Corners, view: CameraView) -> BoolArray:
     """Markings (M,) whose four valid corners are no parallelogram on the ground, as all are painted.
