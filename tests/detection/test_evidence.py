@@ -13,7 +13,7 @@ from v2hdm.detection.corners.evidence import FEATURES, Steps, grey_steps
 from v2hdm.detection.corners.found import Corners
 from v2hdm.detection.corners.grey import linear_grey
 from v2hdm.detection.corners.quad import order_corners
-from v2hdm.detection.corners.refine import doubt_uneven
+from v2hdm.detection.corners.refine import doubt_corners
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, STOP_LINE
@@ -91,18 +91,28 @@ def test_what_spoils_one_corner_of_an_end_spoils_the_other():
     assert steps.spoilt_ends(along)[0].tolist() == [False, True, True, False]
 
 
-@pytest.mark.parametrize(("kind", "vague"), [(DIAMOND, False), (DIAMOND, True), (LANE_DASH, True)])
-def test_uneven_corners_are_not_valid_but_vague_ones_of_diamonds_where_those_are_asked_for(kind, vague):
+@pytest.mark.parametrize(
+    ("kind", "vague", "valid"),
+    [
+        (DIAMOND, False, [False, True, True, False]),
+        (DIAMOND, True, [True, True, True, False]),
+        (LANE_DASH, False, [True, True, False, False]),
+        (LANE_DASH, True, [True, True, False, False]),
+    ],
+)
+def test_doubtful_corners_are_not_valid_but_vague_ones_of_diamonds_where_those_are_asked_for(
+    kind, vague, valid
+):
+    """Of a diamond the uneven ones are in doubt, of anything longer those of its spoilt ends."""
     found = Corners.at(np.zeros((1, 4, 2)))
     found.covariance *= 0.01
     found.valid[0] = True, True, True, False
-    doubt_uneven(found, np.array([[True, False, False, True]]), [kind], vague)
-    kept = kind == DIAMOND and vague
-    assert found.valid[0].tolist() == [kept, True, True, False]
+    uneven, spoilt_ends = np.array([[True, False, False, True]]), np.array([[False, False, True, True]])
+    doubt_corners(found, uneven, spoilt_ends, [kind], vague)
+    assert found.valid[0].tolist() == valid
     sigma = np.sqrt(np.diagonal(found.covariance[0]))
     np.testing.assert_allclose(sigma[2:6], 0.1)
-    if kept:
-        np.testing.assert_allclose(sigma[:2], 2.0, atol=0.01)
+    np.testing.assert_allclose(sigma[:2], 2.0 if kind == DIAMOND and vague else 0.1, atol=0.01)
 
 
 def test_corners_on_the_border_of_a_shadow_are_not_valid(tmp_path):

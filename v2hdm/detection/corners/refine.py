@@ -117,9 +117,7 @@ def fit_markings(
     if options.vague_corners:
         _take_outlines(found, fitted.starts, view, options)
         found.valid[is_cut(found, view)] = False
-    elongated = (np.array(kinds) != DIAMOND)[:, None]
-    doubtful = np.where(elongated, fitted.spoilt_ends, fitted.uneven)
-    doubt_uneven(found, doubtful, kinds, options.vague_corners)
+    doubt_corners(found, fitted.uneven, fitted.spoilt_ends, kinds, options.vague_corners)
     return [
         MarkingDetection(kind, float(score[m]), found.px[m], found.covariance[m], found.valid[m])
         for m, kind in enumerate(kinds)
@@ -319,16 +317,21 @@ def _take_outlines(
         found.valid[m, corner] = True
 
 
-def doubt_uneven(found: Corners, uneven: BoolArray, kinds: list[str], vague: bool) -> None:
-    """Corners (M, 4) of doubtful sides are not valid.
+def doubt_corners(
+    found: Corners, uneven: BoolArray, spoilt_ends: BoolArray, kinds: list[str], vague: bool
+) -> None:
+    """Corners (M, 4) at uneven sides of a diamond, and at spoilt ends of anything longer, are not valid.
 
-    Those of diamonds are vague: wear and shadow shorten a diamond by little, a dash by as much as they like.
+    Diamonds keep theirs as vague ones where such are asked for: wear and shadow shorten a diamond by little,
+    a dash by as much as they like.
     """
-    kept = uneven & found.valid & vague & (np.array(kinds) == DIAMOND)[:, None]
+    diamond = (np.array(kinds) == DIAMOND)[:, None]
+    doubtful = np.where(diamond, uneven, spoilt_ends)
+    kept = doubtful & found.valid & vague & diamond
     marking, corner = np.nonzero(kept)
     for place in (2 * corner, 2 * corner + 1):
         found.covariance[marking, place, place] += _UNEVEN_SIGMA_PX**2
-    found.valid &= ~uneven | kept
+    found.valid &= ~doubtful | kept
 
 
 def _measured_blur(edges: EdgeFit) -> float | None:
