@@ -9,7 +9,7 @@ import pytest
 from tests.benchmarks.detector_confidence import fit
 from tests.detection.pictures import bar, brightness_model, diamond, make_camera, picture, to_image
 from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, SHAPES, TOLD, confidence
-from v2hdm.detection.corners.evidence import FEATURES, Steps, grey_steps
+from v2hdm.detection.corners.evidence import FEATURES, Steps, grey_steps, whole_ends
 from v2hdm.detection.corners.found import Corners
 from v2hdm.detection.corners.grey import linear_grey
 from v2hdm.detection.corners.quad import order_corners
@@ -84,11 +84,12 @@ def test_what_spoils_one_corner_of_an_end_spoils_the_other():
         going_on=going_on,
         overexposed=np.zeros(1),
     )
-    assert steps.runs_on()[0].tolist() == [False, False, True, False]
+    runs_on = steps.runs_on()
+    assert runs_on[0].tolist() == [False, False, True, False]
     assert not steps.uneven().any()
     across, along = np.array([[1.0, 9.0, 1.0, 9.0]]), np.array([[9.0, 1.0, 9.0, 1.0]])
-    assert steps.spoilt_ends(across)[0].tolist() == [False, False, True, True]
-    assert steps.spoilt_ends(along)[0].tolist() == [False, True, True, False]
+    assert whole_ends(runs_on, across)[0].tolist() == [False, False, True, True]
+    assert whole_ends(runs_on, along)[0].tolist() == [False, True, True, False]
 
 
 @pytest.mark.parametrize(

@@ -145,16 +145,16 @@ class Steps:
         side = (ratio < _LEAST_RATIO) | (ratio > _MOST_RATIO) | both
         return np.asarray(side | preceding(side, -1))
 
-    def spoilt_ends(self, length: FloatArray) -> BoolArray:
-        """Corners (M, 4) that share a short side with a doubtful one; ``length`` (M, 4) of the sides.
 
-        The end of a dash is where it should be, or is not: what spoils one of its corners spoils the other.
-        """
-        doubtful = self.runs_on() | self.uneven()
-        first = length[:, 0] + length[:, 2] < length[:, 1] + length[:, 3]
-        # Corners 0 and 1 are the ends of side 0, 1 and 2 those of side 1.
-        partner = np.where(first[:, None], [1, 0, 3, 2], [3, 2, 1, 0])
-        return np.asarray(doubtful | np.take_along_axis(doubtful, partner, axis=1))
+def whole_ends(doubtful: BoolArray, length: FloatArray) -> BoolArray:
+    """Corners (M, 4) that share a short side with one of ``doubtful`` (M, 4); ``length`` (M, 4) of the sides.
+
+    The end of a dash is where it should be, or is not: what spoils one of its corners spoils the other.
+    """
+    first = length[:, 0] + length[:, 2] < length[:, 1] + length[:, 3]
+    # Corners 0 and 1 are the ends of side 0, 1 and 2 those of side 1.
+    partner = np.where(first[:, None], [1, 0, 3, 2], [3, 2, 1, 0])
+    return np.asarray(doubtful | np.take_along_axis(doubtful, partner, axis=1))
 
 
 def grey_steps(grey: GreyBand, corners_px: FloatArray) -> Steps:

@@ -14,7 +14,7 @@ from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.both_sides import painted_parts
 from v2hdm.detection.corners.confidence import confidence
 from v2hdm.detection.corners.edge_fit import EdgeFit, fit_edges
-from v2hdm.detection.corners.evidence import Claim, gather, grey_steps
+from v2hdm.detection.corners.evidence import Claim, gather, grey_steps, whole_ends
 from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.corners.found import Corners, block_diagonal, is_cut, largest_sigma
 from v2hdm.detection.corners.grey import GreyBand, linear_grey
@@ -156,7 +156,8 @@ def _fitted(
             _take_quads(found, overexposed, grey.at_limit, shared, _BLOOM_SIGMA_PX)
     found.covariance = _COVARIANCE_FACTOR * found.covariance + _COVARIANCE_FLOOR_PX**2 * np.eye(8)
     steps = grey_steps(grey, found.px)
-    found.valid &= ~steps.runs_on()
+    runs_on, uneven = steps.runs_on(), steps.uneven()
+    found.valid &= ~runs_on
     _reject(found, view, options)
     row_start = np.repeat(np.arange(len(starts)), [len(s.claims) for s in starts])
     claims = [claim for s in starts for claim in s.claims.values()]
@@ -165,8 +166,8 @@ def _fitted(
         steps.take(row_start), foreground, view, found.px[row_start], ground, claims, found.valid[row_start]
     )
     kinds = [kind for s in starts for kind in s.claims]
-    ends = steps.spoilt_ends(side_frames(found.px)[2])
-    return _Fitted(starts, found, row_start, kinds, ground, evidence, steps.uneven(), ends)
+    ends = whole_ends(runs_on | uneven, side_frames(found.px)[2])
+    return _Fitted(starts, found, row_start, kinds, ground, evidence, uneven, ends)
 
 
 def _stacked(starts: list[QuadStart], view: CameraView) -> tuple[FloatArray, FloatArray]:
