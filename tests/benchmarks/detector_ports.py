@@ -33,13 +33,11 @@ LANES_WITHIN_M = 50.0
 def examples(port: Port, images: int) -> Iterator[Example]:
     """So many images of a port's drive, evenly spread, its cameras by turns, and what they show."""
     names = sorted(port.cameras)
-    quality = [cv2.IMWRITE_JPEG_QUALITY, port.config.exposure.jpeg_quality]
     for number, frame in enumerate(np.linspace(0, len(port.driven.stamp_s) - 1, images).astype(int)):
         name = names[number % len(names)]
         rendered = port.picture(name, int(frame))
-        encoded, data = cv2.imencode(".jpg", rendered.image, quality)
-        assert encoded
-        image = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), dtype=np.uint8)
+        recorded = np.frombuffer(port.jpeg(rendered.image), np.uint8)
+        image = np.asarray(cv2.imdecode(recorded, cv2.IMREAD_COLOR), dtype=np.uint8)
         view = TrainingView(port.cameras[name].info, port.cam_from_map(name, int(frame)), Optics(), Motion())
         shown = example_of(port.renderer.scene, _lanes_near(port, view), view, rendered, _camera(port, name))
         yield replace(shown, image=image)

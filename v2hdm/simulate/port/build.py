@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from v2hdm.errors import ConfigError
+from v2hdm.errors import ConfigError, DriveError
 from v2hdm.records import Camera, FloatArray, GeodeticOrigin, HdMap
 from v2hdm.simulate.port.calibration import cam_from_vehicle, survey_camera
 from v2hdm.simulate.port.config import PortConfig
@@ -67,6 +69,16 @@ class Port:
             self._motion(camera, frame),
             self.moving_boxes(frame),
         )
+
+    def jpeg(self, image_bgr: NDArray[np.uint8]) -> bytes:
+        """The file that the vehicle would have recorded of a picture (H, W, 3)."""
+        quality = [cv2.IMWRITE_JPEG_QUALITY, self.config.exposure.jpeg_quality]
+        encoded, data = cv2.imencode(".jpg", image_bgr, quality)
+        if not encoded:
+            raise DriveError(
+                f"port '{self.config.name}': an image cannot be coded as JPEG; check the OpenCV installation"
+            )
+        return data.tobytes()
 
     def _motion(self, camera: str, frame: int) -> Motion:
         """The camera's motion on its way along the route, in its own frame."""

@@ -149,14 +149,11 @@ def _work(job: _Job) -> None:
 
 def _write_picture(port: Port, job: _Job) -> None:
     camera, frame, target = job
-    quality = [cv2.IMWRITE_JPEG_QUALITY, port.config.exposure.jpeg_quality]
-    encoded, data = cv2.imencode(".jpg", port.picture(camera, frame).image, quality)
-    if not encoded:
-        raise DriveError(f"{target}: the image could not be coded as JPEG; check the OpenCV installation")
     path = Path(target)
+    data = port.jpeg(port.picture(camera, frame).image)
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        unfinished.write_bytes(data.tobytes())
+        unfinished.write_bytes(data)
         unfinished.replace(path)
     finally:
         unfinished.unlink(missing_ok=True)
