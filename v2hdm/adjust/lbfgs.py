@@ -61,23 +61,14 @@ def minimise(
     """
     scale = gradient.abs().sum()
     u = torch.zeros_like(gradient, requires_grad=True)
-
-    # Each call of step() evaluates first where the last one ended, so remember the points of one step.
-    def evaluate(point: Tensor) -> tuple[Tensor, Tensor]:
-        for known, known_cost, known_gradient in recent:
-            if torch.equal(known, point):
-                return known_cost, known_gradient
-        new_cost, new_gradient = objective(point * scale)
-        recent.append((point.clone(), new_cost, new_gradient))
-        return new_cost, new_gradient
+    seen = _Evaluations(lambda point: objective(point * scale), torch.zeros_like(gradient), cost, gradient)
 
     def closure() -> Tensor:
-        new_cost, new_gradient = evaluate(u.detach())
+        new_cost, new_gradient = seen.at(u.detach())
         u.grad = new_gradient / scale
         # Relative to the start, small improvements of a large cost keep their digits.
         return (new_cost - cost) / scale.square()
 
-    recent = [(torch.zeros_like(gradient), cost, gradient)]
     optimizer = _one_step_optimizer(u)
     best, best_gradient = cost, gradient
     gap, slow = predicted_gap(best, best_gradient), False
@@ -85,12 +76,12 @@ def minimise(
         if gap <= tolerance or slow:
             break
         optimizer.step(closure)  # type: ignore[no-untyped-call]
-        reached, reached_gradient = evaluate(u.detach())
+        reached, reached_gradient = seen.at(u.detach())
         if not bool(reached.isfinite()):
             # A line search over a singular direction has run off; the point before it still stands.
-            u.data.copy_(recent[0][0])
+            u.data.copy_(seen.start)
             break
-        recent[:] = [(u.detach().clone(), reached, reached_gradient)]
+        seen.begin_step(u.detach(), reached, reached_gradient)
         progress = float(best - reached)
         best, best_gradient = reached, reached_gradient
         if progress <= _NO_PROGRESS * float(best):
@@ -98,6 +89,32 @@ def minimise(
         before, gap = gap, predicted_gap(best, best_gradient)
         slow = not patient and iteration > 0 and gap > _SLOW * before
     return Minimum(u.detach() * scale, best, best_gradient, slow)
+
+
+class _Evaluations:
+    """An objective that knows the points of one step: each asks first where the last one ended."""
+
+    def __init__(self, objective: Objective, start: Tensor, cost: Tensor, gradient: Tensor) -> None:
+        self._objective = objective
+        self.begin_step(start, cost, gradient)
+
+    def begin_step(self, start: Tensor, cost: Tensor, gradient: Tensor) -> None:
+        """Forget all points but the one that a step starts from, with its cost and gradient."""
+        self._known = [(start.clone(), cost, gradient)]
+
+    @property
+    def start(self) -> Tensor:
+        """The point that the current step started from."""
+        return self._known[0][0]
+
+    def at(self, point: Tensor) -> tuple[Tensor, Tensor]:
+        """Cost and gradient at a point, computed if it is none of the known ones."""
+        for known, cost, gradient in self._known:
+            if torch.equal(known, point):
+                return cost, gradient
+        cost, gradient = self._objective(point)
+        self._known.append((point.clone(), cost, gradient))
+        return cost, gradient
 
 
 def _one_step_optimizer(u: Tensor) -> torch.optim.LBFGS:
