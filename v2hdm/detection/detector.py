@@ -116,7 +116,9 @@ class Detector:
             lanes = trace_lanes(
                 self._lane_paint(candidates), view, self.options.lane_step_m, self.options.max_range_m
             )
-            lanes += link_anchors(sight.anchors, view, lanes, self.options.lane_step_m, foreground)
+            lanes += link_anchors(
+                sight.anchors, view, lanes, self.options.lane_step_m, foreground, info.lane_stride
+            )
         with lap("corners"):
             starts = self._starts(candidates, view)
             markings = fit_markings(image_bgr, view, starts, foreground, self.options)

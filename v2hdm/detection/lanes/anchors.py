@@ -14,7 +14,7 @@ import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.foreground import Foreground
-from v2hdm.detection.lanes.bends import Seen, beside_guide
+from v2hdm.detection.lanes.bends import DRAWN_STEP_PX, Seen, beside_guide
 from v2hdm.detection.lanes.curves import Horizon, basis
 from v2hdm.detection.lanes.ends import solid_end
 from v2hdm.detection.lanes.groups import find_lines
@@ -47,10 +47,9 @@ _LEAST_PAINT_LENGTH_M = 0.8
 _MAX_PAINT_SLOPE = 8.0
 """Paint that runs flatter across the view, px along the horizon per px down, is on no curve of ours."""
 
-_STEP_PX = 8.0
 _SMOOTH_PX = 24.0
 _FREEDOM_M = 0.03
-"""A line is given every so many px; it follows its points within such a distance, and by so much."""
+"""A line follows its points within such a distance, and by so much."""
 
 _EXTENSION_SIGMA = 0.03
 """Lines run on towards the vehicle while known within this share of the image's width."""
@@ -88,6 +87,7 @@ def link_anchors(
     paint: Sequence[LaneDetection] = (),
     paint_step_m: float = 0.5,
     foreground: Foreground | None = None,
+    row_step_px: float = 8.0,
 ) -> list[LaneDetection]:
     """The whole lines of one image.
 
@@ -97,6 +97,7 @@ def link_anchors(
         paint: The centre lines of its lane paint, points ``paint_step_m`` apart.
         paint_step_m: That distance.
         foreground: What the network says of paint, if that is known: it tells where solid lines end.
+        row_step_px: How far apart row anchors are, twice as far where half the resolution is looked at.
     """
     horizon = Horizon(view)
     points = _crossings(rows, view, horizon)
@@ -105,7 +106,7 @@ def link_anchors(
     groups = [np.array(chain.index) for chain in _chains(points)]
     points, on_paint = _with_paint(points, paint, view, horizon)
     lines = find_lines(points, groups + on_paint, view, horizon, paint_step_m, LEAST_LOG_ODDS)
-    drawn = [_drawn(points, line, view, horizon, foreground) for line in lines]
+    drawn = [_drawn(points, line, view, horizon, foreground, row_step_px) for line in lines]
     found = [lane for lane in drawn if lane is not None]
     return _identified(beside_guide(found, view), view)
 
@@ -158,18 +159,23 @@ def _logit(probability: float) -> float:
 
 
 def _drawn(
-    points: LinePoints, line: Line, view: CameraView, horizon: Horizon, foreground: Foreground | None
+    points: LinePoints,
+    line: Line,
+    view: CameraView,
+    horizon: Horizon,
+    foreground: Foreground | None,
+    row_step_px: float,
 ) -> Seen | None:
     """A line's points in the image, near to far, with their standard deviations."""
     nearest = float(points.below[line.members].max())
     lowest = horizon.coordinates(view.undistort(_lower_corners(view)))[1].max()
     farthest = points.below[line.members].min()
-    at = np.arange(farthest, max(lowest, nearest) + _STEP_PX, _STEP_PX)[::-1]
+    at = np.arange(farthest, max(lowest, nearest) + DRAWN_STEP_PX, DRAWN_STEP_PX)[::-1]
     along, sigma = _followed(points, line, horizon, at)
     points_px = view.distort(horizon.pinhole_px(along, at))
-    ends = solid_end(points, line, at, points_px, view, horizon, foreground)
+    ends = solid_end(points, line, at, points_px, view, horizon, foreground, row_step_px)
     known = (at <= nearest) | (sigma < _EXTENSION_SIGMA * view.info.width) if ends is None else at <= ends
-    kept = known & view.inside(points_px, -_STEP_PX)
+    kept = known & view.inside(points_px, -DRAWN_STEP_PX)
     if kept.sum() < 2:
         return None
     score = float(1 / (1 + np.exp(-line.log_odds)))

@@ -46,7 +46,9 @@ _ONE_LINE_M = 0.6
 _BLEND_M = 3.0
 """So far from a line's own points its distance to the guide becomes what it is on the whole."""
 
-_ROW_STEP_PX = 8.0
+DRAWN_STEP_PX = 8.0
+"""Whole lines are given by a point every so many rows of the image."""
+
 _SIGMA_M, _SIGMA_SHARE = 0.05, 0.02
 """A line is known so well beside its guide, and by this share of the way from its own points worse."""
 
@@ -109,7 +111,7 @@ def beside_guide(lines: Sequence[Seen], view: CameraView) -> list[LaneDetection]
 def _near_end(line: Seen, view: CameraView) -> float:
     """The row, px, below which a line has ended; infinite where it leaves the image."""
     first = line.lane.points_px[0]
-    return float(first[1]) if view.inside(first, 3 * _ROW_STEP_PX) else np.inf
+    return float(first[1]) if view.inside(first, 3 * DRAWN_STEP_PX) else np.inf
 
 
 def _grounds(lines: Sequence[Seen], view: CameraView) -> list[FloatArray]:
@@ -220,8 +222,8 @@ def _redrawn(
     px, sigma_m = px[run], sigma_m[run]
     if px[0, 1] < px[-1, 1]:
         px, sigma_m = px[::-1], sigma_m[::-1]
-    lowest = min(px[0, 1], float(view.info.height) + _ROW_STEP_PX)
-    rows = np.arange(max(px[-1, 1], 0.0), lowest, _ROW_STEP_PX)[::-1]
+    lowest = min(px[0, 1], float(view.info.height) + DRAWN_STEP_PX)
+    rows = np.arange(max(px[-1, 1], 0.0), lowest, DRAWN_STEP_PX)[::-1]
     if len(rows) < 2:
         return lane
     u = np.interp(rows, px[::-1, 1], px[::-1, 0])
@@ -231,7 +233,7 @@ def _redrawn(
     beside = view.ground(view.undistort(np.concatenate([points_px - half, points_px + half])))
     width_m = np.hypot(*(beside[: len(rows)] - beside[len(rows) :]).T)
     sigma_px = np.interp(rows, px[::-1, 1], sigma_m[::-1]) / np.maximum(width_m, 1e-6) * np.hypot(1, slope)
-    kept = view.inside(points_px, -_ROW_STEP_PX) & (rows <= nearest_row)
+    kept = view.inside(points_px, -DRAWN_STEP_PX) & (rows <= nearest_row)
     return replace(lane, points_px=points_px[kept], sigma_px=sigma_px[kept]) if kept.sum() > 1 else lane
 
 

@@ -20,9 +20,6 @@ _LONGEST_DASH_M = 6.5
 _LEAST_GAP_M = 1.2
 """Paint of one piece has points nearer to each other than this."""
 
-_ROW_STEP_PX = 8.0
-"""Row anchors are so far apart, twice as far where half the resolution is looked at."""
-
 _EVEN_LOG_ODDS = -1.1
 _NO_CROSSING = -3.0
 """Crossings surer than the first speak for a line, less sure ones against it; a row without any shows one
@@ -51,6 +48,7 @@ def solid_end(
     view: CameraView,
     horizon: Horizon,
     foreground: Foreground | None,
+    row_step_px: float,
 ) -> float | None:
     """The row, px below the horizon, at which a solid line ends near the vehicle; None of any other line.
 
@@ -62,6 +60,7 @@ def solid_end(
         view: The camera.
         horizon: Its horizon.
         foreground: What the network says of paint, if that is known.
+        row_step_px: How far apart row anchors are, twice as far where half the resolution is looked at.
     """
     painted = _nearest_piece(points, line, view)
     if not len(painted) or float(np.hypot(*np.ptp(points.ground[painted], axis=0))) < _LONGEST_DASH_M:
@@ -71,7 +70,8 @@ def solid_end(
     if not len(beyond):
         return paint_ends
     rows = below[beyond]
-    speaks = _crossings(points, line, rows, view.coarse(drawn_px[beyond, 1])) - _EVEN_LOG_ODDS
+    reach_px = np.where(view.coarse(drawn_px[beyond, 1]), row_step_px, row_step_px / 2)
+    speaks = _crossings(points, line, rows, reach_px) - _EVEN_LOG_ODDS
     if foreground is not None:
         half_m = _HALF_WIDTH_OF_DOUBLE_M if line.double else _HALF_WIDTH_M
         half_px = np.maximum(half_m * horizon.px_per_m * rows, _LEAST_HALF_WIDTH_PX)
@@ -93,12 +93,11 @@ def _nearest_piece(points: LinePoints, line: Line, view: CameraView) -> IntArray
     return painted[order[: gaps[0] + 1 if len(gaps) else None]]
 
 
-def _crossings(points: LinePoints, line: Line, rows: FloatArray, coarse: np.ndarray) -> FloatArray:
-    """Log odds (N,) of the surest crossing of a line on each of its rows, ``coarse`` (N,) ones or not."""
+def _crossings(points: LinePoints, line: Line, rows: FloatArray, reach_px: FloatArray) -> FloatArray:
+    """Log odds (N,) of the surest crossing of a line within ``reach_px`` (N,) of each of its rows."""
     own = line.members[~points.is_paint[line.members]]
     off = np.abs(rows[:, None] - points.below[own])
-    reach = np.where(coarse, _ROW_STEP_PX, _ROW_STEP_PX / 2)
-    odds = np.where(off <= reach[:, None], points.odds[own], _NO_CROSSING)
+    odds = np.where(off <= reach_px[:, None], points.odds[own], _NO_CROSSING)
     return np.asarray(odds.max(axis=1, initial=_NO_CROSSING))
 
 
