@@ -45,8 +45,8 @@ def _shortest_bridge(
     if len(ended) < 2:
         return None
     for a, end_a, b, end_b in _gaps(np.stack([ends for _, ends in ended])).tolist():
-        before = _turned(ended[a][0], end_a == _FIRST)
-        after = _turned(ended[b][0], end_b == _LAST)
+        before = ended[a][0].turned(end_a == _FIRST)
+        after = ended[b][0].turned(end_b == _LAST)
         between = _bridge(before.points_map[-1], after.points_map[0], guides, tree, options)
         if between is not None:
             return a, b, _joined(before, between, after)
@@ -69,10 +69,6 @@ def _gaps(ends: FloatArray) -> NDArray[np.int64]:
     i, j = np.nonzero(able)
     order = np.argsort(gap_m[i, j], kind="stable")
     return np.asarray(np.column_stack([path[i], i % 2, path[j], j % 2])[order])
-
-
-def _turned(path: Path, flip: bool) -> Path:
-    return Path(path.points_map[::-1], path.dash, path.images) if flip else path
 
 
 def _ends(path: Path) -> FloatArray:

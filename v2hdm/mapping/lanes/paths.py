@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,10 @@ class Path:
         """Length along the polyline."""
         return float(np.sum(np.linalg.norm(np.diff(self.points_map, axis=0), axis=1)))
 
+    def turned(self, turn: bool) -> Path:
+        """The same from its other end if it is to ``turn``, else as it is."""
+        return replace(self, points_map=self.points_map[::-1]) if turn else self
+
 
 def string_nodes(nodes: Nodes, options: LaneOptions) -> list[Path]:
     """String nodes into paths, each node linked with at most one ahead and one behind.
@@ -62,7 +66,7 @@ def join_paths(paths: list[Path], options: LaneOptions) -> list[Path]:
     chain = _Chains(len(paths))
     for a, end_a, b, end_b in joints:
         chain.join(a, end_a, b, end_b)
-    return [_concatenate([_oriented(paths[p], flip) for p, flip in run], options) for run in chain.runs()]
+    return [_concatenate([paths[p].turned(flip) for p, flip in run], options) for run in chain.runs()]
 
 
 def _mutual_links(nodes: Nodes, reach_m: float) -> IntArray:
@@ -197,10 +201,6 @@ class _Chains:
         while self._root[path] != path:
             path = self._root[path]
         return path
-
-
-def _oriented(path: Path, flip: bool) -> Path:
-    return Path(path.points_map[::-1], path.dash, path.images) if flip else path
 
 
 def _concatenate(paths: list[Path], options: LaneOptions) -> Path:
