@@ -25,7 +25,8 @@ from models import MarkingNet, Prediction
 from models.marking_net import MULTIPLE
 from train.checkpoint import Checkpoint
 from v2hdm.detection.network import METADATA_KEY
-from v2hdm.errors import DetectorError
+from v2hdm.errors import ConfigError, DetectorError
+from v2hdm.files import whole_file
 
 Tell = Callable[[float, str], None]
 """Is told what share of the work is done, and what is being done."""
@@ -147,12 +148,13 @@ def _images(seed: int, frames: int, tell: Tell, start: float, share: float) -> l
 
 
 def _write(model: onnx.ModelProto, label: dict[str, Any], path: Path) -> None:
-    """Write a model with its label; a kill leaves the file before it."""
+    """Write a model with its label, whole or not at all."""
     onnx.helper.set_model_props(model, {METADATA_KEY: json.dumps(label)})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    partial.write_bytes(model.SerializeToString())
-    partial.replace(path)
+    try:
+        with whole_file(path) as partial:
+            partial.write_bytes(model.SerializeToString())
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written ({error.strerror}); set another output=") from None
 
 
 def _name_sizes(model: onnx.ModelProto) -> None:

@@ -16,6 +16,7 @@ from train.data import validation_pairs
 from train.exported import read_exported, unfold
 from train.growth import can_grow, grow, recorded_net
 from v2hdm.errors import ConfigError
+from v2hdm.files import whole_file
 
 # What may differ between the parts of a resumed run without making it another experiment.
 _FREE_TO_CHANGE = (
@@ -87,11 +88,18 @@ def fresh_checkpoint(config: TrainConfig) -> Checkpoint:
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
-    """Write a checkpoint; a kill leaves the one before it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    torch.save(vars(checkpoint), partial)
-    partial.replace(path)
+    """Write a checkpoint; a kill leaves the one before it.
+
+    Raises:
+        ConfigError: It cannot be written there.
+    """
+    try:
+        with whole_file(path) as partial, partial.open("wb") as file:
+            torch.save(vars(checkpoint), file)
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: cannot be written ({error.strerror}); free space or set another output="
+        ) from None
 
 
 def load_checkpoint(path: Path) -> Checkpoint:

@@ -1,4 +1,4 @@
-"""Reading and writing small text files so that a user can mend what is wrong with them.
+"""Reading and writing files so that a user can mend what is wrong with them.
 
 Every reader takes the :class:`~v2hdm.errors.V2hdmError` child to raise, so that a damaged drive
 and a damaged map report as what they are. Writers never leave half a file behind.
@@ -9,7 +9,8 @@ from __future__ import annotations
 import difflib
 import json
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +21,29 @@ from v2hdm.errors import V2hdmError
 from v2hdm.records import FloatArray
 
 
-def replace_text(path: Path, text: str) -> None:
-    """Write ``text`` to ``path`` at once: readers see the old file or the whole new one.
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A hidden name beside ``path`` to write to: readers see the old file or the whole new one.
 
-    The folder is created when absent.
+    What was written takes the place of ``path`` when the block succeeds; else nothing of it is left. The
+    folder is created when absent.
+
+    Raises:
+        OSError: it cannot be written there.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        partial.write_text(text, encoding="utf-8")
+        yield partial
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write ``text`` to ``path`` as :func:`whole_file` does."""
+    with whole_file(path) as partial:
+        partial.write_text(text, encoding="utf-8")
 
 
 def read_text(path: Path, error: type[V2hdmError]) -> str:

@@ -51,7 +51,7 @@ def test_a_run_leaves_checkpoints_whose_network_runs(tmp_path: Path) -> None:
     with torch.inference_mode():
         prediction = loaded.network()(torch.zeros((1, 32, 32, 3), dtype=torch.uint8))
     assert all(torch.isfinite(output).all() for output in prediction)
-    assert not list(tmp_path.glob("*.partial"))
+    assert not list(tmp_path.glob(".*.part"))
 
 
 def test_the_loss_falls_on_a_batch_seen_again_and_again(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from v2hdm.adjust.incremental import IncrementalMap, RigPrior, Settled, State
 from v2hdm.adjust.marking_fit import MarkingObservations, Noise
 from v2hdm.adjust.problem import IntArray
 from v2hdm.errors import AdjustError
+from v2hdm.files import whole_file
 from v2hdm.records import FloatArray
 
 _OBSERVED = tuple(field.name for field in fields(MarkingObservations))
@@ -45,10 +46,8 @@ def save_map(grown: IncrementalMap, path: Path) -> None:
     arrays |= {
         f"settled_{name}": _joined(getattr(one, name) for one in settled) for name in _RAGGED + _STACKED
     }
-    unfinished = path.with_name(path.name + ".part")
-    with unfinished.open("wb") as file:
+    with whole_file(path) as partial, partial.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
-    unfinished.replace(path)
 
 
 def load_map(path: Path) -> IncrementalMap:

@@ -13,6 +13,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 
 from v2hdm.detection.camera.ground import apply_homography
 from v2hdm.detection.camera.lens import distort_points
+from v2hdm.files import whole_file
 from v2hdm.planar import ground_in_vehicle
 from v2hdm.records import CameraInfo, FloatArray, HdMap, Truth
 from v2hdm.report import metrics, style
@@ -92,9 +93,8 @@ def save_overlay(
                 fixed = np.round(piece * 16).astype(np.int32)
                 cv2.polylines(canvas, [fixed], False, colour, 2, cv2.LINE_AA, shift=4)
         cv2.putText(canvas, name, (16, 34 + 30 * row), cv2.FONT_HERSHEY_SIMPLEX, 0.9, colour, 2, cv2.LINE_AA)
-    unfinished = path.with_name(f".part-{path.name}")
-    cv2.imwrite(str(unfinished), canvas)
-    unfinished.replace(path)
+    with whole_file(path) as partial:
+        partial.write_bytes(cv2.imencode(path.suffix, canvas)[1].tobytes())
 
 
 def _draw_truth(axes: Axes, truth: Truth) -> None:

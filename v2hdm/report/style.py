@@ -11,6 +11,8 @@ import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from v2hdm.files import whole_file
+
 TRUTH = "#9aa4ad"
 ROUTE = "#c9d3da"
 METHOD = {"CNI": "#e08a1e", "ENI": "#d0432b", "Opt": "#0b7a75", "ONI": "#3b6fb6"}
@@ -42,6 +44,5 @@ def figure(path: Path, width_in: float, height_in: float, dpi: int = 110) -> Ite
         fig = Figure(figsize=(width_in, height_in), dpi=dpi, layout="constrained", facecolor="white")
         FigureCanvasAgg(fig)
         yield fig
-        unfinished = path.with_name(f".{path.name}.part")
-        fig.savefig(unfinished, format="png")
-        unfinished.replace(path)
+        with whole_file(path) as partial:
+            fig.savefig(partial, format="png")

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import multiprocessing
-import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -25,6 +24,7 @@ from v2hdm.drive import write_drive
 from v2hdm.drive.folder import DRIVE_FILE, TRUTH_FOLDER
 from v2hdm.drive.truth import write_truth
 from v2hdm.errors import DriveError
+from v2hdm.files import whole_file
 from v2hdm.planar import ground_in_vehicle, inside_convex
 from v2hdm.records import Drive, Image, Truth
 from v2hdm.simulate.port.build import Port, build_port
@@ -149,14 +149,9 @@ def _work(job: _Job) -> None:
 
 def _write_picture(port: Port, job: _Job) -> None:
     camera, frame, target = job
-    path = Path(target)
     data = port.jpeg(port.picture(camera, frame).image)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        unfinished.write_bytes(data)
-        unfinished.replace(path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with whole_file(Path(target)) as partial:
+        partial.write_bytes(data)
 
 
 def _truth(port: Port, images: list[Image]) -> Truth:
