@@ -7,6 +7,7 @@ a line and image; latency percentiles at the end on stderr. docs/detect.md descr
 from __future__ import annotations
 
 import argparse
+import errno
 import json
 import os
 import signal
@@ -32,6 +33,7 @@ from v2hdm.detection.road import Road, RoadDetector
 from v2hdm.detection.stopwatch import Stopwatch, lap
 from v2hdm.drive import READERS, read_drive
 from v2hdm.errors import ConfigError, DriveError, V2hdmError
+from v2hdm.files import whole_file
 
 EXIT_USER_ERROR = 2
 _ROUGH_MOUNTING = (1.6, 5.0, 60.0)
@@ -56,9 +58,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except V2hdmError as error:
         print(f"error: {error}", file=sys.stderr)
         return EXIT_USER_ERROR
+    except KeyboardInterrupt:
+        print("error: interrupted before the first image; nothing was written", file=sys.stderr)
+        return EXIT_USER_ERROR
     except BrokenPipeError:  # the reader of our lines has had enough
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
+        _forget_stdout()
     return 0
+
+
+def _forget_stdout() -> None:
+    """Keep Python from writing at its end what could not be written before."""
+    sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -118,6 +128,8 @@ def _detect(parsed: argparse.Namespace) -> None:
 
 def _job(parsed: argparse.Namespace, detector: Detector) -> _Job:
     """What the source is, and which detector its frames want."""
+    if parsed.limit is not None and parsed.limit < 1:
+        raise ConfigError(f"--limit {parsed.limit}: give the number of images to stop after, 1 or more")
     road = None
     if parsed.camera is not None:
         if parsed.mounting is not None:
@@ -125,11 +137,16 @@ def _job(parsed: argparse.Namespace, detector: Detector) -> _Job:
                 "--camera and --mounting exclude each other: a calibration holds the mounting; drop one"
             )
         road = RoadDetector.calibrated(detector, parsed.camera, parsed.linear)
+    path = Path(parsed.source)
     if parsed.source.isdecimal():
+        if path.exists():
+            raise ConfigError(
+                f"{path}: a camera's index, and a file or folder here, too; write ./{path} for that, "
+                "or start from another folder for the camera"
+            )
         info = road and road.camera.info
         frames = camera_frames(int(parsed.source), (info.width, info.height) if info else None)
         return _Job(((frame, road) for frame in frames), live=True)
-    path = Path(parsed.source)
     if not path.exists():
         raise DriveError(f"{path}: no such image, video or folder; a camera is named by its index, such as 0")
     if path.is_dir():
@@ -186,7 +203,7 @@ def _found(
 def _rough_road(frame: Frame, parsed: argparse.Namespace, detector: Detector) -> RoadDetector:
     """A detector for a camera of which only the image size is known; it says so."""
     height_m, pitch_deg, fov_deg = parsed.mounting or _ROUGH_MOUNTING
-    if not (height_m > 0 and -45 < pitch_deg < 85 and 10 <= fov_deg <= 150):
+    if not (0 < height_m < np.inf and -45 < pitch_deg < 85 and 10 <= fov_deg <= 150):
         raise ConfigError(
             f"--mounting {height_m:g} {pitch_deg:g} {fov_deg:g}: give a height above 0 m, a pitch "
             "of -45 to 85 deg (down is positive) and a field of view of 10 to 150 deg"
@@ -217,18 +234,24 @@ def _check_size(frame: Frame, road: RoadDetector) -> None:
 def _lines(output: Path | None) -> Iterator[TextIO]:
     """Where the JSON lines go; a file appears when it is complete."""
     if output is None:
-        yield sys.stdout
+        try:
+            yield sys.stdout
+            sys.stdout.flush()
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            _forget_stdout()
+            raise DriveError(
+                f"standard output: cannot be written ({error.strerror}); give an --output with room for it"
+            ) from error
         return
-    partial = output.with_name(f".{output.name}.{os.getpid()}.part")
     try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("w", encoding="utf-8") as stream:
+        if output.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        with whole_file(output) as partial, partial.open("w", encoding="utf-8") as stream:
             yield stream
-        partial.replace(output)
     except OSError as error:
         raise DriveError(f"{output}: cannot write there ({error.strerror}); give another --output") from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _draw(path: Path, frame: Frame, found: Road) -> None:
@@ -237,15 +260,11 @@ def _draw(path: Path, frame: Frame, found: Road) -> None:
         frame.pixels, [marking.image for marking in found.markings], [lane.image for lane in found.lanes]
     )
     _, packed = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, 92])
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(packed.tobytes())
-        partial.replace(path)
+        with whole_file(path) as partial:
+            partial.write_bytes(packed.tobytes())
     except OSError as error:
         raise DriveError(f"{path}: cannot write there ({error.strerror}); give another --draw") from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _report(stopwatch: Stopwatch) -> None:

@@ -1,8 +1,11 @@
 """The on-vehicle door: every source, what it writes, and what it refuses."""
 
+import errno
+import io
 import json
 import os
 import re
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +16,7 @@ import pytest
 from onnx import numpy_helper
 
 from tests.detection.pictures import HEIGHT, WIDTH, brightness_model, diamond, extrinsic, make_camera, picture
+from v2hdm import detect
 from v2hdm.detect import main
 from v2hdm.detection import frames, network
 from v2hdm.detection.detector import Detector
@@ -229,9 +233,57 @@ def test_a_mistake_is_one_line_exit_code_2_and_nothing_half_written(bench, tmp_p
     assert not list(tmp_path.glob(".*"))
 
 
-def test_a_camera_that_does_not_open_is_one_line(bench, capfd):
-    assert bench.run(97) == 2
-    assert capfd.readouterr().err.startswith("error: camera 97: does not open")
+@pytest.mark.parametrize("index", [97, 99999999999])
+def test_a_camera_that_does_not_open_is_one_line(bench, capfd, index):
+    assert bench.run(index) == 2
+    assert capfd.readouterr().err.startswith(f"error: camera {index}: does not open")
+
+
+def test_a_number_that_is_a_folder_as_well_as_a_cameras_index_is_asked_about(
+    bench, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(bench.folder, tmp_path / "0007")
+    assert bench.run("0007") == 2
+    assert "write ./0007" in capsys.readouterr().err
+    assert bench.run("./0007") == 0
+
+
+@pytest.mark.parametrize("option", ["--output", "--draw"])
+@pytest.mark.parametrize("place", ["file/within", "folder"])
+def test_what_cannot_be_written_is_one_line_that_names_the_option(bench, tmp_path, capsys, option, place):
+    (tmp_path / "file").write_text("kept", encoding="utf-8")
+    (tmp_path / "folder" / "0.jpg").mkdir(parents=True)
+    assert bench.run(bench.folder / "0.png", option, tmp_path / place) == 2
+    error = capsys.readouterr().err
+    assert f"give another {option}" in error
+    assert error.count("\n") == 1
+    assert (tmp_path / "file").read_text(encoding="utf-8") == "kept"
+    assert not list(tmp_path.rglob(".*"))
+
+
+class FullDevice(io.StringIO):
+    def write(self, text: str) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_full_standard_output_is_one_line(bench, monkeypatch, capsys):
+    monkeypatch.setattr("sys.stdout", FullDevice())
+    monkeypatch.setattr(detect, "_forget_stdout", lambda: None)
+    assert bench.run(bench.folder) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: standard output: cannot be written (No space left")
+    assert error.count("\n") == 1
+
+
+def test_an_interruption_before_the_first_image_is_one_line(bench, tmp_path, monkeypatch, capsys):
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Detector, "load", interrupted)
+    assert bench.run(bench.folder, "--output", tmp_path / "out" / "found.jsonl") == 2
+    assert capsys.readouterr().err == "error: interrupted before the first image; nothing was written\n"
+    assert not list((tmp_path / "out").glob("*"))
 
 
 @pytest.mark.parametrize(
@@ -239,6 +291,8 @@ def test_a_camera_that_does_not_open_is_one_line(bench, capfd):
     [
         (["--mounting", 1, 0, 60], "exclude each other"),
         (["--threads", 0], "detector.threads is 0"),
+        (["--threads", 100000], "detector.threads is 100000: set 1 to 256"),
+        (["--limit", -1], "--limit -1: give the number of images"),
     ],
 )
 def test_arguments_that_cannot_work_are_refused(bench, capsys, arguments, words):
@@ -246,8 +300,9 @@ def test_arguments_that_cannot_work_are_refused(bench, capsys, arguments, words)
     assert words in capsys.readouterr().err
 
 
-def test_a_rough_mounting_that_cannot_be_is_refused(bench, capsys):
-    assert bench.run(bench.folder, "--mounting", -1, 0, 60, calibrated=False) == 2
+@pytest.mark.parametrize("height_m", ["-1", "inf", "nan"])
+def test_a_rough_mounting_that_cannot_be_is_refused(bench, capsys, height_m):
+    assert bench.run(bench.folder, "--mounting", height_m, 0, 60, calibrated=False) == 2
     assert "give a height above 0 m" in capsys.readouterr().err
 
 

@@ -18,6 +18,9 @@ from v2hdm.errors import DriveError
 
 _log = logging.getLogger(__name__)
 
+_MOST_CAMERAS = 1 << 16
+"""OpenCV takes a larger index for something else."""
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -94,7 +97,7 @@ def camera_frames(number: int, size: tuple[int, int] | None = None) -> Iterator[
     Raises:
         DriveError: it does not open, or gives no more frames.
     """
-    with _capture(number) as capture:
+    with _capture(min(number, _MOST_CAMERAS)) as capture:
         if not capture.isOpened():
             raise DriveError(f"camera {number}: does not open; is it plugged in and used by no one else?")
         if size is not None:

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 from v2hdm.errors import ConfigError
 
+_MOST_THREADS = 256
+"""More take the machine's memory before they do any work."""
+
 
 @dataclass(kw_only=True)
 class DetectorOptions:
@@ -51,8 +54,8 @@ class DetectorOptions:
         Raises:
             ConfigError: a value is out of range.
         """
-        if self.threads < 1:
-            raise ConfigError(f"detector.threads is {self.threads}: set 1 or more")
+        if not 1 <= self.threads <= _MOST_THREADS:
+            raise ConfigError(f"detector.threads is {self.threads}: set 1 to {_MOST_THREADS}")
         if self.blur_px is not None and not 0.2 <= self.blur_px <= 3.0:
             raise ConfigError(f"detector.blur_px is {self.blur_px}: set 0.2 to 3.0 px, or none to measure it")
         for name in ("max_range_m", "max_corner_sigma_px", "lane_step_m"):
