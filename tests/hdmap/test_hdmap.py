@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -152,3 +153,17 @@ def test_a_calibration_with_a_typo_is_refused(tmp_path: Path) -> None:
     (tmp_path / "front.yaml").write_text(text)
     with pytest.raises(MapFileError, match="did you mean 'camera_matrix'"):
         read_calibration(tmp_path / "front.yaml")
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [-np.eye(6), np.eye(6) + np.eye(6, k=1) / 2, np.eye(6) + 2 * (np.eye(6, k=1) + np.eye(6, k=-1))],
+    ids=["negative", "not symmetric", "correlated by more than 1"],
+)
+def test_what_is_no_covariance_is_refused(tmp_path: Path, wrong: np.ndarray) -> None:
+    path = tmp_path / "front.yaml"
+    write_calibration(Calibration(camera_info(), looking_forward(), np.eye(6)), path)
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    path.write_text(yaml.safe_dump(content | {"covariance": wrong.tolist()}), encoding="utf-8")
+    with pytest.raises(MapFileError, match=r"front\.yaml: covariance: not symmetric or negative"):
+        read_calibration(path)

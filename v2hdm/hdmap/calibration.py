@@ -9,7 +9,7 @@ import numpy as np
 
 from v2hdm.errors import MapFileError
 from v2hdm.files import check_keys, dump_yaml, load_yaml, replace_text, take_array, take_number, take_text
-from v2hdm.records import Calibration, CameraInfo
+from v2hdm.records import Calibration, CameraInfo, FloatArray
 
 _REQUIRED = (
     "camera_name",
@@ -20,6 +20,9 @@ _REQUIRED = (
     "distortion_coefficients",
     "cam_from_vehicle",
 )
+_ROUNDING = 1e-3
+"""Parts of a covariance by which it may be off for having been rounded."""
+
 _OPTIONAL = ("vehicle_from_pinhole_px", "translation_sigma_m", "rotation_sigma_deg", "covariance")
 
 
@@ -48,6 +51,18 @@ def write_calibration(calibration: Calibration, path: Path) -> None:
     replace_text(path, dump_yaml(content))
 
 
+def _is_covariance(matrix: FloatArray) -> bool:
+    """Whether a matrix (n, n) may be a covariance, written with fewer digits than it has."""
+    variance = np.diag(matrix)
+    if (variance < 0).any():
+        return False
+    scale = np.sqrt(np.outer(variance, variance))
+    correlation = matrix / np.where(scale > 0, scale, 1.0)
+    if np.abs(correlation - correlation.T).max() > _ROUNDING:
+        return False
+    return bool(np.linalg.eigvalsh(correlation).min() > -_ROUNDING)
+
+
 def read_calibration(path: Path) -> Calibration:
     """Read what :func:`write_calibration` wrote.
 
@@ -69,4 +84,8 @@ def read_calibration(path: Path) -> Calibration:
         distortion=tuple(array("distortion_coefficients", -1).tolist()),
     )
     covariance = array("covariance", 6, 6) if "covariance" in content else None
+    if covariance is not None and not _is_covariance(covariance):
+        raise MapFileError(
+            f"{path}: covariance: not symmetric or negative somewhere; mend it or leave it out"
+        )
     return Calibration(info=info, cam_from_vehicle=array("cam_from_vehicle", 4, 4), covariance=covariance)
