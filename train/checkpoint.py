@@ -115,7 +115,9 @@ def load_checkpoint(path: Path) -> Checkpoint:
         return Checkpoint(**content)
     except Exception as error:
         raise ConfigError(
-            f"{path} is no checkpoint of `python -m train`: {error!s:.120}".replace("\n", " ")
+            f"{path} is no checkpoint of `python -m train` ({error!s:.60}...): name another".replace(
+                "\n", " "
+            )
         ) from error
 
 

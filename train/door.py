@@ -31,7 +31,12 @@ def open_door(config_name: str, work: Callable[[DictConfig], None]) -> None:
     composed: list[DictConfig] = []
     compose = hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)(composed.append)
     try:
-        compose()
+        try:
+            compose()  # Hydra makes the output folder
+        except OSError as error:
+            raise ConfigError(
+                f"{error.filename}: no folder can be made there ({error.strerror}); set another output="
+            ) from None
         for config in composed:  # none after --help
             work(config)
     except (HydraException, OmegaConfBaseException) as error:

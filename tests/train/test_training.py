@@ -145,6 +145,24 @@ def test_a_mistyped_argument_is_one_line_and_exit_code_2(
     assert "\n" not in line
 
 
+def test_an_output_that_is_a_file_is_one_line_and_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "taken").write_text("kept", encoding="utf-8")
+    monkeypatch.setattr(sys, "argv", ["train", f"output={tmp_path / 'taken'}"])
+    with pytest.raises(SystemExit) as exit_:
+        open_door("train", door.main)
+    assert exit_.value.code == 2
+    assert "taken: no folder can be made there (File exists); set another output=" in capsys.readouterr().err
+    assert (tmp_path / "taken").read_text(encoding="utf-8") == "kept"
+
+
+def test_a_checkpoint_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("kept", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"last\.pt: cannot be written \(File exists\)"):
+        save_checkpoint(train(tiny(tmp_path / "run")), tmp_path / "taken" / "last.pt")
+
+
 def test_a_run_starts_from_the_weights_of_another(tmp_path: Path) -> None:
     first = train(tiny(tmp_path / "first"))
     config = replace(tiny(tmp_path / "second"), start=str(tmp_path / "first" / "last.pt"))
