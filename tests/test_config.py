@@ -52,6 +52,8 @@ def run_door(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
         (("+run=port2", "+mapping.known_sizes.by_class_m={diamond: [1, 0.7]}"), "write 1.0"),
         (("+run=kitti",), "drive.path"),
         (("+run=kitti", "drive.path=nowhere"), "nowhere"),
+        (("+run=kitti", "drive.path=straße"), "wants quotes"),
+        (("+run=kitti", "drive.path=a(1)"), "wants quotes"),
     ],
 )
 def test_a_wrong_argument_is_one_line_that_names_it(

@@ -69,6 +69,8 @@ def explain(error: Exception, overrides: list[str]) -> ConfigError:
         near = difflib.get_close_matches(leaf, {k.split(".")[-1] for k in known}, n=1)
         names = [key for key in known if near and key.split(".")[-1] == near[0]]
         hint = f"; did you mean {' or '.join(names[:3])}?" if names else ""
+    if _UNQUOTED.search(message):
+        hint = "; a value with signs or letters of its own wants quotes: \"drive.path='müll (1)'\""
     whole = re.search(r"Value (-?\d+) \(int\) is incompatible with type hint 'float'", message)
     if whole:  # OmegaConf turns whole numbers into fractions, but not inside of lists
         hint = f"; write {whole.group(1)}.0"
@@ -79,8 +81,11 @@ def explain(error: Exception, overrides: list[str]) -> ConfigError:
 
 
 _NOISE = re.compile(
-    r"(full_key|To append to your config|reference_type|object_type|Set the environment variable|See https?:)"
+    r"(\^$|full_key|To append to your config|reference_type|object_type"
+    r"|Set the environment variable|See https?:)"
 )
+
+_UNQUOTED = re.compile(r"Lexer|no viable alternative|mismatched input|extraneous input|Unknown function")
 
 
 def _keys(schema: type[Any], prefix: str = "") -> list[str]:

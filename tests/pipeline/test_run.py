@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from v2hdm.drive import ReadOptions, read_drive
 from v2hdm.errors import ConfigError, DriveError, MappingError, V2hdmError
 from v2hdm.hdmap.calibration import read_calibration
 from v2hdm.hdmap.geojson import read_geojson
+from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline import DriveConfig, RunConfig, run
 from v2hdm.pipeline.run import camera_sets
 from v2hdm.simulate import PortConfig, render_drive
@@ -164,6 +166,25 @@ def test_a_drive_past_nothing_says_that_no_marking_was_found(drive_folder: Path,
     for image in drive.rglob("*.jpg"):
         cv2.imwrite(str(image), np.full((720, 1280, 3), 90, np.uint8))
     assert "marking" in fails(drive, tmp_path / "out", MappingError)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"name": "../elsewhere"}, "name is '../elsewhere'"),
+        ({"name": ".."}, "name is '..'"),
+        ({"workers": -1}, "workers is -1"),
+        ({"mapping": MappingOptions(mode="both")}, "mapping.mode is 'both'"),
+        ({"mapping": MappingOptions(max_range_m=float("nan"))}, "mapping.max_range_m is nan"),
+        ({"mapping": MappingOptions(loss="square")}, "mapping.loss is 'square'"),
+    ],
+)
+def test_what_cannot_work_is_refused_before_anything_is_read(
+    tmp_path: Path, changes: dict[str, object], named: str
+) -> None:
+    with pytest.raises(ConfigError, match=re.escape(named)):
+        run(run_config(tmp_path / "no such drive", tmp_path / "outputs", **changes))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_run_that_both_renders_and_reads_is_refused(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+from v2hdm.adjust.problem import LOSSES
 from v2hdm.errors import ConfigError
 from v2hdm.records import CORNERED_CLASSES
 
@@ -145,6 +146,7 @@ def check_options(options: MappingOptions) -> None:
     """
     positive = {
         "max_range_m": options.max_range_m,
+        "loss_scale": options.loss_scale,
         "rounds": options.rounds,
         "association.ipm_sigma_rad": options.association.ipm_sigma_rad,
         "association.refined_sigma_rad": options.association.refined_sigma_rad,
@@ -170,6 +172,8 @@ def check_options(options: MappingOptions) -> None:
             f"mapping.pose_model is {options.pose_model!r}, of no use in mapping.mode={INCREMENTAL}, which "
             "estimates each frame's whole pose; leave it out."
         )
+    if options.loss not in LOSSES:
+        raise ConfigError(f"mapping.loss is {options.loss!r}; choose from {', '.join(LOSSES)}.")
     for key, value in positive.items():
         if not value > 0:
             raise ConfigError(f"mapping.{key} is {value}; it must be greater than zero.")

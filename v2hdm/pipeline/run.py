@@ -23,7 +23,7 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.drive import ReadOptions, read_drive
 from v2hdm.errors import ConfigError
 from v2hdm.mapping.methods import run_methods
-from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.pipeline.evaluate import CameraSets, evaluate
 from v2hdm.pipeline.write import write_results
 from v2hdm.records import Drive, ImageDetections
@@ -103,7 +103,7 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
     Raises:
         V2hdmError: The configuration, the drive or the detector is at fault, or no map can be made.
     """
-    _check_device(config.mapping.device)
+    _check(config)
     seconds: dict[str, float] = {}
     with result_folder(Path(config.output) / config.name) as folder, _log_file(folder / "run.log"):
         log.info("v2hdm %s, run %s", __version__, config.name)
@@ -176,12 +176,22 @@ def _map_camera_sets(
     return found
 
 
-def _check_device(device: str) -> None:
-    """Refuse a device that is unknown or not there, before any long work.
+def _check(config: RunConfig) -> None:
+    """Refuse what cannot work before any long work.
 
     Raises:
-        ConfigError: The message names the device.
+        ConfigError: The message names the key.
     """
+    if not config.name.strip(".") or set(config.name) & {"/", os.sep}:
+        raise ConfigError(
+            f"name is {config.name!r}: give the name of a folder within {config.output!r}, without '/'"
+        )
+    _workers(config)
+    check_options(config.mapping)
+    _check_device(config.mapping.device)
+
+
+def _check_device(device: str) -> None:
     if device not in ("cpu", "cuda"):
         raise ConfigError(f"device is {device!r}: choose cpu or cuda")
     if device == "cuda" and not torch.cuda.is_available():
