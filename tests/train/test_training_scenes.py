@@ -9,7 +9,7 @@ from train.config import DataConfig
 from train.data import RenderStream, validation_pairs
 from v2hdm.detection.camera.lens import undistort_points
 from v2hdm.planar import clip_convex, inside_convex
-from v2hdm.records import DIAMOND, LANE_CLASSES, PAINT_CLASSES, CameraInfo
+from v2hdm.records import DIAMOND, LANE_CLASSES, LANE_DASH, PAINT_CLASSES, CameraInfo, FloatArray
 from v2hdm.simulate.render.optics import Motion, Optics
 from v2hdm.simulate.render.scene import Light, box_footprint
 from v2hdm.simulate.training.hardships import (
@@ -23,7 +23,15 @@ from v2hdm.simulate.training.hardships import (
     with_pavements,
     with_seams,
 )
-from v2hdm.simulate.training.paint import Bend, random_brush, rectangle, rhombus, street_paint
+from v2hdm.simulate.training.paint import (
+    Bend,
+    RoadPaint,
+    port_paint,
+    random_brush,
+    rectangle,
+    rhombus,
+    street_paint,
+)
 from v2hdm.simulate.training.scenes import image_line, image_points, random_scene, training_sample
 from v2hdm.simulate.training.views import TrainingView, looking, random_view
 
@@ -97,6 +105,57 @@ def test_lanes_lie_on_their_paint() -> None:
             on_paint += lane_paint[v[inside], u[inside]].sum()
     assert seen > 300
     assert 0.4 < on_paint / seen < 0.95, "dashes leave gaps, double lines are bare between"
+
+
+def test_a_line_is_the_middle_of_the_strands_that_run_there_and_follows_the_one_that_goes_on() -> None:
+    """Three metres about the end of a strand the line passes over; no paint is farther than half a double."""
+    passing, one_of_two, doubles = 1.5, 0, 0
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        road = street_paint(rng, random_brush(rng, 0.0), Bend(0.0))
+        for lane in road.lanes:
+            strands = _solid_strands_about(road, lane)
+            if len(strands) != 2:
+                continue
+            doubles += 1
+            for along, left in lane:
+                near = [(along + passing > start) & (along - passing < end) for start, end, _ in strands]
+                here = [(along - passing > start) & (along + passing < end) for start, end, _ in strands]
+                if near != here or not any(here):
+                    continue
+                one_of_two += sum(here) == 1
+                assert left == pytest.approx(np.mean([strands[k][2] for k in np.flatnonzero(here)]), abs=1e-6)
+            assert np.abs(np.diff(lane[:, 1])).max() < 0.06
+    assert doubles > 5
+    assert one_of_two > 50
+
+
+def _solid_strands_about(road: RoadPaint, lane: FloatArray) -> list[tuple[float, float, float]]:
+    """Start, end and place beside the way of a straight line's solid strands; none if it has dashes."""
+    about = [
+        paint
+        for paint in road.paints
+        if paint.kind in LANE_CLASSES and abs(paint.polygon_map[:, 1].mean() - lane[:, 1].mean()) < 0.7
+    ]
+    if any(paint.kind == LANE_DASH for paint in about):
+        return []
+    corners = [paint.polygon_map for paint in about]
+    return [(float(c[:, 0].min()), float(c[:, 0].max()), float(c[:, 1].mean())) for c in corners]
+
+
+def test_no_two_lines_of_a_port_are_as_near_as_the_strands_of_one() -> None:
+    several = 0
+    for seed in range(150):
+        rng = np.random.default_rng(seed)
+        road = port_paint(rng, random_brush(rng, 0.0), Bend(0.0))
+        left = np.sort([lane[:, 1].mean() for lane in road.lanes])
+        several += len(left) > 1
+        assert not len(left) > 1 or np.diff(left).min() > 0.75
+        for paint in road.paints:
+            if paint.kind in LANE_CLASSES:
+                off = [np.abs(lane[:, 1] - paint.polygon_map[:, 1].mean()).min() for lane in road.lanes]
+                assert min(off) < 0.38, "no paint of what is no line"
+    assert several > 30
 
 
 def test_a_bend_keeps_lengths_along_its_centre_and_turns_left_for_positive_curvature() -> None:

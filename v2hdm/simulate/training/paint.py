@@ -27,6 +27,12 @@ FAR_M = 50.0
 _DIAMONDS_FAR_M = 32.0
 _NEAR_M = -4.0
 _LANE_STEP_M = 0.5
+_PASSING_M = 3.0
+"""Over such a length a curve drawn by hand passes from two strands to the one that goes on."""
+
+_LEAST_APART_M = 0.75
+"""Strands nearer than this are those of one line to whoever drives or labels."""
+
 _PIECE_M = 2.5
 _PIECE_BESIDE_M = 0.02
 
@@ -121,6 +127,24 @@ class RoadPaint:
     paints: list[Paint] = field(default_factory=list)
     lanes: list[FloatArray] = field(default_factory=list)
 
+    def add(self, line: _LaneLine) -> None:
+        """Its paint and its centre."""
+        self.paints += line.paints
+        self.lanes.append(line.centre_map)
+
+
+@dataclass(frozen=True)
+class _LaneLine:
+    """One painted line: its centre (N, 2, map), and how far left of the way its strands are, m."""
+
+    paints: list[Paint]
+    centre_map: FloatArray
+    strands_m: list[float]
+
+    def apart_m(self, other: _LaneLine) -> float:
+        """The distance from its strands to those of another line."""
+        return min(abs(a - b) for a in self.strands_m for b in other.strands_m)
+
 
 def street_paint(rng: np.random.Generator, brush: Brush, bend: Bend) -> RoadPaint:
     """Lane lines of all kinds about the camera, and now and then a junction's markings."""
@@ -135,7 +159,7 @@ def street_paint(rng: np.random.Generator, brush: Brush, bend: Bend) -> RoadPain
         left = (line + 0.5) * lane_m + here
         outer = line in (lines[0], lines[-1])
         style = rng.choice(4, p=[0.4, 0.5, 0.05, 0.05] if outer else [0.74, 0.16, 0.05, 0.05])
-        _lane_line(road, rng, brush, bend, int(style), float(left), width_m, dash)
+        road.add(_lane_line(rng, brush, bend, int(style), float(left), width_m, dash))
     for lane in lines[:-1]:
         if rng.random() < 0.3:
             road.paints += _lane_symbols(rng, brush, bend, (lane + 1) * lane_m + here, lane_m)
@@ -166,9 +190,13 @@ def port_paint(rng: np.random.Generator, brush: Brush, bend: Bend) -> RoadPaint:
         road.paints += _junction(rng, brush, bend, 3.2)
     if rng.random() < 0.35:
         road.paints += _lane_symbols(rng, brush, bend, rng.uniform(-4, 4), 3.2)
+    lines: list[_LaneLine] = []
     for _ in range(int(rng.integers(0, 4))):
         style = int(rng.choice(4, p=[0.4, 0.5, 0.05, 0.05]))
-        _lane_line(road, rng, brush, bend, style, rng.uniform(-6, 6), rng.uniform(0.09, 0.25), dash)
+        line = _lane_line(rng, brush, bend, style, rng.uniform(-6, 6), rng.uniform(0.09, 0.25), dash)
+        if all(line.apart_m(other) >= _LEAST_APART_M for other in lines):
+            lines.append(line)
+            road.add(line)
     road.paints += paints
     return road
 
@@ -180,7 +208,6 @@ def _dash_pattern(rng: np.random.Generator) -> tuple[float, float]:
 
 
 def _lane_line(
-    road: RoadPaint,
     rng: np.random.Generator,
     brush: Brush,
     bend: Bend,
@@ -188,24 +215,37 @@ def _lane_line(
     left: float,
     width_m: float,
     dash: tuple[float, float],
-) -> None:
-    """Add a line to the road. Style 0: dashes, 1: solid, 2: double solid, 3: dashes beside a solid line."""
+) -> _LaneLine:
+    """A line. Style 0: dashes, 1: solid, 2: double solid, 3: dashes beside a solid line."""
     beside = width_m * rng.uniform(1.8, 3.0)
-    extents: list[tuple[float, float]] = []
+    paints: list[Paint] = []
+    strands: list[tuple[float, tuple[float, float]]] = []
     if style in (0, 3):
         for start in np.arange(_NEAR_M - rng.uniform(0, dash[1]), FAR_M, dash[1]):
             strip = _strip(bend, start, start + dash[0], left, width_m)
-            road.paints.append(brush.paint(rng, LANE_DASH, strip))
-        extents.append((_NEAR_M, FAR_M))
+            paints.append(brush.paint(rng, LANE_DASH, strip))
+        strands.append((left, (_NEAR_M, FAR_M)))
     offsets = {1: (0.0,), 2: (-beside / 2, beside / 2), 3: (beside,)}.get(style, ())
     for offset in offsets:
         extent = _solid_extent(rng)
-        road.paints += _solid(rng, brush, bend, extent, left + offset, width_m)
-        extents.append(extent)
-    start, end = min(e[0] for e in extents), max(e[1] for e in extents)
-    centre = left + (beside / 2 if style == 3 else 0.0)
+        paints += _solid(rng, brush, bend, extent, left + offset, width_m)
+        strands.append((left + offset, extent))
+    return _LaneLine(paints, bend.to_map(_centre(strands)), [at for at, _ in strands])
+
+
+def _centre(strands: list[tuple[float, tuple[float, float]]]) -> FloatArray:
+    """The centre (N, 2), along and beside the way, of strands at a place beside it, each of such an extent.
+
+    It is the middle of those that run beside each other, and keeps to the one that goes on.
+    """
+    start, end = min(extent[0] for _, extent in strands), max(extent[1] for _, extent in strands)
     along = np.arange(start, end + 1e-6, _LANE_STEP_M)
-    road.lanes.append(bend.to_map(np.column_stack([along, np.full(len(along), centre)])))
+    runs = np.array([(along >= first) & (along <= last) for _, (first, last) in strands])
+    some = runs.any(axis=0)
+    middle = np.array([left for left, _ in strands]) @ runs[:, some] / runs[:, some].sum(axis=0)
+    reach = round(_PASSING_M / _LANE_STEP_M / 2)
+    beside = np.pad(np.interp(along, along[some], middle), reach, mode="edge")
+    return np.column_stack([along, np.convolve(beside, np.full(2 * reach + 1, 1 / (2 * reach + 1)), "valid")])
 
 
 def _solid_extent(rng: np.random.Generator) -> tuple[float, float]:
