@@ -30,6 +30,7 @@ from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.lanes import anchors, score
 from v2hdm.detection.lanes.curves import Horizon, basis
+from v2hdm.detection.lanes.looks import Looks
 from v2hdm.detection.lanes.points import Line, LinePoints
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.sight import AnchorRow
@@ -54,6 +55,7 @@ class Seen:
     rows: list[AnchorRow]
     paint: list[LaneDetection]
     view: CameraView
+    looks: Looks
     lanes_px: list[FloatArray]
 
 
@@ -62,9 +64,9 @@ def seen(shown: Example, detector: Detector) -> Seen:
     kept: list[Seen] = []
 
     def spy(
-        rows: list[AnchorRow], view: CameraView, paint: list[LaneDetection], *_: object, **__: object
+        rows: list[AnchorRow], view: CameraView, paint: list[LaneDetection], _: float, looks: Looks
     ) -> list[LaneDetection]:
-        kept.append(Seen(rows, list(paint), view, shown.lanes_px))
+        kept.append(Seen(rows, list(paint), view, looks, shown.lanes_px))
         return []
 
     with patch("v2hdm.detection.detector.link_anchors", spy):
@@ -84,7 +86,9 @@ class Proposed:
     true: BoolArray = field(init=False)
 
     def __post_init__(self) -> None:
-        self.evidence = score.evidence(self.lines, self.points, self.image.view)
+        self.evidence = score.evidence(
+            self.lines, self.points, self.image.view, self.horizon, self.image.looks
+        )
         self.true = np.array([self._is_true(line) for line in self.lines], dtype=np.bool_)
 
     def told(self, alone: FloatArray) -> FloatArray:
@@ -104,14 +108,14 @@ def proposed(image: Seen, paint_step_m: float) -> Proposed | None:
     find_lines = anchors.find_lines
 
     def spy(
-        points: LinePoints, groups: list[np.ndarray], view: CameraView, horizon: Horizon, *_: float
+        points: LinePoints, groups: list[np.ndarray], view: CameraView, horizon: Horizon, *_: object
     ) -> list[Line]:
-        lines = find_lines(points, groups, view, horizon, paint_step_m, -np.inf)
+        lines = find_lines(points, groups, view, horizon, paint_step_m, image.looks, -np.inf)
         found.append(Proposed(image, points, lines, horizon))
         return []
 
     with patch.object(anchors, "find_lines", spy):
-        anchors.link_anchors(image.rows, image.view, image.paint, paint_step_m)
+        anchors.link_anchors(image.rows, image.view, image.paint, paint_step_m, image.looks)
     return found[0] if found and found[0].lines else None
 
 

@@ -11,6 +11,7 @@ from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.lanes.anchors import link_anchors
 from v2hdm.detection.lanes.curves import Horizon, Prior
+from v2hdm.detection.lanes.looks import Looks
 from v2hdm.detection.lanes.points import LinePoints
 from v2hdm.detection.lanes.road import find_road
 from v2hdm.detection.sight import AnchorRow
@@ -160,7 +161,7 @@ def test_paint_tells_whether_crossings_carry_a_solid_line_on(view, paint_to_m, e
     for u, v in (on / 2).astype(int):
         odds[max(v - 4, 0) : v + 5, max(u - 2, 0) : u + 3] = 6.0
     foreground = Foreground(odds, np.zeros(odds.shape, dtype=np.int32), 2, 0)
-    (lane,) = link_anchors([*near, *sure], view, [solid], foreground=foreground)
+    (lane,) = link_anchors([*near, *sure], view, [solid], looks=Looks(foreground=foreground))
     ends_px = solid.points_px[0, 1]
     assert lane.points_px[0, 1] > near[0].v_px - 20 if not ends else lane.points_px[0, 1] < ends_px + 20
 
@@ -172,3 +173,17 @@ def test_a_line_whose_far_half_bends_away_a_little_stays_one(view):
     bent = [AnchorRow(r.v_px, r.u_px + (4.0 if r.v_px < split else 0.0), r.odds) for r in rows]
     (lane,) = link_anchors(bent, view)
     assert np.ptp(lane.points_px[:, 1]) > 0.9 * (rows[0].v_px - rows[-1].v_px)
+
+
+@pytest.mark.parametrize(("odds", "carried"), [(-2.8, False), (-1.5, True)])
+def test_faint_crossings_carry_a_line_on_away_from_the_vehicle_as_far_as_they_speak_for_it(
+    view, odds, carried
+):
+    line = straight(view, 1.6)
+    ground = view.ground(view.undistort(line))
+    near = anchors_of(view, [line[ground[:, 0] < 15]])
+    far = [row for row in anchors_of(view, [line]) if row.v_px < near[-1].v_px]
+    far = [AnchorRow(row.v_px, row.u_px, np.array([odds])) for row in far]
+    (lane,) = link_anchors([*near, *far], view, [painted(line, view, 5, 14)])
+    ends_px = far[-1].v_px if carried else near[-1].v_px
+    assert lane.points_px[-1, 1] == pytest.approx(ends_px, abs=9)

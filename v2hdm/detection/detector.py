@@ -16,6 +16,7 @@ from v2hdm.detection.corners.quad import is_convex
 from v2hdm.detection.corners.refine import QuadStart, fit_markings
 from v2hdm.detection.lanes.anchors import link_anchors
 from v2hdm.detection.lanes.centre_lines import LanePaint, trace_lanes
+from v2hdm.detection.lanes.looks import Looks
 from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.paint.blobs import Blob, find_blobs, outline_polygon
@@ -113,11 +114,12 @@ class Detector:
             candidates = self._candidates(blobs, view)
         foreground = Foreground(sight.paint, owner, info.paint_stride, view.far_row)
         with lap("lanes"):
+            looks = Looks.of(image_bgr, foreground)
             lanes = trace_lanes(
                 self._lane_paint(candidates), view, self.options.lane_step_m, self.options.max_range_m
             )
             lanes += link_anchors(
-                sight.anchors, view, lanes, self.options.lane_step_m, foreground, info.lane_stride
+                sight.anchors, view, lanes, self.options.lane_step_m, looks, info.lane_stride
             )
         with lap("corners"):
             starts = self._starts(candidates, view)

@@ -18,6 +18,7 @@ from v2hdm.detection.lanes.bends import DRAWN_STEP_PX, Seen, beside_guide
 from v2hdm.detection.lanes.curves import Horizon, basis
 from v2hdm.detection.lanes.ends import solid_end
 from v2hdm.detection.lanes.groups import find_lines
+from v2hdm.detection.lanes.looks import UNKNOWN_LOOKS, Looks
 from v2hdm.detection.lanes.points import NEIGHBOURS, IntArray, Line, LinePoints
 from v2hdm.detection.sight import AnchorRow
 from v2hdm.records import LANE_BOUNDARY, LANE_LINE, BoolArray, FloatArray, LaneDetection
@@ -50,6 +51,9 @@ _MAX_PAINT_SLOPE = 8.0
 _SMOOTH_PX = 24.0
 _FREEDOM_M = 0.03
 """A line follows its points within such a distance, and by so much."""
+
+_FAINTEST = -2.5
+"""Crossings of lower log odds speak against a line's going on: beyond an end they fade out slowly."""
 
 _EXTENSION_SIGMA = 0.03
 """Lines run on towards the vehicle while known within this share of the image's width."""
@@ -86,7 +90,7 @@ def link_anchors(
     view: CameraView,
     paint: Sequence[LaneDetection] = (),
     paint_step_m: float = 0.5,
-    foreground: Foreground | None = None,
+    looks: Looks = UNKNOWN_LOOKS,
     row_step_px: float = 8.0,
 ) -> list[LaneDetection]:
     """The whole lines of one image.
@@ -96,7 +100,7 @@ def link_anchors(
         view: Its camera.
         paint: The centre lines of its lane paint, points ``paint_step_m`` apart.
         paint_step_m: That distance.
-        foreground: What the network says of paint, if that is known: it tells where solid lines end.
+        looks: What the image shows of lines, if that is known.
         row_step_px: How far apart row anchors are, twice as far where half the resolution is looked at.
     """
     horizon = Horizon(view)
@@ -105,8 +109,8 @@ def link_anchors(
     points = points.where(view.range_m(points.ground) <= _MAX_RANGE_M)
     groups = [np.array(chain.index) for chain in _chains(points)]
     points, on_paint = _with_paint(points, paint, view, horizon)
-    lines = find_lines(points, groups + on_paint, view, horizon, paint_step_m, LEAST_LOG_ODDS)
-    drawn = [_drawn(points, line, view, horizon, foreground, row_step_px) for line in lines]
+    lines = find_lines(points, groups + on_paint, view, horizon, paint_step_m, looks, LEAST_LOG_ODDS)
+    drawn = [_drawn(points, line, view, horizon, looks.foreground, row_step_px) for line in lines]
     found = [lane for lane in drawn if lane is not None]
     return _identified(beside_guide(found, view), view)
 
@@ -169,7 +173,7 @@ def _drawn(
     """A line's points in the image, near to far, with their standard deviations."""
     nearest = float(points.below[line.members].max())
     lowest = horizon.coordinates(view.undistort(_lower_corners(view)))[1].max()
-    farthest = points.below[line.members].min()
+    farthest = _far_end(points, line)
     at = np.arange(farthest, max(lowest, nearest) + DRAWN_STEP_PX, DRAWN_STEP_PX)[::-1]
     along, sigma = _followed(points, line, horizon, at)
     points_px = view.distort(horizon.pinhole_px(along, at))
@@ -181,6 +185,15 @@ def _drawn(
     score = float(1 / (1 + np.exp(-line.log_odds)))
     lane = LaneDetection(LANE_BOUNDARY, score, points_px[kept], sigma_px=sigma[kept])
     return Seen(lane, _is_seen(points.below[line.certain], at[kept]))
+
+
+def _far_end(points: LinePoints, line: Line) -> float:
+    """How far below the horizon, px, a line ends: as far on as the faint crossings on it speak for it."""
+    far = float(points.below[line.certain].min())
+    faint = line.perhaps[points.below[line.perhaps] < far]
+    faint = faint[np.argsort(-points.below[faint])]
+    total = np.cumsum(points.odds[faint] - _FAINTEST)
+    return float(points.below[faint[np.argmax(total)]]) if total.max(initial=0.0) > 0 else far
 
 
 def _is_seen(own: FloatArray, at: FloatArray) -> BoolArray:

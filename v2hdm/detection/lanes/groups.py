@@ -13,6 +13,7 @@ import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.lanes.curves import Evidence, Horizon
+from v2hdm.detection.lanes.looks import Looks
 from v2hdm.detection.lanes.points import IntArray, Line, LinePoints
 from v2hdm.detection.lanes.road import Road, find_road
 from v2hdm.detection.lanes.score import log_odds, log_odds_alone
@@ -35,6 +36,7 @@ def find_lines(
     view: CameraView,
     horizon: Horizon,
     paint_step_m: float,
+    looks: Looks,
     least_log_odds: float,
 ) -> list[Line]:
     """The lines through ``groups`` of points, best first, each with the stray crossings that lie on it."""
@@ -53,7 +55,7 @@ def find_lines(
         Line(curve, group, _NONE, *rest)
         for curve, group, *rest in zip(curves, groups, paint_m, priors, along.tolist(), strict=True)
     ]
-    odds = log_odds_alone(candidates, points, view)
+    odds = log_odds_alone(candidates, points, view, horizon, looks)
     believed = [k for k in np.argsort(-odds).tolist() if odds[k] > least_log_odds - _DOUBTFUL]
     free = ~points.is_paint
     for k in believed:
@@ -67,7 +69,7 @@ def find_lines(
     # What was joined on the way tells of it too, and so do the others.
     sure = [
         replace(line, log_odds=odds)
-        for line, odds in zip(found, log_odds(found, points, view, horizon).tolist(), strict=True)
+        for line, odds in zip(found, log_odds(found, points, view, horizon, looks).tolist(), strict=True)
         if odds > least_log_odds
     ]
     return sorted(sure, key=lambda line: -line.log_odds)

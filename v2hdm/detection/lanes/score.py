@@ -17,6 +17,7 @@ import numpy as np
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.lanes.company import COMPANY, company
 from v2hdm.detection.lanes.curves import Horizon
+from v2hdm.detection.lanes.looks import LOOKS, Looks
 from v2hdm.detection.lanes.points import IntArray, Line, LinePoints
 from v2hdm.records import FloatArray
 
@@ -32,11 +33,12 @@ FEATURES = (
     "paint_odds",
     "paint_share",
     "solid",
+    *LOOKS,
 )
 """In this order: log odds of the three surest crossings; how long the line is on the ground, in the image
 and down the image (upright things are as tall as they are long); how much likelier it is along the road;
 whether it shows paint, the log odds of its surest paint, for how much of its length, how much of that is
-solid."""
+solid; and what the image shows along it."""
 
 TOLD = ("alone", "faint_crossings", *COMPANY)
 """What tells of a line among others: its log odds alone, how many crossings too unlikely by themselves lie on
@@ -50,16 +52,20 @@ _MOST_PAINT_SHARE = 2.0
 """Of a double line there is twice as much paint as the line is long."""
 
 
-def log_odds_alone(lines: Sequence[Line], points: LinePoints, view: CameraView) -> FloatArray:
+def log_odds_alone(
+    lines: Sequence[Line], points: LinePoints, view: CameraView, horizon: Horizon, looks: Looks
+) -> FloatArray:
     """Log odds (N,) of N lines through an image's points, each by itself."""
     weights, bias = fitted()["alone"]
-    return np.asarray(evidence(lines, points, view) @ weights + bias)
+    return np.asarray(evidence(lines, points, view, horizon, looks) @ weights + bias)
 
 
-def log_odds(lines: Sequence[Line], points: LinePoints, view: CameraView, horizon: Horizon) -> FloatArray:
+def log_odds(
+    lines: Sequence[Line], points: LinePoints, view: CameraView, horizon: Horizon, looks: Looks
+) -> FloatArray:
     """Log odds (N,) of N lines, all there are in an image."""
     weights, bias = fitted()["among"]
-    alone = log_odds_alone(lines, points, view)
+    alone = log_odds_alone(lines, points, view, horizon, looks)
     return np.asarray(told(lines, points, horizon, alone) @ weights + bias)
 
 
@@ -70,7 +76,9 @@ def told(lines: Sequence[Line], points: LinePoints, horizon: Horizon, alone: Flo
     return np.column_stack([alone, faint, others])
 
 
-def evidence(lines: Sequence[Line], points: LinePoints, view: CameraView) -> FloatArray:
+def evidence(
+    lines: Sequence[Line], points: LinePoints, view: CameraView, horizon: Horizon, looks: Looks
+) -> FloatArray:
     """What speaks for N lines by themselves (N, F), in the order of :data:`FEATURES`."""
     if not lines:
         return np.empty((0, len(FEATURES)))
@@ -98,6 +106,7 @@ def evidence(lines: Sequence[Line], points: LinePoints, view: CameraView) -> Flo
         np.where(paint > 0, paint_odds, 0.0),
         np.minimum(paint_m / np.maximum(length_m, 1.0), _MOST_PAINT_SHARE),
         solid / np.maximum(paint, 1),
+        looks.along(lines, points, view, horizon),
     )
     return np.column_stack(columns).astype(np.float64)
 
