@@ -61,7 +61,7 @@ def export_float(source: Source, path: Path, opset: int, tolerance: float) -> fl
             f"{path} was not written: its outputs would differ from the network's by {difference:.2g}, "
             f"more than tolerance={tolerance:g}; try another opset"
         )
-    _write(model, source.label | {"precision": "float32", "parity": {"difference": difference}}, path)
+    write_labelled(model, source.label | {"precision": "float32", "parity": {"difference": difference}}, path)
     return difference
 
 
@@ -96,7 +96,7 @@ def export_int8(source: Source, path: Path, opset: int, config: Int8Config, tell
         )
     figures = {name: round(value, 4) for name, value in asdict(parity).items()}
     fitting = {"frames": config.frames, "seed": config.seed, "parity_frames": config.parity_frames}
-    _write(model, source.label | {"precision": "int8", "parity": figures, "int8": fitting}, path)
+    write_labelled(model, source.label | {"precision": "int8", "parity": figures, "int8": fitting}, path)
     tell(1.0, "written")
     return parity
 
@@ -122,7 +122,7 @@ def to_onnx(net: MarkingNet, opset: int) -> onnx.ModelProto:
     assert program is not None
     model = program.model_proto
     _name_sizes(model)
-    _forget_source(model)
+    forget_source(model)
     onnx.checker.check_model(model)
     return model
 
@@ -147,7 +147,7 @@ def _images(seed: int, frames: int, tell: Tell, start: float, share: float) -> l
     return images
 
 
-def _write(model: onnx.ModelProto, label: dict[str, Any], path: Path) -> None:
+def write_labelled(model: onnx.ModelProto, label: dict[str, Any], path: Path) -> None:
     """Write a model with its label, whole or not at all."""
     onnx.helper.set_model_props(model, {METADATA_KEY: json.dumps(label)})
     try:
@@ -166,7 +166,7 @@ def _name_sizes(model: onnx.ModelProto) -> None:
             value.type.tensor_type.shape.dim[axis].dim_param = name
 
 
-def _forget_source(model: onnx.ModelProto) -> None:
+def forget_source(model: onnx.ModelProto) -> None:
     """Drop what the exporter notes of the source of each node: paths of the machine that it ran on."""
     for part in (*model.graph.node, *model.graph.value_info, *model.graph.initializer):
         del part.metadata_props[:]

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 from unittest.mock import patch
@@ -23,9 +23,21 @@ from unittest.mock import patch
 import cv2
 import numpy as np
 
+from export.judge_file import write_judge
+from models.judge import Judge
 from tests.benchmarks.detector_quality import Example, example, polygon_overlap
-from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, SHAPES, TOLD, shape_of, told
+from train.judge import JudgeConfig, Quadrilaterals, judged, train_judge
+from v2hdm.detection.corners.confidence import (
+    CONFIDENCE_FILE,
+    JUDGE_FILE,
+    SHAPES,
+    TOLD,
+    one_hot,
+    shape_of,
+    told,
+)
 from v2hdm.detection.corners.evidence import FEATURES, gather
+from v2hdm.detection.corners.rectified import CHANNELS, SIZE
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import BoolArray, FloatArray
@@ -35,6 +47,7 @@ REFINE = "v2hdm.detection.corners.refine"
 EASY = 0.2
 RIDGE = 2.0
 FOLDS = 5
+CONFIG = JudgeConfig()
 COUNTS = (10, 20, 40, 80)
 """Of false ones, at which those true are counted."""
 
@@ -43,11 +56,12 @@ COUNTS = (10, 20, 40, 80)
 class Gathered:
     """N readings of quadrilaterals as one class, those of one look at an image together.
 
-    Their evidence, corners on the ground, classes, whether they are true (None where either will do), the
-    numbers of the images they are from and of the looks.
+    Their evidence, what they look like, corners on the ground, classes, whether they are true (None where
+    either will do), the numbers of the images they are from and of the looks.
     """
 
     evidence: list[FloatArray] = field(default_factory=list)
+    views: list[np.ndarray] = field(default_factory=list)
     ground: list[FloatArray] = field(default_factory=list)
     kind: list[str] = field(default_factory=list)
     true: list[bool | None] = field(default_factory=list)
@@ -62,8 +76,9 @@ class Gathered:
             corners_px.extend(given[3])
             return gather(*given)
 
-        def spy(evidence: FloatArray, kinds: list[str], ground: FloatArray) -> FloatArray:
+        def spy(evidence: FloatArray, views: np.ndarray, kinds: list[str], ground: FloatArray) -> FloatArray:
             self.evidence.extend(evidence)
+            self.views.extend(views.astype(np.float16))
             self.kind.extend(kinds)
             self.ground.extend(ground)
             return np.ones(len(evidence))
@@ -119,7 +134,7 @@ def log_loss(odds: FloatArray, true: BoolArray) -> float:
 def main() -> None:
     """Gather, fit, print, and write if asked to."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--images", type=int, default=450)
+    parser.add_argument("--images", type=int, default=1650)
     parser.add_argument("--model")
     parser.add_argument("--write", action="store_true")
     parsed = parser.parse_args()
@@ -130,54 +145,77 @@ def main() -> None:
     for index, shown in renders_to_fit(parsed.images, SEED):
         for detector in detectors:
             gathered.add(index, shown, detector)
-    known = [true for true in gathered.true if true is not None]
-    print(f"{sum(known)} of {len(known)} true, in {parsed.images} images")
-    fitted = fit_shapes(gathered)
+    judge, fitted = fit_all(gathered)
     if parsed.write:
-        CONFIDENCE_FILE.write_text(json.dumps(fitted, indent=1) + "\n")
+        write_both(judge, fitted, parsed.images)
 
 
-def fit_shapes(gathered: Gathered) -> dict[str, dict[str, object]]:
-    """What ``confidence.json`` is to hold; prints weights and losses."""
-    alone, odds = _fit_each(gathered, np.array(gathered.evidence), FEATURES)
-    # Each look is told of by odds that its own image had no part in.
-    features, look = np.zeros((len(odds), len(TOLD))), np.array(gathered.look)
+def write_both(judge: Judge, fitted: dict[str, dict[str, object]], images: int) -> None:
+    """Put the judge and the weights among others where the detector looks for them."""
+    label = {"channels": CHANNELS, "features": FEATURES, "shapes": SHAPES, "images": images, "seed": SEED}
+    write_judge(judge, (len(CHANNELS), SIZE, SIZE), label, JUDGE_FILE)
+    CONFIDENCE_FILE.write_text(json.dumps(fitted, indent=1) + "\n")
+
+
+def fit_all(gathered: Gathered) -> tuple[Judge, dict[str, dict[str, object]]]:
+    """The judge, and what ``confidence.json`` is to hold; prints what both are worth on images left out."""
+    known = np.array([true is not None for true in gathered.true])
+    true = np.array([true is True for true in gathered.true])
+    fold = np.array(gathered.image) % FOLDS
+    print(f"{true.sum()} of {known.sum()} true, in {len(set(gathered.image))} images", flush=True)
+    asked = Quadrilaterals(
+        np.array(gathered.views, dtype=np.float32),
+        np.array(gathered.evidence, dtype=np.float32),
+        one_hot(gathered.kind),
+        true,
+    )
+    # Each is told of by odds that its own image had no part in.
+    odds = np.zeros(len(true))
+    for k in range(FOLDS):
+        odds[fold == k] = judged(train_judge(asked.take(known & (fold != k)), CONFIG), asked.take(fold == k))
+    _print_worth("alone", odds[known], true[known])
+    look, ground = np.array(gathered.look), np.array(gathered.ground)
+    features = np.zeros((len(odds), len(TOLD)))
     for number in range(1 + look.max()):
         mine = np.flatnonzero(look == number)
-        kinds = [gathered.kind[m] for m in mine]
-        features[mine] = told(odds[mine], np.array(gathered.ground)[mine], kinds)
-    among, _ = _fit_each(gathered, features, TOLD)
-    return {shape: {"alone": alone[shape], "among": among[shape]} for shape in SHAPES}
+        features[mine] = told(odds[mine], ground[mine], [gathered.kind[m] for m in mine])
+    shape = np.array([shape_of(kind) for kind in gathered.kind])
+    fitted, left_out = _fit_each(features, shape, true, known, fold)
+    _print_worth("among others", left_out[known], true[known])
+    return train_judge(asked.take(known), CONFIG), fitted
 
 
 def _fit_each(
-    gathered: Gathered, features: FloatArray, names: Sequence[str]
-) -> tuple[dict[str, object], FloatArray]:
+    features: FloatArray, shape: np.ndarray, true: BoolArray, known: BoolArray, fold: np.ndarray
+) -> tuple[dict[str, dict[str, object]], FloatArray]:
     """The fit of each shape to features (N, F), and log odds (N,) by fits to other images."""
-    known = np.array([true is not None for true in gathered.true])
-    true = np.array([true is True for true in gathered.true])
-    shape, fold = np.array([shape_of(kind) for kind in gathered.kind]), np.array(gathered.image) % FOLDS
-    fitted: dict[str, object] = {}
+    fitted: dict[str, dict[str, object]] = {}
     effect, left_out = {}, np.zeros(len(true))
     for name in SHAPES:
         mine = known & (shape == name)
         weights, bias = fit(features[mine], true[mine])
         effect[name] = weights * features[mine].std(axis=0)
-        named = dict(zip(names, weights.round(4).tolist(), strict=True))
+        named = dict(zip(TOLD, weights.round(4).tolist(), strict=True))
         fitted[name] = {"bias": round(bias, 4), "weights": named}
         for k in range(FOLDS):
             others, these = mine & (fold != k), (shape == name) & (fold == k)
             weights, bias = fit(features[others], true[others])
             left_out[these] = features[these] @ weights + bias
     print(f"{'':16s} " + " ".join(f"{name:>9s}" for name in SHAPES))
-    for row, name in enumerate(names):
+    for row, name in enumerate(TOLD):
         print(f"{name:16s} " + " ".join(f"{effect[shape][row]:+9.2f}" for shape in SHAPES))
-    print(f"log loss of images left out {log_loss(left_out[known], true[known]):.3f}; true ones at ", end="")
-    order = np.argsort(-left_out[known])
-    false, found = np.cumsum(~true[known][order]), np.cumsum(true[known][order])
-    ranks = [np.searchsorted(false, count, side="right") for count in COUNTS]
-    print(", ".join(f"{count} false {found[rank - 1]}" for count, rank in zip(COUNTS, ranks, strict=True)))
     return fitted, left_out
+
+
+def _print_worth(name: str, odds: FloatArray, true: BoolArray) -> None:
+    """What log odds (N,) of images that had no part in them are worth."""
+    order = np.argsort(-odds)
+    false, found = np.cumsum(~true[order]), np.cumsum(true[order])
+    ranks = [np.searchsorted(false, count, side="right") for count in COUNTS]
+    counts = ", ".join(f"{count} false {found[rank - 1]}" for count, rank in zip(COUNTS, ranks, strict=True))
+    print(
+        f"{name}: log loss of images left out {log_loss(odds, true):.3f}; true ones at {counts}", flush=True
+    )
 
 
 if __name__ == "__main__":

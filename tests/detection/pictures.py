@@ -7,6 +7,7 @@ lens, a Gaussian point spread, noise, sRGB coding. It shares no code with the pa
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -17,7 +18,11 @@ from onnx import TensorProto, helper, numpy_helper
 
 from v2hdm.detection.camera.ground import apply_homography, ipm_from_extrinsic
 from v2hdm.detection.camera.lens import distort_points, undistort_points
-from v2hdm.records import PAINT_CLASSES, Camera, CameraInfo
+from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.corners.foreground import Foreground
+from v2hdm.detection.corners.quad import order_corners
+from v2hdm.detection.corners.rectified import rectified_views
+from v2hdm.records import DIAMOND, PAINT_CLASSES, Camera, CameraInfo
 
 HEIGHT, WIDTH = 360, 640
 OPTICAL_FROM_LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -52,6 +57,28 @@ def to_image(camera: Camera, points_vehicle: np.ndarray) -> np.ndarray:
     """Ground points (N, 2) as recorded pixels."""
     pinhole_px_from_vehicle = np.linalg.inv(camera.ipm[camera.initial_ipm])
     return distort_points(camera.info, apply_homography(pinhole_px_from_vehicle, points_vehicle))
+
+
+def foreground_of(odds: np.ndarray, owner: np.ndarray, top: int) -> Foreground:
+    """Log odds (h, w) of paint and its owners, 2 px apart; what class it is of nobody knows."""
+    kinds = np.zeros((len(PAINT_CLASSES), odds.shape[0] // 2, odds.shape[1] // 2), dtype=np.float32)
+    return Foreground(odds, owner, 2, top, kinds, tuple(PAINT_CLASSES))
+
+
+def crisp_view(kind: str) -> np.ndarray:
+    """A marking (C, 20, 20) as its own frame should show it: bright, of its class, and nothing about it."""
+    camera = make_camera("pinhole")
+    shape = diamond(6.0, 0.0) if kind == DIAMOND else bar(6.0, 0.0, 2.0, 0.4)
+    corners_px = order_corners(to_image(camera, shape))[None]
+    inside = np.zeros((HEIGHT // 2, WIDTH // 2), dtype=np.float32)
+    cv2.fillConvexPoly(inside, np.round(corners_px[0] / 2).astype(np.int32), 1.0)
+    blank = foreground_of(12 * inside - 6, inside.astype(np.int16), 0)
+    kinds = np.zeros_like(blank.kinds)
+    kinds[PAINT_CLASSES.index(kind)] = 8.0
+    view = CameraView(camera, 16)
+    ground = view.ground(view.undistort(corners_px[0]))[None]
+    image = picture(camera, [shape])
+    return rectified_views(image, view, replace(blank, kinds=kinds), corners_px, ground, [kind])[0]
 
 
 def diamond(

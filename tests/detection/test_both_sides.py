@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.detection.pictures import bar, make_camera, picture, to_image
+from tests.detection.pictures import bar, foreground_of, make_camera, picture, to_image
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.both_sides import painted_parts
 from v2hdm.detection.corners.evidence import Claim
@@ -58,7 +58,7 @@ def foreground(sure: tuple[float, ...]) -> Foreground:
     for x in sure:
         px = (to_image(VIEW.camera, bar(x, 0.0, 3.0, 1.5 * WIDE_M)) - [0, VIEW.top]) / 2
         cv2.fillConvexPoly(odds, np.round(px).astype(np.int32), 6.0)
-    return Foreground(odds, np.zeros(odds.shape, np.int16), 2, VIEW.top)
+    return foreground_of(odds, np.zeros(odds.shape, np.int16), VIEW.top)
 
 
 @pytest.mark.parametrize(("begin_m", "end_m"), [(5.5, 12.0), (4.5, 8.5), (4.6, 11.0)])

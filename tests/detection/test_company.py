@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.detection.pictures import crisp_view
 from v2hdm.detection.corners.company import COMPANY, company
 from v2hdm.detection.corners.confidence import confidence
 from v2hdm.detection.corners.evidence import FEATURES
@@ -93,5 +94,6 @@ def test_a_doubtful_diamond_is_believed_among_others_like_it() -> None:
     field = np.stack([diamond(4.0 + 3 * k, 0) for k in range(4)])
     mixed = field.copy()
     mixed[1:] = 4 + 0.4 * (mixed[1:] - 4)
-    among, apart = (confidence(evidence, kinds, ground)[0] for ground in (field, mixed))
+    views = np.stack([crisp_view(DIAMOND)] * 4)
+    among, apart = (confidence(evidence, views, kinds, ground)[0] for ground in (field, mixed))
     assert 1 - apart > 5 * (1 - among)

@@ -4,15 +4,25 @@ import json
 
 import cv2
 import numpy as np
+import onnx
 import pytest
 
 from tests.benchmarks.detector_confidence import fit
-from tests.detection.pictures import bar, brightness_model, diamond, make_camera, picture, to_image
-from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, SHAPES, TOLD, confidence
+from tests.detection.pictures import (
+    bar,
+    brightness_model,
+    crisp_view,
+    diamond,
+    make_camera,
+    picture,
+    to_image,
+)
+from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, JUDGE_FILE, SHAPES, TOLD, confidence
 from v2hdm.detection.corners.evidence import FEATURES, Steps, grey_steps, whole_ends
 from v2hdm.detection.corners.found import Corners
 from v2hdm.detection.corners.grey import linear_grey
 from v2hdm.detection.corners.quad import order_corners
+from v2hdm.detection.corners.rectified import CHANNELS
 from v2hdm.detection.corners.refine import doubt_corners
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
@@ -179,9 +189,13 @@ def test_a_fleck_among_painted_diamonds_is_believed_far_less_than_they_are(tmp_p
     assert faintest / (1 - faintest) > 10 * fleck / (1 - fleck)
 
 
-def test_the_fitted_weights_are_those_of_the_features_and_prefer_evidence():
+def test_judge_and_weights_are_those_of_what_is_measured_and_prefer_evidence():
+    label = json.loads(onnx.load(JUDGE_FILE).metadata_props[0].value)
+    assert (label["features"], label["channels"]) == ([*FEATURES], [*CHANNELS])
+    assert label["shapes"] == [*SHAPES]
     fitted = json.loads(CONFIDENCE_FILE.read_text())
     assert set(fitted) == set(SHAPES)
+    assert all(set(fitted[shape]["weights"]) == set(TOLD) for shape in SHAPES)
     kinds = [DIAMOND, LANE_DASH, STOP_LINE, CROSSWALK_BAR]
     none, all_around = np.zeros((2, len(kinds), len(FEATURES)))
     for name in ("odds_inside", "surest_inside"):
@@ -196,12 +210,10 @@ def test_the_fitted_weights_are_those_of_the_features_and_prefer_evidence():
         "sharpness",
     ):
         all_around[:, FEATURES.index(name)] = 1.0
-    for shape in SHAPES:
-        assert set(fitted[shape]["alone"]["weights"]) == set(FEATURES)
-        assert set(fitted[shape]["among"]["weights"]) == set(TOLD)
+    views = np.stack([crisp_view(kind) for kind in kinds])
     ground = 100.0 * np.arange(len(kinds))[:, None, None] + np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    assert (confidence(none, kinds, ground) < confidence(all_around, kinds, ground)).all()
-    first, second = confidence(all_around, kinds, ground)[2:]
+    assert (confidence(none, views, kinds, ground) < confidence(all_around, views, kinds, ground)).all()
+    first, second = confidence(all_around, views, kinds, ground)[2:]
     assert first == second, "bars of any class are judged alike"
 
 

@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.detection.pictures import diamond, make_camera, to_image
+from tests.detection.pictures import diamond, foreground_of, make_camera, to_image
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.evidence import Claim
-from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.corners.outline_fit import fit_outlines
 from v2hdm.detection.corners.quad import order_corners
 from v2hdm.detection.corners.refine import QuadStart, fit_markings
@@ -74,7 +73,7 @@ def fitted_on_a_blank_image(quad_vehicle: np.ndarray) -> tuple[np.ndarray, list[
     )
     blank = np.full((camera.info.height, camera.info.width, 3), 90, dtype=np.uint8)
     owner = np.zeros((view.height // 2, camera.info.width // 2), dtype=np.int16)
-    foreground = Foreground(np.zeros(owner.shape, np.float32), owner, 2, view.top)
+    foreground = foreground_of(np.zeros(owner.shape, np.float32), owner, view.top)
     options = replace(DetectorOptions.for_mapping(), min_confidence=0.0)
     return view.distort(quad), fit_markings(blank, view, [start], foreground, options)
 

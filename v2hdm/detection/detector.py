@@ -112,7 +112,9 @@ class Detector:
             reach_px = self._reach_px[camera.info.name]
             blobs, owner = find_blobs(sight, info.classes, info.paint_stride, view.far_row, reach_px)
             candidates = self._candidates(blobs, view)
-        foreground = Foreground(sight.paint, owner, info.paint_stride, view.far_row)
+        foreground = Foreground(
+            sight.paint, owner, info.paint_stride, view.far_row, sight.kinds, info.classes
+        )
         with lap("lanes"):
             looks = Looks.of(image_bgr, foreground)
             lanes = trace_lanes(

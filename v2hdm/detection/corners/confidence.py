@@ -1,9 +1,10 @@
-"""How probable it is that a quadrilateral is a whole marking of its class: a logistic function of evidence.
+"""How probable it is that a quadrilateral is a whole marking of its class.
 
-It is asked twice: first what speaks for each one alone, then with what the others, as probable as they were
-alone, say of it. The weights, in ``confidence.json`` beside the network that they belong to, are those that
-``python -m tests.benchmarks.detector_confidence`` fits to renders which no benchmark shows. What speaks for a
-diamond does not speak for a dash, so each of the :data:`SHAPES` has its own.
+It is asked twice. First of each one alone: the network in ``judge.onnx`` gets what was measured of it and
+what it looks like. Then of each among the others, as probable as they were alone: a logistic function of what
+they say of it, whose weights are in ``confidence.json``. Both belong to the paint network beside them;
+``python -m tests.benchmarks.detector_confidence`` fits them to renders which no benchmark shows. What speaks
+for a diamond does not speak for a dash, so each of the :data:`SHAPES` has its own weights.
 """
 
 from __future__ import annotations
@@ -14,12 +15,14 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import onnxruntime
 
 from v2hdm.detection.corners.company import COMPANY, company
-from v2hdm.detection.corners.evidence import FEATURES
 from v2hdm.records import DIAMOND, LANE_DASH, FloatArray
 
 CONFIDENCE_FILE = Path(__file__).parents[1] / "confidence.json"
+JUDGE_FILE = Path(__file__).parents[1] / "judge.onnx"
+JUDGE_INPUTS = ("views", "evidence", "shape")
 
 _Fit = tuple[FloatArray, float]
 """Weights (F,) and bias of a logistic function."""
@@ -36,18 +39,26 @@ def shape_of(kind: str) -> str:
     return kind if kind in SHAPES else SHAPES[-1]
 
 
-def confidence(evidence: FloatArray, kinds: Sequence[str], ground: FloatArray) -> FloatArray:
+def confidence(
+    evidence: FloatArray, views: np.ndarray, kinds: Sequence[str], ground: FloatArray
+) -> FloatArray:
     """Probability (M,) of each one's class.
 
     Args:
-        evidence: (M, F), in the order of :data:`FEATURES`.
+        evidence: (M, F), in the order of :data:`~v2hdm.detection.corners.evidence.FEATURES`.
+        views: (M, C, S, S) float32, what each one looks like: :mod:`v2hdm.detection.corners.rectified`.
         kinds: the classes.
         ground: corners (M, 4, 2) on the ground, m.
     """
-    alone, among = _fitted(CONFIDENCE_FILE)
-    shapes = [shape_of(kind) for kind in kinds]
-    odds = _odds(evidence, [alone[shape] for shape in shapes])
-    return as_probability(_odds(told(odds, ground, kinds), [among[shape] for shape in shapes]))
+    given = (views, evidence.astype(np.float32), one_hot(kinds))
+    odds = _judge(JUDGE_FILE).run(None, dict(zip(JUDGE_INPUTS, given, strict=True)))[0].astype(np.float64)
+    fitted = _fitted(CONFIDENCE_FILE)
+    return as_probability(_odds(told(odds, ground, kinds), [fitted[shape_of(kind)] for kind in kinds]))
+
+
+def one_hot(kinds: Sequence[str]) -> np.ndarray:
+    """Which of the :data:`SHAPES` each class has: (M, 3) float32, 1 there and else 0."""
+    return np.eye(len(SHAPES), dtype=np.float32)[[SHAPES.index(shape_of(kind)) for kind in kinds]]
 
 
 def told(odds: FloatArray, ground: FloatArray, kinds: Sequence[str]) -> FloatArray:
@@ -67,16 +78,17 @@ def _odds(features: FloatArray, fits: Sequence[_Fit]) -> FloatArray:
 
 
 @cache
-def _fitted(path: Path) -> tuple[dict[str, _Fit], dict[str, _Fit]]:
-    """Weights and bias of each shape, alone and among others."""
+def _judge(path: Path) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+@cache
+def _fitted(path: Path) -> dict[str, _Fit]:
+    """Weights and bias of each shape among others."""
     fitted = json.loads(path.read_text(encoding="utf-8"))
-    names = {"alone": FEATURES, "among": TOLD}
-    alone, among = (
-        {
-            shape: (np.array([part["weights"][name] for name in names[asked]]), float(part["bias"]))
-            for shape in SHAPES
-            for part in (fitted[shape][asked],)
-        }
-        for asked in ("alone", "among")
-    )
-    return alone, among
+    return {
+        shape: (np.array([part["weights"][name] for name in TOLD]), float(part["bias"]))
+        for shape, part in fitted.items()
+    }

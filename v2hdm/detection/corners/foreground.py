@@ -17,18 +17,33 @@ _MOST_ODDS = 6.0
 class Foreground:
     """Log odds of paint, ``odds`` (h, w), and which blob owns each: ``owner`` (h, w) 1 + index or 0.
 
-    They are ``stride`` px apart, from image row ``top`` on; element (0, 0) covers stride x stride px.
+    They are ``stride`` px apart, from image row ``top`` on; element (0, 0) covers stride x stride px. Of what
+    is paint, ``kinds`` (K, h', w') are the logits of the ``classes``, over the same part of the image.
     """
 
     odds: np.ndarray
     owner: np.ndarray
     stride: int
     top: int
+    kinds: np.ndarray
+    classes: tuple[str, ...]
 
     def odds_at(self, points_px: FloatArray) -> FloatArray:
         """Log odds of paint, at most 6 either way, at recorded px (..., 2); outside, those of the border."""
-        middle = (self.stride - 1) / 2
-        u = ((points_px[..., 0] - middle) / self.stride).astype(np.float32).reshape(1, -1)
-        v = ((points_px[..., 1] - self.top - middle) / self.stride).astype(np.float32).reshape(1, -1)
-        found = cv2.remap(self.odds, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        found = self._sample(self.odds, self.stride, points_px)
         return np.asarray(np.clip(found, -_MOST_ODDS, _MOST_ODDS), np.float64).reshape(points_px.shape[:-1])
+
+    def shares_at(self, points_px: FloatArray) -> FloatArray:
+        """Probability of each of the classes, were it paint, at recorded px (M, ..., 2): (M, K, ...)."""
+        stride = self.stride * self.odds.shape[1] / self.kinds.shape[2]
+        logits = np.stack([self._sample(plane, stride, points_px) for plane in self.kinds])
+        odds = np.exp(logits - logits.max(axis=0))
+        shares = (odds / odds.sum(axis=0)).reshape(len(odds), *points_px.shape[:-1])
+        return np.asarray(np.moveaxis(shares, 0, 1), dtype=np.float64)
+
+    def _sample(self, plane: np.ndarray, stride: float, points_px: FloatArray) -> np.ndarray:
+        """Values (M, N) of a plane (h, w), elements ``stride`` px apart, at recorded px (M, ..., 2)."""
+        middle, rows = (stride - 1) / 2, len(points_px)
+        u = ((points_px[..., 0] - middle) / stride).astype(np.float32).reshape(rows, -1)
+        v = ((points_px[..., 1] - self.top - middle) / stride).astype(np.float32).reshape(rows, -1)
+        return np.asarray(cv2.remap(plane, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))

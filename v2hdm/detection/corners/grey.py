@@ -79,9 +79,23 @@ def linear_grey(
     return GreyBand(values, top, clipped)
 
 
+def linear_bgr(coded: np.ndarray, linear_response: bool) -> np.ndarray:
+    """Pixels (..., 3) uint8 in [0, 1], proportional to radiance; float32."""
+    return np.asarray(_linear(linear_response)[coded], dtype=np.float32)
+
+
+def grey_of(bgr: np.ndarray) -> np.ndarray:
+    """Grey values (...) of linear pixels (..., 3)."""
+    return np.asarray(bgr @ np.array(_GREY_WEIGHTS_BGR, dtype=np.float32))
+
+
+def _linear(linear_response: bool) -> np.ndarray:
+    """Radiance (256,) in [0, 1] of each byte."""
+    return np.asarray(_CODED if linear_response else _LINEAR_FROM_SRGB)
+
+
 @cache
 def _table(linear_response: bool) -> np.ndarray:
     """What each channel's byte adds to the grey value (1, 256, 3)."""
-    table = _CODED if linear_response else _LINEAR_FROM_SRGB
-    table = np.where(np.arange(len(table)) >= _CLIPPED, np.inf, table)
+    table = np.where(np.arange(256) >= _CLIPPED, np.inf, _linear(linear_response))
     return np.asarray(table[None, :, None] * _GREY_WEIGHTS_BGR, dtype=np.float32)

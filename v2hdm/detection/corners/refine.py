@@ -21,6 +21,7 @@ from v2hdm.detection.corners.grey import GreyBand, linear_grey
 from v2hdm.detection.corners.outline_fit import fit_outlines
 from v2hdm.detection.corners.quad import is_convex, side_frames, width
 from v2hdm.detection.corners.quad_fit import fit_quads, unbow_corners
+from v2hdm.detection.corners.rectified import rectified_views
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import DIAMOND, LANE_DASH, BoolArray, FloatArray, MarkingDetection
 
@@ -75,7 +76,8 @@ class _Fitted:
     """M starts, the corners ``found``, and each in every class that it may be of, R rows in all.
 
     ``row_start`` (R,) is the start of a row, ``kinds`` its class, ``ground`` (R, 4, 2) its corners on the
-    ground, ``evidence`` (R, F) what there is for it. ``uneven`` (M, 4) are corners of doubtful
+    ground, ``evidence`` (R, F) what there is for it, ``views`` (R, C, 20, 20) what it
+    looks like. ``uneven`` (M, 4) are corners of doubtful
     sides, ``spoilt_ends`` (M, 4) those of ends, were it a dash.
     """
 
@@ -85,12 +87,13 @@ class _Fitted:
     kinds: list[str]
     ground: FloatArray
     evidence: FloatArray
+    views: np.ndarray
     uneven: BoolArray
     spoilt_ends: BoolArray
 
     def judged(self) -> tuple[list[str], FloatArray]:
         """The class (M,) of each for which there is most evidence, and its confidence."""
-        score = confidence(self.evidence, self.kinds, self.ground)
+        score = confidence(self.evidence, self.views, self.kinds, self.ground)
         # Stable, so that the likeliest by the network comes first among equals.
         best = np.lexsort((-np.arange(len(score)), score))
         chosen = dict(zip(self.row_start[best].tolist(), best.tolist(), strict=True))
@@ -166,8 +169,9 @@ def _fitted(
         steps.take(row_start), foreground, view, found.px[row_start], ground, claims, found.valid[row_start]
     )
     kinds = [kind for s in starts for kind in s.claims]
+    views = rectified_views(image_bgr, view, foreground, found.px[row_start], ground, kinds)
     ends = whole_ends(runs_on | uneven, side_frames(found.px)[2])
-    return _Fitted(starts, found, row_start, kinds, ground, evidence, uneven, ends)
+    return _Fitted(starts, found, row_start, kinds, ground, evidence, views, uneven, ends)
 
 
 def _stacked(starts: list[QuadStart], view: CameraView) -> tuple[FloatArray, FloatArray]:

@@ -1,0 +1,78 @@
+"""The judge as an ONNX file, checked against torch."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+
+from export.onnx_file import forget_source, write_labelled
+from models.judge import Judge
+from v2hdm.detection.corners.confidence import JUDGE_INPUTS
+from v2hdm.errors import DetectorError
+
+_OPSET = 20
+_TOLERANCE = 1e-3
+_ROWS = (1, 7, 64)
+
+
+def write_judge(judge: Judge, views_shape: tuple[int, int, int], label: dict[str, Any], path: Path) -> None:
+    """Write ``path``, whose inputs are those of :meth:`models.judge.Judge.forward`, of any number of rows.
+
+    Args:
+        judge: has learnt.
+        views_shape: channels, rows and columns of a view.
+        label: what the file says of itself, as JSON in its metadata.
+        path: appears whole and checked, or not at all.
+
+    Raises:
+        DetectorError: the file's answers would not be the network's.
+    """
+    model = _to_onnx(judge, views_shape)
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    for rows in _ROWS:
+        given = _any_rows(judge, views_shape, rows)
+        with torch.no_grad():
+            expected = judge(*given).numpy()
+        named = {name: part.numpy() for name, part in zip(JUDGE_INPUTS, given, strict=True)}
+        difference = float(np.abs(session.run(None, named)[0] - expected).max())
+        if not difference <= _TOLERANCE:
+            raise DetectorError(f"{path} was not written: its log odds would differ by {difference:.2g}")
+    write_labelled(model, label, path)
+
+
+def _to_onnx(judge: Judge, views_shape: tuple[int, int, int]) -> onnx.ModelProto:
+    rows = torch.export.Dim("rows", min=1, max=4096)
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            judge,
+            _any_rows(judge, views_shape, 5),
+            dynamo=True,
+            opset_version=_OPSET,
+            input_names=list(JUDGE_INPUTS),
+            output_names=["odds"],
+            dynamic_shapes=({0: rows}, {0: rows}, {0: rows}),
+            external_data=False,
+            verbose=False,
+        )
+    if program is None:
+        raise DetectorError("the judge could not be exported")
+    model = program.model_proto
+    forget_source(model)
+    return model
+
+
+def _any_rows(judge: Judge, views_shape: tuple[int, int, int], rows: int) -> tuple[torch.Tensor, ...]:
+    generator = torch.Generator().manual_seed(rows)
+    views = torch.randn((rows, *views_shape), generator=generator)
+    evidence = torch.randn((rows, len(judge.mean)), generator=generator)
+    shapes = judge.linear.out_features
+    return views, evidence, torch.eye(shapes)[torch.arange(rows) % shapes]

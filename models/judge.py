@@ -1,0 +1,75 @@
+"""A small network that says of a quadrilateral whether it is a marking: the second stage of the detector.
+
+:class:`models.MarkingNet` tells paint from ground, pixel by pixel; whether some paint is a whole marking of a
+class shows in its shape, and in the image about it. The judge gets both: the quadrilateral seen in its own
+frame (:mod:`v2hdm.detection.corners.rectified`) and what was measured of it
+(:data:`v2hdm.detection.corners.evidence.FEATURES`), as the second stage of Faster R-CNN gets features of its
+region (Ren et al., NeurIPS 2015).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+_CELLS = 2
+"""Rows and columns that convolutions end in: means over parts of a view that overlap in its middle."""
+
+
+class Judge(nn.Module):
+    """Log odds that quadrilaterals are whole markings of their classes.
+
+    A linear function of the evidence, one for each shape, to which what the convolutions see is added.
+
+    Args:
+        channels: of the views.
+        features: of the evidence.
+        shapes: among which classes are told apart.
+        width: channels of the first convolution.
+        hidden: units between the convolutions and the answer.
+        dropout: share of what is hidden in training.
+    """
+
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(
+        self,
+        channels: int,
+        features: int,
+        shapes: int,
+        width: int = 16,
+        hidden: int = 48,
+        dropout: float = 0.3,
+    ):
+        super().__init__()
+        self.see = nn.Sequential(
+            nn.Conv2d(channels, width, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(width, 3 * width // 2, 3, stride=2, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(3 * width // 2, 2 * width, 3, stride=2, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(2 * width, 2 * width, 3, padding=1),
+            nn.ReLU(),
+            nn.AvgPool2d(3, stride=2),
+            nn.Flatten(),
+        )
+        known = features + shapes
+        self.weigh = nn.Sequential(
+            nn.Linear(2 * width * _CELLS**2 + known, hidden),
+            nn.ReLU(),
+            nn.Dropout(dropout),
+            nn.Linear(hidden, shapes),
+        )
+        self.linear = nn.Linear(known, shapes)
+        self.hide = nn.Dropout(dropout)
+        self.register_buffer("mean", torch.zeros(features))
+        self.register_buffer("deviation", torch.ones(features))
+
+    def forward(self, views: Tensor, evidence: Tensor, shape: Tensor) -> Tensor:
+        """Log odds (M,) of ``views`` (M, C, S, S), ``evidence`` (M, F) and ``shape`` (M, K), one-hot."""
+        known = torch.cat([(evidence - self.mean) / self.deviation, shape], dim=1)
+        seen = self.hide(self.see(views))
+        odds = self.weigh(torch.cat([seen, known], dim=1)) + self.linear(known)
+        return (odds * shape).sum(dim=1)

@@ -1,0 +1,54 @@
+"""The judge learns what shows in views alone, and its file answers as it does."""
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+
+from export.judge_file import write_judge
+from train.judge import JudgeConfig, Quadrilaterals, judged, train_judge
+from v2hdm.errors import DetectorError
+
+CONFIG = JudgeConfig(epochs=6, width=4)
+
+
+def quadrilaterals(seed: int, count: int) -> Quadrilaterals:
+    """True ones are bright squares, false ones round spots as bright; the evidence is noise."""
+    rng = np.random.default_rng(seed)
+    true = rng.random(count) < 0.5
+    v, u = np.mgrid[:20, :20] - 9.5
+    square, disc = np.maximum(np.abs(u), np.abs(v)) < 5, np.hypot(u, v) < 5.8
+    views = np.where(true[:, None, None], square, disc)[:, None] + 0.2 * rng.normal(size=(count, 3, 20, 20))
+    evidence = 5 * rng.normal(size=(count, 4)) + 3
+    shape = np.eye(2)[rng.integers(2, size=count)]
+    return Quadrilaterals(*(part.astype(np.float32) for part in (views, evidence, shape)), true)
+
+
+def test_what_shows_in_views_alone_is_learnt_and_a_seed_repeats_it():
+    known, unseen = quadrilaterals(1, 1200), quadrilaterals(2, 400)
+    odds = judged(train_judge(known, CONFIG), unseen)
+    assert ((odds > 0) == unseen.true).mean() > 0.95
+    np.testing.assert_array_equal(odds, judged(train_judge(known, CONFIG), unseen))
+
+
+def test_the_file_answers_as_the_network_does_for_any_number_of_rows(tmp_path):
+    known = quadrilaterals(3, 200)
+    judge = train_judge(known, CONFIG)
+    path = tmp_path / "judge.onnx"
+    write_judge(judge, (3, 20, 20), {"features": ["a"]}, path)
+    assert not onnx.load(path).graph.node[0].metadata_props
+    session = onnxruntime.InferenceSession(path)
+    for rows in (1, 33, 200):
+        part = known.take(np.arange(rows))
+        given = {"views": part.views, "evidence": part.evidence, "shape": part.shape}
+        np.testing.assert_allclose(session.run(None, given)[0], judged(judge, part), atol=1e-4)
+
+
+def test_a_judge_of_broken_weights_is_not_written(tmp_path):
+    judge = train_judge(quadrilaterals(4, 100), CONFIG)
+    with torch.no_grad():
+        judge.linear.bias[0] = torch.nan
+    with pytest.raises(DetectorError, match="not written"):
+        write_judge(judge, (3, 20, 20), {}, tmp_path / "judge.onnx")
+    assert not list(tmp_path.iterdir())

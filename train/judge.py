@@ -1,0 +1,94 @@
+"""Trains the :class:`models.judge.Judge` on quadrilaterals of which it is known whether they are markings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.nn.functional import binary_cross_entropy_with_logits
+
+from models.judge import Judge
+
+_BATCH = 64
+_LEAST_DEVIATION = 1e-6
+_LIGHT_SIGMA = 0.2
+"""Contrast of the views differs by chance by so much in training."""
+
+
+@dataclass(frozen=True)
+class Quadrilaterals:
+    """N of them: ``views`` (N, C, S, S), ``evidence`` (N, F), one-hot ``shape`` (N, K), ``true`` (N,)."""
+
+    views: NDArray[np.float32]
+    evidence: NDArray[np.float32]
+    shape: NDArray[np.float32]
+    true: NDArray[np.bool_]
+
+    def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> Quadrilaterals:
+        """Some of them."""
+        return Quadrilaterals(self.views[rows], self.evidence[rows], self.shape[rows], self.true[rows])
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgeConfig:
+    """How the judge learns; rate and decay are those of AdamW (Loshchilov and Hutter, ICLR 2019)."""
+
+    epochs: int = 12
+    learning_rate: float = 3e-3
+    weight_decay: float = 2e-2
+    width: int = 16
+    dropout: float = 0.3
+    seed: int = 0
+
+
+def train_judge(known: Quadrilaterals, config: JudgeConfig) -> Judge:
+    """A judge that has learnt from all of ``known``, ready to be asked."""
+    torch.manual_seed(config.seed)
+    rng = np.random.default_rng(config.seed)
+    channels, features, shapes = known.views.shape[1], known.evidence.shape[1], known.shape.shape[1]
+    judge = Judge(channels, features, shapes, config.width, dropout=config.dropout).train()
+    judge.mean.copy_(torch.from_numpy(known.evidence.mean(axis=0)))
+    judge.deviation.copy_(torch.from_numpy(np.maximum(known.evidence.std(axis=0), _LEAST_DEVIATION)))
+    parts = [torch.from_numpy(part) for part in (known.views, known.evidence, known.shape)]
+    true = torch.from_numpy(known.true.astype(np.float32))
+    batches = -(-len(true) // _BATCH)
+    optimiser = torch.optim.AdamW(judge.parameters(), config.learning_rate, weight_decay=config.weight_decay)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, config.learning_rate, total_steps=config.epochs * batches
+    )
+    for _ in range(config.epochs):
+        for batch in np.array_split(rng.permutation(len(true)), batches):
+            rows = torch.from_numpy(batch)
+            views, evidence, shape = (part[rows] for part in parts)
+            odds = judge(_varied(views, rng), evidence, shape)
+            loss = binary_cross_entropy_with_logits(odds, true[rows])
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            schedule.step()
+    return judge.eval()
+
+
+def judged(judge: Judge, asked: Quadrilaterals) -> NDArray[np.float64]:
+    """Log odds (N,)."""
+    out = []
+    with torch.no_grad():
+        for first in range(0, len(asked.true), 512):
+            part = asked.take(np.arange(first, min(first + 512, len(asked.true))))
+            given = (torch.from_numpy(array) for array in (part.views, part.evidence, part.shape))
+            out.append(judge(*given).numpy().astype(np.float64))
+    return np.concatenate(out) if out else np.zeros(0)
+
+
+def _varied(views: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
+    """Views in another light, and mirrored: which corner is the first means nothing."""
+    for axis in (2, 3):
+        turned = torch.from_numpy(rng.random(len(views)) < 0.5)[:, None, None, None]
+        views = torch.where(turned, views.flip(axis), views)
+    gain = torch.ones(len(views), views.shape[1], 1, 1)
+    gain[:, :2] += _LIGHT_SIGMA * torch.from_numpy(
+        rng.standard_normal((len(views), 1, 1, 1)).astype(np.float32)
+    )
+    return views * gain

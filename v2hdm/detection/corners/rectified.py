@@ -1,0 +1,110 @@
+"""Quadrilaterals and what lies about them as small pictures, each seen in the quadrilateral's own frame.
+
+A homography takes the four corners to those of a rectangle, so that every marking of a class looks the same
+wherever it lies in the image (Faster R-CNN's region of interest, Ren et al., NeurIPS 2015, along the
+marking's own sides). Light and distance cancel; left is what tells a worn marking from a fleck of sun.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.corners.foreground import Foreground
+from v2hdm.detection.corners.grey import grey_of, linear_bgr, log_grey
+from v2hdm.detection.corners.quad import following, side_frames
+from v2hdm.records import DIAMOND, LANE_LINE, OTHER_PAINT, OUTLINED_CLASSES, FloatArray
+
+CHANNELS = ("log_grey", "blueness", "paint_odds", "own_share", "line_share", "symbol_share", "outside")
+"""Of :func:`rectified_views`: log of the grey value over its median; log of blue over red, over its median;
+log odds of paint; shares of the quadrilateral's own class, of lane lines and of symbols in what the network
+takes it for; whether it is outside the image."""
+
+_SYMBOLS = (*OUTLINED_CLASSES, OTHER_PAINT)
+
+SIZE = 20
+"""Rows and columns of a picture."""
+
+_AROUND = 0.6
+_BEFORE, _BESIDE = 0.3, 1.0
+"""How far a picture reaches beyond the corners, in parts of the sides: of a diamond; of all else along its
+longer sides and across them."""
+
+_FINER = 2
+"""So many samples of the image per element, in each direction."""
+
+_GREY_GAIN, _COLOUR_GAIN, _ODDS_GAIN = 2.0, 2.0, 1 / 3
+"""Bring the channels to about one."""
+
+
+def rectified_views(
+    image_bgr: np.ndarray,
+    view: CameraView,
+    foreground: Foreground,
+    corners_px: FloatArray,
+    ground: FloatArray,
+    kinds: Sequence[str],
+) -> np.ndarray:
+    """Pictures (M, C, 20, 20) float32, whose channels are :data:`CHANNELS`.
+
+    Args:
+        image_bgr: (H, W, 3) uint8.
+        view: the camera.
+        foreground: what the network says of the image.
+        corners_px: (M, 4, 2) recorded px.
+        ground: the same on the ground (M, 4, 2), m; NaN above the horizon.
+        kinds: the classes; columns run along the longer sides of all but diamonds.
+    """
+    diamond = np.array(kinds) == DIAMOND
+    length = np.nan_to_num(side_frames(ground)[2], nan=1.0)
+    lengthwise = length[:, 0] + length[:, 2] >= length[:, 1] + length[:, 3]
+    ordered = np.where(lengthwise[:, None, None], corners_px, following(corners_px))
+    points = _points(ordered, diamond, SIZE)
+    fine = _points(ordered, diamond, _FINER * SIZE)
+    height, width = image_bgr.shape[:2]
+    outside = ((points < 0) | (points > [width - 1, height - 1])).any(axis=-1)
+    grey, blueness = _light(image_bgr, fine, view.camera.linear_response)
+    odds = foreground.odds_at(points)
+    shares = foreground.shares_at(points)
+    own = shares[np.arange(len(kinds)), [foreground.classes.index(kind) for kind in kinds]]
+    lines = shares[:, foreground.classes.index(LANE_LINE)]
+    symbols = shares[:, [foreground.classes.index(name) for name in _SYMBOLS]].sum(axis=1)
+    planes = (_GREY_GAIN * grey, _COLOUR_GAIN * blueness, _ODDS_GAIN * odds, own, lines, symbols, outside)
+    return np.stack(planes, axis=1).astype(np.float32)
+
+
+def _points(corners_px: FloatArray, diamond: np.ndarray, size: int) -> FloatArray:
+    """Where (M, size, size, 2) px the elements of pictures lie, the first corner near the first of them."""
+    along, across = (
+        np.where(diamond, _AROUND, margin)[:, None] * [-1, 1] + [0, 1] for margin in (_BEFORE, _BESIDE)
+    )
+    step = (np.arange(size) + 0.5) / size
+    a = (along[:, :1] + (along[:, 1:] - along[:, :1]) * step)[:, None, :, None]
+    b = (across[:, :1] + (across[:, 1:] - across[:, :1]) * step)[:, :, None, None]
+    first, second, third, fourth = (corners_px[:, None, None, corner] for corner in range(4))
+    # Heckbert, "Fundamentals of Texture Mapping and Image Warping" (1989), 2.2.3: from the unit square.
+    surplus = first - second + third - fourth
+    one, other = second - third, fourth - third
+    cross = _cross(one, other)
+    cross = np.where(np.abs(cross) < 1e-9, 1e-9, cross)
+    g, h = _cross(surplus, other) / cross, _cross(one, surplus) / cross
+    depth = np.maximum(1 + g * a + h * b, 0.05)
+    return np.asarray((first + (second - first + g * second) * a + (fourth - first + h * fourth) * b) / depth)
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(a[..., :1] * b[..., 1:] - a[..., 1:] * b[..., :1])
+
+
+def _light(image_bgr: np.ndarray, points: FloatArray, linear_response: bool) -> tuple[FloatArray, FloatArray]:
+    """Log grey and log of blue over red (M, SIZE, SIZE), over their medians, of finer ``points``."""
+    u, v = (points[..., axis].astype(np.float32).reshape(-1, (_FINER * SIZE) ** 2) for axis in (0, 1))
+    coded = cv2.remap(image_bgr, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    bgr = linear_bgr(coded, linear_response)
+    parts = bgr.reshape(len(points), SIZE, _FINER, SIZE, _FINER, 3).mean(axis=(2, 4))
+    logs = log_grey(parts)
+    grey, blueness = log_grey(grey_of(parts)), logs[..., 0] - logs[..., 2]
+    return tuple(plane - np.median(plane, axis=(1, 2), keepdims=True) for plane in (grey, blueness))
