@@ -13,8 +13,6 @@ from models.judge import Judge
 
 _BATCH = 64
 _LEAST_DEVIATION = 1e-6
-_LIGHT_SIGMA = 0.2
-"""Contrast of the views differs by chance by so much in training."""
 
 
 @dataclass(frozen=True)
@@ -33,13 +31,19 @@ class Quadrilaterals:
 
 @dataclass(frozen=True, kw_only=True)
 class JudgeConfig:
-    """How the judge learns; rate and decay are those of AdamW (Loshchilov and Hutter, ICLR 2019)."""
+    """How the judge learns; rate and decay are those of AdamW (Loshchilov and Hutter, ICLR 2019).
+
+    What it is shown is varied, as other cameras and roads would: each channel of a view by a factor whose
+    logarithm has ``light_sigma``, the evidence by ``evidence_sigma`` of its own deviation.
+    """
 
     epochs: int = 12
     learning_rate: float = 3e-3
     weight_decay: float = 2e-2
     width: int = 16
     dropout: float = 0.3
+    light_sigma: float = 0.2
+    evidence_sigma: float = 0.1
     seed: int = 0
 
 
@@ -62,7 +66,9 @@ def train_judge(known: Quadrilaterals, config: JudgeConfig) -> Judge:
         for batch in np.array_split(rng.permutation(len(true)), batches):
             rows = torch.from_numpy(batch)
             views, evidence, shape = (part[rows] for part in parts)
-            odds = judge(_varied(views, rng), evidence, shape)
+            views = _in_other_light(_mirrored(views, rng), config.light_sigma, rng)
+            noise = torch.from_numpy(rng.standard_normal(evidence.shape).astype(np.float32))
+            odds = judge(views, evidence + config.evidence_sigma * judge.deviation * noise, shape)
             loss = binary_cross_entropy_with_logits(odds, true[rows])
             optimiser.zero_grad()
             loss.backward()
@@ -82,13 +88,15 @@ def judged(judge: Judge, asked: Quadrilaterals) -> NDArray[np.float64]:
     return np.concatenate(out) if out else np.zeros(0)
 
 
-def _varied(views: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
-    """Views in another light, and mirrored: which corner is the first means nothing."""
+def _mirrored(views: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
+    """Half of the views turned about in each direction: which corner is the first means nothing."""
     for axis in (2, 3):
         turned = torch.from_numpy(rng.random(len(views)) < 0.5)[:, None, None, None]
         views = torch.where(turned, views.flip(axis), views)
-    gain = torch.ones(len(views), views.shape[1], 1, 1)
-    gain[:, :2] += _LIGHT_SIGMA * torch.from_numpy(
-        rng.standard_normal((len(views), 1, 1, 1)).astype(np.float32)
-    )
-    return views * gain
+    return views
+
+
+def _in_other_light(views: torch.Tensor, sigma: float, rng: np.random.Generator) -> torch.Tensor:
+    """Views (M, C, S, S) each of whose channels is weaker or stronger by chance."""
+    gain = np.exp(sigma * rng.standard_normal((*views.shape[:2], 1, 1))).astype(np.float32)
+    return views * torch.from_numpy(gain)

@@ -1,14 +1,16 @@
-"""Fits the weights of the detector's confidence, ``v2hdm/detection/confidence.json``, to the shipped network.
+"""Teaches the detector's confidence what claims of the shipped network are worth.
 
-    python -m tests.benchmarks.detector_confidence --images 450 --write
+    python -m tests.benchmarks.detector_confidence --write
 
-Run it after another network was put in place. Quadrilaterals that the detector proposes on rendered scenes,
-first two thirds of full difficulty, then a third of easy ones, are true if they overlap a marking of their
-class by half, and false where the quality benchmark would say so; a logistic regression with a weak ridge
-tells them apart, one for each shape. Each scene is looked at as on the vehicle and as in the mapping. Its
-seed is neither that of the quality benchmark nor one of training. Printed: what each feature adds to the log
-odds per standard deviation, and the log loss on the images of each fifth by weights that were fitted to the
-others.
+Run it after another network was put in place; it takes half an hour. Quadrilaterals that the detector
+proposes on rendered scenes, first two thirds of full difficulty, then a third of easy ones, are true if they
+overlap a marking of their class by half, and false where the quality benchmark would say so. The judge,
+``v2hdm/detection/judge.onnx``, learns to tell them apart; what the others in an image say of each is then
+weighed by logistic regressions with a weak ridge, one for each shape, ``v2hdm/detection/confidence.json``.
+Each scene is looked at as on the vehicle and as in the mapping. Its seed is neither that of the quality
+benchmark nor one of training. Printed: what each of the others' features adds to the log odds per standard
+deviation; log loss, and true ones among so many false ones, on the images of each fifth by what learnt from
+the others.
 """
 
 from __future__ import annotations
@@ -48,6 +50,7 @@ EASY = 0.2
 RIDGE = 2.0
 FOLDS = 5
 CONFIG = JudgeConfig()
+_TOLD_EVERY = 100
 COUNTS = (10, 20, 40, 80)
 """Of false ones, at which those true are counted."""
 
@@ -142,9 +145,11 @@ def main() -> None:
     options = DetectorOptions(model=parsed.model, max_range_m=24.0, min_confidence=0.0)
     detectors = [Detector.load(options=replace(options, mirrored=twice)) for twice in (False, True)]
     gathered = Gathered()
-    for index, shown in renders_to_fit(parsed.images, SEED):
+    for done, (index, shown) in enumerate(renders_to_fit(parsed.images, SEED)):
         for detector in detectors:
             gathered.add(index, shown, detector)
+        if done % _TOLD_EVERY == 0:
+            print(f"{done} of {parsed.images} images", flush=True)
     judge, fitted = fit_all(gathered)
     if parsed.write:
         write_both(judge, fitted, parsed.images)
@@ -162,7 +167,7 @@ def fit_all(gathered: Gathered) -> tuple[Judge, dict[str, dict[str, object]]]:
     known = np.array([true is not None for true in gathered.true])
     true = np.array([true is True for true in gathered.true])
     fold = np.array(gathered.image) % FOLDS
-    print(f"{true.sum()} of {known.sum()} true, in {len(set(gathered.image))} images", flush=True)
+    print(f"{true.sum()} of {known.sum()} readings true", flush=True)
     asked = Quadrilaterals(
         np.array(gathered.views, dtype=np.float32),
         np.array(gathered.evidence, dtype=np.float32),

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from tests.detection.pictures import make_camera
+from tests.detection.pictures import foreground_of, make_camera
 from tests.detection.test_anchors import anchors_of, straight
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.lanes.anchors import link_anchors
 from v2hdm.detection.lanes.curves import Horizon
 from v2hdm.detection.lanes.looks import LOOKS, UNKNOWN_LOOKS, Looks
@@ -37,7 +36,7 @@ def painted_from(view, line_px, nearest_row):
     for u, v in line_px:
         if 0 <= u < view.info.width and 0 <= v < min(nearest_row, view.info.height):
             odds[int(v / 2), max(int(u / 2) - 2, 0) : int(u / 2) + 3] = 5.0
-    return Foreground(odds, np.zeros(odds.shape, dtype=np.int32), 2, 0)
+    return foreground_of(odds, np.zeros(odds.shape, dtype=np.int32), 0)
 
 
 def fine(line_px):

@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
+from v2hdm.detection.options import DetectorOptions
 from v2hdm.drive import ReadOptions, read_drive
-from v2hdm.errors import ConfigError, DriveError, MappingError, V2hdmError
+from v2hdm.errors import ConfigError, DetectorError, DriveError, MappingError, V2hdmError
 from v2hdm.hdmap.calibration import read_calibration
 from v2hdm.hdmap.geojson import read_geojson
 from v2hdm.mapping.options import MappingOptions
@@ -177,12 +178,13 @@ def test_a_drive_past_nothing_says_that_no_marking_was_found(drive_folder: Path,
         ({"mapping": MappingOptions(mode="both")}, "mapping.mode is 'both'"),
         ({"mapping": MappingOptions(max_range_m=float("nan"))}, "mapping.max_range_m is nan"),
         ({"mapping": MappingOptions(loss="square")}, "mapping.loss is 'square'"),
+        ({"detector": DetectorOptions(model="no such.onnx")}, "no such.onnx"),
     ],
 )
 def test_what_cannot_work_is_refused_before_anything_is_read(
     tmp_path: Path, changes: dict[str, object], named: str
 ) -> None:
-    with pytest.raises(ConfigError, match=re.escape(named)):
+    with pytest.raises((ConfigError, DetectorError), match=re.escape(named)):
         run(run_config(tmp_path / "no such drive", tmp_path / "outputs", **changes))
     assert not list(tmp_path.iterdir())
 

@@ -19,6 +19,7 @@ import torch
 
 from v2hdm import __version__
 from v2hdm.detection.batch import detect_all
+from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.drive import ReadOptions, read_drive
 from v2hdm.errors import ConfigError
@@ -181,6 +182,7 @@ def _check(config: RunConfig) -> None:
 
     Raises:
         ConfigError: The message names the key.
+        DetectorError: ``detector.model`` cannot be used.
     """
     if not config.name.strip(".") or set(config.name) & {"/", os.sep}:
         raise ConfigError(
@@ -189,6 +191,7 @@ def _check(config: RunConfig) -> None:
     _workers(config)
     check_options(config.mapping)
     _check_device(config.mapping.device)
+    Detector.load(options=config.detector)
 
 
 def _check_device(device: str) -> None:

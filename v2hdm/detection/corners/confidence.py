@@ -18,6 +18,7 @@ import numpy as np
 import onnxruntime
 
 from v2hdm.detection.corners.company import COMPANY, company
+from v2hdm.detection.odds import as_probability
 from v2hdm.records import DIAMOND, LANE_DASH, FloatArray
 
 CONFIDENCE_FILE = Path(__file__).parents[1] / "confidence.json"
@@ -64,11 +65,6 @@ def one_hot(kinds: Sequence[str]) -> np.ndarray:
 def told(odds: FloatArray, ground: FloatArray, kinds: Sequence[str]) -> FloatArray:
     """The features (M, 6) :data:`TOLD` of quadrilaterals, of the log odds (M,) that each has alone."""
     return np.column_stack([odds, company(ground, kinds, as_probability(odds))])
-
-
-def as_probability(odds: FloatArray) -> FloatArray:
-    """Of log odds, of which more than 30 either way are too many."""
-    return np.asarray(1 / (1 + np.exp(-np.clip(odds, -30, 30))))
 
 
 def _odds(features: FloatArray, fits: Sequence[_Fit]) -> FloatArray:

@@ -20,6 +20,7 @@ from v2hdm.detection.lanes.ends import solid_end
 from v2hdm.detection.lanes.groups import find_lines
 from v2hdm.detection.lanes.looks import UNKNOWN_LOOKS, Looks
 from v2hdm.detection.lanes.points import NEIGHBOURS, IntArray, Line, LinePoints
+from v2hdm.detection.odds import as_probability
 from v2hdm.detection.sight import AnchorRow
 from v2hdm.records import LANE_BOUNDARY, LANE_LINE, BoolArray, FloatArray, LaneDetection
 
@@ -182,7 +183,7 @@ def _drawn(
     kept = known & view.inside(points_px, -DRAWN_STEP_PX)
     if kept.sum() < 2:
         return None
-    score = float(1 / (1 + np.exp(-line.log_odds)))
+    score = float(as_probability(np.array(line.log_odds)))
     lane = LaneDetection(LANE_BOUNDARY, score, points_px[kept], sigma_px=sigma[kept])
     return Seen(lane, _is_seen(points.below[line.certain], at[kept]))
 

@@ -19,6 +19,7 @@ from v2hdm.detection.lanes.company import COMPANY, company
 from v2hdm.detection.lanes.curves import Horizon
 from v2hdm.detection.lanes.looks import LOOKS, Looks
 from v2hdm.detection.lanes.points import IntArray, Line, LinePoints
+from v2hdm.detection.odds import as_probability
 from v2hdm.records import FloatArray
 
 SCORE_FILE = Path(__file__).with_name("score.json")
@@ -72,7 +73,7 @@ def log_odds(
 def told(lines: Sequence[Line], points: LinePoints, horizon: Horizon, alone: FloatArray) -> FloatArray:
     """What tells of N lines (N, T) of such log odds (N,) by themselves, in the order of :data:`TOLD`."""
     faint = np.log1p([len(line.perhaps) for line in lines])
-    others = company(points, lines, horizon, 1 / (1 + np.exp(-alone)))
+    others = company(points, lines, horizon, as_probability(alone))
     return np.column_stack([alone, faint, others])
 
 

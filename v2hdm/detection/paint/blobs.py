@@ -9,6 +9,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
+from v2hdm.detection.odds import as_probability
 from v2hdm.detection.paint.pieces import fills_a_quadrilateral, settle_pieces
 from v2hdm.detection.sight import Sight
 from v2hdm.records import (
@@ -156,7 +157,7 @@ def _hearsay(
     own = piece.ravel()[at] - 1
     cells = np.bincount(own, minlength=count)
     share = 1 / np.maximum(cells, 1)
-    certainty = np.bincount(own, _sigmoid(level.ravel()[at]), count) * share
+    certainty = np.bincount(own, as_probability(level.ravel()[at]), count) * share
     i, j = np.divmod(at, piece.shape[1])
     probability = _class_probability(sight, i - 1, j - 1)
     score = np.stack([np.bincount(own, plane, count) for plane in probability]) * share
@@ -208,7 +209,7 @@ def _split(
                 continue
             mask = labels == label
             scores = probability.take(np.flatnonzero(mask[rows, columns]), axis=1).mean(axis=1)
-            scores *= _sigmoid(level[mask]).mean()
+            scores *= as_probability(level[mask]).mean()
             signed = _signed(mask, own_level)
             first = np.array([max(x - 1, 0), max(y - 1, 0)])
             outline = first + zero_crossings(signed[first[1] : y + h + 1, first[0] : x + w + 1])
@@ -227,10 +228,6 @@ def _class_probability(sight: Sight, rows: np.ndarray, columns: np.ndarray) -> n
     np.exp(odds, out=odds)
     odds /= odds.sum(axis=0)
     return np.asarray(odds)
-
-
-def _sigmoid(level: np.ndarray) -> np.ndarray:
-    return np.asarray(1 / (1 + np.exp(-np.clip(level, -30, 30))))
 
 
 def _lead(sight: Sight, mine: BoolArray, box: tuple[slice, slice]) -> np.ndarray:

@@ -18,8 +18,6 @@ Bgr = tuple[float, float, float]
 WHITE_PAINT: Bgr = (0.70, 0.74, 0.75)
 YELLOW_PAINT: Bgr = (0.07, 0.42, 0.62)
 
-GROUND_TEXTURES: tuple[str, ...] = ("concrete", "asphalt", "gravel", "grass", "brick")
-
 
 @dataclass(frozen=True, kw_only=True)
 class GroundMarks:
