@@ -17,9 +17,10 @@ _CELLS = 2
 
 
 class Judge(nn.Module):
-    """Log odds that quadrilaterals are whole markings of their classes.
+    """Log odds that quadrilaterals are whole markings of their classes: the mean of what two say.
 
-    A linear function of the evidence, one for each shape, to which what the convolutions see is added.
+    One weighs the evidence alone, a linear function for each shape; the other sees the view, too. They learn
+    apart, and where they disagree neither is believed much: what deceives one seldom deceives both.
 
     Args:
         channels: of the views.
@@ -67,9 +68,13 @@ class Judge(nn.Module):
         self.register_buffer("mean", torch.zeros(features))
         self.register_buffer("deviation", torch.ones(features))
 
-    def forward(self, views: Tensor, evidence: Tensor, shape: Tensor) -> Tensor:
-        """Log odds (M,) of ``views`` (M, C, S, S), ``evidence`` (M, F) and ``shape`` (M, K), one-hot."""
+    def both(self, views: Tensor, evidence: Tensor, shape: Tensor) -> Tensor:
+        """Log odds (2, M) by the one and the other; arguments as for :meth:`forward`."""
         known = torch.cat([(evidence - self.mean) / self.deviation, shape], dim=1)
         seen = self.hide(self.see(views))
-        odds = self.weigh(torch.cat([seen, known], dim=1)) + self.linear(known)
-        return (odds * shape).sum(dim=1)
+        odds = torch.stack([self.linear(known), self.weigh(torch.cat([seen, known], dim=1))])
+        return (odds * shape).sum(dim=2)
+
+    def forward(self, views: Tensor, evidence: Tensor, shape: Tensor) -> Tensor:
+        """Log odds (M,) of ``views`` (M, C, S, S), ``evidence`` (M, F) and ``shape`` (M, K), one-hot."""
+        return self.both(views, evidence, shape).mean(dim=0)

@@ -37,13 +37,13 @@ class JudgeConfig:
     logarithm has ``light_sigma``, the evidence by ``evidence_sigma`` of its own deviation.
     """
 
-    epochs: int = 12
+    epochs: int = 18
     learning_rate: float = 3e-3
     weight_decay: float = 2e-2
-    width: int = 16
+    width: int = 24
     dropout: float = 0.3
-    light_sigma: float = 0.2
-    evidence_sigma: float = 0.1
+    light_sigma: float = 0.4
+    evidence_sigma: float = 0.2
     seed: int = 0
 
 
@@ -68,8 +68,8 @@ def train_judge(known: Quadrilaterals, config: JudgeConfig) -> Judge:
             views, evidence, shape = (part[rows] for part in parts)
             views = _in_other_light(_mirrored(views, rng), config.light_sigma, rng)
             noise = torch.from_numpy(rng.standard_normal(evidence.shape).astype(np.float32))
-            odds = judge(views, evidence + config.evidence_sigma * judge.deviation * noise, shape)
-            loss = binary_cross_entropy_with_logits(odds, true[rows])
+            odds = judge.both(views, evidence + config.evidence_sigma * judge.deviation * noise, shape)
+            loss = binary_cross_entropy_with_logits(odds, true[rows].expand(2, -1))
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()

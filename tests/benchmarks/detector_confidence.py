@@ -178,6 +178,14 @@ def fit_all(gathered: Gathered) -> tuple[Judge, dict[str, dict[str, object]]]:
     odds = np.zeros(len(true))
     for k in range(FOLDS):
         odds[fold == k] = judged(train_judge(asked.take(known & (fold != k)), CONFIG), asked.take(fold == k))
+    return train_judge(asked.take(known), CONFIG), fit_among(gathered, odds)
+
+
+def fit_among(gathered: Gathered, odds: FloatArray) -> dict[str, dict[str, object]]:
+    """What ``confidence.json`` is to hold, of the log odds (N,) of each alone; prints what that is worth."""
+    known = np.array([true is not None for true in gathered.true])
+    true = np.array([true is True for true in gathered.true])
+    fold = np.array(gathered.image) % FOLDS
     _print_worth("alone", odds[known], true[known])
     look, ground = np.array(gathered.look), np.array(gathered.ground)
     features = np.zeros((len(odds), len(TOLD)))
@@ -187,7 +195,7 @@ def fit_all(gathered: Gathered) -> tuple[Judge, dict[str, dict[str, object]]]:
     shape = np.array([shape_of(kind) for kind in gathered.kind])
     fitted, left_out = _fit_each(features, shape, true, known, fold)
     _print_worth("among others", left_out[known], true[known])
-    return train_judge(asked.take(known), CONFIG), fitted
+    return fitted
 
 
 def _fit_each(
