@@ -17,16 +17,23 @@ _LEAST_DEVIATION = 1e-6
 
 @dataclass(frozen=True)
 class Quadrilaterals:
-    """N of them: ``views`` (N, C, S, S), ``evidence`` (N, F), one-hot ``shape`` (N, K), ``true`` (N,)."""
+    """N of them: ``views`` (N, C, S, S), ``evidence`` (N, F), one-hot ``shape`` (N, K), ``true`` (N,).
+
+    ``claimed_channels`` and ``claimed_features`` are those of views and evidence that are claims of the paint
+    network; the others are the image's.
+    """
 
     views: NDArray[np.float32]
     evidence: NDArray[np.float32]
     shape: NDArray[np.float32]
     true: NDArray[np.bool_]
+    claimed_channels: tuple[int, ...] = ()
+    claimed_features: tuple[int, ...] = ()
 
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> Quadrilaterals:
         """Some of them."""
-        return Quadrilaterals(self.views[rows], self.evidence[rows], self.shape[rows], self.true[rows])
+        parts = (self.views[rows], self.evidence[rows], self.shape[rows], self.true[rows])
+        return Quadrilaterals(*parts, self.claimed_channels, self.claimed_features)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +41,9 @@ class JudgeConfig:
     """How the judge learns; rate and decay are those of AdamW (Loshchilov and Hutter, ICLR 2019).
 
     What it is shown is varied, as other cameras and roads would: each channel of a view by a factor whose
-    logarithm has ``light_sigma``, the evidence by ``evidence_sigma`` of its own deviation.
+    logarithm has ``light_sigma``, the evidence by ``evidence_sigma`` of its own deviation. In ``sworn_share``
+    of the cases the paint network claims what it claims of markings on average, so that the image has a say
+    of its own where that network is sure and wrong.
     """
 
     epochs: int = 18
@@ -44,6 +53,7 @@ class JudgeConfig:
     dropout: float = 0.3
     light_sigma: float = 0.4
     evidence_sigma: float = 0.2
+    sworn_share: float = 0.2
     seed: int = 0
 
 
@@ -57,6 +67,7 @@ def train_judge(known: Quadrilaterals, config: JudgeConfig) -> Judge:
     judge.deviation.copy_(torch.from_numpy(np.maximum(known.evidence.std(axis=0), _LEAST_DEVIATION)))
     parts = [torch.from_numpy(part) for part in (known.views, known.evidence, known.shape)]
     true = torch.from_numpy(known.true.astype(np.float32))
+    claims = _Claims.of(known)
     batches = -(-len(true) // _BATCH)
     optimiser = torch.optim.AdamW(judge.parameters(), config.learning_rate, weight_decay=config.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
@@ -67,6 +78,8 @@ def train_judge(known: Quadrilaterals, config: JudgeConfig) -> Judge:
             rows = torch.from_numpy(batch)
             views, evidence, shape = (part[rows] for part in parts)
             views = _in_other_light(_mirrored(views, rng), config.light_sigma, rng)
+            sworn = torch.from_numpy(rng.random(len(batch)) < config.sworn_share)
+            views, evidence = claims.put(views, evidence, sworn)
             noise = torch.from_numpy(rng.standard_normal(evidence.shape).astype(np.float32))
             odds = judge.both(views, evidence + config.evidence_sigma * judge.deviation * noise, shape)
             loss = binary_cross_entropy_with_logits(odds, true[rows].expand(2, -1))
@@ -86,6 +99,32 @@ def judged(judge: Judge, asked: Quadrilaterals) -> NDArray[np.float64]:
             given = (torch.from_numpy(array) for array in (part.views, part.evidence, part.shape))
             out.append(judge(*given).numpy().astype(np.float64))
     return np.concatenate(out) if out else np.zeros(0)
+
+
+@dataclass(frozen=True)
+class _Claims:
+    """What the paint network claims of markings on average: channels (C', S, S) and features (F')."""
+
+    channels: list[int]
+    features: list[int]
+    views: torch.Tensor
+    evidence: torch.Tensor
+
+    @classmethod
+    def of(cls, known: Quadrilaterals) -> _Claims:
+        channels, features = list(known.claimed_channels), list(known.claimed_features)
+        views = known.views[known.true][:, channels].mean(axis=0)
+        evidence = known.evidence[known.true][:, features].mean(axis=0)
+        return cls(channels, features, torch.from_numpy(views), torch.from_numpy(evidence))
+
+    def put(
+        self, views: torch.Tensor, evidence: torch.Tensor, where: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Views (M, C, S, S) and evidence (M, F) with these claims in place of their own, ``where`` (M,)."""
+        views, evidence = views.clone(), evidence.clone()
+        views[:, self.channels] = torch.where(where[:, None, None, None], self.views, views[:, self.channels])
+        evidence[:, self.features] = torch.where(where[:, None], self.evidence, evidence[:, self.features])
+        return views, evidence
 
 
 def _mirrored(views: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:

@@ -38,8 +38,8 @@ from v2hdm.detection.corners.confidence import (
     shape_of,
     told,
 )
-from v2hdm.detection.corners.evidence import FEATURES, gather
-from v2hdm.detection.corners.rectified import CHANNELS, SIZE
+from v2hdm.detection.corners.evidence import CLAIMED, FEATURES, gather
+from v2hdm.detection.corners.rectified import CHANNELS, CLAIMED_CHANNELS, SIZE
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import BoolArray, FloatArray
@@ -173,6 +173,8 @@ def fit_all(gathered: Gathered) -> tuple[Judge, dict[str, dict[str, object]]]:
         np.array(gathered.evidence, dtype=np.float32),
         one_hot(gathered.kind),
         true,
+        tuple(CHANNELS.index(name) for name in CLAIMED_CHANNELS),
+        tuple(FEATURES.index(name) for name in CLAIMED),
     )
     # Each is told of by odds that its own image had no part in.
     odds = np.zeros(len(true))

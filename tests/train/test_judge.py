@@ -1,5 +1,7 @@
 """The judge learns what shows in views alone, and its file answers as it does."""
 
+from dataclasses import replace
+
 import numpy as np
 import onnx
 import onnxruntime
@@ -13,13 +15,13 @@ from v2hdm.errors import DetectorError
 CONFIG = JudgeConfig(epochs=6, width=4)
 
 
-def quadrilaterals(seed: int, count: int) -> Quadrilaterals:
+def quadrilaterals(seed: int, count: int, noise: float = 0.2) -> Quadrilaterals:
     """True ones are bright squares, false ones round spots as bright; the evidence is noise."""
     rng = np.random.default_rng(seed)
     true = rng.random(count) < 0.5
     v, u = np.mgrid[:20, :20] - 9.5
     square, disc = np.maximum(np.abs(u), np.abs(v)) < 5, np.hypot(u, v) < 5.8
-    views = np.where(true[:, None, None], square, disc)[:, None] + 0.2 * rng.normal(size=(count, 3, 20, 20))
+    views = np.where(true[:, None, None], square, disc)[:, None] + noise * rng.normal(size=(count, 3, 20, 20))
     evidence = 5 * rng.normal(size=(count, 4)) + 3
     shape = np.eye(2)[rng.integers(2, size=count)]
     return Quadrilaterals(*(part.astype(np.float32) for part in (views, evidence, shape)), true)
@@ -30,6 +32,18 @@ def test_what_shows_in_views_alone_is_learnt_and_a_seed_repeats_it():
     odds = judged(train_judge(known, CONFIG), unseen)
     assert ((odds > 0) == unseen.true).mean() > 0.95
     np.testing.assert_array_equal(odds, judged(train_judge(known, CONFIG), unseen))
+
+
+def test_where_the_paint_network_swears_the_image_has_a_say_of_its_own():
+    """It claims what is true in training, and later swears that all are: then only the views tell."""
+    known, unseen = (replace(quadrilaterals(seed, 1200, 0.5), claimed_features=(0,)) for seed in (5, 6))
+    for part, true in ((known, known.true), (unseen, True)):
+        part.evidence[:, 0] = np.where(true, 2.0, -2.0)
+    told = {}
+    for share in (0.0, 0.3):
+        odds = judged(train_judge(known, replace(CONFIG, sworn_share=share)), unseen)
+        told[share] = np.median(odds[unseen.true]) - np.median(odds[~unseen.true])
+    assert told[0.3] > told[0.0] + 1.0
 
 
 def test_the_file_answers_as_the_network_does_for_any_number_of_rows(tmp_path):

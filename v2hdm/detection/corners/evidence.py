@@ -53,6 +53,9 @@ the side, how much of the inside is overexposed, how far the steps go on beyond 
 where they do so furthest, whether a corner is at the image's border, the log of the width in px. On the
 ground, m: log of length and width, and of how much longer the longest side is than the shortest."""
 
+CLAIMED = FEATURES[: FEATURES.index("four_corners")]
+"""Those of the features that are the network's."""
+
 _PROFILES = 12
 _FAR_PX = 2.0
 _NEAR_PX = 1.0

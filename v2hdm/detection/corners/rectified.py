@@ -23,6 +23,9 @@ CHANNELS = ("log_grey", "blueness", "paint_odds", "own_share", "line_share", "sy
 log odds of paint; shares of the quadrilateral's own class, of lane lines and of symbols in what the network
 takes it for; whether it is outside the image."""
 
+CLAIMED_CHANNELS = CHANNELS[CHANNELS.index("paint_odds") : CHANNELS.index("outside")]
+"""Those that are the network's."""
+
 _SYMBOLS = (*OUTLINED_CLASSES, OTHER_PAINT)
 
 SIZE = 20
