@@ -74,5 +74,4 @@ def _any_rows(judge: Judge, views_shape: tuple[int, int, int], rows: int) -> tup
     generator = torch.Generator().manual_seed(rows)
     views = torch.randn((rows, *views_shape), generator=generator)
     evidence = torch.randn((rows, len(judge.mean)), generator=generator)
-    shapes = judge.linear.out_features
-    return views, evidence, torch.eye(shapes)[torch.arange(rows) % shapes]
+    return views, evidence, torch.eye(judge.shapes)[torch.arange(rows) % judge.shapes]

@@ -17,10 +17,9 @@ _CELLS = 2
 
 
 class Judge(nn.Module):
-    """Log odds that quadrilaterals are whole markings of their classes: the mean of what two say.
+    """Log odds that quadrilaterals are whole markings of their classes.
 
-    One weighs the evidence alone, a linear function for each shape; the other sees the view, too. They learn
-    apart, and where they disagree neither is believed much: what deceives one seldom deceives both.
+    What convolutions see in the views is weighed together with the evidence, for each shape a little otherwise.
 
     Args:
         channels: of the views.
@@ -44,6 +43,7 @@ class Judge(nn.Module):
         dropout: float = 0.3,
     ):
         super().__init__()
+        self.shapes = shapes
         self.see = nn.Sequential(
             nn.Conv2d(channels, width, 3, padding=1),
             nn.ReLU(),
@@ -63,18 +63,12 @@ class Judge(nn.Module):
             nn.Dropout(dropout),
             nn.Linear(hidden, shapes),
         )
-        self.linear = nn.Linear(known, shapes)
         self.hide = nn.Dropout(dropout)
         self.register_buffer("mean", torch.zeros(features))
         self.register_buffer("deviation", torch.ones(features))
 
-    def both(self, views: Tensor, evidence: Tensor, shape: Tensor) -> Tensor:
-        """Log odds (2, M) by the one and the other; arguments as for :meth:`forward`."""
-        known = torch.cat([(evidence - self.mean) / self.deviation, shape], dim=1)
-        seen = self.hide(self.see(views))
-        odds = torch.stack([self.linear(known), self.weigh(torch.cat([seen, known], dim=1))])
-        return (odds * shape).sum(dim=2)
-
     def forward(self, views: Tensor, evidence: Tensor, shape: Tensor) -> Tensor:
         """Log odds (M,) of ``views`` (M, C, S, S), ``evidence`` (M, F) and ``shape`` (M, K), one-hot."""
-        return self.both(views, evidence, shape).mean(dim=0)
+        known = torch.cat([(evidence - self.mean) / self.deviation, shape], dim=1)
+        odds = self.weigh(torch.cat([self.hide(self.see(views)), known], dim=1))
+        return (odds * shape).sum(dim=1)

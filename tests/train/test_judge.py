@@ -62,7 +62,7 @@ def test_the_file_answers_as_the_network_does_for_any_number_of_rows(tmp_path):
 def test_a_judge_of_broken_weights_is_not_written(tmp_path):
     judge = train_judge(quadrilaterals(4, 100), CONFIG)
     with torch.no_grad():
-        judge.linear.bias[0] = torch.nan
+        judge.weigh[0].bias[0] = torch.nan
     with pytest.raises(DetectorError, match="not written"):
         write_judge(judge, (3, 20, 20), {}, tmp_path / "judge.onnx")
     assert not list(tmp_path.iterdir())
