@@ -19,7 +19,7 @@ _CELLS = 2
 class Judge(nn.Module):
     """Log odds that quadrilaterals are whole markings of their classes.
 
-    What convolutions see in the views is weighed together with the evidence, for each shape a little otherwise.
+    What convolutions see in the views is weighed with the evidence, for each shape a little otherwise.
 
     Args:
         channels: of the views.
