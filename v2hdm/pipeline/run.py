@@ -119,7 +119,7 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
         with _timed(seconds, "evaluate"):
             judgement = evaluate(drive, detections, methods, config.mapping, partial(progress, "evaluate"))
         metrics = {"name": config.name, "version": __version__, **judgement.metrics, "seconds": seconds}
-        write_results(folder, drive, list(methods.values())[-1], judgement, metrics)
+        write_results(folder, drive, detections, list(methods.values())[-1], judgement, metrics)
     return RunResult(Path(config.output) / config.name, metrics, judgement.headlines)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,7 @@ from v2hdm.hdmap.calibration import write_calibration
 from v2hdm.hdmap.geojson import write_geojson
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.evaluate import Judgement
-from v2hdm.planar import ground_in_vehicle
-from v2hdm.records import Drive, Image
+from v2hdm.records import Drive, Image, ImageDetections
 from v2hdm.report.figures import save_birdseye, save_growth, save_overlay
 from v2hdm.report.outputs import write_json
 
@@ -26,6 +25,7 @@ BEST = "Opt"
 def write_results(
     folder: Path,
     drive: Drive,
+    detections: Sequence[ImageDetections],
     methods: Mapping[str, MethodResult],
     judgement: Judgement,
     metrics: Mapping[str, Any],
@@ -42,16 +42,16 @@ def write_results(
     if judgement.growth:
         save_growth(folder / "growth.png", judgement.growth)
     for name in best.calibrations:
-        _save_overlay(folder / f"overlay_{name}.png", drive, name, best)
+        image = _fullest_image(drive, name, detections)
+        _save_overlay(folder / f"overlay_{name}.png", drive, image, best)
 
 
-def _save_overlay(path: Path, drive: Drive, name: str, best: MethodResult) -> None:
-    """The map in the image that shows most of it, through the initial and the optimised IPM."""
-    camera = drive.cameras[name]
-    calibration = best.calibrations[name]
+def _save_overlay(path: Path, drive: Drive, image: Image, best: MethodResult) -> None:
+    """The map in an image, through the initial and the optimised IPM."""
+    camera = drive.cameras[image.camera]
+    calibration = best.calibrations[image.camera]
     optimised = ipm_from_extrinsic(camera.info, calibration.cam_from_vehicle)
     initial = {"calibrated": "CNI", "estimated": "ENI"}.get(camera.initial_ipm, camera.initial_ipm)
-    image = _fullest_image(drive, name, best)
     save_overlay(
         path,
         read_image(image, camera),
@@ -62,14 +62,11 @@ def _save_overlay(path: Path, drive: Drive, name: str, best: MethodResult) -> No
     )
 
 
-def _fullest_image(drive: Drive, name: str, best: MethodResult) -> Image:
-    """The image of a camera with most mapped marking centres inside its region of interest."""
-    images = [image for image in drive.images if image.camera == name]
-    centres = np.array([marking.corners_map.mean(axis=0) for marking in best.hd_map.markings]).reshape(-1, 2)
-    low, high = (f(drive.cameras[name].roi_vehicle, axis=0) for f in (np.min, np.max))
-
-    def shown(image: Image) -> int:
-        points_vehicle = ground_in_vehicle(image.map_from_vehicle, centres)
-        return int(((points_vehicle > low) & (points_vehicle < high)).all(axis=1).sum())
-
-    return max(images, key=shown)
+def _fullest_image(drive: Drive, name: str, detections: Sequence[ImageDetections]) -> Image:
+    """The image of a camera in which most corners were found; its first one where there are none."""
+    images = [index for index, image in enumerate(drive.images) if image.camera == name]
+    corners = dict.fromkeys(images, 0)
+    for found in detections:
+        if found.image in corners:
+            corners[found.image] = sum(int(marking.corner_valid.sum()) for marking in found.markings)
+    return drive.images[max(images, key=corners.__getitem__)]
