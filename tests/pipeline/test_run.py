@@ -16,7 +16,7 @@ from v2hdm.drive import ReadOptions, read_drive
 from v2hdm.errors import ConfigError, DetectorError, DriveError, MappingError, V2hdmError
 from v2hdm.hdmap.calibration import read_calibration
 from v2hdm.hdmap.geojson import read_geojson
-from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.options import AcceptanceOptions, LaneOptions, MappingOptions
 from v2hdm.pipeline import DriveConfig, RunConfig, run
 from v2hdm.pipeline.run import camera_sets
 from v2hdm.simulate import PortConfig, render_drive
@@ -178,6 +178,15 @@ def test_a_drive_past_nothing_says_that_no_marking_was_found(drive_folder: Path,
         ({"mapping": MappingOptions(mode="both")}, "mapping.mode is 'both'"),
         ({"mapping": MappingOptions(max_range_m=float("nan"))}, "mapping.max_range_m is nan"),
         ({"mapping": MappingOptions(loss="square")}, "mapping.loss is 'square'"),
+        ({"mapping": MappingOptions(model_floor_px=-0.1)}, "mapping.model_floor_px is -0.1"),
+        (
+            {"mapping": MappingOptions(lanes=LaneOptions(max_range_m=float("nan")))},
+            "mapping.lanes.max_range_m is nan",
+        ),
+        (
+            {"mapping": MappingOptions(acceptance=AcceptanceOptions(min_inlier_share=50))},
+            "mapping.acceptance.min_inlier_share is 50",
+        ),
         ({"detector": DetectorOptions(model="no such.onnx")}, "no such.onnx"),
     ],
 )

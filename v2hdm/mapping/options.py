@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, is_dataclass
 
 from v2hdm.adjust.problem import LOSSES
 from v2hdm.errors import ConfigError
@@ -177,8 +178,22 @@ def check_options(options: MappingOptions) -> None:
     for key, value in positive.items():
         if not value > 0:
             raise ConfigError(f"mapping.{key} is {value}; it must be greater than zero.")
+    for key, value in _numbers(options):
+        if not value >= 0:
+            raise ConfigError(f"mapping.{key} is {value}; it must be a number, zero or greater.")
+        if key.endswith("_share") and value > 1:
+            raise ConfigError(f"mapping.{key} is {value}; a share is one at most.")
     _check_sizes(options)
     _check_survey(options)
+
+
+def _numbers(options: object, where: str = "") -> Iterator[tuple[str, float]]:
+    """All single numbers among settings and the settings within them, by their keys."""
+    for name, value in vars(options).items():
+        if is_dataclass(value):
+            yield from _numbers(value, f"{where}{name}.")
+        elif isinstance(value, (int, float)):
+            yield where + name, value
 
 
 def _check_survey(options: MappingOptions) -> None:
