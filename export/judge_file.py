@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import logging
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import onnxruntime
 import torch
 
-from export.onnx_file import forget_source, write_labelled
+from export.onnx_file import graph_of, write_labelled
 from models.judge import Judge
 from v2hdm.detection.corners.confidence import JUDGE_INPUTS
 from v2hdm.errors import DetectorError
@@ -34,44 +31,23 @@ def write_judge(judge: Judge, views_shape: tuple[int, int, int], label: dict[str
     Raises:
         DetectorError: the file's answers would not be the network's.
     """
-    model = _to_onnx(judge, views_shape)
+    rows_of_each = {0: torch.export.Dim("rows", min=1, max=4096)}
+    model = graph_of(judge, _any_rows(judge, views_shape, 5), ["odds"], (rows_of_each,) * 3, _OPSET)
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     for rows in _ROWS:
         given = _any_rows(judge, views_shape, rows)
         with torch.no_grad():
-            expected = judge(*given).numpy()
-        named = {name: part.numpy() for name, part in zip(JUDGE_INPUTS, given, strict=True)}
+            expected = judge(*given.values()).numpy()
+        named = {name: part.numpy() for name, part in given.items()}
         difference = float(np.abs(session.run(None, named)[0] - expected).max())
         if not difference <= _TOLERANCE:
             raise DetectorError(f"{path} was not written: its log odds would differ by {difference:.2g}")
     write_labelled(model, label, path)
 
 
-def _to_onnx(judge: Judge, views_shape: tuple[int, int, int]) -> onnx.ModelProto:
-    rows = torch.export.Dim("rows", min=1, max=4096)
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        program = torch.onnx.export(
-            judge,
-            _any_rows(judge, views_shape, 5),
-            dynamo=True,
-            opset_version=_OPSET,
-            input_names=list(JUDGE_INPUTS),
-            output_names=["odds"],
-            dynamic_shapes=({0: rows}, {0: rows}, {0: rows}),
-            external_data=False,
-            verbose=False,
-        )
-    if program is None:
-        raise DetectorError("the judge could not be exported")
-    model = program.model_proto
-    forget_source(model)
-    return model
-
-
-def _any_rows(judge: Judge, views_shape: tuple[int, int, int], rows: int) -> tuple[torch.Tensor, ...]:
+def _any_rows(judge: Judge, views_shape: tuple[int, int, int], rows: int) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(rows)
     views = torch.randn((rows, *views_shape), generator=generator)
     evidence = torch.randn((rows, len(judge.mean)), generator=generator)
-    return views, evidence, torch.eye(judge.shapes)[torch.arange(rows) % judge.shapes]
+    shape = torch.eye(judge.shapes)[torch.arange(rows) % judge.shapes]
+    return dict(zip(JUDGE_INPUTS, (views, evidence, shape), strict=True))

@@ -105,24 +105,45 @@ def to_onnx(net: MarkingNet, opset: int) -> onnx.ModelProto:
     """The graph of a network, its height and width left open."""
     rows, columns = torch.export.Dim("rows", min=1, max=512), torch.export.Dim("columns", min=1, max=512)
     image = torch.zeros((1, 5 * MULTIPLE, 7 * MULTIPLE, 3), dtype=torch.uint8)
+    open_sizes = ({1: MULTIPLE * rows, 2: MULTIPLE * columns},)
+    model = graph_of(net, {"image": image}, list(Prediction._fields), open_sizes, opset)
+    _name_sizes(model)
+    return model
+
+
+def graph_of(
+    module: torch.nn.Module,
+    inputs: dict[str, torch.Tensor],
+    outputs: list[str],
+    open_sizes: tuple[dict[int, Any], ...],
+    opset: int,
+) -> onnx.ModelProto:
+    """The checked graph of a module, weights inside, without a word of where it was made.
+
+    Args:
+        module: ready to be asked.
+        inputs: by name, examples of what its ``forward`` takes, in order.
+        outputs: names of what it gives.
+        open_sizes: of each input, which axes may have any size, as ``torch.export.Dim``.
+        opset: ONNX operator set.
+    """
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
-            net,
-            (image,),
+            module,
+            tuple(inputs.values()),
             dynamo=True,
             opset_version=opset,
-            input_names=["image"],
-            output_names=list(Prediction._fields),
-            dynamic_shapes=({1: MULTIPLE * rows, 2: MULTIPLE * columns},),
+            input_names=list(inputs),
+            output_names=outputs,
+            dynamic_shapes=open_sizes,
             external_data=False,
             verbose=False,
         )
     assert program is not None
-    model = program.model_proto
-    _name_sizes(model)
-    forget_source(model)
+    model = program.model_proto  # another copy each time that it is asked for
+    _forget_source(model)
     onnx.checker.check_model(model)
     return model
 
@@ -166,7 +187,7 @@ def _name_sizes(model: onnx.ModelProto) -> None:
             value.type.tensor_type.shape.dim[axis].dim_param = name
 
 
-def forget_source(model: onnx.ModelProto) -> None:
+def _forget_source(model: onnx.ModelProto) -> None:
     """Drop what the exporter notes of the source of each node: paths of the machine that it ran on."""
     for part in (*model.graph.node, *model.graph.value_info, *model.graph.initializer):
         del part.metadata_props[:]

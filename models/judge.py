@@ -22,12 +22,12 @@ class Judge(nn.Module):
     What convolutions see in the views is weighed with the evidence, for each shape a little otherwise.
 
     Args:
-        channels: of the views.
+        channels: of the views, which have 20 rows and columns.
         features: of the evidence.
         shapes: among which classes are told apart.
         width: channels of the first convolution.
-        hidden: units between the convolutions and the answer.
         dropout: share of what is hidden in training.
+        hidden: units between the convolutions and the answer.
     """
 
     mean: Tensor
@@ -38,9 +38,9 @@ class Judge(nn.Module):
         channels: int,
         features: int,
         shapes: int,
-        width: int = 16,
+        width: int,
+        dropout: float,
         hidden: int = 48,
-        dropout: float = 0.3,
     ):
         super().__init__()
         self.shapes = shapes

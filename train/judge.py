@@ -62,7 +62,7 @@ def train_judge(known: Quadrilaterals, config: JudgeConfig) -> Judge:
     torch.manual_seed(config.seed)
     rng = np.random.default_rng(config.seed)
     channels, features, shapes = known.views.shape[1], known.evidence.shape[1], known.shape.shape[1]
-    judge = Judge(channels, features, shapes, config.width, dropout=config.dropout).train()
+    judge = Judge(channels, features, shapes, config.width, config.dropout).train()
     judge.mean.copy_(torch.from_numpy(known.evidence.mean(axis=0)))
     judge.deviation.copy_(torch.from_numpy(np.maximum(known.evidence.std(axis=0), _LEAST_DEVIATION)))
     parts = [torch.from_numpy(part) for part in (known.views, known.evidence, known.shape)]

@@ -62,7 +62,7 @@ class Network:
             DetectorError: there is no such file, it is not an ONNX model or not one of ours.
         """
         self.path = DEFAULT_MODEL if path is None else Path(path)
-        self._session = _open_session(self.path, threads)
+        self._session = open_session(self.path, threads)
         self.info = _read_info(self._session, self.path)
 
     def run(self, image_bgr: np.ndarray) -> NetworkOutput:
@@ -120,7 +120,12 @@ class Network:
         return np.asarray(output[0, :, : -(-size[0] // stride), : -(-size[1] // stride)])
 
 
-def _open_session(path: Path, threads: int) -> Any:
+def open_session(path: Path, threads: int) -> Any:
+    """A model file ready to run on so many threads.
+
+    Raises:
+        DetectorError: there is no such file, or it is not an ONNX model.
+    """
     if not path.is_file():
         raise DetectorError(
             f"{path}: no such detector model; give the path of an ONNX file written by `python -m export`"

@@ -13,11 +13,12 @@ import json
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import onnxruntime
 
 from v2hdm.detection.corners.company import COMPANY, company
+from v2hdm.detection.network import open_session
 from v2hdm.detection.odds import as_probability
 from v2hdm.records import DIAMOND, LANE_DASH, FloatArray
 
@@ -74,10 +75,8 @@ def _odds(features: FloatArray, fits: Sequence[_Fit]) -> FloatArray:
 
 
 @cache
-def _judge(path: Path) -> onnxruntime.InferenceSession:
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+def _judge(path: Path) -> Any:
+    return open_session(path, threads=1)
 
 
 @cache
