@@ -27,7 +27,8 @@ import numpy as np
 
 from export.judge_file import write_judge
 from models.judge import Judge
-from tests.benchmarks.detector_quality import Example, example, polygon_overlap
+from tests.benchmarks.detector_quality import polygon_overlap
+from tests.benchmarks.examples import Example, example
 from train.judge import JudgeConfig, Quadrilaterals, judged, train_judge
 from v2hdm.detection.corners.confidence import (
     CONFIDENCE_FILE,

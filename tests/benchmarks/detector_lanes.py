@@ -25,7 +25,8 @@ import cv2
 import numpy as np
 
 from tests.benchmarks.detector_confidence import FOLDS, fit, log_loss, renders_to_fit
-from tests.benchmarks.detector_quality import LANE_TOLERANCE_PX, Example
+from tests.benchmarks.detector_quality import LANE_TOLERANCE_PX
+from tests.benchmarks.examples import Example
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.lanes import anchors, score

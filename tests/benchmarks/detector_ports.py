@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 
 from tests.benchmarks.adjust_ports import port_config
-from tests.benchmarks.detector_quality import Example, counted, example_of, summary
+from tests.benchmarks.detector_quality import counted, summary
+from tests.benchmarks.examples import Example, example_of
 from v2hdm.detection.camera.ground import ipm_from_extrinsic
 from v2hdm.records import Camera, FloatArray
 from v2hdm.simulate.port.build import Port, build_port

@@ -1,0 +1,176 @@
+"""Rendered images with what there is to be found in them, which no training ever showed.
+
+Full 1280 x 720 images of ports and streets, in any light and state of wear, with their true markings and
+lanes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from v2hdm.detection.camera.ground import apply_homography, ipm_from_extrinsic
+from v2hdm.detection.camera.lens import distort_points
+from v2hdm.planar import clip_convex, clip_half
+from v2hdm.records import (
+    CORNERED_CLASSES,
+    LANE_CLASSES,
+    OUTLINED_CLASSES,
+    PAINT_CLASSES,
+    Camera,
+    FloatArray,
+)
+from v2hdm.simulate.render.renderer import Rendered, Renderer
+from v2hdm.simulate.render.scene import Scene
+from v2hdm.simulate.training.scenes import image_line, image_points, random_scene
+from v2hdm.simulate.training.views import TrainingView, random_view
+
+SEED = 771_000_003
+"""No training or validation seed, whatever their index: those start from single-digit seeds."""
+
+WIDTH, HEIGHT = 1280, 720
+MAX_RANGE_M = 20.0
+WHOLE_SHARE = 0.97
+"""A marking counts as wholly seen when this share of its area is; others may be found or not."""
+
+TOUCHING_PX = 2
+TOUCHED_SHARE = 0.05
+"""Other paint touches a marking if it holds more than this share of a seam of so many px around it."""
+
+NEAREST_M = 0.3
+_FRAME_PX = np.array([[-1.0, -1.0], [2.0, -1.0], [2.0, 2.0], [-1.0, 2.0]]) * (WIDTH, HEIGHT)
+"""Markings are known to be there as far as they lie before the camera and about the image."""
+
+MIN_HEIGHT_PX = 4.0
+LEAST_SHOWN_M = 1.0
+"""A line shows if so much of its paint is in the image and in front of what stands there; who labels images
+cannot know of others. Those parts of such a line that are hidden or between its dashes are asked for."""
+
+_STATION_M = 0.5
+_BESIDE_M = np.linspace(-0.5, 0.5, 21)
+"""Paint this far beside a line's middle is its own: those of double lines are."""
+
+
+@dataclass(frozen=True)
+class TrueMarking:
+    """One painted quadrilateral or symbol in an image; ``fair`` if it must be found, else it may be."""
+
+    kind: str
+    polygon_px: FloatArray
+    range_m: float
+    fair: bool
+
+    @property
+    def narrow_px(self) -> float:
+        """The narrow side of the smallest rectangle around it."""
+        return float(min(cv2.minAreaRect(self.polygon_px.astype(np.float32))[1]))
+
+
+@dataclass(frozen=True)
+class Example:
+    """An image with its camera and truth."""
+
+    image: np.ndarray
+    camera: Camera
+    markings: list[TrueMarking]
+    lanes_px: list[FloatArray]
+    lanes_shown: list[bool] = field(default_factory=list)
+
+
+def example(index: int, difficulty: float = 1.0, seed: int = SEED) -> Example:
+    """Example ``index`` of the fixed set, or of that of another ``seed``."""
+    rng = np.random.default_rng([seed, index])
+    scene, lanes = random_scene(rng, difficulty)
+    view = random_view(rng, WIDTH, HEIGHT)
+    rendered = Renderer(scene).render(view.info, view.cam_from_map, rng, view.optics, view.motion)
+    return example_of(scene, lanes, view, rendered, _camera(view))
+
+
+def example_of(
+    scene: Scene, lanes_map: list[FloatArray], view: TrainingView, rendered: Rendered, camera: Camera
+) -> Example:
+    """What there is to be found in an image of a scene, whose lines (N, 2) have a point every half metre."""
+    lines_px = [image_line(view, lane) for lane in lanes_map]
+    seen = [lane for lane, line_px in zip(lanes_map, lines_px, strict=True) if len(line_px) > 1]
+    lanes_px = [line_px for line_px in lines_px if len(line_px) > 1]
+    lanes_shown = [_shows(lane, view, rendered) for lane in seen]
+    return Example(rendered.image, camera, _markings(scene, view, rendered), lanes_px, lanes_shown)
+
+
+def _shows(lane_map: FloatArray, view: TrainingView, rendered: Rendered) -> bool:
+    """Whether enough paint of a line (N, 2), a point every half metre, is to be seen in the image."""
+    ahead = np.gradient(lane_map, axis=0)
+    left = np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.linalg.norm(ahead, axis=1, keepdims=True)
+    kinds = [PAINT_CLASSES.index(kind) + 1 for kind in LANE_CLASSES]
+    shown = 0
+    for point, across in zip(lane_map, left, strict=True):
+        u, v = np.round(image_points(view, point + _BESIDE_M[:, None] * across)).astype(int).T
+        inside = (u >= 0) & (v >= 0) & (u < WIDTH) & (v < HEIGHT)
+        shown += bool(np.isin(rendered.labels[v[inside], u[inside]], kinds).any())
+    return shown * _STATION_M >= LEAST_SHOWN_M
+
+
+def _camera(view: TrainingView) -> Camera:
+    ipm = ipm_from_extrinsic(view.info, view.cam_from_map)
+    middle = apply_homography(ipm, np.array([[WIDTH / 2, HEIGHT - 1.0]]))
+    square = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
+    return Camera(view.info, {"true": ipm}, "true", middle + square)
+
+
+def _markings(scene: Scene, view: TrainingView, rendered: Rendered) -> list[TrueMarking]:
+    """The scene's paint by piece; pieces that belong together (arrows, chevrons) are judged as one."""
+    centre = -view.cam_from_map[:3, :3].T @ view.cam_from_map[:3, 3]
+    out = []
+    for paint in scene.paints:
+        if paint.kind not in CORNERED_CLASSES + OUTLINED_CLASSES:
+            continue
+        polygon = np.asarray(paint.polygon_map, dtype=np.float64)
+        polygon = _before_camera(polygon, view)
+        cam = polygon @ view.cam_from_map[:3, :2].T + view.cam_from_map[:3, 3]
+        pinhole = (cam @ view.info.intrinsic.T)[:, :2] / cam[:, 2:]
+        pinhole = clip_convex(pinhole, _FRAME_PX) if len(polygon) else pinhole
+        if len(pinhole) < 3:
+            continue
+        polygon_px = distort_points(view.info, pinhole)
+        range_m = float(np.linalg.norm(polygon.mean(axis=0) - centre[:2]))
+        whole = _seen_alone(polygon_px, PAINT_CLASSES.index(paint.kind) + 1, rendered)
+        tall = float(np.ptp(polygon_px[:, 1])) >= MIN_HEIGHT_PX
+        fair = whole and tall and range_m <= MAX_RANGE_M and paint.wear <= 0.4
+        out.append(TrueMarking(paint.kind, polygon_px, range_m, fair and paint.kind in CORNERED_CLASSES))
+    return out
+
+
+def _before_camera(polygon_map: FloatArray, view: TrainingView) -> FloatArray:
+    """The part of a ground polygon (N, 2) that lies before the camera."""
+    depth = polygon_map @ view.cam_from_map[2, :2] + view.cam_from_map[2, 3]
+    return clip_half(polygon_map, depth - NEAREST_M)
+
+
+def _seen_alone(polygon_px: FloatArray, label: int, rendered: Rendered) -> bool:
+    """Whether a polygon is wholly seen, border of the image included, and no other paint touches it.
+
+    Where paint runs into other paint there is no outline to be found.
+    """
+    low = np.floor(polygon_px.min(axis=0)).astype(int) - TOUCHING_PX
+    high = np.ceil(polygon_px.max(axis=0)).astype(int) + 1 + TOUCHING_PX
+    size = high - low
+    mask = np.zeros((size[1], size[0]), dtype=np.uint8)
+    cv2.fillConvexPoly(mask, np.round((polygon_px - low) * 16).astype(np.int32), 1, shift=4)
+    around = cv2.dilate(mask, np.ones((2 * TOUCHING_PX + 1,) * 2, np.uint8)) - mask
+    mask = cv2.erode(mask, np.ones((3, 3), np.uint8), borderValue=0) if mask.sum() > 200 else mask
+    return _share(mask, low, rendered, (label,)) >= WHOLE_SHARE and (
+        _share(around, low, rendered, range(1, len(PAINT_CLASSES) + 1)) <= TOUCHED_SHARE
+    )
+
+
+def _share(mask: np.ndarray, low: np.ndarray, rendered: Rendered, labels: Iterable[int]) -> float:
+    """Share of a mask's pixels, placed at ``low``, that show one of the labels; 0 if some are outside."""
+    v, u = np.nonzero(mask)
+    u, v = u + low[0], v + low[1]
+    inside = (u >= 0) & (v >= 0) & (u < WIDTH) & (v < HEIGHT)
+    if not len(u) or not inside.all():
+        return 0.0
+    return float(np.isin(rendered.labels[v, u], list(labels)).mean())
