@@ -30,6 +30,10 @@ class MappingError(V2hdmError):
     """A drive was read but no map can be made from it."""
 
 
+class WorkerError(V2hdmError):
+    """A process that did part of the work died."""
+
+
 class MissingExtraError(V2hdmError):
     """A door was opened without the optional dependencies that it needs."""
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
@@ -16,10 +13,11 @@ from v2hdm.detection.image_file import read_bgr
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import DriveError
 from v2hdm.records import Camera, Drive, Image, ImageDetections
+from v2hdm.workers import share_out
 
 _worker: tuple[Detector, Drive] | None = None
-_CHUNK = 4
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_FEW_IMAGES = 8
+"""Fewer are looked at before a process has started."""
 
 
 def read_image(image: Image, camera: Camera) -> np.ndarray:
@@ -57,6 +55,7 @@ def detect_all(
     Raises:
         DriveError: an image is missing, damaged or of the wrong size.
         DetectorError: the model cannot be used.
+        WorkerError: a process died.
     """
     options = replace(options) if options else DetectorOptions()
     total = len(drive.images)
@@ -67,35 +66,14 @@ def detect_all(
         if progress:
             progress(len(results), total)
 
-    if workers <= 1 or total < 2 * _CHUNK:
+    if workers <= 1 or total < _FEW_IMAGES:
         detector = Detector.load(options=options)
         for index in range(total):
             collect(_detect_image(detector, drive, index))
         return results
     Detector.load(options=options)  # a bad model is refused here, once, not in every worker
-    context = multiprocessing.get_context("spawn")
-    with (
-        _single_threaded_children(),
-        context.Pool(min(workers, total), _start_worker, (drive, options)) as pool,
-    ):
-        for detections in pool.imap(_work, range(total), chunksize=_CHUNK):
-            collect(detections)
+    share_out(_work, range(total), workers, _start_worker, (drive, options), collect)
     return results
-
-
-@contextmanager
-def _single_threaded_children() -> Iterator[None]:
-    """Keep numpy's linear algebra in child processes from starting a thread a core each."""
-    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def _start_worker(drive: Drive, options: DetectorOptions) -> None:

@@ -8,13 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import multiprocessing
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -32,6 +27,7 @@ from v2hdm.simulate.port.config import PortConfig
 from v2hdm.simulate.port.disturbance import measured_disturbances, pose_noise
 from v2hdm.simulate.port.visibility import points_seen, quad_samples
 from v2hdm.simulate.render.renderer import RENDERER_VERSION
+from v2hdm.workers import share_out
 
 Progress = Callable[[int, int], None]
 _Job = tuple[str, int, str]
@@ -53,6 +49,7 @@ def rendered_drive(config: PortConfig, cache: Path, workers: int, progress: Prog
     Raises:
         ConfigError: when the configuration makes no port.
         DriveError: when the cache cannot be written.
+        WorkerError: when a process died; what it had rendered is kept.
     """
     text = json.dumps([RENDERER_VERSION, asdict(config)], sort_keys=True)
     folder = cache / f"{config.name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
@@ -108,32 +105,18 @@ def _render_all(port: Port, images: list[Image], workers: int, progress: Progres
     ]
     done = len(images) - len(jobs)
     progress(done, len(images))
-    with _renderers(port, workers, len(jobs)) as finished:
-        for _ in finished(jobs):
-            done += 1
-            progress(done, len(images))
 
+    def count(_: object = None) -> None:
+        nonlocal done
+        done += 1
+        progress(done, len(images))
 
-@contextmanager
-def _renderers(port: Port, workers: int, jobs: int) -> Iterator[Callable[[list[_Job]], Iterator[None]]]:
-    """A function that renders jobs and yields as each one ends, in this process or in several.
-
-    Processes are spawned: a fork would inherit the locks of other libraries' threads.
-    """
-    if workers <= 1 or jobs < 2 * workers:
-        yield lambda batch: map(partial(_write_picture, port), batch)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, _start_worker, (port.config,)) as pool:
-        try:
-            yield lambda batch: pool.map(_work, batch, chunksize=4)
-        except BrokenProcessPool:
-            raise DriveError(
-                f"port '{port.config.name}': a rendering process died, perhaps for want of memory; "
-                "start again, it goes on where it was, with fewer workers"
-            ) from None
-        finally:
-            pool.shutdown(cancel_futures=True)
+    if workers <= 1 or len(jobs) < 2 * workers:
+        for job in jobs:
+            _write_picture(port, job)
+            count()
+    else:
+        share_out(_work, jobs, workers, _start_worker, (port.config,), count)
 
 
 def _start_worker(config: PortConfig) -> None:
