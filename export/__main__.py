@@ -1,69 +1,28 @@
-"""The door: `python -m export checkpoint=runs/train/best.pt output=v2hdm/detection/default.onnx`."""
+"""The door: ``python -m export checkpoint=runs/train/best.pt output=v2hdm/detection/default.onnx``."""
 
 from __future__ import annotations
 
-from pathlib import Path
+import sys
 
-from hydra.core.config_store import ConfigStore
-from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from v2hdm.door import answer_signals, open_door
 
-from export.config import ExportConfig, Precision
-from export.onnx_file import Tell, export_float, export_int8
-from export.source import Source, read_source
-from train.door import open_door
-from v2hdm.errors import ConfigError
-
-ConfigStore.instance().store(name="export_schema", node=ExportConfig)
+_INTERRUPTED = "interrupted; nothing was written"
 
 
-def run(composed: DictConfig, tell: Tell = lambda share, doing: None) -> str:
-    """Export as configured; returns what there is to say about it.
-
-    Raises:
-        ConfigError: A value is missing or the checkpoint cannot be read.
-        DetectorError: The file would not do what the network does.
-    """
-    missing = sorted(OmegaConf.missing_keys(composed))
-    if missing:
-        raise ConfigError(f"{', '.join(missing)} is missing: `python -m export checkpoint=... output=...`")
-    config = OmegaConf.to_object(composed)
-    assert isinstance(config, ExportConfig)
-    source = read_source(Path(config.checkpoint))
-    output = Path(config.output)
-    parity = _export(source, output, config, tell)
-    size_mb = output.stat().st_size / 1e6
-    iou = source.label["metrics"].get("mean_iou", float("nan"))
-    return f"{output}: {size_mb:.2f} MB, step {source.label['steps']}, mean IoU {iou:.3f}, {parity}"
+def main() -> int:
+    """Run the door, whose arguments are Hydra overrides (``--help`` lists them); returns its exit code."""
+    return open_door("export", "train", _INTERRUPTED, _export)
 
 
-def _export(source: Source, output: Path, config: ExportConfig, tell: Tell) -> str:
-    """Export, and say how near the file is to the network."""
-    if config.precision is Precision.float32:
-        return f"parity {export_float(source, output, config.opset, config.tolerance):.1e}"
-    parity = export_int8(source, output, config.opset, config.int8, tell)
-    return (
-        f"int8: {parity.paint_changed:.1%} of paint changed, its outline by {parity.outline_px:.3f} px "
-        f"({parity.outline_bias_px:+.3f} outwards), classes {parity.kinds_agree:.1%} the same, "
-        f"lanes {parity.lanes_agree:.1%}, moved by {parity.lane_offset_px:.3f} px"
-    )
+def _export() -> None:
+    from export.config import ExportConfig
+    from export.console import export
+    from v2hdm.config import compositions, to_dataclass
 
-
-def main(composed: DictConfig) -> None:
-    """Export a checkpoint to ONNX."""
-    console = Console(stderr=True)
-    columns = (
-        BarColumn(),
-        TextColumn("{task.percentage:.0f} %"),
-        TimeElapsedColumn(),
-        TextColumn("{task.description}"),
-    )
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("reading", total=1.0)
-        line = run(composed, lambda share, doing: bar.update(task, completed=share, description=doing))
-    console.print(line, soft_wrap=True, highlight=False)
+    for composed in compositions("export", ExportConfig):
+        export(to_dataclass(composed, ExportConfig, "`python -m export checkpoint=... output=...`"))
 
 
 if __name__ == "__main__":
-    open_door("export", main)
+    answer_signals()
+    sys.exit(main())

@@ -17,9 +17,9 @@ RUNS = sorted(path.stem for path in (config.conf_dir() / "run").glob("*.yaml"))
 
 
 def composed(*overrides: str) -> RunConfig:
-    config.register_schemas()
+    config.register("map", RunConfig)
     with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
-        return config.to_run_config(compose("map", overrides=list(overrides)))
+        return config.to_dataclass(compose("map", overrides=list(overrides)), RunConfig, "choose a run")
 
 
 def test_the_runs_that_the_readme_names_are_shipped() -> None:
@@ -32,7 +32,7 @@ def test_every_shipped_run_composes_into_dataclasses(run: str) -> None:
 
 
 def test_no_run_is_an_error_that_lists_the_runs() -> None:
-    with pytest.raises(ConfigError, match=r"\+run=port2"):
+    with pytest.raises(ConfigError, match="no value for name; choose a run"):
         composed()
 
 
@@ -47,6 +47,7 @@ def run_door(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
         (("+run=port2", "maping.max_range_m=3"), "maping"),
         (("+run=port2", "mapping.max_rnge_m=3"), "max_range_m"),
         (("+run=port9",), "port9"),
+        ((), "no value for name; choose a run (+run=port1, +run=port2,"),
         (("+run=port2", "workers=many"), "workers"),
         (("+run=port2", "simulate.route.pieces=[[62.0,0.0],[23,-90.0]]"), "write 23.0"),
         (("+run=port2", "+mapping.known_sizes.by_class_m={diamond: [1, 0.7]}"), "write 1.0"),

@@ -1,52 +1,28 @@
-"""The door: `python -m train [key=value ...]`."""
+"""The training door: ``python -m train [key=value ...]``."""
 
 from __future__ import annotations
 
-import logging
-from pathlib import Path
+import sys
 
-from hydra.core.config_store import ConfigStore
-from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
-from rich.logging import RichHandler
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from v2hdm.door import answer_signals, open_door
 
-from train.config import TrainConfig
-from train.distributed import Team, joined_team
-from train.door import open_door
-from train.loop import Trainer
-
-ConfigStore.instance().store(name="train_schema", node=TrainConfig)
+_INTERRUPTED = "interrupted; what was saved until then is kept"
 
 
-def main(composed: DictConfig) -> None:
-    """Train the detector's network."""
-    config = OmegaConf.to_object(composed)
-    assert isinstance(config, TrainConfig)
-    with joined_team(config.device) as team:
-        _train(config, team)
+def main() -> int:
+    """Run the door, whose arguments are Hydra overrides (``--help`` lists them); returns its exit code."""
+    return open_door("train", "train", _INTERRUPTED, _train)
 
 
-def _train(config: TrainConfig, team: Team) -> None:
-    console = Console(stderr=True, quiet=not team.leads)
-    handler = RichHandler(console=console, show_path=False)
-    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[handler], force=True)
-    columns = (
-        BarColumn(),
-        TextColumn("{task.percentage:.0f} %"),
-        TimeElapsedColumn(),
-        TextColumn("{task.description}"),
-    )
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task("rendering the validation set", total=1.0)
-        trainer = Trainer(
-            config, lambda share, line: bar.update(task, completed=share, description=line), team
-        )
-        state = trainer.run()
-    console.print(
-        f"trained {state.step} steps, mean IoU {state.best_iou:.3f}: {Path(config.output) / 'best.pt'}"
-    )
+def _train() -> None:
+    from train.config import TrainConfig
+    from train.console import train
+    from v2hdm.config import compositions, to_dataclass
+
+    for composed in compositions("train", TrainConfig):
+        train(to_dataclass(composed, TrainConfig, "set it on the command line"))
 
 
 if __name__ == "__main__":
-    open_door("train", main)
+    answer_signals()
+    sys.exit(main())

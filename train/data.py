@@ -17,6 +17,7 @@ from train.labels import LabelledImages, read_labels
 from train.targets import Targets, targets
 from v2hdm.simulate.training.hardships import Hardships
 from v2hdm.simulate.training.scenes import TrainingSample, training_sample
+from v2hdm.workers import undisturbed_starts
 
 _VALIDATION_SEED_OFFSET = 1_000_003
 
@@ -109,7 +110,8 @@ def training_batches(
         worker_init_fn=_single_thread if config.workers else None,
         multiprocessing_context="spawn" if config.workers else None,
     )
-    return iter(loader)
+    with undisturbed_starts():
+        return iter(loader)
 
 
 def validation_pairs(config: DataConfig, seed: int, images: int) -> Iterator[Pair]:

@@ -16,10 +16,10 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from v2hdm.door import EXIT_USER_ERROR
 from v2hdm.errors import ConfigError, V2hdmError
 
 _T = TypeVar("_T")
-_EXIT_USER_ERROR = 2
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Team:
         if failure is not None:
             raise failure
         if failed:
-            raise SystemExit(_EXIT_USER_ERROR)
+            raise SystemExit(EXIT_USER_ERROR)
         dist.broadcast_object_list(message, src=0, device=self.device)
         made = message[0]
         assert made is not None

@@ -34,10 +34,6 @@ class WorkerError(V2hdmError):
     """A process that did part of the work died."""
 
 
-class MissingExtraError(V2hdmError):
-    """A door was opened without the optional dependencies that it needs."""
-
-
 class AdjustError(V2hdmError):
     """A bundle adjustment problem is malformed: the message names the offending item."""
 

@@ -1,68 +1,31 @@
-"""The mapping door: ``python -m v2hdm.map +run=port2`` turns a drive into a map and a calibration.
-
-Hydra lives only here and in :mod:`v2hdm.config`. What a user got wrong ends in one line on stderr
-and exit code 2.
-"""
+"""The mapping door: ``python -m v2hdm.map +run=port2`` turns a drive into a map and a calibration."""
 
 from __future__ import annotations
 
-import os
 import sys
 
-from v2hdm.errors import MissingExtraError, V2hdmError
+from v2hdm.door import answer_signals, open_door
 
-EXIT_USER_ERROR = 2
-
-
-def main() -> None:
-    """Run the door; the arguments are Hydra overrides (``--help`` lists the configuration)."""
-    # Hydra prints composition errors its own way and exits with 1 unless told to raise them.
-    os.environ.setdefault("HYDRA_FULL_ERROR", "1")
-    try:
-        _run_hydra()
-    except V2hdmError as error:
-        _fail(str(error))
-    except KeyboardInterrupt:
-        _fail("interrupted; finished renderings are kept in the cache, no result was written")
+_INTERRUPTED = "interrupted; finished renderings are kept in the cache, no result was written"
+_RUNS = "choose a run (+run=port1, +run=port2, +run=kitti drive.path=...) or set it on the command line"
 
 
-def _run_hydra() -> None:
-    try:
-        import hydra
-        import torch  # noqa: F401  # checked here, so that its absence is one clear line
-        from hydra.errors import HydraException
-        from omegaconf import DictConfig
-        from omegaconf.errors import OmegaConfBaseException
-    except ModuleNotFoundError as error:
-        raise MissingExtraError(
-            f"python -m v2hdm.map needs {error.name}: install the mapping extra, pip install 'v2hdm[map]'"
-        ) from error
+def main() -> int:
+    """Run the door, whose arguments are Hydra overrides (``--help`` lists them); returns its exit code."""
+    return open_door("v2hdm.map", "map", _INTERRUPTED, _map)
+
+
+def _map() -> None:
+    import torch  # noqa: F401  # its absence is told before that of what is built on it
+
     from v2hdm import config, console
+    from v2hdm.pipeline import RunConfig
 
-    config.register_schemas()
-
-    failures: list[V2hdmError] = []
-
-    @hydra.main(config_path=str(config.conf_dir()), config_name="map", version_base="1.3")
-    def run_composed(composed: DictConfig) -> None:
-        # Carried past Hydra, which would announce it with lines of its own.
-        try:
-            console.run_on_terminal(config.to_run_config(composed), config.to_yaml(composed))
-        except V2hdmError as error:
-            failures.append(error)
-
-    try:
-        run_composed()
-    except (HydraException, OmegaConfBaseException) as error:
-        raise config.explain(error, sys.argv[1:]) from error
-    for failure in failures:
-        raise failure
-
-
-def _fail(message: str) -> None:
-    print(f"error: {message}", file=sys.stderr)
-    sys.exit(EXIT_USER_ERROR)
+    for composed in config.compositions("map", RunConfig):
+        run = config.to_dataclass(composed, RunConfig, _RUNS)
+        console.run_on_terminal(run, config.to_yaml(composed))
 
 
 if __name__ == "__main__":
-    main()
+    answer_signals()
+    sys.exit(main())

@@ -16,7 +16,7 @@ import pytest
 from onnx import numpy_helper
 
 from tests.detection.pictures import HEIGHT, WIDTH, brightness_model, diamond, extrinsic, make_camera, picture
-from v2hdm import detect
+from v2hdm import watch
 from v2hdm.detect import main
 from v2hdm.detection import frames, network
 from v2hdm.detection.detector import Detector
@@ -269,20 +269,30 @@ class FullDevice(io.StringIO):
 
 def test_a_full_standard_output_is_one_line(bench, monkeypatch, capsys):
     monkeypatch.setattr("sys.stdout", FullDevice())
-    monkeypatch.setattr(detect, "_forget_stdout", lambda: None)
+    monkeypatch.setattr(watch, "_forget_stdout", lambda: None)
     assert bench.run(bench.folder) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: standard output: cannot be written (No space left")
     assert error.count("\n") == 1
 
 
-def test_an_interruption_before_the_first_image_is_one_line(bench, tmp_path, monkeypatch, capsys):
-    def interrupted(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
+@pytest.mark.parametrize("when", ["load", "detect"])
+def test_an_interruption_before_the_last_image_is_one_line_and_no_half_a_file(
+    bench, tmp_path, monkeypatch, capsys, when
+):
+    calls = []
 
-    monkeypatch.setattr(Detector, "load", interrupted)
+    def interrupted(*arguments: object, **keywords: object) -> object:
+        calls.append(None)
+        if when == "load" or len(calls) == 2:
+            raise KeyboardInterrupt
+        return original(*arguments, **keywords)
+
+    original = getattr(Detector, when)
+    monkeypatch.setattr(Detector, when, interrupted)
     assert bench.run(bench.folder, "--output", tmp_path / "out" / "found.jsonl") == 2
-    assert capsys.readouterr().err == "error: interrupted before the first image; nothing was written\n"
+    line = "error: interrupted before the last image; no --output was written\n"
+    assert capsys.readouterr().err == line
     assert not list((tmp_path / "out").glob("*"))
 
 

@@ -14,10 +14,9 @@ from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 from onnx import numpy_helper
 
-from export import __main__ as door
 from export import onnx_file
 from export.calibration import looks
-from export.config import BoundsConfig, Int8Config
+from export.config import BoundsConfig, ExportConfig, Int8Config, Precision
 from export.equalise import equalise
 from export.graph import Graph, open_session
 from export.int8 import HIGHEST_WEIGHT, to_int8
@@ -28,8 +27,8 @@ from export.source import Source, of_checkpoint, read_source
 from models import MarkingNet, NetConfig, Prediction
 from train.checkpoint import Checkpoint
 from train.config import TrainConfig
-from train.door import explain
 from train.exported import read_exported
+from v2hdm.config import explain, register
 from v2hdm.detection.network import METADATA_KEY, Network
 from v2hdm.errors import ConfigError, DetectorError
 
@@ -303,9 +302,10 @@ def test_int8_without_renders_says_what_to_set(source: Source, quick: None, tmp_
 
 
 def test_the_door_knows_its_precisions() -> None:
+    register("export", ExportConfig)
     with initialize_config_dir(CONF, version_base="1.3"):
         composed = compose("export", overrides=["checkpoint=a", "output=b", "precision=int8"])
-        assert composed.precision is door.Precision.int8
+        assert composed.precision is Precision.int8
         with pytest.raises(HydraException) as caught:
             compose("export", overrides=["precision=int4"])
-    assert "[float32, int8]" in str(explain(caught.value))
+    assert "[float32, int8]" in str(explain(caught.value, ExportConfig, []))

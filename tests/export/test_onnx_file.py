@@ -1,6 +1,7 @@
 """The exported file: the network's function at any size, with a label, whole or not at all."""
 
 import json
+import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -9,7 +10,6 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 
 from export import __main__ as door
 from export import onnx_file
@@ -20,7 +20,7 @@ from train.checkpoint import Checkpoint
 from train.config import DataConfig, TrainConfig
 from train.targets import IGNORE, paint_target
 from v2hdm.detection.network import METADATA_KEY
-from v2hdm.errors import ConfigError, DetectorError
+from v2hdm.errors import DetectorError
 from v2hdm.records import PAINT_CLASSES
 from v2hdm.simulate.training.scenes import training_sample
 
@@ -110,14 +110,24 @@ def test_weights_that_are_no_numbers_are_not_written(checkpoint: Checkpoint, tmp
     [
         (["checkpoint=nowhere.pt", "output=net.onnx"], "no checkpoint at nowhere.pt"),
         (["checkpoint=nowhere.onnx", "output=net.onnx"], "no file nowhere.onnx"),
-        (["output=net.onnx"], "checkpoint is missing"),
+        (["output=net.onnx"], "no value for checkpoint; `python -m export checkpoint=... output=...`"),
     ],
 )
-def test_what_is_missing_is_named_in_one_line(overrides: list[str], line: str) -> None:
-    with initialize_config_dir(CONF, version_base="1.3"):
-        composed = compose("export", overrides=overrides)
-    with pytest.raises(ConfigError, match=line):
-        door.run(composed)
+def test_what_is_missing_is_named_in_one_line(
+    overrides: list[str],
+    line: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["export", *overrides])
+    monkeypatch.chdir(tmp_path)
+    assert door.main() == 2
+    error = capsys.readouterr().err.strip()
+    assert error.startswith("error: ")
+    assert line in error
+    assert "\n" not in error
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_shipped_detector_finds_fresh_paint_where_it_is() -> None:

@@ -12,13 +12,13 @@ from hydra import compose, initialize_config_dir
 from hypothesis import given
 from hypothesis import strategies as st
 
-from train import __main__ as door
 from train.config import DataConfig, TrainConfig
 from train.data import RenderStream
 from train.labels import LabelledImages, paint_labels, read_labels
 from train.labels_image import Shape
 from train.labels_raster import coverage
 from train.targets import IGNORE
+from v2hdm.config import register
 from v2hdm.errors import ConfigError, LabelError
 from v2hdm.records import ARROW, CROSSWALK_BAR, DIAMOND, PAINT_CLASSES
 
@@ -172,7 +172,7 @@ def test_the_advice_about_an_unknown_category_is_an_argument_that_works(tmp_path
     with pytest.raises(LabelError) as refusal:
         read_labels(config(coco=str(path)))
     (argument,) = re.findall("'([+].*?)'", str(refusal.value))
-    assert door.main  # it registers the schema
+    register("train", TrainConfig)
     with initialize_config_dir(CONF, version_base="1.3"):
         composed = compose("train", overrides=[argument.replace("CLASS", CROSSWALK_BAR)])
     assert composed.data.coco_classes == {"zebra": CROSSWALK_BAR}

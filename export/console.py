@@ -1,0 +1,54 @@
+"""An export on the terminal: a progress bar, and what came of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from export.config import ExportConfig, Precision
+from export.onnx_file import Tell, export_float, export_int8
+from export.source import Source, read_source
+
+
+def run(config: ExportConfig, tell: Tell = lambda share, doing: None) -> str:
+    """Export as configured; returns what there is to say about it.
+
+    Raises:
+        ConfigError: The checkpoint cannot be read or the file cannot be written.
+        DetectorError: The file would not do what the network does.
+    """
+    source = read_source(Path(config.checkpoint))
+    output = Path(config.output)
+    parity = _export(source, output, config, tell)
+    size_mb = output.stat().st_size / 1e6
+    iou = source.label["metrics"].get("mean_iou", float("nan"))
+    return f"{output}: {size_mb:.2f} MB, step {source.label['steps']}, mean IoU {iou:.3f}, {parity}"
+
+
+def _export(source: Source, output: Path, config: ExportConfig, tell: Tell) -> str:
+    """Export, and say how near the file is to the network."""
+    if config.precision is Precision.float32:
+        return f"parity {export_float(source, output, config.opset, config.tolerance):.1e}"
+    parity = export_int8(source, output, config.opset, config.int8, tell)
+    return (
+        f"int8: {parity.paint_changed:.1%} of paint changed, its outline by {parity.outline_px:.3f} px "
+        f"({parity.outline_bias_px:+.3f} outwards), classes {parity.kinds_agree:.1%} the same, "
+        f"lanes {parity.lanes_agree:.1%}, moved by {parity.lane_offset_px:.3f} px"
+    )
+
+
+def export(config: ExportConfig) -> None:
+    """Export a checkpoint to ONNX."""
+    console = Console(stderr=True)
+    columns = (
+        BarColumn(),
+        TextColumn("{task.percentage:.0f} %"),
+        TimeElapsedColumn(),
+        TextColumn("{task.description}"),
+    )
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("reading", total=1.0)
+        line = run(config, lambda share, doing: bar.update(task, completed=share, description=doing))
+    console.print(line, soft_wrap=True, highlight=False)

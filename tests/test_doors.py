@@ -1,0 +1,75 @@
+"""Ctrl-C at a door is one line, whenever it comes."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PRESSED_TWICE = """
+import os, signal, time
+try:
+    os.kill(os.getpid(), signal.{signal})
+    time.sleep(9)
+finally:
+    os.kill(os.getpid(), signal.{signal})
+    time.sleep(0.01)
+"""
+
+
+def run_door(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """A door that finds modules of ``folder`` in place of those of the same name."""
+    return subprocess.run(
+        [sys.executable, "-m", *arguments],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+@pytest.mark.parametrize("signal", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize(
+    ("arguments", "slow"),
+    [
+        (("v2hdm.map", "+run=port2"), "torch"),
+        (("train",), "torch"),
+        (("export", "checkpoint=a", "output=b"), "onnx"),
+        (("v2hdm.detect", "images"), "cv2"),
+    ],
+)
+def test_an_interruption_while_libraries_are_loaded_is_one_line(
+    arguments: tuple[str, ...], slow: str, signal: str, tmp_path: Path
+) -> None:
+    (tmp_path / f"{slow}.py").write_text(PRESSED_TWICE.format(signal=signal))
+    done = run_door(tmp_path, *arguments)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith("error: interrupted")
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "missing", "extra"),
+    [
+        (("v2hdm.map", "+run=port2"), "torch", "map"),
+        (("v2hdm.map", "+run=port2"), "kornia", "map"),
+        (("train",), "tensorboard", "train"),
+        (("export", "checkpoint=a", "output=b"), "onnx", "train"),
+    ],
+)
+def test_a_library_that_is_not_installed_is_one_line_that_names_the_extra(
+    arguments: tuple[str, ...], missing: str, extra: str, tmp_path: Path
+) -> None:
+    text = f'raise ModuleNotFoundError("not installed", name="{missing}")'
+    (tmp_path / f"{missing}.py").write_text(text)
+    done = run_door(tmp_path, *arguments)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith(
+        f"error: python -m {arguments[0]} needs {missing}: install the {extra} extra"
+    )
+    assert done.stderr.count("\n") == 1

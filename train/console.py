@@ -1,0 +1,41 @@
+"""A training on the terminal: a progress bar and the log."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from train.config import TrainConfig
+from train.distributed import Team, joined_team
+from train.loop import Trainer
+
+
+def train(config: TrainConfig) -> None:
+    """Train the detector's network, in the team that this process is part of."""
+    with joined_team(config.device) as team:
+        _train(config, team)
+
+
+def _train(config: TrainConfig, team: Team) -> None:
+    console = Console(stderr=True, quiet=not team.leads)
+    handler = RichHandler(console=console, show_path=False)
+    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[handler], force=True)
+    columns = (
+        BarColumn(),
+        TextColumn("{task.percentage:.0f} %"),
+        TimeElapsedColumn(),
+        TextColumn("{task.description}"),
+    )
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("rendering the validation set", total=1.0)
+        trainer = Trainer(
+            config, lambda share, line: bar.update(task, completed=share, description=line), team
+        )
+        state = trainer.run()
+    console.print(
+        f"trained {state.step} steps, mean IoU {state.best_iou:.3f}: {Path(config.output) / 'best.pt'}"
+    )

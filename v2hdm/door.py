@@ -1,0 +1,64 @@
+"""What the doors share: a user's mistake, or Ctrl-C, is one line on stderr and exit code 2.
+
+Nothing heavy is imported here. A door imports this first and all else within its work, so that Ctrl-C is
+one line while torch is still being loaded, too.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections.abc import Callable
+
+from v2hdm.errors import V2hdmError
+
+EXIT_USER_ERROR = 2
+_ONE_PRESS_S = 2.0
+_OURS = ("v2hdm", "models", "train", "export")
+
+
+def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[], None]) -> int:
+    """Do the work of a process; the exit code is 0, or 2 with one line on stderr for what a user can mend.
+
+    Args:
+        name: of the door, as in ``python -m name``.
+        extra: the optional dependencies that it needs, if any.
+        interrupted: what to say after Ctrl-C.
+        work: imports what it needs.
+    """
+    try:
+        work()
+    except V2hdmError as error:
+        return _fail(str(error))
+    except ModuleNotFoundError as error:
+        if extra is None or error.name is None or error.name.split(".")[0] in _OURS:
+            raise
+        return _fail(
+            f"python -m {name} needs {error.name}: install the {extra} extra, pip install 'v2hdm[{extra}]'"
+        )
+    except KeyboardInterrupt:
+        return _fail(interrupted)
+    return 0
+
+
+def _fail(message: str) -> int:
+    print(f"error: {message}", file=sys.stderr)
+    return EXIT_USER_ERROR
+
+
+def answer_signals() -> None:
+    """Take SIGTERM, a service manager's way to say Ctrl-C, for it, and several presses in a row for one.
+
+    Otherwise the second would interrupt the tidying up after the first.
+    """
+    pressed_s = -_ONE_PRESS_S
+
+    def interrupt(*_: object) -> None:
+        nonlocal pressed_s
+        before_s, pressed_s = pressed_s, time.monotonic()
+        if pressed_s - before_s > _ONE_PRESS_S:
+            raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, interrupt)
+    signal.signal(signal.SIGTERM, interrupt)

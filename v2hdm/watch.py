@@ -1,0 +1,265 @@
+"""The detector over a source of images: JSON lines and drawings out, latencies at the end."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import json
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple, TextIO
+
+import cv2
+import numpy as np
+
+from v2hdm.detection.camera.mounting import camera_from_calibration, rough_calibration
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.draw import draw_detections
+from v2hdm.detection.frames import Frame, camera_frames, image_frames, list_images, video_frames
+from v2hdm.detection.image_file import IMAGE_SUFFIXES
+from v2hdm.detection.json_line import as_record
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.detection.road import Road, RoadDetector
+from v2hdm.detection.stopwatch import Stopwatch, lap
+from v2hdm.drive import READERS, read_drive
+from v2hdm.errors import ConfigError, DriveError
+from v2hdm.files import whole_file
+
+_ROUGH_RANGE_M = 40.0
+"""Without a calibration distances may be wrong by a factor of two: nothing may be dropped for being far."""
+
+_STAGES = ("read", "net", "blobs", "corners", "lanes")
+
+
+class _Job(NamedTuple):
+    """Frames to look at, and the detector for each as far as it is known before the first."""
+
+    frames: Iterator[tuple[Frame, RoadDetector | None]]
+    live: bool = False
+
+
+def watch(parsed: argparse.Namespace) -> None:
+    """Detect in every image of a source.
+
+    A live camera is watched until Ctrl-C; for any other source that is raised on, and no file is written.
+
+    Args:
+        parsed: the arguments of :mod:`v2hdm.detect`.
+
+    Raises:
+        V2hdmError: what a user got wrong.
+    """
+    try:
+        _watch(parsed)
+    except BrokenPipeError:  # the reader of our lines has had enough
+        _forget_stdout()
+
+
+def _watch(parsed: argparse.Namespace) -> None:
+    cv2.setNumThreads(1)
+    options = DetectorOptions(model=parsed.model, threads=parsed.threads)
+    if parsed.camera is None:
+        options.max_range_m = _ROUGH_RANGE_M
+    detector = Detector.load(options=options)
+    job = _job(parsed, detector)
+    stopwatch = Stopwatch()
+    failure = None
+    with _lines(parsed.output) as stream:
+        try:
+            for frame, road, found in _found(job, parsed, detector, stopwatch):
+                print(json.dumps(as_record(frame, road.camera.info.name, found)), file=stream)
+                if job.live:
+                    stream.flush()
+                if parsed.draw is not None:
+                    _draw(parsed.draw / f"{frame.name}.jpg", frame, found)
+        except KeyboardInterrupt:
+            if not job.live:
+                raise
+        except DriveError as error:
+            if not (job.live and stopwatch.images):
+                raise
+            failure = error  # hours of a camera that was unplugged are kept
+    _report(stopwatch)
+    if failure:
+        raise failure
+
+
+def _forget_stdout() -> None:
+    """Keep Python from writing at its end what could not be written before."""
+    sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
+
+
+def _job(parsed: argparse.Namespace, detector: Detector) -> _Job:
+    """What the source is, and which detector its frames want."""
+    if parsed.limit is not None and parsed.limit < 1:
+        raise ConfigError(f"--limit {parsed.limit}: give the number of images to stop after, 1 or more")
+    road = None
+    if parsed.camera is not None:
+        if parsed.mounting is not None:
+            raise ConfigError(
+                "--camera and --mounting exclude each other: a calibration holds the mounting; drop one"
+            )
+        road = RoadDetector.calibrated(detector, parsed.camera, parsed.linear)
+    path = Path(parsed.source)
+    if parsed.source.isdecimal():
+        if path.exists():
+            raise ConfigError(
+                f"{path}: a camera's index, and a file or folder here, too; write ./{path} for that, "
+                "or start from another folder for the camera"
+            )
+        info = road and road.camera.info
+        frames = camera_frames(int(parsed.source), (info.width, info.height) if info else None)
+        return _Job(((frame, road) for frame in frames), live=True)
+    if not path.exists():
+        raise DriveError(f"{path}: no such image, video or folder; a camera is named by its index, such as 0")
+    if path.is_dir():
+        paths = list_images(path)
+        if paths:
+            return _Job((frame, road) for frame in image_frames(paths))
+        if any(reader.accepts(path) for reader in READERS.values()):
+            return _Job(_drive_frames(path, detector, road))
+        raise DriveError(f"{path}: no images ({', '.join(IMAGE_SUFFIXES)}) and no drive in this folder")
+    frames = image_frames([path]) if path.suffix.lower() in IMAGE_SUFFIXES else video_frames(path)
+    return _Job((frame, road) for frame in frames)
+
+
+def _drive_frames(
+    path: Path, detector: Detector, road: RoadDetector | None
+) -> Iterator[tuple[Frame, RoadDetector]]:
+    """The images of a drive; if a calibration was given, those of its camera."""
+    drive = read_drive(path)
+    roads = {name: RoadDetector(detector, camera) for name, camera in drive.cameras.items()}
+    if road is not None:
+        name = road.camera.info.name
+        if name not in drive.cameras:
+            raise DriveError(
+                f"{path}: no camera {name!r}, as the calibration calls it; this drive has {', '.join(roads)}"
+            )
+        roads = {name: road}
+    for image in drive.images:
+        if image.camera in roads:
+            (frame,) = image_frames([image.path], grey=True)
+            name = f"{image.camera}_{frame.name}"
+            yield replace(frame, name=name, stamp_s=image.stamp_s), roads[image.camera]
+
+
+def _found(
+    job: _Job, parsed: argparse.Namespace, detector: Detector, stopwatch: Stopwatch
+) -> Iterator[tuple[Frame, RoadDetector, Road]]:
+    """Every frame with what it shows."""
+    frames = iter(job.frames if parsed.limit is None else islice(job.frames, parsed.limit))
+    rough: RoadDetector | None = None
+    while True:
+        with stopwatch.image():
+            with lap("read"):
+                frame, road = next(frames, (None, None))
+            if frame is None:
+                stopwatch.discard()
+                return
+            if road is None:
+                road = rough = rough or _rough_road(frame, parsed, detector)
+            _check_size(frame, road)
+            found = road.detect(frame.pixels)
+        yield frame, road, found
+
+
+def _rough_road(frame: Frame, parsed: argparse.Namespace, detector: Detector) -> RoadDetector:
+    """A detector for a camera of which only the image size is known; it says so."""
+    height_m, pitch_deg, fov_deg = parsed.mounting or parsed.rough_mounting
+    if not (0 < height_m < np.inf and -45 < pitch_deg < 85 and 10 <= fov_deg <= 150):
+        raise ConfigError(
+            f"--mounting {height_m:g} {pitch_deg:g} {fov_deg:g}: give a height above 0 m, a pitch "
+            "of -45 to 85 deg (down is positive) and a field of view of 10 to 150 deg"
+        )
+    if parsed.mounting is None:
+        print(
+            f"no --camera: taking it to be {height_m:g} m up, {pitch_deg:g} deg down, {fov_deg:g} deg wide "
+            "(--mounting says otherwise); positions in px only",
+            file=sys.stderr,
+        )
+    rows, columns = frame.pixels.shape[:2]
+    calibration = rough_calibration("camera", columns, rows, height_m, pitch_deg, fov_deg)
+    return RoadDetector(detector, camera_from_calibration(calibration, parsed.linear))
+
+
+def _check_size(frame: Frame, road: RoadDetector) -> None:
+    info = road.camera.info
+    height, width = frame.pixels.shape[:2]
+    if (width, height) != (info.width, info.height):
+        where = "the calibration" if road.footprint else "what is known"
+        raise DriveError(
+            f"{frame.source}: the image is {width}x{height}, but {where} of camera {info.name!r} is for "
+            f"{info.width}x{info.height}; give images of that size, or the calibration of these"
+        )
+
+
+@contextmanager
+def _lines(output: Path | None) -> Iterator[TextIO]:
+    """Where the JSON lines go; a file appears when it is complete."""
+    if output is None:
+        try:
+            yield sys.stdout
+            sys.stdout.flush()
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            _forget_stdout()
+            raise DriveError(
+                f"standard output: cannot be written ({error.strerror}); give an --output with room for it"
+            ) from error
+        return
+    try:
+        if output.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        with whole_file(output) as partial, partial.open("w", encoding="utf-8") as stream:
+            yield stream
+    except OSError as error:
+        raise DriveError(f"{output}: cannot write there ({error.strerror}); give another --output") from error
+
+
+def _draw(path: Path, frame: Frame, found: Road) -> None:
+    """Write the frame with its detections drawn, at once or not at all."""
+    drawn = draw_detections(
+        frame.pixels, [marking.image for marking in found.markings], [lane.image for lane in found.lanes]
+    )
+    _, packed = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, 92])
+    try:
+        with whole_file(path) as partial:
+            partial.write_bytes(packed.tobytes())
+    except OSError as error:
+        raise DriveError(f"{path}: cannot write there ({error.strerror}); give another --draw") from error
+
+
+def _report(stopwatch: Stopwatch) -> None:
+    """How long it took, on stderr."""
+    if not stopwatch.images:
+        print("no images", file=sys.stderr)
+        return
+    print(f"{stopwatch.images} images{_peak_memory()}", file=sys.stderr)
+    print(f"{'latency, ms':12s} {'p50':>7s} {'p90':>7s} {'p99':>7s}", file=sys.stderr)
+    stages = [stage for stage in _STAGES if stage in stopwatch.stages]
+    stages += [stage for stage in stopwatch.stages if stage not in _STAGES]
+    times_s = {stage: stopwatch.times_s(stage) for stage in stages}
+    times_s["other"] = stopwatch.total_s() - sum(times_s.values())
+    times_s["all"] = stopwatch.total_s()
+    for stage, seconds in times_s.items():
+        p50, p90, p99 = np.percentile(seconds, [50, 90, 99]) * 1e3
+        print(f"{stage:12s} {p50:7.1f} {p90:7.1f} {p99:7.1f}", file=sys.stderr)
+
+
+def _peak_memory() -> str:
+    """The most memory that this process ever held, where the operating system counts it."""
+    status = Path("/proc/self/status")
+    if status.is_file():  # getrusage would count what the parent held when it started us
+        peak = next((line for line in status.read_text().splitlines() if line.startswith("VmHWM")), "")
+        return f", peak memory {int(peak.split()[1]) * 1024 / 1e6:.0f} MB" if peak else ""
+    if sys.platform != "darwin":
+        return ""
+    import resource
+
+    return f", peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.0f} MB"
