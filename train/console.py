@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import logging
+import multiprocessing
+import signal
+import sys
 from pathlib import Path
 
 from rich.console import Console
@@ -35,7 +38,19 @@ def _train(config: TrainConfig, team: Team) -> None:
         trainer = Trainer(
             config, lambda share, line: bar.update(task, completed=share, description=line), team
         )
-        state = trainer.run()
+        try:
+            state = trainer.run()
+        except KeyboardInterrupt:
+            _end_workers()
+            raise
     console.print(
         f"trained {state.step} steps, mean IoU {state.best_iou:.3f}: {Path(config.output) / 'best.pt'}"
     )
+
+
+def _end_workers() -> None:
+    """End the processes that render; torch would wait until each has finished its batch."""
+    if sys.platform != "win32":
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # torch takes the end of one for a failure
+    for process in multiprocessing.active_children():
+        process.terminate()
