@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import json
 import os
+import sys
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +20,8 @@ import yaml
 
 from v2hdm.errors import V2hdmError
 from v2hdm.records import FloatArray
+
+_LARGEST = sys.float_info.max
 
 
 @contextmanager
@@ -139,7 +142,7 @@ def take_array(content: object, shape: tuple[int, ...], where: str, error: type[
     wanted = " x ".join("N" if length < 0 else str(length) for length in shape)
     try:
         array = np.array(content, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise error(f"{where}: expected {wanted} numbers, got {_describe(content)}") from None
     fits = array.ndim == len(shape) and all(w in (-1, n) for w, n in zip(shape, array.shape, strict=True))
     if not fits:
@@ -152,9 +155,9 @@ def take_array(content: object, shape: tuple[int, ...], where: str, error: type[
 
 def take_number(content: object, where: str, error: type[V2hdmError]) -> float:
     """``content`` as a finite float, else an ``error`` that names ``where``."""
-    if isinstance(content, bool) or not isinstance(content, int | float) or not np.isfinite(content):
-        raise error(f"{where}: expected a finite number, got {_describe(content)}")
-    return float(content)
+    if isinstance(content, int | float) and not isinstance(content, bool) and abs(content) <= _LARGEST:
+        return float(content)
+    raise error(f"{where}: expected a finite number, got {_describe(content)}")
 
 
 def take_text(content: object, where: str, error: type[V2hdmError]) -> str:

@@ -96,6 +96,13 @@ def test_a_map_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> None
     assert [entry.name for entry in tmp_path.iterdir()] == ["map.geojson"]
 
 
+def damaged_map(origin: object = None, **properties: object) -> str:
+    """A map of one marking with properties that are wrong."""
+    right = {"class": "diamond", "sightings": 3, "corners_map": [[0, 0], [1, 0], [1, 1], [0, 1]]}
+    features = [{"properties": right | properties}]
+    return json.dumps({"v2hdm": {"origin": origin}, "features": features})
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -105,6 +112,19 @@ def test_a_map_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> None
         ('{"v2hdm": {}, "features": [{"properties": {}}]}', "feature 0: has neither"),
         ('{"v2hdm": {}, "features": [{"properties": {"corners_map": [[0, 0]]}}]}', "feature 0, "),
         ('{"v2hdm": {"origin": {"lat": 1}}, "features": []}', "origin: unknown key 'lat'"),
+        (
+            damaged_map(origin={"latitude_deg": "x", "longitude_deg": 1, "altitude_m": 1}),
+            "origin, latitude_deg",
+        ),
+        (damaged_map(origin={"latitude_deg": 91, "longitude_deg": 1, "altitude_m": 1}), "latitude must lie"),
+        (damaged_map(sightings=1.5), "feature 0, sightings: expected a whole number"),
+        (damaged_map(sightings=2**70), "feature 0, sightings: expected a whole number"),
+        (damaged_map(sightings=10**400), "feature 0, sightings: expected a finite number"),
+        (
+            damaged_map(corners_map=[[10**400, 0], [1, 0], [1, 1], [0, 1]]),
+            "corners_map: expected 4 x 2 numbers",
+        ),
+        (damaged_map(covariance_m2=(-np.eye(8)).tolist()), "covariance_m2: not symmetric or negative"),
     ],
 )
 def test_a_damaged_map_is_refused(tmp_path: Path, text: str, message: str) -> None:
@@ -166,4 +186,26 @@ def test_what_is_no_covariance_is_refused(tmp_path: Path, wrong: np.ndarray) -> 
     content = yaml.safe_load(path.read_text(encoding="utf-8"))
     path.write_text(yaml.safe_dump(content | {"covariance": wrong.tolist()}), encoding="utf-8")
     with pytest.raises(MapFileError, match=r"front\.yaml: covariance: not symmetric or negative"):
+        read_calibration(path)
+
+
+@pytest.mark.parametrize(
+    ("key", "wrong", "message"),
+    [
+        ("image_width", 640.5, "image_width: expected a whole number of 1 to 65535, got 640.5"),
+        ("image_height", 1e308, "image_height: expected a whole number of 1 to 65535"),
+        ("image_height", 2**70, "image_height: expected a whole number of 1 to 65535"),
+        ("camera_matrix", [[500, 0, 320], [0, 500, 240], [-1, 0, 1]], "camera_matrix: not of the form"),
+        ("camera_matrix", [[1e308, 0, 320], [0, 500, 240], [0, 0, 1]], "camera_matrix: beyond"),
+        ("distortion_coefficients", [-0.9, 0, 0, 0, 0], "this lens folds over itself"),
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused_by_name(
+    tmp_path: Path, key: str, wrong: object, message: str
+) -> None:
+    path = tmp_path / "front.yaml"
+    write_calibration(Calibration(camera_info(), looking_forward()), path)
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    path.write_text(yaml.safe_dump(content | {key: wrong}), encoding="utf-8")
+    with pytest.raises(MapFileError, match=f"front.yaml: .*{message}"):
         read_calibration(path)

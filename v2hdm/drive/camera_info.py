@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError
+from v2hdm.fields import check_camera, take_size_px
 from v2hdm.files import (
     check_keys,
     dump_yaml,
@@ -15,7 +16,6 @@ from v2hdm.files import (
     replace_text,
     take_array,
     take_mapping,
-    take_number,
     take_text,
 )
 from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo, FloatArray
@@ -37,7 +37,7 @@ def read_camera_info(path: Path) -> CameraInfo:
 
     Raises:
         DriveError: when the file is missing or damaged, the distortion model is unknown or has
-            another number of coefficients, or the camera matrix is none.
+            another number of coefficients, the camera matrix is none, or the lens cannot be undone.
     """
     content = load_yaml(path, DriveError)
     check_keys(content, _REQUIRED, _IGNORED, str(path), DriveError)
@@ -54,14 +54,16 @@ def read_camera_info(path: Path) -> CameraInfo:
             f"{path}: distortion_coefficients: {model} has {expected} coefficients, got {len(distortion)}; "
             "complete them (zeros where unused) or name the right model"
         )
-    return CameraInfo(
+    info = CameraInfo(
         name=take_text(content["camera_name"], f"{path}: camera_name", DriveError),
-        width=_take_size(content["image_width"], f"{path}: image_width"),
-        height=_take_size(content["image_height"], f"{path}: image_height"),
+        width=take_size_px(content["image_width"], f"{path}: image_width", DriveError),
+        height=take_size_px(content["image_height"], f"{path}: image_height", DriveError),
         intrinsic=_take_intrinsic(content["camera_matrix"], f"{path}: camera_matrix"),
         distortion_model=model,
         distortion=tuple(distortion.tolist()),
     )
+    check_camera(info, str(path), DriveError)
+    return info
 
 
 def write_camera_info(info: CameraInfo, path: Path) -> None:
@@ -87,20 +89,13 @@ def _matrix(values: FloatArray) -> dict[str, Any]:
 def _take_matrix(content: object, where: str) -> FloatArray:
     entry = take_mapping(content, where, DriveError)
     check_keys(entry, ("rows", "cols", "data"), (), where, DriveError)
-    rows, cols = (_take_size(entry[key], f"{where}, {key}") for key in ("rows", "cols"))
+    rows, cols = (take_size_px(entry[key], f"{where}, {key}", DriveError) for key in ("rows", "cols"))
     data = take_array(entry["data"], (-1,), f"{where}, data", DriveError)
     if len(data) != rows * cols:
         raise DriveError(
             f"{where}: {rows} x {cols} does not fit its {len(data)} numbers; mend rows, cols or data"
         )
     return data.reshape(rows, cols)
-
-
-def _take_size(content: object, where: str) -> int:
-    value = take_number(content, where, DriveError)
-    if value != int(value) or value < 1:
-        raise DriveError(f"{where}: expected a positive whole number, got {value:g}; mend it")
-    return int(value)
 
 
 def _take_intrinsic(content: object, where: str) -> FloatArray:

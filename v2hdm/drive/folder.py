@@ -26,8 +26,9 @@ from v2hdm.drive.options import ReadOptions
 from v2hdm.drive.trajectory import Trajectory
 from v2hdm.drive.tum import read_image_list, read_tum, write_image_list, write_tum
 from v2hdm.errors import DriveError
+from v2hdm.fields import take_origin
 from v2hdm.files import check_keys, dump_yaml, load_yaml, replace_text, take_mapping, take_number, take_text
-from v2hdm.records import Camera, Drive, GeodeticOrigin, PoseNoise
+from v2hdm.records import Camera, Drive, PoseNoise
 
 DRIVE_FILE = "drive.yaml"
 POSES_FILE = "poses.tum"
@@ -70,7 +71,7 @@ def read_folder_drive(path: Path, options: ReadOptions) -> Drive:
         cameras=cameras,
         images=images,
         pose_noise=_read_pose_noise(content.get("pose_noise"), f"{where}: pose_noise"),
-        origin=_read_origin(content.get("origin"), f"{where}: origin"),
+        origin=take_origin(content.get("origin"), f"{where}: origin", DriveError),
         truth_dir=_find_truth(content.get("truth"), path, f"{where}: truth"),
     )
 
@@ -166,29 +167,6 @@ def _read_pose_noise(content: object, where: str) -> PoseNoise:
         if getattr(noise, drift) > getattr(noise, total):
             raise DriveError(f"{where}, {drift}: is part of {total} and cannot be above it; mend one of them")
     return noise
-
-
-def _read_origin(content: object, where: str) -> GeodeticOrigin | None:
-    if content is None:
-        return None
-    entry = take_mapping(content, where, DriveError)
-    check_keys(entry, ("latitude_deg", "longitude_deg", "altitude_m"), ("datum", "epoch"), where, DriveError)
-
-    def number(key: str) -> float:
-        return take_number(entry[key], f"{where}, {key}", DriveError)
-
-    latitude_deg, longitude_deg = number("latitude_deg"), number("longitude_deg")
-    if abs(latitude_deg) > 90 or abs(longitude_deg) > 180:
-        raise DriveError(
-            f"{where}: latitude must lie within +-90 and longitude within +-180 degrees; mend them"
-        )
-    return GeodeticOrigin(
-        latitude_deg=latitude_deg,
-        longitude_deg=longitude_deg,
-        altitude_m=number("altitude_m"),
-        datum=take_text(entry.get("datum", "WGS84"), f"{where}, datum", DriveError),
-        epoch=None if entry.get("epoch") is None else number("epoch"),
-    )
 
 
 def _find_truth(content: object, root: Path, where: str) -> Path | None:

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import MapFileError
-from v2hdm.files import check_keys, dump_yaml, load_yaml, replace_text, take_array, take_number, take_text
-from v2hdm.records import Calibration, CameraInfo, FloatArray
+from v2hdm.fields import check_camera, take_covariance, take_size_px
+from v2hdm.files import check_keys, dump_yaml, load_yaml, replace_text, take_array, take_text
+from v2hdm.records import DISTORTION_COEFFICIENTS, Calibration, CameraInfo
 
 _REQUIRED = (
     "camera_name",
@@ -20,9 +21,6 @@ _REQUIRED = (
     "distortion_coefficients",
     "cam_from_vehicle",
 )
-_ROUNDING = 1e-3
-"""Parts of a covariance by which it may be off for having been rounded."""
-
 _OPTIONAL = ("vehicle_from_pinhole_px", "translation_sigma_m", "rotation_sigma_deg", "covariance")
 
 
@@ -51,18 +49,6 @@ def write_calibration(calibration: Calibration, path: Path) -> None:
     replace_text(path, dump_yaml(content))
 
 
-def _is_covariance(matrix: FloatArray) -> bool:
-    """Whether a matrix (n, n) may be a covariance, written with fewer digits than it has."""
-    variance = np.diag(matrix)
-    if (variance < 0).any():
-        return False
-    scale = np.sqrt(np.outer(variance, variance))
-    correlation = matrix / np.where(scale > 0, scale, 1.0)
-    if np.abs(correlation - correlation.T).max() > _ROUNDING:
-        return False
-    return bool(np.linalg.eigvalsh(correlation).min() > -_ROUNDING)
-
-
 def read_calibration(path: Path) -> Calibration:
     """Read what :func:`write_calibration` wrote.
 
@@ -77,15 +63,15 @@ def read_calibration(path: Path) -> Calibration:
 
     info = CameraInfo(
         name=take_text(content["camera_name"], f"{path}: camera_name", MapFileError),
-        width=int(take_number(content["image_width"], f"{path}: image_width", MapFileError)),
-        height=int(take_number(content["image_height"], f"{path}: image_height", MapFileError)),
+        width=take_size_px(content["image_width"], f"{path}: image_width", MapFileError),
+        height=take_size_px(content["image_height"], f"{path}: image_height", MapFileError),
         intrinsic=array("camera_matrix", 3, 3),
         distortion_model=take_text(content["distortion_model"], f"{path}: distortion_model", MapFileError),
         distortion=tuple(array("distortion_coefficients", -1).tolist()),
     )
-    covariance = array("covariance", 6, 6) if "covariance" in content else None
-    if covariance is not None and not _is_covariance(covariance):
-        raise MapFileError(
-            f"{path}: covariance: not symmetric or negative somewhere; mend it or leave it out"
-        )
+    if len(info.distortion) == DISTORTION_COEFFICIENTS.get(info.distortion_model):
+        check_camera(info, str(path), MapFileError)
+    covariance = None
+    if "covariance" in content:
+        covariance = take_covariance(content["covariance"], 6, f"{path}: covariance", MapFileError)
     return Calibration(info=info, cam_from_vehicle=array("cam_from_vehicle", 4, 4), covariance=covariance)

@@ -16,12 +16,14 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import MapFileError
-from v2hdm.files import check_keys, load_json, replace_text, take_array, take_mapping, take_number, take_text
+from v2hdm.fields import take_covariance, take_origin, take_whole
+from v2hdm.files import load_json, replace_text, take_array, take_mapping, take_text
 from v2hdm.hdmap.geodetic import geodetic_from_enu
 from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, Lane, Marking
 
 _WGS84 = "WGS84 longitude and latitude, degrees"
 _LOCAL = "local map frame, metres east and north; NOT longitude and latitude"
+_MOST_SIGHTINGS = 1_000_000_000
 _DEGREE_DECIMALS = 9  # 0.1 mm on the ground
 
 
@@ -69,7 +71,11 @@ def read_geojson(path: Path) -> HdMap:
             raise MapFileError(
                 f"{where}: has neither 'corners_map' nor 'points_map'; add one or drop the feature"
             )
-    return HdMap(markings=tuple(markings), lanes=tuple(lanes), origin=_read_origin(about.get("origin"), path))
+    return HdMap(
+        markings=tuple(markings),
+        lanes=tuple(lanes),
+        origin=take_origin(about.get("origin"), f"{path}: origin", MapFileError),
+    )
 
 
 def _marking_feature(number: int, marking: Marking, origin: GeodeticOrigin | None) -> dict[str, Any]:
@@ -127,10 +133,12 @@ def _read_marking(properties: dict[str, Any], where: str) -> Marking:
     return Marking(
         kind=take_text(properties.get("class"), f"{where}, class", MapFileError),
         corners_map=take_array(properties["corners_map"], (4, 2), f"{where}, corners_map", MapFileError),
-        sightings=int(take_number(properties.get("sightings"), f"{where}, sightings", MapFileError)),
+        sightings=take_whole(
+            properties.get("sightings"), 0, _MOST_SIGHTINGS, f"{where}, sightings", MapFileError
+        ),
         covariance_m2=None
         if covariance is None
-        else take_array(covariance, (8, 8), f"{where}, covariance_m2", MapFileError),
+        else take_covariance(covariance, 8, f"{where}, covariance_m2", MapFileError),
     )
 
 
@@ -138,16 +146,7 @@ def _read_lane(properties: dict[str, Any], where: str) -> Lane:
     return Lane(
         kind=take_text(properties.get("class"), f"{where}, class", MapFileError),
         points_map=take_array(properties["points_map"], (-1, 2), f"{where}, points_map", MapFileError),
-        sightings=int(take_number(properties.get("sightings"), f"{where}, sightings", MapFileError)),
+        sightings=take_whole(
+            properties.get("sightings"), 0, _MOST_SIGHTINGS, f"{where}, sightings", MapFileError
+        ),
     )
-
-
-def _read_origin(content: object, path: Path) -> GeodeticOrigin | None:
-    if content is None:
-        return None
-    where = f"{path}: origin"
-    origin = take_mapping(content, where, MapFileError)
-    check_keys(
-        origin, ("latitude_deg", "longitude_deg", "altitude_m"), ("datum", "epoch"), where, MapFileError
-    )
-    return GeodeticOrigin(**origin)

@@ -10,6 +10,7 @@ from v2hdm.records import DISTORTION_COEFFICIENTS, Calibration, Camera, CameraIn
 
 _ROTATION_TOLERANCE = 1e-6
 _BELOW_M = 0.1
+_FARTHEST_M = 100.0
 
 
 def camera_from_calibration(calibration: Calibration, linear_response: bool = False) -> Camera:
@@ -77,6 +78,8 @@ def _check(calibration: Calibration) -> None:
         problem = f"{info.distortion_model} has {count} coefficients, not {len(info.distortion)}; mend them"
     elif info.width < 1 or info.height < 1 or min(focal_px) <= 0:
         problem = "image size and focal lengths must be positive; mend them"
+    elif np.abs(cam_from_vehicle).max() > _FARTHEST_M:
+        problem = f"cam_from_vehicle puts the camera beyond {_FARTHEST_M:g} m from the vehicle; mend it"
     elif (
         np.abs(rotation @ rotation.T - np.eye(3)).max() > _ROTATION_TOLERANCE
         or np.linalg.det(rotation) < 0
