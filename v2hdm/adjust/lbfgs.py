@@ -65,6 +65,8 @@ def minimise(
 
     def closure() -> Tensor:
         new_cost, new_gradient = seen.at(u.detach())
+        if _is_no_number(new_cost, new_gradient):
+            raise _NoNumberError
         u.grad = new_gradient / scale
         # Relative to the start, small improvements of a large cost keep their digits.
         return (new_cost - cost) / scale.square()
@@ -75,8 +77,11 @@ def minimise(
     for iteration in range(max_iterations):
         if gap <= tolerance or slow:
             break
-        optimizer.step(closure)  # type: ignore[no-untyped-call]
-        reached, reached_gradient = seen.at(u.detach())
+        try:
+            optimizer.step(closure)  # type: ignore[no-untyped-call]
+            reached, reached_gradient = seen.at(u.detach())
+        except _NoNumberError:
+            reached = torch.full_like(cost, torch.inf)
         if not bool(reached.isfinite()):
             # A line search over a singular direction has run off; the point before it still stands.
             u.data.copy_(seen.start)
@@ -89,6 +94,15 @@ def minimise(
         before, gap = gap, predicted_gap(best, best_gradient)
         slow = not patient and iteration > 0 and gap > _SLOW * before
     return Minimum(u.detach() * scale, best, best_gradient, slow)
+
+
+class _NoNumberError(Exception):
+    """The objective is no number where a line search looked, whose comparisons then mean nothing."""
+
+
+def _is_no_number(cost: Tensor, gradient: Tensor) -> bool:
+    """Whether an evaluation holds NaN; an infinite cost is but a step too far, whatever its gradient."""
+    return bool(cost.isnan()) or bool(cost.isfinite() and not gradient.isfinite().all())
 
 
 class _Evaluations:
