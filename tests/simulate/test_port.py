@@ -155,6 +155,7 @@ def test_hidden_points_are_those_the_picture_hides() -> None:
         ({"cameras": {}}, "cameras"),
         ({"initial_ipm": "guess"}, "initial_ipm"),
         ({"route": RouteConfig(pieces=[])}, "route.pieces"),
+        ({"route": RouteConfig(pieces=[[20.0, 0.0]])}, "route.pieces: 20 m in all; give 25 m"),
         ({"calibration": CalibrationConfig(points_ahead_m=[[4, 0], [6, 0], [8, 0]])}, "points_ahead_m"),
         (
             {"calibration": CalibrationConfig(points_ahead_m=[[1, 9], [4, 1], [8, 1], [9, -2]])},

@@ -97,6 +97,10 @@ class Port:
         )
 
 
+_SHORTEST_ROUTE_M = 25.0
+"""What stands in the way does so at least 12 m from either end."""
+
+
 def build_port(config: PortConfig) -> Port:
     """Build a port; equal configurations give equal ports.
 
@@ -109,6 +113,11 @@ def build_port(config: PortConfig) -> Port:
         return np.random.default_rng([config.seed, part])
 
     route = build_route(config.route)
+    if route.length_m < _SHORTEST_ROUTE_M:
+        raise ConfigError(
+            f"port '{config.name}', route.pieces: {route.length_m:g} m in all; "
+            f"give {_SHORTEST_ROUTE_M:g} m or more"
+        )
     layout = build_layout(config.paint, route, stream(_LAYOUT))
     scene = build_scene(config.surface, config.yard, route, stream(_YARD), config.seed)
     survey = stream(_CALIBRATION)
