@@ -175,7 +175,7 @@ def write_labelled(model: onnx.ModelProto, label: dict[str, Any], path: Path) ->
         with whole_file(path) as partial:
             partial.write_bytes(model.SerializeToString())
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be written ({error.strerror}); set another output=") from None
+        raise ConfigError(f"{path}: cannot be written ({error.strerror}); name another file") from None
 
 
 def _name_sizes(model: onnx.ModelProto) -> None:

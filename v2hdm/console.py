@@ -11,31 +11,21 @@ from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from v2hdm import pipeline
+from v2hdm.pipeline.run import logging_to
 from v2hdm.report.table import results_table
 
 
 def run_on_terminal(config: pipeline.RunConfig, config_yaml: str) -> None:
     """Run the pipeline and show what it does and found."""
     console = Console()
-    with _logging_to(console), _bars(console) as progress:
+    handler = RichHandler(logging.INFO, console, show_path=False, show_level=False, log_time_format="%X")
+    with logging_to(handler), _bars(console) as progress:
         result = pipeline.run(config, config_yaml, progress)
     console.print()
     for line in result.headlines:
         console.print(line, highlight=False)
     console.print(results_table(config.name, result.metrics["results"]))
     console.print(f"results in {result.folder}", highlight=False, soft_wrap=True)
-
-
-@contextmanager
-def _logging_to(console: Console) -> Iterator[None]:
-    handler = RichHandler(logging.INFO, console, show_path=False, show_level=False, log_time_format="%X")
-    logger = logging.getLogger("v2hdm")
-    logger.addHandler(handler)
-    logger.setLevel(logging.DEBUG)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
 
 
 @contextmanager

@@ -106,7 +106,10 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
     """
     _check(config)
     seconds: dict[str, float] = {}
-    with result_folder(Path(config.output) / config.name) as folder, _log_file(folder / "run.log"):
+    with (
+        result_folder(Path(config.output) / config.name) as folder,
+        logging_to(_log_file(folder / "run.log")),
+    ):
         log.info("v2hdm %s, run %s", __version__, config.name)
         (folder / "config.yaml").write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
         drive_folder = _drive_folder(config, seconds, progress)
@@ -218,10 +221,8 @@ def _timed(seconds: dict[str, float], step: str) -> Iterator[None]:
 
 
 @contextmanager
-def _log_file(path: Path) -> Iterator[None]:
-    """Send this library's log to a file as well, for as long as the block runs."""
-    handler = logging.FileHandler(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+def logging_to(handler: logging.Handler) -> Iterator[None]:
+    """Send this library's log to ``handler`` as well, for as long as the block runs."""
     logger = logging.getLogger("v2hdm")
     logger.addHandler(handler)
     logger.setLevel(logging.DEBUG)
@@ -230,3 +231,9 @@ def _log_file(path: Path) -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         handler.close()
+
+
+def _log_file(path: Path) -> logging.Handler:
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    return handler
