@@ -22,6 +22,12 @@ _LEAST_PAINT_M = 1.0
 _LEAST_PAINT_SHARE = 0.12
 """Each has so much paint, and this share of the better one's: one dash may be all beside a solid line."""
 
+_ABREAST_M = 0.4
+"""Points of paint abreast of each other differ by less than this along the line, those of a dash and the next
+by more."""
+
+_LEAST_ABREAST = 0.5
+
 _LEAST_OUTSIDE = 0.5
 _CARRIED_ON_M = 0.5
 """A line that repeats another one but for this share of its rows carries that on, if it is so near."""
@@ -60,7 +66,8 @@ class _Strand:
     def take(self, points: LinePoints, line: Line, offset_m: FloatArray, horizon: Horizon) -> None:
         """A line so far (N,) to the right of the best: what that goes on as, its double or nothing new."""
         double = self._left[1] is not None or self._right[1] is not None
-        if not double and _outside(points, line, self.best) > _LEAST_OUTSIDE:
+        outside = _outside(points, line, self.best) > _LEAST_OUTSIDE
+        if not double and outside and not _side_by_side(points, line, self.best, offset_m):
             if np.abs(offset_m).max() <= _CARRIED_ON_M:
                 self.best = _carried_on(points, self.best, line, horizon)
             return
@@ -91,6 +98,17 @@ def _carried_on(points: LinePoints, line: Line, more: Line, horizon: Horizon) ->
     whole = Line.through(certain, evidence, horizon, line.prior, paint_m, line.log_ratio)
     perhaps, row = np.concatenate([line.perhaps, more.perhaps]), points.points_px[:, 1]
     return replace(whole, perhaps=perhaps[~np.isin(row[perhaps], row[certain])])
+
+
+def _side_by_side(points: LinePoints, line: Line, other: Line, offset_m: FloatArray) -> bool:
+    """Whether two lines, so far (N,) apart, are seen in the same places: one line is never seen twice there."""
+    if np.abs(offset_m).min() <= _ONE_LINE_M:
+        return False
+    own, others = (points.ground[each.certain] for each in (line, other))
+    apart_m = np.linalg.norm(own[:, None] - others, axis=2)
+    reach_m = np.hypot(_ABREAST_M, np.abs(offset_m).max())
+    share = max((apart_m.min(axis=k) < reach_m).mean() for k in (0, 1))
+    return bool(share > _LEAST_ABREAST)
 
 
 def _outside(points: LinePoints, line: Line, other: Line) -> float:
