@@ -16,7 +16,7 @@ from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.lanes.bends import DRAWN_STEP_PX, Seen, beside_guide
 from v2hdm.detection.lanes.curves import Horizon, basis
-from v2hdm.detection.lanes.ends import solid_end
+from v2hdm.detection.lanes.ends import alone_from, solid_end
 from v2hdm.detection.lanes.groups import find_lines
 from v2hdm.detection.lanes.looks import UNKNOWN_LOOKS, Looks
 from v2hdm.detection.lanes.points import NEIGHBOURS, IntArray, Line, LinePoints
@@ -48,6 +48,9 @@ _PAINT_SIGMA_PX = 1.0
 _LEAST_PAINT_LENGTH_M = 0.8
 _MAX_PAINT_SLOPE = 8.0
 """Paint that runs flatter across the view, px along the horizon per px down, is on no curve of ours."""
+
+_PASSING_M = 3.0
+"""Over such a length a line passes from the middle of two strands to the one that goes on."""
 
 _SMOOTH_PX = 24.0
 _FREEDOM_M = 0.03
@@ -177,6 +180,9 @@ def _drawn(
     farthest = _far_end(points, line)
     at = np.arange(farthest, max(lowest, nearest) + DRAWN_STEP_PX, DRAWN_STEP_PX)[::-1]
     along, sigma = _followed(points, line, horizon, at)
+    parts_at = alone_from(line, at, view, horizon, foreground)
+    if parts_at is not None:
+        along = _parted(line, along, at, parts_at, horizon)
     points_px = view.distort(horizon.pinhole_px(along, at))
     ends = solid_end(points, line, at, points_px, view, horizon, foreground, row_step_px)
     known = (at <= nearest) | (sigma < _EXTENSION_SIGMA * view.info.width) if ends is None else at <= ends
@@ -186,6 +192,14 @@ def _drawn(
     score = float(as_probability(np.array(line.log_odds)))
     lane = LaneDetection(LANE_BOUNDARY, score, points_px[kept], sigma_px=sigma[kept])
     return Seen(lane, _is_seen(points.below[line.certain], at[kept]))
+
+
+def _parted(line: Line, along: FloatArray, at: FloatArray, parts_at: float, horizon: Horizon) -> FloatArray:
+    """A double line ``along`` (N,) the horizon that passes to the strand which goes on alone."""
+    assert line.strands is not None
+    passed_m = horizon.depth_m(np.array([parts_at])) - horizon.depth_m(at)
+    alone = np.clip(0.5 + passed_m / _PASSING_M, 0, 1)
+    return along + alone * (line.strands.longer.along(basis(at)) - along)
 
 
 def _far_end(points: LinePoints, line: Line) -> float:

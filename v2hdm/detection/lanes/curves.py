@@ -65,6 +65,10 @@ class Horizon:
         """
         return self._units * (direction_rad, beside_m, curvature)
 
+    def depth_m(self, below: FloatArray) -> FloatArray:
+        """How far ahead of the camera the ground is (N,), m, at distances (N,) below the horizon, px."""
+        return np.asarray(self._units[0] / (self.px_per_m * np.maximum(below, _LEAST_BELOW_PX)))
+
     def coordinates(self, pinhole_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Position along (N,) and below (N,) the horizon, px, of pinhole pixels (N, 2)."""
         return pinhole_px @ self._along, pinhole_px @ self._down + self._shift

@@ -1,4 +1,4 @@
-"""Where a solid line ends towards the vehicle.
+"""Where a solid line, or one of the two lines of a double one, ends towards the vehicle.
 
 What is longer than any dash is a solid line and ends with its paint. Row by row, what the network says of
 paint and of crossings makes it likelier that the line is still there or that it has ended: crossings alone
@@ -12,7 +12,7 @@ import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.foreground import Foreground
-from v2hdm.detection.lanes.curves import Horizon
+from v2hdm.detection.lanes.curves import Horizon, basis
 from v2hdm.detection.lanes.points import IntArray, Line, LinePoints
 from v2hdm.records import FloatArray
 
@@ -32,6 +32,9 @@ _PAINT_WEIGHT = 1.5
 
 _HALF_WIDTH_M = 0.15
 _HALF_WIDTH_OF_DOUBLE_M = 0.4
+_HALF_STRAND_M = 0.06
+"""The other strand may be no more than .2 m away."""
+
 _LEAST_HALF_WIDTH_PX = 6.0
 _ACROSS = np.linspace(-1.0, 1.0, 7)
 """Paint is looked for so far to either side of where the line is drawn, and at so many places."""
@@ -106,3 +109,27 @@ def _most_paint(foreground: Foreground, points_px: FloatArray, half_px: FloatArr
     u = points_px[:, :1] + half_px[:, None] * _ACROSS
     places = np.stack([u, np.broadcast_to(points_px[:, 1:], u.shape)], axis=-1)
     return np.asarray(foreground.odds_at(places).max(axis=1))
+
+
+def alone_from(
+    line: Line, below: FloatArray, view: CameraView, horizon: Horizon, foreground: Foreground | None
+) -> float | None:
+    """The row, px below the horizon, from which on one strand of a double line goes on alone, if one does.
+
+    It does where the image shows no paint on the other; ``below`` (N,) as for :func:`solid_end`.
+    """
+    strands = line.strands
+    if strands is None or foreground is None:
+        return None
+    rows = below[(below > strands.shorter_to) & (below <= strands.longer_to)][::-1]
+    px = view.distort(horizon.pinhole_px(strands.shorter.along(basis(rows)), rows))
+    inside = view.inside(px, 0)
+    rows, px = rows[inside], px[inside]
+    if not len(rows):
+        return None
+    half_px = _HALF_STRAND_M * horizon.px_per_m * rows
+    speaks = np.clip(_most_paint(foreground, px, half_px) - _EVEN_PAINT, -_MOST_PAINT, _MOST_PAINT)
+    total = np.cumsum(speaks) * _PAINT_WEIGHT
+    if max(total.max(), 0.0) - total[-1] < _LEAST_AGAINST:
+        return None
+    return float(rows[np.argmax(total)]) if total.max() > 0 else strands.shorter_to

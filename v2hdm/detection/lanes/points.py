@@ -75,11 +75,25 @@ class LinePoints:
 
 
 @dataclass(frozen=True)
+class Strands:
+    """The two lines of a double one, one of which may end before the other towards the vehicle.
+
+    Each is a curve and the row, px below the horizon, down to which it is seen: infinite for dashes.
+    """
+
+    longer: Curve
+    longer_to: float
+    shorter: Curve
+    shorter_to: float
+
+
+@dataclass(frozen=True)
 class Line:
     """A line: its curve and the indices of the points that ``certain``ly and ``perhaps`` are on it.
 
     ``prior`` is what the curve was drawn with, ``log_ratio`` how much likelier the line is along the road
-    than anyhow; there is ``paint_m`` of paint on it. ``double`` lines are the middle of two.
+    than anyhow; there is ``paint_m`` of paint on it. ``double`` lines are the middle of two, which are its
+    ``strands`` where they are not seen equally far.
     """
 
     curve: Curve
@@ -90,6 +104,7 @@ class Line:
     log_ratio: float
     log_odds: float = 0.0
     double: bool = False
+    strands: Strands | None = None
 
     @property
     def members(self) -> IntArray:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from v2hdm.detection.lanes.curves import Horizon, basis, middle_of
-from v2hdm.detection.lanes.points import Line, LinePoints
+from v2hdm.detection.lanes.points import Line, LinePoints, Strands
 from v2hdm.records import BoolArray, FloatArray
 
 _ONE_LINE_M = 0.12
@@ -27,10 +27,14 @@ _ABREAST_M = 0.4
 by more."""
 
 _LEAST_ABREAST = 0.5
+"""Of one of the two lines so many points are abreast of points of the other."""
 
 _LEAST_OUTSIDE = 0.5
 _CARRIED_ON_M = 0.5
 """A line that repeats another one but for this share of its rows carries that on, if it is so near."""
+
+_LEAST_SOLID = 0.5
+"""A strand so much of whose paint is no dashes ends with it."""
 
 _CROSSING_M = 0.3
 """Lines that lie so far to the left of another one here and so far to its right there cross it."""
@@ -52,7 +56,7 @@ def boundaries(points: LinePoints, lines: Sequence[Line], horizon: Horizon) -> l
                 break
         else:
             kept.append(_Strand(line))
-    return [strand.line() for strand in kept]
+    return [strand.line(points) for strand in kept]
 
 
 class _Strand:
@@ -81,13 +85,26 @@ class _Strand:
         elif beside_m > self._right[0] and beside_m - self._left[0] <= _DOUBLE_LINE_M:
             self._right = beside_m, line
 
-    def line(self) -> Line:
+    def line(self, points: LinePoints) -> Line:
         """The boundary."""
         if self._right[0] - self._left[0] <= _ONE_LINE_M:
             return self.best
         left, right = self._left[1] or self.best, self._right[1] or self.best
         members = np.unique(np.concatenate([line.certain for line in (self.best, left, right)]))
-        return replace(self.best, curve=middle_of(left.curve, right.curve), certain=members, double=True)
+        curve = middle_of(left.curve, right.curve)
+        whole = replace(self.best, curve=curve, certain=members, double=True)
+        (shorter_to, shorter), (longer_to, longer) = sorted(
+            ((_seen_to(points, line), line.curve) for line in (left, right)), key=lambda strand: strand[0]
+        )
+        uneven = shorter_to < longer_to
+        return replace(whole, strands=Strands(longer, longer_to, shorter, shorter_to)) if uneven else whole
+
+
+def _seen_to(points: LinePoints, line: Line) -> float:
+    """The row, px below the horizon, down to which a strand is seen; infinite for dashes, which go on."""
+    painted = line.certain[points.is_paint[line.certain]]
+    is_solid = points.is_solid[painted].mean() >= _LEAST_SOLID
+    return float(points.below[line.certain].max()) if is_solid else np.inf
 
 
 def _carried_on(points: LinePoints, line: Line, more: Line, horizon: Horizon) -> Line:
@@ -101,7 +118,7 @@ def _carried_on(points: LinePoints, line: Line, more: Line, horizon: Horizon) ->
 
 
 def _side_by_side(points: LinePoints, line: Line, other: Line, offset_m: FloatArray) -> bool:
-    """Whether two lines, so far (N,) apart, are seen in the same places: one line is never seen twice there."""
+    """Whether two lines, so far (N,) apart, are seen abreast: one line is never seen twice."""
     if np.abs(offset_m).min() <= _ONE_LINE_M:
         return False
     own, others = (points.ground[each.certain] for each in (line, other))
