@@ -31,7 +31,7 @@ def test_every_shipped_run_composes_into_dataclasses(run: str) -> None:
     assert composed(f"+run={run}", "drive.path=x" if run == "kitti" else "workers=1").name == run
 
 
-def test_no_run_is_an_error_that_lists_the_runs() -> None:
+def test_a_missing_value_is_an_error_that_gives_the_advice_of_the_door() -> None:
     with pytest.raises(ConfigError, match="no value for name; choose a run"):
         composed()
 

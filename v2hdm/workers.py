@@ -1,7 +1,8 @@
 """Work shared out among processes that never outlive the one that started them.
 
 Ctrl-C and errors reach this process alone, which ends the others. They see at once when it dies, and it when
-one of them does.
+one of them does: ``multiprocessing.Pool`` waits for ever for a process that was killed, and those of
+``ProcessPoolExecutor`` stay when the process that started them is.
 """
 
 from __future__ import annotations
