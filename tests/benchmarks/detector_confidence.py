@@ -2,15 +2,16 @@
 
     python -m tests.benchmarks.detector_confidence --write
 
-Run it after another network was put in place; it takes half an hour. Quadrilaterals that the detector
-proposes on rendered scenes, first two thirds of full difficulty, then a third of easy ones, are true if they
-overlap a marking of their class by half, and false where the quality benchmark would say so. The judge,
-``v2hdm/detection/judge.onnx``, learns to tell them apart; what the others in an image say of each is then
-weighed by logistic regressions with a weak ridge, one for each shape, ``v2hdm/detection/confidence.json``.
-Each scene is looked at as on the vehicle and as in the mapping. Its seed is neither that of the quality
-benchmark nor one of training. Printed: what each of the others' features adds to the log odds per standard
-deviation; log loss, and true ones among so many false ones, on the images of each fifth by what learnt from
-the others.
+Run it after another network was put in place; it takes three quarters of an hour. Quadrilaterals that the
+detector proposes on rendered scenes, first two thirds of full difficulty, then a third of easy ones, are true
+if they overlap a marking of their class by half, and false where the quality benchmark would say so. The
+judge, ``v2hdm/detection/judge.onnx``, learns to tell them apart; what the others in an image say of each is
+then weighed by logistic regressions with a weak ridge, one for each shape,
+``v2hdm/detection/confidence.json``. Each scene is looked at as on the vehicle and as in the mapping; every
+other one once more with spots of sun of which the paint network swears that they are markings, which the
+judge learns to see through. Its seed is neither that of the quality benchmark nor one of training. Printed:
+what each of the others' features adds to the log odds per standard deviation; log loss, and true ones among
+so many false ones, on the images of each fifth by what learnt from the others.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 from unittest.mock import patch
@@ -29,6 +31,7 @@ from export.judge_file import write_judge
 from models.judge import Judge
 from tests.benchmarks.detector_quality import polygon_overlap
 from tests.benchmarks.examples import Example, example
+from tests.benchmarks.sworn_flecks import Spots, lit, swearing
 from train.judge import JudgeConfig, Quadrilaterals, judged, train_judge
 from v2hdm.detection.corners.confidence import (
     CONFIDENCE_FILE,
@@ -51,6 +54,7 @@ EASY = 0.2
 RIDGE = 2.0
 FOLDS = 5
 CONFIG = JudgeConfig()
+LIT_EVERY = 2
 _TOLD_EVERY = 100
 COUNTS = (10, 20, 40, 80)
 """Of false ones, at which those true are counted."""
@@ -61,7 +65,8 @@ class Gathered:
     """N readings of quadrilaterals as one class, those of one look at an image together.
 
     Their evidence, what they look like, corners on the ground, classes, whether they are true (None where
-    either will do), the numbers of the images they are from and of the looks.
+    either will do), the numbers of the images they are from and of the looks, and whether spots of sun were
+    added to these.
     """
 
     evidence: list[FloatArray] = field(default_factory=list)
@@ -71,9 +76,10 @@ class Gathered:
     true: list[bool | None] = field(default_factory=list)
     image: list[int] = field(default_factory=list)
     look: list[int] = field(default_factory=list)
+    lit: list[bool] = field(default_factory=list)
 
-    def add(self, index: int, shown: Example, detector: Detector) -> None:
-        """What the detector proposes in one image."""
+    def add(self, index: int, shown: Example, detector: Detector, spots: Spots | None = None) -> None:
+        """What the detector proposes in one image; its network swears that ``spots`` are markings."""
         corners_px: list[FloatArray] = []
 
         def gather_spy(*given: Any) -> FloatArray:
@@ -88,12 +94,14 @@ class Gathered:
             return np.ones(len(evidence))
 
         look, first = 1 + max(self.look, default=-1), len(self.kind)
-        with patch(f"{REFINE}.gather", gather_spy), patch(f"{REFINE}.confidence", spy):
+        swear = swearing(spots) if spots is not None else nullcontext()
+        with swear, patch(f"{REFINE}.gather", gather_spy), patch(f"{REFINE}.confidence", spy):
             detector.detect(shown.image, shown.camera)
         for kind, corners in zip(self.kind[first:], corners_px, strict=True):
             self.true.append(is_true(shown, kind, corners))
             self.image.append(index)
             self.look.append(look)
+            self.lit.append(spots is not None)
 
 
 def is_true(shown: Example, kind: str, corners_px: FloatArray) -> bool | None:
@@ -149,6 +157,10 @@ def main() -> None:
     for done, (index, shown) in enumerate(renders_to_fit(parsed.images, SEED)):
         for detector in detectors:
             gathered.add(index, shown, detector)
+        if done % LIT_EVERY == 0:
+            rng = np.random.default_rng([SEED, done])
+            spotted, spots = lit(shown, detectors[0].view(shown.camera), rng)
+            gathered.add(index, spotted, detectors[0], spots)
         if done % _TOLD_EVERY == 0:
             print(f"{done} of {parsed.images} images", flush=True)
     judge, fitted = fit_all(gathered)
@@ -167,8 +179,8 @@ def fit_all(gathered: Gathered) -> tuple[Judge, dict[str, dict[str, object]]]:
     """The judge, and what ``confidence.json`` is to hold; prints what both are worth on images left out."""
     known = np.array([true is not None for true in gathered.true])
     true = np.array([true is True for true in gathered.true])
-    fold = np.array(gathered.image) % FOLDS
-    print(f"{true.sum()} of {known.sum()} readings true", flush=True)
+    fold, spotted = np.array(gathered.image) % FOLDS, np.array(gathered.lit)
+    print(f"{(true & ~spotted).sum()} of {(known & ~spotted).sum()} readings true", flush=True)
     asked = Quadrilaterals(
         np.array(gathered.views, dtype=np.float32),
         np.array(gathered.evidence, dtype=np.float32),
@@ -177,16 +189,23 @@ def fit_all(gathered: Gathered) -> tuple[Judge, dict[str, dict[str, object]]]:
         tuple(CHANNELS.index(name) for name in CLAIMED_CHANNELS),
         tuple(FEATURES.index(name) for name in CLAIMED),
     )
+    # What is true of the images with spots has been seen without them, too.
+    lessons = known & ~(spotted & true)
     # Each is told of by odds that its own image had no part in.
     odds = np.zeros(len(true))
     for k in range(FOLDS):
-        odds[fold == k] = judged(train_judge(asked.take(known & (fold != k)), CONFIG), asked.take(fold == k))
-    return train_judge(asked.take(known), CONFIG), fit_among(gathered, odds)
+        odds[fold == k] = judged(
+            train_judge(asked.take(lessons & (fold != k)), CONFIG), asked.take(fold == k)
+        )
+    seen_through = (odds < 0)[spotted & known & ~true]
+    print(f"seen through: {seen_through.mean():.3f} of what is sworn and false", flush=True)
+    return train_judge(asked.take(lessons), CONFIG), fit_among(gathered, odds)
 
 
 def fit_among(gathered: Gathered, odds: FloatArray) -> dict[str, dict[str, object]]:
     """What ``confidence.json`` is to hold, of the log odds (N,) of each alone; prints what that is worth."""
-    known = np.array([true is not None for true in gathered.true])
+    # With spots of sun in it an image is no more what others look like.
+    known = np.array([true is not None for true in gathered.true]) & ~np.array(gathered.lit)
     true = np.array([true is True for true in gathered.true])
     fold = np.array(gathered.image) % FOLDS
     _print_worth("alone", odds[known], true[known])

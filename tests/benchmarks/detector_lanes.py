@@ -57,6 +57,7 @@ class Seen:
     paint: list[LaneDetection]
     view: CameraView
     looks: Looks
+    row_step_px: float
     lanes_px: list[FloatArray]
 
 
@@ -65,9 +66,14 @@ def seen(shown: Example, detector: Detector) -> Seen:
     kept: list[Seen] = []
 
     def spy(
-        rows: list[AnchorRow], view: CameraView, paint: list[LaneDetection], _: float, looks: Looks
+        rows: list[AnchorRow],
+        view: CameraView,
+        paint: list[LaneDetection],
+        _: float,
+        looks: Looks,
+        row_step_px: float,
     ) -> list[LaneDetection]:
-        kept.append(Seen(rows, list(paint), view, looks, shown.lanes_px))
+        kept.append(Seen(rows, list(paint), view, looks, row_step_px, shown.lanes_px))
         return []
 
     with patch("v2hdm.detection.detector.link_anchors", spy):
@@ -116,7 +122,9 @@ def proposed(image: Seen, paint_step_m: float) -> Proposed | None:
         return []
 
     with patch.object(anchors, "find_lines", spy):
-        anchors.link_anchors(image.rows, image.view, image.paint, paint_step_m, image.looks)
+        anchors.link_anchors(
+            image.rows, image.view, image.paint, paint_step_m, image.looks, image.row_step_px
+        )
     return found[0] if found and found[0].lines else None
 
 

@@ -1,0 +1,118 @@
+"""Spots of sun that the paint network swears are markings: what the judge must see through by itself.
+
+Renders show spots, too, but the network seldom takes them for paint there, so that a judge who has learnt
+from what it does alone would believe it where it is wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from unittest.mock import patch
+
+import cv2
+import numpy as np
+
+from tests.benchmarks.examples import MAX_RANGE_M, Example
+from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.network import Network
+from v2hdm.detection.sight import Sight, look
+from v2hdm.records import CORNERED_CLASSES, CROSSWALK_BAR, DIAMOND, LANE_DASH, PAINT_CLASSES
+
+SPOTS = 3
+_TRIES = 20
+_RADIUS_M = (0.2, 0.9)
+_SLIM = (0.3, 1.0)
+_SOFT = (0.15, 0.8)
+"""By which share of its radius a spot fades out."""
+
+_GAIN = (1.3, 3.5)
+_BOUND_PX = 6
+"""What spots keep from markings, which must not change."""
+
+_SWORN_ODDS = (4.0, 16.0)
+"""How fast the network's log odds of paint rise with the light of a spot."""
+
+_SWORN_LOGIT = 8.0
+_CLAIMED = {DIAMOND: 0.6, LANE_DASH: 0.2, CROSSWALK_BAR: 0.2}
+
+
+@dataclass(frozen=True)
+class Spots:
+    """Spots of sun in an image: ``light`` (H, W) from 0 to 1, and what the network is to say of them."""
+
+    light: np.ndarray
+    steepness: float
+    kind: str
+
+    def sworn(self, sight: Sight, view: CameraView, stride: int) -> Sight:
+        """What the network says, and that the spots are paint of their class."""
+        paint, kinds = sight.paint.copy(), sight.kinds.copy()
+        light = self._at(paint.shape, stride, view.far_row)
+        claimed = np.clip(self.steepness * (light - 0.5), -6, 6)
+        np.maximum(paint, claimed, out=paint, where=light > 0)
+        step = round(stride * sight.kind_scale)
+        within = self._at((kinds.shape[1], kinds.shape[2]), step, view.far_row) > 0.05
+        kinds[:, within] = kinds[:, within].min(axis=0)
+        kinds[PAINT_CLASSES.index(self.kind), within] += _SWORN_LOGIT
+        return replace(sight, paint=paint, kinds=kinds)
+
+    def _at(self, shape: tuple[int, ...], step: int, top: int) -> np.ndarray:
+        """The light (h, w) at elements ``step`` px apart, from image row ``top`` on."""
+        v, u = (np.arange(n, dtype=np.float32) * step + (step - 1) / 2 for n in shape)
+        return cv2.remap(self.light, *np.meshgrid(u, v + top), cv2.INTER_LINEAR, borderValue=0)
+
+
+def lit(shown: Example, view: CameraView, rng: np.random.Generator) -> tuple[Example, Spots]:
+    """An image with some spots of sun on its ground, none of them on a marking."""
+    taken = np.zeros(shown.image.shape[:2], dtype=np.uint8)
+    for true in shown.markings:
+        cv2.fillPoly(taken, [np.round(true.polygon_px).astype(np.int32)], 1)
+    taken = cv2.dilate(taken, np.ones((2 * _BOUND_PX + 1,) * 2, np.uint8))
+    light = np.zeros(taken.shape, dtype=np.float32)
+    soft = rng.uniform(*_SOFT)
+    for _ in range(SPOTS):
+        for _ in range(_TRIES):
+            spot = _spot(taken.shape, view, soft, rng)
+            if spot is not None and not taken[spot > 0].any():
+                light, taken = np.maximum(light, spot), taken | (cv2.dilate(spot, None) > 0).astype(np.uint8)
+                break
+    gain = 1 + (rng.uniform(*_GAIN) - 1) * light[..., None]
+    image = np.clip(np.round(shown.image * gain), 0, 255).astype(np.uint8)
+    kind = str(rng.choice(list(_CLAIMED), p=list(_CLAIMED.values())))
+    assert kind in CORNERED_CLASSES
+    return replace(shown, image=image), Spots(light, float(rng.uniform(*_SWORN_ODDS)), kind)
+
+
+def _spot(
+    shape: tuple[int, ...], view: CameraView, soft: float, rng: np.random.Generator
+) -> np.ndarray | None:
+    """The light (H, W) of an ellipse somewhere on the ground that is wholly in the image; None for none."""
+    height, width = shape
+    at_px = np.array([[rng.uniform(0, width), rng.uniform(view.far_row, height)]])
+    centre = view.ground(view.undistort(at_px))[0]
+    if not view.range_m(centre) < MAX_RANGE_M:
+        return None
+    radius_m, slim, turn = rng.uniform(*_RADIUS_M), rng.uniform(*_SLIM), rng.uniform(0, np.pi)
+    axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    axes /= np.array([[radius_m], [radius_m * slim]])
+    v, u = np.mgrid[view.far_row : height, 0:width]
+    ground = view.ground(view.undistort(np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)))
+    radius = np.linalg.norm((ground - centre) @ axes.T, axis=1).reshape(v.shape)
+    fade = np.clip((1 + soft / 2 - np.nan_to_num(radius, nan=9.0)) / soft, 0, 1)
+    light = np.zeros(shape, dtype=np.float32)
+    light[view.far_row :] = fade * fade * (3 - 2 * fade)
+    border = np.concatenate([light[0], light[-1], light[:, 0], light[:, -1]])
+    return light if light.any() and not border.any() else None
+
+
+@contextmanager
+def swearing(spots: Spots) -> Iterator[None]:
+    """Within, the paint network swears that the spots of sun are markings."""
+
+    def seen(network: Network, image: np.ndarray, view: CameraView, mirrored: bool = False) -> Sight:
+        return spots.sworn(look(network, image, view, mirrored), view, network.info.paint_stride)
+
+    with patch("v2hdm.detection.detector.look", seen):
+        yield

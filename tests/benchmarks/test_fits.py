@@ -1,0 +1,74 @@
+"""What teaches the detector its scores runs against the detector as it is."""
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.benchmarks.detector_confidence import Gathered
+from tests.benchmarks.detector_lanes import proposed, seen
+from tests.benchmarks.examples import Example, example
+from tests.benchmarks.sworn_flecks import Spots, lit, swearing
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.records import MarkingDetection
+
+SEED = 4711
+
+
+@pytest.fixture(scope="module")
+def shown() -> Example:
+    """A scene with several markings and lines."""
+    cv2.setNumThreads(1)
+    scenes = (example(index, 0.2, SEED) for index in range(30))
+    return next(s for s in scenes if sum(m.fair for m in s.markings) > 3 and len(s.lanes_px) > 1)
+
+
+@pytest.fixture
+def detector() -> Detector:
+    return Detector.load(options=DetectorOptions(max_range_m=24.0, min_confidence=0.0))
+
+
+def reported(shown: Example, detector: Detector, spots: Spots) -> list[MarkingDetection]:
+    with swearing(spots):
+        markings, _ = detector.detect(shown.image, shown.camera)
+    return [marking for marking in markings if len(marking.outline_px) == 0]
+
+
+def test_readings_of_quadrilaterals_are_gathered_with_their_truth(shown, detector):
+    gathered = Gathered()
+    gathered.add(0, shown, detector)
+    count = len(gathered.kind)
+    assert count == len(gathered.evidence) == len(gathered.views) == len(gathered.true) == len(gathered.lit)
+    assert gathered.true.count(True) > 3
+
+
+def test_spots_of_sun_are_proposed_as_markings_and_known_to_be_none(shown, detector):
+    view = detector.view(shown.camera)
+    spotted, spots = lit(shown, view, np.random.default_rng(1))
+    without, sworn = Gathered(), Gathered()
+    without.add(0, shown, detector)
+    sworn.add(0, spotted, detector, spots)
+    assert (spots.light > 0).any()
+    assert all(sworn.lit)
+    assert sworn.true.count(False) > without.true.count(False)
+    assert abs(sworn.true.count(True) - without.true.count(True)) <= 1, "markings stay what they are"
+    unlit = spots.light == 0
+    np.testing.assert_array_equal(spotted.image[unlit], shown.image[unlit])
+
+
+def test_spots_of_sun_that_the_network_swears_are_markings_are_not_reported(shown):
+    detector = Detector.load(options=DetectorOptions())
+    view = detector.view(shown.camera)
+    for seed in range(3):
+        spotted, spots = lit(shown, view, np.random.default_rng(seed))
+        for marking in reported(spotted, detector, spots):
+            mask = np.zeros(spots.light.shape, np.uint8)
+            cv2.fillPoly(mask, [np.round(marking.corners_px).astype(np.int32)], 1)
+            assert spots.light[mask > 0].mean() < 0.5
+
+
+def test_lines_of_lanes_are_proposed_with_their_truth(shown, detector):
+    found = proposed(seen(shown, detector), detector.options.lane_step_m)
+    assert found is not None
+    assert len(found.lines) == len(found.evidence) == len(found.true)
+    assert found.true.any()
