@@ -19,6 +19,7 @@ from tests.adjust.scene import Scene, make_scene
 from tests.benchmarks.adjust_accuracy import PLAIN, root_mean_cm, squared_bound_m2
 from v2hdm import config
 from v2hdm.adjust import Drift, PoseSigma, solve
+from v2hdm.pipeline import RunConfig
 from v2hdm.simulate import PortConfig
 from v2hdm.simulate.port.calibration import cam_from_vehicle
 from v2hdm.simulate.port.disturbance import pose_noise
@@ -29,9 +30,10 @@ PIXEL_SIGMA = 0.4
 
 def port_config(run: str) -> PortConfig:
     """The port of a shipped run."""
-    config.register_schemas()
+    config.register("map", RunConfig)
     with initialize_config_dir(str(config.conf_dir()), version_base="1.3"):
-        port = config.to_run_config(compose("map", overrides=[f"+run={run}"])).simulate
+        composed = compose("map", overrides=[f"+run={run}"])
+    port = config.to_dataclass(composed, RunConfig, "ask for a rendered port").simulate
     assert port is not None
     return port
 
