@@ -50,6 +50,12 @@ def test_a_lens_that_folds_over_itself_within_the_image_is_refused(info: CameraI
         check_camera(info, "front.yaml", MapFileError)
 
 
+def test_a_lens_that_folds_in_the_corners_only_is_warned_of(caplog) -> None:
+    check_camera(camera("plumb_bob", (-0.35, 0.0, 0.0, 0.0, 0.0)), "front.yaml", MapFileError)
+    (record,) = caplog.records
+    assert "front.yaml: distortion_coefficients: this lens folds over itself 325 px" in record.getMessage()
+
+
 def test_the_reach_of_a_lens_is_where_it_turns() -> None:
     # r - 0.6 r^3 is greatest at r = 1 / sqrt(1.8).
     turn = 1 / np.sqrt(1.8)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 
 from v2hdm.errors import V2hdmError
 from v2hdm.files import check_keys, take_array, take_mapping, take_number, take_text
 from v2hdm.records import CameraInfo, FloatArray, GeodeticOrigin
+
+_log = logging.getLogger(__name__)
 
 _LARGEST_PX = 65535
 _LONGEST_FOCAL_PX = 1e6
@@ -63,7 +67,8 @@ def take_covariance(content: object, size: int, where: str, error: type[V2hdmErr
 def check_camera(info: CameraInfo, where: str, error: type[V2hdmError]) -> None:
     """Refuse a camera matrix that is none and a lens that cannot be undone within the image.
 
-    The number of coefficients must be the model's.
+    Many a calibration folds over itself in the image's corners only, where its target never was: that is a
+    warning. The number of coefficients must be the model's.
     """
     (fx, skew, cx), (zero, fy, cy), last = info.intrinsic
     if min(fx, fy) <= 0 or zero or list(last) != [0, 0, 1]:
@@ -72,14 +77,17 @@ def check_camera(info: CameraInfo, where: str, error: type[V2hdmError]) -> None:
         )
     if max(fx, fy, abs(skew), abs(cx), abs(cy)) > _LONGEST_FOCAL_PX:
         raise error(f"{where}: camera_matrix: beyond {_LONGEST_FOCAL_PX:g} px; mend it")
-    reach, corner = lens_reach(info), _farthest_corner(info)
-    if reach < corner:
-        scale_px = (fx + fy) / 2
-        raise error(
-            f"{where}: distortion_coefficients: this lens folds over itself {scale_px * reach:.0f} px from "
-            f"its centre, and the image reaches {scale_px * corner:.0f} px from there; calibrate it again "
-            "with points up to the image's corners"
-        )
+    reach, sides = lens_reach(info), _sides(info)
+    if reach >= np.hypot(*sides):
+        return
+    scale_px = (fx + fy) / 2
+    problem = (
+        f"{where}: distortion_coefficients: this lens folds over itself {scale_px * reach:.0f} px from its "
+        f"centre, and the image reaches {scale_px * np.hypot(*sides):.0f} px from there"
+    )
+    if reach < max(sides):
+        raise error(f"{problem}; calibrate it again with points up to the image's corners")
+    _log.warning("%s: do not trust what lies in its corners; calibrate with points up to there", problem)
 
 
 def lens_reach(info: CameraInfo) -> float:
@@ -108,11 +116,12 @@ def _recorded(info: CameraInfo, angles: FloatArray) -> FloatArray:
     return recorded
 
 
-def _farthest_corner(info: CameraInfo) -> float:
+def _sides(info: CameraInfo) -> tuple[float, float]:
+    """How far the image reaches from the axis to a side and up or down, as shares of the focal lengths."""
     (fx, _, cx), (_, fy, cy), _ = info.intrinsic
     across = max(abs(cx + 0.5), abs(info.width - 0.5 - cx)) / fx
     down = max(abs(cy + 0.5), abs(info.height - 0.5 - cy)) / fy
-    return float(np.hypot(across, down))
+    return float(across), float(down)
 
 
 def _is_covariance(matrix: FloatArray) -> bool:
