@@ -18,7 +18,7 @@ from tests.benchmarks.examples import MAX_RANGE_M, Example
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.network import Network
 from v2hdm.detection.sight import Sight, look
-from v2hdm.records import CORNERED_CLASSES, CROSSWALK_BAR, DIAMOND, LANE_DASH, PAINT_CLASSES
+from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, PAINT_CLASSES, FloatArray
 
 SPOTS = 3
 _TRIES = 20
@@ -72,37 +72,40 @@ def lit(shown: Example, view: CameraView, rng: np.random.Generator) -> tuple[Exa
     taken = cv2.dilate(taken, np.ones((2 * _BOUND_PX + 1,) * 2, np.uint8))
     light = np.zeros(taken.shape, dtype=np.float32)
     soft = rng.uniform(*_SOFT)
+    ground = _ground(taken.shape, view)
     for _ in range(SPOTS):
         for _ in range(_TRIES):
-            spot = _spot(taken.shape, view, soft, rng)
+            spot = _spot(ground, view, soft, rng)
             if spot is not None and not taken[spot > 0].any():
                 light, taken = np.maximum(light, spot), taken | (cv2.dilate(spot, None) > 0).astype(np.uint8)
                 break
     gain = 1 + (rng.uniform(*_GAIN) - 1) * light[..., None]
     image = np.clip(np.round(shown.image * gain), 0, 255).astype(np.uint8)
     kind = str(rng.choice(list(_CLAIMED), p=list(_CLAIMED.values())))
-    assert kind in CORNERED_CLASSES
     return replace(shown, image=image), Spots(light, float(rng.uniform(*_SWORN_ODDS)), kind)
 
 
-def _spot(
-    shape: tuple[int, ...], view: CameraView, soft: float, rng: np.random.Generator
-) -> np.ndarray | None:
+def _ground(shape: tuple[int, ...], view: CameraView) -> FloatArray:
+    """Where each pixel (H, W, 2) shows the ground, vehicle frame, m; NaN above the rows in reach."""
+    v, u = np.mgrid[view.far_row : shape[0], 0 : shape[1]]
+    ground = np.full((*shape, 2), np.nan)
+    pixels = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
+    ground[view.far_row :] = view.ground(view.undistort(pixels)).reshape(*v.shape, 2)
+    return ground
+
+
+def _spot(ground: FloatArray, view: CameraView, soft: float, rng: np.random.Generator) -> np.ndarray | None:
     """The light (H, W) of an ellipse somewhere on the ground that is wholly in the image; None for none."""
-    height, width = shape
-    at_px = np.array([[rng.uniform(0, width), rng.uniform(view.far_row, height)]])
-    centre = view.ground(view.undistort(at_px))[0]
+    height, width = ground.shape[:2]
+    centre = ground[rng.integers(view.far_row, height), rng.integers(width)]
     if not view.range_m(centre) < MAX_RANGE_M:
         return None
     radius_m, slim, turn = rng.uniform(*_RADIUS_M), rng.uniform(*_SLIM), rng.uniform(0, np.pi)
     axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     axes /= np.array([[radius_m], [radius_m * slim]])
-    v, u = np.mgrid[view.far_row : height, 0:width]
-    ground = view.ground(view.undistort(np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)))
-    radius = np.linalg.norm((ground - centre) @ axes.T, axis=1).reshape(v.shape)
+    radius = np.linalg.norm((ground - centre) @ axes.T, axis=2)
     fade = np.clip((1 + soft / 2 - np.nan_to_num(radius, nan=9.0)) / soft, 0, 1)
-    light = np.zeros(shape, dtype=np.float32)
-    light[view.far_row :] = fade * fade * (3 - 2 * fade)
+    light = (fade * fade * (3 - 2 * fade)).astype(np.float32)
     border = np.concatenate([light[0], light[-1], light[:, 0], light[:, -1]])
     return light if light.any() and not border.any() else None
 
