@@ -14,7 +14,7 @@ class DataConfig:
     A render of ``render_width`` x ``render_height`` px is shown ``views_per_render`` times on average, the
     oftener the more paint it shows, each time another crop of ``width`` x ``height`` px in other light. Past
     renders to show again are kept in a ``reservoir``. ``easy_samples`` renders pass until scenes are as hard
-    as they get. ``shadows_on_paint`` and those that follow it up to ``kerbs``
+    as they get. ``shadows_on_paint`` and those that follow it up to ``aside``
     are the :class:`~v2hdm.simulate.training.hardships.Hardships` of the renders.
 
     ``coco`` and ``tusimple`` are files of users' own labels: polygons of markings in COCO's format, lanes in
@@ -39,6 +39,7 @@ class DataConfig:
     blue_shade: float = 0.3
     tight_bends: float = 0.15
     kerbs: float = 0.2
+    aside: float = 0.08
     workers: int = 1
     coco: str | None = None
     coco_images: str | None = None

@@ -53,6 +53,10 @@ OUTLINED_CLASSES: tuple[str, ...] = (ARROW, CHEVRON)
 LANE_CLASSES: tuple[str, ...] = (LANE_DASH, LANE_LINE)
 """Classes whose centre lines make up the lanes."""
 
+SEEN_ACROSS: Mapping[str, str] = {LANE_DASH: STOP_LINE, STOP_LINE: LANE_DASH}
+"""Stripes that a camera on the vehicle's side sees as one that looks ahead sees the other: a dash lies across
+its view."""
+
 LANE_BOUNDARY = "lane_boundary"
 """Kind of a lane detection that is a whole line, gaps between dashes and hidden parts included."""
 

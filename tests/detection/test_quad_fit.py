@@ -5,6 +5,7 @@ import pytest
 
 from tests.detection.pictures import brightness_model, diamond, make_camera, picture, to_image
 from tests.detection.test_corners import errors_px, normalised
+from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.correlation import variance_inflation
 from v2hdm.detection.corners.covariance import corner_covariance
 from v2hdm.detection.corners.grey import linear_grey
@@ -78,7 +79,7 @@ def fitted_from(shape, start):
     box = np.array([[0, 0, camera.info.width, camera.info.height]])
     grey = linear_grey(picture(camera, [shape]), 0, camera.info.height, box, False)
     owner = np.zeros((camera.info.height // 2, camera.info.width // 2), dtype=np.int16)
-    fit = fit_quads(grey, owner, 2, np.array([0]), start_px[None], 0.75)
+    fit = fit_quads(grey, owner, 2, np.array([0]), CameraView(camera, 16), start_px[None], 0.75)
     return true_px, fit, np.abs(true_px - start_px).max()
 
 

@@ -1,16 +1,20 @@
-"""Looking at near ground at half the resolution moves nothing."""
+"""Looking at near ground at half the resolution moves nothing, looking to the side turns stripes."""
+
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
-from tests.detection.pictures import brightness_model, diamond, extrinsic, picture
+from tests.detection.pictures import bar, brightness_model, diamond, extrinsic, make_camera, picture
 from v2hdm.detection import sight as sight_module
 from v2hdm.detection.camera.ground import ipm_from_extrinsic
 from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.detector import Detector
 from v2hdm.detection.network import Network, NetworkOutput
+from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.sight import Sight, look
-from v2hdm.records import Camera, CameraInfo
+from v2hdm.records import LANE_DASH, STOP_LINE, Camera, CameraInfo
 
 
 def large_camera(width: int = 1280, height: int = 720) -> Camera:
@@ -112,3 +116,24 @@ def test_the_mirror_image_moves_nothing_whatever_the_width(width):
     ]
     assert len(centres[0]) == 2
     np.testing.assert_allclose(*centres, atol=0.25)
+
+
+def turned(camera: Camera, yaw_deg: float) -> Camera:
+    """The same camera on a vehicle that drives in another direction."""
+    c, s = np.cos(np.deg2rad(yaw_deg)), np.sin(np.deg2rad(yaw_deg))
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    ipm = {name: turn @ homography for name, homography in camera.ipm.items()}
+    return replace(camera, ipm=ipm, roi_vehicle=camera.roi_vehicle @ turn[:2, :2].T)
+
+
+@pytest.mark.parametrize(
+    ("yaw_deg", "kind"),
+    [(0.0, STOP_LINE), (180.0, STOP_LINE), (50.0, STOP_LINE), (90.0, LANE_DASH), (-80.0, LANE_DASH)],
+)
+def test_a_stripe_across_the_view_of_a_camera_that_looks_to_the_side_is_a_dash(tmp_path, yaw_deg, kind):
+    camera = make_camera("pinhole")
+    image = picture(camera, [bar(6.0, 0.0, 0.3, 2.4)], ground=0.2, paint=0.6)
+    detector = Detector.load(brightness_model(tmp_path, STOP_LINE), DetectorOptions(min_confidence=0.0))
+    (seen,) = detector.detect(image, turned(camera, yaw_deg))[0]
+    assert seen.kind == kind
+    assert seen.score > DetectorOptions().min_confidence

@@ -14,7 +14,7 @@ import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.network import Network, NetworkOutput
-from v2hdm.records import FloatArray
+from v2hdm.records import SEEN_ACROSS, FloatArray
 
 _OVERLAP_PX = 64
 """By how much the two parts overlap, so that either has its surroundings where they are joined."""
@@ -66,7 +66,8 @@ def look(network: Network, image_bgr: np.ndarray, view: CameraView, mirrored: bo
     seam = _seam_row(network, view)
     if seam is None:
         output = ask(network, band)
-        return Sight(output.paint, output.kinds, _anchor_rows(output.lanes, network, top, 1))
+        kinds = _as_driven(output.kinds, network, view)
+        return Sight(output.paint, kinds, _anchor_rows(output.lanes, network, top, 1))
     far = ask(network, band[: seam + _OVERLAP_PX])
     near_top = seam - _OVERLAP_PX
     half = cv2.resize(band[near_top:], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
@@ -76,7 +77,20 @@ def look(network: Network, image_bgr: np.ndarray, view: CameraView, mirrored: bo
     near_rows = [row for row in near_rows if row.v_px >= top + seam]
     paint = _joined(far.paint[None], near.paint[None], seam, near_top, network.info.paint_stride)
     kinds = _joined(far.kinds, near.kinds, seam, near_top, network.info.kind_stride)
-    return Sight(paint[0], kinds, near_rows + far_rows)
+    return Sight(paint[0], _as_driven(kinds, network, view), near_rows + far_rows)
+
+
+def _as_driven(kinds: np.ndarray, network: Network, view: CameraView) -> np.ndarray:
+    """Logits (K, h, w) of the classes, of stripes by how they lie to the vehicle's way, not to the view.
+
+    Seen from the side a dash lies across the view, as a stop line does seen from the front, and the other way
+    round. The network knows of the view alone.
+    """
+    names = list(network.info.classes)
+    if not view.aside or not set(SEEN_ACROSS) <= set(names):
+        return kinds
+    order = [names.index(SEEN_ACROSS.get(name, name)) for name in names]
+    return kinds[order]
 
 
 def _answer(network: Network, image_bgr: np.ndarray) -> NetworkOutput:

@@ -21,6 +21,10 @@ FINE_ENOUGH_M = 0.007
 """Ground per pixel, across the view, of which half the resolution shows enough: a dash stays 10 px wide."""
 
 
+ASIDE_RAD = np.deg2rad(60)
+"""A camera that looks farther than this off the way that its vehicle drives, ahead or back, looks across it."""
+
+
 class CameraView:
     """One camera as the detector sees it: fast lens and ground mappings, and the rows worth looking at.
 
@@ -28,8 +32,8 @@ class CameraView:
     (with a margin, since that IPM is coarse); ``height`` is a multiple of ``multiple`` where the
     image is tall enough. ``far_row``, by a multiple of ``multiple`` below ``top``, is the one from which on
     it is worth looking at for ground within :data:`FARTHEST_M`. From ``fine_row`` on (None if there is no
-    such row) a pixel is less than :data:`FINE_ENOUGH_M` of ground wide. Points far from any lens singularity
-    are assumed.
+    such row) a pixel is less than :data:`FINE_ENOUGH_M` of ground wide. ``aside`` cameras look
+    across the way that the vehicle drives. Points far from any lens singularity are assumed.
     """
 
     def __init__(self, camera: Camera, multiple: int = 16):
@@ -40,6 +44,8 @@ class CameraView:
         self._pinhole_lut = _build_pinhole_lut(camera) if has_distortion(camera.info) else None
         seen_vehicle = np.asarray(camera.roi_vehicle, dtype=np.float64).mean(axis=0)
         cam_from_vehicle = extrinsic_from_ipm(self.info, self.vehicle_from_pinhole_px, seen_vehicle)
+        ahead, left, _ = cam_from_vehicle[2, :3]
+        self.aside = bool(np.arctan2(abs(left), abs(ahead)) > ASIDE_RAD)
         self.foot_vehicle = -(cam_from_vehicle[:3, :3].T @ cam_from_vehicle[:3, 3])[:2]
         seen_px = apply_homography(self.pinhole_px_from_vehicle, seen_vehicle[None])
         self._ground_sign = np.sign(self._ground_depth(seen_px))[0]

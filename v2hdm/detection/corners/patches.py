@@ -8,26 +8,31 @@ from functools import cached_property
 import numpy as np
 
 from v2hdm.detection.corners.grey import GreyBand
-from v2hdm.detection.corners.quad import side_frames, signed_area
+from v2hdm.detection.corners.quad import side_frames, signed_area, width
+from v2hdm.detection.corners.straight import StraightFrames
 from v2hdm.records import BoolArray, FloatArray
 
 _OUTSIDE_PX = 3.0
 _INSIDE_PX = 4.0
 _MEDIAN_STRIDE = 3
 _MAX_PIXELS = 350
+_MAX_BETWEEN = 200
+_END_PX = 2.0
+_MOST_ENDS = 1 / 3
+"""What has two ends that make up no more than this share of its length is slim; an end reaches so far past its
+corners."""
 
 
 @dataclass(frozen=True)
 class Patches:
     """Up to N pixels about each of M markings.
 
-    ``points`` (M, 3, N) float32 are (u, v, 1) in recorded px from ``origin_px`` (M, 2); ``values``
+    ``points`` (M, 3, N) float32 are (x, y, 1) in the markings' frames; ``values``
     (M, N) float32 grey; ``use`` (M, N) float32 1 where a pixel takes part, else 0; ``neighbours``
     (2, M, N) the place in the list of the lattice's next pixel to the right and below, 0 for none;
     ``clipped`` (M,) the share of pixels left out since the sensor was at its limit there.
     """
 
-    origin_px: FloatArray
     points: np.ndarray
     values: np.ndarray
     use: np.ndarray
@@ -39,7 +44,6 @@ class Patches:
         if rows.all():
             return self
         return Patches(
-            self.origin_px[rows],
             self.points[rows],
             self.values[rows],
             self.use[rows],
@@ -50,7 +54,6 @@ class Patches:
     def every(self, stride: int) -> Patches:
         """Every ``stride``-th pixel, without neighbours."""
         return Patches(
-            self.origin_px,
             np.ascontiguousarray(self.points[..., ::stride]),
             np.ascontiguousarray(self.values[:, ::stride]),
             np.ascontiguousarray(self.use[:, ::stride]),
@@ -73,7 +76,12 @@ class Patches:
 
 
 def cut_patches(
-    grey: GreyBand, owner: np.ndarray, owner_stride: int, blobs: np.ndarray, corners_px: FloatArray
+    grey: GreyBand,
+    owner: np.ndarray,
+    owner_stride: int,
+    blobs: np.ndarray,
+    frames: StraightFrames,
+    corners_px: FloatArray,
 ) -> Patches:
     """The pixels about the sides of quadrilaterals ``corners_px`` (M, 4, 2), without those of other blobs.
 
@@ -82,19 +90,20 @@ def cut_patches(
         owner: (h, w) 1 + index of the blob on each logit of the same band.
         owner_stride: pixels per logit.
         blobs: (M,) index of each marking's own blob.
+        frames: those of the markings.
         corners_px: starting corners, recorded px.
     """
-    low = np.floor(corners_px.min(axis=1)).astype(np.intp) - int(_OUTSIDE_PX)
-    size = np.ceil(corners_px.max(axis=1)).astype(np.intp) + int(_OUTSIDE_PX) + 1 - low
-    step = _lattice_steps(corners_px, size)
-    # One column and row more than needed, so that the lattice's last pixels have no neighbour.
-    width, height = (-(-size // step)).max(axis=0) + 1
-    columns, rows = step[:, :1] * np.arange(width), step[:, 1:] * np.arange(height)
-    band = _in_band(corners_px - low[:, None], columns, rows)
+    bow_px = frames.bow_px(corners_px)
+    spare = np.ceil(bow_px)[:, None].astype(np.intp) + int(_OUTSIDE_PX)
+    low = np.floor(corners_px.min(axis=1)).astype(np.intp) - spare
+    size = np.ceil(corners_px.max(axis=1)).astype(np.intp) + spare + 1 - low
+    columns, rows = _lattice(corners_px - low[:, None], size)
+    across, down = columns.shape[1], rows.shape[1]
+    band = _in_band(corners_px - low[:, None], bow_px, columns, rows)
     band[..., -1] = band[:, -1] = False
     cell = np.flatnonzero(band)
-    marking, within = np.divmod(cell, width * height)
-    i, j = np.divmod(within, width)
+    marking, within = np.divmod(cell, across * down)
+    i, j = np.divmod(within, across)
     u, v = low[marking, 0] + columns[marking, j], low[marking, 1] + rows[marking, i] - grey.top
     use = (u >= 0) & (u < grey.values.shape[1]) & (v >= 0) & (v < grey.values.shape[0])
     u[~use] = v[~use] = 0
@@ -102,9 +111,9 @@ def cut_patches(
     use &= (cell_owner == 0) | (cell_owner == blobs[marking] + 1)
     count = np.bincount(marking, minlength=len(low))
     place = np.arange(len(cell)) - np.repeat(np.cumsum(count) - count, count)
-    patches = _empty(low + size // 2, max(1, int(count.max())))
-    patches.points[marking, 0, place] = u - patches.origin_px[marking, 0]
-    patches.points[marking, 1, place] = v + grey.top - patches.origin_px[marking, 1]
+    patches = _empty(len(low), max(1, int(count.max())))
+    pixels = np.column_stack([u, v + grey.top]).astype(np.float64)
+    patches.points[marking, :2, place] = frames.take(marking).from_image(pixels[:, None])[:, 0]
     values = grey.values[v, u]
     known = np.isfinite(values)
     patches.values[marking, place] = np.where(known, values, np.float32(0))
@@ -112,30 +121,73 @@ def cut_patches(
     patches.clipped[:] = np.bincount(marking, np.isposinf(values), len(low)) / np.maximum(count, 1)
     place_of_cell = np.zeros(band.size, dtype=np.intp)
     place_of_cell[cell] = place
-    for axis, following in ((0, 1), (1, width)):
+    for axis, following in ((0, 1), (1, across)):
         patches.neighbours[axis, marking, place] = place_of_cell[cell + following]
     return patches
 
 
-def _lattice_steps(corners_px: FloatArray, size: np.ndarray) -> np.ndarray:
-    """Steps (M, 2) along u and v that leave about ``_MAX_PIXELS`` of the band about the sides.
+def _lattice(corners: FloatArray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Columns (M, W) and rows (M, H) that leave about ``_MAX_PIXELS`` of the bands about sides, or some more.
 
     Neighbouring pixels say nearly the same, so a large marking needs only some of them; columns or rows
-    are left out along the marking's longer extent, the finer sampling staying across it.
+    are left out along the marking's longer extent, the finer sampling staying across it. Of a slim one none
+    are left out at its two ends, which tell how long it is, but more between.
+
+    Args:
+        corners: (M, 4, 2) px from the box's first pixel.
+        size: (M, 2) the box, px.
     """
-    _, _, length = side_frames(corners_px)
-    longest, area = length.max(axis=1), np.abs(signed_area(corners_px))
+    each = np.arange(len(corners))
+    along = np.where(size[:, 0] >= size[:, 1], 0, 1)
+    step, band = _lattice_steps(corners, along)
+    place, extent = np.sort(corners[each, :, along], axis=1), size[each, along]
+    thick = width(corners)
+    head = np.ceil(np.minimum(place[:, 1], place[:, 0] + thick) + _END_PX).astype(np.intp)
+    tail = np.floor(np.maximum(place[:, 2], place[:, 3] - thick) - _END_PX).astype(np.intp)
+    slim = (step[each, along] > 1) & (head + extent - tail < _MOST_ENDS * extent)
+    between = np.ceil(band * (tail - head) / extent / _MAX_BETWEEN).astype(np.intp)
+    step[slim] = 1
+    step[each[slim], along[slim]] = np.maximum(between[slim], 1)
+    bounds = np.zeros((len(corners), 2, 2), dtype=np.intp)
+    bounds[..., 1] = size
+    bounds[each[slim], along[slim]] = np.column_stack([head, tail])[slim]
+    columns, rows = (_steps(bounds[:, axis], step[:, axis], size[:, axis]) for axis in (0, 1))
+    return columns, rows
+
+
+def _steps(bounds: np.ndarray, step: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Places (M, n), every one outside ``bounds`` (M, 2) and every ``step``-th (M,) between, up to ``size``.
+
+    There is one more than needed, so that the last have no neighbour.
+    """
+    head, tail = bounds.T
+    between = -(-(tail - head) // step)
+    count = head + between + np.maximum(size - tail, 0)
+    k = np.arange(int(count.max()) + 1)
+    head, step, between = head[:, None], step[:, None], between[:, None]
+    middle, last = head + (k - head) * step, tail[:, None] + k - head - between
+    return np.asarray(np.where(k < head, k, np.where(k < head + between, middle, last)))
+
+
+def _lattice_steps(corners: FloatArray, along: np.ndarray) -> tuple[np.ndarray, FloatArray]:
+    """Steps (M, 2) along u and v that leave about ``_MAX_PIXELS`` of the band (M,) px about the sides."""
+    _, _, length = side_frames(corners)
+    longest, area = length.max(axis=1), np.abs(signed_area(corners))
     band = area + _OUTSIDE_PX * (length.sum(axis=1) + 4 * _OUTSIDE_PX)
     band -= np.maximum(longest - 2 * _INSIDE_PX, 0) * np.maximum(area / longest - 2 * _INSIDE_PX, 0)
     ratio = np.maximum(band / _MAX_PIXELS, 1.0)
-    longer = np.ceil(np.maximum(ratio / np.maximum(ratio / 4, 1), 1))
+    longer = np.ceil(ratio / np.maximum(ratio / 4, 1))
     other = np.ceil(ratio / longer)
-    wide = size[:, 0] >= size[:, 1]
-    return np.where(wide[:, None], np.stack([longer, other], 1), np.stack([other, longer], 1)).astype(np.intp)
+    wide = along[:, None] == 0
+    step = np.where(wide, np.stack([longer, other], 1), np.stack([other, longer], 1)).astype(np.intp)
+    return step, band
 
 
-def _in_band(corners: FloatArray, columns: np.ndarray, rows: np.ndarray) -> BoolArray:
-    """Which pixels (M, H, W) of a lattice are near the nearest side of quadrilaterals (M, 4, 2)."""
+def _in_band(corners: FloatArray, bow_px: FloatArray, columns: np.ndarray, rows: np.ndarray) -> BoolArray:
+    """Which pixels (M, H, W) of a lattice are near the nearest side of quadrilaterals (M, 4, 2).
+
+    The sides are bowed by up to ``bow_px`` (M,).
+    """
     _, normal, _ = side_frames(corners)
     offset = (normal * corners).sum(axis=-1).astype(np.float32)
     normal = normal.astype(np.float32)
@@ -144,13 +196,13 @@ def _in_band(corners: FloatArray, columns: np.ndarray, rows: np.ndarray) -> Bool
     for side in range(4):
         by_row = normal[:, side, 1, None, None] * v - offset[:, side, None, None]
         np.maximum(reach, normal[:, side, 0, None, None] * u + by_row, out=reach)
-    return np.asarray((reach < _OUTSIDE_PX) & (reach > -_INSIDE_PX))
+    spare = bow_px.astype(np.float32)[:, None, None]
+    return np.asarray((reach < spare + np.float32(_OUTSIDE_PX)) & (reach > -spare - np.float32(_INSIDE_PX)))
 
 
-def _empty(origin_px: np.ndarray, pixels: int) -> Patches:
-    markings = len(origin_px)
+def _empty(markings: int, pixels: int) -> Patches:
     points = np.zeros((markings, 3, pixels), dtype=np.float32)
     points[:, 2] = 1.0
     blank = np.zeros((markings, pixels), dtype=np.float32)
     neighbours = np.zeros((2, markings, pixels), dtype=np.intp)
-    return Patches(origin_px.astype(np.float64), points, blank, blank.copy(), neighbours, np.zeros(markings))
+    return Patches(points, blank, blank.copy(), neighbours, np.zeros(markings))

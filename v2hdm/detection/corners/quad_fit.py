@@ -4,7 +4,7 @@ The grey value is modelled as ``b0 + b1 C + b2 u + b3 v``, with C the quadrilate
 a point spread. The ends of the four sides, the levels and the spread are found by Gauss-Newton with Cauchy
 weights, first with a wider blur, which sees farther, then with one near the image's own. Where the sensor
 was at its limit only the flanks of the sides count: how fast they rise tells the level that was cut off. The
-fit runs in recorded pixels; the lens' small bow of the sides is undone afterwards.
+pixels' places are those without the lens, so that all sides are straight.
 """
 
 from __future__ import annotations
@@ -18,14 +18,8 @@ from v2hdm.detection.corners.correlation import variance_inflation
 from v2hdm.detection.corners.coverage import blurred_coverage
 from v2hdm.detection.corners.grey import GreyBand
 from v2hdm.detection.corners.patches import Patches, cut_patches
-from v2hdm.detection.corners.quad import (
-    following,
-    intersect_sides,
-    is_convex,
-    preceding,
-    side_frames,
-    signed_area,
-)
+from v2hdm.detection.corners.quad import is_convex, preceding, side_frames, signed_area
+from v2hdm.detection.corners.straight import StraightFrames
 from v2hdm.records import BoolArray, FloatArray
 
 _WIDER_BLUR_PX = 0.8
@@ -74,12 +68,10 @@ _CORNER = np.arange(4)
 _END = 4 + (_CORNER - 1) % 4
 """Each corner is the start of its own side and the end of the one before, in this place among the moves."""
 
-_GAUSS_POINTS = (0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0))
-
 
 @dataclass(frozen=True)
 class QuadFit:
-    """Fitted quadrilaterals of M markings in recorded px, before the lens' bow is undone.
+    """Fitted quadrilaterals of M markings in recorded px.
 
     ``corners_px`` (M, 4, 2), ``covariance`` (M, 8, 8) px^2, ``amplitude`` (M,) step from ground to
     paint, ``misfit`` (M,) residual over amplitude, ``settled`` (M,) whether the fit stayed near its
@@ -101,6 +93,7 @@ def fit_quads(
     owner: np.ndarray,
     owner_stride: int,
     blobs: np.ndarray,
+    view: CameraView,
     corners_px: FloatArray,
     blur_px: float,
 ) -> QuadFit:
@@ -111,11 +104,13 @@ def fit_quads(
         owner: (h, w) 1 + index of the blob on each logit of the same band; other blobs' pixels are ignored.
         owner_stride: pixels per logit.
         blobs: (M,) index of each marking's own blob.
+        view: the camera.
         corners_px: starting corners, recorded px.
         blur_px: the point spread's standard deviation, pixel aperture included.
     """
-    patches = cut_patches(grey, owner, owner_stride, blobs, corners_px)
-    start = corners_px - patches.origin_px[:, None]
+    frames = StraightFrames.about(view, corners_px)
+    patches = cut_patches(grey, owner, owner_stride, blobs, frames, corners_px)
+    start = frames.from_image(corners_px)
     clipped = np.asarray(patches.clipped > _CLIPPED_SHARE)
     inward_px = np.where(clipped, -_BLOOM * blur_px, 0.0)
     corners = start + _moved(_corner_from_side(start), np.repeat(inward_px[:, None], 8, axis=1))
@@ -132,8 +127,7 @@ def fit_quads(
     # Misfit is paint that is missing on one side; a level beyond the sensor's is an extrapolation.
     doubt = (1 + (misfit / _NOISE_MISFIT) ** 2) * np.maximum(system.amplitude, 1.0) ** 2
     return QuadFit(
-        quads.corners + patches.origin_px[:, None],
-        doubt[:, None, None] * _covariance(system, patches),
+        *frames.to_image(quads.corners, doubt[:, None, None] * _covariance(system, patches)),
         system.amplitude,
         misfit,
         settled,
@@ -151,23 +145,9 @@ def _has_grown(start: FloatArray, corners: FloatArray) -> BoolArray:
     return np.asarray(is_convex(corners) & (outside_px < _ENCLOSED_PX) & small)
 
 
-def unbow_corners(view: CameraView, corners_px: FloatArray) -> FloatArray:
-    """Pinhole corners (M, 4, 2) of quadrilaterals that were fitted with straight sides in the recorded image.
-
-    A straight line fitted to a shallow arc crosses it at the two Gauss points of their common chord; so the
-    true side is the line through those two points once the lens is undone.
-    """
-    ahead = following(corners_px)
-    points = np.stack([corners_px * (1 - s) + ahead * s for s in _GAUSS_POINTS], axis=2)
-    points = view.undistort(points.reshape(-1, 2)).reshape(points.shape)
-    along = points[:, :, 1] - points[:, :, 0]
-    normal = np.stack([-along[..., 1], along[..., 0]], axis=-1)
-    return intersect_sides(points[:, :, 0], normal)
-
-
 @dataclass
 class _Quads:
-    """State of M markings: corners (M, 4, 2), px from the patches' origins, and blur (M,) px.
+    """State of M markings: corners (M, 4, 2) in their frames, and blur (M,) px.
 
     ``levels`` (M, 4) are those of coverage, u, v and 1, all zero before they are first fitted.
     """

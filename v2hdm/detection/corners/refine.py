@@ -20,7 +20,7 @@ from v2hdm.detection.corners.found import Corners, block_diagonal, is_cut, large
 from v2hdm.detection.corners.grey import GreyBand, linear_grey
 from v2hdm.detection.corners.outline_fit import fit_outlines
 from v2hdm.detection.corners.quad import is_convex, side_frames, width
-from v2hdm.detection.corners.quad_fit import fit_quads, unbow_corners
+from v2hdm.detection.corners.quad_fit import fit_quads
 from v2hdm.detection.corners.rectified import rectified_views
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import DIAMOND, LANE_DASH, BoolArray, FloatArray, MarkingDetection
@@ -30,7 +30,9 @@ TYPICAL_BLUR_PX = 0.75
 
 _NEAR_WIDTH_PX = 15.0
 _NEAR_SIDE_PX = 14.0
-_FAR_MAX_PX = 200.0
+_LARGE_PX = 200.0
+"""What is so large has sides to be located one by one, or it has none that can be trusted."""
+
 _COVARIANCE_FACTOR = 1.4
 _COVARIANCE_FLOOR_PX = 0.03
 _MAX_MISFIT = 0.2
@@ -151,7 +153,7 @@ def _fitted(
         edges = fit_edges(grey, view, start[near])
         _take_edges(found, near, edges, view)
         blur_px = blur_px or _measured_blur(edges)
-    far = ~found.valid.any(axis=1) & (np.ptp(found.px, axis=1).max(axis=1) < _FAR_MAX_PX)
+    far = ~found.valid.any(axis=1) & (~near | (np.ptp(found.px, axis=1).max(axis=1) < _LARGE_PX))
     if far.any():
         shared = _Far(foreground, blobs, view, blur_px or TYPICAL_BLUR_PX)
         overexposed = _take_quads(found, np.flatnonzero(far), grey, shared, 0.0)
@@ -277,10 +279,10 @@ def _take_quads(found: Corners, group: np.ndarray, grey: GreyBand, far: _Far, bl
     """
     foreground = far.foreground
     owner = foreground.owner[(grey.top - foreground.top) // foreground.stride :]
-    fit = fit_quads(grey, owner, foreground.stride, far.blobs[group], found.px[group], far.blur_px)
-    pinhole = unbow_corners(far.view, fit.corners_px)
-    corners = far.view.distort(pinhole.reshape(-1, 2)).reshape(-1, 4, 2)
-    covariance = fit.covariance + bloom_px**2 * np.eye(8)
+    fit = fit_quads(
+        grey, owner, foreground.stride, far.blobs[group], far.view, found.px[group], far.blur_px
+    )
+    corners, covariance = fit.corners_px, fit.covariance + bloom_px**2 * np.eye(8)
     good = fit.settled & (fit.misfit < _MAX_MISFIT) & (fit.amplitude > _MIN_AMPLITUDE)
     good &= np.isfinite(corners).all(axis=(1, 2))
     found.px[group[good]] = corners[good]

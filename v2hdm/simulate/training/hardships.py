@@ -43,6 +43,9 @@ class Hardships:
             roundabouts; what would stand on the paint is left out.
         kerbs: share of scenes with a bright kerb along a line of a lane, no wider than paint, that lies open
             in stretches as long as dashes.
+        aside: share of cameras that look to the side of the vehicle. What they see is another scene's worth,
+            and its dashes and stop lines have changed names: see
+            :func:`~v2hdm.simulate.training.scenes.training_sample`.
     """
 
     shadows_on_paint: float = 0.0
@@ -54,6 +57,7 @@ class Hardships:
     blue_shade: float = 0.0
     tight_bends: float = 0.0
     kerbs: float = 0.0
+    aside: float = 0.0
 
 
 NONE = Hardships()

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.detection.camera.lens import distort_points, undistort_points
-from v2hdm.records import FloatArray
+from v2hdm.records import CORNERED_CLASSES, PAINT_CLASSES, SEEN_ACROSS, FloatArray
 from v2hdm.simulate.render.renderer import Renderer
 from v2hdm.simulate.render.scene import Backdrop, Bgr, Dapple, Ground, Light, Scene, Shadow
 from v2hdm.simulate.training.clutter import ground_marks, port_boxes, street_boxes
@@ -31,12 +31,18 @@ from v2hdm.simulate.training.hardships import (
     with_seams,
 )
 from v2hdm.simulate.training.paint import Bend, RoadPaint, port_paint, random_brush, rectangle, street_paint
-from v2hdm.simulate.training.views import TrainingView, random_view
+from v2hdm.simulate.training.views import TrainingView, random_view, turned_aside
 
 # The renderer keeps one tile per fleck size, so sizes come from a short list.
 _NEAR_M = 0.3
 _STEPS_BETWEEN = 5
 _LENS_TOLERANCE_PX = 1.0
+_TO_ONE_ASIDE = np.array(
+    [0, *(1 + PAINT_CLASSES.index(SEEN_ACROSS.get(kind, kind)) for kind in PAINT_CLASSES)], dtype=np.uint8
+)
+"""By label, that which a camera on the vehicle's side is to answer: the detector knows how its cameras look, and
+turns the names back, see :mod:`v2hdm.detection.sight`."""
+
 _FLECK_SIZES_M = tuple(float(s) for s in np.geomspace(0.12, 2.5, 10))
 
 
@@ -76,13 +82,17 @@ def training_sample(
     """
     rng = np.random.default_rng([seed, index])
     scene, lanes = random_scene(rng, difficulty, hardships)
-    view = random_view(rng, width, height)
+    straight = random_view(rng, width, height)
+    places = [paint.polygon_map.mean(axis=0) for paint in scene.paints if paint.kind in CORNERED_CLASSES]
+    for_optics, for_view = rng.spawn(2)
+    view = turned_aside(for_view, straight, places, hardships.aside)
     scene = _without_hidden_boxes(scene, view)
-    optics = overexposed(rng.spawn(1)[0], view.optics, hardships.overexposed)
+    optics = overexposed(for_optics, view.optics, hardships.overexposed)
     rendered = Renderer(scene).render(view.info, view.cam_from_map, rng, optics, view.motion)
     seen = (image_line(view, lane) for lane in lanes)
     lanes_px = tuple(lane for lane in seen if len(lane) > 1)
-    return TrainingSample(rendered.image, rendered.labels, rendered.hidden, lanes_px)
+    labels = rendered.labels if view is straight else _TO_ONE_ASIDE[rendered.labels]
+    return TrainingSample(rendered.image, labels, rendered.hidden, lanes_px)
 
 
 def image_points(view: TrainingView, points_map: FloatArray) -> FloatArray:

@@ -6,16 +6,19 @@ pinhole camera, one whose principal point lies anywhere, even outside: no large 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from v2hdm.detection.camera.lens import distort_points, undistort_points
+from v2hdm.detection.camera.view import ASIDE_RAD
 from v2hdm.records import CameraInfo, FloatArray
 from v2hdm.simulate.render.optics import Motion, Optics
 
 _LENS_TOLERANCE_PX = 0.1
 _BORDER_POINTS = 17
+_PASSED_M = (2.0, 12.0)
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,30 @@ def random_view(rng: np.random.Generator, width: int, height: int) -> TrainingVi
         info = _crop_camera(rng, width, height, focal_px, pitch)
     cam_from_map = looking(np.array([0.0, rng.normal(0, 0.6), height_m]), yaw, float(pitch), roll)
     return TrainingView(info, cam_from_map, _random_optics(rng), _random_motion(rng))
+
+
+def turned_aside(
+    rng: np.random.Generator, view: TrainingView, places_map: Sequence[FloatArray], share: float
+) -> TrainingView:
+    """The view or, in a ``share`` of cases, that of a camera on the vehicle's side that passes a place.
+
+    It looks across the way, at :data:`ASIDE_RAD` to it or more, at one of the places (2,), while the vehicle
+    drives along it, so that what moves during the exposure moves sideways.
+    """
+    if rng.random() >= share or not len(places_map):
+        return view
+    yaw = rng.choice([-1.0, 1.0]) * rng.uniform(ASIDE_RAD, np.pi - ASIDE_RAD)
+    right, _, forward = view.cam_from_map[:3, :3]
+    pitch, roll = -np.arcsin(forward[2]), np.arcsin(np.clip(-right[2] / np.hypot(*forward[:2]), -1, 1))
+    height_m = -view.cam_from_map[:3, 2] @ view.cam_from_map[:3, 3]
+    focal_px, _, centre_px = view.info.intrinsic[0]
+    bearing = yaw - np.arctan((view.info.width / 2 - centre_px) / focal_px) + rng.normal(0, 0.15)
+    away = _log_uniform(rng, *_PASSED_M) * np.array([np.cos(bearing), np.sin(bearing)])
+    centre = np.append(places_map[int(rng.integers(len(places_map)))] - away, height_m)
+    cam_from_map = looking(centre, float(yaw), float(pitch), float(roll))
+    ahead = cam_from_map[:3, 0] * np.linalg.norm(view.motion.velocity_cam)
+    motion = replace(view.motion, velocity_cam=(float(ahead[0]), float(ahead[1]), float(ahead[2])))
+    return TrainingView(view.info, cam_from_map, view.optics, motion)
 
 
 def looking(centre_map: FloatArray, yaw_rad: float, pitch_rad: float, roll_rad: float) -> FloatArray:
