@@ -22,6 +22,7 @@ from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.corners.quad import order_corners
 from v2hdm.detection.corners.rectified import rectified_views
+from v2hdm.detection.corners.straight import Quads
 from v2hdm.records import DIAMOND, PAINT_CLASSES, Camera, CameraInfo
 
 HEIGHT, WIDTH = 360, 640
@@ -78,7 +79,9 @@ def crisp_view(kind: str) -> np.ndarray:
     view = CameraView(camera, 16)
     ground = view.ground(view.undistort(corners_px[0]))[None]
     image = picture(camera, [shape])
-    return rectified_views(image, view, replace(blank, kinds=kinds), corners_px, ground, [kind])[0]
+    return rectified_views(
+        image, view, replace(blank, kinds=kinds), Quads.seen(view, corners_px), ground, [kind]
+    )[0]
 
 
 def diamond(

@@ -24,6 +24,7 @@ from v2hdm.detection.corners.grey import linear_grey
 from v2hdm.detection.corners.quad import order_corners
 from v2hdm.detection.corners.rectified import CHANNELS
 from v2hdm.detection.corners.refine import doubt_corners
+from v2hdm.detection.corners.straight import Quads
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, STOP_LINE
@@ -31,7 +32,7 @@ from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, STOP_LINE
 
 def steps_of(image: np.ndarray, corners_px: np.ndarray) -> Steps:
     whole = np.array([[0, 0, image.shape[1], image.shape[0]]])
-    return grey_steps(linear_grey(image, 0, len(image), whole, False), corners_px)
+    return grey_steps(linear_grey(image, 0, len(image), whole, False), Quads.straight(corners_px))
 
 
 def test_the_steps_of_a_marking_are_those_of_its_paint_and_end_at_its_corners():
@@ -64,7 +65,7 @@ def test_all_sides_of_paint_are_even_in_sun_and_in_shade_and_half_in_each():
     for lit in (image, shaded, 0.4 * image):
         whole = np.array([[0, 0, image.shape[1], image.shape[0]]])
         grey = linear_grey(lit.astype(np.uint8), 0, len(image), whole, True)
-        assert not grey_steps(grey, corners_px).uneven().any()
+        assert not grey_steps(grey, Quads.straight(corners_px)).uneven().any()
 
 
 @pytest.mark.parametrize("beyond", [0.3, 0.05])
@@ -78,7 +79,7 @@ def test_a_worn_end_and_one_that_a_shadow_makes_are_uneven(beyond):
     cv2.fillConvexPoly(image, np.round(rest * 16).astype(np.int32), (beyond,) * 3, cv2.LINE_AA, 4)
     whole = np.array([[0, 0, image.shape[1], image.shape[0]]])
     grey = linear_grey(np.round(255 * image).astype(np.uint8), 0, len(image), whole, True)
-    uneven = grey_steps(grey, corners_px[None]).uneven()[0]
+    uneven = grey_steps(grey, Quads.straight(corners_px[None])).uneven()[0]
     np.testing.assert_array_equal(uneven, corners_px[:, 1] < corners_px[:, 1].mean())
 
 

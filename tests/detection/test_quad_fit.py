@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.detection.pictures import brightness_model, diamond, make_camera, picture, to_image
+from tests.detection.pictures import LENSES, bar, brightness_model, diamond, make_camera, picture, to_image
 from tests.detection.test_corners import errors_px, normalised
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.correlation import variance_inflation
@@ -13,6 +13,7 @@ from v2hdm.detection.corners.quad import intersect_sides, order_corners, side_fr
 from v2hdm.detection.corners.quad_fit import fit_quads
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.records import STOP_LINE
 
 SHAPES = [diamond(x, y, 1.2, 0.7, 9.0 * y) for x in (6.0, 8.0, 10.0) for y in (-1.9, -0.3, 1.4)]
 
@@ -64,6 +65,26 @@ def test_a_marking_that_the_network_draws_small_is_fitted_as_a_whole(kept):
     error = (fit.corners_px[0] - true_px).ravel()
     assert np.abs(error).max() < 1.0
     assert error @ np.linalg.solve(fit.covariance[0], error) < 2 * 8, "as far off as it says"
+
+
+@pytest.mark.parametrize("lens", sorted(LENSES))
+@pytest.mark.parametrize(
+    "shape", [bar(6.0, 0.0, 0.3, 2.4), bar(5.0, 0.3, 0.15, 3.2), bar(7.0, 0.0, 0.4, 4.0)]
+)
+def test_a_bar_across_the_view_is_found_from_end_to_end(tmp_path, lens, shape):
+    """It is too slim for its ends to be located by themselves, and so long that the lens bows its sides."""
+    camera = make_camera(lens)
+    detector = Detector.load(brightness_model(tmp_path, STOP_LINE), DetectorOptions(min_confidence=0.0))
+    truth_px = [to_image(camera, shape)]
+    assert np.ptp(truth_px[0], axis=0)[0] > 200
+    parts = []
+    for seed in range(3):
+        markings, _ = detector.detect(picture(camera, [shape], seed=seed, ground=0.2, paint=0.6), camera)
+        parts.append(errors_px(markings, truth_px))
+    errors, covariances = (np.concatenate(part) for part in zip(*parts, strict=True))
+    assert len(errors) == 3 * 4
+    assert np.linalg.norm(errors, axis=1).max() < 0.25
+    assert np.median(normalised(errors, covariances)) < 4.0
 
 
 def test_a_fit_that_leaves_its_start_behind_has_not_settled():

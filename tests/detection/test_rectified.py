@@ -7,6 +7,7 @@ from tests.detection.pictures import bar, diamond, foreground_of, make_camera, p
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.quad import order_corners
 from v2hdm.detection.corners.rectified import CHANNELS, SIZE, rectified_views
+from v2hdm.detection.corners.straight import Quads
 from v2hdm.records import DIAMOND, LANE_DASH
 
 CAMERA = make_camera("plumb_bob")
@@ -19,7 +20,9 @@ def seen(image: np.ndarray, corners_px: np.ndarray, kind: str) -> np.ndarray:
     blank = np.zeros((CAMERA.info.height // 2, CAMERA.info.width // 2), np.float32)
     foreground = foreground_of(blank, blank.astype(np.int16), 0)
     ground = VIEW.ground(VIEW.undistort(corners_px))
-    return rectified_views(image, VIEW, foreground, corners_px[None], ground[None], [kind])[0]
+    return rectified_views(image, VIEW, foreground, Quads.seen(VIEW, corners_px[None]), ground[None], [kind])[
+        0
+    ]
 
 
 def corners_of(shape: np.ndarray) -> np.ndarray:

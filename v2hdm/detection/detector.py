@@ -180,7 +180,8 @@ class Detector:
             kinds, least = _tried_as(c)
             if not kinds:
                 continue
-            start = starting_corners(kinds[0], c.outline_pinhole_px, c.outline_vehicle, view)
+            paint_px2 = c.blob.cells * self.network.info.paint_stride**2
+            start = starting_corners(kinds[0], c.outline_pinhole_px, c.outline_vehicle, paint_px2, view)
             if start is not None and start[1] >= least:
                 claims = {name: _claim(c, name) for name in kinds}
                 starts.append(QuadStart(claims, start[0], c.index, c.outline_pinhole_px))

@@ -22,7 +22,7 @@ FINE_ENOUGH_M = 0.007
 
 
 ASIDE_RAD = np.deg2rad(60)
-"""A camera that looks farther than this off the way that its vehicle drives, ahead or back, looks across it."""
+"""A camera that looks farther than this off the way that its vehicle drives, ahead or back, looks aside."""
 
 
 class CameraView:

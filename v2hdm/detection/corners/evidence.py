@@ -14,6 +14,7 @@ from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.corners.grey import GreyBand, log_grey
 from v2hdm.detection.corners.quad import preceding, side_frames, width
+from v2hdm.detection.corners.straight import Quads
 from v2hdm.records import BoolArray, FloatArray
 
 FEATURES = (
@@ -160,19 +161,20 @@ def whole_ends(doubtful: BoolArray, length: FloatArray) -> BoolArray:
     return np.asarray(doubtful | np.take_along_axis(doubtful, partner, axis=1))
 
 
-def grey_steps(grey: GreyBand, corners_px: FloatArray) -> Steps:
-    """Look across the sides of quadrilaterals (M, 4, 2), recorded px, and across their continuations."""
-    tangent, normal, length = side_frames(corners_px)
+def grey_steps(grey: GreyBand, quads: Quads) -> Steps:
+    """Look across the sides of M quadrilaterals and across their continuations."""
+    tangent, normal, length = side_frames(quads.corners)
     along = (np.arange(_PROFILES) + 0.5) / _PROFILES * length[..., None]
     beyond = np.concatenate([-_BEYOND_PX + 0 * length[..., None], length[..., None] + _BEYOND_PX], axis=-1)
     place = np.concatenate([along, beyond, along], axis=-1)
-    inside_px = np.minimum(_FAR_PX, _ACROSS_SHARE * width(corners_px))[:, None, None]
+    inside_px = np.minimum(_FAR_PX, _ACROSS_SHARE * width(quads.corners))[:, None, None]
     near = np.arange(place.shape[-1]) >= _PROFILES + beyond.shape[-1]
     inside_px = np.where(near, np.minimum(_NEAR_PX, inside_px / 2), inside_px)
     outside_px = np.broadcast_to(np.where(near, _NEAR_PX, _FAR_PX), inside_px.shape)
-    foot = corners_px[:, :, None] + place[..., None] * tangent[:, :, None]
-    across = np.stack([-inside_px, outside_px])[..., None] * normal[:, :, None]
-    values = grey.at_limit.sample((foot + across).reshape(2, -1, 2)).reshape(2, *place.shape)
+    foot = quads.corners[:, :, None] + place[..., None] * tangent[:, :, None]
+    across = np.stack([-inside_px, outside_px], axis=1)[..., None] * normal[:, None, :, None]
+    points_px = quads.px(foot[:, None] + across).swapaxes(0, 1)
+    values = grey.at_limit.sample(points_px.reshape(2, -1, 2)).reshape(2, *place.shape)
     logs = log_grey(values)
     steps = np.nan_to_num(logs[0] - logs[1]).astype(np.float64)
     first, second = _PROFILES, _PROFILES + beyond.shape[-1]
@@ -195,19 +197,19 @@ def gather(
     steps: Steps,
     foreground: Foreground,
     view: CameraView,
-    corners_px: FloatArray,
+    quads: Quads,
     ground: FloatArray,
     claims: list[Claim],
     valid: BoolArray,
 ) -> FloatArray:
-    """The :data:`FEATURES` (M, F) of quadrilaterals ``corners_px`` (M, 4, 2).
+    """The :data:`FEATURES` (M, F) of M quadrilaterals.
 
     Args:
         steps: what the image shows across their sides.
         foreground: what the network says of the image.
         view: the camera.
-        corners_px: recorded px.
-        ground: the same on the ground (M, 4, 2), m; NaN above the horizon.
+        quads: the quadrilaterals.
+        ground: their corners on the ground (M, 4, 2), m; NaN above the horizon.
         claims: what the network claims of each one's blob.
         valid: (M, 4) which corners the image gave.
     """
@@ -218,10 +220,10 @@ def gather(
     typical = np.maximum(steps.typical, _LEAST_STEP)
     good = steps.along > np.maximum(_SUPPORT_SHARE * typical, _LEAST_STEP)[:, None, None]
     going_on = median(steps.going_on)
-    at_border = ~view.inside(corners_px.reshape(-1, 2), _BORDER_PX).reshape(-1, 4).all(axis=1)
-    inside, beside = _paint_odds(foreground, corners_px)
+    at_border = ~view.inside(quads.px(quads.corners.copy()), _BORDER_PX).all(axis=1)
+    inside, beside = _paint_odds(foreground, quads)
     sharpness = np.clip(steps.near / typical, 0.0, 1.2)
-    log_width_px = np.log(np.maximum(width(corners_px), 0.3))
+    log_width_px = np.log(np.maximum(width(quads.corners), 0.3))
     columns = {
         "odds_inside": inside.mean(axis=1),
         "surest_inside": np.sort(inside, axis=1)[:, _SUREST],
@@ -250,18 +252,18 @@ def gather(
     return np.nan_to_num(np.column_stack([columns[name] for name in FEATURES]).astype(np.float64))
 
 
-def _paint_odds(foreground: Foreground, corners_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _paint_odds(foreground: Foreground, quads: Quads) -> tuple[FloatArray, FloatArray]:
     """Log odds of paint all over the inside (M, 36) of quadrilaterals, and beside each side (M, 4, 6)."""
-    tangent, normal, length = side_frames(corners_px)
+    tangent, normal, length = side_frames(quads.corners)
     along = (_GRID * length[..., None])[..., None] * tangent[:, :, None]
-    beside = corners_px[:, :, None] + along + _BESIDE_PX * normal[:, :, None]
-    inner = _inner_grid(corners_px)
-    odds = foreground.odds_at(np.concatenate([inner, beside.reshape(len(beside), -1, 2)], axis=1))
+    beside = quads.corners[:, :, None] + along + _BESIDE_PX * normal[:, :, None]
+    inner = _inner_grid(quads.corners)
+    odds = foreground.odds_at(quads.px(np.concatenate([inner, beside.reshape(len(beside), -1, 2)], axis=1)))
     return odds[:, : inner.shape[1]], odds[:, inner.shape[1] :].reshape(beside.shape[:-1])
 
 
-def _inner_grid(corners_px: FloatArray) -> FloatArray:
+def _inner_grid(corners: FloatArray) -> FloatArray:
     """Points (M, 36, 2) all over the inside of quadrilaterals (M, 4, 2), by bilinear interpolation."""
     a, b = (part.reshape(-1) for part in np.meshgrid(_GRID, _GRID))
     weight = np.stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b], axis=1)
-    return np.asarray(weight @ corners_px)
+    return np.asarray(weight @ corners)

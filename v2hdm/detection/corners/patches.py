@@ -19,8 +19,8 @@ _MAX_PIXELS = 350
 _MAX_BETWEEN = 200
 _END_PX = 2.0
 _MOST_ENDS = 1 / 3
-"""What has two ends that make up no more than this share of its length is slim; an end reaches so far past its
-corners."""
+"""What has two ends that make up no more than this share of its length is slim; an end reaches so far past
+its corners."""
 
 
 @dataclass(frozen=True)

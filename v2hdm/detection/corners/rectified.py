@@ -16,6 +16,7 @@ from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.corners.grey import grey_of, linear_bgr, log_grey
 from v2hdm.detection.corners.quad import following, side_frames
+from v2hdm.detection.corners.straight import Quads
 from v2hdm.records import DIAMOND, LANE_LINE, OTHER_PAINT, OUTLINED_CLASSES, FloatArray
 
 CHANNELS = ("log_grey", "blueness", "paint_odds", "own_share", "line_share", "symbol_share", "outside")
@@ -47,7 +48,7 @@ def rectified_views(
     image_bgr: np.ndarray,
     view: CameraView,
     foreground: Foreground,
-    corners_px: FloatArray,
+    quads: Quads,
     ground: FloatArray,
     kinds: Sequence[str],
 ) -> np.ndarray:
@@ -57,16 +58,16 @@ def rectified_views(
         image_bgr: (H, W, 3) uint8.
         view: the camera.
         foreground: what the network says of the image.
-        corners_px: (M, 4, 2) recorded px.
-        ground: the same on the ground (M, 4, 2), m; NaN above the horizon.
+        quads: the quadrilaterals.
+        ground: their corners on the ground (M, 4, 2), m; NaN above the horizon.
         kinds: the classes; columns run along the longer sides of all but diamonds.
     """
     diamond = np.array(kinds) == DIAMOND
     length = np.nan_to_num(side_frames(ground)[2], nan=1.0)
     lengthwise = length[:, 0] + length[:, 2] >= length[:, 1] + length[:, 3]
-    ordered = np.where(lengthwise[:, None, None], corners_px, following(corners_px))
-    points = _points(ordered, diamond, SIZE)
-    fine = _points(ordered, diamond, _FINER * SIZE)
+    ordered = np.where(lengthwise[:, None, None], quads.corners, following(quads.corners))
+    points = quads.px(_points(ordered, diamond, SIZE))
+    fine = quads.px(_points(ordered, diamond, _FINER * SIZE))
     height, width = image_bgr.shape[:2]
     outside = ((points < 0) | (points > [width - 1, height - 1])).any(axis=-1)
     grey, blueness = _light(image_bgr, fine, view.camera.linear_response)
@@ -79,15 +80,15 @@ def rectified_views(
     return np.stack(planes, axis=1).astype(np.float32)
 
 
-def _points(corners_px: FloatArray, diamond: np.ndarray, size: int) -> FloatArray:
-    """Where (M, size, size, 2) px the elements of pictures lie, the first corner near the first of them."""
+def _points(corners: FloatArray, diamond: np.ndarray, size: int) -> FloatArray:
+    """Where (M, size, size, 2) the elements of pictures lie, the first corner near the first of them."""
     along, across = (
         np.where(diamond, _AROUND, margin)[:, None] * [-1, 1] + [0, 1] for margin in (_BEFORE, _BESIDE)
     )
     step = (np.arange(size) + 0.5) / size
     a = (along[:, :1] + (along[:, 1:] - along[:, :1]) * step)[:, None, :, None]
     b = (across[:, :1] + (across[:, 1:] - across[:, :1]) * step)[:, :, None, None]
-    first, second, third, fourth = (corners_px[:, None, None, corner] for corner in range(4))
+    first, second, third, fourth = (corners[:, None, None, corner] for corner in range(4))
     # Heckbert, "Fundamentals of Texture Mapping and Image Warping" (1989), 2.2.3: from the unit square.
     surplus = first - second + third - fourth
     one, other = second - third, fourth - third

@@ -22,6 +22,7 @@ from v2hdm.detection.corners.outline_fit import fit_outlines
 from v2hdm.detection.corners.quad import is_convex, side_frames, width
 from v2hdm.detection.corners.quad_fit import fit_quads
 from v2hdm.detection.corners.rectified import rectified_views
+from v2hdm.detection.corners.straight import Quads
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import DIAMOND, LANE_DASH, BoolArray, FloatArray, MarkingDetection
 
@@ -160,18 +161,18 @@ def _fitted(
         if options.vague_corners and len(overexposed):
             _take_quads(found, overexposed, grey.at_limit, shared, _BLOOM_SIGMA_PX)
     found.covariance = _COVARIANCE_FACTOR * found.covariance + _COVARIANCE_FLOOR_PX**2 * np.eye(8)
-    steps = grey_steps(grey, found.px)
+    quads = Quads.seen(view, found.px)
+    steps = grey_steps(grey, quads)
     runs_on, uneven = steps.runs_on(), steps.uneven()
     found.valid &= ~runs_on
     _reject(found, view, options)
     row_start = np.repeat(np.arange(len(starts)), [len(s.claims) for s in starts])
     claims = [claim for s in starts for claim in s.claims.values()]
     ground = view.ground(view.undistort(found.px.reshape(-1, 2))).reshape(found.px.shape)[row_start]
-    evidence = gather(
-        steps.take(row_start), foreground, view, found.px[row_start], ground, claims, found.valid[row_start]
-    )
+    row_quads, row_valid = quads.take(row_start), found.valid[row_start]
+    evidence = gather(steps.take(row_start), foreground, view, row_quads, ground, claims, row_valid)
     kinds = [kind for s in starts for kind in s.claims]
-    views = rectified_views(image_bgr, view, foreground, found.px[row_start], ground, kinds)
+    views = rectified_views(image_bgr, view, foreground, row_quads, ground, kinds)
     ends = whole_ends(runs_on | uneven, side_frames(found.px)[2])
     return _Fitted(starts, found, row_start, kinds, ground, evidence, views, uneven, ends)
 
@@ -279,9 +280,7 @@ def _take_quads(found: Corners, group: np.ndarray, grey: GreyBand, far: _Far, bl
     """
     foreground = far.foreground
     owner = foreground.owner[(grey.top - foreground.top) // foreground.stride :]
-    fit = fit_quads(
-        grey, owner, foreground.stride, far.blobs[group], far.view, found.px[group], far.blur_px
-    )
+    fit = fit_quads(grey, owner, foreground.stride, far.blobs[group], far.view, found.px[group], far.blur_px)
     corners, covariance = fit.corners_px, fit.covariance + bloom_px**2 * np.eye(8)
     good = fit.settled & (fit.misfit < _MAX_MISFIT) & (fit.amplitude > _MIN_AMPLITUDE)
     good &= np.isfinite(corners).all(axis=(1, 2))

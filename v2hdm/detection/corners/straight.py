@@ -1,4 +1,4 @@
-"""Coordinates about a marking in which what is straight on the ground is straight, whatever the lens."""
+"""Markings through a lens: coordinates in which what is straight on the ground is straight."""
 
 from __future__ import annotations
 
@@ -6,10 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from v2hdm.detection.camera.lens import has_distortion
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.found import block_diagonal
 from v2hdm.detection.corners.quad import following
-from v2hdm.records import FloatArray
+from v2hdm.records import BoolArray, FloatArray
+
+_SEEN_BOW_PX = 0.25
+"""What is looked up beside the sides of a quadrilateral is not changed by less."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,10 @@ class StraightFrames:
         """Pinhole px (M, N, 2) of points (M, N, 2) of each marking."""
         return np.asarray(points @ np.linalg.inv(self.scale).swapaxes(1, 2) + self.middle[:, None])
 
+    def to_px(self, points: FloatArray) -> FloatArray:
+        """Recorded px (M, N, 2) of points (M, N, 2) of each marking."""
+        return self.view.distort(self.to_pinhole(points).reshape(-1, 2)).reshape(points.shape)
+
     def to_image(self, corners: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Corners (M, 4, 2) and their covariance (M, 8, 8) in recorded px."""
         pinhole = self.to_pinhole(corners).reshape(-1, 2)
@@ -54,7 +62,51 @@ class StraightFrames:
     def bow_px(self, corners_px: FloatArray) -> FloatArray:
         """By how much (M,) the lens bows the sides of quadrilaterals with recorded corners (M, 4, 2)."""
         corners = self.from_image(corners_px)
-        middles = self.to_pinhole((corners + following(corners)) / 2)
-        recorded = self.view.distort(middles.reshape(-1, 2)).reshape(corners.shape)
+        recorded = self.to_px((corners + following(corners)) / 2)
         chords = (corners_px + following(corners_px)) / 2
         return np.asarray(np.linalg.norm(recorded - chords, axis=-1).max(axis=1))
+
+
+@dataclass(frozen=True)
+class Quads:
+    """M quadrilaterals whose sides are straight between their ``corners`` (M, 4, 2).
+
+    Those are recorded px, but for those ``bowed`` (M,) by the lens: their places are in ``frames`` (of them
+    alone), and :meth:`px` tells where they are in the image.
+    """
+
+    corners: FloatArray
+    bowed: BoolArray
+    frames: StraightFrames | None
+
+    @classmethod
+    def straight(cls, corners_px: FloatArray) -> Quads:
+        """Those (M, 4, 2) in an image without distortion."""
+        return cls(corners_px, np.zeros(len(corners_px), dtype=np.bool_), None)
+
+    @classmethod
+    def seen(cls, view: CameraView, corners_px: FloatArray) -> Quads:
+        """Those with recorded corners (M, 4, 2)."""
+        if not has_distortion(view.info) or not len(corners_px):
+            return cls.straight(corners_px)
+        frames = StraightFrames.about(view, corners_px)
+        bowed = frames.bow_px(corners_px) > _SEEN_BOW_PX
+        if not bowed.any():
+            return cls.straight(corners_px)
+        frames, corners = frames.take(bowed), corners_px.copy()
+        corners[bowed] = frames.from_image(corners_px[bowed])
+        return cls(corners, bowed, frames)
+
+    def take(self, rows: np.ndarray) -> Quads:
+        """Some of them, which may come several times."""
+        bowed = self.bowed[rows]
+        place = np.cumsum(self.bowed) - 1
+        frames = None if self.frames is None else self.frames.take(place[rows][bowed])
+        return Quads(self.corners[rows], bowed, frames)
+
+    def px(self, points: FloatArray) -> FloatArray:
+        """Recorded px (M, ..., 2) of points (M, ..., 2) laid out about each one's corners: those, changed."""
+        if self.frames is not None and self.bowed.any():
+            flat = points[self.bowed].reshape(int(self.bowed.sum()), -1, 2)
+            points[self.bowed] = self.frames.to_px(flat).reshape(-1, *points.shape[1:])
+        return points

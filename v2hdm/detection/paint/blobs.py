@@ -68,6 +68,11 @@ class Blob:
     touches_symbol: bool = False
 
     @property
+    def cells(self) -> int:
+        """How many elements it covers."""
+        return int(np.count_nonzero(self.level > 0))
+
+    @property
     def kind(self) -> str:
         """The likeliest class."""
         return max(self.class_score, key=self.class_score.__getitem__)

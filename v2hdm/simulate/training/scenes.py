@@ -40,8 +40,8 @@ _LENS_TOLERANCE_PX = 1.0
 _TO_ONE_ASIDE = np.array(
     [0, *(1 + PAINT_CLASSES.index(SEEN_ACROSS.get(kind, kind)) for kind in PAINT_CLASSES)], dtype=np.uint8
 )
-"""By label, that which a camera on the vehicle's side is to answer: the detector knows how its cameras look, and
-turns the names back, see :mod:`v2hdm.detection.sight`."""
+"""By label, the answer for a camera on the vehicle's side: the detector knows how its cameras look, and turns
+the names back, see :mod:`v2hdm.detection.sight`."""
 
 _FLECK_SIZES_M = tuple(float(s) for s in np.geomspace(0.12, 2.5, 10))
 
