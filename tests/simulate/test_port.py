@@ -103,6 +103,20 @@ def test_a_dashed_lane_runs_through_the_middle_of_its_dashes() -> None:
     assert np.linalg.norm(middles[:, None] - lane[None], axis=2).min(axis=1).max() < 0.26
 
 
+def test_a_dashed_lane_bends_between_its_dashes_as_its_road_does() -> None:
+    """Bent as sharply as yards are, a straight line across a gap would cut the bend by decimetres."""
+    config = PaintConfig()
+    route = build_route(RouteConfig(pieces=[[20.0, 0.0], [25.0, 120.0], [20.0, 0.0]]))
+    layout = build_layout(config, route, np.random.default_rng(1))
+    lanes = [lane.points_map for lane in layout.lanes if lane.kind == LANE_DASH]
+    stations = np.arange(0.0, route.length_m, 0.01)
+    for lane, offset_m in zip(lanes, config.dashed_offsets_m, strict=True):
+        painted = route.points_at(stations, offset_m)
+        beside = np.linalg.norm(lane[:, None] - painted, axis=2).min(axis=1)
+        assert beside.max() < 0.12, "no more than a straight dash cuts"
+        assert np.linalg.norm(np.diff(lane, axis=0), axis=1).max() <= 0.5 + 1e-3
+
+
 def test_the_route_turns_by_what_its_pieces_say() -> None:
     route = build_route(RouteConfig(pieces=[[30.0, 0.0], [20.0, 90.0], [30.0, 0.0]]))
     assert route.length_m == pytest.approx(80.0)

@@ -106,9 +106,11 @@ def _ribbon(route: Route, ends_m: FloatArray, offset_m: float, width_m: float) -
 def _dashed_line(
     config: PaintConfig, route: Route, offset_m: float, layout: Layout, rng: np.random.Generator
 ) -> None:
-    """Dashes as markings, and one lane through them all, straight within dashes and across gaps."""
+    """Dashes as markings, each straight, and one lane through them all, beside the route between them."""
     period = config.dash_length_m + config.dash_gap_m
-    corners = []
+    longer = 1 + abs(offset_m) * float(np.abs(route.curvature).max())
+    points: list[FloatArray] = []
+    last_m = 0.0
     for start in np.arange(rng.uniform(0.5, period), route.length_m - period, period):
         ends = np.array([start, start + config.dash_length_m])
         polygon = _ribbon(route, ends, offset_m, config.line_width_m)
@@ -117,20 +119,19 @@ def _dashed_line(
             Paint(kind=LANE_DASH, polygon_map=polygon, wear=wear, dirt=dirt, seed=int(rng.integers(1 << 30)))
         )
         layout.markings.append(Marking(LANE_DASH, polygon, 0))
-        corners += [polygon[[0, 3]].mean(axis=0), polygon[[1, 2]].mean(axis=0)]
-    if not corners:
-        return
-    points = _resampled(np.array(corners))
-    layout.lanes.append(Lane(LANE_DASH, points, 0))
+        if points:
+            gap_m = start - last_m
+            points.append(route.points_at(last_m + gap_m * _shares(longer * gap_m)[1:-1], offset_m))
+        tail, head = polygon[[0, 3]].mean(axis=0), polygon[[1, 2]].mean(axis=0)
+        points.append(tail + _shares(float(np.linalg.norm(head - tail)))[:, None] * (head - tail))
+        last_m = float(ends[1])
+    if points:
+        layout.lanes.append(Lane(LANE_DASH, np.concatenate(points), 0))
 
 
-def _resampled(points: FloatArray) -> FloatArray:
-    """A polyline with its own vertices and more between them, at most half a metre apart."""
-    out = [points[:1]]
-    for a, b in pairwise(points):
-        count = max(int(np.ceil(np.linalg.norm(b - a) / _VERTEX_SPACING_M)), 1)
-        out.append(a + (np.arange(1, count + 1) / count)[:, None] * (b - a))
-    return np.vstack(out)
+def _shares(length_m: float) -> FloatArray:
+    """From 0 to 1 in steps that are at most half a metre of a length."""
+    return np.linspace(0.0, 1.0, max(int(np.ceil(length_m / _VERTEX_SPACING_M)), 1) + 1)
 
 
 def _diamond_row(
