@@ -18,7 +18,7 @@ _SEEN_BOW_PX = 0.25
 
 @dataclass(frozen=True)
 class StraightFrames:
-    """One frame for each of M markings: pinhole px from its middle, scaled to recorded ones there.
+    """One frame for each of M markings: pinhole px from its middle in the image, scaled to recorded ones.
 
     So a recorded pixel, and what blurs it, is about as large and as round in them as in the image, also near
     the border of a wide lens. ``middle`` (M, 2) is in pinhole px, ``scale`` (M, 2, 2) leads to recorded ones.
@@ -31,7 +31,9 @@ class StraightFrames:
     @classmethod
     def about(cls, view: CameraView, corners_px: FloatArray) -> StraightFrames:
         """Those of markings with recorded ``corners_px`` (M, 4, 2)."""
-        middle = view.undistort(corners_px.reshape(-1, 2)).reshape(corners_px.shape).mean(axis=1)
+        # Beyond the image a lens model may fold, and has no scale.
+        within = np.clip(corners_px.mean(axis=1), 0.0, [view.info.width - 1, view.info.height - 1])
+        middle = view.undistort(within)
         return cls(view, middle, view.distort_jacobian(middle))
 
     def take(self, rows: np.ndarray) -> StraightFrames:
