@@ -29,7 +29,8 @@ class Patches:
 
     ``points`` (M, 3, N) float32 are (x, y, 1) in the markings' frames; ``values``
     (M, N) float32 grey; ``use`` (M, N) float32 1 where a pixel takes part, else 0; ``neighbours``
-    (2, M, N) the place in the list of the lattice's next pixel to the right and below, 0 for none;
+    (2, M, N) the place in the list of the lattice's next pixel to the right and below, 0 for none that is as
+    near as any is;
     ``clipped`` (M,) the share of pixels left out since the sensor was at its limit there.
     """
 
@@ -121,9 +122,17 @@ def cut_patches(
     patches.clipped[:] = np.bincount(marking, np.isposinf(values), len(low)) / np.maximum(count, 1)
     place_of_cell = np.zeros(band.size, dtype=np.intp)
     place_of_cell[cell] = place
+    near = _near_the_next(columns, size[:, 0])[marking, j], _near_the_next(rows, size[:, 1])[marking, i]
     for axis, following in ((0, 1), (1, across)):
-        patches.neighbours[axis, marking, place] = place_of_cell[cell + following]
+        patches.neighbours[axis, marking, place] = np.where(near[axis], place_of_cell[cell + following], 0)
     return patches
+
+
+def _near_the_next(places: np.ndarray, size: np.ndarray) -> BoolArray:
+    """Which places (M, n) along an axis, of those up to ``size`` (M,), are as near to the next as any is."""
+    apart = np.diff(places, append=places[:, -1:] + 1)
+    within = places + apart < size[:, None]
+    return np.asarray(apart == np.where(within, apart, apart.max()).min(axis=1, keepdims=True))
 
 
 def _lattice(corners: FloatArray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
