@@ -18,7 +18,7 @@ from v2hdm.simulate.render.optics import Motion, Optics
 
 _LENS_TOLERANCE_PX = 0.1
 _BORDER_POINTS = 17
-_PASSED_M = (2.0, 12.0)
+_FARTHEST_PASSED_M = 12.0
 
 
 @dataclass(frozen=True)
@@ -66,9 +66,11 @@ def turned_aside(
     right, _, forward = view.cam_from_map[:3, :3]
     pitch, roll = -np.arcsin(forward[2]), np.arcsin(np.clip(-right[2] / np.hypot(*forward[:2]), -1, 1))
     height_m = -view.cam_from_map[:3, 2] @ view.cam_from_map[:3, 3]
-    focal_px, _, centre_px = view.info.intrinsic[0]
-    bearing = yaw - np.arctan((view.info.width / 2 - centre_px) / focal_px) + rng.normal(0, 0.15)
-    away = _log_uniform(rng, *_PASSED_M) * np.array([np.cos(bearing), np.sin(bearing)])
+    (fx, _, cx), (_, fy, cy), _ = view.info.intrinsic
+    bearing = yaw - np.arctan((view.info.width / 2 - cx) / fx) + rng.normal(0, 0.15)
+    below = pitch + np.arctan((view.info.height * np.array([0.95, 0.15]) - cy) / fy)
+    near_m, far_m = height_m / np.tan(np.clip(below, np.arctan(height_m / _FARTHEST_PASSED_M), np.pi / 3))
+    away = rng.uniform(near_m, far_m) * np.array([np.cos(bearing), np.sin(bearing)])
     centre = np.append(places_map[int(rng.integers(len(places_map)))] - away, height_m)
     cam_from_map = looking(centre, float(yaw), float(pitch), float(roll))
     ahead = cam_from_map[:3, 0] * np.linalg.norm(view.motion.velocity_cam)
