@@ -83,7 +83,7 @@ class Gathered:
         corners_px: list[FloatArray] = []
 
         def gather_spy(*given: Any) -> FloatArray:
-            corners_px.extend(given[3])
+            corners_px.extend(given[3].corners_px)
             return gather(*given)
 
         def spy(evidence: FloatArray, views: np.ndarray, kinds: list[str], ground: FloatArray) -> FloatArray:

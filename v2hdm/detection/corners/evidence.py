@@ -220,7 +220,7 @@ def gather(
     typical = np.maximum(steps.typical, _LEAST_STEP)
     good = steps.along > np.maximum(_SUPPORT_SHARE * typical, _LEAST_STEP)[:, None, None]
     going_on = median(steps.going_on)
-    at_border = ~view.inside(quads.px(quads.corners.copy()), _BORDER_PX).all(axis=1)
+    at_border = ~view.inside(quads.corners_px, _BORDER_PX).all(axis=1)
     inside, beside = _paint_odds(foreground, quads)
     sharpness = np.clip(steps.near / typical, 0.0, 1.2)
     log_width_px = np.log(np.maximum(width(quads.corners), 0.3))

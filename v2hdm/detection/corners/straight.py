@@ -99,6 +99,11 @@ class Quads:
         corners[bowed] = frames.from_image(corners_px[bowed])
         return cls(corners, bowed, frames)
 
+    @property
+    def corners_px(self) -> FloatArray:
+        """Their corners (M, 4, 2) in the image."""
+        return self.px(self.corners.copy())
+
     def take(self, rows: np.ndarray) -> Quads:
         """Some of them, which may come several times."""
         bowed = self.bowed[rows]
