@@ -73,10 +73,11 @@ class StraightFrames:
 class Quads:
     """M quadrilaterals whose sides are straight between their ``corners`` (M, 4, 2).
 
-    Those are recorded px, but for those ``bowed`` (M,) by the lens: their places are in ``frames`` (of them
-    alone), and :meth:`px` tells where they are in the image.
+    Those are the recorded ``corners_px``, but for those ``bowed`` (M,) by the lens: their places are in
+    ``frames`` (of them alone), and :meth:`px` tells where they are in the image.
     """
 
+    corners_px: FloatArray
     corners: FloatArray
     bowed: BoolArray
     frames: StraightFrames | None
@@ -84,7 +85,7 @@ class Quads:
     @classmethod
     def straight(cls, corners_px: FloatArray) -> Quads:
         """Those (M, 4, 2) in an image without distortion."""
-        return cls(corners_px, np.zeros(len(corners_px), dtype=np.bool_), None)
+        return cls(corners_px, corners_px, np.zeros(len(corners_px), dtype=np.bool_), None)
 
     @classmethod
     def seen(cls, view: CameraView, corners_px: FloatArray) -> Quads:
@@ -97,23 +98,20 @@ class Quads:
             return cls.straight(corners_px)
         frames, corners = frames.take(bowed), corners_px.copy()
         corners[bowed] = frames.from_image(corners_px[bowed])
-        return cls(corners, bowed, frames)
-
-    @property
-    def corners_px(self) -> FloatArray:
-        """Their corners (M, 4, 2) in the image."""
-        return self.px(self.corners.copy())
+        return cls(corners_px, corners, bowed, frames)
 
     def take(self, rows: np.ndarray) -> Quads:
         """Some of them, which may come several times."""
         bowed = self.bowed[rows]
         place = np.cumsum(self.bowed) - 1
         frames = None if self.frames is None else self.frames.take(place[rows][bowed])
-        return Quads(self.corners[rows], bowed, frames)
+        return Quads(self.corners_px[rows], self.corners[rows], bowed, frames)
 
     def px(self, points: FloatArray) -> FloatArray:
-        """Recorded px (M, ..., 2) of points (M, ..., 2) laid out about each one's corners: those, changed."""
-        if self.frames is not None and self.bowed.any():
-            flat = points[self.bowed].reshape(int(self.bowed.sum()), -1, 2)
-            points[self.bowed] = self.frames.to_px(flat).reshape(-1, *points.shape[1:])
+        """Recorded px (M, ..., 2) of points (M, ..., 2) laid out about each one's corners."""
+        if self.frames is None or not self.bowed.any():
+            return points
+        points = points.copy()
+        flat = points[self.bowed].reshape(int(self.bowed.sum()), -1, 2)
+        points[self.bowed] = self.frames.to_px(flat).reshape(-1, *points.shape[1:])
         return points
