@@ -59,7 +59,7 @@ class LossConfig:
     paint_weight: float = 2.0
     dice: float = 0.5
     kinds: float = 1.0
-    lanes: float = 0.6
+    lanes: float = 1.0
     lane_weight: float = 3.0
 
 
