@@ -142,3 +142,11 @@ def test_a_diamond_like_the_others_stays_one_whatever_some_images_take_it_for() 
     sound.corners_map[7] = sound.corners_map[7].mean(axis=0) + 1.6 * DIAMOND
     judged = replace(sound, seen_as_symbol=seen_as_symbol)
     assert list(refused(judged)) == [7], "the odd one is refused, not the typical one"
+
+
+def test_the_head_of_an_arrow_is_refused_even_if_it_is_like_the_diamonds() -> None:
+    sound = row_of_diamonds()
+    seen_as_symbol = np.zeros(COUNT, dtype=np.int64)
+    seen_as_symbol[[2, 7]] = sound.sightings[2] - 1, sound.sightings[7]
+    judged = replace(sound, seen_as_symbol=seen_as_symbol)
+    assert refused(judged) == {7: "part of an arrow or a chevron"}

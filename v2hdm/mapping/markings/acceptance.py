@@ -32,7 +32,8 @@ MIN_EASY_VIEWS = 5
 MIN_SYMBOL_VIEWS = 2
 SYMBOL_SHARE = 0.34
 """What so many images show as part of a symbol, and so many for each that shows it alone, is no marking. It
-is, though, if its shape is that of others of its class, and not a dash: shafts are alike, too."""
+is, though, if its shape is that of others of its class, unless as many images show the symbol: the head of an
+arrow is like a diamond. For a dash its shape says nothing: shafts are alike, too."""
 
 MIN_SHAPE_TOLERANCE_M = 0.05
 """Lengths that differ by less are the same, however short they are."""
@@ -88,9 +89,9 @@ def judge(candidates: Candidates, options: AcceptanceOptions) -> list[str | None
     )
     _refuse(verdict, ~is_convex(candidates.corners_map), "not a convex quadrilateral")
     _refuse(verdict, _uncertain(candidates, options), "its position is too uncertain")
-    part_of_symbol = _seen_as_symbol(candidates)
+    part_of_symbol = _seen_as_symbol(candidates, SYMBOL_SHARE)
     shaft = candidates.kind == CORNERED_CLASSES.index(LANE_DASH)
-    _refuse(verdict, part_of_symbol & shaft, PART_OF_SYMBOL)
+    _refuse(verdict, (part_of_symbol & shaft) | _seen_as_symbol(candidates, 1.0), PART_OF_SYMBOL)
     typical, odd = _judge_shapes(candidates, verdict, options)
     _refuse(verdict, odd, ODD_SHAPE)
     _refuse(verdict, part_of_symbol & ~typical, PART_OF_SYMBOL)
@@ -101,11 +102,11 @@ def judge(candidates: Candidates, options: AcceptanceOptions) -> list[str | None
     return verdict
 
 
-def _seen_as_symbol(candidates: Candidates) -> BoolArray:
-    """Groups that often enough lie under what looks like an arrow or a chevron."""
+def _seen_as_symbol(candidates: Candidates, share: float) -> BoolArray:
+    """Groups that lie under what looks like an arrow or a chevron so often for each sighting of theirs."""
     if candidates.seen_as_symbol is None:
         return np.zeros(len(candidates.kind), dtype=bool)
-    limit = np.maximum(MIN_SYMBOL_VIEWS, SYMBOL_SHARE * candidates.sightings)
+    limit = np.maximum(MIN_SYMBOL_VIEWS, share * candidates.sightings)
     return np.asarray(candidates.seen_as_symbol >= limit)
 
 
