@@ -150,3 +150,12 @@ def test_the_head_of_an_arrow_is_refused_even_if_it_is_like_the_diamonds() -> No
     seen_as_symbol[[2, 7]] = sound.sightings[2] - 1, sound.sightings[7]
     judged = replace(sound, seen_as_symbol=seen_as_symbol)
     assert refused(judged) == {7: "part of an arrow or a chevron"}
+
+
+def test_a_head_that_few_images_show_with_its_arrow_is_refused_if_most_do_not_show_it_alone() -> None:
+    sound = row_of_diamonds()
+    seen_as_symbol, easy_detections = np.zeros(COUNT, dtype=np.int64), sound.easy_detections.copy()
+    seen_as_symbol[[2, 5, 7]] = 2, 1, 2
+    easy_detections[[5, 7, 8]] = sound.easy_views[7] // 2 - 1
+    judged = replace(sound, seen_as_symbol=seen_as_symbol, easy_detections=easy_detections)
+    assert refused(judged) == {7: "part of an arrow or a chevron"}

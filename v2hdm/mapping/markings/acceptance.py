@@ -32,8 +32,9 @@ MIN_EASY_VIEWS = 5
 MIN_SYMBOL_VIEWS = 2
 SYMBOL_SHARE = 0.34
 """What so many images show as part of a symbol, and so many for each that shows it alone, is no marking. It
-is, though, if its shape is that of others of its class, unless as many images show the symbol: the head of an
-arrow is like a diamond. For a dash its shape says nothing: shafts are alike, too."""
+is, though, if its shape is that of others of its class, unless as many images show the symbol, or some do and
+most of those with an easy view did not show it alone: the head of an arrow is like a diamond. For a dash its
+shape says nothing: shafts are alike, too."""
 
 MIN_SHAPE_TOLERANCE_M = 0.05
 """Lengths that differ by less are the same, however short they are."""
@@ -89,17 +90,26 @@ def judge(candidates: Candidates, options: AcceptanceOptions) -> list[str | None
     )
     _refuse(verdict, ~is_convex(candidates.corners_map), "not a convex quadrilateral")
     _refuse(verdict, _uncertain(candidates, options), "its position is too uncertain")
-    part_of_symbol = _seen_as_symbol(candidates, SYMBOL_SHARE)
-    shaft = candidates.kind == CORNERED_CLASSES.index(LANE_DASH)
-    _refuse(verdict, (part_of_symbol & shaft) | _seen_as_symbol(candidates, 1.0), PART_OF_SYMBOL)
+    _refuse(verdict, _symbols_of_any_shape(candidates), PART_OF_SYMBOL)
     typical, odd = _judge_shapes(candidates, verdict, options)
     _refuse(verdict, odd, ODD_SHAPE)
-    _refuse(verdict, part_of_symbol & ~typical, PART_OF_SYMBOL)
+    _refuse(verdict, _seen_as_symbol(candidates, SYMBOL_SHARE) & ~typical, PART_OF_SYMBOL)
     _refuse(verdict, candidates.completed & ~typical, LACKS_A_CORNER)
     seldom = _seldom_detected(candidates, verdict, options) & ~typical
     _refuse(verdict, seldom, "found in too few of its images")
     _refuse(verdict, _covered(candidates, verdict), "lies on a better supported marking")
     return verdict
+
+
+def _symbols_of_any_shape(candidates: Candidates) -> BoolArray:
+    """Groups that are parts of arrows or chevrons even if shaped like their class: shafts and heads."""
+    shaft = candidates.kind == CORNERED_CLASSES.index(LANE_DASH)
+    mostly_missed = 2 * candidates.easy_detections < candidates.easy_views
+    mostly_missed &= candidates.easy_views >= MIN_EASY_VIEWS
+    surely = _seen_as_symbol(candidates, SYMBOL_SHARE) & shaft
+    surely |= _seen_as_symbol(candidates, 1.0)
+    surely |= _seen_as_symbol(candidates, 0.0) & mostly_missed
+    return surely
 
 
 def _seen_as_symbol(candidates: Candidates, share: float) -> BoolArray:
