@@ -109,7 +109,7 @@ def _symbols_of_any_shape(candidates: Candidates) -> BoolArray:
     surely = _seen_as_symbol(candidates, SYMBOL_SHARE) & shaft
     surely |= _seen_as_symbol(candidates, 1.0)
     surely |= _seen_as_symbol(candidates, 0.0) & mostly_missed
-    return surely
+    return np.asarray(surely)
 
 
 def _seen_as_symbol(candidates: Candidates, share: float) -> BoolArray:
