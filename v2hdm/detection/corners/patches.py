@@ -16,7 +16,7 @@ _OUTSIDE_PX = 3.0
 _INSIDE_PX = 4.0
 _MEDIAN_STRIDE = 3
 _MAX_PIXELS = 350
-_MAX_BETWEEN = 200
+_MAX_BETWEEN, _MAX_AT_ENDS = 160, 260
 _END_PX = 2.0
 _MOST_ENDS = 1 / 3
 """What has two ends that make up no more than this share of its length is slim; an end reaches so far past
@@ -139,7 +139,7 @@ def _lattice(corners: FloatArray, size: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Columns (M, W) and rows (M, H) that leave about ``_MAX_PIXELS`` of the bands about sides, or some more.
 
     Neighbouring pixels say nearly the same, so a large marking needs only some of them; columns or rows
-    are left out along the marking's longer extent, the finer sampling staying across it. Of a slim one none
+    are left out along the marking's longer extent, the finer sampling staying across it. Of a slim one few
     are left out at its two ends, which tell how long it is, but more between.
 
     Args:
@@ -154,28 +154,33 @@ def _lattice(corners: FloatArray, size: np.ndarray) -> tuple[np.ndarray, np.ndar
     head = np.ceil(np.minimum(place[:, 1], place[:, 0] + thick) + _END_PX).astype(np.intp)
     tail = np.floor(np.maximum(place[:, 2], place[:, 3] - thick) - _END_PX).astype(np.intp)
     slim = (step[each, along] > 1) & (head + extent - tail < _MOST_ENDS * extent)
-    between = np.ceil(band * (tail - head) / extent / _MAX_BETWEEN).astype(np.intp)
+    per_place = band / extent
+    between = np.ceil(per_place * (tail - head) / _MAX_BETWEEN).astype(np.intp)
+    at_ends = np.ceil(per_place * (head + extent - tail) / _MAX_AT_ENDS).astype(np.intp)
     step[slim] = 1
     step[each[slim], along[slim]] = np.maximum(between[slim], 1)
+    outer = np.ones_like(step)
+    outer[each[slim], along[slim]] = at_ends[slim]
     bounds = np.zeros((len(corners), 2, 2), dtype=np.intp)
     bounds[..., 1] = size
     bounds[each[slim], along[slim]] = np.column_stack([head, tail])[slim]
-    columns, rows = (_steps(bounds[:, axis], step[:, axis], size[:, axis]) for axis in (0, 1))
+    columns, rows = (_steps(bounds[:, axis], step[:, axis], outer[:, axis], size[:, axis]) for axis in (0, 1))
     return columns, rows
 
 
-def _steps(bounds: np.ndarray, step: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Places (M, n), every one outside ``bounds`` (M, 2) and every ``step``-th (M,) between, up to ``size``.
+def _steps(bounds: np.ndarray, step: np.ndarray, outer: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Places (M, n), every ``step``-th (M,) within ``bounds`` (M, 2) and every ``outer``-th without.
 
-    There is one more than needed, so that the last have no neighbour.
+    They go up to ``size`` (M,) and one farther, so that the last have no neighbour.
     """
     head, tail = bounds.T
-    between = -(-(tail - head) // step)
-    count = head + between + np.maximum(size - tail, 0)
+    first, between = -(-head // outer), -(-(tail - head) // step)
+    count = first + between + np.maximum(-(-(size - tail) // outer), 0)
     k = np.arange(int(count.max()) + 1)
-    head, step, between = head[:, None], step[:, None], between[:, None]
-    middle, last = head + (k - head) * step, tail[:, None] + k - head - between
-    return np.asarray(np.where(k < head, k, np.where(k < head + between, middle, last)))
+    head, tail, step, outer = head[:, None], tail[:, None], step[:, None], outer[:, None]
+    first, between = first[:, None], between[:, None]
+    middle, last = head + (k - first) * step, tail + (k - first - between) * outer
+    return np.asarray(np.where(k < first, k * outer, np.where(k < first + between, middle, last)))
 
 
 def _lattice_steps(corners: FloatArray, along: np.ndarray) -> tuple[np.ndarray, FloatArray]:

@@ -15,10 +15,11 @@ _RECTANGLES = (LANE_DASH, STOP_LINE, CROSSWALK_BAR)
 """What is painted as a rectangle. The hull of a bar a few px wide says little of its corners, its direction
 on the ground says much."""
 
+_LEAST_STRIPE_PX = 48.0
 _WELL_FILLED = 0.9
 _LEAST_OF_STRIPE = 0.6
 _MUCH_SLIMMER = 0.87
-"""Where the paint fills less than this of its hull, it may be a stripe to which something sticks: one that
+"""What is so large and fills less than this of its hull may be a stripe to which something sticks: one that
 shows its sides over most of its length, and is much slimmer than what is around all."""
 
 
@@ -57,7 +58,8 @@ def starting_corners(
         share = hull_px2 / max(_area_px2(corners), 1e-6)
         if best is None or share > best[1]:
             best = corners, share
-    if best is not None and kind in _RECTANGLES and paint_px2 < _WELL_FILLED * hull_px2:
+    large = float(np.ptp(points, axis=0).max()) >= _LEAST_STRIPE_PX
+    if best is not None and kind in _RECTANGLES and large and paint_px2 < _WELL_FILLED * hull_px2:
         stripe = stripe_of(outline_pinhole_px, view)
         slimmer = stripe is not None and _area_px2(stripe[0]) < _MUCH_SLIMMER * _area_px2(best[0])
         if stripe is not None and slimmer and stripe[1] > _LEAST_OF_STRIPE:
