@@ -67,3 +67,7 @@ def test_a_compact_marking_is_never_lane_paint_whatever_the_network_says(tmp_pat
     markings, lanes = detector.detect(picture(camera, [diamond(8.0, 0.5)]), camera)
     assert [m.kind for m in markings] == ["diamond"], "more likely than not, with the network against it"
     assert lanes == ()
+    detector = Detector.load(brightness_model(tmp_path, "lane_dash"), DetectorOptions())
+    markings, lanes = detector.detect(picture(camera, [diamond(8.0, 0.5), diamond(10.0, -1.0)]), camera)
+    assert [m.kind for m in markings] == ["diamond"] * 2, "beside another it is sure enough to report"
+    assert lanes == ()

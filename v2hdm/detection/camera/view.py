@@ -20,7 +20,6 @@ _SURROUNDINGS_PX = 24
 FINE_ENOUGH_M = 0.007
 """Ground per pixel, across the view, of which half the resolution shows enough: a dash stays 10 px wide."""
 
-
 ASIDE_RAD = np.deg2rad(60)
 """A camera that looks farther than this off the way that its vehicle drives, ahead or back, looks aside."""
 

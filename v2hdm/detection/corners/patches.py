@@ -113,8 +113,9 @@ def cut_patches(
     count = np.bincount(marking, minlength=len(low))
     place = np.arange(len(cell)) - np.repeat(np.cumsum(count) - count, count)
     patches = _empty(len(low), max(1, int(count.max())))
-    pixels = np.column_stack([u, v + grey.top]).astype(np.float64)
-    patches.points[marking, :2, place] = frames.take(marking).from_image(pixels[:, None])[:, 0]
+    pixels = np.repeat(corners_px.mean(axis=1)[:, None], patches.values.shape[1], axis=1)
+    pixels[marking, place] = np.column_stack([u, v + grey.top])
+    patches.points[:, :2] = frames.from_image(pixels).swapaxes(1, 2)
     values = grey.values[v, u]
     known = np.isfinite(values)
     patches.values[marking, place] = np.where(known, values, np.float32(0))

@@ -72,6 +72,9 @@ def training_sample(
 ) -> TrainingSample:
     """Sample ``index`` of the endless, reproducible sequence that ``seed`` stands for.
 
+    Where the camera looks aside, its labels exchange the stripes that it sees as each other, see
+    :data:`v2hdm.records.SEEN_ACROSS`.
+
     Args:
         seed: Names the sequence; training and validation use different ones.
         index: Position in it.
