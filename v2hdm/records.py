@@ -143,6 +143,29 @@ class PoseNoise:
 
 
 @dataclass(frozen=True)
+class Trajectory:
+    """Vehicle poses over time: ``stamp_s`` (P,), strictly rising, and ``map_from_vehicle`` (P, 4, 4)."""
+
+    stamp_s: FloatArray
+    map_from_vehicle: FloatArray
+
+
+@dataclass(frozen=True)
+class Road:
+    """The recorded ground along the route, which the drive's poses have laid flat into z = 0.
+
+    Attributes:
+        points_map: (P, 2) m, places along the route in driving order.
+        height_m: (P,) recorded height of the ground there.
+        slope: (P, 2) its derivative by x and by y.
+    """
+
+    points_map: FloatArray
+    height_m: FloatArray
+    slope: FloatArray
+
+
+@dataclass(frozen=True)
 class Image:
     """One image of a drive and the vehicle's pose (4 x 4) at its time stamp."""
 
@@ -156,7 +179,10 @@ class Image:
 class Drive:
     """Everything the mapper may know of a drive; images are sorted by time, then camera.
 
-    ``truth_dir`` only tells the report where ground truth lies, if there is any.
+    ``truth_dir`` only tells the report where ground truth lies, if there is any. ``trajectory`` holds the
+    poses that those of the images were interpolated from, at the receiver's rate, with the road laid flat;
+    ``recorded`` the same poses as they were recorded. ``road`` is the recorded ground, None where it was
+    recorded as the plane z = 0.
     """
 
     name: str
@@ -166,6 +192,9 @@ class Drive:
     pose_noise: PoseNoise = field(default_factory=PoseNoise)
     origin: GeodeticOrigin | None = None
     truth_dir: Path | None = None
+    trajectory: Trajectory | None = None
+    recorded: Trajectory | None = None
+    road: Road | None = None
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from v2hdm.drive.rotation import (
     rotation_from_quaternion,
     slerp,
 )
-from v2hdm.drive.trajectory import Trajectory, interpolate
-from v2hdm.records import FloatArray
+from v2hdm.drive.trajectory import interpolate
+from v2hdm.records import FloatArray, Trajectory
 
 SEEDS = st.integers(0, 2**32 - 1)
 

@@ -23,12 +23,11 @@ from v2hdm.drive.mounting import (
     take_roi,
 )
 from v2hdm.drive.options import ReadOptions
-from v2hdm.drive.trajectory import Trajectory
 from v2hdm.drive.tum import read_image_list, read_tum, write_image_list, write_tum
 from v2hdm.errors import DriveError
 from v2hdm.fields import take_origin
 from v2hdm.files import check_keys, dump_yaml, load_yaml, replace_text, take_mapping, take_number, take_text
-from v2hdm.records import Camera, Drive, PoseNoise
+from v2hdm.records import Camera, Drive, PoseNoise, Trajectory
 
 DRIVE_FILE = "drive.yaml"
 POSES_FILE = "poses.tum"
@@ -73,6 +72,8 @@ def read_folder_drive(path: Path, options: ReadOptions) -> Drive:
         pose_noise=_read_pose_noise(content.get("pose_noise"), f"{where}: pose_noise"),
         origin=take_origin(content.get("origin"), f"{where}: origin", DriveError),
         truth_dir=_find_truth(content.get("truth"), path, f"{where}: truth"),
+        trajectory=trajectory,
+        recorded=trajectory,
     )
 
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.drive.image_header import image_size
-from v2hdm.drive.trajectory import Trajectory, interpolate
+from v2hdm.drive.trajectory import interpolate
 from v2hdm.errors import DriveError
-from v2hdm.records import Camera, FloatArray, Image
+from v2hdm.records import Camera, FloatArray, Image, Trajectory
 
 _log = logging.getLogger(__name__)
 

@@ -18,11 +18,19 @@ from v2hdm.drive.kitti_calibration import KittiCamera, read_kitti_camera
 from v2hdm.drive.options import KittiOptions, ReadOptions
 from v2hdm.drive.road import RoadAttitude, attitude_to_road
 from v2hdm.drive.rotation import rotation_from_euler
-from v2hdm.drive.trajectory import Trajectory
 from v2hdm.errors import DriveError
 from v2hdm.files import read_text
 from v2hdm.hdmap.geodetic import enu_from_geodetic, geodetic_from_enu
-from v2hdm.records import Calibration, Camera, CentrePrior, Drive, FloatArray, GeodeticOrigin, PoseNoise
+from v2hdm.records import (
+    Calibration,
+    Camera,
+    CentrePrior,
+    Drive,
+    FloatArray,
+    GeodeticOrigin,
+    PoseNoise,
+    Trajectory,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -58,7 +66,8 @@ def read_kitti_drive(path: Path, options: ReadOptions) -> Drive:
         name: _mount(calibration, vehicle_from_imu, options.kitti)
         for name, calibration in calibrations.items()
     }
-    images = pose_images(files, Trajectory(stamp_s, poses), options.max_gap_s, path)
+    trajectory = Trajectory(stamp_s, poses)
+    images = pose_images(files, trajectory, options.max_gap_s, path)
     check_image_files(images, cameras)
     return Drive(
         name=path.name,
@@ -67,6 +76,7 @@ def read_kitti_drive(path: Path, options: ReadOptions) -> Drive:
         images=images,
         pose_noise=_POSE_NOISE,
         origin=_lower(origin_imu, float(vehicle_from_imu[2, 3])),
+        trajectory=trajectory,
     )
 
 

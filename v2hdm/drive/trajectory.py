@@ -1,21 +1,11 @@
-"""A recorded trajectory and the vehicle's pose at any time within it."""
+"""The vehicle's pose at any time within a recorded trajectory."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
 from v2hdm.drive.rotation import quaternion_from_rotation, rotation_from_quaternion, slerp
-from v2hdm.records import BoolArray, FloatArray
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """Vehicle poses over time: ``stamp_s`` (P,), strictly rising, and ``map_from_vehicle`` (P, 4, 4)."""
-
-    stamp_s: FloatArray
-    map_from_vehicle: FloatArray
+from v2hdm.records import BoolArray, FloatArray, Trajectory
 
 
 def interpolate(

@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.drive.mounting import take_rigid
-from v2hdm.drive.trajectory import Trajectory
 from v2hdm.drive.tum import read_tum, write_tum
 from v2hdm.errors import DriveError
 from v2hdm.files import check_keys, dump_yaml, load_yaml, read_text, replace_text, take_mapping, take_number
 from v2hdm.hdmap import read_geojson, write_geojson
-from v2hdm.records import BoolArray, Drive, FloatArray, HdMap, Image, Truth
+from v2hdm.records import BoolArray, Drive, FloatArray, HdMap, Image, Trajectory, Truth
 
 _SIGHTINGS = ("camera", "timestamp", "marking", "visible_fraction")
 _LANE_VISIBLE = ("lane", "vertex")

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from v2hdm.drive.rotation import rotation_from_euler
-from v2hdm.drive.trajectory import Trajectory, interpolate
-from v2hdm.records import FloatArray, PoseNoise
+from v2hdm.drive.trajectory import interpolate
+from v2hdm.records import FloatArray, PoseNoise, Trajectory
 from v2hdm.simulate.port.config import DisturbanceConfig, RouteConfig
 from v2hdm.simulate.port.route import Route
 

@@ -1,0 +1,8 @@
+"""Whether a result can be trusted: named checks, each with a value, a limit, a cause and a remedy.
+
+The checks before the run (``python -m v2hdm.check``) and those after it end in one :class:`Verdict`.
+"""
+
+from v2hdm.quality.verdict import Finding, Status, Verdict
+
+__all__ = ["Finding", "Status", "Verdict"]
