@@ -40,7 +40,7 @@ def with_clock_offsets(drive: Drive, offset_s: Mapping[str, float], max_gap_s: f
             ]
         if not own:
             raise DriveError(
-                f"{drive.root}: {1e3 * offset_s[name]:.0f} ms later than stamped, no image of camera '{name}' "
+                f"{drive.root}: {1e3 * offset_s[name]:.0f} ms after their stamps, no image of '{name}' "
                 "has a pose; record poses for as long as images"
             )
         images += own
