@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,6 +61,12 @@ def pose_images(
             for n in np.flatnonzero(inside).tolist()
         ]
     return tuple(sorted(images, key=lambda image: (image.stamp_s, image.camera)))
+
+
+def count_unposed(files: Sequence[ImageFiles], images: Sequence[Image]) -> dict[str, int]:
+    """How many images of each camera are not among the posed ``images``."""
+    posed = Counter(image.camera for image in images)
+    return {entry.camera: len(entry.paths) - posed[entry.camera] for entry in files}
 
 
 def check_image_files(images: Sequence[Image], cameras: Mapping[str, Camera]) -> None:
