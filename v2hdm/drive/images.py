@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from v2hdm.drive.clocks import why_no_pose
 from v2hdm.drive.image_header import image_size
 from v2hdm.drive.trajectory import interpolate
 from v2hdm.errors import DriveError
@@ -44,7 +45,8 @@ def pose_images(
         if not inside.any():
             raise DriveError(
                 f"{where}: no image of camera '{entry.camera}' ({_span(entry.stamp_s)}) has a pose "
-                f"(poses: {_span(trajectory.stamp_s)}, max_gap_s {max_gap_s:g}); put both on one clock"
+                f"(poses: {_span(trajectory.stamp_s)}); "
+                f"{why_no_pose(entry.stamp_s, trajectory.stamp_s, max_gap_s)}"
             )
         if not inside.all():
             _log.warning(

@@ -17,9 +17,10 @@ from v2hdm.records import Drive
 HIDES: Mapping[str, tuple[str, ...]] = {
     "path length": ("speed", "position jumps", "height jumps", "pose scatter", "image spacing", "pose gaps"),
     "speed": ("position jumps", "height jumps", "pose scatter", "image spacing", "pose rate", "pose gaps"),
-    "heading": ("heading offset", "attitude", "pitch sign", "origin", "pose scatter"),
+    "heading": ("heading offset", "attitude", "pitch sign", "origin", "pose scatter", "position jumps"),
     "repeated poses": ("position jumps", "height jumps", "pose scatter"),
-    "position jumps": ("pose scatter",),
+    "pose scatter": ("position jumps",),
+    "roi": ("image spacing", "roi range"),
     "attitude": ("pitch sign",),
     "principal point": (
         "focal length",

@@ -20,7 +20,7 @@ _OTHER_SIZE = 0.15
 _SHORTEST, _LONGEST = 0.3, 5.0
 """Focal lengths, in image widths, of lenses that map roads: 118 deg wide (fisheyes more) to 11 deg."""
 
-_SQUARE = 0.05
+_SQUARE = 0.03
 """Pixels are square to far less than this."""
 
 _MISSHAPEN = 0.03
@@ -53,12 +53,27 @@ def check_camera(name: str, camera: Camera) -> list[Finding]:
     """All checks of one camera's description."""
     findings = check_intrinsics(name, camera.info)
     ipm = camera.ipm[camera.initial_ipm]
-    cam_from_vehicle = extrinsic_from_ipm(camera.info, ipm, camera.roi_vehicle.mean(axis=0))
+    cam_from_vehicle = guess_of(camera)
     findings += check_roi(name, camera, cam_from_vehicle)
     findings += [_shape(name, camera.info, ipm), *_mounting(name, cam_from_vehicle)]
     if camera.centre_prior is not None:
         findings += check_survey(name, camera.centre_prior, _centre(cam_from_vehicle))
     return findings
+
+
+def guess_of(camera: Camera) -> FloatArray:
+    """``cam_from_vehicle`` (4 x 4) of the initial IPM, above the ground, wherever the ROI lies."""
+    ipm = camera.ipm[camera.initial_ipm]
+    seen = camera.roi_vehicle.mean(axis=0)
+    guess = extrinsic_from_ipm(camera.info, ipm, seen)
+    if _centre(guess)[2] >= 0:
+        return guess
+    # A homography has two solutions; a point behind the camera settles on the one below the ground.
+    below = np.diag([-1.0, -1.0, 1.0])
+    other = guess.copy()
+    other[:3, :3] = guess[:3, :3] @ below
+    other[:3, 3] = -guess[:3, 3]
+    return other
 
 
 def check_intrinsics(name: str, info: CameraInfo) -> list[Finding]:

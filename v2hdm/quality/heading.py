@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 
@@ -39,7 +40,13 @@ _LEVER_M = 0.3
 _SURE = 5.0
 """Sigmas beyond which a measured offset is told: the poses' drift makes sigmas optimistic by up to two."""
 
-_AHEAD = "read as it is, the vehicle drives forwards"
+class Path(Enum):
+    """What the images' ground says of the recorded path."""
+
+    AS_GIVEN = "path and yaw are as the images show them"
+    RIGHT_YAW_WRONG = "the path is right, the yaw is not"
+    MIRRORED = "the path is mirrored"
+
 
 Undo = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
@@ -110,30 +117,29 @@ CONVENTIONS: Mapping[str, Convention] = {
 }
 """The usual mistakes, the likelier first."""
 
+_REFLECTED = ("from north", "clockwise", "south", "from south")
+"""Conventions of yaw that poses alone cannot tell from a path whose axes are swapped."""
+
 AXES_SWAPPED = "x and y of the positions are swapped or one has the wrong sign; write x east and y north"
 
 
-def check_heading(motion: Motion, mirrored: bool | None = None) -> list[Finding]:
+def check_heading(motion: Motion, path: Path | None = None) -> list[Finding]:
     """Whether the recorded poses drive where they point, z up.
 
     Args:
         motion: the recorded poses.
-        mirrored: whether the images' ground says that the path is mirrored; None where it says nothing.
+        path: what the images' ground says of the recorded path; None where it was not asked or does not say.
     """
     chords = motion.chords
     if not len(chords):
         return []  # the check of the path's length says so
-    agrees = _agreement(motion.position, motion.rotation, chords)
-    if agrees >= _FITS:
-        return [_as_given(motion, agrees), *_alignment(motion)]
-    fitting = [
-        convention
-        for convention in CONVENTIONS.values()
-        if _agreement(*convention.undo(motion.position, motion.rotation), chords) >= _FITS
-    ]
-    offset_deg = float(np.rad2deg(_circular_median(_course_minus_yaw(motion))))
-    says = _cause(motion, fitting, offset_deg, mirrored)
-    return [Finding("heading", Status.FAIL, 1 - agrees, 1 - _FITS, "", says, "poses")]
+    _, either = _agreement(motion.position, motion.rotation, chords)
+    if either >= _FITS:
+        return [_as_given(motion, either, path), *_alignment(motion)]
+    says = _cause(motion, _fitting(motion), path)
+    if says is None:
+        return []  # the check of the attitude says so
+    return [Finding("heading", Status.FAIL, 1 - either, 1 - _FITS, "", says, "poses")]
 
 
 def backwards_share(motion: Motion) -> float:
@@ -141,12 +147,15 @@ def backwards_share(motion: Motion) -> float:
     return float((np.abs(_course_minus_yaw(motion)) > np.pi / 2).mean()) if len(motion.chords) else 0.0
 
 
-def _as_given(motion: Motion, agrees: float) -> Finding:
+def _as_given(motion: Motion, agrees: float, path: Path | None) -> Finding:
     back = backwards_share(motion)
-    if back > _FITS:
+    if back > _FITS and path is Path.RIGHT_YAW_WRONG:
+        says = "yaw points backwards although the images drive forwards; turn yaw by 180 deg"
+        return Finding("heading", Status.FAIL, back, _FITS, "", says, "poses")
+    if back > _FITS and path is not Path.AS_GIVEN:
         says = (
-            "the vehicle drives backwards all the time, or its yaw is off by 180 deg; "
-            "if it drove forwards, turn yaw by 180 deg"
+            "the vehicle drives backwards all the time; if it did not, yaw is off by 180 deg (turn it), or the "
+            "poses are vehicle_from_map (write their inverse)"
         )
         return Finding("heading", Status.WARN, back, _FITS, "", says, "poses")
     how = f"it drives backwards on {100 * back:.0f} % of the way" if back > 0.01 else "it drives forwards"
@@ -212,31 +221,45 @@ def _overlap(motion: Motion) -> float:
     return float(max(1.0, np.median(motion.chords.last - motion.chords.first)))
 
 
-def _cause(motion: Motion, fitting: list[Convention], offset_deg: float, mirrored: bool | None) -> str:
-    if mirrored:
+def _fitting(motion: Motion) -> list[str]:
+    """The names of the conventions that make path and attitude agree, those that drive ahead first."""
+    shares = {
+        name: _agreement(*convention.undo(motion.position, motion.rotation), motion.chords)
+        for name, convention in CONVENTIONS.items()
+    }
+    ahead = [name for name, share in shares.items() if share[0] >= _FITS]
+    return ahead or [name for name, share in shares.items() if share[1] >= _FITS]
+
+
+def _cause(motion: Motion, fitting: list[str], path: Path | None) -> str | None:
+    """The sentence that names what is wrong; None where it is not the heading."""
+    if path is Path.MIRRORED:
         return AXES_SWAPPED
     if fitting:
-        told = fitting[0].says
-        # Poses alone cannot tell a reflected yaw from a reflected path.
-        reflected = {CONVENTIONS[name].says for name in ("from north", "clockwise", "south", "from south")}
-        others = [AXES_SWAPPED] if told in reflected and mirrored is None else []
-        others += [convention.says for convention in fitting[1:2]]
-        return "; or ".join([told, *others])
-    if (motion.rotation[:, 2, 2] < np.cos(_UPRIGHT_RAD)).mean() > 1 - _FITS:
-        return (
+        told = [CONVENTIONS[name].says for name in fitting[:2]]
+        if path is None and fitting[0] in _REFLECTED:
+            told.insert(1, AXES_SWAPPED)
+        return "; or ".join(told)
+    offset = _course_minus_yaw(motion)
+    if not _is_upright(motion):
+        along = (np.abs(np.sin(offset)) < np.sin(_AGREES_RAD)).mean() >= _FITS
+        return None if along else (
             "the attitude is no vehicle's on a road; check the order qx qy qz qw and the units of the angles"
         )
-    spread = _course_minus_yaw(motion) - np.deg2rad(offset_deg)
-    if (np.abs(angle_of(spread)) < _AGREES_RAD).mean() >= _FITS:
+    offset_rad = _circular_median(offset)
+    if (np.abs(angle_of(offset - offset_rad)) < _AGREES_RAD).mean() >= _FITS:
         return (
-            f"the vehicle drives {abs(offset_deg):.0f} deg to the {'left' if offset_deg > 0 else 'right'} "
-            "of its heading all the time; subtract that offset of the heading's antennas from yaw"
+            f"the vehicle drives {abs(np.rad2deg(offset_rad)):.0f} deg to the "
+            f"{'left' if offset_rad > 0 else 'right'} of its heading all the time; "
+            "subtract that offset of the heading's antennas from yaw"
         )
     if _turns_too_fast(motion):
-        return (
-            "yaw turns 57 times as fast as the path: degrees were taken for radians; convert yaw to radians"
-        )
+        return "yaw turns 57 times as fast as the path: degrees were taken for radians; convert yaw to radians"
     return "heading and path have nothing to do with each other; check that both come from one and the same drive"
+
+
+def _is_upright(motion: Motion) -> bool:
+    return bool((motion.rotation[motion.chords.first, 2, 2] > np.cos(_UPRIGHT_RAD)).mean() >= _FITS)
 
 
 def _turns_too_fast(motion: Motion) -> bool:
@@ -247,14 +270,12 @@ def _turns_too_fast(motion: Motion) -> bool:
     return bool(np.abs(steps).sum() > 10 * max(path_turn, 0.1))
 
 
-def _agreement(position: FloatArray, rotation: FloatArray, chords: Chords) -> float:
-    """The share of chords along which the vehicle points, ahead or back, and stands upright."""
+def _agreement(position: FloatArray, rotation: FloatArray, chords: Chords) -> tuple[float, float]:
+    """The shares of chords along which the vehicle stands upright and points ahead, and ahead or back."""
     angle = angle_between(_forward(rotation, chords), _course(position, chords))
-    aligned = np.abs(np.sin(angle)) < np.sin(_AGREES_RAD)
-    ahead = aligned & (np.cos(angle) > 0)
     upright: BoolArray = rotation[chords.first, 2, 2] > np.cos(_UPRIGHT_RAD)
-    share = max(float((ahead & upright).mean()), float((aligned & upright).mean()))
-    return share
+    along = (np.abs(np.sin(angle)) < np.sin(_AGREES_RAD)) & upright
+    return float((along & (np.cos(angle) > 0)).mean()), float(along.mean())
 
 
 def _course_minus_yaw(motion: Motion) -> FloatArray:

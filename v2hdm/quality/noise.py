@@ -21,6 +21,9 @@ _ROLL_PITCH_RAD = 0.05
 _UNDERSTATED = 3.0
 """Poses that scatter this many times more than stated make every sigma of the map wrong by as much."""
 
+_USELESS = 10.0
+"""Poses that scatter this many times more than stated make a map that is wrong, not only overconfident."""
+
 _DIFFERENCES = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 """The fourth difference: driving at 10 Hz leaves millimetres in it, white noise sqrt(70) sigmas."""
 
@@ -41,7 +44,9 @@ def check_noise(motion: Motion, noise: PoseNoise) -> list[Finding]:
 
 def _units(motion: Motion, noise: PoseNoise) -> list[Finding]:
     scatter = _white_position_m(motion)
-    measured = "" if scatter is None else f" (from pose to pose they scatter by {scatter:.3f} m)"
+    measured = "" if scatter is None else f"; from pose to pose they scatter by {scatter:.3f} m"
+    if noise.position_m > 1:
+        measured += f"; if millimetres were meant, it is {noise.position_m / 1e3:g} m"
     return [
         _unit("position_m", noise.position_m, _RTK_M, "m", f"no RTK position{measured}", "metres"),
         _unit("heading_rad", noise.heading_rad, _HEADING_RAD, "rad", _in_degrees(noise.heading_rad), "radians"),
@@ -71,22 +76,23 @@ def _in_degrees(value: float) -> str:
 def _scatter(motion: Motion, noise: PoseNoise) -> list[Finding]:
     findings = []
     position = _white_position_m(motion)
-    if position is not None:
+    if position is not None and noise.position_m > 0:
         findings.append(_against("position_m", position, noise.position_m, "m"))
     heading = _white_heading_rad(motion)
-    if heading is not None:
+    if heading is not None and noise.heading_rad > 0:
         findings.append(_against("heading_rad", heading, noise.heading_rad, "rad"))
     return findings
 
 
 def _against(key: str, measured: float, stated: float, unit: str) -> Finding:
-    ratio = measured / max(stated, 1e-9)
+    ratio = measured / stated
+    degrees = " (degrees taken for radians would do that)" if unit == "rad" and ratio > _USELESS else ""
     return judge(
         "pose scatter", f"pose_noise.{key}", ratio, _UNDERSTATED, "",
         fine="the poses scatter no more than stated",
-        wrong=f"from pose to pose they scatter by {measured:.2g} {unit}, {ratio:.0f} times {key} {stated:.2g}; "
+        wrong=f"from pose to pose they scatter by {measured:.2g} {unit}, {ratio:.0f} times {key} {stated:.2g}{degrees}; "
         f"state {key} as it is, or find out why the receiver is worse than it says",
-        status=Status.WARN,
+        status=Status.FAIL if ratio > _USELESS else Status.WARN,
     )  # fmt: skip
 
 
