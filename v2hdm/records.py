@@ -167,12 +167,22 @@ class Road:
 
 @dataclass(frozen=True)
 class Image:
-    """One image of a drive and the vehicle's pose (4 x 4) at its time stamp."""
+    """One image of a drive and the vehicle's pose (4 x 4) when it was taken.
+
+    ``stamp_s`` is its recorded time; ``clock_offset_s`` is how much later it was taken, as far as that is
+    known.
+    """
 
     camera: str
     stamp_s: float
     path: Path
     map_from_vehicle: FloatArray
+    clock_offset_s: float = 0.0
+
+    @property
+    def taken_s(self) -> float:
+        """When the image was taken, on the clock of the poses."""
+        return self.stamp_s + self.clock_offset_s
 
 
 @dataclass(frozen=True)
