@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
-
 from v2hdm.quality.cameras import check_camera
 from v2hdm.quality.clocks import check_clocks
 from v2hdm.quality.heading import check_heading
+from v2hdm.quality.images import check_images
 from v2hdm.quality.motion import Motion
 from v2hdm.quality.noise import check_noise
 from v2hdm.quality.path import check_attitude, check_jumps, check_path
@@ -20,6 +19,9 @@ HIDES: Mapping[str, tuple[str, ...]] = {
     "heading": ("heading offset", "attitude", "pitch sign", "origin", "pose scatter", "position jumps"),
     "repeated poses": ("position jumps", "height jumps", "pose scatter"),
     "pose scatter": ("position jumps",),
+    "bright images": ("frozen images",),
+    "dark images": ("frozen images",),
+    "own images": ("frozen images",),
     "roi": ("image spacing", "roi range"),
     "attitude": ("pitch sign",),
     "principal point": (
@@ -49,6 +51,7 @@ def check_drive(drive: Drive) -> list[Finding]:
     ]
     for name, camera in drive.cameras.items():
         findings += check_camera(name, camera)
+    findings += check_images(drive)
     return causes(findings)
 
 

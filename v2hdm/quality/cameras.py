@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.detection.camera.ground import apply_homography, extrinsic_from_ipm
+from v2hdm.detection.camera.ground import apply_homography
 from v2hdm.detection.camera.lens import distort_points, undistort_points
+from v2hdm.detection.camera.mounting import guessed_extrinsic
 from v2hdm.planar import inside_convex
 from v2hdm.quality.judgement import judge, passed
 from v2hdm.quality.verdict import Finding, Status
@@ -52,28 +53,15 @@ _LOWEST_M = 0.3
 def check_camera(name: str, camera: Camera) -> list[Finding]:
     """All checks of one camera's description."""
     findings = check_intrinsics(name, camera.info)
-    ipm = camera.ipm[camera.initial_ipm]
-    cam_from_vehicle = guess_of(camera)
+    cam_from_vehicle = guessed_extrinsic(camera)
     findings += check_roi(name, camera, cam_from_vehicle)
-    findings += [_shape(name, camera.info, ipm), *_mounting(name, cam_from_vehicle)]
+    findings += [
+        _shape(name, camera.info, camera.ipm[camera.initial_ipm]),
+        *_mounting(name, cam_from_vehicle),
+    ]
     if camera.centre_prior is not None:
         findings += check_survey(name, camera.centre_prior, _centre(cam_from_vehicle))
     return findings
-
-
-def guess_of(camera: Camera) -> FloatArray:
-    """``cam_from_vehicle`` (4 x 4) of the initial IPM, above the ground, wherever the ROI lies."""
-    ipm = camera.ipm[camera.initial_ipm]
-    seen = camera.roi_vehicle.mean(axis=0)
-    guess = extrinsic_from_ipm(camera.info, ipm, seen)
-    if _centre(guess)[2] >= 0:
-        return guess
-    # A homography has two solutions; a point behind the camera settles on the one below the ground.
-    below = np.diag([-1.0, -1.0, 1.0])
-    other = guess.copy()
-    other[:3, :3] = guess[:3, :3] @ below
-    other[:3, 3] = -guess[:3, 3]
-    return other
 
 
 def check_intrinsics(name: str, info: CameraInfo) -> list[Finding]:
@@ -84,7 +72,7 @@ def check_intrinsics(name: str, info: CameraInfo) -> list[Finding]:
     other = abs(scale_u / max(scale_v, 1e-9) - 1) < _OTHER_SIZE and abs(scale_u - 1) > _OTHER_SIZE
     size = f"{scale_u * info.width:.0f} x {scale_v * info.height:.0f}"
     cause = (
-        f"camera_matrix is that of images of about {size}, these are {info.width} x {info.height}; "
+        f"camera_info is that of images of about {size}, these are {info.width} x {info.height}; "
         f"divide fx, fy, cx, cy by {scale_u:.3g}"
         if other
         else f"the principal point is {100 * off:.0f} % of the width off the image's centre; check cx and cy"
@@ -104,8 +92,8 @@ def check_intrinsics(name: str, info: CameraInfo) -> list[Finding]:
     square = judge(
         "square pixels", name, fx / fy - 1, _SQUARE, "",
         fine="fx and fy agree",
-        wrong=f"fx {fx:.0f} and fy {fy:.0f} differ by {100 * abs(fx / fy - 1):.0f} %: pixels are square; "
-        "check both",
+        wrong=f"the focal lengths fx {fx:.0f} and fy {fy:.0f} differ by {100 * abs(fx / fy - 1):.0f} %, "
+        "but pixels are square; check both in camera_info",
         status=Status.WARN,
     )  # fmt: skip
     centre = judge(
@@ -218,12 +206,14 @@ def _shape(name: str, info: CameraInfo, ipm: FloatArray) -> Finding:
     lengths = np.linalg.norm(first), np.linalg.norm(second)
     ratio = float(lengths[0] / lengths[1] - 1)
     cosine = float(first @ second / (lengths[0] * lengths[1]))
-    value = max(abs(ratio), abs(cosine))
+    value, part = (
+        (abs(ratio), "the focal length") if abs(ratio) > abs(cosine) else (abs(cosine), "the principal point")
+    )
     return judge(
         "ipm against camera matrix", name, value, _MISSHAPEN, "",
         fine="the IPM is a homography of this camera matrix",
-        wrong=f"the IPM does not fit camera_matrix by {100 * value:.0f} %: the focal length is wrong by about as much, "
-        "or the IPM was made for another camera, resolution or with distorted pixels; make one of them anew",
+        wrong=f"the IPM and camera_info differ by {100 * value:.0f} %, most in {part}: one of the two is wrong, of "
+        "another resolution, or the IPM was made from distorted pixels; make it anew",
         status=Status.WARN,
     )  # fmt: skip
 

@@ -40,6 +40,7 @@ _LEVER_M = 0.3
 _SURE = 5.0
 """Sigmas beyond which a measured offset is told: the poses' drift makes sigmas optimistic by up to two."""
 
+
 class Path(Enum):
     """What the images' ground says of the recorded path."""
 
@@ -96,7 +97,7 @@ CONVENTIONS: Mapping[str, Convention] = {
     ),
     "z down": Convention(
         _axes([[1, 0, 0], [0, -1, 0], [0, 0, -1]]),
-        "the attitude is that of a frame with z down (x forward, y right); turn it to x forward, y left, z up",
+        "the vehicle's z axis points down (x forward, y right); turn the attitude to x forward, y left, z up",
     ),
     "optical frame": Convention(
         _axes([[0, -1, 0], [0, 0, -1], [1, 0, 0]]),
@@ -120,7 +121,10 @@ CONVENTIONS: Mapping[str, Convention] = {
 _REFLECTED = ("from north", "clockwise", "south", "from south")
 """Conventions of yaw that poses alone cannot tell from a path whose axes are swapped."""
 
-AXES_SWAPPED = "x and y of the positions are swapped or one has the wrong sign; write x east and y north"
+AXES_SWAPPED = (
+    "x and y of the positions are swapped or one has the wrong sign, which mirrors the world; "
+    "write x east and y north"
+)
 
 
 def check_heading(motion: Motion, path: Path | None = None) -> list[Finding]:
@@ -222,13 +226,12 @@ def _overlap(motion: Motion) -> float:
 
 
 def _fitting(motion: Motion) -> list[str]:
-    """The names of the conventions that make path and attitude agree, those that drive ahead first."""
-    shares = {
-        name: _agreement(*convention.undo(motion.position, motion.rotation), motion.chords)
+    """The names of the conventions under which the vehicle drives ahead."""
+    return [
+        name
         for name, convention in CONVENTIONS.items()
-    }
-    ahead = [name for name, share in shares.items() if share[0] >= _FITS]
-    return ahead or [name for name, share in shares.items() if share[1] >= _FITS]
+        if _agreement(*convention.undo(motion.position, motion.rotation), motion.chords)[0] >= _FITS
+    ]
 
 
 def _cause(motion: Motion, fitting: list[str], path: Path | None) -> str | None:
@@ -242,10 +245,7 @@ def _cause(motion: Motion, fitting: list[str], path: Path | None) -> str | None:
         return "; or ".join(told)
     offset = _course_minus_yaw(motion)
     if not _is_upright(motion):
-        along = (np.abs(np.sin(offset)) < np.sin(_AGREES_RAD)).mean() >= _FITS
-        return None if along else (
-            "the attitude is no vehicle's on a road; check the order qx qy qz qw and the units of the angles"
-        )
+        return None
     offset_rad = _circular_median(offset)
     if (np.abs(angle_of(offset - offset_rad)) < _AGREES_RAD).mean() >= _FITS:
         return (
@@ -254,7 +254,9 @@ def _cause(motion: Motion, fitting: list[str], path: Path | None) -> str | None:
             "subtract that offset of the heading's antennas from yaw"
         )
     if _turns_too_fast(motion):
-        return "yaw turns 57 times as fast as the path: degrees were taken for radians; convert yaw to radians"
+        return (
+            "yaw turns 57 times as fast as the path: degrees were taken for radians; convert yaw to radians"
+        )
     return "heading and path have nothing to do with each other; check that both come from one and the same drive"
 
 

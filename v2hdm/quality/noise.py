@@ -88,9 +88,9 @@ def _against(key: str, measured: float, stated: float, unit: str) -> Finding:
     ratio = measured / stated
     degrees = " (degrees taken for radians would do that)" if unit == "rad" and ratio > _USELESS else ""
     return judge(
-        "pose scatter", f"pose_noise.{key}", ratio, _UNDERSTATED, "",
+        "pose scatter", "poses", ratio, _UNDERSTATED, "",
         fine="the poses scatter no more than stated",
-        wrong=f"from pose to pose they scatter by {measured:.2g} {unit}, {ratio:.0f} times {key} {stated:.2g}{degrees}; "
+        wrong=f"from pose to pose they scatter by {measured:.2g} {unit}, {ratio:.0f} times pose_noise.{key} {stated:.2g}{degrees}; "
         f"state {key} as it is, or find out why the receiver is worse than it says",
         status=Status.FAIL if ratio > _USELESS else Status.WARN,
     )  # fmt: skip

@@ -54,8 +54,7 @@ def check_jumps(motion: Motion, noise: PoseNoise) -> list[Finding]:
     """Whether positions and heights jump by more than noise and tyres allow."""
     if len(motion.stamp_s) < 3 or not len(motion.chords):
         return []
-    plane = np.linalg.norm(_off_line(motion, motion.position[:, :2]), axis=1)
-    height = np.abs(_off_line(motion, motion.position[:, 2:])[:, 0])
+    plane, height = _off_line(motion, motion.position[:, :2]), _off_line(motion, motion.position[:, 2:])
     longest_s = np.maximum(motion.interval_s[:-1], motion.interval_s[1:])
     spare = 0.5 * _HARDEST_MPS2 * longest_s**2
     return [
@@ -118,17 +117,20 @@ def _off_line(motion: Motion, values: FloatArray) -> FloatArray:
     return np.asarray(values[1:-1] - (values[:-2] + part * (values[2:] - values[:-2])))
 
 
-def _jump(check: str, motion: Motion, size: FloatArray, limit: FloatArray) -> Finding:
-    """The jump that is worst by its limit: both in metres."""
+def _jump(check: str, motion: Motion, off: FloatArray, limit: FloatArray) -> Finding:
+    """The worst of all offsets ``off`` (P - 2, D), m, from the line between the neighbours, by its limit."""
+    size = np.linalg.norm(off, axis=1)
     worst = int(np.argmax(size / limit))
     count = int((size > limit).sum())
-    where = motion.stamp_s[worst + 1]
+    # A step shows as half of it before and minus half of it behind.
+    beside = off[max(worst - 1, 0) : worst + 2]
+    step_m = float(np.linalg.norm(beside - off[worst], axis=1).max())
     kind = "the position" if check.startswith("position") else "the height"
     return judge(
         check, "poses", float(size[worst]), float(limit[worst]), "m",
         fine=f"{kind} never jumps",
-        wrong=f"{kind} jumps by {size[worst]:.2f} m at {where:.2f} s ({count} such records): the receiver lost its "
-        "RTK fix; leave that stretch out, or state its noise in pose_noise",
+        wrong=f"{kind} jumps by {step_m:.2f} m at {motion.stamp_s[worst + 1]:.2f} s ({count} such records): the "
+        "receiver lost its RTK fix; leave that stretch out, or state its noise in pose_noise",
     )  # fmt: skip
 
 
