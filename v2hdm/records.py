@@ -261,13 +261,16 @@ class ImageDetections:
 class Marking:
     """One mapped marking: ``corners_map`` (4, 2) m, counter-clockwise seen from above.
 
-    ``covariance_m2`` (8, 8) is that of the stacked corners, or None where the method has none.
+    ``covariance_m2`` (8, 8) is that of the stacked corners in the map, or None where the method has none.
+    ``relative_sigma_m`` is the standard deviation of a coordinate of its centre against that of the marking
+    nearest to ten metres away, of which a drift that both share is no part; None where it is not known.
     """
 
     kind: str
     corners_map: FloatArray
     sightings: int
     covariance_m2: FloatArray | None = None
+    relative_sigma_m: float | None = None
 
 
 @dataclass(frozen=True)

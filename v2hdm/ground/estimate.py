@@ -7,16 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2hdm.ground.adjust import Adjusted, Believed, adjust, tangent_covariance
+from v2hdm.ground.adjust import Adjusted, adjust, tangent_covariance
+from v2hdm.ground.beliefs import Beliefs
 from v2hdm.ground.matcher import Matcher, Round
 from v2hdm.ground.motion import motion_of
-from v2hdm.ground.mount import Mount, guessed_mount, rotation
-from v2hdm.ground.beliefs import Beliefs
+from v2hdm.ground.mount import Mount, guessed_mount
 from v2hdm.ground.noise import state_sigmas
 from v2hdm.ground.options import GroundOptions
-from v2hdm.ground.pairs import changing_pairs, spread_pairs
-from v2hdm.ground.results import GroundEstimate, GroundStatus, MatchedGround, Parameter, Reading
-from v2hdm.ground.start import Start, find_start
+from v2hdm.ground.pairs import spread_pairs
+from v2hdm.ground.results import GroundEstimate, GroundStatus, MatchedGround, Reading
+from v2hdm.ground.start import find_start
 from v2hdm.records import Calibration, Drive, FloatArray
 
 _SEARCH_M = (0.9, 0.5, 0.24, 0.15)
@@ -131,5 +131,3 @@ class _Work:
             patches=None,
             seconds=0.0,
         )
-
-

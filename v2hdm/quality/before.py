@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+
 from v2hdm.quality.cameras import check_camera
 from v2hdm.quality.clocks import check_clocks
 from v2hdm.quality.heading import check_heading
