@@ -20,7 +20,10 @@ import numpy as np
 
 from v2hdm.drive.rotation import rotation_from_euler
 from v2hdm.drive.stations import STATION_M, Stations, along_route, local_lines, local_planes
+from v2hdm.drive.unevenness import Unevenness, unevenness
 from v2hdm.records import BoolArray, FloatArray, Road, Trajectory
+
+__all__ = ["Laid", "Unevenness", "lay_flat", "tell", "unevenness"]
 
 _log = logging.getLogger(__name__)
 
@@ -38,8 +41,8 @@ _SWAY_RAD = 0.003
 _SWAY_M = 10.0
 """Way over which that sway lasts, m: a few seconds of driving."""
 
-_HEIGHT_SIGMAS = 2.0
-"""Heights from GNSS are about twice as uncertain as positions: no satellite is below the antenna."""
+_HEIGHT_SIGMAS = 1.5
+"""Heights from GNSS are half again as uncertain as positions: no satellite is below the antenna."""
 
 _HEIGHT_M = 5.0
 """Way over which an error of the height is of one piece, m."""
@@ -80,8 +83,7 @@ class Laid:
 def lay_flat(recorded: Trajectory, position_sigma_m: float) -> Laid:
     """Lay the road under ``recorded`` poses flat into z = 0.
 
-    Roll, or pitch, that is zero throughout was not measured: the vehicle is taken to follow the road. Where
-    all heights are the same, the ground was recorded as level, and attitudes are relative to it.
+    Roll, or pitch, that is zero throughout was not measured: the vehicle is taken to follow the road.
 
     Args:
         recorded: ``map_from_vehicle`` at the receiver's rate.
@@ -94,12 +96,12 @@ def lay_flat(recorded: Trajectory, position_sigma_m: float) -> Laid:
         return Laid(recorded, None, np.zeros(2))
     stations = along_route(poses[:, :2, 3])
     height_m = stations.mean(poses[:, 2, 3])
-    if np.ptp(poses[:, 2, 3]) == 0.0:
-        return _as_level(recorded, stations, height_m)
-    height_sigma_m = _HEIGHT_SIGMAS * position_sigma_m
     yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
     lean = _turned(slope, -yaw)
     measured = np.abs(lean).max(axis=0) > _ROUNDING
+    if not measured.any() and not poses[:, 2, 3].any():
+        return Laid(recorded, None, np.zeros(2))
+    height_sigma_m = _HEIGHT_SIGMAS * position_sigma_m
     if not measured.all():
         ground = stations.at_poses(_slope_of_heights(stations, height_m, height_sigma_m))
         lean[:, ~measured] = _turned(ground, -yaw)[:, ~measured]
@@ -190,16 +192,6 @@ def _integrated(stations: Stations, slope: FloatArray) -> FloatArray:
     steps = np.diff(stations.points_map, axis=0)
     rise = np.einsum("ni,nic->nc", steps, 0.5 * (slope[1:] + slope[:-1]))
     return np.vstack([np.zeros((1, slope.shape[2])), np.cumsum(rise, axis=0)])
-
-
-def _as_level(recorded: Trajectory, stations: Stations, height_m: FloatArray) -> Laid:
-    """Poses that were all recorded at one height: on a level ground."""
-    if height_m[0] == 0.0:
-        return Laid(recorded, None, np.zeros(2))
-    poses = recorded.map_from_vehicle.copy()
-    poses[:, 2, 3] = 0.0
-    road = Road(stations.points_map, height_m, np.zeros((len(height_m), 2)))
-    return Laid(Trajectory(recorded.stamp_s, poses), road, np.zeros(2))
 
 
 def _slope_of_up_axis(poses: FloatArray) -> FloatArray:
