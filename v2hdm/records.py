@@ -264,6 +264,7 @@ class Marking:
     ``covariance_m2`` (8, 8) is that of the stacked corners in the map, or None where the method has none.
     ``relative_sigma_m`` is the standard deviation of a coordinate of its centre against that of the marking
     nearest to ten metres away, of which a drift that both share is no part; None where it is not known.
+    ``heights_m`` (4,) are the recorded heights of the ground there, None where it was recorded as z = 0.
     """
 
     kind: str
@@ -271,15 +272,20 @@ class Marking:
     sightings: int
     covariance_m2: FloatArray | None = None
     relative_sigma_m: float | None = None
+    heights_m: FloatArray | None = None
 
 
 @dataclass(frozen=True)
 class Lane:
-    """One mapped lane line: a polyline ``points_map`` (N, 2) m along its centre."""
+    """One mapped lane line: a polyline ``points_map`` (N, 2) m along its centre.
+
+    ``heights_m`` (N,) are the recorded heights of the ground there, None where it was recorded as z = 0.
+    """
 
     kind: str
     points_map: FloatArray
     sightings: int
+    heights_m: FloatArray | None = None
 
 
 @dataclass(frozen=True)

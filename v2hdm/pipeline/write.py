@@ -12,6 +12,7 @@ from v2hdm.detection.batch import read_image
 from v2hdm.detection.camera.ground import ipm_from_extrinsic
 from v2hdm.hdmap.calibration import write_calibration
 from v2hdm.hdmap.geojson import write_geojson
+from v2hdm.hdmap.heights import with_heights
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.evaluate import Judgement
 from v2hdm.records import Drive, Image, ImageDetections
@@ -32,7 +33,7 @@ def write_results(
 ) -> None:
     """Write map, calibrations, metrics and pictures of one camera set's ``methods`` into ``folder``."""
     best = methods[BEST]
-    write_geojson(best.hd_map, folder / "map.geojson")
+    write_geojson(with_heights(best.hd_map, drive.road), folder / "map.geojson")
     for name, calibration in best.calibrations.items():
         write_calibration(calibration, folder / f"calibration_{name}.yaml")
     write_json(folder / "metrics.json", metrics)
