@@ -131,5 +131,3 @@ class _Work:
             patches=None,
             seconds=0.0,
         )
-
-
