@@ -192,7 +192,7 @@ class Drive:
     ``truth_dir`` only tells the report where ground truth lies, if there is any. ``trajectory`` holds the
     poses that those of the images were interpolated from, at the receiver's rate, with the road laid flat;
     ``recorded`` the same poses as they were recorded. ``road`` is the recorded ground, None where it was
-    recorded as the plane z = 0.
+    recorded as the plane z = 0. ``unposed`` counts, by camera, the images left out for want of a pose.
     """
 
     name: str
@@ -205,6 +205,7 @@ class Drive:
     trajectory: Trajectory | None = None
     recorded: Trajectory | None = None
     road: Road | None = None
+    unposed: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
