@@ -18,12 +18,14 @@ from v2hdm.adjust.problem import (
 from v2hdm.adjust.selection import MODELS, Model, Selection, select_model, with_model
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
+from v2hdm.adjust.suspect import Fault, Suspect, suspects
 
 __all__ = [
     "MODELS",
     "ControlPoints",
     "Drift",
     "Excluded",
+    "Fault",
     "KnownLengths",
     "Model",
     "Observability",
@@ -34,9 +36,11 @@ __all__ = [
     "Solution",
     "SolveOptions",
     "Status",
+    "Suspect",
     "Verdict",
     "observability",
     "select_model",
     "solve",
+    "suspects",
     "with_model",
 ]

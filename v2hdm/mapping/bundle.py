@@ -53,7 +53,7 @@ class Model:
     """What a solve estimates and how much noise it reckons with beyond that of the corners.
 
     ``floor_px`` is added to every corner in quadrature, px; the sum is multiplied by ``variance_factor``.
-    ``sizes`` are those that the user knows, ``survey`` the corners.
+    ``sizes`` are those that the user knows, ``survey`` the corners; ``clock_sigma_s`` holds clock offsets.
     """
 
     pose_sigma: PoseSigma
@@ -62,6 +62,7 @@ class Model:
     variance_factor: float = 1.0
     sizes: SizeOptions = field(default_factory=SizeOptions)
     survey: SurveyOptions = field(default_factory=SurveyOptions)
+    clock_sigma_s: float = CLOCK_SIGMA_S
 
 
 @dataclass(frozen=True)
@@ -235,7 +236,7 @@ def _problem(
         centre_sigma_m=sigma,
         pose_sigma=model.pose_sigma,
         twist_vehicle=vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s)[used.frames],
-        clock_sigma_s=CLOCK_SIGMA_S,
+        clock_sigma_s=model.clock_sigma_s,
     )
 
 
