@@ -167,12 +167,22 @@ class Road:
 
 @dataclass(frozen=True)
 class Image:
-    """One image of a drive and the vehicle's pose (4 x 4) at its time stamp."""
+    """One image of a drive and the vehicle's pose (4 x 4) when it was taken.
+
+    ``stamp_s`` is its recorded time; ``clock_offset_s`` is how much later it was taken, as far as that is
+    known.
+    """
 
     camera: str
     stamp_s: float
     path: Path
     map_from_vehicle: FloatArray
+    clock_offset_s: float = 0.0
+
+    @property
+    def taken_s(self) -> float:
+        """When the image was taken, on the clock of the poses."""
+        return self.stamp_s + self.clock_offset_s
 
 
 @dataclass(frozen=True)
@@ -182,7 +192,7 @@ class Drive:
     ``truth_dir`` only tells the report where ground truth lies, if there is any. ``trajectory`` holds the
     poses that those of the images were interpolated from, at the receiver's rate, with the road laid flat;
     ``recorded`` the same poses as they were recorded. ``road`` is the recorded ground, None where it was
-    recorded as the plane z = 0.
+    recorded as the plane z = 0. ``unposed`` counts, by camera, the images left out for want of a pose.
     """
 
     name: str
@@ -195,6 +205,7 @@ class Drive:
     trajectory: Trajectory | None = None
     recorded: Trajectory | None = None
     road: Road | None = None
+    unposed: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm.drive.camera_info import read_camera_info, write_camera_info
-from v2hdm.drive.images import ImageFiles, check_image_files, pose_images, select_cameras
+from v2hdm.drive.images import ImageFiles, check_image_files, count_unposed, pose_images, select_cameras
 from v2hdm.drive.mounting import (
     IPM_NAMES,
     choose_initial,
@@ -74,6 +74,7 @@ def read_folder_drive(path: Path, options: ReadOptions) -> Drive:
         truth_dir=_find_truth(content.get("truth"), path, f"{where}: truth"),
         trajectory=trajectory,
         recorded=trajectory,
+        unposed=count_unposed(files, images),
     )
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.drive.images import ImageFiles, check_image_files, pose_images, select_cameras
+from v2hdm.drive.images import ImageFiles, check_image_files, count_unposed, pose_images, select_cameras
 from v2hdm.drive.kitti_calibration import KittiCamera, read_kitti_camera
 from v2hdm.drive.options import KittiOptions, ReadOptions
 from v2hdm.drive.road import RoadAttitude, attitude_to_road
@@ -77,6 +77,7 @@ def read_kitti_drive(path: Path, options: ReadOptions) -> Drive:
         pose_noise=_POSE_NOISE,
         origin=_lower(origin_imu, float(vehicle_from_imu[2, 3])),
         trajectory=trajectory,
+        unposed=count_unposed(files, images),
     )
 
 

@@ -3,6 +3,7 @@
 The checks before the run (``python -m v2hdm.check``) and those after it end in one :class:`Verdict`.
 """
 
+from v2hdm.quality.before import check_drive
 from v2hdm.quality.verdict import Finding, Status, Verdict
 
-__all__ = ["Finding", "Status", "Verdict"]
+__all__ = ["Finding", "Status", "Verdict", "check_drive"]

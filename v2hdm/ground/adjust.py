@@ -1,0 +1,259 @@
+"""Robust least squares: the mounting under which matched pixels show the same ground."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from v2hdm.ground.model import GroundHits, by_lens, by_pixel, hit_ground
+from v2hdm.ground.mount import Mount, rotation
+from v2hdm.records import FloatArray
+
+PIXEL_SIGMA = 0.4
+"""What a patch's place in an image is off, px, at the most; the unit of the residuals."""
+
+_LEAST_PIXEL_SIGMA = 0.1
+"""Below this interpolation and the grid itself show, px."""
+
+_RAYLEIGH_MEDIAN = np.sqrt(2 * np.log(2))
+"""Median length of a plane vector whose components have a standard deviation of one."""
+
+_CAUCHY = 2.5
+"""Length of a whitened residual from which on it loses its weight."""
+
+_STEPS = 25
+_CONVERGED = 1e-3
+"""A step below so many standard deviations is the last."""
+
+CENTRE, TURN = slice(3, 6), slice(0, 3)
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Matches of all pairs of one camera.
+
+    Attributes:
+        first: (N,) the image of each match's first pixel, a row of the poses below.
+        second: (N,) that of its second.
+        first_px: (N, 2) raw pixels.
+        second_px: (N, 2) raw pixels.
+        pair: (N,) the pair.
+    """
+
+    first: FloatArray
+    second: FloatArray
+    first_px: FloatArray
+    second_px: FloatArray
+    pair: FloatArray
+
+
+@dataclass(frozen=True)
+class Believed:
+    """What is known before the ground is seen.
+
+    Attributes:
+        poses: (I, 4, 4) ``map_from_vehicle`` as recorded.
+        pose_information: (6, I, I) of the poses' errors; see :func:`v2hdm.ground.noise.pose_information`.
+        velocity: (I, 3) smoothed motion.
+        climb_m: (I,) what a grade of 1 has lifted the poses by, m.
+        centre_vehicle: (3,) surveyed camera centre.
+        centre_sigma_m: (3,) of it.
+    """
+
+    poses: FloatArray
+    pose_information: FloatArray
+    velocity: FloatArray
+    climb_m: FloatArray
+    centre_vehicle: FloatArray
+    centre_sigma_m: FloatArray
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """The solution.
+
+    Attributes:
+        mount: with the lens as freed.
+        extra: the freed parameter's value, 0 without one.
+        information: (K, K) marginal information of turn (3, rad), centre (3, m) and the freed parameter.
+        pose_errors: (I, 6) estimated :data:`v2hdm.ground.noise.STATES`.
+        residual: (N,) lengths in units of :data:`PIXEL_SIGMA` over both pixels.
+        scores: (P, K) gradient of each pair, the poses being estimated.
+    """
+
+    mount: Mount
+    extra: float
+    covariance: FloatArray
+    pose_errors: FloatArray
+    residual: FloatArray
+    weight: FloatArray
+
+
+def adjust(
+    observations: Observations,
+    believed: Believed,
+    start: Mount,
+    free: str | None = None,
+    tolerance: float = 1.0,
+    start_extra: float = 0.0,
+) -> Adjusted:
+    """Find the mounting, beside one parameter ``free`` if any, by Gauss-Newton with Cauchy's weights.
+
+    Args:
+        observations: the matches.
+        believed: poses, survey and their noise.
+        start: where to start from.
+        free: ``clock_s``, ``focal_scale``, ``distortion_k1`` or ``grade``, or None.
+        tolerance: factor on the length of residual from which on a match loses its weight.
+        start_extra: value of the parameter to start from, already within ``believed``'s poses or ``start``.
+    """
+    mount, extra = start, 0.0
+    errors = np.zeros((len(believed.poses), 6))
+    sigma_px = PIXEL_SIGMA
+    for _ in range(_STEPS):
+        residual, jacobian, root = _linearised(observations, believed, mount, extra, errors, free)
+        length = np.linalg.norm((root @ residual[:, :, None])[..., 0], axis=1)
+        usable = np.isfinite(length)
+        scale = float(np.median(length[usable])) / _RAYLEIGH_MEDIAN if usable.any() else 1.0
+        sigma_px = float(np.clip(PIXEL_SIGMA * scale, _LEAST_PIXEL_SIGMA, tolerance * PIXEL_SIGMA))
+        unit = PIXEL_SIGMA / sigma_px
+        weight = np.where(usable, 1 / (1 + (length * unit / (_CAUCHY * tolerance)) ** 2), 0.0)
+        system, gradient = _normal(observations, believed, mount, errors, residual, jacobian, root * unit, weight)
+        step = np.linalg.solve(system, -gradient)
+        known = 6 + (free is not None)
+        mount = mount.moved(step[TURN], step[CENTRE])
+        if free is not None:
+            extra += float(step[6])
+            if free == "focal_scale":
+                mount = mount.with_focal_scale((1 + extra) / (1 + extra - step[6]) - 1)
+            elif free == "distortion_k1":
+                mount = mount.with_k1(float(step[6]))
+        errors = errors + step[known:].reshape(-1, 6)
+        if np.max(np.abs(step) * np.sqrt(np.diag(system))) < _CONVERGED:
+            break
+    covariance = np.linalg.inv(system)[:known, :known]
+    return Adjusted(mount, extra + start_extra, covariance, errors, length, weight)
+
+
+def _linearised(
+    observations: Observations,
+    believed: Believed,
+    mount: Mount,
+    extra: float,
+    errors: FloatArray,
+    free: str | None,
+) -> tuple[FloatArray, list[FloatArray], FloatArray]:
+    """Differences (N, 2) m, their derivatives by mount and parameter and by both poses, whitening (N, 2, 2)."""
+    sides, spread = [], 0.0
+    poses = moved_poses(believed, errors, extra, free)
+    for image, px in ((observations.first, observations.first_px), (observations.second, observations.second_px)):
+        hits = hit_ground(mount, px, poses[image])
+        by_known = hits.by_mount()
+        if free is not None:
+            column = _by_parameter(free, mount, hits, px, poses[image], believed, image)
+            by_known = np.concatenate([by_known, column[:, :, None]], axis=2)
+        sides.append((hits.points_map, by_known, hits.by_pose()))
+        blur = PIXEL_SIGMA * by_pixel(mount, hits)
+        spread = spread + blur @ np.swapaxes(blur, 1, 2)
+    (points, known, pose), (points_2, known_2, pose_2) = sides
+    usable = np.isfinite(spread).all(axis=(1, 2))
+    root = np.full(spread.shape, np.nan)
+    root[usable] = np.linalg.inv(np.linalg.cholesky(spread[usable]))
+    return points - points_2, [known - known_2, pose, -pose_2], root
+
+
+def _by_parameter(
+    free: str,
+    mount: Mount,
+    hits: GroundHits,
+    px: FloatArray,
+    poses: FloatArray,
+    believed: Believed,
+    image: FloatArray,
+) -> FloatArray:
+    if free == "clock_s":
+        return hits.by_motion(believed.velocity[image])
+    if free == "grade":
+        return np.asarray(-hits.plane[:, :, 2] * believed.climb_m[image][:, None])
+    return by_lens(mount, px, poses, free)
+
+
+def moved_poses(believed: Believed, errors: FloatArray, extra: float, free: str | None) -> FloatArray:
+    """The poses (I, 4, 4) with their estimated ``errors`` (I, 6) taken in, and the freed parameter."""
+    shift = errors[:, 3:].copy()
+    turn = errors[:, :3].copy()
+    if free == "clock_s":
+        shift[:, :2] += extra * believed.velocity[:, :2]
+        turn[:, 2] += extra * believed.velocity[:, 2]
+    if free == "grade":
+        shift[:, 2] -= extra * believed.climb_m
+    out = believed.poses.copy()
+    turns = np.array([rotation(vector) for vector in turn])
+    out[:, :3, 3] += (believed.poses[:, :3, :3] @ shift[:, :, None])[..., 0]
+    out[:, :3, :3] = believed.poses[:, :3, :3] @ turns
+    return out
+
+
+def _normal(
+    observations: Observations,
+    believed: Believed,
+    mount: Mount,
+    errors: FloatArray,
+    residual: FloatArray,
+    jacobian: list[FloatArray],
+    root: FloatArray,
+    weight: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """The normal equations over mount, parameter and the six errors of every pose."""
+    known = jacobian[0].shape[2]
+    count = len(believed.poses)
+    size = known + 6 * count
+    system, gradient = np.zeros((size, size)), np.zeros(size)
+    good = weight > 0
+    scaled = np.sqrt(weight[good])[:, None, None] * root[good]
+    rows = scaled @ np.concatenate([part[good] for part in jacobian], axis=2)
+    value = (scaled @ residual[good][:, :, None])[..., 0]
+    first, second = observations.first[good], observations.second[good]
+    cuts = np.flatnonzero(np.diff(observations.pair[good])) + 1
+    for low, high in zip([0, *cuts], [*cuts, len(first)], strict=True):
+        if high == low:
+            continue
+        block = rows[low:high].reshape(-1, known + 12)
+        at = np.concatenate(
+            [np.arange(known)] + [known + 6 * int(image[low]) + np.arange(6) for image in (first, second)]
+        )
+        system[np.ix_(at, at)] += block.T @ block
+        gradient[at] += block.T @ value[low:high].ravel()
+    for state in range(6):
+        at = known + 6 * np.arange(count) + state
+        system[np.ix_(at, at)] += believed.pose_information[state]
+        gradient[at] += believed.pose_information[state] @ errors[:, state]
+    information = believed.centre_sigma_m**-2
+    system[range(3, 6), range(3, 6)] += information
+    gradient[CENTRE] += information * (mount.centre_vehicle - believed.centre_vehicle)
+    # A start with hardly any matches must not be singular.
+    system[range(3), range(3)] += 1.0
+    return system, gradient
+
+
+def tangent_covariance(mount: Mount, covariance: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of the left tangent of ``cam_from_vehicle`` from that of turn and centre."""
+    turn = -mount.vehicle_from_cam_rotation.T
+    jacobian = np.zeros((6, 6))
+    jacobian[:3, CENTRE] = turn
+    jacobian[3:, TURN] = turn
+    return np.asarray(jacobian @ covariance[:6, :6] @ jacobian.T)
+
+
+def without_pair(observations: Observations, pair: int) -> Observations:
+    """All matches but those of one pair."""
+    keep = observations.pair != pair
+    return replace(
+        observations,
+        first=observations.first[keep],
+        second=observations.second[keep],
+        first_px=observations.first_px[keep],
+        second_px=observations.second_px[keep],
+        pair=observations.pair[keep],
+    )
