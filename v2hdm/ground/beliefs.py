@@ -50,7 +50,9 @@ class Beliefs:
         """Distance driven (I,) at all images."""
         return self.motion.path_at_images(self.clock_s)
 
-    def about(self, observations: Observations, loosened: float = 1.0) -> tuple[Observations, Believed, FloatArray]:
+    def about(
+        self, observations: Observations, loosened: float = 1.0
+    ) -> tuple[Observations, Believed, FloatArray]:
         """The observations with images counted anew, what is known of these images, and their rows.
 
         Args:

@@ -7,12 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2hdm.ground.adjust import CENTRE, Adjusted, Observations, adjust
+from v2hdm.ground.adjust import CENTRE, Observations, adjust
 from v2hdm.ground.beliefs import Beliefs
 from v2hdm.ground.motion import Motion
 from v2hdm.ground.mount import Mount
 from v2hdm.ground.results import Parameter
-from v2hdm.records import FloatArray, PoseNoise
 
 _FREE_CENTRE = {"forward_m": (0, 2.0), "left_m": (1, 2.0), "up_m": (2, 0.3)}
 """Axis of the centre, and how far from its survey it may be, m."""

@@ -15,6 +15,7 @@ from v2hdm.hdmap.geojson import write_geojson
 from v2hdm.hdmap.heights import with_heights
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.evaluate import Judgement
+from v2hdm.quality import Verdict
 from v2hdm.records import Drive, Image, ImageDetections
 from v2hdm.report.figures import save_birdseye, save_growth, save_overlay
 from v2hdm.report.outputs import write_json
@@ -30,6 +31,7 @@ def write_results(
     methods: Mapping[str, MethodResult],
     judgement: Judgement,
     metrics: Mapping[str, Any],
+    verdict: Verdict,
 ) -> None:
     """Write map, calibrations, metrics and pictures of one camera set's ``methods`` into ``folder``."""
     best = methods[BEST]
