@@ -149,9 +149,10 @@ def _map_and_judge(
     with _timed(seconds, "judge"):
         verdict = Verdict.of(inspection.findings)
     with _timed(seconds, "evaluate"):
-        judgement = evaluate(drive, detections, methods, config.mapping, partial(progress, "evaluate"))
+        described = inspection.drive_as_described
+        judgement = evaluate(described, detections, methods, config.mapping, partial(progress, "evaluate"))
     metrics = {**about, "verdict": verdict.as_json(), **judgement.metrics, "seconds": seconds}
-    write_results(folder, drive, detections, list(methods.values())[-1], judgement, metrics, verdict)
+    write_results(folder, described, detections, list(methods.values())[-1], judgement, metrics, verdict)
     return RunResult(Path(config.output) / config.name, metrics, judgement.headlines, verdict)
 
 
