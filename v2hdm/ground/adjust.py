@@ -29,6 +29,10 @@ against a pixel, but thousands of matches share it."""
 _BENDS = 6
 """Terms of a smooth error of each pixel coordinate: a polynomial of the second degree."""
 
+_LARGEST_TURN_RAD = 0.05
+_LARGEST_SHIFT_M = 0.2
+"""A step larger than these leaves what the equations are linear in."""
+
 _STEPS = 25
 _CONVERGED = 1e-3
 """A step below so many standard deviations is the last."""
@@ -129,7 +133,7 @@ def adjust(
         unit = PIXEL_SIGMA / sigma_px
         weight = np.where(usable, 1 / (1 + (length * unit / (_CAUCHY * tolerance)) ** 2), 0.0)
         system, gradient = _normal(observations, believed, mount, errors, bends, residual, jacobian, root * unit, weight)
-        step = np.linalg.solve(system, -gradient)
+        step = _short(np.linalg.solve(system, -gradient))
         known = len(step) - errors.size
         mount = mount.moved(step[TURN], step[CENTRE])
         bends = bends + step[6 : 6 + 2 * _BENDS]
@@ -146,6 +150,12 @@ def adjust(
     wanted = [*range(6), *range(known - (free is not None), known)]
     covariance = np.linalg.inv(system)[np.ix_(wanted, wanted)]
     return Adjusted(mount, extra + start_extra, covariance, errors, moved_poses(believed, errors, extra, free), length, weight)
+
+
+def _short(step: FloatArray) -> FloatArray:
+    """The step, shortened to what its linearisation holds for."""
+    turn, shift = np.abs(step[TURN]).max(), np.abs(step[CENTRE]).max()
+    return step / max(1.0, float(turn) / _LARGEST_TURN_RAD, float(shift) / _LARGEST_SHIFT_M)
 
 
 def _linearised(
