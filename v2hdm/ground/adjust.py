@@ -29,6 +29,10 @@ against a pixel, but thousands of matches share it."""
 _BENDS = 6
 """Terms of a smooth error of each pixel coordinate: a polynomial of the second degree."""
 
+_LARGEST_TURN_RAD = 0.05
+_LARGEST_SHIFT_M = 0.2
+"""A step larger than these leaves what the equations are linear in."""
+
 _STEPS = 25
 _CONVERGED = 1e-3
 """A step below so many standard deviations is the last."""
@@ -128,10 +132,8 @@ def adjust(
         sigma_px = float(np.clip(PIXEL_SIGMA * scale, _LEAST_PIXEL_SIGMA, tolerance * PIXEL_SIGMA))
         unit = PIXEL_SIGMA / sigma_px
         weight = np.where(usable, 1 / (1 + (length * unit / (_CAUCHY * tolerance)) ** 2), 0.0)
-        system, gradient = _normal(
-            observations, believed, mount, errors, bends, residual, jacobian, root * unit, weight
-        )
-        step = np.linalg.solve(system, -gradient)
+        system, gradient = _normal(observations, believed, mount, errors, bends, residual, jacobian, root * unit, weight)
+        step = _short(np.linalg.solve(system, -gradient))
         known = len(step) - errors.size
         mount = mount.moved(step[TURN], step[CENTRE])
         bends = bends + step[6 : 6 + 2 * _BENDS]
@@ -147,15 +149,13 @@ def adjust(
             break
     wanted = [*range(6), *range(known - (free is not None), known)]
     covariance = np.linalg.inv(system)[np.ix_(wanted, wanted)]
-    return Adjusted(
-        mount,
-        extra + start_extra,
-        covariance,
-        errors,
-        moved_poses(believed, errors, extra, free),
-        length,
-        weight,
-    )
+    return Adjusted(mount, extra + start_extra, covariance, errors, moved_poses(believed, errors, extra, free), length, weight)
+
+
+def _short(step: FloatArray) -> FloatArray:
+    """The step, shortened to what its linearisation holds for."""
+    turn, shift = np.abs(step[TURN]).max(), np.abs(step[CENTRE]).max()
+    return step / max(1.0, float(turn) / _LARGEST_TURN_RAD, float(shift) / _LARGEST_SHIFT_M)
 
 
 def _linearised(
@@ -170,10 +170,7 @@ def _linearised(
     """Differences (N, 2) m, their derivatives by mount and parameter and by both poses, whitening (N, 2, 2)."""
     sides, spread = [], 0.0
     poses = moved_poses(believed, errors, extra, free)
-    for image, px in (
-        (observations.first, observations.first_px),
-        (observations.second, observations.second_px),
-    ):
+    for image, px in ((observations.first, observations.first_px), (observations.second, observations.second_px)):
         hits = hit_ground(mount, px, poses[image])
         by_px = by_pixel(mount, hits)
         bending = _bending(mount, px, by_px)
