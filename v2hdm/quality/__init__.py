@@ -4,6 +4,7 @@ The checks before the run (``python -m v2hdm.check``) and those after it end in 
 """
 
 from v2hdm.quality.before import check_drive
+from v2hdm.quality.ground import clock_corrections
 from v2hdm.quality.verdict import Finding, Status, Verdict
 
-__all__ = ["Finding", "Status", "Verdict", "check_drive"]
+__all__ = ["Finding", "Status", "Verdict", "check_drive", "clock_corrections"]
