@@ -25,6 +25,10 @@ _LEAST_LEAD = 0.1
 _PEAK_CELLS = 3
 """Half width of what belongs to a peak, in cells of the grid."""
 
+_COARSEST_M = 0.1
+"""Standard deviation of the blur that is taken away: highlights, shadows and wet sheens are wider, and stay
+with the light or the camera instead of the ground, m."""
+
 _LEAST_CONTRAST = 1.0
 """Grey levels; less than this is the noise of an even surface."""
 
@@ -88,7 +92,8 @@ class Sheet:
         px = view.pixels(self.points()).astype(np.float32).reshape(*self.shape, 2)
         seen = ~np.isnan(px[..., 0])
         px[~seen] = -1
-        return cv2.remap(view.grey, px[..., 0], px[..., 1], cv2.INTER_LINEAR).astype(np.float32), seen
+        grey = cv2.remap(view.grey, px[..., 0], px[..., 1], cv2.INTER_LINEAR).astype(np.float32)
+        return grey - cv2.GaussianBlur(grey, (0, 0), _COARSEST_M / self.grid_m), seen
 
 
 def patch_centres(

@@ -79,7 +79,8 @@ def _settle(matcher: Matcher, beliefs: Beliefs, pairs: FloatArray, mount: Mount,
         share, sought = matched.share, matched.sought
         if len(matched.correlation) < _LEAST_MATCHES or share < _PASSES:
             return Start(None, share, sought)
-        mount = adjust(*beliefs.about(matched.observations, _LOOSENED), mount, tolerance=_LOOSENED).mount
+        used, believed, _ = beliefs.about(matched.observations, _LOOSENED)
+        mount = adjust(used, believed, mount, tolerance=_LOOSENED).mount
         away = guess.vehicle_from_cam_rotation.T @ mount.vehicle_from_cam_rotation
         if np.trace(away) < 1 + 2 * np.cos(np.deg2rad(_FARTHEST_DEG)):
             return Start(None, 0.0, sought)
