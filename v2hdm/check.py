@@ -11,25 +11,21 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.door import answer_signals, open_door
+from v2hdm.door import EXIT_FAILED_VERDICT, answer_signals, open_door
 
-EXIT_FAIL = 3
 _INTERRUPTED = "interrupted; nothing was written"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the door; 0 for PASS and WARN, 3 for FAIL, 2 with one line on stderr for what cannot be read."""
     parsed = _parser().parse_args(arguments)
-    failed = False
+    return open_door("v2hdm.check", "map", _INTERRUPTED, lambda: _check(parsed))
 
-    def work() -> None:
-        nonlocal failed
-        from v2hdm.checkup import check_up
 
-        failed = check_up(parsed.drive, parsed.output, parsed.camera, parsed.ground, parsed.workers)
+def _check(parsed: argparse.Namespace) -> int:
+    from v2hdm.checkup import check_up
 
-    code = open_door("v2hdm.check", "map", _INTERRUPTED, work)
-    return EXIT_FAIL if code == 0 and failed else code
+    return EXIT_FAILED_VERDICT if check_up(parsed) else 0
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -44,6 +40,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--no-ground", dest="ground", action="store_false", help="do not match bare ground: faster, says less"
     )
+    parser.add_argument("--all", action="store_true", help="also print the checks that passed")
     parser.add_argument("--workers", type=int, default=0, help="processes (default: one per core)")
     return parser
 

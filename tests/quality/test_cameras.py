@@ -25,7 +25,7 @@ def survey(xyz: FloatArray) -> Spoil:
 
 WRONG: dict[str, tuple[Spoil, str, str]] = {
     "K of half the size": (
-        lambda c: with_k(c, fx=450, fy=450, cx=319.5, cy=179.5), "principal point", "images of about 640 x 360",
+        lambda c: with_k(c, fx=450, fy=450, cx=319.5, cy=179.5), "principal point", "about 640 x 360",
     ),
     "principal point": (lambda c: with_k(c, cx=400.0), "principal point", "19 % of the width"),
     "focal in mm": (lambda c: with_k(c, fx=4.5, fy=4.5), "focal length", "not in mm"),
@@ -33,16 +33,16 @@ WRONG: dict[str, tuple[Spoil, str, str]] = {
     "fx and fy": (
         lambda c: with_k(c, fx=945.0, fy=945.0), "ipm against camera matrix", "most in the focal length",
     ),
-    "cx of the IPM": (lambda c: with_k(c, cx=730.0), "ipm against camera matrix", "most in the principal point"),
+    "cx of the IPM": (lambda c: with_k(c, cx=730.0), "ipm against camera matrix", "in the principal point"),
     "ROI behind": (roi(np.negative), "roi", "behind the camera"),
-    "ROI aside": (roi(lambda points: points + [0, 30]), "roi", "only 0 % of roi_vehicle"),
-    "ROI tiny": (roi(lambda points: 10 + 0.05 * (points - points.mean(axis=0)) - [0, 10]), "roi", "enlarge it"),
+    "ROI aside": (roi(lambda points: points + np.array([0, 30])), "roi", "only 0 % of roi_vehicle"),
+    "ROI tiny": (roi(lambda points: 0.05 * points + np.array([9, 0])), "roi", "enlarge it"),
     "ROI far": (roi(lambda points: points * [5, 1]), "roi range", "reaches 68 m"),
-    "survey sign": (survey(CENTRE * [-1, 1, 1]), "survey against guess", "its x has the wrong sign; write 2.00"),
+    "survey sign": (survey(CENTRE * [-1, 1, 1]), "survey against guess", "its x has the wrong sign"),
     "survey swapped": (survey(CENTRE[[1, 0, 2]]), "survey against guess", "x and y are swapped"),
     "survey in mm": (survey(1e3 * CENTRE), "survey against guess", "in millimetres"),
     "survey in feet": (survey(CENTRE / 0.3048), "survey against guess", "in feet"),
-    "survey elsewhere": (survey(CENTRE + [3, 0, 0]), "survey against guess", "by +3.0, "),
+    "survey elsewhere": (survey(CENTRE + np.array([3, 0, 0])), "survey against guess", "by +3.0, "),
 }  # fmt: skip
 
 
@@ -58,7 +58,7 @@ def test_a_wrong_camera_is_told(name: str) -> None:
 
 
 def test_a_guess_borrowed_from_a_sister_vehicle_is_fine() -> None:
-    borrowed = camera(pitch_deg=20.0, centre=CENTRE + [0.3, -0.2, 0.3])
+    borrowed = camera(pitch_deg=20.0, centre=CENTRE + np.array([0.3, -0.2, 0.3]))
     assert not raised(check_camera("front", borrowed))
 
 

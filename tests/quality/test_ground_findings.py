@@ -9,7 +9,7 @@ import pytest
 
 from tests.quality.drives import CENTRE, camera, drive, poses, raised
 from v2hdm.ground.results import GroundEstimate, GroundStatus, Parameter, Reading
-from v2hdm.quality import Status
+from v2hdm.quality import Status, clock_corrections
 from v2hdm.quality.ground import CHECKS, check_ground, path_of
 from v2hdm.quality.heading import Path
 from v2hdm.records import Calibration
@@ -157,3 +157,12 @@ def test_poses_that_pull_are_told_where_nothing_else_is() -> None:
     pulled = replace(estimate(), pulls={"heading": 4.0, "position": 1.0})
     assert "their heading is 4 times pose_noise off" in told(pulled)["poses against ground"]
     assert list(told(replace(pulled, parameters=estimate(clock_s=0.06).parameters))) == ["clock"]
+
+
+def test_only_clocks_that_are_surely_off_and_correctable_are_corrected() -> None:
+    ground = {
+        "front": estimate("front", clock_s=0.06),
+        "rear": estimate("rear", clock_s=0.01),
+        "left": estimate("left", clock_s=0.4),
+    }
+    assert clock_corrections(ground) == {"front": 0.06}

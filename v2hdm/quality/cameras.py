@@ -72,8 +72,8 @@ def check_intrinsics(name: str, info: CameraInfo) -> list[Finding]:
     other = abs(scale_u / max(scale_v, 1e-9) - 1) < _OTHER_SIZE and abs(scale_u - 1) > _OTHER_SIZE
     size = f"{scale_u * info.width:.0f} x {scale_v * info.height:.0f}"
     cause = (
-        f"camera_info is that of images of about {size}, these are {info.width} x {info.height}; "
-        f"divide fx, fy, cx, cy by {scale_u:.3g}"
+        f"camera_info is that of images of about {size}, these are {info.width} x {info.height}; divide fx, "
+        f"fy, cx, cy by {scale_u:.3g}"
         if other
         else f"the principal point is {100 * off:.0f} % of the width off the image's centre; check cx and cy"
     )
@@ -86,8 +86,8 @@ def check_intrinsics(name: str, info: CameraInfo) -> list[Finding]:
     square = judge(
         "square pixels", name, fx / fy - 1, _SQUARE, "",
         fine="fx and fy agree",
-        wrong=f"the focal lengths fx {fx:.0f} and fy {fy:.0f} differ by {100 * abs(fx / fy - 1):.0f} %, "
-        "but pixels are square; check both in camera_info",
+        wrong=f"the focal lengths fx {fx:.0f} and fy {fy:.0f} differ by {100 * abs(fx / fy - 1):.0f} %, but "
+        "pixels are square; check both in camera_info",
         status=Status.WARN,
     )  # fmt: skip
     centre = judge(
@@ -107,8 +107,8 @@ def check_roi(name: str, camera: Camera, cam_from_vehicle: FloatArray) -> list[F
     behind = float((depth <= 0).mean())
     if behind > 1 - _ROI_SEEN:
         says = (
-            "roi_vehicle lies behind the camera: its x, or the guess, has the wrong sign "
-            "(x is forward, a rear camera's ROI has negative x); mend one of them"
+            "roi_vehicle lies behind the camera: its x, or the guess, has the wrong sign (x is forward, a "
+            "rear camera's ROI has negative x); mend one of them"
         )
         return [Finding("roi", Status.FAIL, 1 - behind, _ROI_SEEN, "", says, name)]
     seen = _share_in_image(camera, grid, depth)
@@ -181,8 +181,7 @@ def _mounting(name: str, cam_from_vehicle: FloatArray) -> list[Finding]:
         "camera tilt", name, tilt_deg, _TILTED_DEG, "deg",
         fine="the guess holds the camera upright",
         wrong=f"the guess tilts the camera by {tilt_deg:.0f} deg about its axis: its axes are x right, y "
-        "down, "
-        "z forward, and v counts downwards; mend the guess, or turn the images",
+        "down, z forward, and v counts downwards; mend the guess, or turn the images",
     )  # fmt: skip
     return [of_vehicle, upright]
 
@@ -201,8 +200,7 @@ def _shape(name: str, info: CameraInfo, ipm: FloatArray) -> Finding:
         "ipm against camera matrix", name, value, _MISSHAPEN, "",
         fine="the IPM is a homography of this camera matrix",
         wrong=f"the IPM and camera_info differ by {100 * value:.0f} %, most in {part}: one of the two is "
-        "wrong, of "
-        "another resolution, or the IPM was made from distorted pixels; make it anew",
+        "wrong, of another resolution, or the IPM was made from distorted pixels; make it anew",
         status=Status.WARN,
     )  # fmt: skip
 

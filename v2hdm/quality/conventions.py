@@ -83,6 +83,6 @@ REFLECTED = ("from north", "clockwise", "south", "from south")
 """Conventions of yaw that poses alone cannot tell from a path whose axes are swapped."""
 
 AXES_SWAPPED = (
-    "x and y of the positions are swapped or one has the wrong sign, which mirrors the world; "
-    "write x east and y north"
+    "x and y of the positions are swapped or one has the wrong sign, which mirrors the world; write x east "
+    "and y north"
 )

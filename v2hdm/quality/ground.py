@@ -112,8 +112,7 @@ def _camera(drive: Drive, name: str, estimate: GroundEstimate) -> list[Finding]:
 
 NO_MATCH = (
     "bare ground does not match between the images as stamps, poses, lens and guess say: check the clock, "
-    "the "
-    "unit of the positions (feet?), whether the images are upside down, and the guess of the mounting"
+    "the unit of the positions (feet?), whether the images are upside down, and the guess of the mounting"
 )
 """The sentence where no cause can be told."""
 
@@ -167,22 +166,19 @@ _PARAMETERS: Mapping[str, tuple[str, float, str, float, Status, str, str]] = {
         "survey height", _UP_M, "m", 1.0, Status.WARN,
         "the ground fits the camera's surveyed height",
         "centre_prior is {size:.2f} m too {way} for what the ground shows; survey the camera's height above "
-        "the "
-        "road anew, or widen its sigma_m",
+        "the road anew, or widen its sigma_m",
     ),
     "forward_m": (
         "survey forward", _ALONG_M, "m", 1.0, Status.WARN,
         "the ground fits the camera's surveyed place along the vehicle",
         "centre_prior puts the camera {size:.1f} m too {way}: poses and survey have different origins (the "
-        "antenna "
-        "instead of the axle?), or its x is wrong; give both for one origin",
+        "antenna instead of the axle?), or its x is wrong; give both for one origin",
     ),
     "left_m": (
         "survey left", _ALONG_M, "m", 1.0, Status.WARN,
         "the ground fits the camera's surveyed place across the vehicle",
         "centre_prior puts the camera {size:.1f} m too {way}: poses and survey have different origins (an "
-        "antenna at "
-        "the side?), or its y is wrong; give both for one origin",
+        "antenna at the side?), or its y is wrong; give both for one origin",
     ),
 }  # fmt: skip
 """Of each parameter: check, limit, unit, factor to that unit, status, sentences where it passes and fails."""
@@ -194,14 +190,13 @@ def _fit(name: str, estimate: GroundEstimate, own: list[Finding]) -> list[Findin
     pulls = {part: pull for part, pull in estimate.pulls.items() if np.isfinite(pull)}
     part = max(pulls, key=lambda key: pulls[key], default="")
     clock = estimate.parameters.get("clock_s")
-    late = clock is not None and clock.told and abs(clock.value) > max(_CLOCK_S, _SURE * clock.sigma)
+    late = clock is not None and _is_off(clock)
     findings = [
         judge(
             "ground residual", name, estimate.median_residual, _RESIDUAL, "",
             fine="matched ground lies where lens and mounting put it",
             wrong="matched ground does not lie where any mounting puts it: the lens' distortion or focal "
-            "length in "
-            "camera_info is wrong, or the road in the ROI is no plane",
+            "length in camera_info is wrong, or the road in the ROI is no plane",
         )
     ]  # fmt: skip
     if pulls and not raised and not late:
@@ -210,26 +205,38 @@ def _fit(name: str, estimate: GroundEstimate, own: list[Finding]) -> list[Findin
                 "poses against ground", name, pulls[part], _PULL, "",
                 fine="the images move as the poses do, within pose_noise",
                 wrong=f"the images move otherwise than the poses: their {part} is {pulls[part]:.0f} times "
-                "pose_noise "
-                "off; state the noise as it is, or check the clock",
+                "pose_noise off; state the noise as it is, or check the clock",
                 status=Status.WARN,
             )
         )  # fmt: skip
     return findings
 
 
-def _clocks(ground: Mapping[str, GroundEstimate]) -> list[Finding]:
-    """Each camera's clock; one sentence for all where they are off alike."""
-    clocks = {
+def clock_corrections(ground: Mapping[str, GroundEstimate]) -> dict[str, float]:
+    """By camera, how much later than stamped its images were taken, s, where that is sure and correctable."""
+    return {name: clock.value for name, clock in _late(ground).items() if abs(clock.value) <= _CORRECTABLE_S}
+
+
+def _asked_clocks(ground: Mapping[str, GroundEstimate]) -> dict[str, Parameter]:
+    return {
         name: estimate.parameters["clock_s"]
         for name, estimate in ground.items()
         if "clock_s" in estimate.parameters and estimate.reading is Reading.AS_GIVEN
     }
-    late = {
-        name: clock
-        for name, clock in clocks.items()
-        if clock.told and abs(clock.value) > max(_CLOCK_S, _SURE * clock.sigma)
-    }
+
+
+def _late(ground: Mapping[str, GroundEstimate]) -> dict[str, Parameter]:
+    """The clocks that are off beyond doubt."""
+    return {name: clock for name, clock in _asked_clocks(ground).items() if _is_off(clock)}
+
+
+def _is_off(clock: Parameter) -> bool:
+    return clock.told and abs(clock.value) > max(_CLOCK_S, _SURE * clock.sigma)
+
+
+def _clocks(ground: Mapping[str, GroundEstimate]) -> list[Finding]:
+    """Each camera's clock; one sentence for all where they are off alike."""
+    clocks, late = _asked_clocks(ground), _late(ground)
     common = len(late) == len(clocks) > 1 and np.ptp([clock.value for clock in late.values()]) < _CLOCK_S
     findings = []
     for name, clock in clocks.items():
@@ -238,14 +245,15 @@ def _clocks(ground: Mapping[str, GroundEstimate]) -> list[Finding]:
             findings.append(Finding("clock", Status.PASS, None, 1e3 * _CLOCK_S, "ms", says, name))
             continue
         size, way = abs(1e3 * clock.value), "later" if clock.value > 0 else "earlier"
+        correctable = abs(clock.value) <= _CORRECTABLE_S
+        remedy = "the map is corrected by it; mend the stamps" if correctable else "mend the stamps"
         whose = "all cameras alike: the poses' clock is off" if common else "this camera's clock is off"
         findings.append(
             judge(
                 "clock", name, 1e3 * clock.value, 1e3 * max(_CLOCK_S, _SURE * clock.sigma), "ms",
                 fine="images and poses are on one clock",
-                wrong=f"the images were taken {size:.0f} ms {way} than their stamps say ({whose}); correct "
-                "the stamps",
-                status=Status.WARN if abs(clock.value) <= _CORRECTABLE_S else Status.FAIL,
+                wrong=f"the images were taken {size:.0f} ms {way} than their stamps say ({whose}); {remedy}",
+                status=Status.WARN if correctable else Status.FAIL,
             )
         )  # fmt: skip
     return findings

@@ -79,8 +79,7 @@ def _as_given(motion: Motion, agrees: float, path: Path | None) -> Finding:
     if back > _FITS and path is not Path.AS_GIVEN:
         says = (
             "the vehicle drives backwards all the time; if it did not, yaw is off by 180 deg (turn it), or "
-            "the "
-            "poses are vehicle_from_map (write their inverse)"
+            "the poses are vehicle_from_map (write their inverse)"
         )
         return Finding("heading", Status.WARN, back, _FITS, "", says, "poses")
     how = f"it drives backwards on {100 * back:.0f} % of the way" if back > 0.01 else "it drives forwards"
@@ -134,8 +133,8 @@ def _lever(offset_rad: FloatArray, curvature: FloatArray, overlap: float) -> lis
             "origin", "poses", value, _LEVER_M + _SURE * sigma, "m",
             fine="the recorded point follows its heading in turns, as one at the rear axle does",
             wrong=f"in turns the recorded point moves as one {abs(value):.1f} m "
-            f"{'ahead of' if value > 0 else 'behind'} the rear axle does (the antenna?); "
-            "give the poses and the survey of the cameras for one and the same origin",
+            f"{'ahead of' if value > 0 else 'behind'} the rear axle does (the antenna?); give the poses and "
+            "the survey of the cameras for one and the same origin",
             status=Status.WARN,
         )
     ]  # fmt: skip
@@ -171,8 +170,8 @@ def _cause(motion: Motion, fitting: list[str], path: Path | None) -> str | None:
     if (np.abs(angle_of(offset - offset_rad)) < _AGREES_RAD).mean() >= _FITS:
         return (
             f"the vehicle drives {abs(np.rad2deg(offset_rad)):.0f} deg to the "
-            f"{'left' if offset_rad > 0 else 'right'} of its heading all the time; "
-            "subtract that offset of the heading's antennas from yaw"
+            f"{'left' if offset_rad > 0 else 'right'} of its heading all the time; subtract that offset of "
+            "the heading's antennas from yaw"
         )
     if _turns_too_fast(motion):
         return (

@@ -86,8 +86,7 @@ def _frozen(name: str, images: Sequence[Image]) -> Finding:
         "frozen images", name, share, _FROZEN, "",
         fine="each image differs from the one before",
         wrong=f"{100 * share:.0f} % of the images repeat the one before while the vehicle moves{where}: the "
-        "camera "
-        "froze, or one file is listed several times; drop the repeats from the list",
+        "camera froze, or one file is listed several times; drop the repeats from the list",
     )  # fmt: skip
 
 
@@ -108,8 +107,8 @@ def _exposure(name: str, camera: Camera, images: Sequence[Image]) -> list[Findin
         judge(
             check, name, float(np.median(shares)), _CLIPPED, "",
             fine="the road is well exposed",
-            wrong=f"{100 * np.median(shares):.0f} % of the road in the ROI is {how}: the images are {cause}; "
-            "set the camera's exposure for the road",
+            wrong=f"{100 * np.median(shares):.0f} % of the road in the ROI is {how}: the images are "
+            f"{cause}; set the camera's exposure for the road",
             status=Status.WARN,
         )
         for check, shares, how, cause in (

@@ -93,8 +93,7 @@ def _against(key: str, measured: float, stated: float, unit: str) -> Finding:
         "pose scatter", "poses", ratio, _UNDERSTATED, "",
         fine="the poses scatter no more than stated",
         wrong=f"from pose to pose they scatter by {measured:.2g} {unit}, {ratio:.0f} times pose_noise.{key} "
-        f"{stated:.2g}{degrees}; "
-        f"state {key} as it is, or find out why the receiver is worse than it says",
+        f"{stated:.2g}{degrees}; state {key} as it is, or find out why the receiver is worse than it says",
         status=Status.FAIL if ratio > _USELESS else Status.WARN,
     )  # fmt: skip
 

@@ -76,9 +76,8 @@ def check_attitude(motion: Motion) -> list[Finding]:
             "attitude", "poses", largest_deg, _STEEPEST_DEG, "deg",
             fine="roll and pitch are those of a vehicle on a road",
             wrong=f"roll or pitch reach {largest_deg:.0f} deg, no vehicle's on a road: were degrees taken "
-            "for radians "
-            f"(then it is {np.deg2rad(largest_deg):.1f} deg), or the quaternions not in the order qx qy qz "
-            "qw?",
+            f"for radians (then it is {np.deg2rad(largest_deg):.1f} deg), or the quaternions not in the "
+            "order qx qy qz qw?",
         )
     ]  # fmt: skip
     return findings + _pitch_sign(motion, pitch_rad)
@@ -94,14 +93,13 @@ def _hardly_moves(motion: Motion) -> Finding:
         return Finding(
             "path length", Status.FAIL, moved_m, CHORD_M, "m",
             f"positions are in {unit}: the path is {moved_m:.2g} m long and smooth; convert them to metres "
-            "east "
-            "and north of the site",
+            "east and north of the site",
             "poses",
         )  # fmt: skip
     return Finding(
         "path length", Status.FAIL, moved_m, CHORD_M, "m",
-        f"the vehicle nowhere moves {CHORD_M:g} m in {lag_s:g} s: a drive that stands maps nothing; "
-        "check that positions are in metres and stamps in seconds",
+        f"the vehicle nowhere moves {CHORD_M:g} m in {lag_s:g} s: a drive that stands maps nothing; check "
+        "that positions are in metres and stamps in seconds",
         "poses",
     )  # fmt: skip
 
@@ -134,8 +132,7 @@ def _jump(check: str, motion: Motion, off: FloatArray, limit: FloatArray) -> Fin
         check, "poses", float(size[worst]), float(limit[worst]), "m",
         fine=f"{kind} never jumps",
         wrong=f"{kind} jumps by {step_m:.2f} m at {motion.stamp_s[worst + 1]:.2f} s ({count} such records): "
-        "the "
-        "receiver lost its RTK fix; leave that stretch out, or state its noise in pose_noise",
+        "the receiver lost its RTK fix; leave that stretch out, or state its noise in pose_noise",
     )  # fmt: skip
 
 
@@ -158,7 +155,6 @@ def _pitch_sign(motion: Motion, pitch_rad: FloatArray) -> list[Finding]:
             "pitch sign", "poses", 1 - slope, 1.0, "",
             fine="the pitch follows the grade",
             wrong="the recorded pitch goes against the grade: it counts nose up; write pitch positive nose "
-            "down "
-            "(a rotation about y, which points left)",
+            "down (a rotation about y, which points left)",
         )
     ]  # fmt: skip
