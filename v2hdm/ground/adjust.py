@@ -22,6 +22,13 @@ _RAYLEIGH_MEDIAN = np.sqrt(2 * np.log(2))
 _CAUCHY = 2.5
 """Length of a whitened residual from which on it loses its weight."""
 
+_LENS_SIGMA_PX = 0.1
+"""How far a good lens model and the matching are off, px, smoothly over the image and alike in all: little
+against a pixel, but thousands of matches share it."""
+
+_BENDS = 6
+"""Terms of a smooth error of each pixel coordinate: a polynomial of the second degree."""
+
 _STEPS = 25
 _CONVERGED = 1e-3
 """A step below so many standard deviations is the last."""
@@ -86,6 +93,7 @@ class Adjusted:
     extra: float
     covariance: FloatArray
     pose_errors: FloatArray
+    poses: FloatArray
     residual: FloatArray
     weight: FloatArray
 
@@ -110,30 +118,44 @@ def adjust(
     """
     mount, extra = start, 0.0
     errors = np.zeros((len(believed.poses), 6))
+    bends = np.zeros(2 * _BENDS)
     sigma_px = PIXEL_SIGMA
     for _ in range(_STEPS):
-        residual, jacobian, root = _linearised(observations, believed, mount, extra, errors, free)
+        residual, jacobian, root = _linearised(observations, believed, mount, extra, errors, bends, free)
         length = np.linalg.norm((root @ residual[:, :, None])[..., 0], axis=1)
         usable = np.isfinite(length)
         scale = float(np.median(length[usable])) / _RAYLEIGH_MEDIAN if usable.any() else 1.0
         sigma_px = float(np.clip(PIXEL_SIGMA * scale, _LEAST_PIXEL_SIGMA, tolerance * PIXEL_SIGMA))
         unit = PIXEL_SIGMA / sigma_px
         weight = np.where(usable, 1 / (1 + (length * unit / (_CAUCHY * tolerance)) ** 2), 0.0)
-        system, gradient = _normal(observations, believed, mount, errors, residual, jacobian, root * unit, weight)
+        system, gradient = _normal(
+            observations, believed, mount, errors, bends, residual, jacobian, root * unit, weight
+        )
         step = np.linalg.solve(system, -gradient)
-        known = 6 + (free is not None)
+        known = len(step) - errors.size
         mount = mount.moved(step[TURN], step[CENTRE])
+        bends = bends + step[6 : 6 + 2 * _BENDS]
         if free is not None:
-            extra += float(step[6])
+            change = float(step[known - 1])
+            extra += change
             if free == "focal_scale":
-                mount = mount.with_focal_scale((1 + extra) / (1 + extra - step[6]) - 1)
+                mount = mount.with_focal_scale((1 + extra) / (1 + extra - change) - 1)
             elif free == "distortion_k1":
-                mount = mount.with_k1(float(step[6]))
+                mount = mount.with_k1(change)
         errors = errors + step[known:].reshape(-1, 6)
         if np.max(np.abs(step) * np.sqrt(np.diag(system))) < _CONVERGED:
             break
-    covariance = np.linalg.inv(system)[:known, :known]
-    return Adjusted(mount, extra + start_extra, covariance, errors, length, weight)
+    wanted = [*range(6), *range(known - (free is not None), known)]
+    covariance = np.linalg.inv(system)[np.ix_(wanted, wanted)]
+    return Adjusted(
+        mount,
+        extra + start_extra,
+        covariance,
+        errors,
+        moved_poses(believed, errors, extra, free),
+        length,
+        weight,
+    )
 
 
 def _linearised(
@@ -142,25 +164,38 @@ def _linearised(
     mount: Mount,
     extra: float,
     errors: FloatArray,
+    bends: FloatArray,
     free: str | None,
 ) -> tuple[FloatArray, list[FloatArray], FloatArray]:
     """Differences (N, 2) m, their derivatives by mount and parameter and by both poses, whitening (N, 2, 2)."""
     sides, spread = [], 0.0
     poses = moved_poses(believed, errors, extra, free)
-    for image, px in ((observations.first, observations.first_px), (observations.second, observations.second_px)):
+    for image, px in (
+        (observations.first, observations.first_px),
+        (observations.second, observations.second_px),
+    ):
         hits = hit_ground(mount, px, poses[image])
-        by_known = hits.by_mount()
+        by_px = by_pixel(mount, hits)
+        bending = _bending(mount, px, by_px)
+        by_known = np.concatenate([hits.by_mount(), bending], axis=2)
         if free is not None:
             column = _by_parameter(free, mount, hits, px, poses[image], believed, image)
             by_known = np.concatenate([by_known, column[:, :, None]], axis=2)
-        sides.append((hits.points_map, by_known, hits.by_pose()))
-        blur = PIXEL_SIGMA * by_pixel(mount, hits)
+        sides.append((hits.points_map + bending @ bends, by_known, hits.by_pose()))
+        blur = PIXEL_SIGMA * by_px
         spread = spread + blur @ np.swapaxes(blur, 1, 2)
     (points, known, pose), (points_2, known_2, pose_2) = sides
     usable = np.isfinite(spread).all(axis=(1, 2))
     root = np.full(spread.shape, np.nan)
     root[usable] = np.linalg.inv(np.linalg.cholesky(spread[usable]))
     return points - points_2, [known - known_2, pose, -pose_2], root
+
+
+def _bending(mount: Mount, px: FloatArray, by_px: FloatArray) -> FloatArray:
+    """Derivative (N, 2, 12) of ground points by the terms of a smooth error of the pixels, in px."""
+    u, v = (2 * px / [mount.info.width, mount.info.height] - 1).T
+    terms = np.stack([np.ones(len(u)), u, v, u * u, u * v, v * v], axis=1)
+    return np.concatenate([by_px[:, :, k, None] * terms[:, None] for k in (0, 1)], axis=2)
 
 
 def _by_parameter(
@@ -200,6 +235,7 @@ def _normal(
     believed: Believed,
     mount: Mount,
     errors: FloatArray,
+    bends: FloatArray,
     residual: FloatArray,
     jacobian: list[FloatArray],
     root: FloatArray,
@@ -232,6 +268,8 @@ def _normal(
     information = believed.centre_sigma_m**-2
     system[range(3, 6), range(3, 6)] += information
     gradient[CENTRE] += information * (mount.centre_vehicle - believed.centre_vehicle)
+    system[range(6, 6 + 2 * _BENDS), range(6, 6 + 2 * _BENDS)] += _LENS_SIGMA_PX**-2
+    gradient[6 : 6 + 2 * _BENDS] += bends / _LENS_SIGMA_PX**2
     # A start with hardly any matches must not be singular.
     system[range(3), range(3)] += 1.0
     return system, gradient

@@ -26,7 +26,8 @@ _HEIGHT_SIGMA_M = 0.2
 class Beliefs:
     """Poses, survey and their noise; ``clock_s`` is added to the images' stamps.
 
-    ``centre_sigma_m`` replaces the survey's own along single axes.
+    ``centre_sigma_m`` replaces the survey's own along single axes; not ``surveyed``, only the
+    guess tells where the centre is.
     """
 
     drive: Drive
@@ -35,6 +36,7 @@ class Beliefs:
     guess: Mount
     clock_s: float = 0.0
     centre_sigma_m: dict[int, float] = field(default_factory=dict)
+    surveyed: bool = True
 
     def at_clock(self, clock_s: float) -> Beliefs:
         """The same with another offset of the clock."""
@@ -48,17 +50,21 @@ class Beliefs:
         """Distance driven (I,) at all images."""
         return self.motion.path_at_images(self.clock_s)
 
-    def about(self, observations: Observations, loosened: float = 1.0) -> tuple[Observations, Believed]:
-        """The observations with images counted anew, and what is known of these images.
+    def about(
+        self, observations: Observations, loosened: float = 1.0
+    ) -> tuple[Observations, Believed, FloatArray]:
+        """The observations with images counted anew, what is known of these images, and their rows.
 
         Args:
             observations: matches between rows of the motion.
             loosened: how much further off than stated headings and sideways places may be.
         """
-        rows, place = np.unique(np.concatenate([observations.first, observations.second]), return_inverse=True)
+        rows, place = np.unique(
+            np.concatenate([observations.first, observations.second]), return_inverse=True
+        )
         count = len(observations.first)
         path_m = self.path_m()[rows]
-        prior = self.camera.centre_prior
+        prior = self.camera.centre_prior if self.surveyed else None
         sigma_m = np.full(3, _UNSURVEYED_M) if prior is None else prior.sigma_m.copy()
         sigma_m[2] = max(sigma_m[2], _HEIGHT_SIGMA_M)
         for axis, wider_m in self.centre_sigma_m.items():
@@ -73,4 +79,4 @@ class Beliefs:
             centre_vehicle=self.guess.centre_vehicle if prior is None else prior.centre_vehicle,
             centre_sigma_m=sigma_m,
         )
-        return replace(observations, first=place[:count], second=place[count:]), believed
+        return replace(observations, first=place[:count], second=place[count:]), believed, rows

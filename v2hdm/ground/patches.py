@@ -25,6 +25,10 @@ _LEAST_LEAD = 0.1
 _PEAK_CELLS = 3
 """Half width of what belongs to a peak, in cells of the grid."""
 
+_COARSEST_M = 0.1
+"""Standard deviation of the blur that is taken away: highlights, shadows and wet sheens are wider, and stay
+with the light or the camera instead of the ground, m."""
+
 _LEAST_CONTRAST = 1.0
 """Grey levels; less than this is the noise of an even surface."""
 
@@ -88,7 +92,8 @@ class Sheet:
         px = view.pixels(self.points()).astype(np.float32).reshape(*self.shape, 2)
         seen = ~np.isnan(px[..., 0])
         px[~seen] = -1
-        return cv2.remap(view.grey, px[..., 0], px[..., 1], cv2.INTER_LINEAR).astype(np.float32), seen
+        grey = cv2.remap(view.grey, px[..., 0], px[..., 1], cv2.INTER_LINEAR).astype(np.float32)
+        return grey - cv2.GaussianBlur(grey, (0, 0), _COARSEST_M / self.grid_m), seen
 
 
 def patch_centres(
@@ -117,7 +122,9 @@ def patch_centres(
     return np.asarray(centres[near])
 
 
-def match_pair(first: View, second: View, centres_map: FloatArray, search_m: float, options: GroundOptions) -> Matches:
+def match_pair(
+    first: View, second: View, centres_map: FloatArray, search_m: float, options: GroundOptions
+) -> Matches:
     """Find the patches around ``centres_map`` (N, 2) of the first image in the second, within ``search_m``."""
     grid_m = options.grid_m
     half = round(options.patch_m / 2 / grid_m)
@@ -185,7 +192,8 @@ def _peak(score: FloatArray) -> tuple[float, float, float] | None:
         return None
     rest = score.copy()
     rest[
-        max(row - _PEAK_CELLS, 0) : row + _PEAK_CELLS + 1, max(column - _PEAK_CELLS, 0) : column + _PEAK_CELLS + 1
+        max(row - _PEAK_CELLS, 0) : row + _PEAK_CELLS + 1,
+        max(column - _PEAK_CELLS, 0) : column + _PEAK_CELLS + 1,
     ] = -1
     if rest.max() > best - _LEAST_LEAD:
         return None

@@ -55,7 +55,9 @@ def find_start(matcher: Matcher, beliefs: Beliefs, guess: Mount) -> Start:
     for turn_deg in _TURNS_DEG:
         # Pitch is about the camera's own sideways axis: a camera may look anywhere.
         sideways = guess.vehicle_from_cam_rotation[:, 0]
-        tried = _settle(matcher, beliefs, pairs, guess.moved(np.deg2rad(turn_deg) * sideways, np.zeros(3)), guess)
+        tried = _settle(
+            matcher, beliefs, pairs, guess.moved(np.deg2rad(turn_deg) * sideways, np.zeros(3)), guess
+        )
         if tried.mount is not None:
             return tried
         best = max(best, tried, key=lambda start: start.share)
@@ -77,7 +79,8 @@ def _settle(matcher: Matcher, beliefs: Beliefs, pairs: FloatArray, mount: Mount,
         share, sought = matched.share, matched.sought
         if len(matched.correlation) < _LEAST_MATCHES or share < _PASSES:
             return Start(None, share, sought)
-        mount = adjust(*beliefs.about(matched.observations, _LOOSENED), mount, tolerance=_LOOSENED).mount
+        used, believed, _ = beliefs.about(matched.observations, _LOOSENED)
+        mount = adjust(used, believed, mount, tolerance=_LOOSENED).mount
         away = guess.vehicle_from_cam_rotation.T @ mount.vehicle_from_cam_rotation
         if np.trace(away) < 1 + 2 * np.cos(np.deg2rad(_FARTHEST_DEG)):
             return Start(None, 0.0, sought)

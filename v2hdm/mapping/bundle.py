@@ -111,7 +111,19 @@ def full_model(
         poses: One of :data:`v2hdm.adjust.MODELS`.
         variance_factor: How many times as large as stated the variances of corners are.
     """
-    pose_sigma = PoseSigma(
+    solver = SolveOptions(
+        loss=options.loss, loss_scale=options.loss_scale, coarse=False, device=options.device
+    )
+    solver = with_model(solver, MODELS[poses])
+    pose_sigma = pose_sigma_of(pose_noise)
+    return Model(
+        pose_sigma, options.model_floor_px, solver, variance_factor, options.known_sizes, options.survey
+    )
+
+
+def pose_sigma_of(pose_noise: PoseNoise) -> PoseSigma:
+    """How far a drive's recorded poses are off, the heave of its vehicle included."""
+    return PoseSigma(
         position_m=pose_noise.position_m,
         heading_rad=pose_noise.heading_rad,
         roll_pitch_rad=pose_noise.roll_pitch_rad,
@@ -119,13 +131,6 @@ def full_model(
         position_drift=Drift(pose_noise.position_drift_m, pose_noise.position_drift_over_m),
         heading_drift=Drift(pose_noise.heading_drift_rad, pose_noise.heading_drift_over_m),
         roll_pitch_drift=Drift(pose_noise.roll_pitch_drift_rad, pose_noise.roll_pitch_drift_over_m),
-    )
-    solver = SolveOptions(
-        loss=options.loss, loss_scale=options.loss_scale, coarse=False, device=options.device
-    )
-    solver = with_model(solver, MODELS[poses])
-    return Model(
-        pose_sigma, options.model_floor_px, solver, variance_factor, options.known_sizes, options.survey
     )
 
 

@@ -147,7 +147,7 @@ def _map_and_judge(
     with _timed(seconds, "map"):
         methods = _map_camera_sets(config, drive, detections, progress)
     with _timed(seconds, "judge"):
-        verdict = Verdict.of([*inspection.findings, *check_result(drive, methods, inspection.ground)])
+        verdict = Verdict.of(inspection.findings)
     with _timed(seconds, "evaluate"):
         judgement = evaluate(drive, detections, methods, config.mapping, partial(progress, "evaluate"))
     metrics = {**about, "verdict": verdict.as_json(), **judgement.metrics, "seconds": seconds}

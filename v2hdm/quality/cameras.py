@@ -8,7 +8,7 @@ from v2hdm.detection.camera.ground import apply_homography
 from v2hdm.detection.camera.lens import distort_points, undistort_points
 from v2hdm.detection.camera.mounting import guessed_extrinsic
 from v2hdm.planar import inside_convex
-from v2hdm.quality.judgement import judge, passed
+from v2hdm.quality.judgement import judge, judge_between, passed
 from v2hdm.quality.verdict import Finding, Status
 from v2hdm.records import Camera, CameraInfo, CentrePrior, FloatArray
 
@@ -78,17 +78,11 @@ def check_intrinsics(name: str, info: CameraInfo) -> list[Finding]:
         else f"the principal point is {100 * off:.0f} % of the width off the image's centre; check cx and cy"
     )
     focal = fx / info.width
-    fitting = Finding(
-        "focal length",
-        Status.PASS if _SHORTEST <= focal <= _LONGEST else Status.FAIL,
-        float(focal),
-        _LONGEST if focal > _LONGEST else _SHORTEST,
-        "image widths",
-        "the focal length is one of a lens for roads"
-        if _SHORTEST <= focal <= _LONGEST
-        else f"fx is {focal:.2g} image widths, no lens for roads; give it in px of these images, not in mm",
-        name,
-    )
+    fitting = judge_between(
+        "focal length", name, focal, (_SHORTEST, _LONGEST), "image widths",
+        fine="the focal length is one of a lens for roads",
+        wrong=f"fx is {focal:.2g} image widths, no lens for roads; give it in px of these images, not in mm",
+    )  # fmt: skip
     square = judge(
         "square pixels", name, fx / fy - 1, _SQUARE, "",
         fine="fx and fy agree",
@@ -177,26 +171,20 @@ def _mounting(name: str, cam_from_vehicle: FloatArray) -> list[Finding]:
     upside_down = cam_from_vehicle[1, 2] > 0
     if upside_down:
         tilt_deg = 180.0 - tilt_deg
-    return [
-        Finding(
-            "camera height",
-            Status.PASS if _LOWEST_M <= height <= _HIGHEST_M else Status.FAIL,
-            height,
-            _HIGHEST_M if height > _HIGHEST_M else _LOWEST_M,
-            "m",
-            "the guess puts the camera at a height of a vehicle's"
-            if _LOWEST_M <= height <= _HIGHEST_M
-            else f"the guess puts the camera {height:.2f} m above the ground; mend the IPM (metres) or the guess",
-            name,
-        ),
-        judge(
-            "camera tilt", name, tilt_deg, _TILTED_DEG, "deg",
-            fine="the guess holds the camera upright",
-            wrong=f"the guess tilts the camera by {tilt_deg:.0f} deg about its axis: its axes are x right, y down, "
-            "z forward and v counts downwards; mend the guess, or turn the images",
-            status=Status.FAIL,
-        ),
-    ]  # fmt: skip
+    of_vehicle = judge_between(
+        "camera height", name, height, (_LOWEST_M, _HIGHEST_M), "m",
+        fine="the guess puts the camera at the height of a vehicle",
+        wrong=f"the guess puts the camera {height:.2f} m above the ground; mend the IPM (in metres) or the "
+        "guess",
+    )  # fmt: skip
+    upright = judge(
+        "camera tilt", name, tilt_deg, _TILTED_DEG, "deg",
+        fine="the guess holds the camera upright",
+        wrong=f"the guess tilts the camera by {tilt_deg:.0f} deg about its axis: its axes are x right, y "
+        "down, "
+        "z forward, and v counts downwards; mend the guess, or turn the images",
+    )  # fmt: skip
+    return [of_vehicle, upright]
 
 
 def _shape(name: str, info: CameraInfo, ipm: FloatArray) -> Finding:
@@ -212,7 +200,8 @@ def _shape(name: str, info: CameraInfo, ipm: FloatArray) -> Finding:
     return judge(
         "ipm against camera matrix", name, value, _MISSHAPEN, "",
         fine="the IPM is a homography of this camera matrix",
-        wrong=f"the IPM and camera_info differ by {100 * value:.0f} %, most in {part}: one of the two is wrong, of "
+        wrong=f"the IPM and camera_info differ by {100 * value:.0f} %, most in {part}: one of the two is "
+        "wrong, of "
         "another resolution, or the IPM was made from distorted pixels; make it anew",
         status=Status.WARN,
     )  # fmt: skip
@@ -237,7 +226,8 @@ def _farthest(name: str, camera: Camera, cam_from_vehicle: FloatArray, grid: Flo
     return judge(
         "roi range", name, float(coarse), _COARSEST_M, "m/px",
         fine="a pixel shows little ground at the ROI's far end",
-        wrong=f"roi_vehicle reaches {range_m:.0f} m, where a pixel shows {coarse:.1f} m of ground; end it nearer",
+        wrong=f"roi_vehicle reaches {range_m:.0f} m, where a pixel shows {coarse:.1f} m of ground; end it "
+        "nearer",
         status=Status.WARN,
     )  # fmt: skip
 

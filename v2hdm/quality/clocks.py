@@ -57,7 +57,8 @@ def _pose_rate(drive: Drive, motion: Motion) -> list[Finding]:
         judge(
             "pose gaps", "poses", longest_s, max(2 * limit_s, 3 * interval_s), "s",
             fine="the poses have no gap while the vehicle moves",
-            wrong=f"the poses have a gap of {longest_s:.2f} s while the vehicle moves, across which images' poses "
+            wrong=f"the poses have a gap of {longest_s:.2f} s while the vehicle moves, across which images' "
+            "poses "
             f"err by {error_m:.2f} m; lower drive.max_gap_s below it or restore the missing poses",
             status=Status.WARN,
         ),
@@ -76,7 +77,8 @@ def _held(motion: Motion) -> list[Finding]:
         judge(
             "repeated poses", "poses", share, _HELD, "",
             fine="no pose repeats the one before while the vehicle moves",
-            wrong=f"{100 * share:.0f} % of the poses repeat the one before while the vehicle moves, up to {jump_m:.2f} m"
+            wrong=f"{100 * share:.0f} % of the poses repeat the one before while the vehicle moves, up to "
+            f"{jump_m:.2f} m"
             " off: the log is faster than the receiver, or the receiver froze; drop the repeats",
         )
     ]  # fmt: skip
@@ -89,7 +91,8 @@ def _posed(drive: Drive, name: str, posed: int) -> list[Finding]:
         judge(
             "images without pose", name, share, _WITHOUT_POSE, "",
             fine="the images have poses",
-            wrong=f"{without} of {posed + without} images have no pose at their time: poses and images overlap only in "
+            wrong=f"{without} of {posed + without} images have no pose at their time: poses and images "
+            "overlap only in "
             "part, or the poses have gaps; check that both are of the same drive and on one clock",
             status=Status.FAIL if share > _HALF else Status.WARN,
         )
@@ -107,7 +110,8 @@ def _overlap(spans: dict[str, FloatArray], name: str) -> list[Finding]:
         judge(
             "camera span", name, missed, _HALF / 2, "",
             fine="the camera records as long as the others",
-            wrong=f"the camera misses {100 * missed:.0f} % of the time that another records; check that its stamps "
+            wrong=f"the camera misses {100 * missed:.0f} % of the time that another records; check that its "
+            "stamps "
             "are on the common clock",
             status=Status.WARN,
         )
@@ -128,7 +132,8 @@ def _spacing(drive: Drive, motion: Motion, name: str) -> list[Finding]:
         judge(
             "image spacing", name, spacing_m, depth_m / _VIEWS, "m",
             fine="markings stay in the ROI for several images",
-            wrong=f"images are {spacing_m:.1f} m apart and the ROI is {depth_m:.1f} m deep: markings are seen less than "
+            wrong=f"images are {spacing_m:.1f} m apart and the ROI is {depth_m:.1f} m deep: markings are "
+            "seen less than "
             "twice; drive slower, record more images or enlarge roi_vehicle",
             status=Status.WARN,
         )

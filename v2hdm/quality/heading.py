@@ -7,13 +7,11 @@ is the cause.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 
-from v2hdm.drive.rotation import quaternion_from_rotation, rotation_from_quaternion
+from v2hdm.quality.conventions import AXES_SWAPPED, CONVENTIONS, REFLECTED
 from v2hdm.quality.judgement import judge, passed
 from v2hdm.quality.motion import Chords, Motion, angle_between
 from v2hdm.quality.verdict import Finding, Status
@@ -49,84 +47,6 @@ class Path(Enum):
     MIRRORED = "the path is mirrored"
 
 
-Undo = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
-
-
-@dataclass(frozen=True)
-class Convention:
-    """A usual mistake: ``undo`` takes positions (P, 3) and rotations (P, 3, 3) to what they should be."""
-
-    undo: Undo
-    says: str
-
-
-def _turned(sign: float, offset_deg: float) -> Undo:
-    """Undo a yaw that is ``sign`` times the true one plus an offset: true yaw = sign * yaw + offset."""
-
-    def undo(position: FloatArray, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
-        forward = rotation[:, :2, 0]
-        yaw = sign * np.arctan2(forward[:, 1], forward[:, 0]) + np.deg2rad(offset_deg)
-        true = np.tile(np.eye(3), (len(yaw), 1, 1))
-        true[:, 0, 0], true[:, 1, 0] = np.cos(yaw), np.sin(yaw)
-        true[:, 0, 1], true[:, 1, 1] = -np.sin(yaw), np.cos(yaw)
-        return position, true
-
-    return undo
-
-
-def _reordered(position: FloatArray, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
-    quaternion = quaternion_from_rotation(rotation)
-    return position, rotation_from_quaternion(quaternion[:, [1, 2, 3, 0]])
-
-
-def _inverted(position: FloatArray, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
-    back = np.swapaxes(rotation, 1, 2)
-    return -(back @ position[:, :, None])[:, :, 0], back
-
-
-def _axes(matrix: list[list[float]]) -> Undo:
-    def undo(position: FloatArray, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return position, np.asarray(rotation @ np.array(matrix))
-
-    return undo
-
-
-CONVENTIONS: Mapping[str, Convention] = {
-    "quaternion order": Convention(
-        _reordered, "the quaternions are in the order qw qx qy qz; write them as qx qy qz qw"
-    ),
-    "z down": Convention(
-        _axes([[1, 0, 0], [0, -1, 0], [0, 0, -1]]),
-        "the vehicle's z axis points down (x forward, y right); turn the attitude to x forward, y left, z up",
-    ),
-    "optical frame": Convention(
-        _axes([[0, -1, 0], [0, 0, -1], [1, 0, 0]]),
-        "the poses are those of a camera (z forward); give those of the vehicle (x forward, y left, z up)",
-    ),
-    "from north": Convention(
-        _turned(-1, 90),
-        "yaw counts clockwise from north; write yaw = 90 deg - it, counter-clockwise from east",
-    ),
-    "clockwise": Convention(_turned(-1, 0), "yaw counts clockwise; write it with the other sign"),
-    "90 ahead": Convention(_turned(1, -90), "yaw is 90 deg too large, as if y were forward; subtract 90 deg"),
-    "90 behind": Convention(_turned(1, 90), "yaw is 90 deg too small, counted from north; add 90 deg"),
-    "inverse": Convention(
-        _inverted, "the poses are vehicle_from_map; write their inverse, the vehicle in the map"
-    ),
-    "south": Convention(_turned(-1, 180), "yaw counts clockwise from west; write yaw = 180 deg - it"),
-    "from south": Convention(_turned(-1, -90), "yaw counts clockwise from south; write yaw = -90 deg - it"),
-}
-"""The usual mistakes, the likelier first."""
-
-_REFLECTED = ("from north", "clockwise", "south", "from south")
-"""Conventions of yaw that poses alone cannot tell from a path whose axes are swapped."""
-
-AXES_SWAPPED = (
-    "x and y of the positions are swapped or one has the wrong sign, which mirrors the world; "
-    "write x east and y north"
-)
-
-
 def check_heading(motion: Motion, path: Path | None = None) -> list[Finding]:
     """Whether the recorded poses drive where they point, z up.
 
@@ -158,7 +78,8 @@ def _as_given(motion: Motion, agrees: float, path: Path | None) -> Finding:
         return Finding("heading", Status.FAIL, back, _FITS, "", says, "poses")
     if back > _FITS and path is not Path.AS_GIVEN:
         says = (
-            "the vehicle drives backwards all the time; if it did not, yaw is off by 180 deg (turn it), or the "
+            "the vehicle drives backwards all the time; if it did not, yaw is off by 180 deg (turn it), or "
+            "the "
             "poses are vehicle_from_map (write their inverse)"
         )
         return Finding("heading", Status.WARN, back, _FITS, "", says, "poses")
@@ -198,7 +119,7 @@ def _constant_offset(offset_rad: FloatArray, turn_rad: FloatArray, overlap: floa
 
 
 def _lever(offset_rad: FloatArray, curvature: FloatArray, overlap: float) -> list[Finding]:
-    """How far ahead of the point that does not slip sideways the origin lies: tan(offset) = lever * curvature."""
+    """How far ahead of the axle, which does not slip sideways, the origin is: tan(offset) / curvature."""
     turns = np.abs(curvature) > 0.02
     if turns.sum() < 30:
         return [passed("origin", "poses", "straight poses do not tell how far the origin is from the axle")]
@@ -240,7 +161,7 @@ def _cause(motion: Motion, fitting: list[str], path: Path | None) -> str | None:
         return AXES_SWAPPED
     if fitting:
         told = [CONVENTIONS[name].says for name in fitting[:2]]
-        if path is None and fitting[0] in _REFLECTED:
+        if path is None and fitting[0] in REFLECTED:
             told.insert(1, AXES_SWAPPED)
         return "; or ".join(told)
     offset = _course_minus_yaw(motion)
@@ -257,7 +178,7 @@ def _cause(motion: Motion, fitting: list[str], path: Path | None) -> str | None:
         return (
             "yaw turns 57 times as fast as the path: degrees were taken for radians; convert yaw to radians"
         )
-    return "heading and path have nothing to do with each other; check that both come from one and the same drive"
+    return "heading and path have nothing to do with each other; check that both are of one drive"
 
 
 def _is_upright(motion: Motion) -> bool:

@@ -62,7 +62,7 @@ def _shared(drive: Drive) -> list[Finding]:
     for image in drive.images:
         other = owner.setdefault(image.path.resolve(), image.camera)
         if other != image.camera:
-            says = f"the images are those of camera '{other}' given twice; give camera '{image.camera}' its own list"
+            says = f"the images are those of camera '{other}' given twice; give this one its own list"
             return [Finding("own images", Status.FAIL, 1.0, 0.0, "", says, image.camera)]
     return []
 
@@ -85,7 +85,8 @@ def _frozen(name: str, images: Sequence[Image]) -> Finding:
     return judge(
         "frozen images", name, share, _FROZEN, "",
         fine="each image differs from the one before",
-        wrong=f"{100 * share:.0f} % of the images repeat the one before while the vehicle moves{where}: the camera "
+        wrong=f"{100 * share:.0f} % of the images repeat the one before while the vehicle moves{where}: the "
+        "camera "
         "froze, or one file is listed several times; drop the repeats from the list",
     )  # fmt: skip
 
@@ -150,7 +151,7 @@ def _read(path: Path) -> np.ndarray:
 
 def _roi_mask(camera: Camera, grey: np.ndarray) -> np.ndarray:
     """Where the reduced image shows the ROI, as the guess says."""
-    pinhole = apply_homography(np.linalg.inv(camera.ipm[camera.initial_ipm]), camera.roi_vehicle)
+    pinhole = apply_homography(np.asarray(np.linalg.inv(camera.ipm[camera.initial_ipm])), camera.roi_vehicle)
     corners = distort_points(camera.info, pinhole) / _REDUCED
     mask = np.zeros(grey.shape, np.uint8)
     limit = 4.0 * max(grey.shape)

@@ -40,6 +40,26 @@ def judge(
     )
 
 
+def judge_between(
+    check: str,
+    about: str,
+    value: float,
+    limits: tuple[float, float],
+    unit: str,
+    *,
+    fine: str,
+    wrong: str,
+    status: Status = Status.FAIL,
+) -> Finding:
+    """As :func:`judge`, for a ``value`` that passes between two limits; the finding holds the nearer one."""
+    low, high = limits
+    inside = low <= value <= high
+    limit = low if abs(value - low) < abs(value - high) else high
+    return Finding(
+        check, Status.PASS if inside else status, float(value), limit, unit, fine if inside else wrong, about
+    )
+
+
 def passed(check: str, about: str, says: str, value: float | None = None, unit: str = "") -> Finding:
     """A finding that passes and has no limit, such as one that this drive cannot tell."""
     return Finding(check, Status.PASS, value, None, unit, says, about)

@@ -6,8 +6,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from v2hdm.records import BoolArray, Drive, FloatArray, Trajectory
+
+IntArray = NDArray[np.intp]
 
 CHORD_M = 2.0
 """Length of the chords whose direction is the course: RTK noise of 2 cm turns one by less than a degree."""
@@ -23,8 +26,8 @@ _MOST_STARTS = 4000
 class Chords:
     """Stretches of :data:`CHORD_M` that the vehicle moved: indices (N,) of their first and last pose."""
 
-    first: FloatArray
-    last: FloatArray
+    first: IntArray
+    last: IntArray
 
     def __len__(self) -> int:
         """The number of chords."""

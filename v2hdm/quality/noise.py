@@ -49,7 +49,9 @@ def _units(motion: Motion, noise: PoseNoise) -> list[Finding]:
         measured += f"; if millimetres were meant, it is {noise.position_m / 1e3:g} m"
     return [
         _unit("position_m", noise.position_m, _RTK_M, "m", f"no RTK position{measured}", "metres"),
-        _unit("heading_rad", noise.heading_rad, _HEADING_RAD, "rad", _in_degrees(noise.heading_rad), "radians"),
+        _unit(
+            "heading_rad", noise.heading_rad, _HEADING_RAD, "rad", _in_degrees(noise.heading_rad), "radians"
+        ),
         _unit(
             "roll_pitch_rad", noise.roll_pitch_rad, _ROLL_PITCH_RAD, "rad",
             _in_degrees(noise.roll_pitch_rad), "radians",
@@ -90,7 +92,8 @@ def _against(key: str, measured: float, stated: float, unit: str) -> Finding:
     return judge(
         "pose scatter", "poses", ratio, _UNDERSTATED, "",
         fine="the poses scatter no more than stated",
-        wrong=f"from pose to pose they scatter by {measured:.2g} {unit}, {ratio:.0f} times pose_noise.{key} {stated:.2g}{degrees}; "
+        wrong=f"from pose to pose they scatter by {measured:.2g} {unit}, {ratio:.0f} times pose_noise.{key} "
+        f"{stated:.2g}{degrees}; "
         f"state {key} as it is, or find out why the receiver is worse than it says",
         status=Status.FAIL if ratio > _USELESS else Status.WARN,
     )  # fmt: skip

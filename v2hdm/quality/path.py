@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from v2hdm.quality.judgement import judge, passed
+from v2hdm.quality.judgement import judge
 from v2hdm.quality.motion import CHORD_M, SLOWEST_MPS, Motion
 from v2hdm.quality.verdict import Finding, Status
 from v2hdm.records import FloatArray, PoseNoise
@@ -18,7 +18,7 @@ _HARDEST_MPS2 = 9.0
 """No tyre turns or brakes a road vehicle harder."""
 
 _EXTREME = 12.0
-"""The second difference of three noisy positions has sqrt(6) sigmas; five of those are never seen by chance."""
+"""A second difference of noisy positions has sqrt(6) sigmas; five of those are never seen by chance."""
 
 _HEIGHT_NOISE = 2.0
 """RTK heights are about twice as noisy as positions in the plane."""
@@ -45,7 +45,8 @@ def check_path(motion: Motion) -> list[Finding]:
         judge(
             "speed", "poses", speed, _FASTEST_MPS, "m/s",
             fine="the vehicle's speed is one of a road vehicle",
-            wrong=f"the vehicle drives at {speed:.0f} m/s: {cause}, or stamps that are not seconds; convert them",
+            wrong=f"the vehicle drives at {speed:.0f} m/s: {cause}, or stamps that are not seconds; convert "
+            "them",
         )
     ]  # fmt: skip
 
@@ -74,8 +75,10 @@ def check_attitude(motion: Motion) -> list[Finding]:
         judge(
             "attitude", "poses", largest_deg, _STEEPEST_DEG, "deg",
             fine="roll and pitch are those of a vehicle on a road",
-            wrong=f"roll or pitch reach {largest_deg:.0f} deg, no vehicle's on a road: were degrees taken for radians "
-            f"(then it is {np.deg2rad(largest_deg):.1f} deg), or the quaternions not in the order qx qy qz qw?",
+            wrong=f"roll or pitch reach {largest_deg:.0f} deg, no vehicle's on a road: were degrees taken "
+            "for radians "
+            f"(then it is {np.deg2rad(largest_deg):.1f} deg), or the quaternions not in the order qx qy qz "
+            "qw?",
         )
     ]  # fmt: skip
     return findings + _pitch_sign(motion, pitch_rad)
@@ -90,7 +93,8 @@ def _hardly_moves(motion: Motion) -> Finding:
             continue
         return Finding(
             "path length", Status.FAIL, moved_m, CHORD_M, "m",
-            f"positions are in {unit}: the path is {moved_m:.2g} m long and smooth; convert them to metres east "
+            f"positions are in {unit}: the path is {moved_m:.2g} m long and smooth; convert them to metres "
+            "east "
             "and north of the site",
             "poses",
         )  # fmt: skip
@@ -129,7 +133,8 @@ def _jump(check: str, motion: Motion, off: FloatArray, limit: FloatArray) -> Fin
     return judge(
         check, "poses", float(size[worst]), float(limit[worst]), "m",
         fine=f"{kind} never jumps",
-        wrong=f"{kind} jumps by {step_m:.2f} m at {motion.stamp_s[worst + 1]:.2f} s ({count} such records): the "
+        wrong=f"{kind} jumps by {step_m:.2f} m at {motion.stamp_s[worst + 1]:.2f} s ({count} such records): "
+        "the "
         "receiver lost its RTK fix; leave that stretch out, or state its noise in pose_noise",
     )  # fmt: skip
 
@@ -146,13 +151,14 @@ def _pitch_sign(motion: Motion, pitch_rad: FloatArray) -> list[Finding]:
     middle = (pitch_rad[chords.first] + pitch_rad[chords.last]) / 2
     spread = np.subtract(*np.percentile(grade_rad, [95, 5]))
     if spread < _GRADE_CHANGE_RAD or np.std(middle) < 0.3 * np.std(grade_rad):
-        return [passed("pitch sign", "poses", "the route is too level, or has no recorded pitch, to tell it")]
+        return []
     slope = float(np.cov(middle, -grade_rad)[0, 1] / np.var(grade_rad))
     return [
         judge(
             "pitch sign", "poses", 1 - slope, 1.0, "",
             fine="the pitch follows the grade",
-            wrong="the recorded pitch goes against the grade: it counts nose up; write pitch positive nose down "
+            wrong="the recorded pitch goes against the grade: it counts nose up; write pitch positive nose "
+            "down "
             "(a rotation about y, which points left)",
         )
     ]  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -141,7 +142,7 @@ def _label(
 
 def _dense(line: FloatArray) -> FloatArray:
     parts = np.linspace(0, 1, 40)[:, None]
-    return np.concatenate([a + parts * (b - a) for a, b in zip(line[:-1], line[1:], strict=True)])
+    return np.concatenate([a + parts * (b - a) for a, b in itertools.pairwise(line)])
 
 
 def _draw(canvas: np.ndarray, pieces: list[FloatArray], colour: tuple[int, int, int], width: int) -> None:
@@ -153,5 +154,7 @@ def _draw(canvas: np.ndarray, pieces: list[FloatArray], colour: tuple[int, int, 
 def _write(
     canvas: np.ndarray, text: str, at: tuple[int, int], colour: tuple[int, int, int], size: float = 0.6
 ) -> None:
-    cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, (0, 0, 0), 3, cv2.LINE_AA)
+    (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
+    corner, opposite = (at[0] - 2, at[1] - height - 2), (at[0] + width + 2, at[1] + below)
+    cv2.rectangle(canvas, corner, opposite, (40, 40, 40), cv2.FILLED)
     cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
