@@ -15,6 +15,7 @@ from v2hdm.adjust.problem import (
     Problem,
     SolveOptions,
 )
+from v2hdm.adjust.pulls import PosePulls, pose_pulls
 from v2hdm.adjust.selection import MODELS, Model, Selection, select_model, with_model
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
@@ -30,6 +31,7 @@ __all__ = [
     "Model",
     "Observability",
     "Observations",
+    "PosePulls",
     "PoseSigma",
     "Problem",
     "Selection",
@@ -39,6 +41,7 @@ __all__ = [
     "Suspect",
     "Verdict",
     "observability",
+    "pose_pulls",
     "select_model",
     "solve",
     "suspects",

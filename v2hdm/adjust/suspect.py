@@ -236,7 +236,8 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
         for axis in range(3):
             for camera in cameras:
                 yield _Hypothesis(Fault.SURVEY, _survey(camera, axis), camera, axis)
-            yield _Hypothesis(Fault.LEVER, _survey(-1, axis), -1, axis)
+            if arrays.camera_count > 1:
+                yield _Hypothesis(Fault.LEVER, _survey(-1, axis), -1, axis)
     if bool((arrays.control_information > 0).any()):
         for axis in (0, 1):
             yield _Hypothesis(Fault.DATUM, _datum(axis), axis=axis)

@@ -68,6 +68,10 @@ class SolveEvidence:
         variance_factor: as in :class:`CameraFit`, of all cameras.
         along_route: (W,) the same of windows of :data:`WINDOW_OBSERVATIONS` in driving order.
         window_s: (W,) when each window begins, s.
+        pose_pulls: root mean square by state of a pose, of what was taken off it, in the stated sigmas; at
+            most 1 where these are right.
+        worst_pull: the largest of them all, in sigmas.
+        worst_pull_s: when, s.
         clock_s: by camera its estimated clock offset and sigma, where the pose model has one.
     """
 
@@ -79,6 +83,9 @@ class SolveEvidence:
     variance_factor: float
     along_route: FloatArray
     window_s: FloatArray
+    pose_pulls: Mapping[str, float]
+    worst_pull: float
+    worst_pull_s: float
     clock_s: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property

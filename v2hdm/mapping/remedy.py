@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from v2hdm.adjust import Fault, Suspect, suspects
+from v2hdm.adjust import Fault, Suspect, pose_pulls, suspects
 from v2hdm.drive.clock import with_clock_offsets
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.evidence import Contradiction, SolveEvidence
@@ -117,9 +117,24 @@ def optimise(
         corrected.append(told)
         drive, detections, options = remedied.drive, remedied.detections, remedied.options
     optimised = optimiser.finish(settled, tell)
+    evidence = _evidence(settled, contradictions(settled, found), corrected, optimiser, optimised, sightings)
+    return Outcome(inputs, optimiser, optimised, evidence)
+
+
+def _evidence(
+    settled: Bundle,
+    found: tuple[Contradiction, ...],
+    corrected: Sequence[Contradiction],
+    optimiser: Optimiser,
+    optimised: Optimised,
+    sightings: Sightings,
+) -> SolveEvidence:
     factors, window_s = along_route(settled, sightings.stamp_s[sightings.frame[settled.row]])
-    evidence = SolveEvidence(
-        suspects=contradictions(settled, found),
+    pulls = pose_pulls(settled.solution)
+    largest = np.abs(pulls.pulls).max(axis=1, initial=0.0)
+    frames_s = np.unique(sightings.stamp_s[sightings.frame[settled.row]])
+    return SolveEvidence(
+        suspects=found,
         corrected=tuple(corrected),
         pose_model=optimiser.pose_model,
         held_out=optimiser.held_out,
@@ -127,9 +142,11 @@ def optimise(
         variance_factor=overall_factor(settled),
         along_route=factors,
         window_s=window_s,
+        pose_pulls=pulls.rms(),
+        worst_pull=float(largest.max()),
+        worst_pull_s=float(frames_s[int(largest.argmax())]),
         clock_s=_clocks(optimised),
     )
-    return Outcome(inputs, optimiser, optimised, evidence)
 
 
 def _is_ambiguous(worst: Suspect, found: Sequence[Suspect]) -> bool:
