@@ -132,7 +132,9 @@ def adjust(
         sigma_px = float(np.clip(PIXEL_SIGMA * scale, _LEAST_PIXEL_SIGMA, tolerance * PIXEL_SIGMA))
         unit = PIXEL_SIGMA / sigma_px
         weight = np.where(usable, 1 / (1 + (length * unit / (_CAUCHY * tolerance)) ** 2), 0.0)
-        system, gradient = _normal(observations, believed, mount, errors, bends, residual, jacobian, root * unit, weight)
+        system, gradient = _normal(
+            observations, believed, mount, errors, bends, residual, jacobian, root * unit, weight
+        )
         step = _short(np.linalg.solve(system, -gradient))
         known = len(step) - errors.size
         mount = mount.moved(step[TURN], step[CENTRE])
@@ -149,7 +151,15 @@ def adjust(
             break
     wanted = [*range(6), *range(known - (free is not None), known)]
     covariance = np.linalg.inv(system)[np.ix_(wanted, wanted)]
-    return Adjusted(mount, extra + start_extra, covariance, errors, moved_poses(believed, errors, extra, free), length, weight)
+    return Adjusted(
+        mount,
+        extra + start_extra,
+        covariance,
+        errors,
+        moved_poses(believed, errors, extra, free),
+        length,
+        weight,
+    )
 
 
 def _short(step: FloatArray) -> FloatArray:
@@ -170,7 +180,10 @@ def _linearised(
     """Differences (N, 2) m, their derivatives by mount and parameter and by both poses, whitening (N, 2, 2)."""
     sides, spread = [], 0.0
     poses = moved_poses(believed, errors, extra, free)
-    for image, px in ((observations.first, observations.first_px), (observations.second, observations.second_px)):
+    for image, px in (
+        (observations.first, observations.first_px),
+        (observations.second, observations.second_px),
+    ):
         hits = hit_ground(mount, px, poses[image])
         by_px = by_pixel(mount, hits)
         bending = _bending(mount, px, by_px)

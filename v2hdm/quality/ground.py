@@ -257,17 +257,3 @@ def _clocks(ground: Mapping[str, GroundEstimate]) -> list[Finding]:
             )
         )  # fmt: skip
     return findings
-
-
-def clock_corrections(ground: Mapping[str, GroundEstimate]) -> dict[str, float]:
-    """By camera, how much later than stamped its images were taken, s, where the ground is sure of it."""
-    offsets = {
-        name: estimate.parameters["clock_s"]
-        for name, estimate in ground.items()
-        if "clock_s" in estimate.parameters and estimate.reading is Reading.AS_GIVEN
-    }
-    return {
-        name: clock.value
-        for name, clock in offsets.items()
-        if clock.told and max(_CLOCK_S, _SURE * clock.sigma) < abs(clock.value) <= _CORRECTABLE_S
-    }
