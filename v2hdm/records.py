@@ -12,8 +12,9 @@ Index letters, everywhere: ``i`` image, ``j`` marking, ``k`` corner observation.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -140,6 +141,33 @@ class PoseNoise:
     heading_drift_over_m: float = 5.0
     roll_pitch_drift_rad: float = 0.0
     roll_pitch_drift_over_m: float = 1.0
+
+    @classmethod
+    def as_far_as_stated(cls, **stated: float) -> PoseNoise:
+        """The noise of a drive whose description may leave out some of it.
+
+        A drift that is not stated takes half of its variance: an error that repeats from image to image does
+        not average out, and a map that reckons with none is less certain than it says.
+        """
+        noise = cls(**stated)
+        drifts = {
+            drift: math.sqrt(_USUAL_DRIFT_SHARE) * getattr(noise, total)
+            for total, drift in _DRIFTS.items()
+            if drift not in stated
+        }
+        return replace(noise, **drifts)
+
+
+_DRIFTS: Mapping[str, str] = {
+    "position_m": "position_drift_m",
+    "heading_rad": "heading_drift_rad",
+    "roll_pitch_rad": "roll_pitch_drift_rad",
+}
+"""Of each standard deviation of :class:`PoseNoise`, its drift."""
+
+_USUAL_DRIFT_SHARE = 0.5
+"""Share of a variance that drifts where nobody says otherwise: RTK's errors are about half multipath and
+atmosphere, which last for tens of metres."""
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,10 @@
 """Whether the stated uncertainty holds: the share of errors inside their 95 % regions, over whole drives.
 
-``python -m tests.benchmarks.uncertainty [--runs port1 port2] [--seeds 11 12 13 14] [--workers 2]`` renders ports,
-maps each with all cameras, and compares with the truth: corners (an ellipse each), side lengths, distances of
-markings about ten metres apart, and each camera's height, roll, pitch and yaw. ``--bare`` takes the statement of
-the poses' noise out of the drives, so that the defaults must hold. Detections are kept beside the drives.
+``python -m tests.benchmarks.uncertainty [--runs port1 port2] [--seeds 11 12 13 14] [--workers 2]`` renders
+ports, maps each with all cameras, and compares with the truth: corners (an ellipse each), side lengths,
+distances of markings about ten metres apart, and each camera's height, roll, pitch and yaw. ``--bare`` takes
+the statement of the poses' noise out of the drives, so that the defaults must hold. Detections are kept beside
+the drives.
 """
 
 from __future__ import annotations
@@ -113,7 +114,7 @@ def measure(folder: Path, workers: int, bare: bool) -> Inside:
     drive = read_drive(folder)
     truth, detections = read_truth(drive), detections_of(drive, workers)
     if bare:
-        drive = replace(drive, pose_noise=PoseNoise())
+        drive = replace(drive, pose_noise=PoseNoise.as_far_as_stated())
     result = run_methods(drive, detections, tuple(drive.cameras))["Opt"]
     inside: Inside = defaultdict(list)
     pairs = paired(result.hd_map.markings, truth)

@@ -154,7 +154,7 @@ def _list_images(camera: str, path: Path) -> ImageFiles:
 
 def _read_pose_noise(content: object, where: str) -> PoseNoise:
     if content is None:
-        return PoseNoise()
+        return PoseNoise.as_far_as_stated()
     entry = take_mapping(content, where, DriveError)
     check_keys(entry, (), [field.name for field in fields(PoseNoise)], where, DriveError)
     values = {key: take_number(value, f"{where}, {key}", DriveError) for key, value in entry.items()}
@@ -165,7 +165,7 @@ def _read_pose_noise(content: object, where: str) -> PoseNoise:
             raise DriveError(
                 f"{where}, {key}: an error that fades over no distance is no drift; leave it out"
             )
-    noise = PoseNoise(**values)
+    noise = PoseNoise.as_far_as_stated(**values)
     for total, drift in (
         ("position_m", "position_drift_m"),
         ("heading_rad", "heading_drift_rad"),

@@ -34,7 +34,7 @@ def with_relative_sigma(
     """
     corner = bundle.corner_index[groups]
     pairs = np.stack([corner[:, list(pair)] for pair in _OPPOSITE], axis=1)
-    whole = (pairs >= 0).all(axis=2)
+    whole = np.asarray((pairs >= 0).all(axis=2))
     known = np.flatnonzero(whole.any(axis=1))
     if len(known) < 2:
         return markings
