@@ -3,8 +3,8 @@
 ``python -m tests.benchmarks.uncertainty [--runs port1 port2] [--seeds 11 12 13 14] [--workers 2]`` renders
 ports, maps each with all cameras, and compares with the truth: corners (an ellipse each), side lengths,
 distances of markings about ten metres apart, and each camera's height, roll, pitch and yaw. ``--bare`` takes
-the statement of the poses' noise out of the drives, so that the defaults must hold. Detections are kept beside
-the drives.
+the statement of the poses' noise out of the drives, so that the defaults must hold. Detections are kept
+beside the drives.
 """
 
 from __future__ import annotations
