@@ -29,8 +29,12 @@ against a pixel, but thousands of matches share it."""
 _BENDS = 6
 """Terms of a smooth error of each pixel coordinate: a polynomial of the second degree."""
 
-_STEPS = 25
-_CONVERGED = 1e-3
+_LARGEST_TURN_RAD = 0.05
+_LARGEST_SHIFT_M = 0.2
+"""A step larger than these leaves what the equations are linear in."""
+
+_STEPS = 20
+_CONVERGED = 0.02
 """A step below so many standard deviations is the last."""
 
 CENTRE, TURN = slice(3, 6), slice(0, 3)
@@ -83,16 +87,19 @@ class Adjusted:
     Attributes:
         mount: with the lens as freed.
         extra: the freed parameter's value, 0 without one.
-        information: (K, K) marginal information of turn (3, rad), centre (3, m) and the freed parameter.
+        covariance: (K, K) of turn (3, rad), centre (3, m) and the freed parameter, if any.
         pose_errors: (I, 6) estimated :data:`v2hdm.ground.noise.STATES`.
+        bends: (12,) estimated smooth error of the pixels, px.
+        poses: (I, 4, 4) ``map_from_vehicle`` with their errors, and the parameter, taken in.
         residual: (N,) lengths in units of :data:`PIXEL_SIGMA` over both pixels.
-        scores: (P, K) gradient of each pair, the poses being estimated.
+        weight: (N,) 1 for a match that fits, 0 for one that does not.
     """
 
     mount: Mount
     extra: float
     covariance: FloatArray
     pose_errors: FloatArray
+    bends: FloatArray
     poses: FloatArray
     residual: FloatArray
     weight: FloatArray
@@ -104,7 +111,7 @@ def adjust(
     start: Mount,
     free: str | None = None,
     tolerance: float = 1.0,
-    start_extra: float = 0.0,
+    near: Adjusted | None = None,
 ) -> Adjusted:
     """Find the mounting, beside one parameter ``free`` if any, by Gauss-Newton with Cauchy's weights.
 
@@ -114,11 +121,11 @@ def adjust(
         start: where to start from.
         free: ``clock_s``, ``focal_scale``, ``distortion_k1`` or ``grade``, or None.
         tolerance: factor on the length of residual from which on a match loses its weight.
-        start_extra: value of the parameter to start from, already within ``believed``'s poses or ``start``.
+        near: a solution for the same images, without the parameter, to start from instead.
     """
-    mount, extra = start, 0.0
-    errors = np.zeros((len(believed.poses), 6))
-    bends = np.zeros(2 * _BENDS)
+    mount, extra = start if near is None else near.mount, 0.0
+    errors = np.zeros((len(believed.poses), 6)) if near is None else near.pose_errors
+    bends = np.zeros(2 * _BENDS) if near is None else near.bends
     sigma_px = PIXEL_SIGMA
     for _ in range(_STEPS):
         residual, jacobian, root = _linearised(observations, believed, mount, extra, errors, bends, free)
@@ -129,7 +136,7 @@ def adjust(
         unit = PIXEL_SIGMA / sigma_px
         weight = np.where(usable, 1 / (1 + (length * unit / (_CAUCHY * tolerance)) ** 2), 0.0)
         system, gradient = _normal(observations, believed, mount, errors, bends, residual, jacobian, root * unit, weight)
-        step = np.linalg.solve(system, -gradient)
+        step = _short(np.linalg.solve(system, -gradient))
         known = len(step) - errors.size
         mount = mount.moved(step[TURN], step[CENTRE])
         bends = bends + step[6 : 6 + 2 * _BENDS]
@@ -145,7 +152,13 @@ def adjust(
             break
     wanted = [*range(6), *range(known - (free is not None), known)]
     covariance = np.linalg.inv(system)[np.ix_(wanted, wanted)]
-    return Adjusted(mount, extra + start_extra, covariance, errors, moved_poses(believed, errors, extra, free), length, weight)
+    return Adjusted(mount, extra, covariance, errors, bends, moved_poses(believed, errors, extra, free), length, weight)
+
+
+def _short(step: FloatArray) -> FloatArray:
+    """The step, shortened to what its linearisation holds for."""
+    turn, shift = np.abs(step[TURN]).max(), np.abs(step[CENTRE]).max()
+    return step / max(1.0, float(turn) / _LARGEST_TURN_RAD, float(shift) / _LARGEST_SHIFT_M)
 
 
 def _linearised(

@@ -57,9 +57,7 @@ class Beliefs:
             observations: matches between rows of the motion.
             loosened: how much further off than stated headings and sideways places may be.
         """
-        rows, place = np.unique(
-            np.concatenate([observations.first, observations.second]), return_inverse=True
-        )
+        rows, place = np.unique(np.concatenate([observations.first, observations.second]), return_inverse=True)
         count = len(observations.first)
         path_m = self.path_m()[rows]
         prior = self.camera.centre_prior if self.surveyed else None

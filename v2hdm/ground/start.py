@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +17,9 @@ _PAIRS = 10
 _SHORT_M = (0.3, 1.6)
 """Distance between the images of a pair: a wrong guess shifts the ground by a part of it."""
 
-_LOOSENED = 8.0
+_TOLERANCE = 8.0
+"""Factor on the residual from which on a match loses its weight: the guess is degrees off."""
+
 _SEARCH_M = (0.9, 0.5)
 _GRID_M = 0.06
 _PASSES = 0.15
@@ -55,9 +57,7 @@ def find_start(matcher: Matcher, beliefs: Beliefs, guess: Mount) -> Start:
     for turn_deg in _TURNS_DEG:
         # Pitch is about the camera's own sideways axis: a camera may look anywhere.
         sideways = guess.vehicle_from_cam_rotation[:, 0]
-        tried = _settle(
-            matcher, beliefs, pairs, guess.moved(np.deg2rad(turn_deg) * sideways, np.zeros(3)), guess
-        )
+        tried = _settle(matcher, beliefs, pairs, guess.moved(np.deg2rad(turn_deg) * sideways, np.zeros(3)), guess)
         if tried.mount is not None:
             return tried
         best = max(best, tried, key=lambda start: start.share)
@@ -74,13 +74,16 @@ def short_pairs(path_m: FloatArray) -> FloatArray:
 
 def _settle(matcher: Matcher, beliefs: Beliefs, pairs: FloatArray, mount: Mount, guess: Mount) -> Start:
     share, sought = 0.0, 0
+    prior = beliefs.camera.centre_prior
+    # Between neighbouring images a higher camera and a longer way look alike; the survey tells them apart.
+    surveyed = beliefs if prior is None else replace(beliefs, centre_sigma_m={2: float(prior.sigma_m[2])})
     for search_m in _SEARCH_M:
         matched = matcher.match(mount, beliefs.poses(), pairs, search_m, _GRID_M)
         share, sought = matched.share, matched.sought
         if len(matched.correlation) < _LEAST_MATCHES or share < _PASSES:
             return Start(None, share, sought)
-        used, believed, _ = beliefs.about(matched.observations, _LOOSENED)
-        mount = adjust(used, believed, mount, tolerance=_LOOSENED).mount
+        used, believed, _ = surveyed.about(matched.observations)
+        mount = adjust(used, believed, mount, tolerance=_TOLERANCE).mount
         away = guess.vehicle_from_cam_rotation.T @ mount.vehicle_from_cam_rotation
         if np.trace(away) < 1 + 2 * np.cos(np.deg2rad(_FARTHEST_DEG)):
             return Start(None, 0.0, sought)
