@@ -261,22 +261,31 @@ class ImageDetections:
 class Marking:
     """One mapped marking: ``corners_map`` (4, 2) m, counter-clockwise seen from above.
 
-    ``covariance_m2`` (8, 8) is that of the stacked corners, or None where the method has none.
+    ``covariance_m2`` (8, 8) is that of the stacked corners in the map, or None where the method has none.
+    ``relative_sigma_m`` is the standard deviation of a coordinate of its centre against that of the marking
+    nearest to ten metres away, of which a drift that both share is no part; None where it is not known.
+    ``heights_m`` (4,) are the recorded heights of the ground there, None where it was recorded as z = 0.
     """
 
     kind: str
     corners_map: FloatArray
     sightings: int
     covariance_m2: FloatArray | None = None
+    relative_sigma_m: float | None = None
+    heights_m: FloatArray | None = None
 
 
 @dataclass(frozen=True)
 class Lane:
-    """One mapped lane line: a polyline ``points_map`` (N, 2) m along its centre."""
+    """One mapped lane line: a polyline ``points_map`` (N, 2) m along its centre.
+
+    ``heights_m`` (N,) are the recorded heights of the ground there, None where it was recorded as z = 0.
+    """
 
     kind: str
     points_map: FloatArray
     sightings: int
+    heights_m: FloatArray | None = None
 
 
 @dataclass(frozen=True)

@@ -33,8 +33,8 @@ _LARGEST_TURN_RAD = 0.05
 _LARGEST_SHIFT_M = 0.2
 """A step larger than these leaves what the equations are linear in."""
 
-_STEPS = 20
-_CONVERGED = 0.02
+_STEPS = 25
+_CONVERGED = 1e-3
 """A step below so many standard deviations is the last."""
 
 CENTRE, TURN = slice(3, 6), slice(0, 3)
@@ -87,19 +87,16 @@ class Adjusted:
     Attributes:
         mount: with the lens as freed.
         extra: the freed parameter's value, 0 without one.
-        covariance: (K, K) of turn (3, rad), centre (3, m) and the freed parameter, if any.
+        information: (K, K) marginal information of turn (3, rad), centre (3, m) and the freed parameter.
         pose_errors: (I, 6) estimated :data:`v2hdm.ground.noise.STATES`.
-        bends: (12,) estimated smooth error of the pixels, px.
-        poses: (I, 4, 4) ``map_from_vehicle`` with their errors, and the parameter, taken in.
         residual: (N,) lengths in units of :data:`PIXEL_SIGMA` over both pixels.
-        weight: (N,) 1 for a match that fits, 0 for one that does not.
+        scores: (P, K) gradient of each pair, the poses being estimated.
     """
 
     mount: Mount
     extra: float
     covariance: FloatArray
     pose_errors: FloatArray
-    bends: FloatArray
     poses: FloatArray
     residual: FloatArray
     weight: FloatArray
@@ -111,7 +108,7 @@ def adjust(
     start: Mount,
     free: str | None = None,
     tolerance: float = 1.0,
-    near: Adjusted | None = None,
+    start_extra: float = 0.0,
 ) -> Adjusted:
     """Find the mounting, beside one parameter ``free`` if any, by Gauss-Newton with Cauchy's weights.
 
@@ -121,11 +118,11 @@ def adjust(
         start: where to start from.
         free: ``clock_s``, ``focal_scale``, ``distortion_k1`` or ``grade``, or None.
         tolerance: factor on the length of residual from which on a match loses its weight.
-        near: a solution for the same images, without the parameter, to start from instead.
+        start_extra: value of the parameter to start from, already within ``believed``'s poses or ``start``.
     """
-    mount, extra = start if near is None else near.mount, 0.0
-    errors = np.zeros((len(believed.poses), 6)) if near is None else near.pose_errors
-    bends = np.zeros(2 * _BENDS) if near is None else near.bends
+    mount, extra = start, 0.0
+    errors = np.zeros((len(believed.poses), 6))
+    bends = np.zeros(2 * _BENDS)
     sigma_px = PIXEL_SIGMA
     for _ in range(_STEPS):
         residual, jacobian, root = _linearised(observations, believed, mount, extra, errors, bends, free)
@@ -135,7 +132,9 @@ def adjust(
         sigma_px = float(np.clip(PIXEL_SIGMA * scale, _LEAST_PIXEL_SIGMA, tolerance * PIXEL_SIGMA))
         unit = PIXEL_SIGMA / sigma_px
         weight = np.where(usable, 1 / (1 + (length * unit / (_CAUCHY * tolerance)) ** 2), 0.0)
-        system, gradient = _normal(observations, believed, mount, errors, bends, residual, jacobian, root * unit, weight)
+        system, gradient = _normal(
+            observations, believed, mount, errors, bends, residual, jacobian, root * unit, weight
+        )
         step = _short(np.linalg.solve(system, -gradient))
         known = len(step) - errors.size
         mount = mount.moved(step[TURN], step[CENTRE])
@@ -152,7 +151,15 @@ def adjust(
             break
     wanted = [*range(6), *range(known - (free is not None), known)]
     covariance = np.linalg.inv(system)[np.ix_(wanted, wanted)]
-    return Adjusted(mount, extra, covariance, errors, bends, moved_poses(believed, errors, extra, free), length, weight)
+    return Adjusted(
+        mount,
+        extra + start_extra,
+        covariance,
+        errors,
+        moved_poses(believed, errors, extra, free),
+        length,
+        weight,
+    )
 
 
 def _short(step: FloatArray) -> FloatArray:
@@ -173,7 +180,10 @@ def _linearised(
     """Differences (N, 2) m, their derivatives by mount and parameter and by both poses, whitening (N, 2, 2)."""
     sides, spread = [], 0.0
     poses = moved_poses(believed, errors, extra, free)
-    for image, px in ((observations.first, observations.first_px), (observations.second, observations.second_px)):
+    for image, px in (
+        (observations.first, observations.first_px),
+        (observations.second, observations.second_px),
+    ):
         hits = hit_ground(mount, px, poses[image])
         by_px = by_pixel(mount, hits)
         bending = _bending(mount, px, by_px)

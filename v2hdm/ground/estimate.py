@@ -21,28 +21,10 @@ from v2hdm.ground.readings import Readings, try_readings
 from v2hdm.ground.results import GroundEstimate, GroundStatus, MatchedGround, Parameter, Reading
 from v2hdm.records import Calibration, Drive, FloatArray, PoseNoise
 
-
-
-@dataclass(frozen=True)
-class _Stage:
-    """One round: how far matches are searched, on which grid, in which of the pairs.
-
-    ``loosened`` is how much further off than stated the poses' heading and sideways place may be, so that the
-    few pairs which show a wrong clock do not count as outliers.
-    """
-
-    search_m: float
-    grid_m: float
-    every: int
-    loosened: float
-
-
-_STAGES = (
-    _Stage(0.9, 0.06, 2, 20.0),
-    _Stage(0.5, 0.06, 2, 8.0),
-    _Stage(0.24, 0.04, 1, 2.0),
-    _Stage(0.12, 0.04, 1, 1.0),
-)
+_SEARCH_M = (0.9, 0.5, 0.24, 0.15)
+_LOOSENED = (20.0, 8.0, 2.0, 1.0)
+"""How much further off than stated the poses' heading and sideways place may be in each round, so that the
+few pairs which show a wrong clock do not count as outliers."""
 
 _CLOCK_APART_M = (0.8, 4.0)
 """Distance between the images of a pair that shows the clock: motion changes within it."""
@@ -93,12 +75,12 @@ def _solve(matcher: Matcher, beliefs: Beliefs, mount: Mount, options: GroundOpti
         velocity = beliefs.motion.velocity_at_images()
         pairs = np.vstack([pairs, changing_pairs(path_m, velocity, options.clock_pairs, *_CLOCK_APART_M)])
     poses = beliefs.poses()
-    for stage in _STAGES:
-        matched = matcher.match(mount, poses, pairs[:: stage.every], stage.search_m, stage.grid_m)
+    for search_m, loosened in zip(_SEARCH_M, _LOOSENED, strict=True):
+        matched = matcher.match(mount, poses, pairs, search_m)
         if len(matched.correlation) < _LEAST_MATCHES:
             return None
-        used, believed, rows = beliefs.about(matched.observations, stage.loosened)
-        adjusted = adjust(used, believed, mount, free, max(stage.loosened / 2, 1.0))
+        used, believed, rows = beliefs.about(matched.observations, loosened)
+        adjusted = adjust(used, believed, mount, free, max(loosened / 2, 1.0))
         mount = adjusted.mount
         if free is not None:
             beliefs = beliefs.at_clock(beliefs.clock_s + adjusted.extra)
@@ -123,7 +105,7 @@ def _found(camera: str, solved: _Solved, readings: Readings, options: GroundOpti
         reading=readings.best,
         calibration=Calibration(mount.info, mount.cam_from_vehicle, covariance),
         guess_cam_from_vehicle=solved.beliefs.guess.cam_from_vehicle,
-        parameters=free_parameters(options.free, seen, solved.beliefs, solved.adjusted, solved.clock),
+        parameters=free_parameters(options.free, seen, solved.beliefs, mount, solved.clock),
         median_residual=float(np.median(solved.adjusted.residual)),
         pulls=_pulls(solved.adjusted, solved.beliefs.drive.pose_noise),
         patches=MatchedGround(

@@ -18,12 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.adjust.incremental import IncrementalMap, RigPrior, State
-from v2hdm.adjust.marking_fit import MarkingObservations, Noise
+from v2hdm.adjust.marking_fit import MarkingObservations
+from v2hdm.adjust.pose_errors import Noise
 from v2hdm.adjust.rigid import exp
 from v2hdm.errors import AdjustError
 from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.association.merge import group_kinds
-from v2hdm.mapping.bundle import HEAVE_SIGMA_M, centre_priors
+from v2hdm.mapping.bundle import centre_priors, pose_sigma_of
 from v2hdm.mapping.markings.completion import SolvedCorners, completed_corners
 from v2hdm.mapping.markings.verdict import Seen, judge_and_mend
 from v2hdm.mapping.options import MappingOptions
@@ -117,15 +118,13 @@ class IncrementalMapper:
         centre, sigma = centre_priors(self._cameras, rig.cam_from_vehicle)
         focal = rig.intrinsic
         intrinsic = np.column_stack([focal[:, 0, 0], focal[:, 1, 1], focal[:, :2, 2]])
-        white_m = np.sqrt(max(pose_noise.position_m**2 - pose_noise.position_drift_m**2, 0.0))
-        tilt = pose_noise.roll_pitch_rad
-        pose_sigma = np.array([white_m, white_m, HEAVE_SIGMA_M, tilt, tilt, pose_noise.heading_rad])
         self._prior = RigPrior(intrinsic, rig.cam_from_vehicle, centre, sigma)
-        self._noise = Noise(pose_sigma, options.loss_scale)
-        self._drift_m = pose_noise.position_drift_m
-        self._jitter_rad = float(np.hypot(tilt, pose_noise.heading_rad))
+        self._noise = _noise(pose_noise, options)
+        self._jitter_rad = float(np.hypot(pose_noise.roll_pitch_rad, pose_noise.heading_rad))
         self._floor_m = float(pose_noise.position_m)
         self._vehicle_from_map: FloatArray = np.asarray(np.linalg.inv(rig.map_from_vehicle), np.float64)
+        step_m = np.linalg.norm(np.diff(rig.map_from_vehicle[:, :3, 3], axis=0), axis=1)
+        self._travelled_m = np.concatenate([[0.0], np.cumsum(step_m)])
         self._begin(None, 0)
 
     def run(self, views: Views, progress: Callable[[str], None]) -> Grown:
@@ -154,7 +153,7 @@ class IncrementalMapper:
 
         So many need not be up to date one by one again: they are solved a unit at a time.
         """
-        self.grown = IncrementalMap(self._prior, self._noise, self._drift_m)
+        self.grown = IncrementalMap(self._prior, self._noise)
         if before is not None:
             self.grown.state = State.empty(self._prior, before.state.tangents)
         self._start, self._known = before, known
@@ -266,6 +265,7 @@ class IncrementalMapper:
             camera=sightings.camera[row],
             corner=dense.astype(np.int64),
             frame=sightings.frame[row],
+            travelled_m=self._travelled_m[sightings.frame[row]],
             vehicle_from_map=self._vehicle_from_map[sightings.frame[row]],
             pinhole_px=sightings.corners_pinhole_px[row, own],
             covariance_px=sightings.covariance_px[row, own] + floor_px**2 * np.eye(2),
@@ -370,3 +370,15 @@ class IncrementalMapper:
         noise = sightings.covariance_px[row, own] + jitter_px**2 * np.eye(2)
         squared = np.sum(residual * np.linalg.solve(noise, residual[..., None])[..., 0], axis=1)
         return row, group, residual, squared < _INLIER_SQUARED
+
+
+def _noise(pose_noise: PoseNoise, options: MappingOptions) -> Noise:
+    """The noise of the batch, in the arrays of the incremental map."""
+    sigma = pose_sigma_of(pose_noise)
+    drifts = sigma.drift_by_state()
+    return Noise(
+        sigma.by_state(),
+        options.loss_scale,
+        np.array([drift.sigma for drift in drifts]),
+        np.array([drift.over_m for drift in drifts]),
+    )

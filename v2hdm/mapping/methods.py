@@ -19,10 +19,10 @@ from v2hdm.mapping.growth import grow_map
 from v2hdm.mapping.incremental import Grown
 from v2hdm.mapping.lanes.fuse import map_lanes
 from v2hdm.mapping.lanes.points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
-from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.naive import naive_markings
 from v2hdm.mapping.optimise import Optimiser, nearest_extrinsic
 from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
+from v2hdm.mapping.remedy import Outcome, optimise
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.sightings.table import Sightings, camera_of, collect_sightings
 from v2hdm.mapping.sightings.views import views_of
@@ -81,8 +81,12 @@ def run_methods(
         grown = optimiser.run_incrementally(tell)
         optimal = _incremental_result(drive, detections, cameras, grown, options, begin_s)
     else:
-        optimised = optimiser.run(tracks, tell)
-        optimal = _optimised_result(drive, detections, cameras, optimised, options, begin_s)
+        outcome = optimise(drive, detections, cameras, options, tell)
+        optimal = _optimised_result(cameras, outcome, begin_s)
+        optimiser, optimised, inputs = outcome.optimiser, outcome.optimised, outcome.inputs
+        drive, detections, options = inputs.drive, inputs.detections, inputs.options
+        if inputs.sightings is not sightings:
+            sightings, tracks = inputs.sightings, optimiser.initial_tracks()
         if growth_steps:
             tell("growth of the map")
             optimal = replace(optimal, growth=grow_map(optimiser, optimised, growth_steps))
@@ -119,14 +123,8 @@ def run_naive(
     )
 
 
-def _optimised_result(
-    drive: Drive,
-    detections: Sequence[ImageDetections],
-    cameras: Sequence[str],
-    optimised: Optimised,
-    options: MappingOptions,
-    begin_s: float,
-) -> MethodResult:
+def _optimised_result(cameras: Sequence[str], outcome: Outcome, begin_s: float) -> MethodResult:
+    optimised, options, drive = outcome.optimised, outcome.inputs.options, outcome.inputs.drive
     solution = optimised.bundle.solution
     if solution.status is not Status.CONVERGED:
         _log.warning(
@@ -141,7 +139,8 @@ def _optimised_result(
             options.survey.reach_m,
             ", ".join(f"({x:.2f}, {y:.2f})" for x, y in lost),
         )
-    lanes = _lanes(drive, detections, ground_by_rig(drive, cameras, optimised.bundle.rig), options)
+    ground = ground_by_rig(drive, cameras, optimised.bundle.rig)
+    lanes = _lanes(drive, outcome.inputs.detections, ground, options)
     return MethodResult(
         name="Opt",
         cameras=tuple(cameras),
@@ -159,6 +158,7 @@ def _optimised_result(
             "time_s": time.perf_counter() - begin_s,
         },
         certainty=_certainty(optimised.bundle),
+        evidence=outcome.evidence,
     )
 
 

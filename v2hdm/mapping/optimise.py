@@ -42,6 +42,8 @@ SETTLED_MODEL = "heave"
 STEEP_SINE = 0.15
 """Sine of a ray's depression from which the coarse stage uses it (unless most rays are flatter)."""
 
+LOOSE_CLOCK_SIGMA_S = 0.3
+"""How far clocks may be apart, s, once the drive has said that they are: half a period of a slow receiver."""
 
 _LEAST_OBSERVATIONS = 200
 """Of fewer, the residuals cannot tell how large their variance is."""
@@ -68,8 +70,14 @@ class Optimiser:
         self._options = options
         self._pose_model = SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
         self._variance_factor = 1.0
+        self.held_out: Mapping[str, float] = {}
         self.camera_names = sightings.cameras
         self.initial_rig = initial_rig(self._cameras, sightings.map_from_vehicle)
+
+    @property
+    def pose_model(self) -> str:
+        """What is estimated of the poses, of :data:`v2hdm.adjust.MODELS`."""
+        return self._pose_model
 
     def initial_tracks(self) -> Association:
         """Sightings linked from image to image under the initial IPMs."""
@@ -78,6 +86,10 @@ class Optimiser:
 
     def run(self, tracks: Association, progress: Callable[[str], None] | None = None) -> Optimised:
         """Optimise from ``tracks`` (see :meth:`initial_tracks`); ``progress`` gets each step's name."""
+        return self.finish(self.settle(tracks, progress), progress)
+
+    def settle(self, tracks: Association, progress: Callable[[str], None] | None = None) -> Bundle:
+        """Associate and solve by turns, until it is settled which sightings are of one marking."""
         tell = progress or _silent
         tell("coarse solve")
         bundle = self._solve_steep(tracks)
@@ -94,6 +106,11 @@ class Optimiser:
             tell("joint solve with settled corners")
             bundle = self._solve(settled, usable, bundle.rig)
             self._reweigh(bundle)
+        return bundle
+
+    def finish(self, bundle: Bundle, progress: Callable[[str], None] | None = None) -> Optimised:
+        """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude."""
+        tell = progress or _silent
         if self._options.pose_model == AUTO:
             tell("choice of the pose model")
             self._pose_model = self._choose_pose_model(bundle)
@@ -106,6 +123,16 @@ class Optimiser:
             self._pose_noise.roll_pitch_rad,
             self._options.acceptance,
         )
+
+    def clock_offsets_s(self, bundle: Bundle) -> dict[str, float]:
+        """Each camera's clock offset by a solve that expects none in particular, from ``bundle``."""
+        model = full_model(self._pose_noise, self._options, "clock", bundle.model.variance_factor)
+        model = replace(model, clock_sigma_s=LOOSE_CLOCK_SIGMA_S)
+        usable = self._locate(bundle.rig).valid
+        solved = solve_bundle(
+            self._sightings, bundle.association, usable, bundle.rig, self._cameras, model
+        ).solution
+        return {name: float(solved.clock_offset_s[c]) for name, c in bundle.camera_index.items()}
 
     def run_incrementally(self, progress: Callable[[str], None] | None = None) -> Grown:
         """Map one track after the other, as the vehicle would; ``progress`` is told how large the map is."""
@@ -199,6 +226,7 @@ class Optimiser:
             _log.warning("the pose model stays %r, since none could be chosen: %s", SETTLED_MODEL, failure)
             return SETTLED_MODEL
         _log.info("%s: %s", ", ".join(self.camera_names), selection.sentence)
+        self.held_out = selection.scores
         return selection.name
 
     def _gate(self, bundle: Bundle) -> tuple[BoolArray, BoolArray]:

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from v2hdm.records import Calibration, FloatArray, HdMap, Marking
+import numpy as np
+
+from v2hdm.mapping.evidence import SolveEvidence
+from v2hdm.records import BoolArray, Calibration, FloatArray, HdMap, Marking
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,28 @@ class GrowthStep:
 
 
 @dataclass(frozen=True)
+class AdjustedPoses:
+    """The vehicle's poses at the images' times, as a solve has adjusted them.
+
+    Attributes:
+        stamp_s: (F,) when images were taken, on the clock of the poses, rising.
+        map_from_vehicle: (F, 4, 4); those as recorded where no marking was seen.
+        sigma: (F, 6) standard deviations of x, y, z (m) and of the turns about them (rad), along the
+            vehicle's axes; those stated by the drive where no marking was seen.
+        seen: (F,) whether a marking was seen then.
+    """
+
+    stamp_s: FloatArray
+    map_from_vehicle: FloatArray
+    sigma: FloatArray
+    seen: BoolArray
+
+    def at(self, stamp_s: float) -> FloatArray:
+        """The pose (4, 4) of the frame nearest to ``stamp_s``."""
+        return np.asarray(self.map_from_vehicle[int(np.argmin(np.abs(self.stamp_s - stamp_s)))])
+
+
+@dataclass(frozen=True)
 class MethodResult:
     """The outcome of one method on one set of cameras.
 
@@ -35,7 +60,8 @@ class MethodResult:
     over the same accepted corner observations; None for methods that do not reproject.
     ``growth`` is how the result came about, marking by marking, where that was asked for;
     ``diagnostics`` are named figures for the log and the report; ``certainty`` says of each camera
-    in a sentence what the drive determined and what rests on the survey.
+    in a sentence what the drive determined and what rests on the survey; ``evidence`` is what the checks
+    after the solve rest on, ``poses`` the vehicle's poses as the solve has adjusted them.
     """
 
     name: str
@@ -48,3 +74,5 @@ class MethodResult:
     growth: tuple[GrowthStep, ...] = ()
     diagnostics: Mapping[str, float] = field(default_factory=dict)
     certainty: Mapping[str, str] = field(default_factory=dict)
+    evidence: SolveEvidence | None = None
+    poses: AdjustedPoses | None = None

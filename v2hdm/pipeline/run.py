@@ -29,6 +29,8 @@ from v2hdm.pipeline.evaluate import CameraSets, evaluate
 from v2hdm.pipeline.inspect import Inspection, inspect
 from v2hdm.pipeline.write import write_results
 from v2hdm.quality import Finding, Status, Verdict
+from v2hdm.quality.against_ground import check_against_ground
+from v2hdm.quality.solution import BEST, check_solution
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.outputs import result_folder, write_json
 from v2hdm.simulate import PortConfig, rendered_drive
@@ -147,11 +149,19 @@ def _map_and_judge(
     with _timed(seconds, "map"):
         methods = _map_camera_sets(config, drive, detections, progress)
     with _timed(seconds, "judge"):
-        verdict = Verdict.of([*inspection.findings, *check_result(drive, methods, inspection.ground)])
+        best = list(methods.values())[-1][BEST]
+        verdict = Verdict.of(
+            [
+                *inspection.findings,
+                *check_solution(drive, methods),
+                *check_against_ground(best.calibrations, inspection.ground),
+            ]
+        )
     with _timed(seconds, "evaluate"):
-        judgement = evaluate(drive, detections, methods, config.mapping, partial(progress, "evaluate"))
+        described = inspection.drive_as_described
+        judgement = evaluate(described, detections, methods, config.mapping, partial(progress, "evaluate"))
     metrics = {**about, "verdict": verdict.as_json(), **judgement.metrics, "seconds": seconds}
-    write_results(folder, drive, detections, list(methods.values())[-1], judgement, metrics, verdict)
+    write_results(folder, described, detections, list(methods.values())[-1], judgement, metrics, verdict)
     return RunResult(Path(config.output) / config.name, metrics, judgement.headlines, verdict)
 
 

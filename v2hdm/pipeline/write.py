@@ -12,8 +12,10 @@ from v2hdm.detection.batch import read_image
 from v2hdm.detection.camera.ground import ipm_from_extrinsic
 from v2hdm.hdmap.calibration import write_calibration
 from v2hdm.hdmap.geojson import write_geojson
+from v2hdm.hdmap.heights import with_heights
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.evaluate import Judgement
+from v2hdm.quality import Verdict
 from v2hdm.records import Drive, Image, ImageDetections
 from v2hdm.report.figures import save_birdseye, save_growth, save_overlay
 from v2hdm.report.outputs import write_json
@@ -29,10 +31,11 @@ def write_results(
     methods: Mapping[str, MethodResult],
     judgement: Judgement,
     metrics: Mapping[str, Any],
+    verdict: Verdict,
 ) -> None:
     """Write map, calibrations, metrics and pictures of one camera set's ``methods`` into ``folder``."""
     best = methods[BEST]
-    write_geojson(best.hd_map, folder / "map.geojson")
+    write_geojson(with_heights(best.hd_map, drive.road), folder / "map.geojson")
     for name, calibration in best.calibrations.items():
         write_calibration(calibration, folder / f"calibration_{name}.yaml")
     write_json(folder / "metrics.json", metrics)

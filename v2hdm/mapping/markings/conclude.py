@@ -12,6 +12,7 @@ from v2hdm.mapping.association.groups import fuse_groups
 from v2hdm.mapping.association.merge import group_kinds
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.markings.completion import solved_corners
+from v2hdm.mapping.markings.neighbours import with_relative_sigma
 from v2hdm.mapping.markings.verdict import Seen, judge_and_mend
 from v2hdm.mapping.options import AcceptanceOptions
 from v2hdm.mapping.results import Exclusion
@@ -85,7 +86,7 @@ def conclude(
         inlier_share=agreeing / np.maximum(total, 1),
     )
     judged = judge_and_mend(solved_corners(final), seen, options)
-    markings = judged.markings()
+    markings = with_relative_sigma(judged.markings(), judged.accepted, final)
     used = np.isin(final.group, judged.accepted)
     return Optimised(
         bundle=final,
