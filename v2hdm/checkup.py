@@ -16,7 +16,7 @@ from v2hdm.detection.camera.mounting import guessed_extrinsic
 from v2hdm.detection.image_file import read_bgr
 from v2hdm.drive import ReadOptions, read_drive
 from v2hdm.errors import ConfigError
-from v2hdm.ground import GroundEstimate
+from v2hdm.ground import GroundEstimate, estimate_cameras
 from v2hdm.quality import Status, Verdict, check_drive
 from v2hdm.records import Drive, FloatArray, Trajectory
 from v2hdm.report.camera_grid import save_grid
@@ -48,8 +48,6 @@ def check_up(parsed: argparse.Namespace) -> bool:
     with result_folder(folder) as unfinished:
         ground: Mapping[str, GroundEstimate] = {}
         if parsed.ground:
-            from v2hdm.ground import estimate_cameras
-
             ground = estimate_cameras(drive, parsed.workers or os.cpu_count() or 1, _quietly)
         verdict = Verdict.of(check_drive(drive, ground))
         write_json(unfinished / "verdict.json", verdict.as_json())
