@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from v2hdm.drive import with_clock_offsets
-from v2hdm.ground import GroundEstimate
+from v2hdm.ground import GroundEstimate, better_start
 from v2hdm.ground.rig import estimate_cameras
 from v2hdm.quality import Finding, Status, check_drive, clock_corrections
-from v2hdm.records import Drive
+from v2hdm.records import Camera, Drive
 
 log = logging.getLogger(__name__)
 
@@ -21,15 +21,22 @@ class Inspection:
 
     Attributes:
         drive: with the clocks that the ground contradicts corrected, and the ground's better start.
+        given: cameras as the drive describes them.
         ground: by camera, what the bare ground says.
         clock_offset_s: by camera, how much later than stamped its images are taken to be, s.
         findings: of all checks before the run.
     """
 
     drive: Drive
+    given: Mapping[str, Camera]
     ground: Mapping[str, GroundEstimate]
     clock_offset_s: Mapping[str, float]
     findings: tuple[Finding, ...]
+
+    @property
+    def drive_as_described(self) -> Drive:
+        """The drive with corrected clocks, and its cameras as they were described."""
+        return replace(self.drive, cameras=self.given)
 
     @property
     def has_failed(self) -> bool:
@@ -55,4 +62,4 @@ def inspect(drive: Drive, max_gap_s: float, workers: int, progress: Callable[[in
             log.info("%s", finding.line)
     offset_s = clock_corrections(ground)
     corrected = better_start(with_clock_offsets(drive, offset_s, max_gap_s), ground)
-    return Inspection(corrected, ground, offset_s, findings)
+    return Inspection(corrected, drive.cameras, ground, offset_s, findings)

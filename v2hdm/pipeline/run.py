@@ -71,6 +71,7 @@ class RunConfig:
         cache: folder that keeps rendered drives.
         workers: processes for rendering and detection; 0 takes one per core.
         device: what ``conf/map.yaml`` hands on as ``mapping.device``, ``cpu`` or ``cuda``.
+        all_maps: whether the map of every method and camera set is written, into ``maps/``.
         mode: what it hands on as ``mapping.mode``, ``batch`` or ``incremental``.
     """
 
@@ -84,6 +85,7 @@ class RunConfig:
     workers: int = 0
     device: str = "cpu"
     mode: str = "batch"
+    all_maps: bool = False
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,7 @@ def _map_and_judge(
     with _timed(seconds, "evaluate"):
         judgement = evaluate(drive, detections, methods, config.mapping, partial(progress, "evaluate"))
     metrics = {**about, "verdict": verdict.as_json(), **judgement.metrics, "seconds": seconds}
-    write_results(folder, drive, detections, list(methods.values())[-1], judgement, metrics, verdict)
+    write_results(folder, drive, detections, methods, judgement, metrics, verdict, config.all_maps)
     return RunResult(Path(config.output) / config.name, metrics, judgement.headlines, verdict)
 
 
