@@ -22,6 +22,7 @@ from v2hdm.mapping.lanes.points import ImageGround, collect_lane_points, ground_
 from v2hdm.mapping.naive import naive_markings
 from v2hdm.mapping.optimise import Optimiser, nearest_extrinsic
 from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
+from v2hdm.mapping.outputs import adjusted_poses, clock_offsets
 from v2hdm.mapping.remedy import Outcome, optimise
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.sightings.table import Sightings, camera_of, collect_sightings
@@ -159,6 +160,8 @@ def _optimised_result(cameras: Sequence[str], outcome: Outcome, begin_s: float) 
         },
         certainty=_certainty(optimised.bundle),
         evidence=outcome.evidence,
+        poses=adjusted_poses(outcome),
+        clocks=clock_offsets(outcome),
     )
 
 

@@ -29,8 +29,7 @@ from v2hdm.pipeline.evaluate import CameraSets, evaluate
 from v2hdm.pipeline.inspect import Inspection, inspect
 from v2hdm.pipeline.write import write_results
 from v2hdm.quality import Finding, Status, Verdict
-from v2hdm.quality.against_ground import check_against_ground
-from v2hdm.quality.solution import BEST, check_solution
+from v2hdm.quality.after import check_result
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.outputs import result_folder, write_json
 from v2hdm.simulate import PortConfig, rendered_drive
@@ -73,6 +72,7 @@ class RunConfig:
         cache: folder that keeps rendered drives.
         workers: processes for rendering and detection; 0 takes one per core.
         device: what ``conf/map.yaml`` hands on as ``mapping.device``, ``cpu`` or ``cuda``.
+        all_maps: whether the map of every method and camera set is written, into ``maps/``.
         mode: what it hands on as ``mapping.mode``, ``batch`` or ``incremental``.
     """
 
@@ -86,6 +86,7 @@ class RunConfig:
     workers: int = 0
     device: str = "cpu"
     mode: str = "batch"
+    all_maps: bool = False
 
 
 @dataclass(frozen=True)
@@ -149,19 +150,13 @@ def _map_and_judge(
     with _timed(seconds, "map"):
         methods = _map_camera_sets(config, drive, detections, progress)
     with _timed(seconds, "judge"):
-        best = list(methods.values())[-1][BEST]
-        verdict = Verdict.of(
-            [
-                *inspection.findings,
-                *check_solution(drive, methods),
-                *check_against_ground(best.calibrations, inspection.ground),
-            ]
-        )
+        found = check_result(drive, methods, inspection.ground)
+        verdict = Verdict.of([*inspection.findings, *found])
     with _timed(seconds, "evaluate"):
         described = inspection.drive_as_described
         judgement = evaluate(described, detections, methods, config.mapping, partial(progress, "evaluate"))
     metrics = {**about, "verdict": verdict.as_json(), **judgement.metrics, "seconds": seconds}
-    write_results(folder, described, detections, list(methods.values())[-1], judgement, metrics, verdict)
+    write_results(folder, described, detections, methods, judgement, metrics, verdict, config.all_maps)
     return RunResult(Path(config.output) / config.name, metrics, judgement.headlines, verdict)
 
 

@@ -27,7 +27,8 @@ LEAST_OFFSET_M = 0.03
 """An offset of less than this is no finding, however sure it is: corners are good to two centimetres."""
 
 MOUNTING_LIMIT_SIGMAS = 5.0
-"""A mounting by one camera alone against that by all, in the sigmas of the former: clean drives stay below 2."""
+"""A mounting by one camera alone against that by all, in the sigmas of the former: clean drives stay below
+2."""
 
 
 def check_agreement(results: Mapping[str, MethodResult], drive: Drive) -> list[Finding]:
@@ -56,7 +57,8 @@ def check_agreement(results: Mapping[str, MethodResult], drive: Drive) -> list[F
                 MOUNTING_LIMIT_SIGMAS,
                 "sigmas",
                 fine="mapped alone and with the others, it has the same mounting",
-                wrong=f"mapped alone its mounting is {sigmas:.0f} sigmas from the one that it has with the others: "
+                wrong=f"mapped alone its mounting is {sigmas:.0f} sigmas from the one that it has with "
+                f"the others: "
                 "cameras do not agree; check its clock, its survey and camera_info",
             )
         )

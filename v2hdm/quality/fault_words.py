@@ -26,10 +26,13 @@ _MAP_AXES = ("east", "north")
 _REMEDIES: Mapping[Fault, str] = {
     Fault.CLOCK: "synchronise the clocks of cameras and receiver, or shift the stamps by as much",
     Fault.FOCAL: "check fx and fy in camera_info against the resolution, or calibrate the lens anew",
-    Fault.DISTORTION: "check distortion_coefficients (and the focal length) in camera_info, or calibrate anew",
+    Fault.DISTORTION: "check distortion_coefficients (and the focal length) in camera_info, or "
+    "calibrate anew",
     Fault.SLOPE: "record the height of the poses, or roll and pitch against the road",
-    Fault.SURVEY: "measure the camera's centre anew, mind signs, axes and the origin on the ground under the axle",
-    Fault.LEVER: "state the centres from the point that the poses are of, such as the antenna, or move the poses",
+    Fault.SURVEY: "measure the camera's centre anew, mind signs, axes and the origin on the ground "
+    "under the axle",
+    Fault.LEVER: "state the centres from the point that the poses are of, such as the antenna, or "
+    "move the poses",
     Fault.SIZE: "measure the paint, or leave it out of mapping.known_sizes",
     Fault.CONTROL: "measure it anew, or leave it out of mapping.survey",
     Fault.DATUM: "check that survey and poses have the same datum and origin",
@@ -64,7 +67,8 @@ def wrong_as(one: Contradiction) -> str:
             return f"the surveyed centre of {whose} is {cm:+.0f} cm {_AXES[one.axis]} off"
         case Fault.LEVER:
             return (
-                f"the surveyed centres of {whose} are all {cm:+.0f} cm {_AXES[one.axis]} off, as if the poses were "
+                f"the surveyed centres of {whose} are all {cm:+.0f} cm {_AXES[one.axis]} off, as if the "
+                f"poses were "
                 "of another point of the vehicle than the centres (antenna instead of axle)"
             )
         case Fault.SIZE:

@@ -36,7 +36,8 @@ REJECTED_LIMIT = 0.06
 """Share of corner observations that the rest contradicts: clean drives reach .02, no distortion .14."""
 
 VARIANCE_LIMIT = 3.0
-"""Variance of observations as a multiple of the detector's statement: clean drives reach .2, no distortion 6."""
+"""Variance of observations as a multiple of the detector's statement: clean drives reach .2, no distortion
+6."""
 
 WINDOW_LIMIT = 8.0
 """The worst window of the route as a multiple of the median one: clean drives reach 2."""
@@ -141,7 +142,8 @@ def _untold(evidence: SolveEvidence, raised: set[str]) -> list[Finding]:
             passed(
                 "clock",
                 "all cameras",
-                f"the markings do not tell a clock offset that all cameras share {sure}: drive a turn, or change "
+                f"the markings do not tell a clock offset that all cameras share {sure}: drive a turn, or "
+                f"change "
                 "the speed",
             )
         )
@@ -154,7 +156,8 @@ def _untold(evidence: SolveEvidence, raised: set[str]) -> list[Finding]:
             passed(
                 "survey",
                 "all cameras",
-                f"this drive does not tell {names} where the cameras sit on the vehicle, nor of which point of it "
+                f"this drive does not tell {names} where the cameras sit on the vehicle, nor of which "
+                f"point of it "
                 "the poses are: the survey of centre and antenna is relied on; drive a turn",
             )
         )
@@ -174,7 +177,8 @@ def check_fit(evidence: SolveEvidence) -> list[Finding]:
             VARIANCE_LIMIT,
             "",
             fine=f"corners scatter with {factor:.2f} times the variance that the detector states",
-            wrong=f"corners scatter with {factor:.1f} times the variance that the detector states: poses, lens and "
+            wrong=f"corners scatter with {factor:.1f} times the variance that the detector states: poses, "
+            f"lens and "
             "images do not fit together; check camera_info and the pose_noise first",
         ),
         judge(
@@ -184,7 +188,8 @@ def check_fit(evidence: SolveEvidence) -> list[Finding]:
             WINDOW_LIMIT,
             "",
             fine="the fit is even along the route",
-            wrong=f"from {evidence.window_s[worst]:.1f} s on corners scatter with {window:.0f} times the usual "
+            wrong=f"from {evidence.window_s[worst]:.1f} s on corners scatter with {window:.0f} times the "
+            f"usual "
             "variance: the position jumps there, or poses are missing; check the fix of the receiver",
         ),
     ]
@@ -197,7 +202,8 @@ def check_fit(evidence: SolveEvidence) -> list[Finding]:
                 REJECTED_LIMIT,
                 "",
                 fine=f"{100 * fit.rejected_share:.1f} % of its corners contradict the rest",
-                wrong=f"{100 * fit.rejected_share:.0f} % of its corners contradict the rest: its lens, clock or "
+                wrong=f"{100 * fit.rejected_share:.0f} % of its corners contradict the rest: its lens, "
+                f"clock or "
                 "mounting is not as stated",
             )
         )
@@ -211,7 +217,8 @@ def check_fit(evidence: SolveEvidence) -> list[Finding]:
                 HELD_OUT_LIMIT,
                 "",
                 fine="the map predicts corners that it has not seen as well as the noise allows",
-                wrong="the map mispredicts corners that it has not seen: an error of poses, clocks or lens is left",
+                wrong="the map mispredicts corners that it has not seen: an error of poses, clocks or "
+                "lens is left",
             )
         )
     return [*findings, *_poses(evidence)]
@@ -233,7 +240,8 @@ def _poses(evidence: SolveEvidence) -> list[Finding]:
             POSE_PULL_LIMIT,
             "sigmas",
             fine="the poses are as good as pose_noise says, or better",
-            wrong=f"the {state} of the poses errs {pull:.1f} times as much as pose_noise says: sigmas of the map are "
+            wrong=f"the {state} of the poses errs {pull:.1f} times as much as pose_noise says: sigmas of "
+            f"the map are "
             f"too small; state a larger {key}",
             status=Status.WARN,
         ),
@@ -244,7 +252,8 @@ def _poses(evidence: SolveEvidence) -> list[Finding]:
             JUMP_LIMIT,
             "sigmas",
             fine="no pose stands out from the others",
-            wrong=f"at {evidence.worst_pull_s:.1f} s the pose is {evidence.worst_pull:.0f} sigmas from where the "
+            wrong=f"at {evidence.worst_pull_s:.1f} s the pose is {evidence.worst_pull:.0f} sigmas from "
+            f"where the "
             "markings put it: the position jumps, or the fix was lost; check the receiver's log there",
             status=Status.WARN,
         ),
@@ -261,7 +270,8 @@ def _excluded(best: MethodResult) -> Finding:
         EXCLUDED_LIMIT,
         "",
         fine=f"{left_out} of {left_out + mapped} candidates were left out",
-        wrong=f"{left_out} of {left_out + mapped} candidates were left out: markings are seen, but not where others "
+        wrong=f"{left_out} of {left_out + mapped} candidates were left out: markings are seen, but not "
+        f"where others "
         "put them; see excluded.geojson",
         status=Status.WARN,
     )
