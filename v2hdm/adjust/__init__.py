@@ -5,7 +5,7 @@ inside. :mod:`v2hdm.adjust.problem` states the model.
 """
 
 from v2hdm.adjust.gating import Excluded, Verdict
-from v2hdm.adjust.observability import Observability, observability
+from v2hdm.adjust.observability import Observability, observability, observed
 from v2hdm.adjust.problem import (
     ControlPoints,
     Drift,
@@ -36,6 +36,7 @@ __all__ = [
     "Status",
     "Verdict",
     "observability",
+    "observed",
     "select_model",
     "solve",
     "with_model",
