@@ -76,12 +76,13 @@ def estimate_ground(drive: Drive, camera: str, options: GroundOptions | None = N
 
 @dataclass(frozen=True)
 class _Solved:
-    """The last round's matches, what was believed of them, and the solution."""
+    """The last round's matches, what was believed of them, the solution and its poses of all images."""
 
     pairs: FloatArray
     matched: Round
     beliefs: Beliefs
     adjusted: Adjusted
+    poses: FloatArray
     clock: Parameter | None
 
 
@@ -109,7 +110,7 @@ def _solve(matcher: Matcher, beliefs: Beliefs, mount: Mount, options: GroundOpti
     if free is not None:
         sigma = float(np.sqrt(adjusted.covariance[6, 6]))
         clock = Parameter("clock_s", beliefs.clock_s, sigma, told=True)
-    return _Solved(pairs, matched, beliefs, adjusted, clock)
+    return _Solved(pairs, matched, beliefs, adjusted, poses, clock)
 
 
 def _found(camera: str, solved: _Solved, readings: Readings, options: GroundOptions) -> GroundEstimate:
@@ -129,7 +130,7 @@ def _found(camera: str, solved: _Solved, readings: Readings, options: GroundOpti
         median_residual=float(np.median(solved.adjusted.residual)),
         pulls=_pulls(solved.adjusted, solved.beliefs.drive.pose_noise),
         patches=MatchedGround(
-            image[solved.pairs], seen.pair, seen.first_px, seen.second_px, matched.correlation
+            image[solved.pairs], solved.poses[solved.pairs], seen.pair, seen.first_px, seen.second_px, matched.correlation
         ),
         seconds=0.0,
     )

@@ -27,9 +27,10 @@ _TITLE_PX = 30
 
 @dataclass(frozen=True)
 class _Pair:
-    """One pair: indices into the drive's images and the matches' pixels (N, 2)."""
+    """One pair: indices into the drive's images, estimated poses (2, 4, 4) and the matches' pixels (N, 2)."""
 
     images: tuple[int, int]
+    poses: FloatArray
     first_px: FloatArray
     second_px: FloatArray
 
@@ -37,7 +38,8 @@ class _Pair:
 def draw_matched_ground(drive: Drive, estimate: GroundEstimate) -> NDArray[np.uint8] | None:
     """The pair with most matches, under the guess and under the estimate side by side; BGR.
 
-    Orange and blue are the two images: where they agree the ground is grey. An arrow leads from where the
+    Both with the estimated errors of the two poses, so that the mounting makes the difference. Orange and blue
+    are the two images: where they agree the ground is grey. An arrow leads from where the
     first image sees a patch to where the second sees it, five times as long. None without an estimate.
     """
     if estimate.calibration is None or estimate.patches is None:
@@ -62,21 +64,21 @@ def _fullest(patches: MatchedGround) -> _Pair:
     number = int(np.argmax(np.bincount(patches.pair)))
     own = patches.pair == number
     first, second = (int(image) for image in patches.pair_images[number])
-    return _Pair((first, second), patches.first_px[own], patches.second_px[own])
+    return _Pair((first, second), patches.pair_poses[number], patches.first_px[own], patches.second_px[own])
 
 
 def _panel(drive: Drive, pair: _Pair, mount: Mount, title: str) -> NDArray[np.uint8]:
     images = [drive.images[k] for k in pair.images]
     hits = [
-        hit_ground(mount, px, np.tile(image.map_from_vehicle, (len(px), 1, 1))).points_map
-        for px, image in zip((pair.first_px, pair.second_px), images, strict=True)
+        hit_ground(mount, px, np.tile(pose, (len(px), 1, 1))).points_map
+        for px, pose in zip((pair.first_px, pair.second_px), pair.poses, strict=True)
     ]
-    sheet = _sheet(hits[0], images[0].map_from_vehicle)
+    sheet = _sheet(hits[0], pair.poses[0])
     layers = []
-    for image in images:
-        grey, seen = sheet.lay(View(read_grey(str(image.path)), mount, image.map_from_vehicle))
-        spread = 3 * float(grey[seen].std()) if seen.any() else 1.0
-        layers.append(np.where(seen, np.clip(0.5 + grey / (2 * spread + 1e-9), 0, 1), 0.5))
+    for image, pose in zip(images, pair.poses, strict=True):
+        grey, seen = sheet.lay(View(read_grey(str(image.path)), mount, pose))
+        low, high = np.percentile(grey[seen], (1, 99)) if seen.any() else (0.0, 255.0)
+        layers.append(np.where(seen, np.clip((grey - low) / max(high - low, 1.0), 0, 1), 0.5))
     # Orange on blue: blue and red channels from one image each, green from both.
     first, second = layers
     panel = (255 * np.stack([first, (first + second) / 2, second], axis=-1)).astype(np.uint8)
