@@ -14,12 +14,15 @@ from collections.abc import Callable
 from v2hdm.errors import V2hdmError
 
 EXIT_USER_ERROR = 2
+EXIT_FAILED_VERDICT = 3
 _ONE_PRESS_S = 2.0
 _OURS = ("v2hdm", "models", "train", "export")
 
 
-def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[], None]) -> int:
-    """Do the work of a process; the exit code is 0, or 2 with one line on stderr for what a user can mend.
+def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[], int | None]) -> int:
+    """Do the work of a process; the exit code is that of the work, 0 unless it returns one.
+
+    It is 2, with one line on stderr, for what a user can mend.
 
     Args:
         name: of the door, as in ``python -m name``.
@@ -28,7 +31,7 @@ def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[],
         work: imports what it needs.
     """
     try:
-        work()
+        return work() or 0
     except V2hdmError as error:
         return _fail(str(error))
     except ModuleNotFoundError as error:
@@ -39,7 +42,6 @@ def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[],
         )
     except KeyboardInterrupt:
         return _fail(interrupted)
-    return 0
 
 
 def _fail(message: str) -> int:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from v2hdm.drive import KittiOptions, ReadOptions, read_drive
-from v2hdm.drive.road import attitude_to_road
 from v2hdm.errors import DriveError
 from v2hdm.hdmap.geodetic import geodetic_from_enu
 from v2hdm.records import FloatArray, GeodeticOrigin
@@ -64,7 +63,9 @@ def test_a_kitti_drive_is_recognised_and_laid_flat(tmp_path: Path, suffix: str) 
     np.testing.assert_array_equal(poses[:, 2, 3], 0.0)
     # Neither the hill nor the cross-fall nor the sensor's mount is left in the attitude.
     np.testing.assert_allclose(poses[:, 2, 2], 1.0, atol=1e-8)
-    np.testing.assert_allclose(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]), np.pi / 4, atol=1e-9)
+    # On the cross-fall, the vehicle's axis and that of a sensor pitched on it have not quite one heading.
+    heading = np.pi / 4 - MOUNT_PITCH_RAD * CROSS_FALL_RAD
+    np.testing.assert_allclose(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]), heading, atol=1e-5)
     steps = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)
     np.testing.assert_allclose(steps, STEP_M, atol=1e-5)
 
@@ -130,22 +131,6 @@ def test_damage_is_named(tmp_path: Path, file: str, content: str | None, message
         (drive / file).write_text(content)
     with pytest.raises(DriveError, match=message):
         read_drive(drive)
-
-
-def test_what_the_vehicle_does_on_the_road_stays_in_its_attitude() -> None:
-    position, attitude = straight_up_a_hill(200)
-    bounce = 0.005 * np.sin(np.arange(200) * 0.9)
-    road = attitude_to_road(position, attitude[:, 0] - bounce, attitude[:, 1] + bounce, smoothing_m=50.0)
-    np.testing.assert_allclose(road.pitch_rad, bounce - bounce.mean(), atol=1e-9)
-    np.testing.assert_allclose(road.roll_rad, -bounce, atol=5e-4)
-    assert road.mount_pitch_rad == pytest.approx(MOUNT_PITCH_RAD + bounce.mean(), abs=1e-9)
-
-
-def test_a_vehicle_that_stands_has_no_grade() -> None:
-    still = np.zeros((20, 3))
-    still[:, 2] = np.random.default_rng(0).normal(scale=0.05, size=20)
-    road = attitude_to_road(still, np.full(20, 0.02), np.full(20, 0.01), smoothing_m=50.0)
-    assert road.mount_pitch_rad == pytest.approx(0.01)
 
 
 def real_drive() -> Path:

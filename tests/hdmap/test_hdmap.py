@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from tests.drive.example import ORIGIN, camera_info, looking_forward, make_map
 from v2hdm.detection.camera.ground import ipm_from_extrinsic
 from v2hdm.errors import MapFileError
-from v2hdm.hdmap import read_calibration, read_geojson, write_calibration, write_geojson
+from v2hdm.hdmap import read_calibration, read_geojson, with_heights, write_calibration, write_geojson
 from v2hdm.hdmap.geodetic import enu_from_geodetic, geodetic_from_enu
-from v2hdm.records import Calibration, GeodeticOrigin, HdMap, Marking
+from v2hdm.records import Calibration, GeodeticOrigin, HdMap, Lane, Marking, Road
 
 LATITUDES, LONGITUDES = st.floats(-89.9, 89.9), st.floats(-180, 180)
 
@@ -43,9 +43,11 @@ def assert_same(got: HdMap, expected: HdMap) -> None:
         assert (a.covariance_m2 is None) == (b.covariance_m2 is None)
         if a.covariance_m2 is not None:
             np.testing.assert_array_equal(a.covariance_m2, b.covariance_m2)
+        np.testing.assert_array_equal(a.heights_m, b.heights_m)
     for c, d in zip(got.lanes, expected.lanes, strict=True):
         assert (c.kind, c.sightings) == (d.kind, d.sightings)
         np.testing.assert_array_equal(c.points_map, d.points_map)
+        np.testing.assert_array_equal(c.heights_m, d.heights_m)
 
 
 @pytest.mark.parametrize("origin", [None, ORIGIN])
@@ -67,18 +69,41 @@ def test_rings_are_closed_and_counter_clockwise_whatever_the_corners_do(tmp_path
     geometry = json.loads((tmp_path / "map.geojson").read_text())["features"][0]["geometry"]
     ring = np.array(geometry["coordinates"][0])
     assert geometry["type"] == "Polygon"
-    assert ring.shape == (5, 2)
+    assert ring.shape == (5, 3)
     np.testing.assert_array_equal(ring[0], ring[-1])
-    x, y = (ring - ring[0]).T
+    x, y, _ = (ring - ring[0]).T
     assert x[:-1] @ y[1:] - y[:-1] @ x[1:] > 0
 
 
 def test_coordinates_are_longitude_and_latitude_to_a_tenth_of_a_millimetre(tmp_path: Path) -> None:
     write_geojson(make_map(), tmp_path / "map.geojson")
     feature = json.loads((tmp_path / "map.geojson").read_text())["features"][-1]
-    lon, lat = np.array(feature["geometry"]["coordinates"]).T
-    metres = enu_from_geodetic(ORIGIN, np.column_stack([lat, lon, np.full(len(lat), ORIGIN.altitude_m)]))
+    lon, lat, height_m = np.array(feature["geometry"]["coordinates"]).T
+    metres = enu_from_geodetic(ORIGIN, np.column_stack([lat, lon, height_m]))
     np.testing.assert_allclose(metres[:, :2], make_map().lanes[0].points_map, atol=2e-4)
+    np.testing.assert_allclose(metres[:, 2], 0.0, atol=1e-4)
+
+
+@pytest.mark.parametrize(("origin", "above_m"), [(None, 0.0), (ORIGIN, ORIGIN.altitude_m)])
+def test_the_road_s_height_is_the_third_coordinate_and_survives_the_file(
+    tmp_path: Path, origin: GeodeticOrigin | None, above_m: float
+) -> None:
+    stations = np.column_stack([np.arange(-20.0, 21.0), np.zeros(41)])
+    road = Road(stations, 2.0 + 0.05 * stations[:, 0], np.tile([0.05, 0.02], (41, 1)))
+    corners = np.array([[0.0, 1.0], [0.0, 0.0], [2.0, 0.0], [2.0, 1.0]])
+    lane = Lane("lane_line", np.array([[0.0, 2.0], [10.0, 2.0]]), 4)
+    hd_map = with_heights(HdMap((Marking("diamond", corners, 3),), (lane,), origin), road)
+    expected = [2.02, 2.0, 2.1, 2.12]
+    assert hd_map.markings[0].heights_m is not None
+    np.testing.assert_allclose(hd_map.markings[0].heights_m, expected, atol=1e-9)
+    write_geojson(hd_map, tmp_path / "map.geojson")
+    ring, line = (
+        feature["geometry"]["coordinates"]
+        for feature in json.loads((tmp_path / "map.geojson").read_text())["features"]
+    )
+    np.testing.assert_allclose([p[2] - above_m for p in ring[0]], [*expected, expected[0]], atol=2e-4)
+    np.testing.assert_allclose([p[2] - above_m for p in line], [2.04, 2.54], atol=2e-4)
+    assert_same(read_geojson(tmp_path / "map.geojson"), hd_map)
 
 
 def test_local_metres_say_that_they_are_not_degrees(tmp_path: Path) -> None:
@@ -117,6 +142,7 @@ def damaged_map(origin: object = None, **properties: object) -> str:
             "origin, latitude_deg",
         ),
         (damaged_map(origin={"latitude_deg": 91, "longitude_deg": 1, "altitude_m": 1}), "latitude must lie"),
+        (damaged_map(heights_m=[1.0, 2.0]), "feature 0, heights_m"),
         (damaged_map(sightings=1.5), "feature 0, sightings: expected a whole number"),
         (damaged_map(sightings=2**70), "feature 0, sightings: expected a whole number"),
         (damaged_map(sightings=10**400), "feature 0, sightings: expected a finite number"),

@@ -6,13 +6,23 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from v2hdm.drive.clock import with_clock_offsets
 from v2hdm.drive.folder import is_folder_drive, read_folder_drive, write_drive
 from v2hdm.drive.kitti import is_kitti_drive, read_kitti_drive
 from v2hdm.drive.options import KittiOptions, ReadOptions
 from v2hdm.errors import DriveError
 from v2hdm.records import Drive, Trajectory
 
-__all__ = ["READERS", "KittiOptions", "ReadOptions", "Reader", "Trajectory", "read_drive", "write_drive"]
+__all__ = [
+    "READERS",
+    "KittiOptions",
+    "ReadOptions",
+    "Reader",
+    "Trajectory",
+    "read_drive",
+    "with_clock_offsets",
+    "write_drive",
+]
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm.drive.camera_info import read_camera_info, write_camera_info
-from v2hdm.drive.images import ImageFiles, check_image_files, pose_images, select_cameras
+from v2hdm.drive.images import ImageFiles, check_image_files, count_unposed, pose_images, select_cameras
 from v2hdm.drive.mounting import (
     IPM_NAMES,
     choose_initial,
@@ -23,6 +23,7 @@ from v2hdm.drive.mounting import (
     take_roi,
 )
 from v2hdm.drive.options import ReadOptions
+from v2hdm.drive.road import lay_flat, tell
 from v2hdm.drive.tum import read_image_list, read_tum, write_image_list, write_tum
 from v2hdm.errors import DriveError
 from v2hdm.fields import take_origin
@@ -61,19 +62,24 @@ def read_folder_drive(path: Path, options: ReadOptions) -> Drive:
         check_keys(entry, *_CAMERA_KEYS, place, DriveError)
         cameras[name] = _read_camera(entry, path, place)
         files.append(_list_images(name, path / take_text(entry["images"], f"{place}, images", DriveError)))
-    trajectory = read_tum(path / take_text(content.get("poses", POSES_FILE), f"{where}: poses", DriveError))
-    images = pose_images(files, trajectory, options.max_gap_s, path)
+    recorded = read_tum(path / take_text(content.get("poses", POSES_FILE), f"{where}: poses", DriveError))
+    pose_noise = _read_pose_noise(content.get("pose_noise"), f"{where}: pose_noise")
+    laid = lay_flat(recorded, pose_noise.position_m)
+    tell(laid, path)
+    images = pose_images(files, laid.trajectory, options.max_gap_s, path)
     check_image_files(images, cameras)
     return Drive(
         name=take_text(content.get("name", path.resolve().name), f"{where}: name", DriveError),
         root=path,
         cameras=cameras,
         images=images,
-        pose_noise=_read_pose_noise(content.get("pose_noise"), f"{where}: pose_noise"),
+        pose_noise=pose_noise,
         origin=take_origin(content.get("origin"), f"{where}: origin", DriveError),
         truth_dir=_find_truth(content.get("truth"), path, f"{where}: truth"),
-        trajectory=trajectory,
-        recorded=trajectory,
+        unposed=count_unposed(files, images),
+        trajectory=laid.trajectory,
+        recorded=recorded,
+        road=laid.road,
     )
 
 
@@ -148,7 +154,7 @@ def _list_images(camera: str, path: Path) -> ImageFiles:
 
 def _read_pose_noise(content: object, where: str) -> PoseNoise:
     if content is None:
-        return PoseNoise()
+        return PoseNoise.as_far_as_stated()
     entry = take_mapping(content, where, DriveError)
     check_keys(entry, (), [field.name for field in fields(PoseNoise)], where, DriveError)
     values = {key: take_number(value, f"{where}, {key}", DriveError) for key, value in entry.items()}
@@ -159,7 +165,7 @@ def _read_pose_noise(content: object, where: str) -> PoseNoise:
             raise DriveError(
                 f"{where}, {key}: an error that fades over no distance is no drift; leave it out"
             )
-    noise = PoseNoise(**values)
+    noise = PoseNoise.as_far_as_stated(**values)
     for total, drift in (
         ("position_m", "position_drift_m"),
         ("heading_rad", "heading_drift_rad"),

@@ -8,15 +8,16 @@ gives the reasons for what the format leaves open.
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
-from v2hdm.drive.images import ImageFiles, check_image_files, pose_images, select_cameras
+from v2hdm.drive.images import ImageFiles, check_image_files, count_unposed, pose_images, select_cameras
 from v2hdm.drive.kitti_calibration import KittiCamera, read_kitti_camera
 from v2hdm.drive.options import KittiOptions, ReadOptions
-from v2hdm.drive.road import RoadAttitude, attitude_to_road
+from v2hdm.drive.road import lay_flat, tell
 from v2hdm.drive.rotation import rotation_from_euler
 from v2hdm.errors import DriveError
 from v2hdm.files import read_text
@@ -59,15 +60,19 @@ def read_kitti_drive(path: Path, options: ReadOptions) -> Drive:
 
     origin_imu = GeodeticOrigin(float(oxts[0, 0]), float(oxts[0, 1]), float(oxts[0, 2]))
     position_enu = enu_from_geodetic(origin_imu, oxts[:, :3])
-    road = attitude_to_road(position_enu, oxts[:, 3], oxts[:, 4], options.kitti.road_smoothing_m)
-    vehicle_from_imu = _level_mount(calibrations[names[0]], road, options.kitti.camera_height_m)
-    poses = _lay_flat(position_enu, oxts[:, 3:6], road, vehicle_from_imu)
+    enu_from_imu = np.tile(np.eye(4), (len(oxts), 1, 1))
+    enu_from_imu[:, :3, :3] = rotation_from_euler(*oxts[:, 3:6].T)
+    enu_from_imu[:, :3, 3] = position_enu
+    by_imu = lay_flat(Trajectory(stamp_s, enu_from_imu), _POSE_NOISE.position_m)
+    vehicle_from_imu = _level_mount(calibrations[names[0]], by_imu.mount_rad, options.kitti.camera_height_m)
+    recorded = Trajectory(stamp_s, enu_from_imu @ np.linalg.inv(vehicle_from_imu))
+    laid = lay_flat(recorded, _POSE_NOISE.position_m)
     cameras = {
         name: _mount(calibration, vehicle_from_imu, options.kitti)
         for name, calibration in calibrations.items()
     }
-    trajectory = Trajectory(stamp_s, poses)
-    images = pose_images(files, trajectory, options.max_gap_s, path)
+    tell(replace(laid, mount_rad=by_imu.mount_rad), path)
+    images = pose_images(files, laid.trajectory, options.max_gap_s, path)
     check_image_files(images, cameras)
     return Drive(
         name=path.name,
@@ -76,7 +81,10 @@ def read_kitti_drive(path: Path, options: ReadOptions) -> Drive:
         images=images,
         pose_noise=_POSE_NOISE,
         origin=_lower(origin_imu, float(vehicle_from_imu[2, 3])),
-        trajectory=trajectory,
+        unposed=count_unposed(files, images),
+        trajectory=laid.trajectory,
+        recorded=recorded,
+        road=laid.road,
     )
 
 
@@ -149,27 +157,14 @@ def _read_stamps(path: Path) -> FloatArray:
     return np.array(stamps)
 
 
-def _level_mount(calibration: KittiCamera, road: RoadAttitude, camera_height_m: float) -> FloatArray:
-    """``vehicle_from_imu``: the IMU's pitch on the vehicle, and its height from that of the camera."""
+def _level_mount(calibration: KittiCamera, mount_rad: FloatArray, camera_height_m: float) -> FloatArray:
+    """``vehicle_from_imu``: how the IMU sits on the vehicle, and its height from that of the camera."""
     vehicle_from_imu = np.eye(4)
-    zero = np.zeros(1)
-    vehicle_from_imu[:3, :3] = rotation_from_euler(zero, np.array([road.mount_pitch_rad]), zero)[0]
+    roll, pitch = mount_rad[:, None]
+    vehicle_from_imu[:3, :3] = rotation_from_euler(roll, pitch, np.zeros(1))[0]
     camera_imu = np.linalg.inv(calibration.cam_from_imu)[:3, 3]
     vehicle_from_imu[2, 3] = camera_height_m - (vehicle_from_imu[:3, :3] @ camera_imu)[2]
     return vehicle_from_imu
-
-
-def _lay_flat(
-    position_enu: FloatArray, attitude_rad: FloatArray, road: RoadAttitude, vehicle_from_imu: FloatArray
-) -> FloatArray:
-    """``map_from_vehicle`` (P, 4, 4): the ground point under the IMU at z = 0, attitude to the road."""
-    enu_from_imu = rotation_from_euler(*attitude_rad.T)
-    down_imu = -(vehicle_from_imu[:3, :3].T @ vehicle_from_imu[:3, 3])
-    ground_enu = position_enu + enu_from_imu @ down_imu
-    poses = np.tile(np.eye(4), (len(position_enu), 1, 1))
-    poses[:, :3, :3] = rotation_from_euler(road.roll_rad, road.pitch_rad, attitude_rad[:, 2])
-    poses[:, :2, 3] = ground_enu[:, :2]
-    return poses
 
 
 def _mount(calibration: KittiCamera, vehicle_from_imu: FloatArray, options: KittiOptions) -> Camera:

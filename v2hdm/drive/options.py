@@ -15,7 +15,6 @@ class KittiOptions:
         roi_near_m: where the trusted ground begins, ahead of the camera.
         roi_far_m: where it ends.
         roi_half_width_m: how far it extends to either side of the camera.
-        road_smoothing_m: length over which the road's grade and cross-fall are taken for constant.
     """
 
     camera_height_m: float = 1.65
@@ -23,7 +22,6 @@ class KittiOptions:
     roi_near_m: float = 5.0
     roi_far_m: float = 20.0
     roi_half_width_m: float = 6.0
-    road_smoothing_m: float = 50.0
 
 
 @dataclass(kw_only=True)

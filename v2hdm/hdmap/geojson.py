@@ -3,12 +3,15 @@
 With a geodetic origin the geometry is WGS84 longitude and latitude, as the RFC demands, and any GIS
 shows the map in its place. Without one it is local metres, which the foreign member ``v2hdm`` says
 under ``coordinates``. Either way the properties ``corners_map`` and ``points_map`` hold the local
-coordinates at full precision; reading back uses these.
+coordinates at full precision; reading back uses these. ``heights_m`` are the ground's heights in the map
+frame. Where there are any, or an origin, positions have a third coordinate, in m: above the ellipsoid, or
+above the local z = 0.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -21,27 +24,48 @@ from v2hdm.files import load_json, replace_text, take_array, take_mapping, take_
 from v2hdm.hdmap.geodetic import geodetic_from_enu
 from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, Lane, Marking
 
-_WGS84 = "WGS84 longitude and latitude, degrees"
-_LOCAL = "local map frame, metres east and north; NOT longitude and latitude"
+_WGS84 = "WGS84 longitude and latitude, degrees, and height above the ellipsoid, metres"
+_LOCAL = "local map frame, metres east and north, up where known; NOT longitude and latitude"
 _MOST_SIGHTINGS = 1_000_000_000
 _DEGREE_DECIMALS = 9  # 0.1 mm on the ground
+_HEIGHT_DECIMALS = 4
 
 
-def write_geojson(hd_map: HdMap, path: Path) -> None:
+def write_geojson(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None) -> None:
     """Write ``hd_map`` to ``path`` as a FeatureCollection, atomically.
 
-    Markings become Polygons (closed, counter-clockwise), lanes LineStrings.
+    Markings become Polygons (closed, counter-clockwise), lanes LineStrings. The ``verdict`` on the run that
+    made the map, as JSON, stands in the foreign member ``v2hdm``.
     """
     features = [
         _marking_feature(number, marking, hd_map.origin) for number, marking in enumerate(hd_map.markings)
     ]
     features += [_lane_feature(number, lane, hd_map.origin) for number, lane in enumerate(hd_map.lanes)]
-    about: dict[str, Any] = {"frame": "map", "coordinates": _LOCAL if hd_map.origin is None else _WGS84}
-    if hd_map.origin is not None:
-        about["origin"] = asdict(hd_map.origin)
+    write_features(path, features, hd_map.origin, {} if verdict is None else {"verdict": dict(verdict)})
+
+
+def write_features(
+    path: Path, features: Sequence[Mapping[str, Any]], origin: GeodeticOrigin | None, about: Mapping[str, Any]
+) -> None:
+    """Write GeoJSON ``features`` a line each, atomically, with the frame and ``about`` under ``v2hdm``."""
+    told: dict[str, Any] = {"frame": "map", "coordinates": _LOCAL if origin is None else _WGS84}
+    if origin is not None:
+        told["origin"] = asdict(origin)
+    head = json.dumps(told | dict(about), allow_nan=False)
     lines = ",\n".join(json.dumps(feature, allow_nan=False) for feature in features)
-    text = f'{{"type": "FeatureCollection", "v2hdm": {json.dumps(about)}, "features": [\n{lines}\n]}}\n'
+    text = f'{{"type": "FeatureCollection", "v2hdm": {head}, "features": [\n{lines}\n]}}\n'
     replace_text(path, text)
+
+
+def read_verdict(path: Path) -> Mapping[str, Any] | None:
+    """The verdict that :func:`write_geojson` wrote beside a map, None where there is none.
+
+    Raises:
+        MapFileError: when the file is missing or damaged.
+    """
+    about = load_json(path, MapFileError).get("v2hdm")
+    verdict = about.get("verdict") if isinstance(about, dict) else None
+    return verdict if isinstance(verdict, dict) else None
 
 
 def read_geojson(path: Path) -> HdMap:
@@ -82,33 +106,40 @@ def _marking_feature(number: int, marking: Marking, origin: GeodeticOrigin | Non
     corners = marking.corners_map
     x, y = corners.T
     counter_clockwise = float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) >= 0.0
-    ring = corners if counter_clockwise else corners[::-1]
+    turn = slice(None) if counter_clockwise else slice(None, None, -1)
+    heights = marking.heights_m
+    ring = geojson_positions(corners[turn], None if heights is None else heights[turn], origin)
     properties: dict[str, Any] = {
         "id": number,
         "class": marking.kind,
         "sightings": marking.sightings,
         "corners_map": corners.tolist(),
     }
+    if heights is not None:
+        properties["heights_m"] = heights.tolist()
     if marking.covariance_m2 is not None:
         properties["sigma_m"] = float(np.sqrt(np.trace(marking.covariance_m2) / len(marking.covariance_m2)))
         properties["covariance_m2"] = marking.covariance_m2.tolist()
-    closed = np.vstack([ring, ring[:1]])
-    return _feature(f"marking/{number}", "Polygon", [_positions(closed, origin)], properties)
+    return geojson_feature(f"marking/{number}", "Polygon", [[*ring, ring[0]]], properties)
 
 
 def _lane_feature(number: int, lane: Lane, origin: GeodeticOrigin | None) -> dict[str, Any]:
-    properties = {
+    properties: dict[str, Any] = {
         "id": number,
         "class": lane.kind,
         "sightings": lane.sightings,
         "points_map": lane.points_map.tolist(),
     }
-    return _feature(f"lane/{number}", "LineString", _positions(lane.points_map, origin), properties)
+    if lane.heights_m is not None:
+        properties["heights_m"] = lane.heights_m.tolist()
+    places = geojson_positions(lane.points_map, lane.heights_m, origin)
+    return geojson_feature(f"lane/{number}", "LineString", places, properties)
 
 
-def _feature(
+def geojson_feature(
     identity: str, geometry: str, coordinates: list[Any], properties: dict[str, Any]
 ) -> dict[str, Any]:
+    """A feature of a FeatureCollection."""
     return {
         "type": "Feature",
         "id": identity,
@@ -117,14 +148,18 @@ def _feature(
     }
 
 
-def _positions(points_map: FloatArray, origin: GeodeticOrigin | None) -> list[list[float]]:
-    """GeoJSON positions of ground points (N, 2): longitude, latitude, or local x, y."""
+def geojson_positions(
+    points_map: FloatArray, heights_m: FloatArray | None, origin: GeodeticOrigin | None
+) -> list[list[float]]:
+    """Positions of ground points (N, 2): longitude, latitude and height, or local metres."""
     if origin is None:
-        local: list[list[float]] = points_map.tolist()
-        return local
-    ground = np.column_stack([points_map, np.zeros(len(points_map))])
-    degrees = geodetic_from_enu(origin, ground)[:, [1, 0]]
-    positions: list[list[float]] = np.round(degrees, _DEGREE_DECIMALS).tolist()
+        local = points_map if heights_m is None else np.column_stack([points_map, heights_m])
+        metres: list[list[float]] = local.tolist()
+        return metres
+    ground = np.column_stack([points_map, np.zeros(len(points_map)) if heights_m is None else heights_m])
+    latitude, longitude, height_m = geodetic_from_enu(origin, ground).T
+    degrees = np.round(np.column_stack([longitude, latitude]), _DEGREE_DECIMALS)
+    positions: list[list[float]] = np.column_stack([degrees, np.round(height_m, _HEIGHT_DECIMALS)]).tolist()
     return positions
 
 
@@ -139,14 +174,23 @@ def _read_marking(properties: dict[str, Any], where: str) -> Marking:
         covariance_m2=None
         if covariance is None
         else take_covariance(covariance, 8, f"{where}, covariance_m2", MapFileError),
+        heights_m=_read_heights(properties, 4, where),
     )
 
 
 def _read_lane(properties: dict[str, Any], where: str) -> Lane:
+    points_map = take_array(properties["points_map"], (-1, 2), f"{where}, points_map", MapFileError)
     return Lane(
         kind=take_text(properties.get("class"), f"{where}, class", MapFileError),
-        points_map=take_array(properties["points_map"], (-1, 2), f"{where}, points_map", MapFileError),
+        points_map=points_map,
         sightings=take_whole(
             properties.get("sightings"), 0, _MOST_SIGHTINGS, f"{where}, sightings", MapFileError
         ),
+        heights_m=_read_heights(properties, len(points_map), where),
     )
+
+
+def _read_heights(properties: dict[str, Any], count: int, where: str) -> FloatArray | None:
+    if "heights_m" not in properties:
+        return None
+    return take_array(properties["heights_m"], (count,), f"{where}, heights_m", MapFileError)
