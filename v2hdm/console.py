@@ -24,7 +24,7 @@ def run_on_terminal(config: pipeline.RunConfig, config_yaml: str) -> None:
     console.print()
     for line in result.headlines:
         console.print(line, highlight=False)
-    console.print(results_table(config.name, result.metrics["results"]))
+    console.print(results_table(result.metrics["name"], result.metrics["results"]))
     console.print(f"results in {result.folder}", highlight=False, soft_wrap=True)
 
 

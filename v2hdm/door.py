@@ -6,6 +6,7 @@ one line while torch is still being loaded, too.
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import time
@@ -14,6 +15,10 @@ from collections.abc import Callable
 from v2hdm.errors import V2hdmError
 
 EXIT_USER_ERROR = 2
+_WAITING = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "0", "KMP_BLOCKTIME": "0"}
+"""OpenMP's threads sleep while they wait for each other. Spinning, they hold up those that they wait for as
+soon as the machine has something else to do. Libraries read this when they are loaded."""
+
 _ONE_PRESS_S = 2.0
 _OURS = ("v2hdm", "models", "train", "export")
 
@@ -27,8 +32,14 @@ def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[],
         interrupted: what to say after Ctrl-C.
         work: imports what it needs.
     """
+    for variable, value in _WAITING.items():
+        os.environ.setdefault(variable, value)
     try:
-        work()
+        _to_the_end(work)
+    except BrokenPipeError:  # the reader of our output has had enough
+        from v2hdm.files import forget_stdout
+
+        forget_stdout()
     except V2hdmError as error:
         return _fail(str(error))
     except ModuleNotFoundError as error:
@@ -40,6 +51,16 @@ def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[],
     except KeyboardInterrupt:
         return _fail(interrupted)
     return 0
+
+
+def _to_the_end(work: Callable[[], None]) -> None:
+    """Do the work and write all that it printed, while it can still be told that nobody reads it."""
+    try:
+        work()
+    except SystemExit:  # argparse, after --help
+        sys.stdout.flush()
+        raise
+    sys.stdout.flush()
 
 
 def _fail(message: str) -> int:

@@ -21,7 +21,7 @@ from v2hdm import __version__
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.drive import ReadOptions, read_drive
+from v2hdm.drive import ReadOptions, drive_name, read_drive
 from v2hdm.errors import ConfigError
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions, check_options
@@ -32,6 +32,11 @@ from v2hdm.report.outputs import result_folder
 from v2hdm.simulate import PortConfig, rendered_drive
 
 log = logging.getLogger(__name__)
+
+_NO_DRIVE = (
+    "drive.path is not set: name the folder of the drive, e.g. drive.path=my_drive, "
+    "or choose a run (+run=port1, +run=port2, +run=kitti drive.path=...)"
+)
 
 GROWTH_STEPS = 8
 """Sizes of the growing map at which its error is drawn."""
@@ -60,7 +65,7 @@ class RunConfig:
     """Everything about one run.
 
     Attributes:
-        name: names the results, ``<output>/<name>/``.
+        name: names the results, ``<output>/<name>/``; None takes the drive's own name.
         drive: the drive to map.
         simulate: renders the drive into the cache first, instead of reading ``drive.path``.
         detector: settings of the detector.
@@ -72,7 +77,7 @@ class RunConfig:
         mode: what it hands on as ``mapping.mode``, ``batch`` or ``incremental``.
     """
 
-    name: str
+    name: str | None = None
     drive: DriveConfig = field(default_factory=DriveConfig)
     simulate: PortConfig | None = None
     detector: DetectorOptions = field(default_factory=DetectorOptions.for_mapping)
@@ -104,13 +109,13 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
     Raises:
         V2hdmError: The configuration, the drive or the detector is at fault, or no map can be made.
     """
-    _check(config)
+    name = _check(config)
     seconds: dict[str, float] = {}
     with (
-        result_folder(Path(config.output) / config.name) as folder,
+        result_folder(Path(config.output) / name) as folder,
         logging_to(_log_file(folder / "run.log")),
     ):
-        log.info("v2hdm %s, run %s", __version__, config.name)
+        log.info("v2hdm %s, run %s", __version__, name)
         (folder / "config.yaml").write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
         drive_folder = _drive_folder(config, seconds, progress)
         drive = read_drive(drive_folder, config.drive)
@@ -121,9 +126,9 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
             methods = _map_camera_sets(config, drive, detections, progress)
         with _timed(seconds, "evaluate"):
             judgement = evaluate(drive, detections, methods, config.mapping, partial(progress, "evaluate"))
-        metrics = {"name": config.name, "version": __version__, **judgement.metrics, "seconds": seconds}
+        metrics = {"name": name, "version": __version__, **judgement.metrics, "seconds": seconds}
         write_results(folder, drive, detections, list(methods.values())[-1], judgement, metrics)
-    return RunResult(Path(config.output) / config.name, metrics, judgement.headlines)
+    return RunResult(Path(config.output) / name, metrics, judgement.headlines)
 
 
 def camera_sets(drive: Drive) -> dict[str, tuple[str, ...]]:
@@ -138,7 +143,7 @@ def camera_sets(drive: Drive) -> dict[str, tuple[str, ...]]:
 def _drive_folder(config: RunConfig, seconds: dict[str, float], progress: Progress) -> Path:
     if config.simulate is None:
         if not config.drive.path:
-            raise ConfigError("drive.path is not set: name the folder of the drive, e.g. drive.path=my_drive")
+            raise ConfigError(_NO_DRIVE)
         return Path(config.drive.path)
     if config.drive.path:
         raise ConfigError(
@@ -180,21 +185,34 @@ def _map_camera_sets(
     return found
 
 
-def _check(config: RunConfig) -> None:
-    """Refuse what cannot work before any long work.
+def _check(config: RunConfig) -> str:
+    """Refuse what cannot work before any long work; returns the run's name.
 
     Raises:
         ConfigError: The message names the key.
         DetectorError: ``detector.model`` cannot be used.
     """
-    if not config.name.strip(".") or set(config.name) & {"/", os.sep}:
+    name = run_name(config)
+    if not name.strip(".") or set(name) & {"/", os.sep}:
         raise ConfigError(
-            f"name is {config.name!r}: give the name of a folder within {config.output!r}, without '/'"
+            f"name is {name!r}: give the name of a folder within {config.output!r}, without '/'"
         )
     _workers(config)
     check_options(config.mapping)
     _check_device(config.mapping.device)
     Detector.load(options=config.detector)
+    return name
+
+
+def run_name(config: RunConfig) -> str:
+    """The name of the run: as configured, else that of the drive which is to be rendered or read."""
+    if config.name is not None:
+        return config.name
+    if config.simulate is not None:
+        return config.simulate.name
+    if not config.drive.path:
+        raise ConfigError(_NO_DRIVE)
+    return drive_name(Path(config.drive.path))
 
 
 def _check_device(device: str) -> None:
