@@ -15,10 +15,6 @@ from collections.abc import Callable
 from v2hdm.errors import V2hdmError
 
 EXIT_USER_ERROR = 2
-_WAITING = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "0", "KMP_BLOCKTIME": "0"}
-"""OpenMP's threads sleep while they wait for each other. Spinning, they hold up those that they wait for as
-soon as the machine has something else to do. Libraries read this when they are loaded."""
-
 _ONE_PRESS_S = 2.0
 _OURS = ("v2hdm", "models", "train", "export")
 
@@ -32,8 +28,9 @@ def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[],
         interrupted: what to say after Ctrl-C.
         work: imports what it needs.
     """
-    for variable, value in _WAITING.items():
-        os.environ.setdefault(variable, value)
+    # OpenMP's threads sleep while they wait for each other. Spinning, they hold up those that they wait for
+    # as soon as the machine is busy otherwise. Libraries read this when they are loaded.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
         _to_the_end(work)
     except BrokenPipeError:  # the reader of our output has had enough
