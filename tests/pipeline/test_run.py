@@ -21,7 +21,7 @@ from v2hdm.hdmap.calibration import read_calibration
 from v2hdm.hdmap.geojson import read_geojson
 from v2hdm.mapping.options import AcceptanceOptions, LaneOptions, MappingOptions
 from v2hdm.pipeline import DriveConfig, RunConfig, run
-from v2hdm.pipeline.run import camera_sets
+from v2hdm.pipeline.run import camera_sets, run_name
 from v2hdm.quality import Status
 from v2hdm.records import Trajectory
 from v2hdm.simulate import PortConfig, render_drive
@@ -235,6 +235,16 @@ def test_what_cannot_work_is_refused_before_anything_is_read(
     with pytest.raises((ConfigError, DetectorError), match=re.escape(named)):
         run(run_config(tmp_path / "no such drive", tmp_path / "outputs", **changes))
     assert not list(tmp_path.iterdir())
+
+
+def test_a_run_without_a_name_has_that_of_its_drive(drive_folder: Path, tmp_path: Path) -> None:
+    drive = small_copy(drive_folder, tmp_path / "folder")
+    assert run_name(run_config(drive, tmp_path, name=None)) == "short"
+    description = drive / "drive.yaml"
+    lines = description.read_text().splitlines(keepends=True)
+    description.write_text("".join(line for line in lines if not line.startswith("name:")))
+    assert run_name(run_config(drive, tmp_path, name=None)) == "folder"
+    assert run_name(run_config(drive, tmp_path, name="given")) == "given"
 
 
 def test_a_run_that_both_renders_and_reads_is_refused(tmp_path: Path) -> None:
