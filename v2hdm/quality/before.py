@@ -14,6 +14,7 @@ from v2hdm.quality.images import check_images
 from v2hdm.quality.motion import Motion
 from v2hdm.quality.noise import check_noise
 from v2hdm.quality.path import check_attitude, check_jumps, check_path
+from v2hdm.quality.road import check_road
 from v2hdm.quality.verdict import Finding, Status
 from v2hdm.records import Drive
 
@@ -23,12 +24,12 @@ _MOUNTING = ("roi", "roi range", "ipm against camera matrix", "camera height", "
 HIDES: Mapping[str, tuple[str, ...]] = {
     "path length": (*_STEPS, *ground_checks.CHECKS),
     "speed": (*_STEPS, *ground_checks.CHECKS),
-    "heading": ("heading offset", "attitude", "pitch sign", "origin", *_STEPS, *ground_checks.CHECKS),
-    "attitude": ("pitch sign", *ground_checks.CHECKS),
+    "heading": ("heading offset", "attitude", "pitch sign", "road", "origin", *_STEPS, *ground_checks.CHECKS),
+    "attitude": ("pitch sign", "road", *ground_checks.CHECKS),
     "repeated poses": (*_STEPS, *ground_checks.CHECKS),
     "pose scatter": ("position jumps", *ground_checks.CHECKS),
     "position jumps": ground_checks.CHECKS,
-    "height jumps": ("grade", "ground match", "ground residual", "poses against ground"),
+    "height jumps": ("road", "grade", "ground match", "ground residual", "poses against ground"),
     "origin": ("survey forward", "poses against ground"),
     "own images": ("frozen images", *ground_checks.CHECKS),
     "bright images": ("frozen images", "ground match"),
@@ -72,6 +73,7 @@ def check_drive(drive: Drive, ground: Mapping[str, GroundEstimate] | None = None
         *check_jumps(motion, drive.pose_noise),
         *check_clocks(drive, motion),
         *check_noise(motion, drive.pose_noise),
+        *check_road(drive),
     ]
     for name, camera in drive.cameras.items():
         findings += check_camera(name, camera)
