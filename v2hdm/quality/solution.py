@@ -134,6 +134,10 @@ def _contradicted(one: Contradiction, others: list[Contradiction]) -> Finding:
 
 def _agrees(check: str, tested: list[Contradiction]) -> Finding:
     worst = max(tested, key=lambda one: one.sigmas)
+    if _is_contradicted(worst):
+        return passed(
+            check, ", ".join(worst.cameras), "not told apart from what is named as wrong: mend that first"
+        )
     says = f"the markings agree with what is stated ({wrong_as(worst)} at most)"
     return Finding(
         check, Status.PASS, worst.sigmas, CONTRADICTED_SIGMAS, "sigmas", says, ", ".join(worst.cameras)
