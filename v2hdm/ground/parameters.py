@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2hdm.ground.adjust import CENTRE, Observations, adjust
+from v2hdm.ground.adjust import CENTRE, Adjusted, Observations, adjust
 from v2hdm.ground.beliefs import Beliefs
 from v2hdm.ground.motion import Motion
 from v2hdm.ground.results import Parameter

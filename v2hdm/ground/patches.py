@@ -119,9 +119,7 @@ def patch_centres(
     return np.asarray(centres[near])
 
 
-def match_pair(
-    first: View, second: View, centres_map: FloatArray, search_m: float, options: GroundOptions
-) -> Matches:
+def match_pair(first: View, second: View, centres_map: FloatArray, search_m: float, options: GroundOptions) -> Matches:
     """Find the patches around ``centres_map`` (N, 2) of the first image in the second, within ``search_m``."""
     grid_m = options.grid_m
     half = round(options.patch_m / 2 / grid_m)
@@ -194,8 +192,7 @@ def _peak(score: FloatArray) -> tuple[float, float, float] | None:
         return None
     rest = score.copy()
     rest[
-        max(row - _PEAK_CELLS, 0) : row + _PEAK_CELLS + 1,
-        max(column - _PEAK_CELLS, 0) : column + _PEAK_CELLS + 1,
+        max(row - _PEAK_CELLS, 0) : row + _PEAK_CELLS + 1, max(column - _PEAK_CELLS, 0) : column + _PEAK_CELLS + 1
     ] = -1
     if rest.max() > best - _LEAST_LEAD:
         return None
