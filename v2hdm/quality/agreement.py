@@ -75,7 +75,7 @@ def _offset(first: str, a: MethodResult, second: str, b: MethodResult, drive: Dr
     sigma = np.hypot(centre_sigma_m(a.calibrations[first])[:2], centre_sigma_m(b.calibrations[second])[:2])
     sigmas = np.where(np.abs(middle) > LEAST_OFFSET_M, np.abs(middle) / np.hypot(sigma, spread), 0.0)
     axis = int(np.argmax(sigmas))
-    where = ("ahead of", "left of")[axis]
+    where = (("behind", "ahead of"), ("right of", "left of"))[axis][int(middle[axis] > 0)]
     cause = (
         "their clocks or the forward survey of a centre disagree",
         "a heading or a lateral survey disagrees",
@@ -87,7 +87,7 @@ def _offset(first: str, a: MethodResult, second: str, b: MethodResult, drive: Dr
         OFFSET_LIMIT_SIGMAS,
         "sigmas",
         fine=f"{len(apart)} markings that both saw lie in one place",
-        wrong=f"{second} maps {len(apart)} markings {100 * middle[axis]:+.0f} cm {where} where {first} does: "
+        wrong=f"{second} maps {len(apart)} markings {100 * abs(middle[axis]):.0f} cm {where} where {first} does: "
         f"{cause[axis]}; synchronise and measure anew",
     )
 

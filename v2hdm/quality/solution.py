@@ -9,6 +9,7 @@ clean and spoilt drives measure.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -60,15 +61,26 @@ def check_solution(drive: Drive, methods: Mapping[str, Mapping[str, MethodResult
         methods: results by camera set, the one of all cameras last, then by method.
     """
     best = list(methods.values())[-1][BEST]
-    findings: list[Finding] = []
+    causes: list[Finding] = []
+    symptoms: list[Finding] = []
     if best.evidence is not None:
-        findings += check_inputs(best.evidence)
-        findings += check_fit(best.evidence)
-        findings.append(_excluded(best))
-    findings += check_doubles(best)
+        causes = check_inputs(best.evidence)
+        symptoms = [*check_fit(best.evidence), _excluded(best)]
+    symptoms += check_doubles(best)
     if len(methods) > 1:
-        findings += check_agreement({name: by_method[BEST] for name, by_method in methods.items()}, drive)
-    return findings
+        symptoms += check_agreement({name: by_method[BEST] for name, by_method in methods.items()}, drive)
+    named = next((finding for finding in causes if finding.status is Status.FAIL), None)
+    return [*causes, *(_explained(finding, named) for finding in symptoms)]
+
+
+def _explained(finding: Finding, named: Finding | None) -> Finding:
+    """A symptom that points to the cause which the tests of the inputs have named, if they have.
+
+    What is wrong stands before the colon of its sentence, and the causes that are likely otherwise after it.
+    """
+    if named is None or finding.status is Status.PASS:
+        return finding
+    return replace(finding, says=f"{finding.says.split(': ')[0]}: see {named.check}")
 
 
 def check_inputs(evidence: SolveEvidence) -> list[Finding]:
@@ -122,6 +134,10 @@ def _contradicted(one: Contradiction, others: list[Contradiction]) -> Finding:
 
 def _agrees(check: str, tested: list[Contradiction]) -> Finding:
     worst = max(tested, key=lambda one: one.sigmas)
+    if _is_contradicted(worst):
+        return passed(
+            check, ", ".join(worst.cameras), "not told apart from what is named as wrong: mend that first"
+        )
     says = f"the markings agree with what is stated ({wrong_as(worst)} at most)"
     return Finding(
         check, Status.PASS, worst.sigmas, CONTRADICTED_SIGMAS, "sigmas", says, ", ".join(worst.cameras)
