@@ -128,17 +128,18 @@ class PoseNoise:
 
     Of each, ``..._drift_...`` is the part that changes only slowly, as RTK's errors do: a first-order
     Gauss-Markov process that fades to 1 / e over ``..._drift_over_m`` of driving. The rest, in quadrature, is
-    drawn anew at every image; without a drift all of it is.
+    drawn anew at every image. The defaults are a guess for a receiver with RTK whose data sheet says nothing:
+    one centimetre of drift in two, and half the variance of the angles.
     """
 
     position_m: float = 0.02
     heading_rad: float = 0.001
     roll_pitch_rad: float = 0.003
-    position_drift_m: float = 0.0
+    position_drift_m: float = 0.01
     position_drift_over_m: float = 30.0
-    heading_drift_rad: float = 0.0
+    heading_drift_rad: float = 0.0007
     heading_drift_over_m: float = 5.0
-    roll_pitch_drift_rad: float = 0.0
+    roll_pitch_drift_rad: float = 0.002
     roll_pitch_drift_over_m: float = 1.0
 
 
@@ -261,13 +262,16 @@ class ImageDetections:
 class Marking:
     """One mapped marking: ``corners_map`` (4, 2) m, counter-clockwise seen from above.
 
-    ``covariance_m2`` (8, 8) is that of the stacked corners, or None where the method has none.
+    ``covariance_m2`` (8, 8) is that of the stacked corners in the map, or None where the method has none.
+    ``relative_sigma_m`` is what the marking contributes to the error of a distance to one about 10 m away,
+    one standard deviation a coordinate: without the drift and the survey that both share. None if unknown.
     """
 
     kind: str
     corners_map: FloatArray
     sightings: int
     covariance_m2: FloatArray | None = None
+    relative_sigma_m: float | None = None
 
 
 @dataclass(frozen=True)

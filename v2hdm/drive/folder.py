@@ -33,6 +33,13 @@ DRIVE_FILE = "drive.yaml"
 POSES_FILE = "poses.tum"
 TRUTH_FOLDER = "truth"
 
+_DRIFT_OF = (
+    ("position_m", "position_drift_m"),
+    ("heading_rad", "heading_drift_rad"),
+    ("roll_pitch_rad", "roll_pitch_drift_rad"),
+)
+"""Errors of poses, and the part of each that drifts."""
+
 _DRIVE_KEYS = (("cameras",), ("name", "poses", "pose_noise", "origin", "truth"))
 _CAMERA_KEYS = (
     ("camera_info", "images", "roi_vehicle"),
@@ -160,12 +167,12 @@ def _read_pose_noise(content: object, where: str) -> PoseNoise:
             raise DriveError(
                 f"{where}, {key}: an error that fades over no distance is no drift; leave it out"
             )
+    usual = PoseNoise()
+    for total, drift in _DRIFT_OF:
+        if total in values:
+            values.setdefault(drift, values[total] * getattr(usual, drift) / getattr(usual, total))
     noise = PoseNoise(**values)
-    for total, drift in (
-        ("position_m", "position_drift_m"),
-        ("heading_rad", "heading_drift_rad"),
-        ("roll_pitch_rad", "roll_pitch_drift_rad"),
-    ):
+    for total, drift in _DRIFT_OF:
         if getattr(noise, drift) > getattr(noise, total):
             raise DriveError(f"{where}, {drift}: is part of {total} and cannot be above it; mend one of them")
     return noise
