@@ -23,7 +23,7 @@ def joint(pairs: np.ndarray) -> FloatArray:
 
 def street(spacing_m: float, paint_m: float = 0.0) -> list[Marking]:
     own = covariance_of(4) + paint_m**2 * np.eye(8)
-    return [Marking("diamond", SQUARE + [spacing_m * k, 0.0], 9, own) for k in range(5)]
+    return [Marking("diamond", SQUARE + np.array([spacing_m * k, 0.0]), 9, own) for k in range(5)]
 
 
 def test_a_drift_that_markings_share_is_no_part_of_what_they_contribute() -> None:
@@ -36,7 +36,7 @@ def test_a_drift_that_markings_share_is_no_part_of_what_they_contribute() -> Non
 def test_errors_of_the_paint_are_a_markings_own() -> None:
     index = np.arange(20).reshape(5, 4)
     for marking in with_relative_sigma(street(5.0, PAINT_M), index, joint):
-        assert marking.relative_sigma_m == pytest.approx(PAINT_M / 2, rel=0.05)
+        assert marking.relative_sigma_m == pytest.approx(np.hypot(CORNER_M, PAINT_M) / 2)
 
 
 def test_nothing_is_said_of_a_marking_alone_or_unseen() -> None:
