@@ -29,7 +29,7 @@ from v2hdm.drive.tum import read_image_list, read_tum, write_image_list, write_t
 from v2hdm.errors import DriveError
 from v2hdm.fields import take_origin
 from v2hdm.files import check_keys, dump_yaml, load_yaml, replace_text, take_mapping, take_number, take_text
-from v2hdm.records import Camera, Drive, PoseNoise, Trajectory
+from v2hdm.records import DRIFTS, Camera, Drive, PoseNoise, Trajectory
 
 DRIVE_FILE = "drive.yaml"
 POSES_FILE = "poses.tum"
@@ -179,11 +179,7 @@ def _read_pose_noise(content: object, where: str) -> PoseNoise:
                 f"{where}, {key}: an error that fades over no distance is no drift; leave it out"
             )
     noise = PoseNoise.as_far_as_stated(**values)
-    for total, drift in (
-        ("position_m", "position_drift_m"),
-        ("heading_rad", "heading_drift_rad"),
-        ("roll_pitch_rad", "roll_pitch_drift_rad"),
-    ):
+    for total, drift in DRIFTS.items():
         if getattr(noise, drift) > getattr(noise, total):
             raise DriveError(f"{where}, {drift}: is part of {total} and cannot be above it; mend one of them")
     return noise
