@@ -12,11 +12,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from v2hdm import pipeline
 from v2hdm.pipeline.run import logging_to
+from v2hdm.quality import Status, Verdict
 from v2hdm.report.table import results_table
 
+_STYLES = {Status.PASS: "bold green", Status.WARN: "bold yellow", Status.FAIL: "bold red"}
 
-def run_on_terminal(config: pipeline.RunConfig, config_yaml: str) -> None:
-    """Run the pipeline and show what it does and found."""
+
+def run_on_terminal(config: pipeline.RunConfig, config_yaml: str) -> Verdict:
+    """Run the pipeline, show what it does and found, and return the verdict on it."""
     console = Console()
     handler = RichHandler(logging.INFO, console, show_path=False, show_level=False, log_time_format="%X")
     with logging_to(handler), _bars(console) as progress:
@@ -24,8 +27,15 @@ def run_on_terminal(config: pipeline.RunConfig, config_yaml: str) -> None:
     console.print()
     for line in result.headlines:
         console.print(line, highlight=False)
-    console.print(results_table(result.metrics["name"], result.metrics["results"]))
+    if result.metrics["results"]:
+        console.print(results_table(result.metrics["name"], result.metrics["results"]))
+    style = _STYLES[result.verdict.status]
+    for number, line in enumerate(result.verdict.lines):
+        console.print(
+            line, style=style if number == 0 else None, highlight=False, markup=False, soft_wrap=True
+        )
     console.print(f"results in {result.folder}", highlight=False, soft_wrap=True)
+    return result.verdict
 
 
 @contextmanager

@@ -15,12 +15,15 @@ from collections.abc import Callable
 from v2hdm.errors import V2hdmError
 
 EXIT_USER_ERROR = 2
+EXIT_FAILED_VERDICT = 3
 _ONE_PRESS_S = 2.0
 _OURS = ("v2hdm", "models", "train", "export")
 
 
-def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[], None]) -> int:
-    """Do the work of a process; the exit code is 0, or 2 with one line on stderr for what a user can mend.
+def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[], int | None]) -> int:
+    """Do the work of a process; the exit code is that of the work, 0 unless it returns one.
+
+    It is 2, with one line on stderr, for what a user can mend.
 
     Args:
         name: of the door, as in ``python -m name``.
@@ -32,11 +35,12 @@ def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[],
     # as soon as the machine is busy otherwise. Libraries read this when they are loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
-        _to_the_end(work)
+        return _to_the_end(work)
     except BrokenPipeError:  # the reader of our output has had enough
         from v2hdm.files import forget_stdout
 
         forget_stdout()
+        return 0
     except V2hdmError as error:
         return _fail(str(error))
     except ModuleNotFoundError as error:
@@ -47,17 +51,17 @@ def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[],
         )
     except KeyboardInterrupt:
         return _fail(interrupted)
-    return 0
 
 
-def _to_the_end(work: Callable[[], None]) -> None:
+def _to_the_end(work: Callable[[], int | None]) -> int:
     """Do the work and write all that it printed, while it can still be told that nobody reads it."""
     try:
-        work()
+        code = work() or 0
     except SystemExit:  # argparse, after --help
         sys.stdout.flush()
         raise
     sys.stdout.flush()
+    return code
 
 
 def _fail(message: str) -> int:

@@ -4,26 +4,32 @@ from __future__ import annotations
 
 import sys
 
-from v2hdm.door import answer_signals, open_door
+from v2hdm.door import EXIT_FAILED_VERDICT, answer_signals, open_door
 
 _INTERRUPTED = "interrupted; finished renderings are kept in the cache, no result was written"
 _RUNS = "choose a run (+run=port1, +run=port2, +run=kitti drive.path=...) or set it on the command line"
 
 
 def main() -> int:
-    """Run the door, whose arguments are Hydra overrides (``--help`` lists them); returns its exit code."""
+    """Run the door, whose arguments are Hydra overrides (``--help`` lists them).
+
+    The exit code is 0, 2 where a user must mend something, or 3 where a verdict is FAIL.
+    """
     return open_door("v2hdm.map", "map", _INTERRUPTED, _map)
 
 
-def _map() -> None:
+def _map() -> int:
     import torch  # noqa: F401  # its absence is told before that of what is built on it
 
     from v2hdm import config, console
     from v2hdm.pipeline import RunConfig
+    from v2hdm.quality import Status
 
+    failed = False
     for composed in config.compositions("map", RunConfig):
         run = config.to_dataclass(composed, RunConfig, _RUNS)
-        console.run_on_terminal(run, config.to_yaml(composed))
+        failed |= console.run_on_terminal(run, config.to_yaml(composed)).status is Status.FAIL
+    return EXIT_FAILED_VERDICT if failed else 0
 
 
 if __name__ == "__main__":

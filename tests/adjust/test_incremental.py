@@ -7,14 +7,32 @@ import numpy as np
 import pytest
 
 from tests.adjust.scene import Scene, make_scene
-from v2hdm.adjust import Observations, PoseSigma, Problem, SolveOptions, solve
+from v2hdm.adjust import Drift, Observations, PoseSigma, Problem, SolveOptions, solve
 from v2hdm.adjust.incremental import IncrementalMap, RigPrior
 from v2hdm.adjust.incremental_file import load_map, save_map
-from v2hdm.adjust.marking_fit import MarkingObservations, Noise
+from v2hdm.adjust.marking_fit import MarkingObservations
+from v2hdm.adjust.pose_errors import Noise
 from v2hdm.errors import AdjustError
 
 STILL = Noise(np.zeros(6), np.inf)
 JITTER = PoseSigma(position_m=0.01, heading_rad=0.001, roll_pitch_rad=0.002, height_m=0.005)
+
+
+DRIFTING = PoseSigma(
+    position_m=0.012,
+    heading_rad=0.001,
+    roll_pitch_rad=0.002,
+    height_m=0.005,
+    position_drift=Drift(0.01, 20.0),
+    heading_drift=Drift(0.0008, 5.0),
+    roll_pitch_drift=Drift(0.0015, 2.0),
+)
+
+
+def noise_of(sigma: PoseSigma) -> Noise:
+    drifts = sigma.drift_by_state()
+    fading = (np.array([drift.sigma for drift in drifts]), np.array([drift.over_m for drift in drifts]))
+    return Noise(sigma.by_state(), np.inf, *fading)
 
 
 def street(**changes) -> Scene:
@@ -32,6 +50,8 @@ def prior_of(problem: Problem) -> RigPrior:
 def by_marking(problem: Problem) -> list[MarkingObservations]:
     """Four corners each, in the order of their numbers."""
     seen, out = problem.observations, []
+    step_m = np.linalg.norm(np.diff(problem.map_from_vehicle[:, :3, 3], axis=0), axis=1)
+    travelled_m = np.concatenate([[0.0], np.cumsum(step_m)])
     for first in range(0, problem.corner_count - 3, 4):
         rows = np.flatnonzero((seen.corner >= first) & (seen.corner < first + 4))
         out.append(
@@ -39,11 +59,23 @@ def by_marking(problem: Problem) -> list[MarkingObservations]:
                 seen.camera[rows],
                 seen.corner[rows] - first,
                 seen.frame[rows],
+                travelled_m[seen.frame[rows]],
                 np.linalg.inv(problem.map_from_vehicle)[seen.frame[rows]],
                 seen.pinhole_px[rows],
                 seen.covariance_px[rows],
             )
         )
+    return out
+
+
+def in_units(problem: Problem, size: int = 4) -> list[MarkingObservations]:
+    """So many markings each."""
+    markings, out = by_marking(problem), []
+    for first in range(0, len(markings), size):
+        unit = markings[first]
+        for k, seen in enumerate(markings[first + 1 : first + size], 1):
+            unit = unit.joined(replace(seen, corner=seen.corner + 4 * k))
+        out.append(unit)
     return out
 
 
@@ -92,24 +124,46 @@ def test_with_poses_taken_at_their_word_it_is_the_papers_optimum():
 
 def test_with_pose_errors_it_is_the_optimum_of_markings_that_share_none():
     scene = street(frames=40, jitter=JITTER)
-    problem = whole_markings(scene.problem)
+    problem = with_frames_of_their_own(whole_markings(scene.problem))
     grown = grow(problem, Noise(JITTER.by_state(), np.inf))
-    assert_is_the_batch_optimum(grown, with_frames_of_their_own(problem), SolveOptions(loss="none"))
+    assert_is_the_batch_optimum(grown, problem, SolveOptions(loss="none"))
 
 
 def as_one_unit(problem: Problem) -> IncrementalMap:
     """All markings as one, which shares the errors of the images that it is seen in."""
-    shared = IncrementalMap(prior_of(problem), Noise(JITTER.by_state(), np.inf))
-    for marking, seen in enumerate(by_marking(problem)):
-        shared.observe(0, replace(seen, corner=seen.corner + 4 * marking))
+    shared = IncrementalMap(prior_of(problem), noise_of(problem.pose_sigma))
+    for seen in in_units(problem, problem.corner_count):
+        shared.observe(0, seen)
     return shared
 
 
-def test_markings_of_one_unit_share_the_errors_of_their_images():
-    problem = whole_markings(street(frames=40, jitter=JITTER).problem)
+@pytest.mark.parametrize("sigma", [JITTER, DRIFTING], ids=["white", "drifting"])
+def test_markings_of_one_unit_share_the_errors_of_their_images(sigma):
+    problem = whole_markings(street(frames=40, jitter=sigma).problem)
     best = solve(problem, SolveOptions(loss="none"))
     sigma = np.sqrt(np.diag(best.corner_covariance(np.arange(problem.corner_count)))).reshape(-1, 2)
-    assert np.max(np.abs(as_one_unit(problem).corners_map(0) - best.corners_map) / sigma) < 0.01
+    unit = as_one_unit(problem)
+    assert np.max(np.abs(unit.corners_map(0) - best.corners_map) / sigma) < 0.01
+    np.testing.assert_allclose(unit.extrinsic_covariance, best.extrinsic_covariance, rtol=0.05, atol=1e-9)
+
+
+def test_the_extrinsics_sigmas_hold_where_markings_share_the_drift_of_their_poses():
+    """Four markings to a unit: normalised squared errors per degree of freedom, two cameras, ten drives."""
+    nees = []
+    for seed in range(10):
+        scene = street(frames=40, jitter=DRIFTING, noise_seed=seed)
+        grown = IncrementalMap(prior_of(scene.problem), noise_of(DRIFTING))
+        for unit, seen in enumerate(in_units(whole_markings(scene.problem))):
+            grown.observe(unit, seen)
+        off = grown.cam_from_vehicle @ np.linalg.inv(scene.cam_from_vehicle)
+        tangent = np.concatenate(
+            [off[:, :3, 3], np.stack([off[:, 2, 1], off[:, 0, 2], off[:, 1, 0]], axis=1)], axis=1
+        )
+        covariance = grown.extrinsic_covariance
+        nees += [
+            error @ np.linalg.solve(own, error) / 6 for error, own in zip(tangent, covariance, strict=True)
+        ]
+    assert 0.6 < np.mean(nees) < 1.5
 
 
 def test_sharing_the_errors_of_images_makes_corners_more_exact():
@@ -183,8 +237,8 @@ def test_a_marking_that_cannot_be_re_estimated_stays_as_it_was():
 def test_a_saved_map_goes_on_as_if_nothing_had_happened(tmp_path):
     problem = whole_markings(street(frames=40, jitter=JITTER).problem)
     markings = by_marking(problem)
-    noise = Noise(JITTER.by_state(), 3.0)
-    straight_on, stopped = (IncrementalMap(prior_of(problem), noise, 0.01) for _ in range(2))
+    noise = Noise(JITTER.by_state(), 3.0, np.array([0.008, 0.008, 0, 0, 0, 0.0005]), np.full(6, 20.0))
+    straight_on, stopped = (IncrementalMap(prior_of(problem), noise) for _ in range(2))
     for marking, seen in enumerate(markings[:7]):
         straight_on.observe(marking, seen)
         stopped.observe(marking, seen)

@@ -18,7 +18,8 @@ from tests.adjust.scene import make_scene
 from tests.benchmarks.adjust_scaling import driven_on
 from v2hdm.adjust import Problem, SolveOptions, solve
 from v2hdm.adjust.incremental import IncrementalMap, RigPrior
-from v2hdm.adjust.marking_fit import MarkingObservations, Noise
+from v2hdm.adjust.marking_fit import MarkingObservations
+from v2hdm.adjust.pose_errors import Noise
 from v2hdm.adjust.subset import restrict
 
 CORNERS = 4
@@ -53,6 +54,7 @@ def by_marking(problem: Problem, markings: int) -> list[MarkingObservations]:
                 camera=seen.camera[rows],
                 corner=seen.corner[rows] - CORNERS * marking,
                 frame=seen.frame[rows],
+                travelled_m=np.zeros(len(rows)),
                 vehicle_from_map=vehicle_from_map[seen.frame[rows]],
                 pinhole_px=seen.pinhole_px[rows],
                 covariance_px=seen.covariance_px[rows],

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from v2hdm.mapping.markings.completion import SolvedCorners
+from v2hdm.mapping.markings.paint_error import PaintError
 from v2hdm.mapping.markings.shape_prior import common_shape, fuse, with_class_shapes, without_guessed_lengths
 
 DIAMOND = np.array([[0.6, 0.0], [0.0, 0.35], [-0.6, 0.0], [0.0, -0.35]])
@@ -100,7 +101,7 @@ def test_what_fits_no_hypothesis_is_left_where_it_was_and_said_to_be_uncertain()
     solved = seen(true, rng, 0.005)
     shape = common_shape(solved.corners_map, solved.covariance_m2)
     odd = solved.corners_map[0] * 1.3
-    fused, covariance = fuse(odd, solved.covariance_m2[0], shape)
+    fused, covariance = fuse(odd, solved.covariance_m2[0], shape, PaintError(0.001, 3.0))
     np.testing.assert_array_equal(fused, odd)
     assert np.trace(covariance) > 10 * np.trace(solved.covariance_m2[0])
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from v2hdm.quality import Finding, Status, Verdict
 
 
-def finding(status: Status, check: str = "clock") -> Finding:
-    return Finding(check, status, 118.0, 15.0, "ms", "images are 118 ms late; mend the stamps", "front")
+def finding(status: Status, check: str = "clock", value: float | None = 118.0) -> Finding:
+    return Finding(check, status, value, 15.0, "ms", "images are 118 ms late; mend the stamps", "front")
 
 
 def test_a_run_without_findings_passes() -> None:
@@ -29,6 +29,14 @@ def test_what_passed_is_told_apart_from_what_was_raised() -> None:
 
 def test_the_terminal_shows_the_status_first_and_a_line_for_each_finding() -> None:
     lines = Verdict.of([finding(Status.PASS), finding(Status.WARN)]).lines
-    assert lines[0] == "verdict: WARN, 1 finding"
+    assert lines[0] == "verdict: WARN (1 finding, 1 checks passed)"
     assert lines[1] == "WARN clock (front): images are 118 ms late; mend the stamps"
     assert len(lines) == 2
+
+
+def test_a_check_that_the_drive_cannot_answer_is_told_apart_from_one_that_passed() -> None:
+    verdict = Verdict.of([finding(Status.PASS, value=None)])
+    assert verdict.status is Status.PASS
+    assert not verdict.passed
+    assert verdict.as_json()["untold"][0]["check"] == "clock"
+    assert verdict.lines[1].startswith("cannot tell clock (front)")

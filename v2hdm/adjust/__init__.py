@@ -5,7 +5,7 @@ inside. :mod:`v2hdm.adjust.problem` states the model.
 """
 
 from v2hdm.adjust.gating import Excluded, Verdict
-from v2hdm.adjust.observability import Observability, observability
+from v2hdm.adjust.observability import Observability, observability, observed
 from v2hdm.adjust.problem import (
     ControlPoints,
     Drift,
@@ -15,28 +15,36 @@ from v2hdm.adjust.problem import (
     Problem,
     SolveOptions,
 )
+from v2hdm.adjust.pulls import PosePulls, pose_pulls
 from v2hdm.adjust.selection import MODELS, Model, Selection, select_model, with_model
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
+from v2hdm.adjust.suspect import Fault, Suspect, suspects
 
 __all__ = [
     "MODELS",
     "ControlPoints",
     "Drift",
     "Excluded",
+    "Fault",
     "KnownLengths",
     "Model",
     "Observability",
     "Observations",
+    "PosePulls",
     "PoseSigma",
     "Problem",
     "Selection",
     "Solution",
     "SolveOptions",
     "Status",
+    "Suspect",
     "Verdict",
     "observability",
+    "observed",
+    "pose_pulls",
     "select_model",
     "solve",
+    "suspects",
     "with_model",
 ]

@@ -7,8 +7,11 @@ its own Schur complement is added. Every corner stays an affine function of :mat
 take a marking back out, subtract what was added; to see it again, do that and solve it with all sightings.
 When the number of markings has doubled, all are linearised anew: a constant share of the cost of each.
 
-The poses' errors are marginalised out marking by marking, so that two markings in one image do not
-share them: what that gives away against the batch adjustment is the price of its independence.
+The poses' errors are marginalised out marking by marking, so that for the estimate two markings in one image
+do not share them: what that gives away against the batch adjustment is the price of its independence. For the
+covariance they do: with H the information, J_m the influence of the poses' errors e_m on marking m's part of
+the gradient, it is that of a composite likelihood (Varin, Reid and Firth, Statistica Sinica 21, 2011),
+:math:`H^{-1} (H + \sum_{m \ne n} J_m \, \mathrm{cov}(e_m, e_n) \, J_n^T) H^{-1}`.
 """
 
 from __future__ import annotations
@@ -21,12 +24,14 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from v2hdm.adjust.marking_fit import (
     MarkingObservations,
-    Noise,
     Normal,
     back_projected,
     normal_equations,
+    squared_residuals,
 )
+from v2hdm.adjust.pose_errors import Noise
 from v2hdm.adjust.rigid import exp, left_jacobians
+from v2hdm.adjust.variance import VarianceFactors, variance_factors
 from v2hdm.errors import AdjustError
 from v2hdm.records import FloatArray
 
@@ -35,6 +40,8 @@ _MAX_STEPS = 30
 _STEP_TOLERANCE = 1e-4
 _PREVIEW_TOLERANCE = 1e-2
 _PASSES = 2
+# Beyond so many times its length a drift's correlation is below one per cent.
+_REACHES = 5.0
 
 
 @dataclass(frozen=True)
@@ -60,7 +67,8 @@ class Settled:
     Its corners are ``corners_map`` (n, 2) there and move by ``-gain`` (2n, 6C) times the change of the
     tangents; given the extrinsics their covariance is ``covariance_m2`` (2n, 2n). ``information`` (6C, 6C)
     and ``vector`` (6C,) are the marking's part of the extrinsics' normal equations. ``frame_state`` (F, 6)
-    are the states of the marking's own frames.
+    are the states of the marking's own frames, which cost ``state_squared`` standard deviations squared;
+    ``influence`` (6C, 6F) is what errors of these states add to the vector.
     """
 
     observations: MarkingObservations
@@ -71,6 +79,8 @@ class Settled:
     information: FloatArray
     vector: FloatArray
     frame_state: FloatArray
+    state_squared: float
+    influence: FloatArray
 
     def corners_at(self, tangents: FloatArray) -> FloatArray:
         """The corners (n, 2) under other extrinsics."""
@@ -100,21 +110,16 @@ class State:
 class IncrementalMap:
     """Extrinsics and corners, up to date after every marking."""
 
-    def __init__(
-        self, prior: RigPrior, noise: Noise, drift_m: float = 0.0, state: State | None = None
-    ) -> None:
+    def __init__(self, prior: RigPrior, noise: Noise, state: State | None = None) -> None:
         """Begin with an empty map, or go on from ``state``.
 
         Args:
             prior: what is known of the cameras.
-            noise: how observations and poses err; of the poses, what differs from image to image.
-            drift_m: standard deviation of the slow part of the position error, which a whole marking
-                shares and no observation can tell: it goes into the corners' covariances.
+            noise: how observations and poses err.
             state: where another map of the same rig stopped.
         """
         self.prior = prior
         self.noise = noise
-        self.drift_m = drift_m
         if state is None:
             state = State.empty(prior, np.zeros(6 * len(prior.cam_from_vehicle)))
         self.state = state
@@ -143,9 +148,31 @@ class IncrementalMap:
     def corner_covariance(self, marking: int) -> FloatArray:
         """Joint covariance (2n, 2n), m^2, of a marking's corners."""
         settled = self._known(marking)
-        shared = np.tile(self.drift_m**2 * np.eye(2), (len(settled.corners_map),) * 2)
-        extrinsic = np.linalg.inv(self.state.information)
-        return np.asarray(settled.covariance_m2 + settled.gain @ extrinsic @ settled.gain.T + shared)
+        extrinsic = self._tangent_covariance()
+        return np.asarray(settled.covariance_m2 + settled.gain @ extrinsic @ settled.gain.T)
+
+    def variance(self) -> VarianceFactors:
+        """How many times as large as stated the variances are."""
+        squared, of_priors, corners = [np.zeros(0)], self._prior_squared(), 0
+        for marking, settled in self.state.settled.items():
+            fit = squared_residuals(
+                settled.observations,
+                self.prior.intrinsic,
+                self.cam_from_vehicle,
+                self.corners_map(marking),
+                settled.frame_state,
+            )
+            squared.append(fit)
+            of_priors += settled.state_squared
+            corners += len(settled.corners_map)
+        free = 2 * corners + self.state.tangents.size - int(np.isfinite(self.prior.centre_sigma_m).sum())
+        return variance_factors(np.concatenate(squared), of_priors, free)
+
+    def _prior_squared(self) -> float:
+        """How far the cameras' centres are from their prior, standard deviations squared."""
+        extrinsics = self.cam_from_vehicle
+        centre = -np.einsum("cba,cb->ca", extrinsics[:, :3, :3], extrinsics[:, :3, 3])
+        return float(np.sum(((centre - self.prior.centre_vehicle) / self.prior.centre_sigma_m) ** 2))
 
     def preview(self, observations: MarkingObservations) -> FloatArray:
         """Where a marking's corners (n, 2) would come to lie, without taking it into the map.
@@ -215,7 +242,26 @@ class IncrementalMap:
     def _left_covariance(self) -> FloatArray:
         """Covariance (6C, 6C) of the left tangents at the present extrinsics."""
         turn = block_diag(*left_jacobians(self.state.tangents.reshape(-1, 6)))
-        return np.asarray(turn @ np.linalg.inv(self.state.information) @ turn.T)
+        return np.asarray(turn @ self._tangent_covariance() @ turn.T)
+
+    def _tangent_covariance(self) -> FloatArray:
+        """Covariance (6C, 6C) of the tangents, errors that markings share included."""
+        alone = np.linalg.inv(self.state.information)
+        return np.asarray(alone + alone @ self._shared() @ alone)
+
+    def _shared(self) -> FloatArray:
+        """What the poses' errors that markings share add to the variance (6C, 6C) of the vector."""
+        settled = list(self.state.settled.values())
+        frames = [one.observations.frames for one in settled]
+        begin, end = (np.array([pick(f.travelled_m) for f in frames]) for pick in (np.min, np.max))
+        reach_m = _REACHES * self.noise.reach_m
+        out = np.zeros_like(self.state.information)
+        for m, one in enumerate(settled):
+            near = (begin <= end[m] + reach_m) & (end >= begin[m] - reach_m)
+            for n in np.flatnonzero(near[:m]).tolist():
+                part = one.influence @ self.noise.covariance(frames[m], frames[n]) @ settled[n].influence.T
+                out += part + part.T
+        return out
 
     def _solve(
         self,
@@ -314,4 +360,6 @@ def _eliminated(
         information=(information + information.T) / 2,
         vector=information @ tangents - gradient,
         frame_state=normal.frame_state,
+        state_squared=normal.state_squared,
+        influence=chart.T @ (normal.influence[: len(chart)] - gain.T @ normal.influence[len(chart) :]),
     )

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.adjust.incremental import IncrementalMap, RigPrior, Settled, State
-from v2hdm.adjust.marking_fit import MarkingObservations, Noise
+from v2hdm.adjust.marking_fit import MarkingObservations
+from v2hdm.adjust.pose_errors import Noise
 from v2hdm.adjust.problem import IntArray
 from v2hdm.errors import AdjustError
 from v2hdm.files import whole_file
@@ -20,8 +21,8 @@ from v2hdm.records import FloatArray
 
 _OBSERVED = tuple(field.name for field in fields(MarkingObservations))
 # What markings have in different numbers, flattened end to end; the rest is stacked.
-_RAGGED = ("corners_map", "gain", "covariance_m2", "frame_state")
-_STACKED = ("at", "information", "vector")
+_RAGGED = ("corners_map", "gain", "covariance_m2", "frame_state", "influence")
+_STACKED = ("at", "information", "vector", "state_squared")
 
 
 def save_map(grown: IncrementalMap, path: Path) -> None:
@@ -30,7 +31,6 @@ def save_map(grown: IncrementalMap, path: Path) -> None:
     arrays = {f"prior_{name}": np.asarray(value) for name, value in vars(grown.prior).items()}
     arrays |= {f"noise_{name}": np.asarray(value) for name, value in vars(grown.noise).items()}
     arrays |= {
-        "drift_m": np.asarray(grown.drift_m),
         "linearised_count": np.asarray(grown.state.linearised_count),
         "tangents": grown.state.tangents,
         "information": grown.state.information,
@@ -76,8 +76,12 @@ def _restored(arrays: dict[str, FloatArray]) -> IncrementalMap:
     settled = dict(zip(arrays["markings"].tolist(), _settled(arrays), strict=True))
     return IncrementalMap(
         prior,
-        Noise(arrays["noise_pose_sigma"], float(arrays["noise_cauchy_scale"])),
-        float(arrays["drift_m"]),
+        Noise(
+            arrays["noise_pose_sigma"],
+            float(arrays["noise_cauchy_scale"]),
+            arrays["noise_drift_sigma"],
+            arrays["noise_drift_over_m"],
+        ),
         State(
             settled,
             int(arrays["linearised_count"]),
@@ -95,6 +99,7 @@ def _shapes(corners: int, frames: int, unknowns: int) -> dict[str, tuple[int, in
         "gain": (2 * corners, unknowns),
         "covariance_m2": (2 * corners, 2 * corners),
         "frame_state": (frames, 6),
+        "influence": (unknowns, 6 * frames),
     }
 
 
@@ -118,6 +123,7 @@ def _settled(arrays: dict[str, FloatArray]) -> list[Settled]:
             at=by_tangent[m],
             information=information[m],
             vector=vector[m],
+            state_squared=float(arrays["settled_state_squared"][m]),
             **{name: parts[m] for name, parts in own.items()},
         )
         for m in range(count)
@@ -128,6 +134,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {
     "camera": (),
     "corner": (),
     "frame": (),
+    "travelled_m": (),
     "vehicle_from_map": (4, 4),
     "pinhole_px": (2,),
     "covariance_px": (2, 2),

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from v2hdm.adjust.pose_errors import Frames, Noise
 from v2hdm.adjust.problem import IntArray
 from v2hdm.adjust.rigid import adjoints, exp, hat, left_jacobians
 from v2hdm.records import FloatArray
@@ -25,14 +26,15 @@ _MIN_WEIGHT = 1e-4
 class MarkingObservations:
     """K sightings of the corners of one marking, or of several that are to share their frames' errors.
 
-    ``camera`` (K,) and ``corner`` (K,), 0 to n - 1; ``frame`` (K,) numbers images taken at one time alike;
-    ``vehicle_from_map`` (K, 4, 4) are the recorded poses, inverted; ``pinhole_px`` (K, 2) and
-    ``covariance_px`` (K, 2, 2).
+    ``camera`` (K,) and ``corner`` (K,), 0 to n - 1; ``frame`` (K,) numbers images taken at one time alike,
+    and ``travelled_m`` (K,) is how far the vehicle had driven by then; ``vehicle_from_map`` (K, 4, 4) are the
+    recorded poses, inverted; ``pinhole_px`` (K, 2) and ``covariance_px`` (K, 2, 2).
     """
 
     camera: IntArray
     corner: IntArray
     frame: IntArray
+    travelled_m: FloatArray
     vehicle_from_map: FloatArray
     pinhole_px: FloatArray
     covariance_px: FloatArray
@@ -42,22 +44,16 @@ class MarkingObservations:
         """Which of the marking's own frames (K,) each observation belongs to, 0 to F - 1."""
         return np.asarray(np.unique(self.frame, return_inverse=True)[1])
 
+    @property
+    def frames(self) -> Frames:
+        """The marking's own frames, by number."""
+        number, first = np.unique(self.frame, return_index=True)
+        return Frames(number, self.travelled_m[first], self.vehicle_from_map[first])
+
     def joined(self, more: MarkingObservations) -> MarkingObservations:
         """These and ``more`` of the same marking."""
         parts = zip(vars(self).values(), vars(more).values(), strict=True)
         return MarkingObservations(*(np.concatenate(pair) for pair in parts))
-
-
-@dataclass(frozen=True)
-class Noise:
-    """How the observations err beyond their covariances.
-
-    ``pose_sigma`` (6,) of the frames' tangents (0 where a state does not err); ``cauchy_scale`` is the
-    residual, in standard deviations, from which an observation loses weight (infinite: never).
-    """
-
-    pose_sigma: FloatArray
-    cauchy_scale: float
 
 
 @dataclass(frozen=True)
@@ -66,7 +62,9 @@ class Normal:
 
     With d the left tangents of all C extrinsics, stacked, and x the step of the corners: ``V`` (2n, 2n),
     ``W`` (6C, 2n), ``U`` (6C, 6C) and the gradients ``by_corner`` (2n,), ``by_extrinsic`` (6C,) of half the
-    squared, reweighted residuals. ``frame_state`` (F, 6) is where the frames' states come to lie.
+    squared, reweighted residuals. ``frame_state`` (F, 6) is where the frames' states come to lie, which costs
+    ``state_squared`` standard deviations squared. An error e of the frames' states adds ``influence``
+    (6C + 2n, 6F) times e to the gradients.
     """
 
     V: FloatArray
@@ -75,6 +73,8 @@ class Normal:
     by_corner: FloatArray
     by_extrinsic: FloatArray
     frame_state: FloatArray
+    state_squared: float
+    influence: FloatArray
 
 
 def normal_equations(
@@ -92,8 +92,7 @@ def normal_equations(
     by_state = -by_pair @ adjoints(cam_from_vehicle)[camera] @ left_jacobians(-frame_state)[rank]
     at_rest = residual[..., None] - by_state @ frame_state[rank][..., None]
     root = _root_information(seen, residual, noise)
-    # In units of its sigma a state has the prior 1, also where it does not err.
-    pair, place, unit, rest = (root @ j for j in (by_pair, by_corner, by_state * noise.pose_sigma, at_rest))
+    pair, place, unit, rest = (root @ j for j in (by_pair, by_corner, by_state, at_rest))
     no_row = np.zeros_like(camera)
     own = np.block(
         [
@@ -115,19 +114,37 @@ def normal_equations(
             _gram((frames, corners), (rank, corner), unit, place),
             _gram((frames, 1), (rank, no_row), unit, rest),
         ]
-    ).reshape(frames, 6, -1)
-    held = np.eye(6) + _summed((frames,), (rank,), np.swapaxes(unit, 1, 2) @ unit)
-    solved = np.linalg.solve(held, across)
-    own -= across[..., :-1].reshape(6 * frames, -1).T @ solved.reshape(6 * frames, -1)
-    size = 6 * cameras
+    )
+    held = _summed((frames,), (rank,), np.swapaxes(unit, 1, 2) @ unit)
+    covariance = noise.covariance(seen.frames, seen.frames)
+    # (P^-1 + H)^-1 = P (I + H P)^-1, which a state that does not err leaves regular.
+    times = np.einsum("fab,fbk->fak", held, covariance.reshape(frames, 6, -1)).reshape(6 * frames, -1)
+    solved = np.linalg.solve(np.eye(6 * frames) + times, across)
+    own -= across[:, :-1].T @ covariance @ solved
+    size, force = 6 * cameras, -solved[:, -1]
+    state = covariance @ force
     return Normal(
         V=own[size:, size:-1],
         W=own[:size, size:-1],
         U=own[:size, :size],
         by_corner=own[size:, -1],
         by_extrinsic=own[:size, -1],
-        frame_state=-noise.pose_sigma * solved[..., -1],
+        frame_state=state.reshape(frames, 6),
+        state_squared=float(force @ state),
+        influence=solved[:, :-1].T,
     )
+
+
+def squared_residuals(
+    seen: MarkingObservations,
+    intrinsic: FloatArray,
+    cam_from_vehicle: FloatArray,
+    corners_map: FloatArray,
+    frame_state: FloatArray,
+) -> FloatArray:
+    """Squared residuals (K,) of ``seen`` in standard deviations, as :func:`normal_equations` has them."""
+    residual = _linearise(seen, intrinsic, cam_from_vehicle, corners_map, frame_state)[0]
+    return np.einsum("ka,ka->k", residual, np.linalg.solve(seen.covariance_px, residual[..., None])[..., 0])
 
 
 def _root_information(seen: MarkingObservations, residual: FloatArray, noise: Noise) -> FloatArray:
@@ -152,7 +169,9 @@ def _summed(shape: tuple[int, ...], index: tuple[IntArray, ...], values: FloatAr
     """Values (K, ...) summed by index."""
     flat = np.ravel_multi_index(index, shape)
     out = np.zeros((int(np.prod(shape)), *values.shape[1:]))
-    np.add.at(out, flat, values)
+    order = np.argsort(flat, kind="stable")
+    begins = np.flatnonzero(np.diff(flat[order], prepend=-1))
+    out[flat[order][begins]] = np.add.reduceat(values[order], begins, axis=0)
     return out.reshape(*shape, *values.shape[1:])
 
 

@@ -233,13 +233,17 @@ class Tally:
     def add(self, run: Run, view: View, robust: Loss) -> Tensor:
         """Add a run; returns the weights (k,) that the loss gives its observations."""
         rho, weight = loss(robust.name, view.squared, robust.scale)
-        a, b, c = run.root_information
-        first, second = view.residual * weight
-        force = view.force(torch.stack([torch.addcmul(a * first, b, second), c * second]))
         self.cost += rho.sum() / 2
+        self.pull(run, view, view.residual * weight)
+        return weight
+
+    def pull(self, run: Run, view: View, by_residual: Tensor) -> None:
+        """Add the gradient of what has the gradient ``by_residual`` (2, k) by the whitened residuals."""
+        a, b, c = run.root_information
+        first, second = by_residual
+        force = view.force(torch.stack([torch.addcmul(a * first, b, second), c * second]))
         self.by_table.index_add_(1, run.pair, view.by_table(force))
         self.by_corner[run.corners] = run.sum_by_corner(view.along_axes(force))
-        return weight
 
 
 def cost_and_gradient(arrays: Arrays, estimate: Estimate, robust: Loss) -> tuple[dict[str, Tensor], Gradient]:
@@ -267,16 +271,34 @@ def with_priors(
         "control_points": (off_control.square().sum(1) * arrays.control_information).sum() / 2,
         "known_lengths": length.square().sum() / 2,
     }
-    wrench = wrenches(table, tally.by_table).T.reshape(arrays.camera_count, arrays.frame_count, 6)
+    by_corner = tally.by_corner + by_corner_priors(arrays, estimate, slice(0, arrays.corner_count))
+    return terms, by_unknowns(
+        arrays, estimate, table, tally.by_table, by_corner, Priors(centre, state, clock)
+    )
+
+
+@dataclass(frozen=True)
+class Priors:
+    """Whitened residuals of the priors on centres (C, 3), frame states (J, S) and clock offsets (C, Q)."""
+
+    centre: Tensor
+    state: Tensor
+    clock: Tensor
+
+
+def by_unknowns(
+    arrays: Arrays, estimate: Estimate, table: Tensor, by_table: Tensor, by_corner: Tensor, priors: Priors
+) -> Gradient:
+    """The gradient by all that is estimated, from that by the pairs' columns (9, P) and by corner (N, 2)."""
+    wrench = wrenches(table, by_table).T.reshape(arrays.camera_count, arrays.frame_count, 6)
     by_extrinsic = wrench.sum(1)
     # A left perturbation moves the centre by minus its translation part, turned into the vehicle.
     rotation = estimate.cam_from_vehicle[:, :3, :3]
-    by_extrinsic[:, :3] -= (rotation @ (centre * arrays.centre_information_root)[..., None])[..., 0]
+    by_extrinsic[:, :3] -= (rotation @ (priors.centre * arrays.centre_information_root)[..., None])[..., 0]
     by_state = (pair_from_state(arrays, estimate).mT @ wrench[..., None])[..., 0].sum(0)
-    innovation = state * arrays.state_information_root
+    innovation = priors.state * arrays.state_information_root
     by_state += innovation
     by_state[:-1] -= (arrays.state_transition.mT @ innovation[..., None])[1:, :, 0]
     by_clock = (pair_from_clock(arrays, estimate).mT @ wrench[..., None])[..., 0].sum(1)
-    by_clock += clock * arrays.clock_information_root
-    by_corner = tally.by_corner + by_corner_priors(arrays, estimate, slice(0, arrays.corner_count))
-    return terms, Gradient(by_extrinsic, by_state, by_corner, by_clock)
+    by_clock += priors.clock * arrays.clock_information_root
+    return Gradient(by_extrinsic, by_state, by_corner, by_clock)

@@ -103,6 +103,15 @@ class Whitening:
         """What the Hessian counts the observations of a run for (k,)."""
         return loss(self.robust.name, view.squared, self.robust.scale)[1].clamp(min=_WEIGHT_FLOOR)
 
+    def whiten(self, gradient: Gradient) -> Tensor:
+        """A gradient by x as one by y, under the factors of this Hessian."""
+        whitener = Whitener(self.arrays, self.table)
+        for run in self.arrays.runs():
+            whitener.add(
+                self.linear(run), self.corner_factor.part(run.corners), gradient.corners_map[run.corners]
+            )
+        return whitener.whitened(self.plan, self.spread, self.reduced_factor, gradient)
+
     def corner_part(self, whitened: Tensor) -> Tensor:
         """Of whitened variables those of the corners, (N, 2)."""
         return whitened[self.reduced_factor.size :].reshape(-1, 2)

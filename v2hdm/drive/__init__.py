@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from v2hdm.drive.clock import with_clock_offsets
 from v2hdm.drive.folder import folder_drive_name, is_folder_drive, read_folder_drive, write_drive
 from v2hdm.drive.kitti import is_kitti_drive, read_kitti_drive
 from v2hdm.drive.options import KittiOptions, ReadOptions
@@ -20,6 +21,7 @@ __all__ = [
     "Trajectory",
     "drive_name",
     "read_drive",
+    "with_clock_offsets",
     "write_drive",
 ]
 

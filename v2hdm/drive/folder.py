@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm.drive.camera_info import read_camera_info, write_camera_info
-from v2hdm.drive.images import ImageFiles, check_image_files, pose_images, select_cameras
+from v2hdm.drive.images import ImageFiles, check_image_files, count_unposed, pose_images, select_cameras
 from v2hdm.drive.mounting import (
     IPM_NAMES,
     check_roi_in_view,
@@ -29,7 +29,7 @@ from v2hdm.drive.tum import read_image_list, read_tum, write_image_list, write_t
 from v2hdm.errors import DriveError
 from v2hdm.fields import take_origin
 from v2hdm.files import check_keys, dump_yaml, load_yaml, replace_text, take_mapping, take_number, take_text
-from v2hdm.records import Camera, Drive, PoseNoise, Trajectory
+from v2hdm.records import DRIFTS, Camera, Drive, PoseNoise, Trajectory
 
 DRIVE_FILE = "drive.yaml"
 POSES_FILE = "poses.tum"
@@ -77,6 +77,7 @@ def read_folder_drive(path: Path, options: ReadOptions) -> Drive:
         pose_noise=pose_noise,
         origin=take_origin(content.get("origin"), f"{where}: origin", DriveError),
         truth_dir=_find_truth(content.get("truth"), path, f"{where}: truth"),
+        unposed=count_unposed(files, images),
         trajectory=laid.trajectory,
         recorded=recorded,
         road=laid.road,
@@ -166,7 +167,7 @@ def _list_images(camera: str, path: Path) -> ImageFiles:
 
 def _read_pose_noise(content: object, where: str) -> PoseNoise:
     if content is None:
-        return PoseNoise()
+        return PoseNoise.as_far_as_stated()
     entry = take_mapping(content, where, DriveError)
     check_keys(entry, (), [field.name for field in fields(PoseNoise)], where, DriveError)
     values = {key: take_number(value, f"{where}, {key}", DriveError) for key, value in entry.items()}
@@ -177,12 +178,8 @@ def _read_pose_noise(content: object, where: str) -> PoseNoise:
             raise DriveError(
                 f"{where}, {key}: an error that fades over no distance is no drift; leave it out"
             )
-    noise = PoseNoise(**values)
-    for total, drift in (
-        ("position_m", "position_drift_m"),
-        ("heading_rad", "heading_drift_rad"),
-        ("roll_pitch_rad", "roll_pitch_drift_rad"),
-    ):
+    noise = PoseNoise.as_far_as_stated(**values)
+    for total, drift in DRIFTS.items():
         if getattr(noise, drift) > getattr(noise, total):
             raise DriveError(f"{where}, {drift}: is part of {total} and cannot be above it; mend one of them")
     return noise

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from v2hdm.drive.clocks import why_no_pose
 from v2hdm.drive.image_header import image_size
 from v2hdm.drive.trajectory import interpolate
 from v2hdm.errors import DriveError
@@ -43,7 +45,8 @@ def pose_images(
         if not inside.any():
             raise DriveError(
                 f"{where}: no image of camera '{entry.camera}' ({_span(entry.stamp_s)}) has a pose "
-                f"(poses: {_span(trajectory.stamp_s)}, max_gap_s {max_gap_s:g}); put both on one clock"
+                f"(poses: {_span(trajectory.stamp_s)}); "
+                f"{why_no_pose(entry.stamp_s, trajectory.stamp_s, max_gap_s)}"
             )
         if not inside.all():
             _log.warning(
@@ -60,6 +63,12 @@ def pose_images(
             for n in np.flatnonzero(inside).tolist()
         ]
     return tuple(sorted(images, key=lambda image: (image.stamp_s, image.camera)))
+
+
+def count_unposed(files: Sequence[ImageFiles], images: Sequence[Image]) -> dict[str, int]:
+    """How many images of each camera are not among the posed ``images``."""
+    posed = Counter(image.camera for image in images)
+    return {entry.camera: len(entry.paths) - posed[entry.camera] for entry in files}
 
 
 def check_image_files(images: Sequence[Image], cameras: Mapping[str, Camera]) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.drive.images import ImageFiles, check_image_files, pose_images, select_cameras
+from v2hdm.drive.images import ImageFiles, check_image_files, count_unposed, pose_images, select_cameras
 from v2hdm.drive.kitti_calibration import KittiCamera, read_kitti_camera
 from v2hdm.drive.options import KittiOptions, ReadOptions
 from v2hdm.drive.road import lay_flat, tell
@@ -39,7 +39,7 @@ _CAMERAS = ("image_00", "image_01", "image_02", "image_03")
 _SUFFIXES = (".png", ".jpg", ".jpeg")
 _OXTS_COLUMNS = 30
 # Of the data sheet's 0.1 m and 0.1 deg most is drift that a stretch of road in view shares.
-_POSE_NOISE = PoseNoise(position_m=0.02, heading_rad=0.001, roll_pitch_rad=0.002)
+_POSE_NOISE = PoseNoise(roll_pitch_rad=0.002, roll_pitch_drift_rad=0.0014)
 
 
 def is_kitti_drive(path: Path) -> bool:
@@ -83,6 +83,7 @@ def read_kitti_drive(path: Path, options: ReadOptions) -> Drive:
         images=images,
         pose_noise=_POSE_NOISE,
         origin=_lower(origin_imu, float(vehicle_from_imu[2, 3])),
+        unposed=count_unposed(files, images),
         trajectory=laid.trajectory,
         recorded=recorded,
         road=laid.road,

@@ -48,12 +48,19 @@ CLOCK_SIGMA_S = 0.01
 """How far the clocks of camera and receiver may be apart where nobody says that they are synchronised."""
 
 
+LEAST_OBSERVATIONS = 200
+"""Of fewer, the residuals cannot tell how large their variance is."""
+
+VARIANCE_FACTORS = (0.05, 20.0)
+"""Between these a detector's own statement may be corrected."""
+
+
 @dataclass(frozen=True)
 class Model:
     """What a solve estimates and how much noise it reckons with beyond that of the corners.
 
     ``floor_px`` is added to every corner in quadrature, px; the sum is multiplied by ``variance_factor``.
-    ``sizes`` are those that the user knows, ``survey`` the corners.
+    ``sizes`` are those that the user knows, ``survey`` the corners; ``clock_sigma_s`` holds clock offsets.
     """
 
     pose_sigma: PoseSigma
@@ -62,6 +69,7 @@ class Model:
     variance_factor: float = 1.0
     sizes: SizeOptions = field(default_factory=SizeOptions)
     survey: SurveyOptions = field(default_factory=SurveyOptions)
+    clock_sigma_s: float = CLOCK_SIGMA_S
 
 
 @dataclass(frozen=True)
@@ -110,7 +118,19 @@ def full_model(
         poses: One of :data:`v2hdm.adjust.MODELS`.
         variance_factor: How many times as large as stated the variances of corners are.
     """
-    pose_sigma = PoseSigma(
+    solver = SolveOptions(
+        loss=options.loss, loss_scale=options.loss_scale, coarse=False, device=options.device
+    )
+    solver = with_model(solver, MODELS[poses])
+    pose_sigma = pose_sigma_of(pose_noise)
+    return Model(
+        pose_sigma, options.model_floor_px, solver, variance_factor, options.known_sizes, options.survey
+    )
+
+
+def pose_sigma_of(pose_noise: PoseNoise) -> PoseSigma:
+    """How far a drive's recorded poses are off, the heave of its vehicle included."""
+    return PoseSigma(
         position_m=pose_noise.position_m,
         heading_rad=pose_noise.heading_rad,
         roll_pitch_rad=pose_noise.roll_pitch_rad,
@@ -118,13 +138,6 @@ def full_model(
         position_drift=Drift(pose_noise.position_drift_m, pose_noise.position_drift_over_m),
         heading_drift=Drift(pose_noise.heading_drift_rad, pose_noise.heading_drift_over_m),
         roll_pitch_drift=Drift(pose_noise.roll_pitch_drift_rad, pose_noise.roll_pitch_drift_over_m),
-    )
-    solver = SolveOptions(
-        loss=options.loss, loss_scale=options.loss_scale, coarse=False, device=options.device
-    )
-    solver = with_model(solver, MODELS[poses])
-    return Model(
-        pose_sigma, options.model_floor_px, solver, variance_factor, options.known_sizes, options.survey
     )
 
 
@@ -235,7 +248,7 @@ def _problem(
         centre_sigma_m=sigma,
         pose_sigma=model.pose_sigma,
         twist_vehicle=vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s)[used.frames],
-        clock_sigma_s=CLOCK_SIGMA_S,
+        clock_sigma_s=model.clock_sigma_s,
     )
 
 

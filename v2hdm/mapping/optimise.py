@@ -22,9 +22,17 @@ from v2hdm.geometry.ground import extrinsic_from_ipm
 from v2hdm.mapping.association.groups import Association, fuse_groups, same_groups
 from v2hdm.mapping.association.merge import merge_groups
 from v2hdm.mapping.association.tracks import Uncertainty, build_tracks
-from v2hdm.mapping.bundle import Bundle, coarse_model, full_model, solve_bundle
+from v2hdm.mapping.bundle import (
+    LEAST_OBSERVATIONS,
+    VARIANCE_FACTORS,
+    Bundle,
+    coarse_model,
+    full_model,
+    solve_bundle,
+)
 from v2hdm.mapping.corner_order import settle_corner_order
-from v2hdm.mapping.incremental import Grown, IncrementalMapper
+from v2hdm.mapping.grown import Grown
+from v2hdm.mapping.incremental import IncrementalMapper
 from v2hdm.mapping.markings.conclude import Evidence, Optimised, conclude
 from v2hdm.mapping.options import AUTO, MappingOptions
 from v2hdm.mapping.sightings.location import Located, locate
@@ -42,13 +50,8 @@ SETTLED_MODEL = "heave"
 STEEP_SINE = 0.15
 """Sine of a ray's depression from which the coarse stage uses it (unless most rays are flatter)."""
 
-
-_LEAST_OBSERVATIONS = 200
-"""Of fewer, the residuals cannot tell how large their variance is."""
-
-_VARIANCE_FACTORS = (0.05, 20.0)
-"""Between these a detector's own statement may be corrected."""
-
+LOOSE_CLOCK_SIGMA_S = 0.3
+"""How far clocks may be apart, s, once the drive has said that they are: half a period of a slow receiver."""
 
 class Optimiser:
     """Takes one set of cameras through association and solving."""
@@ -68,8 +71,14 @@ class Optimiser:
         self._options = options
         self._pose_model = SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
         self._variance_factor = 1.0
+        self.held_out: Mapping[str, float] = {}
         self.camera_names = sightings.cameras
         self.initial_rig = initial_rig(self._cameras, sightings.map_from_vehicle)
+
+    @property
+    def pose_model(self) -> str:
+        """What is estimated of the poses, of :data:`v2hdm.adjust.MODELS`."""
+        return self._pose_model
 
     def initial_tracks(self) -> Association:
         """Sightings linked from image to image under the initial IPMs."""
@@ -78,6 +87,10 @@ class Optimiser:
 
     def run(self, tracks: Association, progress: Callable[[str], None] | None = None) -> Optimised:
         """Optimise from ``tracks`` (see :meth:`initial_tracks`); ``progress`` gets each step's name."""
+        return self.finish(self.settle(tracks, progress), progress)
+
+    def settle(self, tracks: Association, progress: Callable[[str], None] | None = None) -> Bundle:
+        """Associate and solve by turns, until it is settled which sightings are of one marking."""
         tell = progress or _silent
         tell("coarse solve")
         bundle = self._solve_steep(tracks)
@@ -94,6 +107,11 @@ class Optimiser:
             tell("joint solve with settled corners")
             bundle = self._solve(settled, usable, bundle.rig)
             self._reweigh(bundle)
+        return bundle
+
+    def finish(self, bundle: Bundle, progress: Callable[[str], None] | None = None) -> Optimised:
+        """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude."""
+        tell = progress or _silent
         if self._options.pose_model == AUTO:
             tell("choice of the pose model")
             self._pose_model = self._choose_pose_model(bundle)
@@ -107,6 +125,16 @@ class Optimiser:
             self._options.acceptance,
         )
 
+    def clock_offsets_s(self, bundle: Bundle) -> dict[str, float]:
+        """Each camera's clock offset by a solve that expects none in particular, from ``bundle``."""
+        model = full_model(self._pose_noise, self._options, "clock", bundle.model.variance_factor)
+        model = replace(model, clock_sigma_s=LOOSE_CLOCK_SIGMA_S)
+        usable = self._locate(bundle.rig).valid
+        solved = solve_bundle(
+            self._sightings, bundle.association, usable, bundle.rig, self._cameras, model
+        ).solution
+        return {name: float(solved.clock_offset_s[c]) for name, c in bundle.camera_index.items()}
+
     def run_incrementally(self, progress: Callable[[str], None] | None = None) -> Grown:
         """Map one track after the other, as the vehicle would; ``progress`` is told how large the map is."""
 
@@ -119,6 +147,11 @@ class Optimiser:
             self._sightings, self.initial_rig, self._cameras, self._pose_noise, self._options, link
         )
         return mapper.run(self._views, progress or _silent)
+
+    def joint_solve(self, grown: Grown) -> Bundle:
+        """All that an incremental map was grown from, solved together: the evidence to judge it by."""
+        self._variance_factor = grown.variance_factor
+        return self._solve(grown.association, grown.usable, grown.rig)
 
     def solve_groups(self, optimised: Optimised, groups: IntArray) -> Bundle:
         """Solve with only some ``groups`` of a finished optimisation, from the initial extrinsics."""
@@ -186,9 +219,9 @@ class Optimiser:
         How well the poses are known is on the receiver's data sheet; how well corners are found in this
         light, on this paint, under what is left of the lens's distortion, only the drive itself can tell.
         """
-        if len(bundle.row) >= _LEAST_OBSERVATIONS:
+        if len(bundle.row) >= LEAST_OBSERVATIONS:
             factor = self._variance_factor * bundle.solution.observation_factor
-            self._variance_factor = float(np.clip(factor, *_VARIANCE_FACTORS))
+            self._variance_factor = float(np.clip(factor, *VARIANCE_FACTORS))
 
     def _choose_pose_model(self, bundle: Bundle) -> str:
         """The name of the model that predicts held-out observations best, from where ``bundle`` ended."""
@@ -199,6 +232,7 @@ class Optimiser:
             _log.warning("the pose model stays %r, since none could be chosen: %s", SETTLED_MODEL, failure)
             return SETTLED_MODEL
         _log.info("%s: %s", ", ".join(self.camera_names), selection.sentence)
+        self.held_out = selection.scores
         return selection.name
 
     def _gate(self, bundle: Bundle) -> tuple[BoolArray, BoolArray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -74,13 +75,24 @@ def evaluate(
 
 def _own_figures(result: MethodResult) -> dict[str, Any]:
     """What a method says of itself, without truth."""
-    figures: dict[str, Any] = {"excluded": len(result.excluded)}
+    reasons = Counter(exclusion.reason for exclusion in result.excluded)
+    figures: dict[str, Any] = {
+        "excluded": len(result.excluded),
+        "excluded_for": dict(reasons.most_common()),
+        "median_sigma_m": _median_sigma_m(result.hd_map),
+    }
     if result.reprojection_rmse_px is not None:
         figures["reprojection_rmse_px"] = result.reprojection_rmse_px
         figures["initial_reprojection_rmse_px"] = result.initial_reprojection_rmse_px
     if result.diagnostics:
         figures["diagnostics"] = dict(result.diagnostics)
     return figures
+
+
+def _median_sigma_m(hd_map: HdMap) -> float:
+    """Median over the markings of the standard deviation of a corner's coordinate, nan where unknown."""
+    variance = [np.trace(m.covariance_m2) / 8 for m in hd_map.markings if m.covariance_m2 is not None]
+    return float(np.sqrt(np.median(variance))) if variance else float("nan")
 
 
 def _naive_under_true_extrinsic(
@@ -131,6 +143,10 @@ def _extrinsics(drive: Drive, methods: CameraSets, truth: Truth | None) -> dict[
                 truth.cam_from_vehicle[name] if truth else None,
             )
             found["certainty"] = optimised.certainty.get(name, "")
+            clock = optimised.clocks.get(name)
+            if clock is not None:
+                found["clock_offset_s"] = clock.value_s
+                found["clock_sigma_s"] = clock.sigma_s if np.isfinite(clock.sigma_s) else None
             if calibration.covariance is not None:
                 sigma = np.sqrt(np.diag(calibration.covariance))
                 found["translation_sigma_m"] = float(np.linalg.norm(sigma[:3]))

@@ -22,13 +22,16 @@ from v2hdm.detection.batch import detect_all
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.drive import ReadOptions, drive_name, read_drive
-from v2hdm.errors import ConfigError
+from v2hdm.errors import ConfigError, MappingError
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.pipeline.evaluate import CameraSets, evaluate
+from v2hdm.pipeline.inspect import Inspection, inspect
 from v2hdm.pipeline.write import write_results
+from v2hdm.quality import Finding, Status, Verdict
+from v2hdm.quality.after import check_result
 from v2hdm.records import Drive, ImageDetections
-from v2hdm.report.outputs import result_folder
+from v2hdm.report.outputs import result_folder, write_json
 from v2hdm.simulate import PortConfig, rendered_drive
 
 log = logging.getLogger(__name__)
@@ -74,6 +77,7 @@ class RunConfig:
         cache: folder that keeps rendered drives.
         workers: processes for rendering and detection; 0 takes one per core.
         device: what ``conf/map.yaml`` hands on as ``mapping.device``, ``cpu`` or ``cuda``.
+        all_maps: whether the map of every method and camera set is written, into ``maps/``.
         mode: what it hands on as ``mapping.mode``, ``batch`` or ``incremental``.
     """
 
@@ -87,15 +91,17 @@ class RunConfig:
     workers: int = 0
     device: str = "cpu"
     mode: str = "batch"
+    all_maps: bool = False
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run leaves behind: its folder, ``metrics.json``'s content, and sentences for a reader."""
+    """The folder of a run, ``metrics.json``'s content, sentences for a reader, and the verdict."""
 
     folder: Path
     metrics: Mapping[str, Any]
     headlines: Sequence[str]
+    verdict: Verdict
 
 
 def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -> RunResult:
@@ -120,15 +126,54 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
         drive_folder = _drive_folder(config, seconds, progress)
         drive = read_drive(drive_folder, config.drive)
         log.info("drive %s: %d images of cameras %s", drive.name, len(drive.images), ", ".join(drive.cameras))
-        with _timed(seconds, "detect"):
-            detections = _detect(config, drive, progress)
-        with _timed(seconds, "map"):
-            methods = _map_camera_sets(config, drive, detections, progress)
-        with _timed(seconds, "evaluate"):
-            judgement = evaluate(drive, detections, methods, config.mapping, partial(progress, "evaluate"))
-        metrics = {"name": name, "version": __version__, **judgement.metrics, "seconds": seconds}
-        write_results(folder, drive, detections, list(methods.values())[-1], judgement, metrics)
-    return RunResult(Path(config.output) / name, metrics, judgement.headlines)
+        with _timed(seconds, "check"):
+            inspection = inspect(drive, config.drive.max_gap_s, _workers(config), partial(progress, "check"))
+        about = {"name": name, "version": __version__}
+        try:
+            result = _map_and_judge(config, inspection, folder, about, seconds, progress)
+        except MappingError as failure:
+            if not inspection.has_failed:
+                raise
+            result = _without_map(config, inspection, failure, folder, about)
+        for line in result.verdict.lines:
+            log.info("%s", line)
+    return result
+
+
+def _map_and_judge(
+    config: RunConfig,
+    inspection: Inspection,
+    folder: Path,
+    about: Mapping[str, Any],
+    seconds: dict[str, float],
+    progress: Progress,
+) -> RunResult:
+    """Detect, map, check and write."""
+    drive = inspection.drive
+    with _timed(seconds, "detect"):
+        detections = _detect(config, drive, progress)
+    with _timed(seconds, "map"):
+        methods = _map_camera_sets(config, drive, detections, progress)
+    with _timed(seconds, "judge"):
+        found = check_result(drive, methods, inspection.ground)
+        verdict = Verdict.of([*inspection.findings, *found])
+    with _timed(seconds, "evaluate"):
+        described = inspection.drive_as_described
+        judgement = evaluate(described, detections, methods, config.mapping, partial(progress, "evaluate"))
+    metrics = {**about, "verdict": verdict.as_json(), **judgement.metrics, "seconds": seconds}
+    write_results(folder, described, detections, methods, judgement, metrics, verdict, config.all_maps)
+    return RunResult(Path(config.output) / about["name"], metrics, judgement.headlines, verdict)
+
+
+def _without_map(
+    config: RunConfig, inspection: Inspection, failure: MappingError, folder: Path, about: Mapping[str, Any]
+) -> RunResult:
+    """The result of a run whose checks failed and of which no map came."""
+    failed = Finding("map", Status.FAIL, None, None, "", f"no map came of this drive: {failure}", "map")
+    verdict = Verdict.of([*inspection.findings, failed])
+    metrics = {**about, "verdict": verdict.as_json(), "results": {}}
+    write_json(folder / "metrics.json", metrics)
+    return RunResult(Path(config.output) / about["name"], metrics, (), verdict)
 
 
 def camera_sets(drive: Drive) -> dict[str, tuple[str, ...]]:

@@ -29,7 +29,7 @@ class Finding:
         check: name of the check, stable from version to version, such as ``clock``.
         status: PASS within the limit. WARN where the result still holds, or was corrected. FAIL where the
             result is wrong or cannot be relied on.
-        value: what was measured, in ``unit``; None where the check could not measure.
+        value: what was measured, in ``unit``; None where this drive cannot tell.
         limit: the largest ``value`` that passes, in ``unit``; None where there is none.
         unit: of ``value`` and ``limit``, such as ``ms``; empty for a ratio or a count.
         says: one sentence that names the cause and the remedy.
@@ -57,9 +57,15 @@ class Finding:
         }
 
     @property
+    def is_untold(self) -> bool:
+        """Whether this drive cannot tell: nothing speaks against it, and nothing for it."""
+        return self.status is Status.PASS and self.value is None
+
+    @property
     def line(self) -> str:
         """The finding as one line for the terminal and the log."""
-        return f"{self.status.value} {self.check} ({self.about}): {self.says}"
+        outcome = "cannot tell" if self.is_untold else self.status.value
+        return f"{outcome} {self.check} ({self.about}): {self.says}"
 
 
 @dataclass(frozen=True)
@@ -83,18 +89,28 @@ class Verdict:
         """The findings that did not pass, the worst first."""
         return tuple(finding for finding in self.findings if finding.status is not Status.PASS)
 
+    @property
+    def untold(self) -> tuple[Finding, ...]:
+        """The checks that this drive gives no answer to."""
+        return tuple(finding for finding in self.findings if finding.is_untold)
+
+    @property
+    def passed(self) -> tuple[Finding, ...]:
+        """The checks that were answered, within their limits."""
+        return tuple(f for f in self.findings if f.status is Status.PASS and not f.is_untold)
+
     def as_json(self) -> dict[str, Any]:
-        """The verdict as an object of ``metrics.json``: what was raised, and what was checked and passed."""
-        passed = [finding.as_json() for finding in self.findings if finding.status is Status.PASS]
+        """The verdict as an object of ``metrics.json``: raised, untold and passed checks apart."""
         return {
             "status": self.status.value,
             "findings": [finding.as_json() for finding in self.raised],
-            "passed": passed,
+            "untold": [finding.as_json() for finding in self.untold],
+            "passed": [finding.as_json() for finding in self.passed],
         }
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """The verdict and what was raised, one line each, for a terminal."""
-        count = len(self.raised)
-        summary = {0: f"{len(self.findings)} checks passed", 1: "1 finding"}.get(count, f"{count} findings")
-        return (f"verdict: {self.status.value}, {summary}", *(finding.line for finding in self.raised))
+        """The verdict, what was raised and what this drive cannot tell, one line each, for a terminal."""
+        raised = {0: "nothing raised", 1: "1 finding"}.get(len(self.raised), f"{len(self.raised)} findings")
+        summary = f"verdict: {self.status.value} ({raised}, {len(self.passed)} checks passed)"
+        return (summary, *(finding.line for finding in (*self.raised, *self.untold)))

@@ -14,6 +14,9 @@ from v2hdm.report.dashes import dash_spacing
 from v2hdm.report.lane_metrics import lane_metrics
 from v2hdm.report.metrics import extrinsic_metrics, marking_metrics
 
+_MAIN_REASONS = 3
+"""Reasons of exclusion that a headline names."""
+
 
 def map_figures(hd_map: HdMap, truth: Truth | None, expected: BoolArray | None) -> dict[str, Any]:
     """Figures of one map: against the truth where there is one, counts and dash spacing always.
@@ -62,12 +65,24 @@ def headline(cameras: str, results: Mapping[str, Mapping[str, Any]]) -> str:
     best = results.get("Opt", {})
     start = next((results[m] for m in ("ENI", "CNI") if m in results), {})
     if "corner_rmse_m" not in best or "corner_rmse_m" not in start:
-        lanes = best.get("lanes", {}).get("lanes", 0)
-        return f"{cameras}: {best.get('markings', 0)} markings, {lanes} lane lines"
+        return f"{cameras}: {_own_words(best)}"
     return (
         f"{cameras}: corners {100 * start['corner_rmse_m']:.1f} cm off before, "
         f"{100 * best['corner_rmse_m']:.1f} cm after the optimisation"
     )
+
+
+def _own_words(figures: Mapping[str, Any]) -> str:
+    """The size of a map, its accuracy, and the main reasons why candidates are not in it."""
+    words = f"{figures.get('markings', 0)} markings"
+    if np.isfinite(figures.get("median_sigma_m", np.nan)):
+        words += f" (sigma of a corner {100 * figures['median_sigma_m']:.1f} cm)"
+    words += f", {figures.get('lanes', {}).get('lanes', 0)} lane lines"
+    reasons = list(figures.get("excluded_for", {}).items())[:_MAIN_REASONS]
+    if reasons:
+        told = ", ".join(f"{count} {reason}" for reason, count in reasons)
+        words += f"; {figures['excluded']} candidates left out, most often: {told}"
+    return words
 
 
 def _lane_figures(hd_map: HdMap, truth: Truth | None) -> dict[str, Any]:

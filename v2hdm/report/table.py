@@ -15,6 +15,10 @@ METHODS: Mapping[str, str] = {
 """The methods of the paper (IROS 2023), in the order of its tables."""
 
 
+_AGAINST_TRUTH = ("recall", "false", "corner RMSE (cm)", "bias (cm)")
+_WITHOUT_TRUTH = ("sigma (cm)", "reprojection (px)")
+
+
 def results_table(title: str, results: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Table:
     """Method x camera set: markings, recall and corner errors, from ``metrics.json``'s ``results``."""
     has_truth = any("recall" in row for rows in results.values() for row in rows.values())
@@ -22,7 +26,7 @@ def results_table(title: str, results: Mapping[str, Mapping[str, Mapping[str, fl
     table.add_column("method")
     for heading in ("cameras", "markings"):
         table.add_column(heading, justify="right" if heading == "markings" else "left")
-    headings = ("recall", "false", "corner RMSE (cm)", "bias (cm)") if has_truth else ("reprojection (px)",)
+    headings = _AGAINST_TRUTH if has_truth else _WITHOUT_TRUTH
     for heading in headings:
         table.add_column(heading, justify="right")
     methods = sorted({m for rows in results.values() for m in rows}, key=lambda m: (_order(m), m))
@@ -40,7 +44,11 @@ def _order(method: str) -> int:
 
 def _cells(row: Mapping[str, float], has_truth: bool) -> list[str]:
     if not has_truth:
-        return [str(row["markings"]), _number(row.get("reprojection_rmse_px"), 2)]
+        return [
+            str(row["markings"]),
+            _number(_times_100(row.get("median_sigma_m")), 1),
+            _number(row.get("reprojection_rmse_px"), 2),
+        ]
     return [
         str(row["markings"]),
         _number(row.get("recall"), 3),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.detection.camera.ground import apply_homography, ipm_from_extrinsic
+from v2hdm.detection.camera.ground import apply_homography, extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.errors import MapFileError
 from v2hdm.records import DISTORTION_COEFFICIENTS, Calibration, Camera, CameraInfo, FloatArray
 
@@ -49,6 +49,20 @@ def rough_calibration(
     cam_from_vehicle[:3, :3] = [[0, -1, 0], [-s, 0, -c], [c, 0, -s]]
     cam_from_vehicle[:3, 3] = -cam_from_vehicle[:3, :3] @ [0, 0, height_m]
     return Calibration(CameraInfo(name, width, height, intrinsic), cam_from_vehicle)
+
+
+def guessed_extrinsic(camera: Camera) -> FloatArray:
+    """The ``cam_from_vehicle`` (4 x 4) nearest to the initial IPM, its centre above the ground.
+
+    A homography has two solutions, one of them below the ground: a region of interest behind the camera would
+    settle on that one.
+    """
+    guess = extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm], camera.roi_vehicle.mean(axis=0))
+    if (guess[:3, :3].T @ guess[:3, 3])[2] < 0:
+        return guess
+    guess[:3] *= -1
+    guess[:3, 2] *= -1
+    return guess
 
 
 def _seen_ground(calibration: Calibration) -> FloatArray:

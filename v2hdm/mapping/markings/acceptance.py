@@ -24,6 +24,8 @@ LACKS_A_CORNER = "a corner was never seen twice"
 ODD_SHAPE = "not shaped like the others of its class"
 """Reasons that the shape of the class may mend."""
 
+TOO_UNCERTAIN = "its position is too uncertain"
+
 PART_OF_SYMBOL = "part of an arrow or a chevron"
 
 MIN_EASY_VIEWS = 5
@@ -89,7 +91,7 @@ def judge(candidates: Candidates, options: AcceptanceOptions) -> list[str | None
         "its sightings contradict each other",
     )
     _refuse(verdict, ~is_convex(candidates.corners_map), "not a convex quadrilateral")
-    _refuse(verdict, _uncertain(candidates, options), "its position is too uncertain")
+    _refuse(verdict, is_uncertain(candidates, options), TOO_UNCERTAIN)
     _refuse(verdict, _symbols_of_any_shape(candidates), PART_OF_SYMBOL)
     typical, odd = _judge_shapes(candidates, verdict, options)
     _refuse(verdict, odd, ODD_SHAPE)
@@ -148,7 +150,7 @@ def _seldom_detected(
     return seldom
 
 
-def _uncertain(candidates: Candidates, options: AcceptanceOptions) -> BoolArray:
+def is_uncertain(candidates: Candidates, options: AcceptanceOptions) -> BoolArray:
     """Groups less certain than the best by more than is allowed.
 
     What even the best one has is shared by all: a shift of the whole map, which a straight drive

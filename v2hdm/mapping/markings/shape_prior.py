@@ -13,6 +13,7 @@ holds where nothing else is known.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +22,7 @@ from scipy.stats import chi2
 
 from v2hdm.mapping.markings.acceptance import characteristic_lengths
 from v2hdm.mapping.markings.completion import SolvedCorners
+from v2hdm.mapping.markings.paint_error import PaintError, learn_paint_error
 from v2hdm.records import FloatArray
 
 IntArray = NDArray[np.int64]
@@ -82,10 +84,23 @@ def with_class_shapes(solved: SolvedCorners, kind: IntArray, accepted: IntArray)
     """
     corners, covariance = solved.corners_map.copy(), solved.covariance_m2.copy()
     shapes = class_shapes(solved, kind, accepted)
+    paint = _paint_error(solved, [(group, shapes.get(int(kind[group]))) for group in accepted])
     for group in accepted:
         shape = shapes.get(int(kind[group]))
-        corners[group], covariance[group] = fuse(corners[group], covariance[group], shape)
+        corners[group], covariance[group] = fuse(corners[group], covariance[group], shape, paint)
     return replace(solved, corners_map=corners, covariance_m2=covariance)
+
+
+def _paint_error(solved: SolvedCorners, members: Sequence[tuple[int, Shape | None]]) -> PaintError:
+    """What the markings' deviations from the shapes of their classes say about errors of the paint."""
+    updates = [
+        update
+        for group, shape in members
+        if shape is not None and not solved.completed[group]
+        for update in [_shaped(solved.corners_map[group], solved.covariance_m2[group], shape)]
+        if update.plausibility > _GATE_PROBABILITY
+    ]
+    return learn_paint_error([update.residual for update in updates], [update.formal for update in updates])
 
 
 def without_guessed_lengths(
@@ -161,16 +176,23 @@ def common_shape(corners: FloatArray, covariance: FloatArray) -> Shape | None:
     return Shape(shape, _spread_m(shape, corners[members], covariance[members]))
 
 
-def fuse(corners: FloatArray, covariance: FloatArray, shape: Shape | None) -> tuple[FloatArray, FloatArray]:
-    """Corners (4, 2) and covariance (8, 8) under what is known of the shape; as seen if nothing fits."""
+def fuse(
+    corners: FloatArray, covariance: FloatArray, shape: Shape | None, paint: PaintError
+) -> tuple[FloatArray, FloatArray]:
+    """Corners (4, 2) and covariance (8, 8) under what is known of the shape; as seen if nothing fits.
+
+    ``paint`` is the distribution of errors that all images share.
+    """
     update = _closed(corners, covariance) if shape is None else _shaped(corners, covariance, shape)
+    own_m2 = paint.variance_m2(update.residual, update.formal)
     if update.plausibility > _GATE_PROBABILITY:
-        return update.result
-    excess = max(update.distance2 / len(update.residual), 1.0)
-    doubts = [] if shape is None else _doubts(corners, covariance, shape)
+        return replace(update, covariance=covariance + own_m2 * np.eye(8)).result
+    doubts = [] if shape is None else _doubts(corners, covariance + paint.sigma_m**2 * np.eye(8), shape)
     best = max(doubts, key=lambda doubt: doubt.plausibility, default=update)
     # What contradicts itself for no reason that can be told is known as badly as it contradicts itself.
-    return best.result if best.plausibility > _AFTERTHOUGHT_PROBABILITY else (corners, excess * covariance)
+    if best.plausibility > _AFTERTHOUGHT_PROBABILITY:
+        return best.result
+    return corners, covariance + own_m2 * np.eye(8)
 
 
 @dataclass(frozen=True)
@@ -188,8 +210,13 @@ class _Update:
     left_open: int = 0
 
     @property
+    def formal(self) -> FloatArray:
+        """Covariance (m, m) of the residual by that of the corners alone."""
+        return np.asarray(self.jacobian @ self.covariance @ self.jacobian.T)
+
+    @property
     def _innovation(self) -> FloatArray:
-        return np.asarray(self.jacobian @ self.covariance @ self.jacobian.T + self.noise)
+        return np.asarray(self.formal + self.noise)
 
     @property
     def distance2(self) -> float:
@@ -205,7 +232,9 @@ class _Update:
     def result(self) -> tuple[FloatArray, FloatArray]:
         """Corners (4, 2) and covariance (8, 8) under the hypothesis (a Kalman update)."""
         gain = np.linalg.solve(self._innovation, self.jacobian @ self.covariance).T
-        covariance = self.covariance - gain @ self.jacobian @ self.covariance
+        # Joseph's form: a sum of squares, so that what is nearly known keeps its small variance.
+        left = np.eye(8) - gain @ self.jacobian
+        covariance = left @ self.covariance @ left.T + gain @ self.noise @ gain.T
         return (self.corners - gain @ self.residual).reshape(4, 2), (covariance + covariance.T) / 2
 
 

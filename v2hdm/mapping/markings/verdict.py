@@ -9,7 +9,14 @@ from numpy.typing import NDArray
 
 from v2hdm.errors import MappingError
 from v2hdm.mapping.association.groups import Association, fuse_groups, vague_corners
-from v2hdm.mapping.markings.acceptance import LACKS_A_CORNER, ODD_SHAPE, Candidates, judge
+from v2hdm.mapping.markings.acceptance import (
+    LACKS_A_CORNER,
+    ODD_SHAPE,
+    TOO_UNCERTAIN,
+    Candidates,
+    is_uncertain,
+    judge,
+)
 from v2hdm.mapping.markings.completion import SolvedCorners, without_misplaced_corners
 from v2hdm.mapping.markings.known_shape import with_known_shapes
 from v2hdm.mapping.markings.shape_prior import with_class_shapes, without_guessed_lengths
@@ -141,7 +148,19 @@ def judge_and_mend(solved: SolvedCorners, seen: Seen, options: AcceptanceOptions
         vague_map = vague_corners(seen.association, located)
         placed = with_known_shapes(now.solved, fused, vague_map, doubtful, kind, now.accepted)
         now = judged_as(without_guessed_lengths(now.solved, placed, fused.corners_map, kind, now.accepted))
-    return replace(now, solved=with_class_shapes(now.solved, kind, now.accepted))
+    return _certain_enough(
+        replace(now, solved=with_class_shapes(now.solved, kind, now.accepted)), seen, options
+    )
+
+
+def _certain_enough(judged: Judged, seen: Seen, options: AcceptanceOptions) -> Judged:
+    """Without the markings that deviate from their class by so much that their corners are not known."""
+    uncertain = is_uncertain(seen.candidates(judged.solved), options)
+    verdict = [
+        reason or (TOO_UNCERTAIN if vague else None)
+        for reason, vague in zip(judged.verdict, uncertain, strict=True)
+    ]
+    return replace(judged, verdict=verdict)
 
 
 def _pair_keys(pairs: IntArray) -> IntArray:

@@ -80,9 +80,9 @@ class Frames:
 
 
 def frames_of(drive: Drive) -> Frames:
-    """Number the distinct time stamps of ``drive``; images of one stamp share a frame."""
-    stamps_s = np.array([image.stamp_s for image in drive.images])
-    distinct_s, first, inverse = np.unique(stamps_s, return_index=True, return_inverse=True)
+    """Number the distinct times of ``drive``; images taken together share a frame."""
+    taken_s = np.array([image.taken_s for image in drive.images])
+    distinct_s, first, inverse = np.unique(taken_s, return_index=True, return_inverse=True)
     poses = np.stack([drive.images[i].map_from_vehicle for i in first])
     return Frames(
         frame_of_image=inverse.astype(np.int64),

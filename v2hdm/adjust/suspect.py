@@ -1,0 +1,375 @@
+r"""Which single wrong input would explain the residuals best: score tests at a solution.
+
+A fault is one number p more in the model, zero in what was solved: a clock offset, a focal length, a shift
+of a survey. At the optimum the gradient of all that was estimated vanishes, so with whitened residuals r
+and their derivatives J_p the fault's value and what it would take off the cost follow from one step,
+
+.. math:: p = -\frac{J_p' r}{s}, \quad s = J_p' J_p - \|N_{yp}\|^2, \quad \text{gain} = \frac{(J_p' r)^2}{s},
+
+where N_yp is the coupling of p to the whitened variables (:mod:`v2hdm.adjust.whitening`): everything else
+is estimated anew along with p (Rao's score test; Rao, Linear Statistical Inference and Its Applications,
+2nd ed., section 6e). The gain is chi-square with one degree of freedom where the model is right. A fault
+costs about as much as one evaluation of the gradient, and no solve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from v2hdm.adjust.arrays import Arrays
+from v2hdm.adjust.problem import Problem
+from v2hdm.adjust.residuals import (
+    Priors,
+    Tally,
+    by_unknowns,
+    centre_residual,
+    length_residual,
+    observe,
+)
+from v2hdm.adjust.solution import Solution
+from v2hdm.adjust.whitening import Whitening
+from v2hdm.geometry.transform import exp, inverse
+
+_STEP = 1e-3
+"""Step of central differences, in the unit of the fault (s or rad): millimetres of motion."""
+
+_LEAST_TOLD = 1e-9
+"""Share of a fault's own information, left by all else, below which rounding alone is left of it."""
+
+
+class Fault(Enum):
+    """What may be wrong, and the unit of its value."""
+
+    CLOCK = "clock"  # images were taken later than they say
+    FOCAL = "focal"  # share by which the focal length is longer than stated
+    DISTORTION = "distortion"  # first radial coefficient
+    PRINCIPAL = "principal"  # point of the image on the optical axis
+    SLOPE = "slope"  # of the ground, which the poses do not know of
+    SURVEY = "survey"  # of one camera's centre
+    LEVER = "lever"  # all centres alike: from the point that the poses are of
+    SIZE = "size"  # known lengths of one value
+    CONTROL = "control"  # one surveyed point
+    DATUM = "datum"  # all surveyed points alike
+
+    @property
+    def unit(self) -> str:
+        """Of the value and its sigma."""
+        return _UNITS[self]
+
+
+_UNITS = {
+    Fault.CLOCK: "s",
+    Fault.FOCAL: "",
+    Fault.DISTORTION: "",
+    Fault.PRINCIPAL: "px",
+    Fault.SLOPE: "rad",
+    Fault.SURVEY: "m",
+    Fault.LEVER: "m",
+    Fault.SIZE: "m",
+    Fault.CONTROL: "m",
+    Fault.DATUM: "m",
+}
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """One fault, as the residuals see it.
+
+    Attributes:
+        fault: what would be wrong.
+        camera: of which camera of the problem; -1 for all together.
+        axis: along which axis, 0 to 2: of the vehicle (survey, lever), of the map (slope, datum), of the
+            image (principal).
+        item: which of the problem's control points or known lengths; -1 for none or all.
+        value: by how much, true minus stated.
+        sigma: how well the drive tells, inf where it cannot.
+        gain: by how much twice the cost would fall: chi-square with one degree of freedom.
+    """
+
+    fault: Fault
+    camera: int
+    axis: int
+    item: int
+    value: float
+    sigma: float
+    gain: float
+
+    @property
+    def sigmas(self) -> float:
+        """The value in its standard deviations."""
+        return float(np.sqrt(self.gain))
+
+
+@dataclass(frozen=True)
+class _Column:
+    """J_p of one fault: how the whitened residuals change with it; None for blocks that do not.
+
+    ``observations`` (2, K), ``centre`` (C, 3), ``control`` (N, 2), ``length`` (M,).
+    """
+
+    observations: Tensor | None = None
+    centre: Tensor | None = None
+    control: Tensor | None = None
+    length: Tensor | None = None
+
+    def dot(self, other: _Column) -> float:
+        """The product with another column."""
+        pairs = (
+            (self.observations, other.observations),
+            (self.centre, other.centre),
+            (self.control, other.control),
+            (self.length, other.length),
+        )
+        return sum(float((a * b).sum()) for a, b in pairs if a is not None and b is not None)
+
+
+@dataclass(frozen=True)
+class _Hypothesis:
+    """One fault, and how to get its column."""
+
+    fault: Fault
+    column: Callable[[_Bench], _Column]
+    camera: int = -1
+    axis: int = 0
+    item: int = -1
+
+
+@dataclass(frozen=True)
+class _Bench:
+    """A solution made ready for tests: ``arrays`` hold the robust loss's weights, so least squares remain."""
+
+    whitening: Whitening
+    arrays: Arrays
+    residuals: _Column
+
+    @classmethod
+    def at(cls, whitening: Whitening) -> _Bench:
+        """The bench of a solution's Hessian."""
+        arrays, estimate = whitening.arrays, whitening.estimate
+        views = [observe(run, whitening.table, estimate.corners_map) for run in arrays.runs()]
+        root = torch.cat([whitening.weight(view) for view in views]).sqrt()
+        length, _ = length_residual(arrays, estimate.corners_map)
+        off = (estimate.corners_map - arrays.control) * arrays.control_information.sqrt()[:, None]
+        residuals = _Column(
+            torch.cat([view.residual for view in views], dim=1) * root,
+            centre_residual(arrays, estimate),
+            off,
+            length,
+        )
+        return cls(whitening, replace(arrays, root_information=arrays.root_information * root), residuals)
+
+    def residual(self, arrays: Arrays, table: Tensor) -> Tensor:
+        """Residuals (2, K) of the observations."""
+        corners_map = self.whitening.estimate.corners_map
+        return torch.cat([observe(run, table, corners_map).residual for run in arrays.runs()], dim=1)
+
+    def coupling(self, column: _Column) -> Tensor:
+        """N_yp: what the column has in common with all that is estimated, whitened."""
+        arrays, estimate, table = self.arrays, self.whitening.estimate, self.whitening.table
+        tally = Tally(arrays)
+        if column.observations is not None:
+            for run in arrays.runs():
+                view = observe(run, table, estimate.corners_map)
+                tally.pull(run, view, column.observations[:, run.observations])
+        by_corner = tally.by_corner
+        if column.control is not None:
+            by_corner = by_corner + column.control * arrays.control_information.sqrt()[:, None]
+        if column.length is not None:
+            _, by_first = length_residual(arrays, estimate.corners_map)
+            pull = by_first * column.length[:, None]
+            by_corner = by_corner.index_add(0, arrays.lengths.first, pull)
+            by_corner = by_corner.index_add(0, arrays.lengths.second, pull, alpha=-1)
+        nothing = torch.zeros_like(arrays.centre)
+        priors = Priors(
+            nothing if column.centre is None else column.centre,
+            torch.zeros_like(arrays.state_information_root),
+            arrays.no_clock(),
+        )
+        return self.whitening.whiten(by_unknowns(arrays, estimate, table, tally.by_table, by_corner, priors))
+
+
+def suspects(problem: Problem, solution: Solution) -> tuple[Suspect, ...]:
+    """Every fault that ``problem`` can have, each tested by itself at its ``solution``; largest gain first.
+
+    Where residuals are larger than the model says, sigmas are larger, and gains smaller, by as much.
+    """
+    bench = _Bench.at(solution.covariance.whitening)
+    found = [_test(hypothesis, bench) for hypothesis in _hypotheses(problem, bench.arrays)]
+    found += _control_points(problem, solution)
+    factor = max(1.0, solution.chi2_per_dof)
+    inflated = [replace(one, sigma=one.sigma * factor**0.5, gain=one.gain / factor) for one in found]
+    return tuple(sorted(inflated, key=lambda suspect: -suspect.gain))
+
+
+def _test(hypothesis: _Hypothesis, bench: _Bench) -> Suspect:
+    column = hypothesis.column(bench)
+    coupling, own = bench.coupling(column), column.dot(column)
+    left = own - float(coupling.square().sum())
+    # What the descent has left of the gradient counts where a fault is nearly what something else can be.
+    slope = column.dot(bench.residuals) - float(coupling @ bench.whitening.gradient)
+    told = own > 0 and left > _LEAST_TOLD * own
+    return Suspect(
+        hypothesis.fault,
+        hypothesis.camera,
+        hypothesis.axis,
+        hypothesis.item,
+        value=-slope / left if told else 0.0,
+        sigma=float(left**-0.5) if told else float("inf"),
+        gain=slope**2 / left if told else 0.0,
+    )
+
+
+def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
+    cameras = range(arrays.camera_count)
+    groups = [*([-1] if arrays.camera_count > 1 else []), *cameras]
+    for camera in groups:
+        if problem.twist_vehicle is not None:
+            yield _Hypothesis(Fault.CLOCK, _moving(_clock_motion(problem, camera)), camera)
+        yield _Hypothesis(Fault.FOCAL, _lens(camera, 0), camera)
+        yield _Hypothesis(Fault.DISTORTION, _lens(camera, 1), camera)
+        for axis in (0, 1):
+            yield _Hypothesis(Fault.PRINCIPAL, _principal(problem, camera, axis), camera, axis)
+    for axis in (0, 1):
+        yield _Hypothesis(Fault.SLOPE, _moving(_slope_motion(axis)), axis=axis)
+    if bool((arrays.centre_information_root > 0).any()):
+        for axis in range(3):
+            for camera in cameras:
+                yield _Hypothesis(Fault.SURVEY, _survey(camera, axis), camera, axis)
+            if arrays.camera_count > 1:
+                yield _Hypothesis(Fault.LEVER, _survey(-1, axis), -1, axis)
+    if bool((arrays.control_information > 0).any()):
+        for axis in (0, 1):
+            yield _Hypothesis(Fault.DATUM, _datum(axis), axis=axis)
+    for item, length_m in enumerate(torch.unique(arrays.lengths.length_m)):
+        yield _Hypothesis(Fault.SIZE, _size(arrays.lengths.length_m == length_m), item=item)
+
+
+def _control_points(problem: Problem, solution: Solution) -> Iterator[Suspect]:
+    """Each surveyed point against what everything else says of its corner.
+
+    What the adjustment leaves between a point and its corner has the covariance of the point less that of
+    the corner; the two axes are tested together, so the gain has two degrees of freedom.
+    """
+    control = problem.control
+    if control is None or not len(control.corner):
+        return
+    covariance = solution.corner_covariance(control.corner[:, None])
+    for m, (point, sigma_m) in enumerate(zip(control.points_map, control.sigma_m, strict=True)):
+        off = solution.corners_map[control.corner[m]] - point
+        expected = sigma_m**2 * np.eye(2) - covariance[m]
+        if np.linalg.eigvalsh(expected).min() <= _LEAST_TOLD * sigma_m**2:
+            continue
+        gain = float(off @ np.linalg.solve(expected, off))
+        # Without the point its corner would lie farther from it, by the share that it had of the information.
+        apart = float(np.linalg.norm(sigma_m**2 * np.linalg.solve(expected, off)))
+        yield Suspect(Fault.CONTROL, -1, -1, m, apart, apart / max(gain, 1e-12) ** 0.5, gain)
+
+
+def _lens(camera: int, power: int) -> Callable[[_Bench], _Column]:
+    """Points seen farther out by the share p, times the squared radius to the ``power``, than they are.
+
+    A focal length longer than stated by the share p, or a first radial coefficient larger by p.
+    """
+
+    def column(bench: _Bench) -> _Column:
+        arrays, corners_map = bench.arrays, bench.whitening.estimate.corners_map
+        parts = []
+        for run in arrays.runs():
+            mine = (run.pair // arrays.frame_count == camera) | (camera < 0)
+            view = observe(run, bench.whitening.table, corners_map)
+            # The projected points, not the measured ones: pixels, whose noise is stated, do not scale.
+            projected = run.measured + view.off
+            dx, dy = projected * projected.square().sum(0) ** power * mine
+            a, b, c = run.root_information
+            parts.append(torch.stack([a * dx, b * dx + c * dy]))
+        return _Column(torch.cat(parts, dim=1))
+
+    return column
+
+
+def _principal(problem: Problem, camera: int, axis: int) -> Callable[[_Bench], _Column]:
+    """A principal point that lies farther right, or down, by one pixel."""
+    focal_px = torch.as_tensor(problem.intrinsic[:, axis])
+
+    def column(bench: _Bench) -> _Column:
+        arrays = bench.arrays
+        seen_by = (arrays.pair // arrays.frame_count).long()
+        off = ((seen_by == camera) | (camera < 0)) / focal_px.to(seen_by.device)[seen_by]
+        a, b, c = arrays.root_information
+        return _Column(torch.stack([a * off, b * off] if axis == 0 else [torch.zeros_like(off), c * off]))
+
+    return column
+
+
+def _moving(motion: Callable[[Arrays], Tensor]) -> Callable[[_Bench], _Column]:
+    """The column of a motion of the vehicle (C, J, 6) in its own frame, by central differences."""
+
+    def column(bench: _Bench) -> _Column:
+        tangent = motion(bench.arrays) * _STEP
+        high, low = (bench.residual(bench.arrays, _moved(bench, sign * tangent)) for sign in (1.0, -1.0))
+        return _Column((high - low) / (2 * _STEP))
+
+    return column
+
+
+def _moved(bench: _Bench, tangent: Tensor) -> Tensor:
+    """The pairs' columns (9, P) where the vehicle is off each pose by ``tangent`` (C, J, 6)."""
+    cameras, frames = tangent.shape[:2]
+    columns = bench.whitening.table.view(3, 3, cameras, frames).permute(2, 3, 1, 0)
+    extrinsic = bench.whitening.estimate.cam_from_vehicle[:, None]
+    motion = extrinsic @ exp(-tangent) @ inverse(extrinsic)
+    turned = motion[..., :3, :3] @ columns
+    turned[..., 2] += motion[..., :3, 3]
+    out: Tensor = turned.permute(3, 2, 0, 1).reshape(9, -1)
+    return out
+
+
+def _clock_motion(problem: Problem, camera: int) -> Callable[[Arrays], Tensor]:
+    twist = torch.as_tensor(np.asarray(problem.twist_vehicle))
+
+    def motion(arrays: Arrays) -> Tensor:
+        out = arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6)
+        out[slice(None) if camera < 0 else camera] = twist.to(out.device)
+        return out
+
+    return motion
+
+
+def _slope_motion(axis: int) -> Callable[[Arrays], Tensor]:
+    """Ground that rises along an axis of the map, under poses that do not know of it."""
+
+    def motion(arrays: Arrays) -> Tensor:
+        turn = arrays.centre.new_tensor([0.0, -1.0, 0.0] if axis == 0 else [1.0, 0.0, 0.0])
+        out = arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6)
+        out[..., 3:] = arrays.vehicle_from_map[:, :3, :3] @ turn
+        return out
+
+    return motion
+
+
+def _survey(camera: int, axis: int) -> Callable[[_Bench], _Column]:
+    def column(bench: _Bench) -> _Column:
+        out, which = torch.zeros_like(bench.arrays.centre), slice(None) if camera < 0 else camera
+        out[which, axis] = -bench.arrays.centre_information_root[which, axis]
+        return _Column(centre=out)
+
+    return column
+
+
+def _datum(axis: int) -> Callable[[_Bench], _Column]:
+    def column(bench: _Bench) -> _Column:
+        out = torch.zeros_like(bench.arrays.control)
+        out[:, axis] = -bench.arrays.control_information.sqrt()
+        return _Column(control=out)
+
+    return column
+
+
+def _size(which: Tensor) -> Callable[[_Bench], _Column]:
+    return lambda bench: _Column(length=-bench.arrays.lengths.information_root * which)

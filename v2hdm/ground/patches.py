@@ -1,0 +1,221 @@
+"""Patches of ground that two images share: laid out from above, matched, and turned back into raw pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from v2hdm.ground.mount import Mount
+from v2hdm.ground.options import GroundOptions
+from v2hdm.planar import ground_in_vehicle, inside_convex
+from v2hdm.records import BoolArray, FloatArray
+
+_LEAST_CORRELATION = 0.5
+"""Normalised cross-correlation below which two patches are not the same ground."""
+
+_LEAST_ROUNDNESS = 0.1
+"""Ratio of a peak's curvatures; below it the patch holds one straight edge, which slides along itself."""
+
+_LEAST_LEAD = 0.1
+"""A second peak, elsewhere in the search, must stay so much below the best one."""
+
+_PEAK_CELLS = 3
+"""Half width of what belongs to a peak, in cells of the grid."""
+
+_COARSEST_M = 0.1
+"""Standard deviation of the blur that is taken away: highlights, shadows and wet sheens are wider, and stay
+with the light or the camera instead of the ground, m."""
+
+_LEAST_CONTRAST = 1.0
+"""Grey levels; less than this is the noise of an even surface."""
+
+_ALL = 0.9999
+"""Mean of flags that are all set, but for rounding."""
+
+_HOMOGRAPHY_PX = 2.0
+"""Matches of a pair lie on one plane to within this: off it are kerbs, shadows and what moves."""
+
+_LEAST_OF_A_PAIR = 8
+"""Twice the four that a homography takes."""
+
+
+@dataclass(frozen=True)
+class View:
+    """One image of a pair: ``grey`` (H, W), the camera and the vehicle's pose (4, 4)."""
+
+    grey: FloatArray
+    mount: Mount
+    map_from_vehicle: FloatArray
+
+    def pixels(self, ground_map: FloatArray) -> FloatArray:
+        """Raw pixels (N, 2) of ground points (N, 2) of the map, nan where the image does not show them."""
+        return self.mount.project_ground(ground_map, self.map_from_vehicle)
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Matches of one pair: raw pixels (N, 2) in both images, and how many patches were looked for."""
+
+    first_px: FloatArray
+    second_px: FloatArray
+    correlation: FloatArray
+    sought: int
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A rectangle of ground: ``corner_map`` (2,), unit ``axes`` (2, 2) as rows, and a grid of ``shape``."""
+
+    corner_map: FloatArray
+    axes: FloatArray
+    grid_m: float
+    shape: tuple[int, int]
+
+    def points(self) -> FloatArray:
+        """All grid points (rows * columns, 2) in the map."""
+        rows, columns = self.shape
+        ahead, left = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
+        return self.at(np.column_stack([ahead.ravel(), left.ravel()]))
+
+    def at(self, cells: FloatArray) -> FloatArray:
+        """Map points (N, 2) of grid places (N, 2): rows, columns."""
+        return np.asarray(self.corner_map + self.grid_m * np.asarray(cells, dtype=np.float64) @ self.axes)
+
+    def lay(self, view: View) -> tuple[FloatArray, BoolArray]:
+        """The ground as ``view`` shows it (rows, columns), float32, and where it does."""
+        px = view.pixels(self.points()).astype(np.float32).reshape(*self.shape, 2)
+        seen = ~np.isnan(px[..., 0])
+        px[~seen] = -1
+        grey = cv2.remap(view.grey, px[..., 0], px[..., 1], cv2.INTER_LINEAR).astype(np.float32)
+        return grey, seen
+
+    def texture(self, view: View) -> tuple[FloatArray, BoolArray]:
+        """The same without what is wider than the texture of the ground."""
+        grey, seen = self.lay(view)
+        return grey - cv2.GaussianBlur(grey, (0, 0), _COARSEST_M / self.grid_m), seen
+
+
+def patch_centres(
+    poses: tuple[FloatArray, FloatArray],
+    roi_vehicle: FloatArray,
+    path_map: FloatArray,
+    options: GroundOptions,
+) -> FloatArray:
+    """Centres (N, 2) in the map of patches within the region of both poses and beside the driven path.
+
+    They lie on a lattice that is aligned with the first pose.
+    """
+    pose = poses[0]
+    low, high = roi_vehicle.min(axis=0), roi_vehicle.max(axis=0)
+    ahead, left = np.meshgrid(*(np.arange(a, b, options.step_m) for a, b in zip(low, high, strict=True)))
+    vehicle = np.column_stack([ahead.ravel(), left.ravel(), np.zeros(ahead.size)])
+    centres = (vehicle @ pose[:3, :3].T + pose[:3, 3])[:, :2]
+    inside = np.ones(len(centres), dtype=np.bool_)
+    for each in poses:
+        inside &= inside_convex(roi_vehicle, ground_in_vehicle(each, centres))
+    centres = centres[inside]
+    if not len(centres):
+        return centres
+    # The path goes on straight beyond the drive's ends.
+    near = np.linalg.norm(centres[:, None] - path_map[None], axis=2).min(axis=1) <= options.strip_m
+    return np.asarray(centres[near])
+
+
+def match_pair(first: View, second: View, centres_map: FloatArray, search_m: float, options: GroundOptions) -> Matches:
+    """Find the patches around ``centres_map`` (N, 2) of the first image in the second, within ``search_m``."""
+    grid_m = options.grid_m
+    half = round(options.patch_m / 2 / grid_m)
+    reach = max(round(search_m / grid_m), _PEAK_CELLS)
+    sheet, cells = _sheet_around(centres_map, first.map_from_vehicle, half + reach + 1, grid_m)
+    first_grey, first_seen = sheet.texture(first)
+    second_grey, second_seen = sheet.texture(second)
+    wide = half + reach
+    row, column = cells.T
+    in_view = (_mean(first_seen, half) > _ALL)[row, column] & (_mean(second_seen, half) > _ALL)[row, column]
+    rough = (_mean(first_grey * first_grey, half) > _LEAST_CONTRAST**2)[row, column]
+    found = []
+    for number in np.flatnonzero(in_view & rough & (_mean(second_seen, wide) > _ALL)[row, column]).tolist():
+        row, column = cells[number]
+        own = np.s_[row - half : row + half + 1, column - half : column + half + 1]
+        area = np.s_[row - wide : row + wide + 1, column - wide : column + wide + 1]
+        peak = _peak(cv2.matchTemplate(second_grey[area], first_grey[own], cv2.TM_CCOEFF_NORMED))
+        if peak is not None:
+            found.append((number, *peak))
+    sought = int(in_view.sum())
+    if len(found) < _LEAST_OF_A_PAIR:
+        return _no_matches(sought)
+    table = np.array(found)
+    at = cells[table[:, 0].astype(np.int64)]
+    first_px = first.pixels(sheet.at(at))
+    second_px = second.pixels(sheet.at(at + table[:, 1:3] - reach))
+    return _on_one_plane(Matches(first_px, second_px, table[:, 3], sought))
+
+
+def _mean(values: FloatArray | BoolArray, half: int) -> FloatArray:
+    """Means over squares of ``2 half + 1`` cells around each."""
+    return np.asarray(cv2.blur(values.astype(np.float32), (2 * half + 1, 2 * half + 1)))
+
+
+def _no_matches(sought: int) -> Matches:
+    return Matches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0), sought)
+
+
+def _sheet_around(
+    centres_map: FloatArray, pose: FloatArray, margin: int, grid_m: float
+) -> tuple[Sheet, FloatArray]:
+    """A sheet that holds all centres with a ``margin`` of cells, and the centres' cells (N, 2) in it."""
+    axes = pose[:2, :2].T / np.linalg.norm(pose[:2, :2], axis=0)[:, None]
+    axes[1] = [-axes[0, 1], axes[0, 0]]
+    along = centres_map @ axes.T
+    low = along.min(axis=0)
+    cells = np.round((along - low) / grid_m).astype(np.int64) + margin
+    rows, columns = cells.max(axis=0) + margin + 1
+    return Sheet((low - margin * grid_m) @ axes, axes, grid_m, (int(rows), int(columns))), cells
+
+
+def _peak(score: FloatArray) -> tuple[float, float, float] | None:
+    """Row, column and height of the best place, refined by a paraboloid; None for no clear one."""
+    _, best, _, (column, row) = cv2.minMaxLoc(score)
+    rows, columns = score.shape
+    if best < _LEAST_CORRELATION or not (0 < row < rows - 1 and 0 < column < columns - 1):
+        return None
+    around = score[row - 1 : row + 2, column - 1 : column + 2].astype(np.float64)
+    slope = np.array([around[2, 1] - around[0, 1], around[1, 2] - around[1, 0]]) / 2
+    rr = around[2, 1] - 2 * around[1, 1] + around[0, 1]
+    cc = around[1, 2] - 2 * around[1, 1] + around[1, 0]
+    rc = (around[2, 2] - around[2, 0] - around[0, 2] + around[0, 0]) / 4
+    trace, spread = (rr + cc) / 2, np.hypot((rr - cc) / 2, rc)
+    if trace + spread >= 0 or trace + spread > _LEAST_ROUNDNESS * (trace - spread):
+        return None
+    determinant = rr * cc - rc * rc
+    down = -(cc * slope[0] - rc * slope[1]) / determinant
+    right = -(rr * slope[1] - rc * slope[0]) / determinant
+    if abs(down) > 1 or abs(right) > 1:
+        return None
+    rest = score.copy()
+    rest[
+        max(row - _PEAK_CELLS, 0) : row + _PEAK_CELLS + 1, max(column - _PEAK_CELLS, 0) : column + _PEAK_CELLS + 1
+    ] = -1
+    if rest.max() > best - _LEAST_LEAD:
+        return None
+    return row + float(down), column + float(right), float(best)
+
+
+def _on_one_plane(matches: Matches) -> Matches:
+    """Those that one homography of the two images explains: a plane seen twice."""
+    known = ~(np.isnan(matches.first_px) | np.isnan(matches.second_px)).any(axis=1)
+    first, second = matches.first_px[known], matches.second_px[known]
+    if len(first) < _LEAST_OF_A_PAIR:
+        return _no_matches(matches.sought)
+    _, inlier = cv2.findHomography(first, second, cv2.RANSAC, _HOMOGRAPHY_PX)
+    if inlier is None or inlier.sum() < _LEAST_OF_A_PAIR:
+        return _no_matches(matches.sought)
+    keep = inlier.ravel().astype(np.bool_)
+    return Matches(first[keep], second[keep], matches.correlation[known][keep], matches.sought)
+
+
+ReadGrey = Callable[[int], FloatArray]
+"""Reads the grey image of an index into ``Drive.images``."""

@@ -1,0 +1,113 @@
+"""How well observations fit a solved bundle, and its contradicted inputs in the user's words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from v2hdm.adjust import Fault, Suspect
+from v2hdm.mapping.bundle import Bundle
+from v2hdm.mapping.evidence import CELLS, WINDOW_OBSERVATIONS, CameraFit, Contradiction
+from v2hdm.records import FloatArray
+
+MEDIAN_SQUARED = 2 * float(np.log(2))
+"""Median of a squared residual in sigmas: chi-square with two degrees of freedom."""
+
+CELL_OBSERVATIONS = 40
+"""Observations of a cell from which its median residual counts."""
+
+
+def contradictions(bundle: Bundle, found: Sequence[Suspect]) -> tuple[Contradiction, ...]:
+    """``found`` in the bundle's problem, in the words of the user's inputs."""
+    names = tuple(bundle.camera_index)
+    return tuple(
+        Contradiction(
+            one.fault,
+            names if one.camera < 0 else (names[one.camera],),
+            one.axis,
+            _about(bundle, one),
+            one.value,
+            one.sigma,
+            one.sigmas,
+        )
+        for one in found
+    )
+
+
+def sizes_of(bundle: Bundle, length_m: float) -> list[str]:
+    """The classes that have a side or diagonal stated as ``length_m``."""
+    stated = bundle.model.sizes.by_class_m
+    return [name for name, size in stated.items() if any(abs(one - length_m) < 1e-9 for one in size)]
+
+
+def length_of(bundle: Bundle, item: int) -> float:
+    """The known length, m, that a suspect's ``item`` is."""
+    lengths = bundle.problem.lengths
+    return float(np.unique(lengths.length_m)[item]) if lengths is not None else float("nan")
+
+
+def point_of(bundle: Bundle, item: int) -> FloatArray:
+    """The surveyed point (2,) that a suspect's ``item`` is."""
+    control = bundle.problem.control
+    return control.points_map[item] if control is not None else np.full(2, np.nan)
+
+
+def camera_fits(bundle: Bundle) -> dict[str, CameraFit]:
+    """How well each camera's observations fit ``bundle``, a solve before anything was left out."""
+    seen, solution = bundle.problem.observations, bundle.solution
+    fits = {}
+    for name, c in bundle.camera_index.items():
+        own = seen.camera == c
+        fits[name] = CameraFit(
+            observations=int(own.sum()),
+            variance_factor=_factor(bundle, solution.mahalanobis2[own]),
+            rejected_share=float(1 - bundle.inliers[own].mean()),
+            bias_px=_cell_bias(
+                seen.pinhole_px[own & bundle.inliers], solution.residual_px[own & bundle.inliers]
+            ),
+        )
+    return fits
+
+
+def along_route(bundle: Bundle, stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Variance factors (W,) of windows along the route and when they begin, given the observations' times."""
+    order = np.argsort(stamp_s, kind="stable")
+    count = max(len(order) // WINDOW_OBSERVATIONS, 1)
+    windows = np.array_split(order, count)
+    factors = [_factor(bundle, bundle.solution.mahalanobis2[window]) for window in windows]
+    return np.array(factors), np.array([stamp_s[window[0]] for window in windows])
+
+
+def overall_factor(bundle: Bundle) -> float:
+    """How many times as large as stated by the detector the variances of all observations are."""
+    return _factor(bundle, bundle.solution.mahalanobis2)
+
+
+def _factor(bundle: Bundle, mahalanobis2: FloatArray) -> float:
+    return bundle.model.variance_factor * float(np.median(mahalanobis2)) / MEDIAN_SQUARED
+
+
+def _cell_bias(places_px: FloatArray, residual_px: FloatArray) -> float:
+    """Longest median residual of the cells that the places (K, 2) span."""
+    if not len(places_px):
+        return 0.0
+    rows, columns = CELLS
+    low, span = places_px.min(axis=0), np.maximum(np.ptp(places_px, axis=0), 1.0)
+    share = (places_px - low) / span * (1 - 1e-9)
+    cell = (share[:, 1] * rows).astype(np.int64) * columns + (share[:, 0] * columns).astype(np.int64)
+    biases = [
+        float(np.linalg.norm(np.median(residual_px[cell == number], axis=0)))
+        for number in np.flatnonzero(np.bincount(cell) >= CELL_OBSERVATIONS)
+    ]
+    return max(biases, default=0.0)
+
+
+def _about(bundle: Bundle, suspect: Suspect) -> str:
+    if suspect.fault is Fault.SIZE:
+        length_m = length_of(bundle, suspect.item)
+        return f"{', '.join(sizes_of(bundle, length_m))} {length_m:.2f} m"
+    if suspect.fault is Fault.CONTROL:
+        x, y = point_of(bundle, suspect.item)
+        return f"({x:.2f}, {y:.2f})"
+    return ""

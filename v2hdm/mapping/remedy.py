@@ -1,0 +1,256 @@
+"""Optimise, and where the drive contradicts an input that it can do without, drop that and optimise again.
+
+A survey, a known size or a clock is held against what everything else says before the result is solved. What
+is contradicted is dropped (clocks: put right) and told, never obeyed in silence; what the drive cannot do
+without, such as the focal length, stays and is told.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from v2hdm.adjust import Fault, Suspect, pose_pulls, suspects
+from v2hdm.drive.clock import with_clock_offsets
+from v2hdm.mapping.bundle import Bundle
+from v2hdm.mapping.evidence import Contradiction, SolveEvidence
+from v2hdm.mapping.fit import (
+    along_route,
+    camera_fits,
+    contradictions,
+    length_of,
+    overall_factor,
+    point_of,
+    sizes_of,
+)
+from v2hdm.mapping.markings.conclude import Optimised
+from v2hdm.mapping.optimise import Optimiser
+from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.sightings.backprojection import camera_centres
+from v2hdm.mapping.sightings.table import Sightings, collect_sightings
+from v2hdm.mapping.sightings.views import views_of
+from v2hdm.records import Drive, ImageDetections
+
+_log = logging.getLogger(__name__)
+
+CONTRADICTED_SIGMAS = 5.0
+"""From so many sigmas an input is contradicted: clean drives stay below 3 (docs/verdict.md), and one in two
+million would exceed it by chance."""
+
+LEAST_VALUE: Mapping[Fault, float] = {
+    Fault.CLOCK: 0.005,
+    Fault.FOCAL: 0.003,
+    Fault.DISTORTION: 0.002,
+    Fault.PRINCIPAL: 5.0,
+    Fault.SLOPE: 0.002,
+    Fault.SURVEY: 0.03,
+    Fault.LEVER: 0.03,
+    Fault.SIZE: 0.01,
+    Fault.CONTROL: 0.02,
+    Fault.DATUM: 0.02,
+}
+"""Below this, in the fault's unit, an input is as good as a drive needs it, however sure the drive is."""
+
+LOOSE_CENTRE_SIGMA_M = 10.0
+"""Sigma of a surveyed axis that was contradicted: it no longer says where on the vehicle the camera is."""
+
+AMBIGUOUS_SHARE = 0.8
+"""Share of its sigmas from which a fault of one camera may be the other's: a straight road at constant
+speed tells the distance of two centres, or the difference of two clocks, alone."""
+
+CLOCK_TOLD_S = 0.004
+"""Sigma of a clock offset, s, up to which it is put right: two of them are 8 ms."""
+
+MOST_CORRECTIONS = 4
+"""Inputs that may be dropped one after the other; with more wrong than that nothing can be relied on."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a camera set is mapped from, after corrections."""
+
+    drive: Drive
+    detections: Sequence[ImageDetections]
+    options: MappingOptions
+    sightings: Sightings
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What was optimised from which inputs, and the evidence for the checks."""
+
+    inputs: Inputs
+    optimiser: Optimiser
+    optimised: Optimised
+    evidence: SolveEvidence
+
+
+def optimise(
+    drive: Drive,
+    detections: Sequence[ImageDetections],
+    cameras: Sequence[str],
+    options: MappingOptions,
+    tell: Callable[[str], None],
+) -> Outcome:
+    """Optimise a drive, as often as inputs have to be dropped.
+
+    Raises:
+        MappingError: There is nothing to map.
+    """
+    corrected: list[Contradiction] = []
+    while True:
+        sightings = collect_sightings(drive, detections, cameras)
+        optimiser = Optimiser(sightings, views_of(drive, cameras), drive.cameras, drive.pose_noise, options)
+        settled = optimiser.settle(optimiser.initial_tracks(), tell)
+        tell("tests of the inputs")
+        found = [
+            one for one in suspects(settled.problem, settled.solution) if _is_stated(one, settled, drive)
+        ]
+        worst = next((one for one in found if is_contradicted(one.fault, one.value, one.sigmas)), None)
+        inputs = Inputs(drive, detections, options, sightings)
+        remedied = None
+        if worst is not None and len(corrected) < MOST_CORRECTIONS and not _is_ambiguous(worst, found):
+            remedied = _remedied(inputs, worst, settled, optimiser)
+        if worst is None or remedied is None:
+            break
+        told = contradictions(settled, (worst,))[0]
+        _log.warning("%s: the drive contradicts %s by %.0f sigma", ", ".join(cameras), told, told.sigmas)
+        corrected.append(told)
+        drive, detections, options = remedied.drive, remedied.detections, remedied.options
+    optimised = optimiser.finish(settled, tell)
+    corrected = [_as_solved(one, settled) for one in corrected]
+    evidence = _evidence(settled, contradictions(settled, found), corrected, optimiser, optimised, sightings)
+    return Outcome(inputs, optimiser, optimised, evidence)
+
+
+def _is_stated(one: Suspect, bundle: Bundle, drive: Drive) -> bool:
+    """Whether what is suspected was stated at all: a centre may be unsurveyed, and is then a guess."""
+    if one.fault not in (Fault.SURVEY, Fault.LEVER):
+        return True
+    names = list(bundle.camera_index)
+    own = names if one.camera < 0 else [names[one.camera]]
+    return all(drive.cameras[name].centre_prior is not None for name in own)
+
+
+def _as_solved(one: Contradiction, bundle: Bundle) -> Contradiction:
+    """A survey that was dropped, off by what the solve without it says; others as they are."""
+    if one.fault not in (Fault.SURVEY, Fault.LEVER) or bundle.problem.centre_vehicle is None:
+        return one
+    rows = [bundle.camera_index[name] for name in one.cameras if name in bundle.camera_index]
+    off = camera_centres(bundle.solution.cam_from_vehicle)[rows] - bundle.problem.centre_vehicle[rows]
+    return replace(one, value=float(off[:, one.axis].mean()))
+
+
+def _evidence(
+    settled: Bundle,
+    found: tuple[Contradiction, ...],
+    corrected: Sequence[Contradiction],
+    optimiser: Optimiser,
+    optimised: Optimised,
+    sightings: Sightings,
+) -> SolveEvidence:
+    factors, window_s = along_route(settled, sightings.stamp_s[sightings.frame[settled.row]])
+    pulls = pose_pulls(settled.solution)
+    largest = np.abs(pulls.pulls).max(axis=1, initial=0.0)
+    frames_s = np.unique(sightings.stamp_s[sightings.frame[settled.row]])
+    return SolveEvidence(
+        suspects=found,
+        corrected=tuple(corrected),
+        pose_model=optimiser.pose_model,
+        held_out=optimiser.held_out,
+        fits=camera_fits(settled),
+        variance_factor=overall_factor(settled),
+        along_route=factors,
+        window_s=window_s,
+        pose_pulls=pulls.rms(),
+        worst_pull=float(largest.max()),
+        worst_pull_s=float(frames_s[int(largest.argmax())]),
+        clock_s=_clocks(optimised),
+    )
+
+
+def _is_ambiguous(worst: Suspect, found: Sequence[Suspect]) -> bool:
+    """Whether the same fault of another camera would explain nearly as much."""
+    rivals = [
+        one.sigmas
+        for one in found
+        if one.fault is worst.fault
+        and one.axis == worst.axis
+        and min(one.camera, worst.camera) >= 0
+        and one.camera != worst.camera
+    ]
+    return max(rivals, default=0.0) > AMBIGUOUS_SHARE * worst.sigmas
+
+
+def is_contradicted(fault: Fault, value: float, sigmas: float) -> bool:
+    """Whether an input is off by more than chance and by more than matters."""
+    return sigmas > CONTRADICTED_SIGMAS and abs(value) > LEAST_VALUE[fault]
+
+
+def _clocks(optimised: Optimised) -> dict[str, tuple[float, float]]:
+    bundle = optimised.bundle
+    if not bundle.model.solver.clock_offset:
+        return {}
+    sigma = np.sqrt(bundle.solution.covariance.clock_s2())
+    return {
+        name: (float(bundle.solution.clock_offset_s[c]), float(sigma[c]))
+        for name, c in bundle.camera_index.items()
+    }
+
+
+def _remedied(inputs: Inputs, worst: Suspect, settled: Bundle, optimiser: Optimiser) -> Inputs | None:
+    """The inputs without what ``worst`` says is wrong; None where the drive cannot do without."""
+    if worst.fault is Fault.CLOCK:
+        if worst.sigma > CLOCK_TOLD_S:
+            return None
+        return _with_clocks(inputs, optimiser.clock_offsets_s(settled))
+    if worst.fault in (Fault.SURVEY, Fault.LEVER):
+        names = tuple(settled.camera_index)
+        return _without_axis(inputs, names if worst.camera < 0 else (names[worst.camera],), worst.axis)
+    options = inputs.options
+    if worst.fault is Fault.SIZE:
+        wrong = sizes_of(settled, length_of(settled, worst.item))
+        left = {name: size for name, size in options.known_sizes.by_class_m.items() if name not in wrong}
+        return replace(
+            inputs, options=replace(options, known_sizes=replace(options.known_sizes, by_class_m=left))
+        )
+    if worst.fault in (Fault.CONTROL, Fault.DATUM):
+        point = point_of(settled, worst.item) if worst.fault is Fault.CONTROL else None
+        points = [
+            one for one in options.survey.points_map if point is not None and tuple(one) != tuple(point)
+        ]
+        return replace(inputs, options=replace(options, survey=replace(options.survey, points_map=points)))
+    return None
+
+
+def _with_clocks(inputs: Inputs, later_s: Mapping[str, float]) -> Inputs | None:
+    """The images of each camera posed for ``later_s`` after the times that they have by now."""
+    drive = inputs.drive
+    if drive.trajectory is None:
+        return None
+    so_far = {image.camera: image.clock_offset_s for image in drive.images}
+    offset_s = {name: so_far.get(name, 0.0) + later for name, later in later_s.items()}
+    moved = with_clock_offsets(drive, offset_s, max_gap_s=float("inf"))
+    number = {image.path: n for n, image in enumerate(moved.images)}
+    detections = [
+        replace(one, image=number[drive.images[one.image].path])
+        for one in inputs.detections
+        if drive.images[one.image].path in number
+    ]
+    return replace(inputs, drive=moved, detections=sorted(detections, key=lambda one: one.image))
+
+
+def _without_axis(inputs: Inputs, names: Sequence[str], axis: int) -> Inputs | None:
+    """The survey of some cameras' centres known no more along one axis; None where it already is not."""
+    cameras = dict(inputs.drive.cameras)
+    for name in names:
+        prior = cameras[name].centre_prior
+        if prior is None or prior.sigma_m[axis] >= LOOSE_CENTRE_SIGMA_M:
+            return None
+        sigma_m = prior.sigma_m.copy()
+        sigma_m[axis] = LOOSE_CENTRE_SIGMA_M
+        cameras[name] = replace(cameras[name], centre_prior=replace(prior, sigma_m=sigma_m))
+    return replace(inputs, drive=replace(inputs.drive, cameras=cameras))

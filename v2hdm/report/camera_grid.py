@@ -1,0 +1,160 @@
+"""What a mounting says of an image: the horizon, the ground in metres, the region of interest."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from v2hdm.detection.camera.lens import distort_points
+from v2hdm.files import whole_file
+from v2hdm.records import Camera, CameraInfo, FloatArray
+
+_FARTHEST_M = 40.0
+"""Lines farther along the view lie on top of each other near the horizon."""
+
+_ALONG_M, _ACROSS_M = 5.0, 2.0
+"""Spacing of the grid along and across the vehicle."""
+
+_HALF_WIDTH_M = 8.0
+"""How far the grid reaches to either side of the camera."""
+
+_NEAREST_M = 0.3
+"""Ground nearer than this to the camera's plane has no place in an image."""
+
+COLOURS: Mapping[str, tuple[int, int, int]] = {"guess": (40, 140, 255), "ground": (160, 190, 20)}
+"""Colour (BGR) of the grid under each mounting: the guess, and the one found from bare ground."""
+
+_ROI_BGR = (255, 255, 255)
+
+
+def save_grid(
+    path: Path, image: np.ndarray, camera: Camera, mountings: Mapping[str, FloatArray], caption: str
+) -> None:
+    """Draw horizon, metric ground grid and ROI into an image.
+
+    Args:
+        path: where the picture goes.
+        image: (H, W, 3) BGR, as recorded.
+        camera: intrinsics and ROI.
+        mountings: ``cam_from_vehicle`` (4 x 4) by a name of :data:`COLOURS`.
+        caption: text in the picture's corner.
+    """
+    canvas = image.copy()
+    for row, (name, cam_from_vehicle) in enumerate(mountings.items()):
+        colour = COLOURS[name]
+        for line in _grid_lines(cam_from_vehicle):
+            _draw(canvas, project_line(camera.info, cam_from_vehicle, line), colour, 1)
+        _draw(canvas, [_horizon(camera.info, cam_from_vehicle)], colour, 2)
+        _label(canvas, camera.info, cam_from_vehicle, colour, below=18 * row)
+        _write(canvas, name, (12, 52 + 24 * row), colour)
+    closed = np.vstack([camera.roi_vehicle, camera.roi_vehicle[:1]])
+    first = next(iter(mountings.values()))
+    _draw(canvas, project_line(camera.info, first, _dense(closed)), _ROI_BGR, 2)
+    _write(canvas, f"{caption}; white: roi_vehicle", (12, 26), _ROI_BGR)
+    with whole_file(path) as partial:
+        partial.write_bytes(cv2.imencode(path.suffix, canvas, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes())
+
+
+def project_line(
+    info: CameraInfo, cam_from_vehicle: FloatArray, line_vehicle: FloatArray
+) -> list[FloatArray]:
+    """The pieces (N, 2), recorded px, of a dense ground line (M, 2) that lie in and near the image."""
+    points = line_vehicle @ cam_from_vehicle[:3, :2].T + cam_from_vehicle[:3, 3]
+    visible = points[:, 2] > _NEAREST_M
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pinhole = (points @ info.intrinsic.T)[:, :2] / points[:, 2:]
+    margin = 0.15 * np.array([info.width, info.height])
+    size = np.array([info.width, info.height])
+    visible &= ((pinhole > -margin) & (pinhole < size + margin)).all(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], visible.astype(int), [0]])))
+    pieces = [pinhole[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
+    return [distort_points(info, piece) for piece in pieces]
+
+
+def _axes(cam_from_vehicle: FloatArray) -> tuple[FloatArray, int, float]:
+    """The camera's foot, the vehicle axis (0 or 1) that it looks along most, and to which side."""
+    foot = -(cam_from_vehicle[:3, :3].T @ cam_from_vehicle[:3, 3])[:2]
+    view = cam_from_vehicle[2, :2]
+    along = int(np.argmax(np.abs(view)))
+    return foot, along, float(np.sign(view[along]) or 1.0)
+
+
+def _marks(cam_from_vehicle: FloatArray) -> FloatArray:
+    """Coordinates of the lines across the view, in the vehicle frame."""
+    foot, along, side = _axes(cam_from_vehicle)
+    ends = np.sort([foot[along], foot[along] + side * _FARTHEST_M])
+    return np.arange(np.ceil(ends[0] / _ALONG_M), np.floor(ends[1] / _ALONG_M) + 1) * _ALONG_M
+
+
+def _grid_lines(cam_from_vehicle: FloatArray) -> list[FloatArray]:
+    foot, along, side = _axes(cam_from_vehicle)
+    other = 1 - along
+    middle = round(float(foot[other]) / _ACROSS_M) * _ACROSS_M
+    sides = middle + np.arange(-_HALF_WIDTH_M, _HALF_WIDTH_M + 0.1, _ACROSS_M)
+    lines = []
+    for mark in _marks(cam_from_vehicle):
+        line = np.empty((60, 2))
+        line[:, along], line[:, other] = mark, np.linspace(sides[0], sides[-1], 60)
+        lines.append(line)
+    for mark in sides:
+        line = np.empty((300, 2))
+        # Denser where it is near: the same number of points to each doubling of the distance.
+        line[:, along] = foot[along] + side * np.geomspace(0.2, _FARTHEST_M, 300)
+        line[:, other] = mark
+        lines.append(line)
+    return lines
+
+
+def _horizon(info: CameraInfo, cam_from_vehicle: FloatArray) -> FloatArray:
+    """Where level directions within 60 deg of the view are seen, recorded px (N, 2)."""
+    heading = np.arctan2(cam_from_vehicle[2, 1], cam_from_vehicle[2, 0])
+    angles = heading + np.deg2rad(np.linspace(-60, 60, 241))
+    rays = np.column_stack([np.cos(angles), np.sin(angles)]) @ cam_from_vehicle[:3, :2].T
+    rays = rays[rays[:, 2] > 0.2]
+    pinhole = (rays @ info.intrinsic.T)[:, :2] / rays[:, 2:]
+    near = (pinhole[:, 0] > -0.1 * info.width) & (pinhole[:, 0] < 1.1 * info.width)
+    return distort_points(info, pinhole[near])
+
+
+def _label(
+    canvas: np.ndarray,
+    info: CameraInfo,
+    cam_from_vehicle: FloatArray,
+    colour: tuple[int, int, int],
+    below: int,
+) -> None:
+    """Write the lines' coordinates in metres where they cross the middle of the view."""
+    foot, along, _ = _axes(cam_from_vehicle)
+    last_v = np.inf
+    for mark in sorted(_marks(cam_from_vehicle), key=lambda mark: abs(mark - foot[along])):
+        place = foot.copy()
+        place[along] = mark
+        pieces = project_line(info, cam_from_vehicle, np.array([place, place]))
+        if not pieces or last_v - pieces[0][0, 1] < 16:
+            continue
+        u, last_v = pieces[0][0]
+        _write(canvas, f"{'xy'[along]} {mark:g} m", (int(u) + 6, int(last_v) - 4 + below), colour, 0.45)
+
+
+def _dense(line: FloatArray) -> FloatArray:
+    parts = np.linspace(0, 1, 40)[:, None]
+    return np.concatenate([a + parts * (b - a) for a, b in itertools.pairwise(line)])
+
+
+def _draw(canvas: np.ndarray, pieces: list[FloatArray], colour: tuple[int, int, int], width: int) -> None:
+    for piece in pieces:
+        fixed = np.round(np.clip(piece, -1e4, 1e4) * 16).astype(np.int32)
+        cv2.polylines(canvas, [fixed], False, colour, width, cv2.LINE_AA, shift=4)
+
+
+def _write(
+    canvas: np.ndarray, text: str, at: tuple[int, int], colour: tuple[int, int, int], size: float = 0.6
+) -> None:
+    (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
+    corner, opposite = (at[0] - 2, at[1] - height - 2), (at[0] + width + 2, at[1] + below)
+    cv2.rectangle(canvas, corner, opposite, (40, 40, 40), cv2.FILLED)
+    cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
