@@ -70,6 +70,14 @@ def test_a_kitti_drive_is_recognised_and_laid_flat(tmp_path: Path, suffix: str) 
     np.testing.assert_allclose(steps, STEP_M, atol=1e-5)
 
 
+def test_the_road_has_the_recorded_height_above_the_map_s_origin(tmp_path: Path) -> None:
+    road = read_drive(make_kitti(tmp_path / "2011_09_26")).road
+    assert road is not None
+    along_m = STEP_M * np.arange(40)
+    np.testing.assert_allclose(road.height_m, GRADE * along_m, atol=0.01)
+    np.testing.assert_allclose(road.slope @ [np.sqrt(0.5), np.sqrt(0.5)], GRADE, atol=1e-4)
+
+
 def test_times_are_those_of_the_images(tmp_path: Path) -> None:
     drive = read_drive(make_kitti(tmp_path / "2011_09_26"))
     # 2011-09-26 13:10:00 UTC

@@ -65,7 +65,9 @@ def read_kitti_drive(path: Path, options: ReadOptions) -> Drive:
     enu_from_imu[:, :3, 3] = position_enu
     by_imu = lay_flat(Trajectory(stamp_s, enu_from_imu), _POSE_NOISE.position_m)
     vehicle_from_imu = _level_mount(calibrations[names[0]], by_imu.mount_rad, options.kitti.camera_height_m)
-    recorded = Trajectory(stamp_s, enu_from_imu @ np.linalg.inv(vehicle_from_imu))
+    enu_from_vehicle = enu_from_imu @ np.linalg.inv(vehicle_from_imu)
+    enu_from_vehicle[:, 2, 3] += vehicle_from_imu[2, 3]  # the map's origin is on the road
+    recorded = Trajectory(stamp_s, enu_from_vehicle)
     laid = lay_flat(recorded, _POSE_NOISE.position_m)
     cameras = {
         name: _mount(calibration, vehicle_from_imu, options.kitti)
