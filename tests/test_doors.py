@@ -59,7 +59,6 @@ def test_an_interruption_while_libraries_are_loaded_is_one_line(
     [
         (("v2hdm.map", "+run=port2"), "torch", "map"),
         (("v2hdm.map", "+run=port2"), "kornia", "map"),
-        (("v2hdm.check", "drive"), "scipy", "map"),
         (("v2hdm.check", "drive"), "matplotlib", "map"),
         (("train",), "tensorboard", "train"),
         (("export", "checkpoint=a", "output=b"), "onnx", "train"),
