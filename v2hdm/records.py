@@ -12,8 +12,9 @@ Index letters, everywhere: ``i`` image, ``j`` marking, ``k`` corner observation.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -141,6 +142,33 @@ class PoseNoise:
     roll_pitch_drift_rad: float = 0.0
     roll_pitch_drift_over_m: float = 1.0
 
+    @classmethod
+    def as_far_as_stated(cls, **stated: float) -> PoseNoise:
+        """The noise of a drive whose description may leave out some of it.
+
+        A drift that is not stated takes half of its variance: an error that repeats from image to image does
+        not average out, and a map that reckons with none is less certain than it says.
+        """
+        noise = cls(**stated)
+        drifts = {
+            drift: math.sqrt(_USUAL_DRIFT_SHARE) * getattr(noise, total)
+            for total, drift in DRIFTS.items()
+            if drift not in stated
+        }
+        return replace(noise, **drifts)
+
+
+DRIFTS: Mapping[str, str] = {
+    "position_m": "position_drift_m",
+    "heading_rad": "heading_drift_rad",
+    "roll_pitch_rad": "roll_pitch_drift_rad",
+}
+"""Of each standard deviation of :class:`PoseNoise`, its drift."""
+
+_USUAL_DRIFT_SHARE = 0.5
+"""Share of a variance that drifts where nobody says otherwise: RTK's errors are about half multipath and
+atmosphere, which last for tens of metres."""
+
 
 @dataclass(frozen=True)
 class Trajectory:
@@ -262,8 +290,8 @@ class Marking:
     """One mapped marking: ``corners_map`` (4, 2) m, counter-clockwise seen from above.
 
     ``covariance_m2`` (8, 8) is that of the stacked corners in the map, or None where the method has none.
-    ``relative_sigma_m`` is the standard deviation of a coordinate of its centre against that of the marking
-    nearest to ten metres away, of which a drift that both share is no part; None where it is not known.
+    ``relative_sigma_m`` is what the marking contributes to the error of a distance to one about 10 m away,
+    one standard deviation a coordinate: without the drift and the survey that both share. None if unknown.
     ``heights_m`` (4,) are the recorded heights of the ground there, None where it was recorded as z = 0.
     """
 

@@ -160,9 +160,10 @@ def test_the_extrinsics_sigmas_hold_where_markings_share_the_drift_of_their_pose
             [off[:, :3, 3], np.stack([off[:, 2, 1], off[:, 0, 2], off[:, 1, 0]], axis=1)], axis=1
         )
         covariance = grown.extrinsic_covariance
-        nees += [error @ np.linalg.solve(own, error) / 6 for error, own in zip(tangent, covariance, strict=True)]
+        nees += [
+            error @ np.linalg.solve(own, error) / 6 for error, own in zip(tangent, covariance, strict=True)
+        ]
     assert 0.6 < np.mean(nees) < 1.5
-
 
 
 def test_sharing_the_errors_of_images_makes_corners_more_exact():

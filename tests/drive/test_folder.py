@@ -10,6 +10,7 @@ from tests.drive.example import ORIGIN, make_drive, make_truth
 from v2hdm.drive import ReadOptions, read_drive
 from v2hdm.drive.truth import read_truth
 from v2hdm.errors import DriveError
+from v2hdm.records import PoseNoise
 
 
 def test_a_drive_that_was_written_is_read_back_as_it_was(tmp_path: Path) -> None:
@@ -74,3 +75,10 @@ def test_a_drive_without_any_posed_image_is_refused(tmp_path: Path) -> None:
     make_drive(tmp_path, stamps=(5.0, 6.0))
     with pytest.raises(DriveError, match="no image of camera 'front'"):
         read_drive(tmp_path)
+
+
+def test_a_drift_that_is_not_stated_takes_half_of_its_variance() -> None:
+    noise = PoseNoise.as_far_as_stated(position_m=0.01, heading_drift_rad=0.0)
+    assert noise.position_drift_m == pytest.approx(0.01 / np.sqrt(2))
+    assert noise.heading_drift_rad == 0.0
+    assert noise.roll_pitch_drift_rad == pytest.approx(0.003 / np.sqrt(2))

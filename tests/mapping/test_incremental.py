@@ -29,6 +29,39 @@ def test_marking_by_marking_the_map_is_nearly_that_of_all_at_once() -> None:
     assert all(np.all(np.isfinite(marking.covariance_m2)) for marking in result.hd_map.markings)
 
 
+def test_both_modes_say_the_same_of_themselves() -> None:
+    scene = make_scene(SceneOptions(length_m=50.0, seed=5))
+    batch, grown = (
+        run_methods(scene.drive, scene.detections, ("front", "rear"), options, growth_steps=4)["Opt"]
+        for options in (MappingOptions(), INCREMENTAL)
+    )
+    assert batch.reprojection_rmse_px is not None
+    assert grown.reprojection_rmse_px is not None
+    assert grown.reprojection_rmse_px == pytest.approx(batch.reprojection_rmse_px, rel=0.2)
+    assert grown.initial_reprojection_rmse_px == pytest.approx(batch.initial_reprojection_rmse_px, rel=0.2)
+    assert batch.diagnostics.keys() - grown.diagnostics.keys() == {"evaluations", "gap"}
+    assert grown.diagnostics["observations"] == pytest.approx(batch.diagnostics["observations"], rel=0.1)
+    assert grown.diagnostics["chi2_per_dof"] == pytest.approx(1.0, abs=0.3)
+    assert grown.certainty.keys() == batch.certainty.keys() == {"front", "rear"}
+    for name, calibration in batch.calibrations.items():
+        assert calibration.covariance is not None
+        sigma, other = (
+            np.sqrt(np.diag(c)) for c in (calibration.covariance, grown.calibrations[name].covariance)
+        )
+        assert np.all(other < 1.6 * sigma)
+        assert np.all(other > 0.7 * sigma)
+    ours, theirs = (
+        np.median([marking.relative_sigma_m for marking in result.hd_map.markings])
+        for result in (grown, batch)
+    )
+    assert ours == pytest.approx(theirs, rel=0.3)
+    sizes = [len(step.markings) for step in grown.growth]
+    assert sizes == sorted(sizes)
+    assert 3 <= len(sizes) <= 4
+    assert sizes[-1] == len(grown.hd_map.markings)
+    assert all(step.cam_from_vehicle.keys() == {"front", "rear"} for step in grown.growth)
+
+
 def test_an_unknown_mode_is_refused() -> None:
     scene = make_scene(SceneOptions(length_m=20.0, seed=1))
     with pytest.raises(ConfigError, match=r"mapping.mode is 'online'; choose batch or incremental"):

@@ -35,9 +35,9 @@ def test_the_overlay_draws_the_marking_where_the_camera_sees_it(tmp_path: Path) 
     info = drive.cameras["front"].info
     # 2 m above the ground, optical axis level and forward: ground at (10, 0) projects to v = 240 + 100.
     cam_from_vehicle = np.array([[0.0, -1, 0, 0], [0, 0, -1, 2.0], [1, 0, 0, 0], [0, 0, 0, 1]])
-    ipms = {"Opt": ipm_from_extrinsic(info, cam_from_vehicle)}
+    views = {"Opt": np.linalg.inv(ipm_from_extrinsic(info, cam_from_vehicle))}
     black = np.zeros((480, 640, 3), np.uint8)
-    save_overlay(tmp_path / "overlay.png", black, info, np.eye(4), HdMap((diamond_at(10, 0),)), ipms)
+    save_overlay(tmp_path / "overlay.png", black, info, HdMap((diamond_at(10, 0),)), np.zeros(2), views)
     drawn = cv2.imread(str(tmp_path / "overlay.png")).any(axis=2)
     drawn[:60] = False  # the legend
     rows, columns = np.nonzero(drawn)

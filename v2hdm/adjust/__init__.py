@@ -5,7 +5,7 @@ inside. :mod:`v2hdm.adjust.problem` states the model.
 """
 
 from v2hdm.adjust.gating import Excluded, Verdict
-from v2hdm.adjust.observability import Observability, observability
+from v2hdm.adjust.observability import Observability, observability, observed
 from v2hdm.adjust.problem import (
     ControlPoints,
     Drift,
@@ -41,6 +41,7 @@ __all__ = [
     "Suspect",
     "Verdict",
     "observability",
+    "observed",
     "pose_pulls",
     "select_model",
     "solve",

@@ -20,6 +20,8 @@ from v2hdm.records import FloatArray
 # these may consist.
 _CORNERS_AT_ONCE = 256
 _NUMBERS_AT_ONCE = 1 << 25
+# Frames whose right-hand sides are solved for together.
+_FRAMES_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,23 @@ class Covariance:
         joint = torch.cholesky_inverse(self.whitening.reduced_factor.tip)
         variance = joint.diagonal().reshape(arrays.camera_count, -1)[:, 6:]
         return np.asarray(variance.sum(1).cpu().numpy())
+
+    def poses(self) -> FloatArray:
+        """Variances (J, 6) of each frame's tangent, how well its pose is known; 0 without states."""
+        arrays, whitening = self.whitening.arrays, self.whitening
+        frames, states = arrays.frame_count, len(arrays.states)
+        out = np.zeros((frames, 6))
+        columns = torch.tensor(arrays.states, dtype=torch.int64, device=arrays.centre.device)
+        acts = torch.nn.functional.one_hot(columns, 6).to(torch.float64)
+        for begin in range(0, frames if states else 0, _FRAMES_AT_ONCE):
+            own = torch.arange(begin, min(begin + _FRAMES_AT_ONCE, frames), device=columns.device)
+            wanted = acts.new_zeros(frames, states, len(own), 6)
+            wanted[own, :, own - begin] = acts
+            tiles = to_tiles(whitening.plan, wanted.flatten(2))
+            tip = tiles.new_zeros(len(whitening.reduced_factor.tip), tiles.shape[1])
+            root = whitening.reduced_factor.solve(torch.cat([tiles, tip]))
+            out[own.cpu().numpy()] = root.square().sum(0).view(len(own), 6).cpu().numpy()
+        return out
 
     def corners(self, groups: NDArray[np.int64]) -> FloatArray:
         """Joint covariance (M, 2 n, 2 n), m^2, within each of M groups (M, n) of corners of the problem."""

@@ -22,9 +22,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
-from v2hdm.adjust.marking_fit import MarkingObservations, Normal, back_projected, normal_equations
+from v2hdm.adjust.marking_fit import (
+    MarkingObservations,
+    Normal,
+    back_projected,
+    normal_equations,
+    squared_residuals,
+)
 from v2hdm.adjust.pose_errors import Noise
 from v2hdm.adjust.rigid import exp, left_jacobians
+from v2hdm.adjust.variance import VarianceFactors, variance_factors
 from v2hdm.errors import AdjustError
 from v2hdm.records import FloatArray
 
@@ -143,6 +150,29 @@ class IncrementalMap:
         settled = self._known(marking)
         extrinsic = self._tangent_covariance()
         return np.asarray(settled.covariance_m2 + settled.gain @ extrinsic @ settled.gain.T)
+
+    def variance(self) -> VarianceFactors:
+        """How many times as large as stated the variances are."""
+        squared, of_priors, corners = [np.zeros(0)], self._prior_squared(), 0
+        for marking, settled in self.state.settled.items():
+            fit = squared_residuals(
+                settled.observations,
+                self.prior.intrinsic,
+                self.cam_from_vehicle,
+                self.corners_map(marking),
+                settled.frame_state,
+            )
+            squared.append(fit)
+            of_priors += settled.state_squared
+            corners += len(settled.corners_map)
+        free = 2 * corners + self.state.tangents.size - int(np.isfinite(self.prior.centre_sigma_m).sum())
+        return variance_factors(np.concatenate(squared), of_priors, free)
+
+    def _prior_squared(self) -> float:
+        """How far the cameras' centres are from their prior, standard deviations squared."""
+        extrinsics = self.cam_from_vehicle
+        centre = -np.einsum("cba,cb->ca", extrinsics[:, :3, :3], extrinsics[:, :3, 3])
+        return float(np.sum(((centre - self.prior.centre_vehicle) / self.prior.centre_sigma_m) ** 2))
 
     def preview(self, observations: MarkingObservations) -> FloatArray:
         """Where a marking's corners (n, 2) would come to lie, without taking it into the map.

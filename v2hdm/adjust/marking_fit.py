@@ -135,6 +135,18 @@ def normal_equations(
     )
 
 
+def squared_residuals(
+    seen: MarkingObservations,
+    intrinsic: FloatArray,
+    cam_from_vehicle: FloatArray,
+    corners_map: FloatArray,
+    frame_state: FloatArray,
+) -> FloatArray:
+    """Squared residuals (K,) of ``seen`` in standard deviations, as :func:`normal_equations` has them."""
+    residual = _linearise(seen, intrinsic, cam_from_vehicle, corners_map, frame_state)[0]
+    return np.einsum("ka,ka->k", residual, np.linalg.solve(seen.covariance_px, residual[..., None])[..., 0])
+
+
 def _root_information(seen: MarkingObservations, residual: FloatArray, noise: Noise) -> FloatArray:
     """Roots (K, 2, 2) of the observations' information, robust weights included."""
     root = np.linalg.inv(np.linalg.cholesky(seen.covariance_px))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import dataclass
 
@@ -22,16 +21,12 @@ from v2hdm.adjust.problem import Problem, SolveOptions
 from v2hdm.adjust.residuals import Estimate, Loss, cost_and_gradient, frame_tangent, observe
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.start import back_project
+from v2hdm.adjust.variance import VarianceFactors, variance_factors
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.camera import NEAR_M
 from v2hdm.geometry.transform import exp
 from v2hdm.records import BoolArray, FloatArray
-
-# Squared residual that one good observation in a thousand exceeds: chi-square, 2 degrees of freedom.
-_OUTLIER_SQUARED = 13.8
-# Mean of half such a variable below that limit: leaving the tail out takes a little off the chi-square.
-_TRIMMED_MEAN = 1 - _OUTLIER_SQUARED / 2 / math.expm1(_OUTLIER_SQUARED / 2)
 
 
 def solve(problem: Problem, options: SolveOptions | None = None) -> Solution:
@@ -102,7 +97,7 @@ def _report(
         terms, _ = cost_and_gradient(arrays, estimate, robust)
     seen = _seen(problem, whitening)
     scale = noise_scale(seen.mahalanobis2)
-    variance = _variance_factors(arrays, terms, seen.mahalanobis2, scale)
+    variance = _variance_factors(arrays, terms, seen.mahalanobis2)
     corners_map = _unsorted(estimate.corners_map, arrays.corner_order)
     corners_map += origin_map
     return Solution(
@@ -180,32 +175,10 @@ def _status(descent: Descent, options: SolveOptions, behind: bool) -> Status:
     return Status.EVALUATIONS_EXHAUSTED if descent.progressing else Status.STALLED
 
 
-@dataclass(frozen=True)
-class _VarianceFactors:
-    """Variances as multiples of the stated ones: of everything, and of the observations alone."""
-
-    all: float
-    observations: float
-
-
-def _variance_factors(
-    arrays: Arrays, terms: dict[str, Tensor], squared: FloatArray, scale: float
-) -> _VarianceFactors:
-    """Chi-square per degree of freedom, of good observations and priors together and of the former.
-
-    What the priors have left of their own degrees of freedom is what the observations have taken of them:
-    the expected chi-square of a prior is the one less the other (Foerstner and Wrobel, Photogrammetric
-    Computer Vision, section 4.2.4, on variance components).
-    """
-    good = squared <= _OUTLIER_SQUARED * scale
-    of_observations = float(squared.sum(where=good)) / _TRIMMED_MEAN
+def _variance_factors(arrays: Arrays, terms: dict[str, Tensor], squared: FloatArray) -> VarianceFactors:
+    """Those of a solve whose cost consists of ``terms``."""
     of_priors = 2 * sum(float(value) for name, value in terms.items() if name != "observations")
     centres = int((arrays.centre_information_root > 0).sum())
     surveyed = int((arrays.control_information > 0).sum())
     known = 2 * surveyed + centres + len(arrays.lengths.first)
-    free = 2 * arrays.corner_count + 6 * arrays.camera_count - known
-    redundancy = 2 * int(good.sum()) - free
-    return _VarianceFactors(
-        all=(of_observations + of_priors) / max(redundancy, 1),
-        observations=of_observations / max(redundancy - of_priors, 1),
-    )
+    return variance_factors(squared, of_priors, 2 * arrays.corner_count + 6 * arrays.camera_count - known)

@@ -49,6 +49,7 @@ class Fault(Enum):
     CLOCK = "clock"  # images were taken later than they say
     FOCAL = "focal"  # share by which the focal length is longer than stated
     DISTORTION = "distortion"  # first radial coefficient
+    PRINCIPAL = "principal"  # point of the image on the optical axis
     SLOPE = "slope"  # of the ground, which the poses do not know of
     SURVEY = "survey"  # of one camera's centre
     LEVER = "lever"  # all centres alike: from the point that the poses are of
@@ -66,6 +67,7 @@ _UNITS = {
     Fault.CLOCK: "s",
     Fault.FOCAL: "",
     Fault.DISTORTION: "",
+    Fault.PRINCIPAL: "px",
     Fault.SLOPE: "rad",
     Fault.SURVEY: "m",
     Fault.LEVER: "m",
@@ -82,7 +84,8 @@ class Suspect:
     Attributes:
         fault: what would be wrong.
         camera: of which camera of the problem; -1 for all together.
-        axis: along which axis, 0 to 2, of the vehicle (survey, lever) or the map (slope, control).
+        axis: along which axis, 0 to 2: of the vehicle (survey, lever), of the map (slope, datum), of the
+            image (principal).
         item: which of the problem's control points or known lengths; -1 for none or all.
         value: by how much, true minus stated.
         sigma: how well the drive tells, inf where it cannot.
@@ -230,6 +233,8 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
             yield _Hypothesis(Fault.CLOCK, _moving(_clock_motion(problem, camera)), camera)
         yield _Hypothesis(Fault.FOCAL, _lens(camera, 0), camera)
         yield _Hypothesis(Fault.DISTORTION, _lens(camera, 1), camera)
+        for axis in (0, 1):
+            yield _Hypothesis(Fault.PRINCIPAL, _principal(problem, camera, axis), camera, axis)
     for axis in (0, 1):
         yield _Hypothesis(Fault.SLOPE, _moving(_slope_motion(axis)), axis=axis)
     if bool((arrays.centre_information_root > 0).any()):
@@ -284,6 +289,20 @@ def _lens(camera: int, power: int) -> Callable[[_Bench], _Column]:
             a, b, c = run.root_information
             parts.append(torch.stack([a * dx, b * dx + c * dy]))
         return _Column(torch.cat(parts, dim=1))
+
+    return column
+
+
+def _principal(problem: Problem, camera: int, axis: int) -> Callable[[_Bench], _Column]:
+    """A principal point that lies farther right, or down, by one pixel."""
+    focal_px = torch.as_tensor(problem.intrinsic[:, axis])
+
+    def column(bench: _Bench) -> _Column:
+        arrays = bench.arrays
+        seen_by = (arrays.pair // arrays.frame_count).long()
+        off = ((seen_by == camera) | (camera < 0)) / focal_px.to(seen_by.device)[seen_by]
+        a, b, c = arrays.root_information
+        return _Column(torch.stack([a * off, b * off] if axis == 0 else [torch.zeros_like(off), c * off]))
 
     return column
 

@@ -4,6 +4,7 @@ from v2hdm.ground.better import better_start
 from v2hdm.ground.estimate import estimate_ground
 from v2hdm.ground.options import GroundOptions
 from v2hdm.ground.results import GroundEstimate, GroundStatus, MatchedGround, Parameter, Reading
+from v2hdm.ground.rig import estimate_cameras
 
 __all__ = [
     "GroundEstimate",
@@ -13,5 +14,6 @@ __all__ = [
     "Parameter",
     "Reading",
     "better_start",
+    "estimate_cameras",
     "estimate_ground",
 ]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from v2hdm.ground.model import GroundHits, by_lens, by_pixel, hit_ground
 from v2hdm.ground.mount import Mount, rotation
-from v2hdm.records import FloatArray
+from v2hdm.records import BoolArray, FloatArray
 
 PIXEL_SIGMA = 0.4
 """What a patch's place in an image is off, px, at the most; the unit of the residuals."""
@@ -33,8 +33,8 @@ _LARGEST_TURN_RAD = 0.05
 _LARGEST_SHIFT_M = 0.2
 """A step larger than these leaves what the equations are linear in."""
 
-_STEPS = 25
-_CONVERGED = 1e-3
+_STEPS = 20
+_CONVERGED = 0.02
 """A step below so many standard deviations is the last."""
 
 CENTRE, TURN = slice(3, 6), slice(0, 3)
@@ -57,6 +57,12 @@ class Observations:
     first_px: FloatArray
     second_px: FloatArray
     pair: FloatArray
+
+    def only(self, keep: BoolArray) -> Observations:
+        """Those of a mask (N,)."""
+        return Observations(
+            self.first[keep], self.second[keep], self.first_px[keep], self.second_px[keep], self.pair[keep]
+        )
 
 
 @dataclass(frozen=True)
@@ -87,16 +93,19 @@ class Adjusted:
     Attributes:
         mount: with the lens as freed.
         extra: the freed parameter's value, 0 without one.
-        information: (K, K) marginal information of turn (3, rad), centre (3, m) and the freed parameter.
+        covariance: (K, K) of turn (3, rad), centre (3, m) and the freed parameter, if any.
         pose_errors: (I, 6) estimated :data:`v2hdm.ground.noise.STATES`.
+        bends: (12,) estimated smooth error of the pixels, px.
+        poses: (I, 4, 4) ``map_from_vehicle`` with their errors, and the parameter, taken in.
         residual: (N,) lengths in units of :data:`PIXEL_SIGMA` over both pixels.
-        scores: (P, K) gradient of each pair, the poses being estimated.
+        weight: (N,) 1 for a match that fits, 0 for one that does not.
     """
 
     mount: Mount
     extra: float
     covariance: FloatArray
     pose_errors: FloatArray
+    bends: FloatArray
     poses: FloatArray
     residual: FloatArray
     weight: FloatArray
@@ -108,7 +117,7 @@ def adjust(
     start: Mount,
     free: str | None = None,
     tolerance: float = 1.0,
-    start_extra: float = 0.0,
+    near: Adjusted | None = None,
 ) -> Adjusted:
     """Find the mounting, beside one parameter ``free`` if any, by Gauss-Newton with Cauchy's weights.
 
@@ -118,11 +127,11 @@ def adjust(
         start: where to start from.
         free: ``clock_s``, ``focal_scale``, ``distortion_k1`` or ``grade``, or None.
         tolerance: factor on the length of residual from which on a match loses its weight.
-        start_extra: value of the parameter to start from, already within ``believed``'s poses or ``start``.
+        near: a solution for the same images, without the parameter, to start from instead.
     """
-    mount, extra = start, 0.0
-    errors = np.zeros((len(believed.poses), 6))
-    bends = np.zeros(2 * _BENDS)
+    mount, extra = start if near is None else near.mount, 0.0
+    errors = np.zeros((len(believed.poses), 6)) if near is None else near.pose_errors
+    bends = np.zeros(2 * _BENDS) if near is None else near.bends
     sigma_px = PIXEL_SIGMA
     for _ in range(_STEPS):
         residual, jacobian, root = _linearised(observations, believed, mount, extra, errors, bends, free)
@@ -132,9 +141,7 @@ def adjust(
         sigma_px = float(np.clip(PIXEL_SIGMA * scale, _LEAST_PIXEL_SIGMA, tolerance * PIXEL_SIGMA))
         unit = PIXEL_SIGMA / sigma_px
         weight = np.where(usable, 1 / (1 + (length * unit / (_CAUCHY * tolerance)) ** 2), 0.0)
-        system, gradient = _normal(
-            observations, believed, mount, errors, bends, residual, jacobian, root * unit, weight
-        )
+        system, gradient = _normal(observations, believed, mount, errors, bends, residual, jacobian, root * unit, weight)
         step = _short(np.linalg.solve(system, -gradient))
         known = len(step) - errors.size
         mount = mount.moved(step[TURN], step[CENTRE])
@@ -151,15 +158,7 @@ def adjust(
             break
     wanted = [*range(6), *range(known - (free is not None), known)]
     covariance = np.linalg.inv(system)[np.ix_(wanted, wanted)]
-    return Adjusted(
-        mount,
-        extra + start_extra,
-        covariance,
-        errors,
-        moved_poses(believed, errors, extra, free),
-        length,
-        weight,
-    )
+    return Adjusted(mount, extra, covariance, errors, bends, moved_poses(believed, errors, extra, free), length, weight)
 
 
 def _short(step: FloatArray) -> FloatArray:
@@ -180,10 +179,7 @@ def _linearised(
     """Differences (N, 2) m, their derivatives by mount and parameter and by both poses, whitening (N, 2, 2)."""
     sides, spread = [], 0.0
     poses = moved_poses(believed, errors, extra, free)
-    for image, px in (
-        (observations.first, observations.first_px),
-        (observations.second, observations.second_px),
-    ):
+    for image, px in ((observations.first, observations.first_px), (observations.second, observations.second_px)):
         hits = hit_ground(mount, px, poses[image])
         by_px = by_pixel(mount, hits)
         bending = _bending(mount, px, by_px)
@@ -292,16 +288,3 @@ def tangent_covariance(mount: Mount, covariance: FloatArray) -> FloatArray:
     jacobian[:3, CENTRE] = turn
     jacobian[3:, TURN] = turn
     return np.asarray(jacobian @ covariance[:6, :6] @ jacobian.T)
-
-
-def without_pair(observations: Observations, pair: int) -> Observations:
-    """All matches but those of one pair."""
-    keep = observations.pair != pair
-    return replace(
-        observations,
-        first=observations.first[keep],
-        second=observations.second[keep],
-        first_px=observations.first_px[keep],
-        second_px=observations.second_px[keep],
-        pair=observations.pair[keep],
-    )

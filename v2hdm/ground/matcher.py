@@ -91,7 +91,9 @@ def path_of(motion: Motion) -> FloatArray:
     length = motion.path_m[-1]
     at = np.arange(0.0, length + _PATH_STEP_M, _PATH_STEP_M)
     keep = np.concatenate([[True], np.diff(motion.path_m) > 1e-9])
-    path = np.column_stack([np.interp(at, motion.path_m[keep], poses[keep, axis, 3]) for axis in (0, 1)])
+    path = np.column_stack(
+        [np.interp(at, motion.path_m[keep], poses[keep, axis, 3]) for axis in (0, 1)]
+    )
     beyond = np.arange(_PATH_STEP_M, _BEYOND_M, _PATH_STEP_M)[:, None]
     return np.vstack([path, path[:1] - beyond * poses[0, :2, 0], path[-1:] + beyond * poses[-1, :2, 0]])
 

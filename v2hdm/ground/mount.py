@@ -54,18 +54,24 @@ class Mount:
         cam = np.column_stack([pinhole, np.ones(len(pinhole))]) @ np.linalg.inv(self.info.intrinsic).T
         return np.asarray(cam @ self.vehicle_from_cam_rotation.T)
 
-    def project(self, points_vehicle: FloatArray) -> FloatArray:
-        """Recorded pixels (N, 2) of points (N, 3) in the vehicle frame; nan behind the camera."""
-        cam = (points_vehicle - self.centre_vehicle) @ self.vehicle_from_cam_rotation
+    def project_ground(self, ground_map: FloatArray, map_from_vehicle: FloatArray) -> FloatArray:
+        """Recorded pixels (N, 2) of ground points (N, 2) of the map; nan where the image does not show them."""
+        cam_from_map = self.cam_from_vehicle @ np.linalg.inv(map_from_vehicle)
+        matrix = self.info.intrinsic @ cam_from_map[:3][:, [0, 1, 3]]
+        pinhole = ground_map @ matrix[:2, :2].T + matrix[:2, 2]
+        depth = ground_map @ matrix[2, :2] + matrix[2, 2]
+        size = np.array([self.info.width, self.info.height])
         with np.errstate(divide="ignore", invalid="ignore"):
-            pinhole = cam @ self.info.intrinsic.T
-            pinhole = pinhole[:, :2] / pinhole[:, 2:]
-        # A lens model bends back what lies far outside the view.
-        width, height = self.info.width, self.info.height
-        seen = (cam[:, 2] > 0) & (np.abs(pinhole - [width / 2, height / 2]) < [width, height]).all(axis=1)
-        out = np.full((len(cam), 2), np.nan)
-        out[seen] = distort_points(self.info, pinhole[seen])
-        return out
+            pinhole /= depth[:, None]
+            # A lens model bends back what lies far outside the view.
+            low, high = -0.5 * size, 1.5 * size
+            far = (pinhole < low) | (pinhole > high)
+            hidden = (depth <= 0) | far[:, 0] | far[:, 1]
+            pinhole[hidden] = size / 2
+            px = distort_points(self.info, pinhole)
+            outside = (px < 0) | (px > size - 1)
+        px[hidden | outside[:, 0] | outside[:, 1]] = np.nan
+        return px
 
     @property
     def depression_rad(self) -> float:

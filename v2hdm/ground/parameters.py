@@ -7,10 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2hdm.ground.adjust import CENTRE, Observations, adjust
+from v2hdm.ground.adjust import CENTRE, Adjusted, Observations, adjust
 from v2hdm.ground.beliefs import Beliefs
 from v2hdm.ground.motion import Motion
-from v2hdm.ground.mount import Mount
 from v2hdm.ground.results import Parameter
 
 _FREE_CENTRE = {"forward_m": (0, 2.0), "left_m": (1, 2.0), "up_m": (2, 0.3)}
@@ -59,8 +58,9 @@ def free_parameters(
     names: tuple[str, ...],
     observations: Observations,
     beliefs: Beliefs,
-    mount: Mount,
+    solved: Adjusted,
     clock: Parameter | None,
+    factor: float,
 ) -> Mapping[str, Parameter]:
     """Each of ``names`` freed alone.
 
@@ -68,31 +68,33 @@ def free_parameters(
         names: see :class:`v2hdm.ground.results.Parameter`.
         observations: matches between rows of the motion.
         beliefs: about poses and survey.
-        mount: the solution without any of them.
+        solved: the solution without any of them.
         clock: its estimate, where the drive shows it.
+        factor: of all variances; see :func:`v2hdm.ground.scatter.scatter`.
     """
     turns = clock_shows(beliefs.motion)
     out = {}
     for name in names:
         if name == "clock_s" and clock is not None:
-            out[name] = clock
+            out[name] = replace(clock, sigma=clock.sigma * float(np.sqrt(factor)))
             continue
-        value, sigma = _free(name, observations, beliefs, mount)
+        value, sigma = _free(name, observations, beliefs, solved)
+        sigma *= float(np.sqrt(factor))
         told = sigma < _TOLD_SIGMA[name]
         if name == "clock_s":
             told = False
         if name == "focal_scale":
-            told = told and (turns or mount.depression_rad > _STEEP_RAD)
+            told = told and (turns or solved.mount.depression_rad > _STEEP_RAD)
         out[name] = Parameter(name, value, sigma, told, "" if told else _REMEDY[name])
     return out
 
 
-def _free(name: str, observations: Observations, beliefs: Beliefs, mount: Mount) -> tuple[float, float]:
+def _free(name: str, observations: Observations, beliefs: Beliefs, solved: Adjusted) -> tuple[float, float]:
     if name in _FREE_CENTRE:
         axis, sigma_m = _FREE_CENTRE[name]
         wider = replace(beliefs, centre_sigma_m={**beliefs.centre_sigma_m, axis: sigma_m})
         used, believed, _ = wider.about(observations)
-        adjusted = adjust(used, believed, mount)
+        adjusted = adjust(used, believed, solved.mount, near=solved)
         value = adjusted.mount.centre_vehicle[axis] - believed.centre_vehicle[axis]
         return float(value), float(np.sqrt(adjusted.covariance[CENTRE, CENTRE][axis, axis]))
     prior = beliefs.camera.centre_prior
@@ -100,5 +102,5 @@ def _free(name: str, observations: Observations, beliefs: Beliefs, mount: Mount)
         # A longer focal length and a higher camera look alike; the survey tells them apart.
         beliefs = replace(beliefs, centre_sigma_m={2: float(prior.sigma_m[2])})
     used, believed, _ = beliefs.about(observations)
-    adjusted = adjust(used, believed, mount, free=name)
+    adjusted = adjust(used, believed, solved.mount, free=name, near=solved)
     return adjusted.extra, float(np.sqrt(adjusted.covariance[6, 6]))

@@ -32,6 +32,9 @@ with the light or the camera instead of the ground, m."""
 _LEAST_CONTRAST = 1.0
 """Grey levels; less than this is the noise of an even surface."""
 
+_ALL = 0.9999
+"""Mean of flags that are all set, but for rounding."""
+
 _HOMOGRAPHY_PX = 2.0
 """Matches of a pair lie on one plane to within this: off it are kerbs, shadows and what moves."""
 
@@ -49,13 +52,7 @@ class View:
 
     def pixels(self, ground_map: FloatArray) -> FloatArray:
         """Raw pixels (N, 2) of ground points (N, 2) of the map, nan where the image does not show them."""
-        pose = self.map_from_vehicle
-        points = np.column_stack([ground_map, np.zeros(len(ground_map))])
-        px = self.mount.project((points - pose[:3, 3]) @ pose[:3, :3])
-        height, width = self.grey.shape
-        outside = ~((px >= 0) & (px <= [width - 1, height - 1])).all(axis=1)
-        px[outside] = np.nan
-        return px
+        return self.mount.project_ground(ground_map, self.map_from_vehicle)
 
 
 @dataclass(frozen=True)
@@ -93,6 +90,11 @@ class Sheet:
         seen = ~np.isnan(px[..., 0])
         px[~seen] = -1
         grey = cv2.remap(view.grey, px[..., 0], px[..., 1], cv2.INTER_LINEAR).astype(np.float32)
+        return grey, seen
+
+    def texture(self, view: View) -> tuple[FloatArray, BoolArray]:
+        """The same without what is wider than the texture of the ground."""
+        grey, seen = self.lay(view)
         return grey - cv2.GaussianBlur(grey, (0, 0), _COARSEST_M / self.grid_m), seen
 
 
@@ -122,29 +124,27 @@ def patch_centres(
     return np.asarray(centres[near])
 
 
-def match_pair(
-    first: View, second: View, centres_map: FloatArray, search_m: float, options: GroundOptions
-) -> Matches:
+def match_pair(first: View, second: View, centres_map: FloatArray, search_m: float, options: GroundOptions) -> Matches:
     """Find the patches around ``centres_map`` (N, 2) of the first image in the second, within ``search_m``."""
     grid_m = options.grid_m
     half = round(options.patch_m / 2 / grid_m)
     reach = max(round(search_m / grid_m), _PEAK_CELLS)
     sheet, cells = _sheet_around(centres_map, first.map_from_vehicle, half + reach + 1, grid_m)
-    first_grey, first_seen = sheet.lay(first)
-    second_grey, second_seen = sheet.lay(second)
-    sought, found = 0, []
-    for number, (row, column) in enumerate(cells):
+    first_grey, first_seen = sheet.texture(first)
+    second_grey, second_seen = sheet.texture(second)
+    wide = half + reach
+    row, column = cells.T
+    in_view = (_mean(first_seen, half) > _ALL)[row, column] & (_mean(second_seen, half) > _ALL)[row, column]
+    rough = (_mean(first_grey * first_grey, half) > _LEAST_CONTRAST**2)[row, column]
+    found = []
+    for number in np.flatnonzero(in_view & rough & (_mean(second_seen, wide) > _ALL)[row, column]).tolist():
+        row, column = cells[number]
         own = np.s_[row - half : row + half + 1, column - half : column + half + 1]
-        wide = half + reach
         area = np.s_[row - wide : row + wide + 1, column - wide : column + wide + 1]
-        if not first_seen[own].all() or not second_seen[own].all():
-            continue
-        sought += 1
-        if first_grey[own].std() < _LEAST_CONTRAST or not second_seen[area].all():
-            continue
         peak = _peak(cv2.matchTemplate(second_grey[area], first_grey[own], cv2.TM_CCOEFF_NORMED))
         if peak is not None:
             found.append((number, *peak))
+    sought = int(in_view.sum())
     if len(found) < _LEAST_OF_A_PAIR:
         return _no_matches(sought)
     table = np.array(found)
@@ -152,6 +152,11 @@ def match_pair(
     first_px = first.pixels(sheet.at(at))
     second_px = second.pixels(sheet.at(at + table[:, 1:3] - reach))
     return _on_one_plane(Matches(first_px, second_px, table[:, 3], sought))
+
+
+def _mean(values: FloatArray | BoolArray, half: int) -> FloatArray:
+    """Means over squares of ``2 half + 1`` cells around each."""
+    return np.asarray(cv2.blur(values.astype(np.float32), (2 * half + 1, 2 * half + 1)))
 
 
 def _no_matches(sought: int) -> Matches:
@@ -192,8 +197,7 @@ def _peak(score: FloatArray) -> tuple[float, float, float] | None:
         return None
     rest = score.copy()
     rest[
-        max(row - _PEAK_CELLS, 0) : row + _PEAK_CELLS + 1,
-        max(column - _PEAK_CELLS, 0) : column + _PEAK_CELLS + 1,
+        max(row - _PEAK_CELLS, 0) : row + _PEAK_CELLS + 1, max(column - _PEAK_CELLS, 0) : column + _PEAK_CELLS + 1
     ] = -1
     if rest.max() > best - _LEAST_LEAD:
         return None

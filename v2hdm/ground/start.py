@@ -57,9 +57,7 @@ def find_start(matcher: Matcher, beliefs: Beliefs, guess: Mount) -> Start:
     for turn_deg in _TURNS_DEG:
         # Pitch is about the camera's own sideways axis: a camera may look anywhere.
         sideways = guess.vehicle_from_cam_rotation[:, 0]
-        tried = _settle(
-            matcher, beliefs, pairs, guess.moved(np.deg2rad(turn_deg) * sideways, np.zeros(3)), guess
-        )
+        tried = _settle(matcher, beliefs, pairs, guess.moved(np.deg2rad(turn_deg) * sideways, np.zeros(3)), guess)
         if tried.mount is not None:
             return tried
         best = max(best, tried, key=lambda start: start.share)

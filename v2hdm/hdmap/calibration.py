@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +22,35 @@ _REQUIRED = (
     "distortion_coefficients",
     "cam_from_vehicle",
 )
-_OPTIONAL = ("vehicle_from_pinhole_px", "translation_sigma_m", "rotation_sigma_deg", "covariance")
+_OPTIONAL = (
+    "vehicle_from_pinhole_px",
+    "translation_sigma_m",
+    "rotation_sigma_deg",
+    "covariance",
+    "clock_offset_s",
+    "clock_sigma_s",
+    "verdict",
+)
 
 
-def write_calibration(calibration: Calibration, path: Path) -> None:
+def write_calibration(
+    calibration: Calibration,
+    path: Path,
+    *,
+    clock_s: tuple[float, float] | None = None,
+    verdict: Mapping[str, Any] | None = None,
+) -> None:
     """Write ``calibration`` to ``path``, atomically.
 
     The sigmas are those of the left-perturbation tangent of ``cam_from_vehicle``, so both are along
     the camera's own axes (right, down, forward); they are left out where there is no covariance.
+
+    Args:
+        calibration: what is written.
+        path: where to.
+        clock_s: how much later than stamped the camera's images were taken, and the sigma of that (infinite
+            where it is not known; it is then left out).
+        verdict: that on the run which found it, as JSON.
     """
     info = calibration.info
     content: dict[str, Any] = {
@@ -46,6 +68,12 @@ def write_calibration(calibration: Calibration, path: Path) -> None:
         content["translation_sigma_m"] = sigma[:3].tolist()
         content["rotation_sigma_deg"] = np.degrees(sigma[3:]).tolist()
         content["covariance"] = calibration.covariance.tolist()
+    if clock_s is not None:
+        content["clock_offset_s"] = float(clock_s[0])
+        if np.isfinite(clock_s[1]):
+            content["clock_sigma_s"] = float(clock_s[1])
+    if verdict is not None:
+        content["verdict"] = dict(verdict)
     replace_text(path, dump_yaml(content))
 
 

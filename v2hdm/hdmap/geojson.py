@@ -11,6 +11,7 @@ above the local z = 0.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ import numpy as np
 
 from v2hdm.errors import MapFileError
 from v2hdm.fields import take_covariance, take_origin, take_whole
-from v2hdm.files import load_json, replace_text, take_array, take_mapping, take_text
+from v2hdm.files import load_json, replace_text, take_array, take_mapping, take_number, take_text
 from v2hdm.hdmap.geodetic import geodetic_from_enu
 from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, Lane, Marking
 
@@ -30,21 +31,41 @@ _DEGREE_DECIMALS = 9  # 0.1 mm on the ground
 _HEIGHT_DECIMALS = 4
 
 
-def write_geojson(hd_map: HdMap, path: Path) -> None:
+def write_geojson(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None) -> None:
     """Write ``hd_map`` to ``path`` as a FeatureCollection, atomically.
 
-    Markings become Polygons (closed, counter-clockwise), lanes LineStrings.
+    Markings become Polygons (closed, counter-clockwise), lanes LineStrings. The ``verdict`` on the run that
+    made the map, as JSON, stands in the foreign member ``v2hdm``.
     """
     features = [
         _marking_feature(number, marking, hd_map.origin) for number, marking in enumerate(hd_map.markings)
     ]
     features += [_lane_feature(number, lane, hd_map.origin) for number, lane in enumerate(hd_map.lanes)]
-    about: dict[str, Any] = {"frame": "map", "coordinates": _LOCAL if hd_map.origin is None else _WGS84}
-    if hd_map.origin is not None:
-        about["origin"] = asdict(hd_map.origin)
+    write_features(path, features, hd_map.origin, {} if verdict is None else {"verdict": dict(verdict)})
+
+
+def write_features(
+    path: Path, features: Sequence[Mapping[str, Any]], origin: GeodeticOrigin | None, about: Mapping[str, Any]
+) -> None:
+    """Write GeoJSON ``features`` a line each, atomically, with the frame and ``about`` under ``v2hdm``."""
+    told: dict[str, Any] = {"frame": "map", "coordinates": _LOCAL if origin is None else _WGS84}
+    if origin is not None:
+        told["origin"] = asdict(origin)
+    head = json.dumps(told | dict(about), allow_nan=False)
     lines = ",\n".join(json.dumps(feature, allow_nan=False) for feature in features)
-    text = f'{{"type": "FeatureCollection", "v2hdm": {json.dumps(about)}, "features": [\n{lines}\n]}}\n'
+    text = f'{{"type": "FeatureCollection", "v2hdm": {head}, "features": [\n{lines}\n]}}\n'
     replace_text(path, text)
+
+
+def read_verdict(path: Path) -> Mapping[str, Any] | None:
+    """The verdict that :func:`write_geojson` wrote beside a map, None where there is none.
+
+    Raises:
+        MapFileError: when the file is missing or damaged.
+    """
+    about = load_json(path, MapFileError).get("v2hdm")
+    verdict = about.get("verdict") if isinstance(about, dict) else None
+    return verdict if isinstance(verdict, dict) else None
 
 
 def read_geojson(path: Path) -> HdMap:
@@ -87,7 +108,7 @@ def _marking_feature(number: int, marking: Marking, origin: GeodeticOrigin | Non
     counter_clockwise = float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) >= 0.0
     turn = slice(None) if counter_clockwise else slice(None, None, -1)
     heights = marking.heights_m
-    ring = _positions(corners[turn], None if heights is None else heights[turn], origin)
+    ring = geojson_positions(corners[turn], None if heights is None else heights[turn], origin)
     properties: dict[str, Any] = {
         "id": number,
         "class": marking.kind,
@@ -99,7 +120,9 @@ def _marking_feature(number: int, marking: Marking, origin: GeodeticOrigin | Non
     if marking.covariance_m2 is not None:
         properties["sigma_m"] = float(np.sqrt(np.trace(marking.covariance_m2) / len(marking.covariance_m2)))
         properties["covariance_m2"] = marking.covariance_m2.tolist()
-    return _feature(f"marking/{number}", "Polygon", [[*ring, ring[0]]], properties)
+    if marking.relative_sigma_m is not None:
+        properties["relative_sigma_m"] = marking.relative_sigma_m
+    return geojson_feature(f"marking/{number}", "Polygon", [[*ring, ring[0]]], properties)
 
 
 def _lane_feature(number: int, lane: Lane, origin: GeodeticOrigin | None) -> dict[str, Any]:
@@ -111,13 +134,14 @@ def _lane_feature(number: int, lane: Lane, origin: GeodeticOrigin | None) -> dic
     }
     if lane.heights_m is not None:
         properties["heights_m"] = lane.heights_m.tolist()
-    positions = _positions(lane.points_map, lane.heights_m, origin)
-    return _feature(f"lane/{number}", "LineString", positions, properties)
+    places = geojson_positions(lane.points_map, lane.heights_m, origin)
+    return geojson_feature(f"lane/{number}", "LineString", places, properties)
 
 
-def _feature(
+def geojson_feature(
     identity: str, geometry: str, coordinates: list[Any], properties: dict[str, Any]
 ) -> dict[str, Any]:
+    """A feature of a FeatureCollection."""
     return {
         "type": "Feature",
         "id": identity,
@@ -126,10 +150,10 @@ def _feature(
     }
 
 
-def _positions(
+def geojson_positions(
     points_map: FloatArray, heights_m: FloatArray | None, origin: GeodeticOrigin | None
 ) -> list[list[float]]:
-    """GeoJSON positions of ground points (N, 2): longitude, latitude and height, or local metres."""
+    """Positions of ground points (N, 2): longitude, latitude and height, or local metres."""
     if origin is None:
         local = points_map if heights_m is None else np.column_stack([points_map, heights_m])
         metres: list[list[float]] = local.tolist()
@@ -142,7 +166,7 @@ def _positions(
 
 
 def _read_marking(properties: dict[str, Any], where: str) -> Marking:
-    covariance = properties.get("covariance_m2")
+    covariance, relative = properties.get("covariance_m2"), properties.get("relative_sigma_m")
     return Marking(
         kind=take_text(properties.get("class"), f"{where}, class", MapFileError),
         corners_map=take_array(properties["corners_map"], (4, 2), f"{where}, corners_map", MapFileError),
@@ -153,6 +177,9 @@ def _read_marking(properties: dict[str, Any], where: str) -> Marking:
         if covariance is None
         else take_covariance(covariance, 8, f"{where}, covariance_m2", MapFileError),
         heights_m=_read_heights(properties, 4, where),
+        relative_sigma_m=None
+        if relative is None
+        else take_number(relative, f"{where}, relative_sigma_m", MapFileError),
     )
 
 

@@ -48,6 +48,13 @@ CLOCK_SIGMA_S = 0.01
 """How far the clocks of camera and receiver may be apart where nobody says that they are synchronised."""
 
 
+LEAST_OBSERVATIONS = 200
+"""Of fewer, the residuals cannot tell how large their variance is."""
+
+VARIANCE_FACTORS = (0.05, 20.0)
+"""Between these a detector's own statement may be corrected."""
+
+
 @dataclass(frozen=True)
 class Model:
     """What a solve estimates and how much noise it reckons with beyond that of the corners.

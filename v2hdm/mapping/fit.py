@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from v2hdm.adjust import Fault, Suspect
@@ -16,7 +18,7 @@ CELL_OBSERVATIONS = 40
 """Observations of a cell from which its median residual counts."""
 
 
-def contradictions(bundle: Bundle, found: tuple[Suspect, ...]) -> tuple[Contradiction, ...]:
+def contradictions(bundle: Bundle, found: Sequence[Suspect]) -> tuple[Contradiction, ...]:
     """``found`` in the bundle's problem, in the words of the user's inputs."""
     names = tuple(bundle.camera_index)
     return tuple(

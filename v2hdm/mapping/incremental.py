@@ -24,16 +24,15 @@ from v2hdm.adjust.rigid import exp
 from v2hdm.errors import AdjustError
 from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.association.merge import group_kinds
-from v2hdm.mapping.bundle import centre_priors, pose_sigma_of
-from v2hdm.mapping.markings.completion import SolvedCorners, completed_corners
-from v2hdm.mapping.markings.verdict import Seen, judge_and_mend
+from v2hdm.mapping.bundle import LEAST_OBSERVATIONS, VARIANCE_FACTORS, centre_priors, pose_sigma_of
+from v2hdm.mapping.grown import Grown, Place, Taken, conclude_grown, corners_of, growth_step
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.mapping.results import Exclusion
+from v2hdm.mapping.results import GrowthStep
 from v2hdm.mapping.shapes import align, diameters
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import Sightings
-from v2hdm.mapping.sightings.views import Views, project_ground
-from v2hdm.records import BoolArray, Camera, FloatArray, Marking, PoseNoise
+from v2hdm.mapping.sightings.views import Views
+from v2hdm.records import BoolArray, Camera, FloatArray, PoseNoise
 
 IntArray = NDArray[np.int64]
 
@@ -49,36 +48,8 @@ _FIRST_LINK_MARKINGS = 12
 _LEAST_CORNERS = 3
 """Corners that fix a marking: all are parallelograms."""
 
-# Squared distance that one sound observation in ten thousand exceeds (2 degrees of freedom).
-_INLIER_SQUARED = 18.4
-
-
-@dataclass(frozen=True)
-class Grown:
-    """What the drive has left behind.
-
-    ``rig`` holds the final extrinsics and poses; ``grown`` goes on with the next drive.
-    """
-
-    grown: IncrementalMap
-    rig: Rig
-    markings: tuple[Marking, ...]
-    excluded: tuple[Exclusion, ...]
-    residual_px: FloatArray
-
-
-@dataclass
-class _Place:
-    """Where a marking is kept: the unit, and which of its corners (4,) are the marking's, -1 if none.
-
-    ``images`` are those that showed it; ``preview`` (4, 2) is where it lay before its unit was solved.
-    """
-
-    unit: int
-    corner: IntArray
-    kind: int
-    images: set[int]
-    preview: FloatArray
+_GROWTH_STEP = 1.5
+"""How many times as large the map is whenever it is kept to show how it grew."""
 
 
 @dataclass(frozen=True)
@@ -114,8 +85,8 @@ class IncrementalMapper:
             link: Finds the tracks.
         """
         self._sightings, self._link, self._rig = sightings, link, rig
-        self._cameras, self._options = list(cameras.values()), options
-        centre, sigma = centre_priors(self._cameras, rig.cam_from_vehicle)
+        self._cameras, self._options = cameras, options
+        centre, sigma = centre_priors(list(cameras.values()), rig.cam_from_vehicle)
         focal = rig.intrinsic
         intrinsic = np.column_stack([focal[:, 0, 0], focal[:, 1, 1], focal[:, :2, 2]])
         self._prior = RigPrior(intrinsic, rig.cam_from_vehicle, centre, sigma)
@@ -125,6 +96,8 @@ class IncrementalMapper:
         self._vehicle_from_map: FloatArray = np.asarray(np.linalg.inv(rig.map_from_vehicle), np.float64)
         step_m = np.linalg.norm(np.diff(rig.map_from_vehicle[:, :3, 3], axis=0), axis=1)
         self._travelled_m = np.concatenate([[0.0], np.cumsum(step_m)])
+        self._names, self._variance_factor = sightings.cameras, 1.0
+        self._growth: list[GrowthStep] = []
         self._begin(None, 0)
 
     def run(self, views: Views, progress: Callable[[str], None]) -> Grown:
@@ -142,11 +115,27 @@ class IncrementalMapper:
         while not ended:
             ended = self._take_up_safely(tracks, usable, due)[1]
             progress(f"linking anew with {len(self._places)} markings mapped")
+            self._reweigh()
             tracks, usable = self._link(self._present_rig(), False)
             self._begin(self.grown, len(self._places))
             due *= 2
         association, _ = self._take_up_safely(tracks, usable, len(self._sightings))
-        return self._conclude(association, usable, views)
+        if self.grown.markings:
+            self.grown.linearise()
+        taken = Taken(
+            sightings=self._sightings,
+            association=association,
+            usable=usable,
+            views=views,
+            cameras=self._cameras,
+            initial_rig=self._rig,
+            jitter_rad=self._jitter_rad,
+            floor_px=self._options.model_floor_px,
+            variance_factor=self._variance_factor,
+        )
+        return conclude_grown(
+            self.grown, self._places, self._present_rig(), taken, self._growth, self._options.acceptance
+        )
 
     def _begin(self, before: IncrementalMap | None, known: int) -> None:
         """An empty map with the extrinsics that the one ``before`` found, which had ``known`` markings.
@@ -157,7 +146,7 @@ class IncrementalMapper:
         if before is not None:
             self.grown.state = State.empty(self._prior, before.state.tangents)
         self._start, self._known = before, known
-        self._places: list[_Place] = []
+        self._places: list[Place] = []
         self._centres = np.zeros((0, 2))
         self._corner_counts: list[int] = []
         self._waiting: list[MarkingObservations] = []
@@ -219,9 +208,10 @@ class IncrementalMapper:
         if marking is None:
             self._places.append(place)
             self._centres = np.vstack([self._centres, np.nanmean(track.corners_map, axis=0)])
+            self._keep_step()
         return True
 
-    def _further_place(self, track: _Track) -> _Place:
+    def _further_place(self, track: _Track) -> Place:
         """A place for a marking that the map does not have, in the newest unit or, if it is full, another."""
         newest = len(self._corner_counts) - 1
         last = self._places[-_UNIT_MARKINGS:]
@@ -229,7 +219,7 @@ class IncrementalMapper:
             self._settle()
             self._corner_counts.append(0)
             newest += 1
-        return _Place(newest, np.full(4, -1, dtype=np.int64), track.kind, set(), track.corners_map)
+        return Place(newest, np.full(4, -1, dtype=np.int64), track.kind, set(), track.corners_map)
 
     def _settle(self) -> None:
         """Solve for what waits for its unit to be full."""
@@ -245,10 +235,7 @@ class IncrementalMapper:
         place = self._places[marking]
         if self._waiting and place.unit == len(self._corner_counts) - 1:
             return place.preview
-        out = np.full((4, 2), np.nan)
-        known = place.corner >= 0
-        out[known] = self.grown.corners_map(place.unit)[place.corner[known]]
-        return out
+        return corners_of(self.grown, place)
 
     def _track(self, rows: IntArray, kind: int, tracks: Association, usable: BoolArray) -> _Track | None:
         """What ``rows`` saw of corners that they saw twice; None where that fixes no marking."""
@@ -268,7 +255,8 @@ class IncrementalMapper:
             travelled_m=self._travelled_m[sightings.frame[row]],
             vehicle_from_map=self._vehicle_from_map[sightings.frame[row]],
             pinhole_px=sightings.corners_pinhole_px[row, own],
-            covariance_px=sightings.covariance_px[row, own] + floor_px**2 * np.eye(2),
+            covariance_px=self._variance_factor
+            * (sightings.covariance_px[row, own] + floor_px**2 * np.eye(2)),
         )
         corners = np.full((4, 2), np.nan)
         try:
@@ -319,57 +307,21 @@ class IncrementalMapper:
             most[chosen] = count[better]
         return Rig(self._rig.intrinsic, self.grown.cam_from_vehicle, poses)
 
-    def _conclude(self, association: Association, usable: BoolArray, views: Views) -> Grown:
-        """Judge the markings as the batch does."""
-        rig = self._present_rig()
-        row, group, residual_px, agrees = self._residuals(association, usable, rig)
-        share = np.bincount(group[agrees], minlength=association.count)
-        seen = Seen(
-            association=association,
-            kind=np.array([place.kind for place in self._places], dtype=np.int64),
-            sightings=self._sightings,
-            rig=rig,
-            views=views,
-            cameras=tuple(self._cameras),
-            jitter_rad=self._jitter_rad,
-            row=row,
-            group=group,
-            inlier_share=share / np.maximum(np.bincount(group, minlength=association.count), 1),
-        )
-        judged = judge_and_mend(self._solved(), seen, self._options.acceptance)
-        return Grown(self.grown, rig, judged.markings(), judged.exclusions(), residual_px)
-
-    def _solved(self) -> SolvedCorners:
-        """All corners and their covariances, a missing fourth corner completed."""
+    def _keep_step(self) -> None:
+        """Keep the map as it is, if it has grown enough since the last time that it was kept."""
         count = len(self._places)
-        corners, covariance = np.full((count, 4, 2), np.nan), np.full((count, 8, 8), np.nan)
-        by_unit = {unit: self.grown.corner_covariance(unit) for unit in self.grown.markings}
-        for marking, place in enumerate(self._places):
-            corners[marking] = self._corners(marking)
-            known = np.flatnonzero(place.corner >= 0)
-            rows, own = (2 * at[:, None] + np.arange(2) for at in (known, place.corner[known]))
-            block = by_unit[place.unit][np.ix_(own.ravel(), own.ravel())]
-            covariance[marking][np.ix_(rows.ravel(), rows.ravel())] = block
-        return completed_corners(corners, covariance)
+        if count > self._known and count >= _GROWTH_STEP * len(
+            self._growth[-1].markings if self._growth else ()
+        ):
+            self._growth.append(growth_step(self.grown, self._places, self._names))
 
-    def _residuals(
-        self, association: Association, usable: BoolArray, rig: Rig
-    ) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
-        """Of all K observations of known corners: row, marking, residual (K, 2) px, and whether it agrees."""
-        sightings = self._sightings
-        corners = np.stack([self._corners(m) for m in range(association.count)] or [np.zeros((4, 2))])
-        inside = association.in_group_order(usable) & (association.group >= 0)[:, None]
-        row, corner = np.nonzero(inside & np.isfinite(corners[association.group]).all(axis=2))
-        group, own = association.group[row], association.corner_order()[row, corner]
-        vehicle_from_map = np.linalg.inv(rig.map_from_vehicle)[sightings.frame[row]]
-        cam_from_map = rig.cam_from_vehicle[sightings.camera[row]] @ vehicle_from_map
-        focal = rig.intrinsic[sightings.camera[row]]
-        pixel, _ = project_ground(focal, cam_from_map, corners[group, corner][:, None])
-        residual = pixel[:, 0] - sightings.corners_pinhole_px[row, own]
-        jitter_px = float(np.mean(rig.intrinsic[:, 0, 0])) * self._jitter_rad
-        noise = sightings.covariance_px[row, own] + jitter_px**2 * np.eye(2)
-        squared = np.sum(residual * np.linalg.solve(noise, residual[..., None])[..., 0], axis=1)
-        return row, group, residual, squared < _INLIER_SQUARED
+    def _reweigh(self) -> None:
+        """Take the observations for as good as their residuals say, as the batch does."""
+        observations = sum(len(one.observations.camera) for one in self.grown.markings.values())
+        if observations >= LEAST_OBSERVATIONS:
+            self.grown.linearise()
+            factor = self._variance_factor * self.grown.variance().observations
+            self._variance_factor = float(np.clip(factor, *VARIANCE_FACTORS))
 
 
 def _noise(pose_noise: PoseNoise, options: MappingOptions) -> Noise:

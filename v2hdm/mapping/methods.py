@@ -15,19 +15,20 @@ from v2hdm.adjust import Status, observability
 from v2hdm.detection.camera.ground import ipm_from_extrinsic
 from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.mapping.growth import grow_map
-from v2hdm.mapping.incremental import Grown
+from v2hdm.mapping.grown import Grown
+from v2hdm.mapping.growth import chosen_steps, grow_map
 from v2hdm.mapping.lanes.fuse import map_lanes
 from v2hdm.mapping.lanes.points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
 from v2hdm.mapping.naive import naive_markings
 from v2hdm.mapping.optimise import Optimiser, nearest_extrinsic
 from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
+from v2hdm.mapping.outputs import adjusted_poses, clock_offsets
 from v2hdm.mapping.remedy import Outcome, optimise
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.sightings.table import Sightings, camera_of, collect_sightings
 from v2hdm.mapping.sightings.views import views_of
 from v2hdm.mapping.survey import without_corner
-from v2hdm.records import Calibration, Drive, FloatArray, HdMap, ImageDetections, Lane
+from v2hdm.records import Drive, FloatArray, HdMap, ImageDetections, Lane
 
 Progress = Callable[[str], None]
 
@@ -53,7 +54,8 @@ def run_methods(
         cameras: Which cameras to map with, together.
         options: Settings of the mapping.
         progress: Called with the name of each step as it begins.
-        growth_steps: At how many sizes of the growing map ``Opt`` is solved again; 0 for none.
+        growth_steps: At how many sizes of the growing map ``Opt`` is solved again (in incremental mode,
+            shown as it was); 0 for none.
 
     Returns:
         Results by method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``.
@@ -79,7 +81,7 @@ def run_methods(
     begin_s = time.perf_counter()
     if options.mode == INCREMENTAL:
         grown = optimiser.run_incrementally(tell)
-        optimal = _incremental_result(drive, detections, cameras, grown, options, begin_s)
+        optimal = _incremental_result(drive, detections, cameras, grown, options, begin_s, growth_steps)
     else:
         outcome = optimise(drive, detections, cameras, options, tell)
         optimal = _optimised_result(cameras, outcome, begin_s)
@@ -159,6 +161,8 @@ def _optimised_result(cameras: Sequence[str], outcome: Outcome, begin_s: float) 
         },
         certainty=_certainty(optimised.bundle),
         evidence=outcome.evidence,
+        poses=adjusted_poses(outcome),
+        clocks=clock_offsets(outcome),
     )
 
 
@@ -169,22 +173,25 @@ def _incremental_result(
     grown: Grown,
     options: MappingOptions,
     begin_s: float,
+    growth_steps: int,
 ) -> MethodResult:
     lanes = _lanes(drive, detections, ground_by_rig(drive, cameras, grown.rig), options)
-    covariance = grown.grown.extrinsic_covariance
     return MethodResult(
         name="Opt",
         cameras=tuple(cameras),
         hd_map=HdMap(grown.markings, lanes, drive.origin),
-        calibrations={
-            name: Calibration(drive.cameras[name].info, grown.rig.cam_from_vehicle[c], covariance[c])
-            for c, name in enumerate(cameras)
-        },
+        calibrations=grown.calibrations,
         excluded=grown.excluded,
+        reprojection_rmse_px=grown.reprojection_rmse_px,
+        initial_reprojection_rmse_px=grown.initial_reprojection_rmse_px,
+        growth=chosen_steps(grown.growth, growth_steps),
         diagnostics={
-            "candidates": float(len(grown.grown.markings)),
+            "observations": float(grown.observations),
+            "candidates": float(grown.association.count),
+            "chi2_per_dof": grown.chi2_per_dof,
             "time_s": time.perf_counter() - begin_s,
         },
+        certainty=grown.certainty,
     )
 
 

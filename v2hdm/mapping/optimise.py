@@ -22,9 +22,17 @@ from v2hdm.geometry.ground import extrinsic_from_ipm
 from v2hdm.mapping.association.groups import Association, fuse_groups, same_groups
 from v2hdm.mapping.association.merge import merge_groups
 from v2hdm.mapping.association.tracks import Uncertainty, build_tracks
-from v2hdm.mapping.bundle import Bundle, coarse_model, full_model, solve_bundle
+from v2hdm.mapping.bundle import (
+    LEAST_OBSERVATIONS,
+    VARIANCE_FACTORS,
+    Bundle,
+    coarse_model,
+    full_model,
+    solve_bundle,
+)
 from v2hdm.mapping.corner_order import settle_corner_order
-from v2hdm.mapping.incremental import Grown, IncrementalMapper
+from v2hdm.mapping.grown import Grown
+from v2hdm.mapping.incremental import IncrementalMapper
 from v2hdm.mapping.markings.conclude import Evidence, Optimised, conclude
 from v2hdm.mapping.options import AUTO, MappingOptions
 from v2hdm.mapping.sightings.location import Located, locate
@@ -44,13 +52,6 @@ STEEP_SINE = 0.15
 
 LOOSE_CLOCK_SIGMA_S = 0.3
 """How far clocks may be apart, s, once the drive has said that they are: half a period of a slow receiver."""
-
-_LEAST_OBSERVATIONS = 200
-"""Of fewer, the residuals cannot tell how large their variance is."""
-
-_VARIANCE_FACTORS = (0.05, 20.0)
-"""Between these a detector's own statement may be corrected."""
-
 
 class Optimiser:
     """Takes one set of cameras through association and solving."""
@@ -147,6 +148,11 @@ class Optimiser:
         )
         return mapper.run(self._views, progress or _silent)
 
+    def joint_solve(self, grown: Grown) -> Bundle:
+        """All that an incremental map was grown from, solved together: the evidence to judge it by."""
+        self._variance_factor = grown.variance_factor
+        return self._solve(grown.association, grown.usable, grown.rig)
+
     def solve_groups(self, optimised: Optimised, groups: IntArray) -> Bundle:
         """Solve with only some ``groups`` of a finished optimisation, from the initial extrinsics."""
         association = optimised.bundle.association
@@ -213,9 +219,9 @@ class Optimiser:
         How well the poses are known is on the receiver's data sheet; how well corners are found in this
         light, on this paint, under what is left of the lens's distortion, only the drive itself can tell.
         """
-        if len(bundle.row) >= _LEAST_OBSERVATIONS:
+        if len(bundle.row) >= LEAST_OBSERVATIONS:
             factor = self._variance_factor * bundle.solution.observation_factor
-            self._variance_factor = float(np.clip(factor, *_VARIANCE_FACTORS))
+            self._variance_factor = float(np.clip(factor, *VARIANCE_FACTORS))
 
     def _choose_pose_model(self, bundle: Bundle) -> str:
         """The name of the model that predicts held-out observations best, from where ``bundle`` ended."""

@@ -29,6 +29,7 @@ from v2hdm.mapping.fit import (
 from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.sightings.backprojection import camera_centres
 from v2hdm.mapping.sightings.table import Sightings, collect_sightings
 from v2hdm.mapping.sightings.views import views_of
 from v2hdm.records import Drive, ImageDetections
@@ -43,6 +44,7 @@ LEAST_VALUE: Mapping[Fault, float] = {
     Fault.CLOCK: 0.005,
     Fault.FOCAL: 0.003,
     Fault.DISTORTION: 0.002,
+    Fault.PRINCIPAL: 5.0,
     Fault.SLOPE: 0.002,
     Fault.SURVEY: 0.03,
     Fault.LEVER: 0.03,
@@ -104,7 +106,9 @@ def optimise(
         optimiser = Optimiser(sightings, views_of(drive, cameras), drive.cameras, drive.pose_noise, options)
         settled = optimiser.settle(optimiser.initial_tracks(), tell)
         tell("tests of the inputs")
-        found = suspects(settled.problem, settled.solution)
+        found = [
+            one for one in suspects(settled.problem, settled.solution) if _is_stated(one, settled, drive)
+        ]
         worst = next((one for one in found if is_contradicted(one.fault, one.value, one.sigmas)), None)
         inputs = Inputs(drive, detections, options, sightings)
         remedied = None
@@ -117,8 +121,27 @@ def optimise(
         corrected.append(told)
         drive, detections, options = remedied.drive, remedied.detections, remedied.options
     optimised = optimiser.finish(settled, tell)
+    corrected = [_as_solved(one, settled) for one in corrected]
     evidence = _evidence(settled, contradictions(settled, found), corrected, optimiser, optimised, sightings)
     return Outcome(inputs, optimiser, optimised, evidence)
+
+
+def _is_stated(one: Suspect, bundle: Bundle, drive: Drive) -> bool:
+    """Whether what is suspected was stated at all: a centre may be unsurveyed, and is then a guess."""
+    if one.fault not in (Fault.SURVEY, Fault.LEVER):
+        return True
+    names = list(bundle.camera_index)
+    own = names if one.camera < 0 else [names[one.camera]]
+    return all(drive.cameras[name].centre_prior is not None for name in own)
+
+
+def _as_solved(one: Contradiction, bundle: Bundle) -> Contradiction:
+    """A survey that was dropped, off by what the solve without it says; others as they are."""
+    if one.fault not in (Fault.SURVEY, Fault.LEVER) or bundle.problem.centre_vehicle is None:
+        return one
+    rows = [bundle.camera_index[name] for name in one.cameras if name in bundle.camera_index]
+    off = camera_centres(bundle.solution.cam_from_vehicle)[rows] - bundle.problem.centre_vehicle[rows]
+    return replace(one, value=float(off[:, one.axis].mean()))
 
 
 def _evidence(

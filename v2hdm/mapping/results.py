@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from v2hdm.mapping.evidence import SolveEvidence
-from v2hdm.records import BoolArray, Calibration, FloatArray, HdMap, Marking
+from v2hdm.records import BoolArray, Calibration, FloatArray, HdMap, Image, Marking
 
 
 @dataclass(frozen=True)
@@ -35,20 +36,33 @@ class AdjustedPoses:
 
     Attributes:
         stamp_s: (F,) when images were taken, on the clock of the poses, rising.
-        map_from_vehicle: (F, 4, 4); those as recorded where no marking was seen.
-        sigma: (F, 6) standard deviations of x, y, z (m) and of the turns about them (rad), along the
-            vehicle's axes; those stated by the drive where no marking was seen.
+        before: (F, 4, 4) ``map_from_vehicle`` as it went into the solve.
+        map_from_vehicle: (F, 4, 4) adjusted; as before where no marking was seen.
+        sigma: (F, 6) standard deviations along and about the vehicle's axes, m and rad; those stated by the
+            drive where no marking was seen.
         seen: (F,) whether a marking was seen then.
+        frame: which of them each image is of, by its path.
     """
 
     stamp_s: FloatArray
+    before: FloatArray
     map_from_vehicle: FloatArray
     sigma: FloatArray
     seen: BoolArray
+    frame: Mapping[Path, int]
 
-    def at(self, stamp_s: float) -> FloatArray:
-        """The pose (4, 4) of the frame nearest to ``stamp_s``."""
-        return np.asarray(self.map_from_vehicle[int(np.argmin(np.abs(self.stamp_s - stamp_s)))])
+    def of_image(self, image: Image) -> FloatArray:
+        """The adjusted pose (4, 4) of an image, that in its record where the solve knew nothing of it."""
+        frame = self.frame.get(image.path)
+        return image.map_from_vehicle if frame is None else np.asarray(self.map_from_vehicle[frame])
+
+
+@dataclass(frozen=True)
+class ClockOffset:
+    """How much later than stamped a camera's images were taken, s, and how well that is known."""
+
+    value_s: float
+    sigma_s: float
 
 
 @dataclass(frozen=True)
@@ -61,7 +75,8 @@ class MethodResult:
     ``growth`` is how the result came about, marking by marking, where that was asked for;
     ``diagnostics`` are named figures for the log and the report; ``certainty`` says of each camera
     in a sentence what the drive determined and what rests on the survey; ``evidence`` is what the checks
-    after the solve rest on, ``poses`` the vehicle's poses as the solve has adjusted them.
+    after the solve rest on, ``poses`` the vehicle's poses as the solve has adjusted them, ``clocks`` the
+    offsets of the cameras' clocks, corrections before the solve included.
     """
 
     name: str
@@ -76,3 +91,4 @@ class MethodResult:
     certainty: Mapping[str, str] = field(default_factory=dict)
     evidence: SolveEvidence | None = None
     poses: AdjustedPoses | None = None
+    clocks: Mapping[str, ClockOffset] = field(default_factory=dict)

@@ -143,6 +143,10 @@ def _extrinsics(drive: Drive, methods: CameraSets, truth: Truth | None) -> dict[
                 truth.cam_from_vehicle[name] if truth else None,
             )
             found["certainty"] = optimised.certainty.get(name, "")
+            clock = optimised.clocks.get(name)
+            if clock is not None:
+                found["clock_offset_s"] = clock.value_s
+                found["clock_sigma_s"] = clock.sigma_s if np.isfinite(clock.sigma_s) else None
             if calibration.covariance is not None:
                 sigma = np.sqrt(np.diag(calibration.covariance))
                 found["translation_sigma_m"] = float(np.linalg.norm(sigma[:3]))

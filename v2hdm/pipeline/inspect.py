@@ -7,8 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from v2hdm.drive import with_clock_offsets
-from v2hdm.ground import GroundEstimate, better_start
-from v2hdm.ground.rig import estimate_cameras
+from v2hdm.ground import GroundEstimate, better_start, estimate_cameras
 from v2hdm.quality import Finding, Status, check_drive, clock_corrections
 from v2hdm.records import Camera, Drive
 

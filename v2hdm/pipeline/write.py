@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from v2hdm.detection.batch import read_image
-from v2hdm.detection.camera.ground import ipm_from_extrinsic
 from v2hdm.hdmap.calibration import write_calibration
+from v2hdm.hdmap.exclusions import ExcludedMarking, write_exclusions
 from v2hdm.hdmap.geojson import write_geojson
 from v2hdm.hdmap.heights import with_heights
 from v2hdm.mapping.results import MethodResult
-from v2hdm.pipeline.evaluate import Judgement
+from v2hdm.pipeline.evaluate import CameraSets, Judgement
+from v2hdm.pipeline.trajectory import write_trajectory
 from v2hdm.quality import Verdict
 from v2hdm.records import Drive, Image, ImageDetections
 from v2hdm.report.figures import save_birdseye, save_growth, save_overlay
@@ -28,16 +29,37 @@ def write_results(
     folder: Path,
     drive: Drive,
     detections: Sequence[ImageDetections],
-    methods: Mapping[str, MethodResult],
+    sets: CameraSets,
     judgement: Judgement,
     metrics: Mapping[str, Any],
     verdict: Verdict,
+    all_maps: bool = False,
 ) -> None:
-    """Write map, calibrations, metrics and pictures of one camera set's ``methods`` into ``folder``."""
-    best = methods[BEST]
-    write_geojson(with_heights(best.hd_map, drive.road), folder / "map.geojson")
+    """Write map, calibrations, trajectory, metrics and pictures of a run into ``folder``.
+
+    Args:
+        folder: where to.
+        drive: what was mapped.
+        detections: what was found in its images.
+        sets: results by camera set, then by method; the last set's are the run's result.
+        judgement: its figures.
+        metrics: what goes into ``metrics.json``.
+        verdict: on the run.
+        all_maps: whether to write the map of every method and camera set as well.
+    """
+    methods = list(sets.values())[-1]
+    best, told = methods[BEST], verdict.as_json()
+    write_geojson(with_heights(best.hd_map, drive.road), folder / "map.geojson", told)
     for name, calibration in best.calibrations.items():
-        write_calibration(calibration, folder / f"calibration_{name}.yaml")
+        clock = best.clocks.get(name)
+        clock_s = None if clock is None else (clock.value_s, clock.sigma_s)
+        path = folder / f"calibration_{name}.yaml"
+        write_calibration(calibration, path, clock_s=clock_s, verdict=told)
+    if best.poses is not None:
+        write_trajectory(best.poses, drive, folder)
+    _write_exclusions(folder / "excluded.geojson", drive, sets)
+    if all_maps:
+        _write_maps(folder / "maps", drive, sets)
     write_json(folder / "metrics.json", metrics)
     maps = {name: result.hd_map for name, result in methods.items()}
     route_map = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
@@ -49,20 +71,36 @@ def write_results(
         _save_overlay(folder / f"overlay_{name}.png", drive, image, best)
 
 
+def _write_exclusions(path: Path, drive: Drive, sets: CameraSets) -> None:
+    """What the best method left out, of every camera set."""
+    excluded = [
+        ExcludedMarking(one.kind, one.position_map, one.sightings, one.reason, name)
+        for name, methods in sets.items()
+        for one in methods[BEST].excluded
+    ]
+    write_exclusions(excluded, path, drive.origin, drive.road)
+
+
+def _write_maps(folder: Path, drive: Drive, sets: CameraSets) -> None:
+    folder.mkdir()
+    for name, methods in sets.items():
+        for method, result in methods.items():
+            write_geojson(with_heights(result.hd_map, drive.road), folder / f"{name}_{method}.geojson")
+
+
 def _save_overlay(path: Path, drive: Drive, image: Image, best: MethodResult) -> None:
-    """The map in an image, through the initial and the optimised IPM."""
+    """The map in an image: by the initial IPM and the recorded pose, and by what the solve has adjusted."""
     camera = drive.cameras[image.camera]
-    calibration = best.calibrations[image.camera]
-    optimised = ipm_from_extrinsic(camera.info, calibration.cam_from_vehicle)
+    adjusted = image.map_from_vehicle if best.poses is None else best.poses.of_image(image)
     initial = {"calibrated": "CNI", "estimated": "ENI"}.get(camera.initial_ipm, camera.initial_ipm)
-    save_overlay(
-        path,
-        read_image(image, camera),
-        camera.info,
-        image.map_from_vehicle,
-        best.hd_map,
-        {initial: camera.ipm[camera.initial_ipm], BEST: optimised},
-    )
+    cam_from_map = best.calibrations[image.camera].cam_from_vehicle @ np.linalg.inv(adjusted)
+    planar = np.linalg.inv(image.map_from_vehicle)[[0, 1, 3]][:, [0, 1, 3]]
+    views = {
+        initial: np.linalg.inv(camera.ipm[camera.initial_ipm]) @ planar,
+        BEST: camera.info.intrinsic @ cam_from_map[:3][:, [0, 1, 3]],
+    }
+    position_map = adjusted[:2, 3]
+    save_overlay(path, read_image(image, camera), camera.info, best.hd_map, position_map, views)
 
 
 def _fullest_image(drive: Drive, name: str, detections: Sequence[ImageDetections]) -> Image:

@@ -50,8 +50,10 @@ def _compare(name: str, mapped: Calibration, ground: Calibration) -> Finding:
         GROUND_LIMIT_SIGMAS,
         "sigmas",
         fine=f"markings and bare ground agree on its mounting ({np.abs(turn_deg).max():.2f} deg at most)",
-        wrong=f"markings and bare ground do not agree on its mounting (roll {roll:+.2f}, pitch {pitch:+.2f}, yaw "
-        f"{yaw:+.2f} deg, height {100 * up_m:+.0f} cm): wrong associations, or ground that is not flat; look at "
+        wrong=f"markings and bare ground do not agree on its mounting (roll {roll:+.2f}, pitch "
+        f"{pitch:+.2f}, yaw "
+        f"{yaw:+.2f} deg, height {100 * up_m:+.0f} cm): wrong associations, or ground that is not flat; "
+        f"look at "
         "the overlay",
     )
 

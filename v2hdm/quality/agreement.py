@@ -27,7 +27,8 @@ LEAST_OFFSET_M = 0.03
 """An offset of less than this is no finding, however sure it is: corners are good to two centimetres."""
 
 MOUNTING_LIMIT_SIGMAS = 5.0
-"""A mounting by one camera alone against that by all, in the sigmas of the former: clean drives stay below 2."""
+"""A mounting by one camera alone against that by all, in the sigmas of the former: clean drives stay below
+2."""
 
 
 def check_agreement(results: Mapping[str, MethodResult], drive: Drive) -> list[Finding]:
@@ -56,7 +57,8 @@ def check_agreement(results: Mapping[str, MethodResult], drive: Drive) -> list[F
                 MOUNTING_LIMIT_SIGMAS,
                 "sigmas",
                 fine="mapped alone and with the others, it has the same mounting",
-                wrong=f"mapped alone its mounting is {sigmas:.0f} sigmas from the one that it has with the others: "
+                wrong=f"mapped alone its mounting is {sigmas:.0f} sigmas from the one that it has with "
+                f"the others: "
                 "cameras do not agree; check its clock, its survey and camera_info",
             )
         )
@@ -73,7 +75,7 @@ def _offset(first: str, a: MethodResult, second: str, b: MethodResult, drive: Dr
     sigma = np.hypot(centre_sigma_m(a.calibrations[first])[:2], centre_sigma_m(b.calibrations[second])[:2])
     sigmas = np.where(np.abs(middle) > LEAST_OFFSET_M, np.abs(middle) / np.hypot(sigma, spread), 0.0)
     axis = int(np.argmax(sigmas))
-    where = ("ahead of", "left of")[axis]
+    where = (("behind", "ahead of"), ("right of", "left of"))[axis][int(middle[axis] > 0)]
     cause = (
         "their clocks or the forward survey of a centre disagree",
         "a heading or a lateral survey disagrees",
@@ -85,7 +87,7 @@ def _offset(first: str, a: MethodResult, second: str, b: MethodResult, drive: Dr
         OFFSET_LIMIT_SIGMAS,
         "sigmas",
         fine=f"{len(apart)} markings that both saw lie in one place",
-        wrong=f"{second} maps {len(apart)} markings {100 * middle[axis]:+.0f} cm {where} where {first} does: "
+        wrong=f"{second} maps {len(apart)} markings {100 * abs(middle[axis]):.0f} cm {where} where {first} does: "
         f"{cause[axis]}; synchronise and measure anew",
     )
 

@@ -15,7 +15,8 @@ OVERLAP = 0.1
 """Share of the smaller of two markings of a class that both cover; paint does not lie on paint."""
 
 DOUBLES_LIMIT = 0.02
-"""Share of markings that overlap another: clean drives have none, one in a hundred may be paint over old paint."""
+"""Share of markings that overlap another: clean drives have none, one in a hundred may be paint over old
+paint."""
 
 
 def check_doubles(best: MethodResult) -> list[Finding]:
@@ -36,7 +37,8 @@ def check_doubles(best: MethodResult) -> list[Finding]:
             DOUBLES_LIMIT,
             "",
             fine=f"{len(pairs)} of {count} markings overlap another of their class",
-            wrong=f"{len(pairs)} of {count} markings overlap another of their class{where}: laps or cameras do not "
+            wrong=f"{len(pairs)} of {count} markings overlap another of their class{where}: laps or "
+            f"cameras do not "
             "agree; check clocks, the receiver's fix and the mountings",
         )
     ]

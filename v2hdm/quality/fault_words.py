@@ -11,6 +11,7 @@ CHECKS: Mapping[Fault, str] = {
     Fault.CLOCK: "clock",
     Fault.FOCAL: "focal length",
     Fault.DISTORTION: "distortion",
+    Fault.PRINCIPAL: "principal point",
     Fault.SLOPE: "slope",
     Fault.SURVEY: "survey",
     Fault.LEVER: "survey",
@@ -20,20 +21,29 @@ CHECKS: Mapping[Fault, str] = {
 }
 """The check that each fault is told by."""
 
-_AXES = ("forward", "left", "up")
+_WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))
 _MAP_AXES = ("east", "north")
 
 _REMEDIES: Mapping[Fault, str] = {
     Fault.CLOCK: "synchronise the clocks of cameras and receiver, or shift the stamps by as much",
     Fault.FOCAL: "check fx and fy in camera_info against the resolution, or calibrate the lens anew",
-    Fault.DISTORTION: "check distortion_coefficients (and the focal length) in camera_info, or calibrate anew",
+    Fault.DISTORTION: "check distortion_coefficients (and the focal length) in camera_info, or "
+    "calibrate anew",
+    Fault.PRINCIPAL: "check cx and cy in camera_info against the image's size and crop, or calibrate anew",
     Fault.SLOPE: "record the height of the poses, or roll and pitch against the road",
-    Fault.SURVEY: "measure the camera's centre anew, mind signs, axes and the origin on the ground under the axle",
-    Fault.LEVER: "state the centres from the point that the poses are of, such as the antenna, or move the poses",
+    Fault.SURVEY: "measure the camera's centre anew, mind signs, axes and the origin on the ground "
+    "under the axle",
+    Fault.LEVER: "state the centres from the point that the poses are of, such as the antenna, or "
+    "move the poses",
     Fault.SIZE: "measure the paint, or leave it out of mapping.known_sizes",
     Fault.CONTROL: "measure it anew, or leave it out of mapping.survey",
     Fault.DATUM: "check that survey and poses have the same datum and origin",
 }
+
+
+def _way(one: Contradiction) -> str:
+    """How far and where to along an axis of the vehicle."""
+    return f"{100 * abs(one.value):.0f} cm {_WAYS[one.axis][one.value > 0]}"
 
 
 def remedy_of(one: Contradiction) -> str:
@@ -56,16 +66,19 @@ def wrong_as(one: Contradiction) -> str:
             return f"the focal length of {whose} is {100 * off:.1f} % {larger} than camera_info says"
         case Fault.DISTORTION:
             return f"the lens distortion of {whose} is not that of camera_info (k1 off by {one.value:+.3f})"
+        case Fault.PRINCIPAL:
+            way = ("right", "down")[one.axis]
+            return f"the principal point of {whose} lies {one.value:+.0f} px {way} of where camera_info says"
         case Fault.SLOPE:
             return (
                 f"the ground rises by {100 * one.value:+.1f} % to the {_MAP_AXES[one.axis]} under the poses"
             )
         case Fault.SURVEY:
-            return f"the surveyed centre of {whose} is {cm:+.0f} cm {_AXES[one.axis]} off"
+            return f"the centre of {whose} lies {_way(one)} its survey"
         case Fault.LEVER:
             return (
-                f"the surveyed centres of {whose} are all {cm:+.0f} cm {_AXES[one.axis]} off, as if the poses were "
-                "of another point of the vehicle than the centres (antenna instead of axle)"
+                f"the centres of {whose} all lie {_way(one)} their surveys, as if the poses were of another "
+                "point of the vehicle (antenna instead of axle)"
             )
         case Fault.SIZE:
             return f"paint stated in known_sizes as {one.about} is {cm:+.1f} cm longer"

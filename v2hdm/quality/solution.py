@@ -9,6 +9,7 @@ clean and spoilt drives measure.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -36,7 +37,8 @@ REJECTED_LIMIT = 0.06
 """Share of corner observations that the rest contradicts: clean drives reach .02, no distortion .14."""
 
 VARIANCE_LIMIT = 3.0
-"""Variance of observations as a multiple of the detector's statement: clean drives reach .2, no distortion 6."""
+"""Variance of observations as a multiple of the detector's statement: clean drives reach .2, no distortion
+6."""
 
 WINDOW_LIMIT = 8.0
 """The worst window of the route as a multiple of the median one: clean drives reach 2."""
@@ -59,15 +61,26 @@ def check_solution(drive: Drive, methods: Mapping[str, Mapping[str, MethodResult
         methods: results by camera set, the one of all cameras last, then by method.
     """
     best = list(methods.values())[-1][BEST]
-    findings: list[Finding] = []
+    causes: list[Finding] = []
+    symptoms: list[Finding] = []
     if best.evidence is not None:
-        findings += check_inputs(best.evidence)
-        findings += check_fit(best.evidence)
-        findings.append(_excluded(best))
-    findings += check_doubles(best)
+        causes = check_inputs(best.evidence)
+        symptoms = [*check_fit(best.evidence), _excluded(best)]
+    symptoms += check_doubles(best)
     if len(methods) > 1:
-        findings += check_agreement({name: by_method[BEST] for name, by_method in methods.items()}, drive)
-    return findings
+        symptoms += check_agreement({name: by_method[BEST] for name, by_method in methods.items()}, drive)
+    named = next((finding for finding in causes if finding.status is Status.FAIL), None)
+    return [*causes, *(_explained(finding, named) for finding in symptoms)]
+
+
+def _explained(finding: Finding, named: Finding | None) -> Finding:
+    """A symptom that points to the cause which the tests of the inputs have named, if they have.
+
+    What is wrong stands before the colon of its sentence, and the causes that are likely otherwise after it.
+    """
+    if named is None or finding.status is Status.PASS:
+        return finding
+    return replace(finding, says=f"{finding.says.split(': ')[0]}: see {named.check}")
 
 
 def check_inputs(evidence: SolveEvidence) -> list[Finding]:
@@ -121,6 +134,10 @@ def _contradicted(one: Contradiction, others: list[Contradiction]) -> Finding:
 
 def _agrees(check: str, tested: list[Contradiction]) -> Finding:
     worst = max(tested, key=lambda one: one.sigmas)
+    if _is_contradicted(worst):
+        return passed(
+            check, ", ".join(worst.cameras), "not told apart from what is named as wrong: mend that first"
+        )
     says = f"the markings agree with what is stated ({wrong_as(worst)} at most)"
     return Finding(
         check, Status.PASS, worst.sigmas, CONTRADICTED_SIGMAS, "sigmas", says, ", ".join(worst.cameras)
@@ -141,7 +158,8 @@ def _untold(evidence: SolveEvidence, raised: set[str]) -> list[Finding]:
             passed(
                 "clock",
                 "all cameras",
-                f"the markings do not tell a clock offset that all cameras share {sure}: drive a turn, or change "
+                f"the markings do not tell a clock offset that all cameras share {sure}: drive a turn, or "
+                f"change "
                 "the speed",
             )
         )
@@ -154,7 +172,8 @@ def _untold(evidence: SolveEvidence, raised: set[str]) -> list[Finding]:
             passed(
                 "survey",
                 "all cameras",
-                f"this drive does not tell {names} where the cameras sit on the vehicle, nor of which point of it "
+                f"this drive does not tell {names} where the cameras sit on the vehicle, nor of which "
+                f"point of it "
                 "the poses are: the survey of centre and antenna is relied on; drive a turn",
             )
         )
@@ -174,7 +193,8 @@ def check_fit(evidence: SolveEvidence) -> list[Finding]:
             VARIANCE_LIMIT,
             "",
             fine=f"corners scatter with {factor:.2f} times the variance that the detector states",
-            wrong=f"corners scatter with {factor:.1f} times the variance that the detector states: poses, lens and "
+            wrong=f"corners scatter with {factor:.1f} times the variance that the detector states: poses, "
+            f"lens and "
             "images do not fit together; check camera_info and the pose_noise first",
         ),
         judge(
@@ -184,7 +204,8 @@ def check_fit(evidence: SolveEvidence) -> list[Finding]:
             WINDOW_LIMIT,
             "",
             fine="the fit is even along the route",
-            wrong=f"from {evidence.window_s[worst]:.1f} s on corners scatter with {window:.0f} times the usual "
+            wrong=f"from {evidence.window_s[worst]:.1f} s on corners scatter with {window:.0f} times the "
+            f"usual "
             "variance: the position jumps there, or poses are missing; check the fix of the receiver",
         ),
     ]
@@ -197,7 +218,8 @@ def check_fit(evidence: SolveEvidence) -> list[Finding]:
                 REJECTED_LIMIT,
                 "",
                 fine=f"{100 * fit.rejected_share:.1f} % of its corners contradict the rest",
-                wrong=f"{100 * fit.rejected_share:.0f} % of its corners contradict the rest: its lens, clock or "
+                wrong=f"{100 * fit.rejected_share:.0f} % of its corners contradict the rest: its lens, "
+                f"clock or "
                 "mounting is not as stated",
             )
         )
@@ -211,7 +233,8 @@ def check_fit(evidence: SolveEvidence) -> list[Finding]:
                 HELD_OUT_LIMIT,
                 "",
                 fine="the map predicts corners that it has not seen as well as the noise allows",
-                wrong="the map mispredicts corners that it has not seen: an error of poses, clocks or lens is left",
+                wrong="the map mispredicts corners that it has not seen: an error of poses, clocks or "
+                "lens is left",
             )
         )
     return [*findings, *_poses(evidence)]
@@ -233,7 +256,8 @@ def _poses(evidence: SolveEvidence) -> list[Finding]:
             POSE_PULL_LIMIT,
             "sigmas",
             fine="the poses are as good as pose_noise says, or better",
-            wrong=f"the {state} of the poses errs {pull:.1f} times as much as pose_noise says: sigmas of the map are "
+            wrong=f"the {state} of the poses errs {pull:.1f} times as much as pose_noise says: sigmas of "
+            f"the map are "
             f"too small; state a larger {key}",
             status=Status.WARN,
         ),
@@ -244,7 +268,8 @@ def _poses(evidence: SolveEvidence) -> list[Finding]:
             JUMP_LIMIT,
             "sigmas",
             fine="no pose stands out from the others",
-            wrong=f"at {evidence.worst_pull_s:.1f} s the pose is {evidence.worst_pull:.0f} sigmas from where the "
+            wrong=f"at {evidence.worst_pull_s:.1f} s the pose is {evidence.worst_pull:.0f} sigmas from "
+            f"where the "
             "markings put it: the position jumps, or the fix was lost; check the receiver's log there",
             status=Status.WARN,
         ),
@@ -261,7 +286,8 @@ def _excluded(best: MethodResult) -> Finding:
         EXCLUDED_LIMIT,
         "",
         fine=f"{left_out} of {left_out + mapped} candidates were left out",
-        wrong=f"{left_out} of {left_out + mapped} candidates were left out: markings are seen, but not where others "
+        wrong=f"{left_out} of {left_out + mapped} candidates were left out: markings are seen, but not "
+        f"where others "
         "put them; see excluded.geojson",
         status=Status.WARN,
     )

@@ -14,7 +14,6 @@ from matplotlib.collections import LineCollection, PolyCollection
 from v2hdm.detection.camera.ground import apply_homography
 from v2hdm.detection.camera.lens import distort_points
 from v2hdm.files import whole_file
-from v2hdm.planar import ground_in_vehicle
 from v2hdm.records import CameraInfo, FloatArray, HdMap, Truth
 from v2hdm.report import metrics, style
 
@@ -78,17 +77,25 @@ def save_overlay(
     path: Path,
     image: np.ndarray,
     info: CameraInfo,
-    map_from_vehicle: FloatArray,
     hd_map: HdMap,
-    ipms: Mapping[str, FloatArray],
+    position_map: FloatArray,
+    views: Mapping[str, FloatArray],
 ) -> None:
-    """Draw a map into an image through several IPMs (``vehicle_from_pinhole_px``), by their names."""
+    """Draw a map into an image as several calibrations and poses see it.
+
+    Args:
+        path: where the picture goes.
+        image: as recorded.
+        info: its camera.
+        hd_map: what is drawn.
+        position_map: (2,) the vehicle's; what lies far from it is not drawn.
+        views: by name the homography ``pinhole_px_from_map`` (3 x 3) of the ground.
+    """
     canvas = image.copy()
-    for row, (name, ipm) in enumerate(ipms.items()):
+    for row, (name, pinhole_px_from_map) in enumerate(views.items()):
         colour = _bgr(style.METHOD.get(name, "#ffffff"))
-        pinhole_px_from_vehicle = np.asarray(np.linalg.inv(ipm), dtype=np.float64)
         for line, closed in _lines_of(hd_map):
-            points_px = _project_line(line, closed, info, map_from_vehicle, pinhole_px_from_vehicle)
+            points_px = _project_line(line, closed, info, position_map, pinhole_px_from_map)
             for piece in points_px:
                 fixed = np.round(piece * 16).astype(np.int32)
                 cv2.polylines(canvas, [fixed], False, colour, 2, cv2.LINE_AA, shift=4)
@@ -176,25 +183,22 @@ def _project_line(
     line_map: FloatArray,
     closed: bool,
     info: CameraInfo,
-    map_from_vehicle: FloatArray,
-    pinhole_px_from_vehicle: FloatArray,
+    position_map: FloatArray,
+    pinhole_px_from_map: FloatArray,
 ) -> list[FloatArray]:
     """The visible pieces (N, 2), recorded px, of a ground line; densified, so lenses bend it."""
     ends = np.vstack([line_map, line_map[:1]]) if closed else line_map
     dense = np.concatenate([np.linspace(a, b, 8) for a, b in itertools.pairwise(ends)])
-    points_vehicle = ground_in_vehicle(map_from_vehicle, dense)
     # The homography's sign is free: the side of the horizon that holds the image's bottom is in front.
-    bottom = np.linalg.inv(pinhole_px_from_vehicle) @ [info.width / 2, info.height - 1.0, 1.0]
-    ahead = np.sign((pinhole_px_from_vehicle @ (bottom / bottom[2]))[2])
-    depth = (
-        np.column_stack([points_vehicle, np.ones(len(points_vehicle))]) @ pinhole_px_from_vehicle[2] * ahead
-    )
-    points_pinhole_px = apply_homography(pinhole_px_from_vehicle, points_vehicle)
+    bottom = np.linalg.inv(pinhole_px_from_map) @ [info.width / 2, info.height - 1.0, 1.0]
+    ahead = np.sign((pinhole_px_from_map @ (bottom / bottom[2]))[2])
+    depth = np.column_stack([dense, np.ones(len(dense))]) @ pinhole_px_from_map[2] * ahead
+    points_pinhole_px = apply_homography(pinhole_px_from_map, dense)
     margin = np.array([info.width, info.height]) * 0.1
     size = np.array([info.width, info.height])
     visible = (
         (depth > 0)
-        & (np.linalg.norm(points_vehicle, axis=1) < _OVERLAY_RANGE_M)
+        & (np.linalg.norm(dense - position_map, axis=1) < _OVERLAY_RANGE_M)
         & ((points_pinhole_px > -margin) & (points_pinhole_px < size + margin)).all(axis=1)
     )
     edges = np.flatnonzero(np.diff(np.concatenate([[0], visible.astype(int), [0]])))

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.mapping.association.groups import fuse_groups
+from v2hdm.mapping.association.groups import Association, fuse_groups
 from v2hdm.mapping.association.merge import group_kinds
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.markings.completion import solved_corners
-from v2hdm.mapping.markings.neighbours import with_relative_sigma
+from v2hdm.mapping.markings.relative import with_relative_sigma
 from v2hdm.mapping.markings.verdict import Seen, judge_and_mend
 from v2hdm.mapping.options import AcceptanceOptions
 from v2hdm.mapping.results import Exclusion
@@ -40,6 +40,19 @@ class Evidence:
     ungated: Bundle
     inlier: BoolArray
     usable: BoolArray
+
+
+@dataclass(frozen=True)
+class Observed:
+    """K observations: the row (K,) of the sightings, the candidate ``group`` (K,) and its corner (K,)."""
+
+    row: IntArray
+    group: IntArray
+    corner: IntArray
+
+    def only(self, chosen: BoolArray) -> Observed:
+        """Those that are ``chosen`` (K,)."""
+        return Observed(self.row[chosen], self.group[chosen], self.corner[chosen])
 
 
 @dataclass(frozen=True)
@@ -86,8 +99,15 @@ def conclude(
         inlier_share=agreeing / np.maximum(total, 1),
     )
     judged = judge_and_mend(solved_corners(final), seen, options)
-    markings = with_relative_sigma(judged.markings(), judged.accepted, final)
+    scale = max(1.0, final.solution.chi2_per_dof)
+    markings = with_relative_sigma(
+        judged.markings(),
+        final.corner_index[judged.accepted],
+        lambda pairs: scale * final.solution.corner_covariance(pairs),
+    )
     used = np.isin(final.group, judged.accepted)
+    observed = Observed(final.row, final.group, final.corner)
+    at_start = residuals_under(initial_rig, evidence.sightings, final.association, observed, jitter_rad)
     return Optimised(
         bundle=final,
         usable=evidence.usable,
@@ -95,8 +115,8 @@ def conclude(
         markings=markings,
         excluded=judged.exclusions(),
         calibrations=_calibrations(final, evidence.sightings.cameras, evidence.cameras),
-        reprojection_rmse_px=_rms(final.solution.residual_px[used]),
-        initial_reprojection_rmse_px=_rms(_residuals_under(initial_rig, evidence, jitter_rad)[used]),
+        reprojection_rmse_px=root_mean_square(final.solution.residual_px[used]),
+        initial_reprojection_rmse_px=root_mean_square(at_start[used]),
     )
 
 
@@ -115,19 +135,33 @@ def _calibrations(
     }
 
 
-def _residuals_under(rig: Rig, evidence: Evidence, jitter_rad: float) -> FloatArray:
-    """Residuals (K, 2), px, of the final observations when ``rig`` and its own best corners hold."""
-    bundle, sightings = evidence.final, evidence.sightings
-    fused = fuse_groups(bundle.association, locate(sightings, rig), jitter_rad)
-    camera, frame = sightings.camera[bundle.row], sightings.frame[bundle.row]
-    cam_from_map = rig.cam_from_vehicle[camera] @ np.linalg.inv(rig.map_from_vehicle[frame])
-    points = fused.corners_map[bundle.group, bundle.corner]
+def residuals_under(
+    rig: Rig, sightings: Sightings, association: Association, observed: Observed, jitter_rad: float
+) -> FloatArray:
+    """Residuals (K, 2), px, of the observations when ``rig`` and its own best corners hold."""
+    fused = fuse_groups(association, locate(sightings, rig), jitter_rad)
+    poses = rig.map_from_vehicle[sightings.frame[observed.row]]
+    return reprojected(rig, poses, sightings, association, observed, fused.corners_map)
+
+
+def reprojected(
+    rig: Rig,
+    map_from_vehicle: FloatArray,
+    sightings: Sightings,
+    association: Association,
+    observed: Observed,
+    corners_map: FloatArray,
+) -> FloatArray:
+    """Residuals (K, 2), px, of the observations of corners (G, 4, 2) from poses (K, 4, 4)."""
+    camera = sightings.camera[observed.row]
+    cam_from_map = rig.cam_from_vehicle[camera] @ np.linalg.inv(map_from_vehicle)
+    points = corners_map[observed.group, observed.corner]
     pixel, _ = project_ground(rig.intrinsic[camera], cam_from_map, points[:, None])
-    own_corner = bundle.association.corner_order()[bundle.row, bundle.corner]
-    return np.asarray(pixel[:, 0] - sightings.corners_pinhole_px[bundle.row, own_corner])
+    own_corner = association.corner_order()[observed.row, observed.corner]
+    return np.asarray(pixel[:, 0] - sightings.corners_pinhole_px[observed.row, own_corner])
 
 
-def _rms(residual_px: FloatArray) -> float:
+def root_mean_square(residual_px: FloatArray) -> float:
     """Root mean square length of residuals (K, 2); those that cannot be projected are left out."""
     squared = np.sum(residual_px**2, axis=1)
     finite = squared[np.isfinite(squared)]

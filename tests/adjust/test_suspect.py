@@ -1,0 +1,112 @@
+"""Score tests of wrong inputs, against solving with the input freed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.adjust.scene import Scene, make_scene, with_late_clocks
+from v2hdm.adjust import (
+    ControlPoints,
+    Fault,
+    KnownLengths,
+    PoseSigma,
+    Problem,
+    SolveOptions,
+    Suspect,
+    solve,
+    suspects,
+)
+
+OPTIONS = SolveOptions(coarse=False, loss="none")
+POSES = PoseSigma(0.01, 0.001, 0.002, 0.005)
+
+
+def scene(seed: int = 3) -> Scene:
+    return make_scene(seed, frames=60, every_m=3.0, jitter=POSES, start_error_deg=0.5)
+
+
+def found_of(problem: Problem, fault: Fault, camera: int, axis: int = 0) -> Suspect:
+    found = suspects(problem, solve(problem, OPTIONS))
+    (one,) = [s for s in found if (s.fault, s.camera, s.axis) == (fault, camera, axis)]
+    return one
+
+
+def with_focal(problem: Problem, factor: float) -> Problem:
+    intrinsic = problem.intrinsic.copy()
+    intrinsic[:, :2] *= factor
+    return replace(problem, intrinsic=intrinsic)
+
+
+def test_a_right_problem_contradicts_nothing() -> None:
+    problem = scene().problem
+    assert all(one.sigmas < 4 for one in suspects(problem, solve(problem, OPTIONS)))
+
+
+def test_the_gain_and_the_value_of_a_focal_length_are_those_of_solving_for_it() -> None:
+    problem = with_focal(scene().problem, 1.002)
+    step = 5e-4
+    low, middle, high = (2 * solve(with_focal(problem, 1 + p), OPTIONS).cost for p in (-step, 0.0, step))
+    curvature, slope = (high - 2 * middle + low) / step**2, (high - low) / (2 * step)
+    one = found_of(problem, Fault.FOCAL, -1)
+    assert one.value == pytest.approx(-slope / curvature, rel=0.05)
+    assert one.sigma == pytest.approx((2 / curvature) ** 0.5, rel=0.05)
+    assert one.gain == pytest.approx(slope**2 / (2 * curvature), rel=0.1)
+    assert one.value == pytest.approx(-0.002, abs=4 * one.sigma)
+
+
+def test_a_late_clock_is_found_and_named_first() -> None:
+    late = with_late_clocks(scene(), np.array([0.06, 0.0])).problem
+    found = suspects(late, solve(late, OPTIONS))
+    assert (found[0].fault, found[0].camera) == (Fault.CLOCK, 0)
+    assert found[0].value == pytest.approx(0.06, abs=0.01)
+    assert found[0].sigmas > 10
+
+
+def test_a_survey_is_held_against_what_the_drive_says_without_it() -> None:
+    problem = scene().problem
+    assert problem.centre_vehicle is not None
+    centre = problem.centre_vehicle + np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+    wrong = replace(problem, centre_vehicle=centre)
+    sigma = problem.centre_sigma_m.copy()  # type: ignore[union-attr]
+    sigma[0, 2] = 1e3
+    free = solve(replace(wrong, centre_sigma_m=sigma), OPTIONS)
+    rotation, translation = free.cam_from_vehicle[0, :3, :3], free.cam_from_vehicle[0, :3, 3]
+    without_m = float((-rotation.T @ translation)[2])
+    one = found_of(wrong, Fault.SURVEY, 0, 2)
+    assert one.value == pytest.approx(without_m - centre[0, 2], abs=0.02)
+    assert one.sigmas > 5
+
+
+def test_centres_that_are_all_off_alike_are_laid_to_the_point_of_the_poses() -> None:
+    problem = scene().problem
+    assert problem.centre_vehicle is not None
+    off = replace(problem, centre_vehicle=problem.centre_vehicle + np.array([1.2, 0.0, 0.0]))
+    first = suspects(off, solve(off, OPTIONS))[0]
+    assert (first.fault, first.axis) == (Fault.LEVER, 0)
+    assert first.value == pytest.approx(-1.2, abs=0.1)
+
+
+def test_known_sizes_that_the_paint_does_not_have_are_told_with_those_that_it_has() -> None:
+    street = scene()
+    side_m = 0.35 * 2**0.5
+    corners = street.corners_map
+    first = np.flatnonzero(np.abs(np.linalg.norm(np.diff(corners, axis=0), axis=1) - side_m) < 1e-6)
+    stated = KnownLengths(first, first + 1, np.full(len(first), side_m - 0.05), np.full(len(first), 0.005))
+    problem = replace(street.problem, lengths=stated)
+    one = suspects(problem, solve(problem, OPTIONS))[0]
+    assert one.fault is Fault.SIZE
+    assert one.value == pytest.approx(0.05, abs=0.005)
+
+
+def test_one_surveyed_point_off_is_told_from_all_off() -> None:
+    street = scene()
+    chosen = np.arange(0, len(street.corners_map), 12)
+    points = street.corners_map[chosen].copy()
+    points[1] += (0.2, 0.0)
+    control = ControlPoints(chosen, points, np.full(len(chosen), 0.01))
+    one = suspects(p := replace(street.problem, control=control), solve(p, OPTIONS))[0]
+    assert (one.fault, one.item) == (Fault.CONTROL, 1)
+    assert one.value == pytest.approx(0.2, abs=0.05)

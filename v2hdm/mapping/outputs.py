@@ -1,0 +1,46 @@
+"""What an optimisation estimates besides map and mountings: the vehicle's poses and the cameras' clocks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from v2hdm.adjust import Fault
+from v2hdm.mapping.remedy import Outcome
+from v2hdm.mapping.results import AdjustedPoses, ClockOffset
+from v2hdm.mapping.sightings.table import frames_of
+
+
+def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
+    """The poses of all frames of the drive."""
+    drive, sightings, bundle = outcome.inputs.drive, outcome.inputs.sightings, outcome.optimised.bundle
+    sigma = np.tile(bundle.model.pose_sigma.by_state(), (len(sightings.stamp_s), 1))
+    used = np.unique(sightings.frame[bundle.row])
+    if bundle.model.solver.pose_states:
+        inflation = max(1.0, bundle.solution.chi2_per_dof)
+        sigma[used] = np.sqrt(bundle.solution.covariance.poses() * inflation)
+    seen = np.zeros(len(sightings.stamp_s), dtype=bool)
+    seen[used] = True
+    frames = frames_of(drive).frame_of_image
+    return AdjustedPoses(
+        stamp_s=sightings.stamp_s,
+        before=sightings.map_from_vehicle,
+        map_from_vehicle=bundle.rig.map_from_vehicle,
+        sigma=sigma,
+        seen=seen,
+        frame={image.path: int(frame) for image, frame in zip(drive.images, frames, strict=True)},
+    )
+
+
+def clock_offsets(outcome: Outcome) -> dict[str, ClockOffset]:
+    """Each camera's clock offset: what its images were posed anew by, and what the solve estimates beyond."""
+    evidence = outcome.evidence
+    applied_s = {image.camera: image.clock_offset_s for image in outcome.inputs.drive.images}
+    clocks = {}
+    for name in outcome.inputs.sightings.cameras:
+        beyond_s, sigma_s = evidence.clock_s.get(name, (0.0, 0.0))
+        if name not in evidence.clock_s:
+            # Of each camera, and of all of them together: a clock of its own may differ by both.
+            tested = [one for one in evidence.suspects if one.fault is Fault.CLOCK and name in one.cameras]
+            sigma_s = float(np.sqrt(sum(one.sigma**2 for one in tested))) if tested else float("inf")
+        clocks[name] = ClockOffset(applied_s.get(name, 0.0) + beyond_s, sigma_s)
+    return clocks
