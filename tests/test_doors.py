@@ -41,6 +41,7 @@ def run_door(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
         (("train",), "torch"),
         (("export", "checkpoint=a", "output=b"), "onnx"),
         (("v2hdm.detect", "images"), "cv2"),
+        (("v2hdm.check", "drive"), "cv2"),
     ],
 )
 def test_an_interruption_while_libraries_are_loaded_is_one_line(
@@ -58,6 +59,7 @@ def test_an_interruption_while_libraries_are_loaded_is_one_line(
     [
         (("v2hdm.map", "+run=port2"), "torch", "map"),
         (("v2hdm.map", "+run=port2"), "kornia", "map"),
+        (("v2hdm.check", "drive"), "matplotlib", "map"),
         (("train",), "tensorboard", "train"),
         (("export", "checkpoint=a", "output=b"), "onnx", "train"),
     ],

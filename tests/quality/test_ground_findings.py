@@ -24,6 +24,7 @@ def estimate(name: str = "front", **values: float) -> GroundEstimate:
     """A clean camera, apart from some parameters."""
     parameters = {key: Parameter(key, values.get(key, 0.0), sigma, told=True) for key, sigma in SIGMA.items()}
     guess = np.eye(4)
+    guess[:3, :3] = [[0, -1, 0], [-0.26, 0, -0.966], [0.966, 0, -0.26]]  # 15 deg down
     return GroundEstimate(
         camera=name,
         status=GroundStatus.FOUND,
@@ -181,3 +182,21 @@ def test_a_mirrored_path_is_told_although_most_of_a_straight_route_matches_as_gi
 def test_a_clean_drive_that_matches_mirrored_as_well_is_taken_as_given() -> None:
     alike = replace(estimate(), shares={Reading.AS_GIVEN: 0.41, Reading.MIRRORED: 0.52})
     assert not raised(check_ground(drive(poses()), {"front": alike}))
+
+
+def test_a_straight_road_cannot_tell_the_focal_length_from_the_height() -> None:
+    straight = estimate(focal_scale=0.08)
+    ahead = Parameter("forward_m", 0.4, 0.8, told=False, why_not="the vehicle drives straight")
+    straight = replace(straight, parameters={**straight.parameters, "forward_m": ahead})
+    findings = check_ground(drive(poses()), {"front": straight})
+    assert not raised(findings)
+    assert "focal length from ground" in {finding.check for finding in findings if finding.is_untold}
+
+
+def test_a_level_camera_cannot_tell_a_bent_lens_from_a_bent_road() -> None:
+    level = np.eye(4)
+    level[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+    flat = replace(estimate(distortion_k1=-0.055), calibration=Calibration(camera().info, level, np.eye(6)))
+    findings = check_ground(drive(poses()), {"front": flat})
+    assert not raised(findings)
+    assert "distortion" in {finding.check for finding in findings if finding.is_untold}
