@@ -60,8 +60,8 @@ TOLD_SIGMA: Mapping[Fault, float] = {
     Fault.DISTORTION: 0.02,
     Fault.PRINCIPAL: 10.0,
     Fault.SLOPE: 0.003,
-    Fault.SURVEY: 0.2,
-    Fault.LEVER: 0.2,
+    Fault.SURVEY: 1.0,
+    Fault.LEVER: 1.0,
     Fault.SIZE: 0.05,
     Fault.CONTROL: 0.05,
     Fault.DATUM: 0.05,
@@ -78,6 +78,9 @@ speed tells the distance of two centres, or the difference of two clocks, alone.
 
 CLOCK_TOLD_S = 0.004
 """Sigma of a clock offset, s, up to which it is put right: two of them are 8 ms."""
+
+CENTRE_TOLD_M = 0.1
+"""Sigma of a centre, m, up to which the drive can do without its survey: it moves the whole map."""
 
 MOST_CORRECTIONS = 4
 """Inputs that may be dropped one after the other; with more wrong than that nothing can be relied on."""
@@ -224,6 +227,8 @@ def _remedied(inputs: Inputs, worst: Suspect, settled: Bundle, optimiser: Optimi
             return None
         return _with_clocks(inputs, optimiser.clock_offsets_s(settled))
     if worst.fault in (Fault.SURVEY, Fault.LEVER):
+        if worst.sigma > CENTRE_TOLD_M:
+            return None
         names = tuple(settled.camera_index)
         return _without_axis(inputs, names if worst.camera < 0 else (names[worst.camera],), worst.axis)
     options = inputs.options
