@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 
 from v2hdm import config
 from v2hdm.errors import ConfigError
@@ -31,9 +33,16 @@ def test_every_shipped_run_composes_into_dataclasses(run: str) -> None:
     assert composed(f"+run={run}", "drive.path=x" if run == "kitti" else "workers=1").name == run
 
 
+@dataclass
+class Needy:
+    """A configuration with a value that must be given."""
+
+    path: str
+
+
 def test_a_missing_value_is_an_error_that_gives_the_advice_of_the_door() -> None:
-    with pytest.raises(ConfigError, match="no value for name; choose a run"):
-        composed()
+    with pytest.raises(ConfigError, match="no value for path; choose a run"):
+        config.to_dataclass(OmegaConf.structured(Needy), Needy, "choose a run")
 
 
 def run_door(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
@@ -47,7 +56,11 @@ def run_door(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
         (("+run=port2", "maping.max_range_m=3"), "maping"),
         (("+run=port2", "mapping.max_rnge_m=3"), "max_range_m"),
         (("+run=port9",), "port9"),
-        ((), "no value for name; choose a run (+run=port1, +run=port2,"),
+        (
+            (),
+            "drive.path is not set: name the folder of the drive, e.g. drive.path=my_drive, or choose a run",
+        ),
+        (("drive.path=nowhere",), "nowhere: no such drive folder"),
         (("+run=port2", "workers=many"), "workers"),
         (("+run=port2", "simulate.route.pieces=[[62.0,0.0],[23,-90.0]]"), "write 23.0"),
         (("+run=port2", "+mapping.known_sizes.by_class_m={diamond: [1, 0.7]}"), "write 1.0"),

@@ -73,3 +73,25 @@ def test_a_library_that_is_not_installed_is_one_line_that_names_the_extra(
         f"error: python -m {arguments[0]} needs {missing}: install the {extra} extra"
     )
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("arguments", [("v2hdm.map", "--help"), ("v2hdm.detect", "--help")])
+def test_help_that_nobody_reads_to_its_end_is_no_error(arguments: tuple[str, ...]) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as closed:
+        done = subprocess.run(
+            [sys.executable, "-m", *arguments], cwd=ROOT, stdout=closed, stderr=subprocess.PIPE, timeout=60
+        )
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+@pytest.mark.parametrize(("given", "expected"), [(None, "passive"), ("active", "active")])
+def test_openmp_waits_without_spinning_unless_the_user_says_so(
+    given: str | None, expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    if given is not None:
+        monkeypatch.setenv("OMP_WAIT_POLICY", given)
+    (tmp_path / "torch.py").write_text("import os; raise SystemExit(os.environ['OMP_WAIT_POLICY'])")
+    assert run_door(tmp_path, "v2hdm.map", "+run=port2").stderr.strip() == expected

@@ -82,7 +82,7 @@ class LabelledImages:
 
     def _window(self, rng: np.random.Generator, image: LabelledImage) -> TrainingSample:
         """A part of the image of a render's size or, where it is smaller, all of it."""
-        pixels = read_bgr(image.path, grey=True)
+        pixels = read_bgr(image.path)
         rows, columns = pixels.shape[:2]
         width, height = min(columns, self.config.render_width), min(rows, self.config.render_height)
         corner = rng.integers(0, (columns - width + 1, rows - height + 1))
@@ -121,7 +121,7 @@ def _check(image: LabelledImage, config: DataConfig) -> None:
     except DriveError as error:
         raise LabelError(f"{image.where}: {error}") from error
     if size is None:
-        size = tuple(reversed(read_bgr(image.path, grey=True).shape[:2]))
+        size = tuple(reversed(read_bgr(image.path).shape[:2]))
     if image.size is not None and image.size != size:
         raise LabelError(
             f"{image.where}: {image.path} is {size[0]}x{size[1]} but its labels are for "

@@ -16,7 +16,8 @@ from v2hdm.detection.camera.mounting import guessed_extrinsic
 from v2hdm.detection.image_file import read_bgr
 from v2hdm.drive import ReadOptions, read_drive
 from v2hdm.errors import ConfigError
-from v2hdm.ground import GroundEstimate, estimate_cameras
+from v2hdm.ground import GroundEstimate
+from v2hdm.ground.rig import estimate_cameras
 from v2hdm.quality import Status, Verdict, check_drive
 from v2hdm.records import Drive, FloatArray, Trajectory
 from v2hdm.report.camera_grid import save_grid

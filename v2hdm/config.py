@@ -54,6 +54,8 @@ def compositions(name: str, schema: type[Any]) -> list[DictConfig]:
         compose()
     except (HydraException, OmegaConfBaseException) as error:
         raise explain(error, schema, sys.argv[1:]) from error
+    except BrokenPipeError:  # --help has met a reader who has had enough
+        raise
     except OSError as error:
         raise ConfigError(
             f"{error.filename}: no folder can be made there ({error.strerror}); set another output="

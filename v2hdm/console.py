@@ -28,7 +28,7 @@ def run_on_terminal(config: pipeline.RunConfig, config_yaml: str) -> Verdict:
     for line in result.headlines:
         console.print(line, highlight=False)
     if result.metrics["results"]:
-        console.print(results_table(config.name, result.metrics["results"]))
+        console.print(results_table(result.metrics["name"], result.metrics["results"]))
     style = _STYLES[result.verdict.status]
     for number, line in enumerate(result.verdict.lines):
         console.print(

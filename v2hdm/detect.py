@@ -19,11 +19,11 @@ _INTERRUPTED = "interrupted before the last image; no --output was written"
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the door; the exit code is 0, or 2 with one line on stderr for what a user got wrong."""
+    return open_door("v2hdm.detect", None, _INTERRUPTED, lambda: _watch(arguments))
+
+
+def _watch(arguments: Sequence[str] | None) -> None:
     parsed = _parser().parse_args(arguments)
-    return open_door("v2hdm.detect", None, _INTERRUPTED, lambda: _watch(parsed))
-
-
-def _watch(parsed: argparse.Namespace) -> None:
     from v2hdm.watch import watch
 
     watch(parsed)

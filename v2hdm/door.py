@@ -6,6 +6,7 @@ one line while torch is still being loaded, too.
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import time
@@ -30,8 +31,16 @@ def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[],
         interrupted: what to say after Ctrl-C.
         work: imports what it needs.
     """
+    # OpenMP's threads sleep while they wait for each other. Spinning, they hold up those that they wait for
+    # as soon as the machine is busy otherwise. Libraries read this when they are loaded.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
-        return work() or 0
+        return _to_the_end(work)
+    except BrokenPipeError:  # the reader of our output has had enough
+        from v2hdm.files import forget_stdout
+
+        forget_stdout()
+        return 0
     except V2hdmError as error:
         return _fail(str(error))
     except ModuleNotFoundError as error:
@@ -42,6 +51,17 @@ def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[],
         )
     except KeyboardInterrupt:
         return _fail(interrupted)
+
+
+def _to_the_end(work: Callable[[], int | None]) -> int:
+    """Do the work and write all that it printed, while it can still be told that nobody reads it."""
+    try:
+        code = work() or 0
+    except SystemExit:  # argparse, after --help
+        sys.stdout.flush()
+        raise
+    sys.stdout.flush()
+    return code
 
 
 def _fail(message: str) -> int:

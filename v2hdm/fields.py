@@ -97,12 +97,12 @@ def lens_reach(info: CameraInfo) -> float:
     """
     angles = np.linspace(0, _WIDEST_RAD, 4096)
     with np.errstate(all="ignore"):  # absurd coefficients do not rise
-        recorded = _recorded(info, angles)
+        recorded = recorded_distance(info, angles)
         falls = np.flatnonzero(~(np.diff(recorded) > 0))
     return float(recorded[falls[0]]) if len(falls) else np.inf
 
 
-def _recorded(info: CameraInfo, angles: FloatArray) -> FloatArray:
+def recorded_distance(info: CameraInfo, angles: FloatArray) -> FloatArray:
     """Distance from the centre, in focal lengths, of rays by their angles from the axis (rad)."""
     k = info.distortion
     if info.distortion_model == "equidistant":

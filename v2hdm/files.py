@@ -170,3 +170,8 @@ def take_text(content: object, where: str, error: type[V2hdmError]) -> str:
 def _describe(content: object) -> str:
     text = repr(content)
     return "nothing" if content is None else text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def forget_stdout() -> None:
+    """Keep Python from writing at its end what could not be written before."""
+    sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123

@@ -152,13 +152,13 @@ class PoseNoise:
         noise = cls(**stated)
         drifts = {
             drift: math.sqrt(_USUAL_DRIFT_SHARE) * getattr(noise, total)
-            for total, drift in _DRIFTS.items()
+            for total, drift in DRIFTS.items()
             if drift not in stated
         }
         return replace(noise, **drifts)
 
 
-_DRIFTS: Mapping[str, str] = {
+DRIFTS: Mapping[str, str] = {
     "position_m": "position_drift_m",
     "heading_rad": "heading_drift_rad",
     "roll_pitch_rad": "roll_pitch_drift_rad",
@@ -290,8 +290,8 @@ class Marking:
     """One mapped marking: ``corners_map`` (4, 2) m, counter-clockwise seen from above.
 
     ``covariance_m2`` (8, 8) is that of the stacked corners in the map, or None where the method has none.
-    ``relative_sigma_m`` is the standard deviation of a coordinate of its centre against that of the marking
-    nearest to ten metres away, of which a drift that both share is no part; None where it is not known.
+    ``relative_sigma_m`` is what the marking contributes to the error of a distance to one about 10 m away,
+    one standard deviation a coordinate: without the drift and the survey that both share. None if unknown.
     ``heights_m`` (4,) are the recorded heights of the ground there, None where it was recorded as z = 0.
     """
 

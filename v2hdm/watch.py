@@ -28,7 +28,7 @@ from v2hdm.detection.road import Road, RoadDetector
 from v2hdm.detection.stopwatch import Stopwatch, lap
 from v2hdm.drive import READERS, read_drive
 from v2hdm.errors import ConfigError, DriveError
-from v2hdm.files import whole_file
+from v2hdm.files import forget_stdout, whole_file
 
 _ROUGH_RANGE_M = 40.0
 """Without a calibration distances may be wrong by a factor of two: nothing may be dropped for being far."""
@@ -54,13 +54,6 @@ def watch(parsed: argparse.Namespace) -> None:
     Raises:
         V2hdmError: what a user got wrong.
     """
-    try:
-        _watch(parsed)
-    except BrokenPipeError:  # the reader of our lines has had enough
-        _forget_stdout()
-
-
-def _watch(parsed: argparse.Namespace) -> None:
     cv2.setNumThreads(1)
     options = DetectorOptions(model=parsed.model, threads=parsed.threads)
     if parsed.camera is None:
@@ -87,11 +80,6 @@ def _watch(parsed: argparse.Namespace) -> None:
     _report(stopwatch)
     if failure:
         raise failure
-
-
-def _forget_stdout() -> None:
-    """Keep Python from writing at its end what could not be written before."""
-    sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
 
 
 def _job(parsed: argparse.Namespace, detector: Detector) -> _Job:
@@ -143,7 +131,7 @@ def _drive_frames(
         roads = {name: road}
     for image in drive.images:
         if image.camera in roads:
-            (frame,) = image_frames([image.path], grey=True)
+            (frame,) = image_frames([image.path])
             name = f"{image.camera}_{frame.name}"
             yield replace(frame, name=name, stamp_s=image.stamp_s), roads[image.camera]
 
@@ -208,7 +196,7 @@ def _lines(output: Path | None) -> Iterator[TextIO]:
         except BrokenPipeError:
             raise
         except OSError as error:
-            _forget_stdout()
+            forget_stdout()
             raise DriveError(
                 f"standard output: cannot be written ({error.strerror}); give an --output with room for it"
             ) from error

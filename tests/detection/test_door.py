@@ -187,9 +187,7 @@ def bad_source(name: str, bench: Bench, folder: Path) -> list[object]:
     """The arguments of one mistake."""
     image = cv2.imread(str(bench.folder / "0.png"))
     path = folder / f"{name}.png"
-    if name == "grey":
-        cv2.imwrite(str(path), image[..., 0])
-    elif name == "deep":
+    if name == "deep":
         cv2.imwrite(str(path), image.astype(np.uint16) * 256)
     elif name == "small":
         cv2.imwrite(str(path), image[::2, ::2])
@@ -208,11 +206,18 @@ def bad_source(name: str, bench: Bench, folder: Path) -> list[object]:
     return [path]
 
 
+def test_a_grey_image_in_a_folder_is_looked_at_like_the_others(bench, tmp_path):
+    image = cv2.imread(str(bench.folder / "0.png"))
+    for name, pixels in (("0", image), ("1", cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)), ("2", image)):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), pixels)
+    assert bench.run(tmp_path, "--output", tmp_path / "found.jsonl") == 0
+    assert len((tmp_path / "found.jsonl").read_text().splitlines()) == 3
+
+
 @pytest.mark.parametrize(
     ("mistake", "words"),
     [
         ("missing", "missing.png: no such image, video or folder"),
-        ("grey", "grey.png: the image has one channel; convert it"),
         ("deep", "deep.png: the image has 16 bits a channel; convert it to 8 bits"),
         ("small", "the image is 320x180, but the calibration of camera 'front' is for 640x360"),
         ("video", "broken.mp4: neither an image nor a video"),
@@ -269,7 +274,7 @@ class FullDevice(io.StringIO):
 
 def test_a_full_standard_output_is_one_line(bench, monkeypatch, capsys):
     monkeypatch.setattr("sys.stdout", FullDevice())
-    monkeypatch.setattr(watch, "_forget_stdout", lambda: None)
+    monkeypatch.setattr(watch, "forget_stdout", lambda: None)
     assert bench.run(bench.folder) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: standard output: cannot be written (No space left")

@@ -3,6 +3,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from tests.drive.example import make_drive
@@ -18,9 +19,9 @@ def test_the_documented_drive_reads_and_its_cameras_look_at_their_rois(tmp_path:
     make_drive(tmp_path)
     (tmp_path / "drive.yaml").write_text(BLOCKS[0])
     for name in ("front", "rear"):
-        (tmp_path / name / "camera_info.yaml").write_text(
-            BLOCKS[1].replace("width: 1280", "width: 64").replace("height: 720", "height: 48")
-        )
+        (tmp_path / name / "camera_info.yaml").write_text(BLOCKS[1])
+        for image in (tmp_path / name / "images").iterdir():
+            cv2.imwrite(str(image), np.zeros((720, 1280, 3), np.uint8))
     drive = read_drive(tmp_path)
     assert drive.name == "quay-7"
     for camera in drive.cameras.values():

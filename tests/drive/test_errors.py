@@ -186,3 +186,31 @@ def test_damaged_truth_is_refused(tmp_path: Path, damage: Damage, message: str) 
     damage(tmp_path)
     with pytest.raises(DriveError, match=message):
         read_truth(read_drive(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("roi", "cause"),
+    [
+        ([[-9.0, -3.0], [-3.0, -3.0], [-3.0, 3.0], [-9.0, 3.0]], "lies behind the camera"),
+        ([[3.0, 20.0], [9.0, 20.0], [9.0, 26.0], [3.0, 26.0]], "lies outside the image"),
+        ([[0.5, -1.0], [1.5, -1.0], [1.5, 1.0], [0.5, 1.0]], "lies outside the image"),
+    ],
+)
+def test_a_region_that_the_camera_does_not_see_is_named_for_that(
+    tmp_path: Path, roi: list[list[float]], cause: str
+) -> None:
+    make_drive(tmp_path)
+    front(roi_vehicle=roi)(tmp_path)
+    with pytest.raises(DriveError, match=f"camera 'front', roi_vehicle: {cause}"):
+        read_drive(tmp_path)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_region_of_which_the_image_shows_a_part_is_taken_whatever_the_sign_of_the_ipm(
+    tmp_path: Path, sign: float
+) -> None:
+    make_drive(tmp_path)
+    content = yaml.safe_load((tmp_path / "drive.yaml").read_text())
+    ipm = {name: (sign * np.array(m)).tolist() for name, m in content["cameras"]["front"]["ipm"].items()}
+    front(ipm=ipm, roi_vehicle=[[-1.0, -9.0], [30.0, -9.0], [30.0, 9.0], [-1.0, 9.0]])(tmp_path)
+    assert read_drive(tmp_path).images

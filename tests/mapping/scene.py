@@ -102,6 +102,9 @@ def make_scene(options: SceneOptions) -> Scene:
         max(options.rtk_m, 0.005),
         max(np.deg2rad(options.heading_deg), 2e-4),
         max(np.deg2rad(options.jitter_deg), 2e-4),
+        position_drift_m=0.0,
+        heading_drift_rad=0.0,
+        roll_pitch_drift_rad=0.0,
     )
     drive = Drive("yard", Path(), cameras, images, noise)
     return Scene(drive, detections, markings, lanes, truth)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.mapping.scene import Scene, SceneOptions, make_scene
-from v2hdm.mapping.association.groups import Association, fuse_groups, keep_rows, same_groups
+from v2hdm.mapping.association.groups import Association, FusedGroups, fuse_groups, keep_rows, same_groups
 from v2hdm.mapping.association.merge import merge_groups
 from v2hdm.mapping.association.tracks import Uncertainty, build_tracks
 from v2hdm.mapping.optimise import initial_rig
@@ -151,3 +151,15 @@ def test_a_far_sighting_cannot_ruin_the_mean_of_near_ones() -> None:
     )
     fused = fuse_groups(Association(np.zeros(4, int), np.zeros(4, int), 1), located, 0.002)
     assert np.abs(fused.corners_map[0] - corners[0]).max() < 0.02
+
+
+def test_merging_no_groups_gives_none(scene: Scene, sightings: Sightings) -> None:
+    none = keep_rows(
+        tracks_under(true_rig(scene, sightings), sightings, 0.001)[0], np.zeros(len(sightings), dtype=bool)
+    )
+    fused = FusedGroups(np.empty((0, 4, 2)), np.empty((0, 4, 2, 2)), np.empty((0, 4), dtype=np.int64))
+    merged = merge_groups(
+        none, sightings, fused, floor_m=0.3, gate_sigmas=3.0, max_distance_m=0.3, shape_tolerance=0.1
+    )
+    assert merged.count == 0
+    assert (merged.group == -1).all()

@@ -50,6 +50,11 @@ def test_both_modes_say_the_same_of_themselves() -> None:
         )
         assert np.all(other < 1.6 * sigma)
         assert np.all(other > 0.7 * sigma)
+    ours, theirs = (
+        np.median([marking.relative_sigma_m for marking in result.hd_map.markings])
+        for result in (grown, batch)
+    )
+    assert ours == pytest.approx(theirs, rel=0.3)
     sizes = [len(step.markings) for step in grown.growth]
     assert sizes == sorted(sizes)
     assert 3 <= len(sizes) <= 4

@@ -168,3 +168,14 @@ def test_an_unknown_camera_is_named(scene: Scene) -> None:
 def test_an_option_out_of_range_is_named(scene: Scene) -> None:
     with pytest.raises(ConfigError, match=r"mapping\.max_range_m"):
         run_methods(scene.drive, scene.detections, ("front",), MappingOptions(max_range_m=0.0))
+
+
+def test_where_no_marking_lies_inside_the_regions_of_interest_the_naive_maps_are_empty(scene: Scene) -> None:
+    tiny = np.array([[6.0, -0.05], [6.1, -0.05], [6.1, 0.05], [6.0, 0.05]])
+    cameras = {
+        name: replace(camera, roi_vehicle=tiny * np.sign(camera.roi_vehicle[:, 0].mean()))
+        for name, camera in scene.drive.cameras.items()
+    }
+    found = run_methods(replace(scene.drive, cameras=cameras), scene.detections, ("front", "rear"))
+    assert [len(found[name].hd_map.markings) for name in ("CNI", "ENI", "ONI")] == [0, 0, 0]
+    assert found["Opt"].hd_map.markings

@@ -10,15 +10,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.drive import ReadOptions, read_drive
-from v2hdm.errors import ConfigError, DetectorError, DriveError, MappingError, V2hdmError
+from v2hdm.drive.rotation import rotation_from_euler
+from v2hdm.drive.tum import read_tum, write_tum
+from v2hdm.errors import ConfigError, DetectorError, DriveError, V2hdmError
 from v2hdm.hdmap.calibration import read_calibration
 from v2hdm.hdmap.geojson import read_geojson
 from v2hdm.mapping.options import AcceptanceOptions, LaneOptions, MappingOptions
 from v2hdm.pipeline import DriveConfig, RunConfig, run
-from v2hdm.pipeline.run import camera_sets
+from v2hdm.pipeline.run import camera_sets, run_name
+from v2hdm.quality import Status
+from v2hdm.records import Trajectory
 from v2hdm.simulate import PortConfig, render_drive
 from v2hdm.simulate.port.config import RouteConfig, YardConfig
 
@@ -62,6 +67,35 @@ def test_every_method_is_judged_on_every_camera_set(result: Path) -> None:
             assert {"markings", "recall", "corner_rmse_m", "corner_bias_m"} <= set(figures)
     assert set(metrics["extrinsics"]) == {"front", "rear"}
     assert metrics["disturbances"]
+
+
+def test_a_good_drive_passes_and_every_file_says_so(result: Path) -> None:
+    verdict = json.loads((result / "metrics.json").read_text())["verdict"]
+    assert verdict["status"] == "PASS", verdict["findings"]
+    assert {"heading", "clock", "ground match"} <= {
+        one["check"] for one in verdict["passed"] + verdict["untold"]
+    }
+    assert json.loads((result / "map.geojson").read_text())["v2hdm"]["verdict"]["status"] == "PASS"
+    assert yaml.safe_load((result / "calibration_front.yaml").read_text())["verdict"]["status"] == "PASS"
+    assert "verdict: PASS" in (result / "run.log").read_text()
+
+
+def test_yaw_from_north_fails_by_name_and_what_was_computed_is_still_written(
+    drive_folder: Path, tmp_path: Path
+) -> None:
+    drive = tmp_path / "north"
+    shutil.copytree(drive_folder, drive)
+    recorded = read_tum(drive / "poses.tum")
+    poses = recorded.map_from_vehicle.copy()
+    yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
+    poses[:, :3, :3] = rotation_from_euler(0 * yaw, 0 * yaw, np.pi / 2 - yaw)
+    write_tum(Trajectory(recorded.stamp_s, poses), drive / "poses.tum")
+    outcome = run(run_config(drive, tmp_path / "out"))
+    assert outcome.verdict.status is Status.FAIL
+    assert outcome.verdict.findings[0].check == "heading"
+    assert "north" in outcome.verdict.findings[0].says
+    metrics = json.loads((outcome.folder / "metrics.json").read_text())
+    assert metrics["verdict"]["status"] == "FAIL"
 
 
 def test_the_optimisation_repairs_another_vehicles_calibration(result: Path) -> None:
@@ -162,11 +196,16 @@ def test_an_image_of_another_size_is_named_with_both_sizes(drive_folder: Path, t
     assert "1280" in message
 
 
-def test_a_drive_past_nothing_says_that_no_marking_was_found(drive_folder: Path, tmp_path: Path) -> None:
+def test_a_drive_past_nothing_fails_and_says_that_no_marking_was_found(
+    drive_folder: Path, tmp_path: Path
+) -> None:
     drive = small_copy(drive_folder, tmp_path / "drive")
     for image in drive.rglob("*.jpg"):
         cv2.imwrite(str(image), np.full((720, 1280, 3), 90, np.uint8))
-    assert "marking" in fails(drive, tmp_path / "out", MappingError)
+    outcome = run(run_config(drive, tmp_path / "out"))
+    assert outcome.verdict.status is Status.FAIL
+    assert any("no marking was found" in finding.says for finding in outcome.verdict.raised)
+    assert not (outcome.folder / "map.geojson").exists()
 
 
 @pytest.mark.parametrize(
@@ -196,6 +235,16 @@ def test_what_cannot_work_is_refused_before_anything_is_read(
     with pytest.raises((ConfigError, DetectorError), match=re.escape(named)):
         run(run_config(tmp_path / "no such drive", tmp_path / "outputs", **changes))
     assert not list(tmp_path.iterdir())
+
+
+def test_a_run_without_a_name_has_that_of_its_drive(drive_folder: Path, tmp_path: Path) -> None:
+    drive = small_copy(drive_folder, tmp_path / "folder")
+    assert run_name(run_config(drive, tmp_path, name=None)) == "short"
+    description = drive / "drive.yaml"
+    lines = description.read_text().splitlines(keepends=True)
+    description.write_text("".join(line for line in lines if not line.startswith("name:")))
+    assert run_name(run_config(drive, tmp_path, name=None)) == "folder"
+    assert run_name(run_config(drive, tmp_path, name="given")) == "given"
 
 
 def test_a_run_that_both_renders_and_reads_is_refused(tmp_path: Path) -> None:

@@ -51,6 +51,12 @@ def test_a_cause_in_the_poses_hides_consequences_in_every_camera() -> None:
     assert [one.check for one in kept] == ["heading"]
 
 
+def test_a_cause_is_as_bad_as_its_worst_consequence() -> None:
+    warned = finding("square pixels", "front", Status.WARN)
+    (kept,) = causes([warned, finding("ground residual", "front", Status.FAIL)])
+    assert (kept.check, kept.status) == ("square pixels", Status.FAIL)
+
+
 def test_what_passed_hides_nothing() -> None:
     assert len(causes([finding("heading", "poses", Status.PASS), finding("clock", "rear")])) == 2
 

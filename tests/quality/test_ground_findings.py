@@ -166,3 +166,18 @@ def test_only_clocks_that_are_surely_off_and_correctable_are_corrected() -> None
         "left": estimate("left", clock_s=0.4),
     }
     assert clock_corrections(ground) == {"front": 0.06}
+
+
+def test_a_mirrored_path_is_told_although_most_of_a_straight_route_matches_as_given() -> None:
+    mirrored = {Reading.AS_GIVEN: 0.41, Reading.MIRRORED: 0.52}
+    bent = {name: replace(estimate(name, clock_s=-0.3), shares=mirrored) for name in ("front", "rear")}
+    found = raised(check_ground(drive(poses(), ("front", "rear")), bent))
+    assert list(found) == ["path"]
+    assert "swapped (NED" in found["path"]
+    assert path_of(bent) is Path.MIRRORED
+    assert not clock_corrections(bent)
+
+
+def test_a_clean_drive_that_matches_mirrored_as_well_is_taken_as_given() -> None:
+    alike = replace(estimate(), shares={Reading.AS_GIVEN: 0.41, Reading.MIRRORED: 0.52})
+    assert not raised(check_ground(drive(poses()), {"front": alike}))

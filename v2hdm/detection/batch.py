@@ -26,7 +26,7 @@ def read_image(image: Image, camera: Camera) -> np.ndarray:
     Raises:
         DriveError: the file is missing, truncated, not 8-bit or not of the camera's size.
     """
-    pixels = read_bgr(image.path, grey=True)
+    pixels = read_bgr(image.path)
     expected = (camera.info.height, camera.info.width)
     if pixels.shape[:2] != expected:
         raise DriveError(

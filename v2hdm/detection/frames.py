@@ -37,21 +37,17 @@ class Frame:
     pixels: np.ndarray
 
 
-def image_frames(paths: Sequence[Path], grey: bool = False) -> Iterator[Frame]:
+def image_frames(paths: Sequence[Path]) -> Iterator[Frame]:
     """Image files, each read when its turn comes.
 
-    Args:
-        paths: the files.
-        grey: take images of one channel, too.
-
     Raises:
-        DriveError: a file is missing, damaged or not 8-bit colour.
+        DriveError: a file is missing, damaged or not of 8 bits.
     """
     names = [path.stem for path in paths]
     unique = len(set(names)) == len(names)
     for index, path in enumerate(paths):
         name = path.stem if unique else path.name.replace(".", "_")
-        yield Frame(str(path), name, index, None, read_bgr(path, grey))
+        yield Frame(str(path), name, index, None, read_bgr(path))
 
 
 def list_images(folder: Path) -> list[Path]:

@@ -16,15 +16,11 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 _AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
 
 
-def read_bgr(path: Path, grey: bool = False) -> np.ndarray:
-    """Decode an image file to (H, W, 3) uint8 BGR.
-
-    Args:
-        path: the file.
-        grey: take images of one channel, too, as those of a grey camera of a drive.
+def read_bgr(path: Path) -> np.ndarray:
+    """Decode an image file, in colour or grey, to (H, W, 3) uint8 BGR.
 
     Raises:
-        DriveError: the file is missing, truncated or not 8-bit colour.
+        DriveError: the file is missing, truncated or not of 8 bits.
     """
     try:
         data = np.fromfile(path, dtype=np.uint8)
@@ -40,8 +36,6 @@ def read_bgr(path: Path, grey: bool = False) -> np.ndarray:
             f"{path}: the image has {8 * pixels.dtype.itemsize} bits a channel; convert it to 8 bits"
         )
     if pixels.ndim == 2:
-        if not grey:
-            raise DriveError(f"{path}: the image has one channel; convert it to 8-bit colour (3 channels)")
         pixels = cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR)
     return np.asarray(pixels)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from v2hdm.drive.clock import with_clock_offsets
-from v2hdm.drive.folder import is_folder_drive, read_folder_drive, write_drive
+from v2hdm.drive.folder import folder_drive_name, is_folder_drive, read_folder_drive, write_drive
 from v2hdm.drive.kitti import is_kitti_drive, read_kitti_drive
 from v2hdm.drive.options import KittiOptions, ReadOptions
 from v2hdm.errors import DriveError
@@ -19,6 +19,7 @@ __all__ = [
     "ReadOptions",
     "Reader",
     "Trajectory",
+    "drive_name",
     "read_drive",
     "with_clock_offsets",
     "write_drive",
@@ -66,3 +67,12 @@ def read_drive(path: Path, options: ReadOptions | None = None) -> Drive:
     raise DriveError(
         f"{path}: not a drive in any known format ({', '.join(READERS)}); see docs/drive-format.md"
     )
+
+
+def drive_name(path: Path) -> str:
+    """What the drive at ``path`` is called: by its ``drive.yaml``, else like its folder.
+
+    Raises:
+        DriveError: when ``drive.yaml`` cannot be read or names it otherwise than by text.
+    """
+    return folder_drive_name(path) if is_folder_drive(path) else path.resolve().name

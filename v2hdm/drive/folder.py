@@ -15,6 +15,7 @@ from v2hdm.drive.camera_info import read_camera_info, write_camera_info
 from v2hdm.drive.images import ImageFiles, check_image_files, count_unposed, pose_images, select_cameras
 from v2hdm.drive.mounting import (
     IPM_NAMES,
+    check_roi_in_view,
     choose_initial,
     describe_prior,
     ipm_from_guess,
@@ -28,7 +29,7 @@ from v2hdm.drive.tum import read_image_list, read_tum, write_image_list, write_t
 from v2hdm.errors import DriveError
 from v2hdm.fields import take_origin
 from v2hdm.files import check_keys, dump_yaml, load_yaml, replace_text, take_mapping, take_number, take_text
-from v2hdm.records import Camera, Drive, PoseNoise, Trajectory
+from v2hdm.records import DRIFTS, Camera, Drive, PoseNoise, Trajectory
 
 DRIVE_FILE = "drive.yaml"
 POSES_FILE = "poses.tum"
@@ -69,7 +70,7 @@ def read_folder_drive(path: Path, options: ReadOptions) -> Drive:
     images = pose_images(files, laid.trajectory, options.max_gap_s, path)
     check_image_files(images, cameras)
     return Drive(
-        name=take_text(content.get("name", path.resolve().name), f"{where}: name", DriveError),
+        name=_name(content, path),
         root=path,
         cameras=cameras,
         images=images,
@@ -81,6 +82,11 @@ def read_folder_drive(path: Path, options: ReadOptions) -> Drive:
         recorded=recorded,
         road=laid.road,
     )
+
+
+def folder_drive_name(path: Path) -> str:
+    """The name that the drive at ``path`` gives itself."""
+    return _name(load_yaml(path / DRIVE_FILE, DriveError), path)
 
 
 def write_drive(folder: Path, drive: Drive, trajectory: Trajectory) -> None:
@@ -116,6 +122,10 @@ def write_drive(folder: Path, drive: Drive, trajectory: Trajectory) -> None:
     replace_text(folder / DRIVE_FILE, dump_yaml(content))
 
 
+def _name(content: dict[str, Any], path: Path) -> str:
+    return take_text(content.get("name", path.resolve().name), f"{path / DRIVE_FILE}: name", DriveError)
+
+
 def _read_camera(entry: dict[str, Any], root: Path, where: str) -> Camera:
     info = read_camera_info(root / take_text(entry["camera_info"], f"{where}, camera_info", DriveError))
     if ("ipm" in entry) == ("cam_from_vehicle" in entry):
@@ -137,11 +147,14 @@ def _read_camera(entry: dict[str, Any], root: Path, where: str) -> Camera:
         check_keys(
             take_mapping(prior, prior_where, DriveError), ("xyz", "sigma_m"), (), prior_where, DriveError
         )
+    initial_ipm = choose_initial(entry.get("initial_ipm"), ipm, where)
+    roi_vehicle = take_roi(entry["roi_vehicle"], f"{where}, roi_vehicle")
+    check_roi_in_view(info, ipm[initial_ipm], roi_vehicle, f"{where}, roi_vehicle")
     return Camera(
         info=info,
         ipm=ipm,
-        initial_ipm=choose_initial(entry.get("initial_ipm"), ipm, where),
-        roi_vehicle=take_roi(entry["roi_vehicle"], f"{where}, roi_vehicle"),
+        initial_ipm=initial_ipm,
+        roi_vehicle=roi_vehicle,
         centre_prior=None if prior is None else take_centre_prior(prior, f"{where}, centre_prior"),
         linear_response=linear,
     )
@@ -166,11 +179,7 @@ def _read_pose_noise(content: object, where: str) -> PoseNoise:
                 f"{where}, {key}: an error that fades over no distance is no drift; leave it out"
             )
     noise = PoseNoise.as_far_as_stated(**values)
-    for total, drift in (
-        ("position_m", "position_drift_m"),
-        ("heading_rad", "heading_drift_rad"),
-        ("roll_pitch_rad", "roll_pitch_drift_rad"),
-    ):
+    for total, drift in DRIFTS.items():
         if getattr(noise, drift) > getattr(noise, total):
             raise DriveError(f"{where}, {drift}: is part of {total} and cannot be above it; mend one of them")
     return noise

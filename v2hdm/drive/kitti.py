@@ -39,7 +39,7 @@ _CAMERAS = ("image_00", "image_01", "image_02", "image_03")
 _SUFFIXES = (".png", ".jpg", ".jpeg")
 _OXTS_COLUMNS = 30
 # Of the data sheet's 0.1 m and 0.1 deg most is drift that a stretch of road in view shares.
-_POSE_NOISE = PoseNoise(position_m=0.02, heading_rad=0.001, roll_pitch_rad=0.002)
+_POSE_NOISE = PoseNoise(roll_pitch_rad=0.002, roll_pitch_drift_rad=0.0014)
 
 
 def is_kitti_drive(path: Path) -> bool:

@@ -7,13 +7,16 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError
+from v2hdm.fields import recorded_distance
 from v2hdm.files import take_array, take_mapping, take_text
-from v2hdm.records import Calibration, CameraInfo, CentrePrior, FloatArray
+from v2hdm.records import BoolArray, Calibration, CameraInfo, CentrePrior, FloatArray
 
 IPM_NAMES = ("calibrated", "estimated")
 
 _SINGULAR = 1e-12  # reciprocal condition number, rows and columns scaled to unit norm
 _ROTATION_TOLERANCE = 1e-4
+_ROI_SAMPLES = 8
+"""Points along each edge of a region of interest that are looked for in the image."""
 
 
 def take_ipm(content: object, where: str) -> FloatArray:
@@ -79,6 +82,42 @@ def take_roi(content: object, where: str) -> FloatArray:
     if not one_way or not turns.any() or not np.isclose(abs(winding_rad), 2 * np.pi):
         raise DriveError(f"{where}: polygon is not convex; give its corners in order around the region")
     return roi if winding_rad > 0 else roi[::-1].copy()
+
+
+def check_roi_in_view(info: CameraInfo, ipm: FloatArray, roi_vehicle: FloatArray, where: str) -> None:
+    """Refuse a region of interest that a camera of this IPM does not see at all.
+
+    Raises:
+        DriveError: when all of it lies behind the camera or outside the image.
+    """
+    centre = roi_vehicle.mean(axis=0)
+    edge = np.linspace(roi_vehicle, np.roll(roi_vehicle, -1, axis=0), _ROI_SAMPLES).reshape(-1, 2)
+    points = np.vstack([centre + share * (edge - centre) for share in (0.0, 0.5, 1.0)])
+    cam_from_ground = np.linalg.inv(ipm @ info.intrinsic)
+    # Of a homography's two signs, one puts the camera above the ground. A mirrored one has it below: then
+    # the image's lower edge, which shows ground, decides.
+    if np.linalg.det(cam_from_ground) > 0:
+        cam_from_ground = -cam_from_ground
+    rays = np.column_stack([points, np.ones(len(points))]) @ cam_from_ground.T
+    lowest = np.linalg.inv(cam_from_ground) @ np.linalg.solve(
+        info.intrinsic, [0.5 * info.width, info.height - 1.0, 1.0]
+    )
+    if (rays[:, 2] <= 0).all() and lowest[2] > 0:
+        raise DriveError(f"{where}: lies behind the camera; give ground that it sees, x forward and y left")
+    if not _in_image(info, rays if (rays[:, 2] > 0).any() else -rays).any():
+        raise DriveError(
+            f"{where}: lies outside the image, as the camera is mounted by its initial IPM; mend one of them"
+        )
+
+
+def _in_image(info: CameraInfo, rays_cam: FloatArray) -> BoolArray:
+    """Which rays (N, 3) the image shows."""
+    across = np.linalg.norm(rays_cam[:, :2], axis=1)
+    recorded = recorded_distance(info, np.arctan2(across, rays_cam[:, 2]))
+    scale = np.where(across > 0, recorded / np.maximum(across, 1e-12), 0.0)
+    pixels = np.column_stack([rays_cam[:, :2] * scale[:, None], np.ones(len(rays_cam))]) @ info.intrinsic.T
+    inside = (pixels[:, :2] > -0.5) & (pixels[:, :2] < np.array([info.width, info.height]) - 0.5)
+    return np.asarray(inside.all(axis=1) & (rays_cam[:, 2] > 0))
 
 
 def take_centre_prior(content: object, where: str) -> CentrePrior:

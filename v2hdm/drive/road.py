@@ -111,7 +111,8 @@ def lay_flat(recorded: Trajectory, position_sigma_m: float) -> Laid:
     relative[:, ~measured] = 0.0
     flat = poses.copy()
     flat[:, 2, 3] = 0.0
-    flat[:, :3, :3] = rotation_from_euler(*_roll_pitch(relative).T, yaw)
+    roll, pitch = _roll_pitch(relative).T
+    flat[:, :3, :3] = rotation_from_euler(roll, pitch, yaw)
     road = Road(stations.points_map, fit.height_m, fit.slope)
     return Laid(Trajectory(recorded.stamp_s, flat), road, _roll_pitch(fit.mount[None])[0])
 

@@ -64,4 +64,4 @@ def _left(points_map: FloatArray) -> FloatArray:
         return np.zeros_like(points_map)
     ahead = np.gradient(points_map, axis=0)
     length = np.linalg.norm(ahead, axis=1, keepdims=True)
-    return np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.maximum(length, 1e-9)
+    return np.asarray(np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.maximum(length, 1e-9))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from v2hdm.ground.model import GroundHits, by_lens, by_pixel, hit_ground
 from v2hdm.ground.mount import Mount, rotation
-from v2hdm.records import FloatArray
+from v2hdm.records import BoolArray, FloatArray
 
 PIXEL_SIGMA = 0.4
 """What a patch's place in an image is off, px, at the most; the unit of the residuals."""
@@ -57,6 +57,12 @@ class Observations:
     first_px: FloatArray
     second_px: FloatArray
     pair: FloatArray
+
+    def only(self, keep: BoolArray) -> Observations:
+        """Those of a mask (N,)."""
+        return Observations(
+            self.first[keep], self.second[keep], self.first_px[keep], self.second_px[keep], self.pair[keep]
+        )
 
 
 @dataclass(frozen=True)
@@ -282,16 +288,3 @@ def tangent_covariance(mount: Mount, covariance: FloatArray) -> FloatArray:
     jacobian[:3, CENTRE] = turn
     jacobian[3:, TURN] = turn
     return np.asarray(jacobian @ covariance[:6, :6] @ jacobian.T)
-
-
-def without_pair(observations: Observations, pair: int) -> Observations:
-    """All matches but those of one pair."""
-    keep = observations.pair != pair
-    return replace(
-        observations,
-        first=observations.first[keep],
-        second=observations.second[keep],
-        first_px=observations.first_px[keep],
-        second_px=observations.second_px[keep],
-        pair=observations.pair[keep],
-    )

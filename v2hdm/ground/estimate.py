@@ -18,6 +18,7 @@ from v2hdm.ground.options import GroundOptions
 from v2hdm.ground.pairs import changing_pairs, spread_pairs
 from v2hdm.ground.parameters import clock_shows, free_parameters
 from v2hdm.ground.readings import Readings, try_readings
+from v2hdm.ground.scatter import scatter
 from v2hdm.ground.results import GroundEstimate, GroundStatus, MatchedGround, Parameter, Reading
 from v2hdm.records import Calibration, Drive, FloatArray, PoseNoise
 
@@ -25,23 +26,23 @@ from v2hdm.records import Calibration, Drive, FloatArray, PoseNoise
 
 @dataclass(frozen=True)
 class _Stage:
-    """One round: how far matches are searched, on which grid, in which of the pairs.
+    """One round: how far matches are searched, on how wide a grid, in every how manieth pair.
 
     ``loosened`` is how much further off than stated the poses' heading and sideways place may be, so that the
     few pairs which show a wrong clock do not count as outliers.
     """
 
     search_m: float
-    grid_m: float
+    grids: float
     every: int
     loosened: float
 
 
 _STAGES = (
-    _Stage(0.9, 0.06, 2, 20.0),
-    _Stage(0.5, 0.06, 2, 8.0),
-    _Stage(0.24, 0.04, 1, 2.0),
-    _Stage(0.12, 0.04, 1, 1.0),
+    _Stage(0.9, 1.5, 2, 20.0),
+    _Stage(0.5, 1.5, 2, 8.0),
+    _Stage(0.24, 1.0, 1, 2.0),
+    _Stage(0.12, 1.0, 1, 1.0),
 )
 
 _CLOCK_APART_M = (0.8, 4.0)
@@ -75,12 +76,13 @@ def estimate_ground(drive: Drive, camera: str, options: GroundOptions | None = N
 
 @dataclass(frozen=True)
 class _Solved:
-    """The last round's matches, what was believed of them, and the solution."""
+    """The last round's matches, what was believed of them, the solution and its poses of all images."""
 
     pairs: FloatArray
     matched: Round
     beliefs: Beliefs
     adjusted: Adjusted
+    poses: FloatArray
     clock: Parameter | None
 
 
@@ -94,7 +96,7 @@ def _solve(matcher: Matcher, beliefs: Beliefs, mount: Mount, options: GroundOpti
         pairs = np.vstack([pairs, changing_pairs(path_m, velocity, options.clock_pairs, *_CLOCK_APART_M)])
     poses = beliefs.poses()
     for stage in _STAGES:
-        matched = matcher.match(mount, poses, pairs[:: stage.every], stage.search_m, stage.grid_m)
+        matched = matcher.match(mount, poses, pairs[:: stage.every], stage.search_m, stage.grids * options.grid_m)
         if len(matched.correlation) < _LEAST_MATCHES:
             return None
         used, believed, rows = beliefs.about(matched.observations, stage.loosened)
@@ -108,13 +110,14 @@ def _solve(matcher: Matcher, beliefs: Beliefs, mount: Mount, options: GroundOpti
     if free is not None:
         sigma = float(np.sqrt(adjusted.covariance[6, 6]))
         clock = Parameter("clock_s", beliefs.clock_s, sigma, told=True)
-    return _Solved(pairs, matched, beliefs, adjusted, clock)
+    return _Solved(pairs, matched, beliefs, adjusted, poses, clock)
 
 
 def _found(camera: str, solved: _Solved, readings: Readings, options: GroundOptions) -> GroundEstimate:
     mount, matched = solved.adjusted.mount, solved.matched
-    covariance = tangent_covariance(mount, solved.adjusted.covariance)
     seen = matched.observations
+    factor = scatter(seen, solved.beliefs, solved.adjusted)
+    covariance = factor * tangent_covariance(mount, solved.adjusted.covariance)
     image = solved.beliefs.motion.image
     return GroundEstimate(
         camera=camera,
@@ -123,11 +126,11 @@ def _found(camera: str, solved: _Solved, readings: Readings, options: GroundOpti
         reading=readings.best,
         calibration=Calibration(mount.info, mount.cam_from_vehicle, covariance),
         guess_cam_from_vehicle=solved.beliefs.guess.cam_from_vehicle,
-        parameters=free_parameters(options.free, seen, solved.beliefs, solved.adjusted, solved.clock),
+        parameters=free_parameters(options.free, seen, solved.beliefs, solved.adjusted, solved.clock, factor),
         median_residual=float(np.median(solved.adjusted.residual)),
         pulls=_pulls(solved.adjusted, solved.beliefs.drive.pose_noise),
         patches=MatchedGround(
-            image[solved.pairs], seen.pair, seen.first_px, seen.second_px, matched.correlation
+            image[solved.pairs], solved.poses[solved.pairs], seen.pair, seen.first_px, seen.second_px, matched.correlation
         ),
         seconds=0.0,
     )

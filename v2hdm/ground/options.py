@@ -26,7 +26,7 @@ class GroundOptions:
     clock_pairs: int = 16
     shortest_m: float = 2.0
     longest_m: float = 4.0
-    strip_m: float = 2.5
+    strip_m: float = 2.0
     patch_m: float = 0.9
     step_m: float = 0.6
     grid_m: float = 0.04

@@ -60,6 +60,7 @@ def free_parameters(
     beliefs: Beliefs,
     solved: Adjusted,
     clock: Parameter | None,
+    factor: float,
 ) -> Mapping[str, Parameter]:
     """Each of ``names`` freed alone.
 
@@ -69,14 +70,16 @@ def free_parameters(
         beliefs: about poses and survey.
         solved: the solution without any of them.
         clock: its estimate, where the drive shows it.
+        factor: of all variances; see :func:`v2hdm.ground.scatter.scatter`.
     """
     turns = clock_shows(beliefs.motion)
     out = {}
     for name in names:
         if name == "clock_s" and clock is not None:
-            out[name] = clock
+            out[name] = replace(clock, sigma=clock.sigma * float(np.sqrt(factor)))
             continue
         value, sigma = _free(name, observations, beliefs, solved)
+        sigma *= float(np.sqrt(factor))
         told = sigma < _TOLD_SIGMA[name]
         if name == "clock_s":
             told = False

@@ -90,6 +90,11 @@ class Sheet:
         seen = ~np.isnan(px[..., 0])
         px[~seen] = -1
         grey = cv2.remap(view.grey, px[..., 0], px[..., 1], cv2.INTER_LINEAR).astype(np.float32)
+        return grey, seen
+
+    def texture(self, view: View) -> tuple[FloatArray, BoolArray]:
+        """The same without what is wider than the texture of the ground."""
+        grey, seen = self.lay(view)
         return grey - cv2.GaussianBlur(grey, (0, 0), _COARSEST_M / self.grid_m), seen
 
 
@@ -125,8 +130,8 @@ def match_pair(first: View, second: View, centres_map: FloatArray, search_m: flo
     half = round(options.patch_m / 2 / grid_m)
     reach = max(round(search_m / grid_m), _PEAK_CELLS)
     sheet, cells = _sheet_around(centres_map, first.map_from_vehicle, half + reach + 1, grid_m)
-    first_grey, first_seen = sheet.lay(first)
-    second_grey, second_seen = sheet.lay(second)
+    first_grey, first_seen = sheet.texture(first)
+    second_grey, second_seen = sheet.texture(second)
     wide = half + reach
     row, column = cells.T
     in_view = (_mean(first_seen, half) > _ALL)[row, column] & (_mean(second_seen, half) > _ALL)[row, column]

@@ -6,7 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
+import numpy as np
+from numpy.typing import NDArray
+
 from v2hdm.records import Calibration, FloatArray
+
+IntArray = NDArray[np.int64]
 
 
 class GroundStatus(Enum):
@@ -53,11 +58,13 @@ class MatchedGround:
     """Patches of ground found in both images of pairs, as raw pixels.
 
     ``pair_images`` (P, 2) are indices into ``Drive.images``; ``pair`` (N,) is each match's row of it;
+    ``pair_poses`` (P, 2, 4, 4) are the ``map_from_vehicle`` of both with their estimated errors taken in.
     ``first_px`` and ``second_px`` (N, 2) are where the patch lies in the two images; ``correlation`` (N,).
     """
 
-    pair_images: FloatArray
-    pair: FloatArray
+    pair_images: IntArray
+    pair_poses: FloatArray
+    pair: IntArray
     first_px: FloatArray
     second_px: FloatArray
     correlation: FloatArray

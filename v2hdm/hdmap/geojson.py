@@ -20,7 +20,7 @@ import numpy as np
 
 from v2hdm.errors import MapFileError
 from v2hdm.fields import take_covariance, take_origin, take_whole
-from v2hdm.files import load_json, replace_text, take_array, take_mapping, take_text
+from v2hdm.files import load_json, replace_text, take_array, take_mapping, take_number, take_text
 from v2hdm.hdmap.geodetic import geodetic_from_enu
 from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, Lane, Marking
 
@@ -120,6 +120,8 @@ def _marking_feature(number: int, marking: Marking, origin: GeodeticOrigin | Non
     if marking.covariance_m2 is not None:
         properties["sigma_m"] = float(np.sqrt(np.trace(marking.covariance_m2) / len(marking.covariance_m2)))
         properties["covariance_m2"] = marking.covariance_m2.tolist()
+    if marking.relative_sigma_m is not None:
+        properties["relative_sigma_m"] = marking.relative_sigma_m
     return geojson_feature(f"marking/{number}", "Polygon", [[*ring, ring[0]]], properties)
 
 
@@ -164,7 +166,7 @@ def geojson_positions(
 
 
 def _read_marking(properties: dict[str, Any], where: str) -> Marking:
-    covariance = properties.get("covariance_m2")
+    covariance, relative = properties.get("covariance_m2"), properties.get("relative_sigma_m")
     return Marking(
         kind=take_text(properties.get("class"), f"{where}, class", MapFileError),
         corners_map=take_array(properties["corners_map"], (4, 2), f"{where}, corners_map", MapFileError),
@@ -175,6 +177,9 @@ def _read_marking(properties: dict[str, Any], where: str) -> Marking:
         if covariance is None
         else take_covariance(covariance, 8, f"{where}, covariance_m2", MapFileError),
         heights_m=_read_heights(properties, 4, where),
+        relative_sigma_m=None
+        if relative is None
+        else take_number(relative, f"{where}, relative_sigma_m", MapFileError),
     )
 
 

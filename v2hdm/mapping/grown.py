@@ -15,6 +15,7 @@ from v2hdm.adjust.rigid import exp
 from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.markings.completion import SolvedCorners, completed_corners
 from v2hdm.mapping.markings.conclude import Observed, reprojected, residuals_under, root_mean_square
+from v2hdm.mapping.markings.relative import with_relative_sigma
 from v2hdm.mapping.markings.verdict import Seen, judge_and_mend
 from v2hdm.mapping.options import AcceptanceOptions
 from v2hdm.mapping.results import Exclusion, GrowthStep
@@ -162,7 +163,7 @@ def conclude_grown(
         ),
         options,
     )
-    markings = judged.markings()
+    markings = _with_relative_sigma(grown, [places[m] for m in judged.accepted], judged.markings(), scale)
     accepted = agrees & np.isin(seen.group, judged.accepted)
     at_start = residuals_under(
         taken.initial_rig, taken.sightings, association, seen.only(accepted), taken.jitter_rad
@@ -189,6 +190,27 @@ def conclude_grown(
         initial_reprojection_rmse_px=root_mean_square(at_start),
         growth=(*(step for step in growth if len(step.markings) < len(markings)), last),
     )
+
+
+def _with_relative_sigma(
+    grown: IncrementalMap, places: Sequence[Place], markings: Sequence[Marking], scale: float
+) -> tuple[Marking, ...]:
+    """The markings with their relative standard deviations, beside others of their unit."""
+    out = list(markings)
+    for unit in grown.markings:
+        own = [m for m, place in enumerate(places) if place.unit == unit]
+        covariance = scale * grown.corner_covariance(unit)
+
+        def joint(pairs: IntArray, covariance: FloatArray = covariance) -> FloatArray:
+            rows = (2 * pairs[..., None] + np.arange(2)).reshape(len(pairs), -1)
+            return np.asarray(covariance[rows[:, :, None], rows[:, None, :]])
+
+        index = np.array([places[m].corner for m in own], dtype=np.int64).reshape(-1, 4)
+        for m, marking in zip(
+            own, with_relative_sigma([markings[m] for m in own], index, joint), strict=True
+        ):
+            out[m] = marking
+    return tuple(out)
 
 
 def _observed(taken: Taken, corners_map: FloatArray) -> Observed:

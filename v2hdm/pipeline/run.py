@@ -21,7 +21,7 @@ from v2hdm import __version__
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.drive import ReadOptions, read_drive
+from v2hdm.drive import ReadOptions, drive_name, read_drive
 from v2hdm.errors import ConfigError, MappingError
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions, check_options
@@ -35,6 +35,11 @@ from v2hdm.report.outputs import result_folder, write_json
 from v2hdm.simulate import PortConfig, rendered_drive
 
 log = logging.getLogger(__name__)
+
+_NO_DRIVE = (
+    "drive.path is not set: name the folder of the drive, e.g. drive.path=my_drive, "
+    "or choose a run (+run=port1, +run=port2, +run=kitti drive.path=...)"
+)
 
 GROWTH_STEPS = 8
 """Sizes of the growing map at which its error is drawn."""
@@ -63,7 +68,7 @@ class RunConfig:
     """Everything about one run.
 
     Attributes:
-        name: names the results, ``<output>/<name>/``.
+        name: names the results, ``<output>/<name>/``; None takes the drive's own name.
         drive: the drive to map.
         simulate: renders the drive into the cache first, instead of reading ``drive.path``.
         detector: settings of the detector.
@@ -76,7 +81,7 @@ class RunConfig:
         mode: what it hands on as ``mapping.mode``, ``batch`` or ``incremental``.
     """
 
-    name: str
+    name: str | None = None
     drive: DriveConfig = field(default_factory=DriveConfig)
     simulate: PortConfig | None = None
     detector: DetectorOptions = field(default_factory=DetectorOptions.for_mapping)
@@ -110,20 +115,20 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
     Raises:
         V2hdmError: The configuration, the drive or the detector is at fault, or no map can be made.
     """
-    _check(config)
+    name = _check(config)
     seconds: dict[str, float] = {}
     with (
-        result_folder(Path(config.output) / config.name) as folder,
+        result_folder(Path(config.output) / name) as folder,
         logging_to(_log_file(folder / "run.log")),
     ):
-        log.info("v2hdm %s, run %s", __version__, config.name)
+        log.info("v2hdm %s, run %s", __version__, name)
         (folder / "config.yaml").write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
         drive_folder = _drive_folder(config, seconds, progress)
         drive = read_drive(drive_folder, config.drive)
         log.info("drive %s: %d images of cameras %s", drive.name, len(drive.images), ", ".join(drive.cameras))
         with _timed(seconds, "check"):
             inspection = inspect(drive, config.drive.max_gap_s, _workers(config), partial(progress, "check"))
-        about = {"name": config.name, "version": __version__}
+        about = {"name": name, "version": __version__}
         try:
             result = _map_and_judge(config, inspection, folder, about, seconds, progress)
         except MappingError as failure:
@@ -157,7 +162,7 @@ def _map_and_judge(
         judgement = evaluate(described, detections, methods, config.mapping, partial(progress, "evaluate"))
     metrics = {**about, "verdict": verdict.as_json(), **judgement.metrics, "seconds": seconds}
     write_results(folder, described, detections, methods, judgement, metrics, verdict, config.all_maps)
-    return RunResult(Path(config.output) / config.name, metrics, judgement.headlines, verdict)
+    return RunResult(Path(config.output) / about["name"], metrics, judgement.headlines, verdict)
 
 
 def _without_map(
@@ -168,7 +173,7 @@ def _without_map(
     verdict = Verdict.of([*inspection.findings, failed])
     metrics = {**about, "verdict": verdict.as_json(), "results": {}}
     write_json(folder / "metrics.json", metrics)
-    return RunResult(Path(config.output) / config.name, metrics, (), verdict)
+    return RunResult(Path(config.output) / about["name"], metrics, (), verdict)
 
 
 def camera_sets(drive: Drive) -> dict[str, tuple[str, ...]]:
@@ -183,7 +188,7 @@ def camera_sets(drive: Drive) -> dict[str, tuple[str, ...]]:
 def _drive_folder(config: RunConfig, seconds: dict[str, float], progress: Progress) -> Path:
     if config.simulate is None:
         if not config.drive.path:
-            raise ConfigError("drive.path is not set: name the folder of the drive, e.g. drive.path=my_drive")
+            raise ConfigError(_NO_DRIVE)
         return Path(config.drive.path)
     if config.drive.path:
         raise ConfigError(
@@ -225,21 +230,34 @@ def _map_camera_sets(
     return found
 
 
-def _check(config: RunConfig) -> None:
-    """Refuse what cannot work before any long work.
+def _check(config: RunConfig) -> str:
+    """Refuse what cannot work before any long work; returns the run's name.
 
     Raises:
         ConfigError: The message names the key.
         DetectorError: ``detector.model`` cannot be used.
     """
-    if not config.name.strip(".") or set(config.name) & {"/", os.sep}:
+    name = run_name(config)
+    if not name.strip(".") or set(name) & {"/", os.sep}:
         raise ConfigError(
-            f"name is {config.name!r}: give the name of a folder within {config.output!r}, without '/'"
+            f"name is {name!r}: give the name of a folder within {config.output!r}, without '/'"
         )
     _workers(config)
     check_options(config.mapping)
     _check_device(config.mapping.device)
     Detector.load(options=config.detector)
+    return name
+
+
+def run_name(config: RunConfig) -> str:
+    """The name of the run: as configured, else that of the drive which is to be rendered or read."""
+    if config.name is not None:
+        return config.name
+    if config.simulate is not None:
+        return config.simulate.name
+    if not config.drive.path:
+        raise ConfigError(_NO_DRIVE)
+    return drive_name(Path(config.drive.path))
 
 
 def _check_device(device: str) -> None:

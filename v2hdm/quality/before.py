@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 from v2hdm.ground.results import GroundEstimate
 from v2hdm.quality import ground as ground_checks
@@ -14,21 +15,25 @@ from v2hdm.quality.images import check_images
 from v2hdm.quality.motion import Motion
 from v2hdm.quality.noise import check_noise
 from v2hdm.quality.path import check_attitude, check_jumps, check_path
+from v2hdm.quality.road import check_road
+from v2hdm.quality.suspects import find_suspect
 from v2hdm.quality.verdict import Finding, Status
 from v2hdm.records import Drive
 
 _STEPS = ("position jumps", "height jumps", "pose scatter", "image spacing", "pose gaps", "pose rate")
 _MOUNTING = ("roi", "roi range", "ipm against camera matrix", "camera height", "survey against guess")
 
+_SURVEY = ("survey height", "survey forward", "survey left")
+
 HIDES: Mapping[str, tuple[str, ...]] = {
     "path length": (*_STEPS, *ground_checks.CHECKS),
     "speed": (*_STEPS, *ground_checks.CHECKS),
-    "heading": ("heading offset", "attitude", "pitch sign", "origin", *_STEPS, *ground_checks.CHECKS),
-    "attitude": ("pitch sign", *ground_checks.CHECKS),
+    "heading": ("heading offset", "attitude", "pitch sign", "road", "origin", *_STEPS, *ground_checks.CHECKS),
+    "attitude": ("pitch sign", "road", *ground_checks.CHECKS),
     "repeated poses": (*_STEPS, *ground_checks.CHECKS),
     "pose scatter": ("position jumps", *ground_checks.CHECKS),
     "position jumps": ground_checks.CHECKS,
-    "height jumps": ("grade", "ground match", "ground residual", "poses against ground"),
+    "height jumps": ("road", "grade", "ground match", "ground residual", "poses against ground"),
     "origin": ("survey forward", "poses against ground"),
     "own images": ("frozen images", *ground_checks.CHECKS),
     "bright images": ("frozen images", "ground match"),
@@ -46,8 +51,8 @@ HIDES: Mapping[str, tuple[str, ...]] = {
     "camera height": ("survey against guess", "ground match"),
     "roi": ("image spacing", "roi range", "ground match"),
     "survey against guess": ground_checks.CHECKS,
-    "distortion": ("focal length from ground", "ground residual", "survey height"),
-    "focal length from ground": ("ipm against camera matrix", "ground residual", "survey height"),
+    "distortion": ("focal length from ground", "ground residual", *_SURVEY),
+    "focal length from ground": ("ipm against camera matrix", "ground residual", *_SURVEY),
     "clock": ("survey forward", "survey left", "poses against ground"),
 }
 """Checks that fail because another one did: the cause is told, its consequences are not."""
@@ -72,22 +77,43 @@ def check_drive(drive: Drive, ground: Mapping[str, GroundEstimate] | None = None
         *check_jumps(motion, drive.pose_noise),
         *check_clocks(drive, motion),
         *check_noise(motion, drive.pose_noise),
+        *check_road(drive),
     ]
     for name, camera in drive.cameras.items():
         findings += check_camera(name, camera)
-    findings += [*check_images(drive), *check_ground(drive, ground)]
-    return causes(findings)
+    findings += check_images(drive)
+    return causes([*findings, *_of_ground(drive, ground, findings)])
+
+
+def _of_ground(
+    drive: Drive, ground: Mapping[str, GroundEstimate], findings: Iterable[Finding]
+) -> list[Finding]:
+    """What the ground says; where it never matches and nothing else explains that, suspects are tried."""
+    explained = any("ground match" in HIDES.get(f.check, ()) for f in findings if f.status is not Status.PASS)
+    return check_ground(drive, ground, None if explained else find_suspect(drive, ground))
 
 
 def causes(findings: Iterable[Finding]) -> list[Finding]:
-    """The findings without those that another one explains, about the same camera or the poses."""
+    """The findings without those that another one explains (:data:`HIDES`).
+
+    A cause hides its consequences about the same camera, one in the poses those about every camera. It is as
+    bad as the worst of them.
+    """
     findings = list(findings)
     raised = [finding for finding in findings if finding.status is not Status.PASS]
-    hidden = {(check, cause.about) for cause in raised for check in HIDES.get(cause.check, ())}
-    everywhere = {check for check, about in hidden if about == "poses"}
+    explained: set[int] = set()
+    worst: dict[int, Status] = {}
+    for cause in raised:
+        own = [finding for finding in raised if _explains(cause, finding)]
+        explained |= {id(finding) for finding in own}
+        worst[id(cause)] = max((finding.status for finding in (cause, *own)), key=lambda status: status.rank)
     return [
-        finding
+        replace(finding, status=worst.get(id(finding), finding.status))
         for finding in findings
-        if finding.status is Status.PASS
-        or ((finding.check, finding.about) not in hidden and finding.check not in everywhere)
+        if id(finding) not in explained
     ]
+
+
+def _explains(cause: Finding, finding: Finding) -> bool:
+    same = cause.about in ("poses", finding.about)
+    return same and finding is not cause and finding.check in HIDES.get(cause.check, ())

@@ -41,6 +41,8 @@ def merge_groups(
         max_distance_m: Largest distance of two groups in metres.
         shape_tolerance: Largest deviation of a corner as a fraction of the marking's diameter.
     """
+    if not association.count:
+        return association
     pairs, shifts, distance = _coinciding_pairs(
         association, sightings, fused, floor_m, gate_sigmas, max_distance_m, shape_tolerance
     )

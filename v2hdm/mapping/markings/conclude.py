@@ -12,7 +12,7 @@ from v2hdm.mapping.association.groups import Association, fuse_groups
 from v2hdm.mapping.association.merge import group_kinds
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.markings.completion import solved_corners
-from v2hdm.mapping.markings.neighbours import with_relative_sigma
+from v2hdm.mapping.markings.relative import with_relative_sigma
 from v2hdm.mapping.markings.verdict import Seen, judge_and_mend
 from v2hdm.mapping.options import AcceptanceOptions
 from v2hdm.mapping.results import Exclusion
@@ -99,7 +99,12 @@ def conclude(
         inlier_share=agreeing / np.maximum(total, 1),
     )
     judged = judge_and_mend(solved_corners(final), seen, options)
-    markings = with_relative_sigma(judged.markings(), judged.accepted, final)
+    scale = max(1.0, final.solution.chi2_per_dof)
+    markings = with_relative_sigma(
+        judged.markings(),
+        final.corner_index[judged.accepted],
+        lambda pairs: scale * final.solution.corner_covariance(pairs),
+    )
     used = np.isin(final.group, judged.accepted)
     observed = Observed(final.row, final.group, final.corner)
     at_start = residuals_under(initial_rig, evidence.sightings, final.association, observed, jitter_rad)
