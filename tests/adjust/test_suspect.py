@@ -16,6 +16,7 @@ from v2hdm.adjust import (
     Problem,
     SolveOptions,
     Suspect,
+    pose_pulls,
     solve,
     suspects,
 )
@@ -110,3 +111,27 @@ def test_one_surveyed_point_off_is_told_from_all_off() -> None:
     one = suspects(p := replace(street.problem, control=control), solve(p, OPTIONS))[0]
     assert (one.fault, one.item) == (Fault.CONTROL, 1)
     assert one.value == pytest.approx(0.2, abs=0.05)
+
+
+def test_a_pose_that_nothing_was_seen_from_is_as_uncertain_as_stated_and_others_less() -> None:
+    problem = scene().problem
+    vague = replace(
+        problem,
+        observations=replace(problem.observations, covariance_px=1e8 * problem.observations.covariance_px),
+    )
+    stated = POSES.by_state() ** 2
+    np.testing.assert_allclose(
+        solve(vague, OPTIONS).covariance.poses(),
+        np.tile(stated, (len(problem.map_from_vehicle), 1)),
+        rtol=0.05,
+    )
+    seen = solve(problem, OPTIONS).covariance.poses()
+    assert (np.median(seen, axis=0) < 0.7 * stated).all()
+
+
+def test_the_pulls_on_poses_are_at_most_one_where_their_sigmas_are_right_and_more_where_not() -> None:
+    problem = scene().problem
+    right = pose_pulls(solve(problem, OPTIONS)).rms()
+    assert max(right.values()) < 1.2
+    small = replace(problem, pose_sigma=PoseSigma(0.01, 0.0001, 0.002, 0.005))
+    assert pose_pulls(solve(small, OPTIONS)).rms()["heading"] > 1.4

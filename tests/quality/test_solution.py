@@ -123,7 +123,7 @@ def test_neighbours_of_another_class_or_beside_one_another_are_no_doubles(drive:
 
 
 def test_a_third_of_the_candidates_left_out_is_told(drive: Drive) -> None:
-    left_out = tuple(Exclusion("diamond", np.zeros(2), 3, "odd shape") for _ in range(6))
+    left_out = tuple(Exclusion("diamond", np.zeros(2), 3, "odd shape") for _ in range(12))
     assert set(raised(result(excluded=left_out), drive)) == {"excluded"}
 
 

@@ -54,6 +54,21 @@ LEAST_VALUE: Mapping[Fault, float] = {
 }
 """Below this, in the fault's unit, an input is as good as a drive needs it, however sure the drive is."""
 
+TOLD_SIGMA: Mapping[Fault, float] = {
+    Fault.CLOCK: 0.02,
+    Fault.FOCAL: 0.01,
+    Fault.DISTORTION: 0.02,
+    Fault.PRINCIPAL: 10.0,
+    Fault.SLOPE: 0.003,
+    Fault.SURVEY: 1.0,
+    Fault.LEVER: 1.0,
+    Fault.SIZE: 0.05,
+    Fault.CONTROL: 0.05,
+    Fault.DATUM: 0.05,
+}
+"""Sigma, in the fault's unit, up to which a drive tells it. A fault that it tells less well is nearly what
+something else can be, and takes up what is left of other errors: of k1 on a straight street (.04), say."""
+
 LOOSE_CENTRE_SIGMA_M = 10.0
 """Sigma of a surveyed axis that was contradicted: it no longer says where on the vehicle the camera is."""
 
@@ -63,6 +78,9 @@ speed tells the distance of two centres, or the difference of two clocks, alone.
 
 CLOCK_TOLD_S = 0.004
 """Sigma of a clock offset, s, up to which it is put right: two of them are 8 ms."""
+
+CENTRE_TOLD_M = 0.1
+"""Sigma of a centre, m, up to which the drive can do without its survey: it moves the whole map."""
 
 MOST_CORRECTIONS = 4
 """Inputs that may be dropped one after the other; with more wrong than that nothing can be relied on."""
@@ -109,7 +127,7 @@ def optimise(
         found = [
             one for one in suspects(settled.problem, settled.solution) if _is_stated(one, settled, drive)
         ]
-        worst = next((one for one in found if is_contradicted(one.fault, one.value, one.sigmas)), None)
+        worst = next((one for one in found if is_contradicted(one)), None)
         inputs = Inputs(drive, detections, options, sightings)
         remedied = None
         if worst is not None and len(corrected) < MOST_CORRECTIONS and not _is_ambiguous(worst, found):
@@ -185,9 +203,10 @@ def _is_ambiguous(worst: Suspect, found: Sequence[Suspect]) -> bool:
     return max(rivals, default=0.0) > AMBIGUOUS_SHARE * worst.sigmas
 
 
-def is_contradicted(fault: Fault, value: float, sigmas: float) -> bool:
-    """Whether an input is off by more than chance and by more than matters."""
-    return sigmas > CONTRADICTED_SIGMAS and abs(value) > LEAST_VALUE[fault]
+def is_contradicted(one: Suspect | Contradiction) -> bool:
+    """Whether an input is off by more than chance and by more than matters, and this drive can tell."""
+    told = one.sigma <= TOLD_SIGMA[one.fault]
+    return told and one.sigmas > CONTRADICTED_SIGMAS and abs(one.value) > LEAST_VALUE[one.fault]
 
 
 def _clocks(optimised: Optimised) -> dict[str, tuple[float, float]]:
@@ -208,6 +227,8 @@ def _remedied(inputs: Inputs, worst: Suspect, settled: Bundle, optimiser: Optimi
             return None
         return _with_clocks(inputs, optimiser.clock_offsets_s(settled))
     if worst.fault in (Fault.SURVEY, Fault.LEVER):
+        if worst.sigma > CENTRE_TOLD_M:
+            return None
         names = tuple(settled.camera_index)
         return _without_axis(inputs, names if worst.camera < 0 else (names[worst.camera],), worst.axis)
     options = inputs.options
