@@ -135,7 +135,11 @@ def optimise(
         if worst is None or remedied is None:
             break
         told = contradictions(settled, (worst,))[0]
-        _log.warning("%s: the drive contradicts %s by %.0f sigma", ", ".join(cameras), told, told.sigmas)
+        whose, about = " and ".join(told.cameras), f" {told.about}" if told.about else ""
+        _log.warning(
+            "%s: mapped again, for the drive contradicts the %s%s of %s by %.0f sigmas (%+.3g %s)",
+            ", ".join(cameras), told.fault.value, about, whose, told.sigmas, told.value, told.fault.unit,
+        )  # fmt: skip
         corrected.append(told)
         drive, detections, options = remedied.drive, remedied.detections, remedied.options
     optimised = optimiser.finish(settled, tell)

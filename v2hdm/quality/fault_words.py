@@ -81,7 +81,8 @@ def wrong_as(one: Contradiction) -> str:
                 "point of the vehicle (antenna instead of axle)"
             )
         case Fault.SIZE:
-            return f"paint stated in known_sizes as {one.about} is {cm:+.1f} cm longer"
+            longer = "longer" if one.value > 0 else "shorter"
+            return f"paint that known_sizes states as {one.about} is {100 * off:.1f} cm {longer}"
         case Fault.CONTROL:
             return f"the surveyed point {one.about} is {100 * off:.0f} cm off the marking's corner"
         case Fault.DATUM:
