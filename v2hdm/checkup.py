@@ -78,7 +78,7 @@ def draw(drive: Drive, folder: Path, found: Mapping[str, FloatArray]) -> None:
             mountings["ground"] = found[name]
         for number in range(_PICTURES):
             image = images[(2 * number + 1) * len(images) // (2 * _PICTURES)]
-            pixels = read_bgr(image.path, grey=True)
+            pixels = read_bgr(image.path)
             caption = f"{name}, {image.stamp_s:.2f} s"
             save_grid(folder / f"{name}_{number + 1}.jpg", pixels, camera, mountings, caption)
 

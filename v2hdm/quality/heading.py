@@ -121,7 +121,9 @@ def _lever(offset_rad: FloatArray, curvature: FloatArray, overlap: float) -> lis
     """How far ahead of the axle, which does not slip sideways, the origin is: tan(offset) / curvature."""
     turns = np.abs(curvature) > 0.02
     if turns.sum() < 30:
-        return [passed("origin", "poses", "straight poses do not tell how far the origin is from the axle")]
+        same = "a straight route looks the same in a mirrored world (x and y swapped, NED): drive a turn"
+        untold = "straight poses do not tell how far the origin (antenna?) is from the axle: drive a turn"
+        return [passed("mirrored", "poses", same), passed("origin", "poses", untold)]
     centred = offset_rad - np.median(offset_rad[~turns]) if (~turns).any() else offset_rad
     lever = np.tan(centred[turns]) / curvature[turns]
     weight = curvature[turns] ** 2
