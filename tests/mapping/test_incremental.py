@@ -55,6 +55,13 @@ def test_both_modes_say_the_same_of_themselves() -> None:
         for result in (grown, batch)
     )
     assert ours == pytest.approx(theirs, rel=0.3)
+    assert batch.evidence is not None
+    assert grown.evidence is not None
+    assert grown.evidence.held_out_loss is not None
+    assert grown.evidence.held_out_loss < 3.0
+    assert len(grown.evidence.suspects) == len(batch.evidence.suspects)
+    assert grown.poses is not None
+    assert grown.clocks.keys() == batch.clocks.keys()
     sizes = [len(step.markings) for step in grown.growth]
     assert sizes == sorted(sizes)
     assert 3 <= len(sizes) <= 4

@@ -95,9 +95,7 @@ def test_a_clock_60_ms_late_is_put_right(scene: Scene) -> None:
     late = replace(scene.drive, images=images, trajectory=trajectory, recorded=trajectory)
     late = replace(
         late,
-        images=[
-            replace(image, map_from_vehicle=_before(trajectory, image.stamp_s)) for image in late.images
-        ],
+        images=[replace(image, map_from_vehicle=_before(trajectory, image.stamp_s)) for image in late.images],
     )
     result = mapped(scene, late)
     assert faults(result) == [Fault.CLOCK]

@@ -147,9 +147,12 @@ class IncrementalMap:
 
     def corner_covariance(self, marking: int) -> FloatArray:
         """Joint covariance (2n, 2n), m^2, of a marking's corners."""
-        settled = self._known(marking)
+        return _corner_covariance(self._known(marking), self._tangent_covariance())
+
+    def corner_covariances(self) -> dict[int, FloatArray]:
+        """The same of all markings, by their number."""
         extrinsic = self._tangent_covariance()
-        return np.asarray(settled.covariance_m2 + settled.gain @ extrinsic @ settled.gain.T)
+        return {marking: _corner_covariance(one, extrinsic) for marking, one in self.markings.items()}
 
     def variance(self) -> VarianceFactors:
         """How many times as large as stated the variances are."""
@@ -336,6 +339,10 @@ def _prior_at(prior: RigPrior, tangents: FloatArray) -> tuple[FloatArray, FloatA
     vector += information @ tangents
     turns = np.tile([0, 0, 0, 1, 1, 1], len(extrinsics)) / prior.rotation_sigma_rad**2
     return information + np.diag(turns), vector
+
+
+def _corner_covariance(settled: Settled, extrinsic: FloatArray) -> FloatArray:
+    return np.asarray(settled.covariance_m2 + settled.gain @ extrinsic @ settled.gain.T)
 
 
 def _solved(information: FloatArray, vector: FloatArray) -> FloatArray:

@@ -144,7 +144,8 @@ def squared_residuals(
 ) -> FloatArray:
     """Squared residuals (K,) of ``seen`` in standard deviations, as :func:`normal_equations` has them."""
     residual = _linearise(seen, intrinsic, cam_from_vehicle, corners_map, frame_state)[0]
-    return np.einsum("ka,ka->k", residual, np.linalg.solve(seen.covariance_px, residual[..., None])[..., 0])
+    white = np.linalg.solve(seen.covariance_px, residual[..., None])[..., 0]
+    return np.asarray(np.sum(residual * white, axis=1))
 
 
 def _root_information(seen: MarkingObservations, residual: FloatArray, noise: Noise) -> FloatArray:

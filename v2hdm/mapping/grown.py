@@ -100,7 +100,7 @@ def corners_of(grown: IncrementalMap, place: Place) -> FloatArray:
 def solved_places(grown: IncrementalMap, places: Sequence[Place], scale: float = 1.0) -> SolvedCorners:
     """All corners and their covariances, times ``scale``; a missing fourth corner completed."""
     corners, covariance = np.full((len(places), 4, 2), np.nan), np.full((len(places), 8, 8), np.nan)
-    by_unit = {unit: scale * grown.corner_covariance(unit) for unit in grown.markings}
+    by_unit = {unit: scale * one for unit, one in grown.corner_covariances().items()}
     for marking, place in enumerate(places):
         corners[marking] = corners_of(grown, place)
         known = np.flatnonzero(place.corner >= 0)
@@ -113,7 +113,7 @@ def solved_places(grown: IncrementalMap, places: Sequence[Place], scale: float =
 def growth_step(grown: IncrementalMap, places: Sequence[Place], names: Sequence[str]) -> GrowthStep:
     """The map as it is now; markings of which less than three corners are known are left out."""
     solved = solved_places(grown, places)
-    whole = np.flatnonzero(np.isfinite(solved.corners_map).all(axis=(1, 2)))
+    whole = np.flatnonzero(np.isfinite(solved.corners_map).all(axis=(1, 2))).tolist()
     markings = tuple(
         Marking(
             kind=CORNERED_CLASSES[places[m].kind],
@@ -197,9 +197,9 @@ def _with_relative_sigma(
 ) -> tuple[Marking, ...]:
     """The markings with their relative standard deviations, beside others of their unit."""
     out = list(markings)
-    for unit in grown.markings:
+    for unit, formal in grown.corner_covariances().items():
         own = [m for m, place in enumerate(places) if place.unit == unit]
-        covariance = scale * grown.corner_covariance(unit)
+        covariance = scale * formal
 
         def joint(pairs: IntArray, covariance: FloatArray = covariance) -> FloatArray:
             rows = (2 * pairs[..., None] + np.arange(2)).reshape(len(pairs), -1)

@@ -19,11 +19,12 @@ from v2hdm.mapping.grown import Grown
 from v2hdm.mapping.growth import chosen_steps, grow_map
 from v2hdm.mapping.lanes.fuse import map_lanes
 from v2hdm.mapping.lanes.points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
+from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.naive import naive_markings
 from v2hdm.mapping.optimise import Optimiser, nearest_extrinsic
 from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
 from v2hdm.mapping.outputs import adjusted_poses, clock_offsets
-from v2hdm.mapping.remedy import Outcome, optimise
+from v2hdm.mapping.remedy import Inputs, Outcome, judge_grown, optimise
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.sightings.table import Sightings, camera_of, collect_sightings
 from v2hdm.mapping.sightings.views import views_of
@@ -81,11 +82,13 @@ def run_methods(
     begin_s = time.perf_counter()
     if options.mode == INCREMENTAL:
         grown = optimiser.run_incrementally(tell)
-        optimal = _incremental_result(drive, detections, cameras, grown, options, begin_s, growth_steps)
+        tell("tests of the inputs")
+        outcome = judge_grown(Inputs(drive, detections, options, sightings), optimiser, grown)
+        optimal = _incremental_result(cameras, grown, outcome, begin_s, growth_steps)
     else:
-        outcome = optimise(drive, detections, cameras, options, tell)
-        optimal = _optimised_result(cameras, outcome, begin_s)
-        optimiser, optimised, inputs = outcome.optimiser, outcome.optimised, outcome.inputs
+        outcome, optimised = optimise(drive, detections, cameras, options, tell)
+        optimal = _optimised_result(cameras, outcome, optimised, begin_s)
+        optimiser, inputs = outcome.optimiser, outcome.inputs
         drive, detections, options = inputs.drive, inputs.detections, inputs.options
         if inputs.sightings is not sightings:
             sightings, tracks = inputs.sightings, optimiser.initial_tracks()
@@ -125,8 +128,10 @@ def run_naive(
     )
 
 
-def _optimised_result(cameras: Sequence[str], outcome: Outcome, begin_s: float) -> MethodResult:
-    optimised, options, drive = outcome.optimised, outcome.inputs.options, outcome.inputs.drive
+def _optimised_result(
+    cameras: Sequence[str], outcome: Outcome, optimised: Optimised, begin_s: float
+) -> MethodResult:
+    options, drive = outcome.inputs.options, outcome.inputs.drive
     solution = optimised.bundle.solution
     if solution.status is not Status.CONVERGED:
         _log.warning(
@@ -167,14 +172,9 @@ def _optimised_result(cameras: Sequence[str], outcome: Outcome, begin_s: float) 
 
 
 def _incremental_result(
-    drive: Drive,
-    detections: Sequence[ImageDetections],
-    cameras: Sequence[str],
-    grown: Grown,
-    options: MappingOptions,
-    begin_s: float,
-    growth_steps: int,
+    cameras: Sequence[str], grown: Grown, outcome: Outcome, begin_s: float, growth_steps: int
 ) -> MethodResult:
+    drive, detections, options = outcome.inputs.drive, outcome.inputs.detections, outcome.inputs.options
     lanes = _lanes(drive, detections, ground_by_rig(drive, cameras, grown.rig), options)
     return MethodResult(
         name="Opt",
@@ -192,6 +192,9 @@ def _incremental_result(
             "time_s": time.perf_counter() - begin_s,
         },
         certainty=grown.certainty,
+        evidence=outcome.evidence,
+        poses=adjusted_poses(outcome),
+        clocks=clock_offsets(outcome),
     )
 
 

@@ -53,6 +53,7 @@ STEEP_SINE = 0.15
 LOOSE_CLOCK_SIGMA_S = 0.3
 """How far clocks may be apart, s, once the drive has said that they are: half a period of a slow receiver."""
 
+
 class Optimiser:
     """Takes one set of cameras through association and solving."""
 
@@ -149,9 +150,11 @@ class Optimiser:
         return mapper.run(self._views, progress or _silent)
 
     def joint_solve(self, grown: Grown) -> Bundle:
-        """All that an incremental map was grown from, solved together: the evidence to judge it by."""
+        """All that an incremental map was grown from, solved together; and how well that predicts."""
         self._variance_factor = grown.variance_factor
-        return self._solve(grown.association, grown.usable, grown.rig)
+        bundle = self._solve(grown.association, grown.usable, grown.rig)
+        self._choose_pose_model(bundle)
+        return bundle
 
     def solve_groups(self, optimised: Optimised, groups: IntArray) -> Bundle:
         """Solve with only some ``groups`` of a finished optimisation, from the initial extrinsics."""

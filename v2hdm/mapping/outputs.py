@@ -12,7 +12,7 @@ from v2hdm.mapping.sightings.table import frames_of
 
 def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
     """The poses of all frames of the drive."""
-    drive, sightings, bundle = outcome.inputs.drive, outcome.inputs.sightings, outcome.optimised.bundle
+    drive, sightings, bundle = outcome.inputs.drive, outcome.inputs.sightings, outcome.bundle
     sigma = np.tile(bundle.model.pose_sigma.by_state(), (len(sightings.stamp_s), 1))
     used = np.unique(sightings.frame[bundle.row])
     if bundle.model.solver.pose_states:

@@ -26,6 +26,7 @@ from v2hdm.mapping.fit import (
     point_of,
     sizes_of,
 )
+from v2hdm.mapping.grown import Grown
 from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions
@@ -98,11 +99,14 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What was optimised from which inputs, and the evidence for the checks."""
+    """What was optimised from which inputs, and the evidence for the checks.
+
+    ``bundle`` holds the adjusted poses.
+    """
 
     inputs: Inputs
     optimiser: Optimiser
-    optimised: Optimised
+    bundle: Bundle
     evidence: SolveEvidence
 
 
@@ -112,7 +116,7 @@ def optimise(
     cameras: Sequence[str],
     options: MappingOptions,
     tell: Callable[[str], None],
-) -> Outcome:
+) -> tuple[Outcome, Optimised]:
     """Optimise a drive, as often as inputs have to be dropped.
 
     Raises:
@@ -124,9 +128,7 @@ def optimise(
         optimiser = Optimiser(sightings, views_of(drive, cameras), drive.cameras, drive.pose_noise, options)
         settled = optimiser.settle(optimiser.initial_tracks(), tell)
         tell("tests of the inputs")
-        found = [
-            one for one in suspects(settled.problem, settled.solution) if _is_stated(one, settled, drive)
-        ]
+        found = _suspects(settled, drive)
         worst = next((one for one in found if is_contradicted(one)), None)
         inputs = Inputs(drive, detections, options, sightings)
         remedied = None
@@ -144,8 +146,27 @@ def optimise(
         drive, detections, options = remedied.drive, remedied.detections, remedied.options
     optimised = optimiser.finish(settled, tell)
     corrected = [_as_solved(one, settled) for one in corrected]
-    evidence = _evidence(settled, contradictions(settled, found), corrected, optimiser, optimised, sightings)
-    return Outcome(inputs, optimiser, optimised, evidence)
+    evidence = _evidence(
+        settled, contradictions(settled, found), corrected, optimiser, optimised.bundle, sightings
+    )
+    return Outcome(inputs, optimiser, optimised.bundle, evidence), optimised
+
+
+def judge_grown(inputs: Inputs, optimiser: Optimiser, grown: Grown) -> Outcome:
+    """The same evidence of a map that was grown marking by marking: all that it rests on, solved together.
+
+    Nothing is dropped: a vehicle has used its inputs long before.
+    """
+    bundle = optimiser.joint_solve(grown)
+    found = contradictions(bundle, _suspects(bundle, inputs.drive))
+    evidence = _evidence(bundle, found, (), optimiser, bundle, inputs.sightings)
+    return Outcome(inputs, optimiser, bundle, evidence)
+
+
+def _suspects(bundle: Bundle, drive: Drive) -> tuple[Suspect, ...]:
+    """The inputs that can be tested and were stated at all, the most contradicted first."""
+    found = suspects(bundle.problem, bundle.solution)
+    return tuple(one for one in found if _is_stated(one, bundle, drive))
 
 
 def _is_stated(one: Suspect, bundle: Bundle, drive: Drive) -> bool:
@@ -171,7 +192,7 @@ def _evidence(
     found: tuple[Contradiction, ...],
     corrected: Sequence[Contradiction],
     optimiser: Optimiser,
-    optimised: Optimised,
+    final: Bundle,
     sightings: Sightings,
 ) -> SolveEvidence:
     factors, window_s = along_route(settled, sightings.stamp_s[sightings.frame[settled.row]])
@@ -190,7 +211,7 @@ def _evidence(
         pose_pulls=pulls.rms(),
         worst_pull=float(largest.max()),
         worst_pull_s=float(frames_s[int(largest.argmax())]),
-        clock_s=_clocks(optimised),
+        clock_s=_clocks(final),
     )
 
 
@@ -213,8 +234,7 @@ def is_contradicted(one: Suspect | Contradiction) -> bool:
     return told and one.sigmas > CONTRADICTED_SIGMAS and abs(one.value) > LEAST_VALUE[one.fault]
 
 
-def _clocks(optimised: Optimised) -> dict[str, tuple[float, float]]:
-    bundle = optimised.bundle
+def _clocks(bundle: Bundle) -> dict[str, tuple[float, float]]:
     if not bundle.model.solver.clock_offset:
         return {}
     sigma = np.sqrt(bundle.solution.covariance.clock_s2())

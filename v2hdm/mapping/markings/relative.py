@@ -41,7 +41,7 @@ def with_relative_sigma(
     seen = np.flatnonzero((corner_index >= 0).sum(axis=1) >= 3)
     if not len(seen):
         return tuple(markings)
-    chosen = [markings[m] for m in seen]
+    chosen = [markings[m] for m in seen.tolist()]
     diagonal = _diagonals(corner_index[seen])
     first, second = neighbours(np.array([marking.corners_map.mean(axis=0) for marking in chosen]))
     if not len(first):
@@ -80,5 +80,5 @@ def neighbours(centres_map: FloatArray) -> tuple[IntArray, IntArray]:
 
 def _diagonals(corner_index: IntArray) -> IntArray:
     """Of markings (M, 4) of which three corners are known, two (M, 2) that are opposite each other."""
-    even = (corner_index[:, [0, 2]] >= 0).all(axis=1)
-    return np.where(even[:, None], corner_index[:, [0, 2]], corner_index[:, [1, 3]])
+    even = np.asarray((corner_index[:, [0, 2]] >= 0).all(axis=1, keepdims=True))
+    return np.where(even, corner_index[:, [0, 2]], corner_index[:, [1, 3]])
