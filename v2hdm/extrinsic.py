@@ -36,7 +36,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("drive", type=Path, help="the drive's folder; see docs/drive-format.md")
     parser.add_argument("--camera", action="append", metavar="NAME", help="only this camera; may be repeated")
     parser.add_argument("--format", default="auto", help="auto, folder or kitti (default: auto)")
-    parser.add_argument("--output", type=Path, help="folder for the results (default: outputs/<drive>-extrinsic)")
+    parser.add_argument(
+        "--output", type=Path, help="folder for the results (default: outputs/<drive>-extrinsic)"
+    )
     return parser
 
 
