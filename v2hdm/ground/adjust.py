@@ -8,6 +8,7 @@ import numpy as np
 
 from v2hdm.ground.model import GroundHits, by_lens, by_pixel, hit_ground
 from v2hdm.ground.mount import Mount, rotation
+from v2hdm.ground.results import IntArray
 from v2hdm.records import BoolArray, FloatArray
 
 PIXEL_SIGMA = 0.4
@@ -52,11 +53,11 @@ class Observations:
         pair: (N,) the pair.
     """
 
-    first: FloatArray
-    second: FloatArray
+    first: IntArray
+    second: IntArray
     first_px: FloatArray
     second_px: FloatArray
-    pair: FloatArray
+    pair: IntArray
 
     def only(self, keep: BoolArray) -> Observations:
         """Those of a mask (N,)."""
@@ -141,8 +142,10 @@ def adjust(
         sigma_px = float(np.clip(PIXEL_SIGMA * scale, _LEAST_PIXEL_SIGMA, tolerance * PIXEL_SIGMA))
         unit = PIXEL_SIGMA / sigma_px
         weight = np.where(usable, 1 / (1 + (length * unit / (_CAUCHY * tolerance)) ** 2), 0.0)
-        system, gradient = _normal(observations, believed, mount, errors, bends, residual, jacobian, root * unit, weight)
-        step = _short(np.linalg.solve(system, -gradient))
+        system, gradient = _normal(
+            observations, believed, mount, errors, bends, residual, jacobian, root * unit, weight
+        )
+        step = _short(np.asarray(np.linalg.solve(system, -gradient)))
         known = len(step) - errors.size
         mount = mount.moved(step[TURN], step[CENTRE])
         bends = bends + step[6 : 6 + 2 * _BENDS]
@@ -157,8 +160,10 @@ def adjust(
         if np.max(np.abs(step) * np.sqrt(np.diag(system))) < _CONVERGED:
             break
     wanted = [*range(6), *range(known - (free is not None), known)]
-    covariance = np.linalg.inv(system)[np.ix_(wanted, wanted)]
-    return Adjusted(mount, extra, covariance, errors, bends, moved_poses(believed, errors, extra, free), length, weight)
+    covariance = np.asarray(np.linalg.inv(system)[np.ix_(wanted, wanted)])
+    return Adjusted(
+        mount, extra, covariance, errors, bends, moved_poses(believed, errors, extra, free), length, weight
+    )
 
 
 def _short(step: FloatArray) -> FloatArray:
@@ -176,10 +181,14 @@ def _linearised(
     bends: FloatArray,
     free: str | None,
 ) -> tuple[FloatArray, list[FloatArray], FloatArray]:
-    """Differences (N, 2) m, their derivatives by mount and parameter and by both poses, whitening (N, 2, 2)."""
-    sides, spread = [], 0.0
+    """Differences (N, 2) m, their derivatives by mount, parameter and both poses, whitening (N, 2, 2)."""
+    sides = []
+    spread = np.zeros((len(observations.first), 2, 2))
     poses = moved_poses(believed, errors, extra, free)
-    for image, px in ((observations.first, observations.first_px), (observations.second, observations.second_px)):
+    for image, px in (
+        (observations.first, observations.first_px),
+        (observations.second, observations.second_px),
+    ):
         hits = hit_ground(mount, px, poses[image])
         by_px = by_pixel(mount, hits)
         bending = _bending(mount, px, by_px)
@@ -211,7 +220,7 @@ def _by_parameter(
     px: FloatArray,
     poses: FloatArray,
     believed: Believed,
-    image: FloatArray,
+    image: IntArray,
 ) -> FloatArray:
     if free == "clock_s":
         return hits.by_motion(believed.velocity[image])

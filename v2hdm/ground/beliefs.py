@@ -10,6 +10,7 @@ from v2hdm.ground.adjust import Believed, Observations
 from v2hdm.ground.motion import Motion
 from v2hdm.ground.mount import Mount
 from v2hdm.ground.noise import pose_information
+from v2hdm.ground.results import IntArray
 from v2hdm.records import Camera, Drive, FloatArray
 
 _FORWARD_LOOSENED = 2.0
@@ -50,14 +51,18 @@ class Beliefs:
         """Distance driven (I,) at all images."""
         return self.motion.path_at_images(self.clock_s)
 
-    def about(self, observations: Observations, loosened: float = 1.0) -> tuple[Observations, Believed, FloatArray]:
+    def about(
+        self, observations: Observations, loosened: float = 1.0
+    ) -> tuple[Observations, Believed, IntArray]:
         """The observations with images counted anew, what is known of these images, and their rows.
 
         Args:
             observations: matches between rows of the motion.
             loosened: how much further off than stated headings and sideways places may be.
         """
-        rows, place = np.unique(np.concatenate([observations.first, observations.second]), return_inverse=True)
+        rows, place = np.unique(
+            np.concatenate([observations.first, observations.second]), return_inverse=True
+        )
         count = len(observations.first)
         path_m = self.path_m()[rows]
         prior = self.camera.centre_prior if self.surveyed else None

@@ -18,10 +18,9 @@ from v2hdm.ground.options import GroundOptions
 from v2hdm.ground.pairs import changing_pairs, spread_pairs
 from v2hdm.ground.parameters import clock_shows, free_parameters
 from v2hdm.ground.readings import Readings, try_readings
+from v2hdm.ground.results import GroundEstimate, GroundStatus, IntArray, MatchedGround, Parameter, Reading
 from v2hdm.ground.scatter import scatter
-from v2hdm.ground.results import GroundEstimate, GroundStatus, MatchedGround, Parameter, Reading
 from v2hdm.records import Calibration, Drive, FloatArray, PoseNoise
-
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ def estimate_ground(drive: Drive, camera: str, options: GroundOptions | None = N
 class _Solved:
     """The last round's matches, what was believed of them, the solution and its poses of all images."""
 
-    pairs: FloatArray
+    pairs: IntArray
     matched: Round
     beliefs: Beliefs
     adjusted: Adjusted
@@ -96,7 +95,9 @@ def _solve(matcher: Matcher, beliefs: Beliefs, mount: Mount, options: GroundOpti
         pairs = np.vstack([pairs, changing_pairs(path_m, velocity, options.clock_pairs, *_CLOCK_APART_M)])
     poses = beliefs.poses()
     for stage in _STAGES:
-        matched = matcher.match(mount, poses, pairs[:: stage.every], stage.search_m, stage.grids * options.grid_m)
+        matched = matcher.match(
+            mount, poses, pairs[:: stage.every], stage.search_m, stage.grids * options.grid_m
+        )
         if len(matched.correlation) < _LEAST_MATCHES:
             return None
         used, believed, rows = beliefs.about(matched.observations, stage.loosened)
@@ -130,7 +131,12 @@ def _found(camera: str, solved: _Solved, readings: Readings, options: GroundOpti
         median_residual=float(np.median(solved.adjusted.residual)),
         pulls=_pulls(solved.adjusted, solved.beliefs.drive.pose_noise),
         patches=MatchedGround(
-            image[solved.pairs], solved.poses[solved.pairs], seen.pair, seen.first_px, seen.second_px, matched.correlation
+            image[solved.pairs],
+            solved.poses[solved.pairs],
+            seen.pair,
+            seen.first_px,
+            seen.second_px,
+            matched.correlation,
         ),
         seconds=0.0,
     )

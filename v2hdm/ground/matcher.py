@@ -12,7 +12,8 @@ from v2hdm.ground.adjust import Observations
 from v2hdm.ground.motion import Motion
 from v2hdm.ground.mount import Mount
 from v2hdm.ground.options import GroundOptions
-from v2hdm.ground.patches import Matches, View, match_pair, patch_centres
+from v2hdm.ground.patches import ImageArray, Matches, View, match_pair, patch_centres
+from v2hdm.ground.results import IntArray
 from v2hdm.records import Drive, FloatArray
 
 _PATH_STEP_M = 0.5
@@ -39,7 +40,7 @@ class Matcher:
         self._roi = np.asarray(drive.cameras[camera].roi_vehicle, dtype=np.float64)
         self._path = path_of(motion)
         self._options = options
-        self._grey: dict[int, FloatArray] = {}
+        self._grey: dict[int, ImageArray] = {}
 
     def under(self, motion: Motion, turned: bool = False) -> Matcher:
         """The same images under another reading of the poses, the region ``turned`` to the other end."""
@@ -49,14 +50,14 @@ class Matcher:
         other._roi = -self._roi if turned else self._roi
         return other
 
-    def grey(self, row: int) -> FloatArray:
+    def grey(self, row: int) -> ImageArray:
         """The image of a row of the motion, as grey values."""
         if row not in self._grey:
             self._grey[row] = read_grey(str(self._drive.images[int(self._image[row])].path))
         return self._grey[row]
 
     def match(
-        self, mount: Mount, poses: FloatArray, pairs: FloatArray, search_m: float, grid_m: float | None = None
+        self, mount: Mount, poses: FloatArray, pairs: IntArray, search_m: float, grid_m: float | None = None
     ) -> Round:
         """Match every pair (P, 2) of rows of ``poses``, laid out from ``mount``."""
         options = self._options if grid_m is None else replace(self._options, grid_m=grid_m)
@@ -91,14 +92,12 @@ def path_of(motion: Motion) -> FloatArray:
     length = motion.path_m[-1]
     at = np.arange(0.0, length + _PATH_STEP_M, _PATH_STEP_M)
     keep = np.concatenate([[True], np.diff(motion.path_m) > 1e-9])
-    path = np.column_stack(
-        [np.interp(at, motion.path_m[keep], poses[keep, axis, 3]) for axis in (0, 1)]
-    )
+    path = np.column_stack([np.interp(at, motion.path_m[keep], poses[keep, axis, 3]) for axis in (0, 1)])
     beyond = np.arange(_PATH_STEP_M, _BEYOND_M, _PATH_STEP_M)[:, None]
     return np.vstack([path, path[:1] - beyond * poses[0, :2, 0], path[-1:] + beyond * poses[-1, :2, 0]])
 
 
-def read_grey(path: str) -> FloatArray:
+def read_grey(path: str) -> ImageArray:
     """The image file at ``path`` as grey values (H, W), uint8.
 
     Raises:

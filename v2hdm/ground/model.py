@@ -67,7 +67,11 @@ def _hit(mount: Mount, rays_vehicle: FloatArray, poses: FloatArray) -> GroundHit
 def by_lens(mount: Mount, points_px: FloatArray, poses: FloatArray, name: str) -> FloatArray:
     """Derivative (N, 2) of the ground points by ``focal_scale`` or ``distortion_k1``, by differences."""
     if name == "focal_scale":
-        step, low, high = _FOCAL_STEP, mount.with_focal_scale(-_FOCAL_STEP), mount.with_focal_scale(_FOCAL_STEP)
+        step, low, high = (
+            _FOCAL_STEP,
+            mount.with_focal_scale(-_FOCAL_STEP),
+            mount.with_focal_scale(_FOCAL_STEP),
+        )
     else:
         step, low, high = _K1_STEP, mount.with_k1(-_K1_STEP), mount.with_k1(_K1_STEP)
     ends = [hit_ground(each, points_px, poses).points_map for each in (low, high)]

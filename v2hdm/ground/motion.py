@@ -8,7 +8,7 @@ import numpy as np
 
 from v2hdm.drive.rotation import rotation_from_euler
 from v2hdm.drive.trajectory import interpolate
-from v2hdm.ground.results import Reading
+from v2hdm.ground.results import IntArray, Reading
 from v2hdm.records import Drive, FloatArray, Trajectory
 
 SMOOTHING_S = 0.5
@@ -30,7 +30,7 @@ class Motion:
         velocity: (P, 3) forward and left in m/s and yaw rate in rad/s, smoothed, at each pose.
     """
 
-    image: FloatArray
+    image: IntArray
     stamp_s: FloatArray
     trajectory: Trajectory
     path_m: FloatArray

@@ -29,7 +29,7 @@ class Mount:
         return out
 
     def moved(self, turn_rad: FloatArray, shift_m: FloatArray) -> Mount:
-        """Turned about its centre by a rotation vector (3,) in vehicle axes (roll, pitch, yaw), and shifted."""
+        """Turned about its centre by a rotation vector (3,) in vehicle axes, and shifted (3,) m."""
         return replace(
             self,
             vehicle_from_cam_rotation=rotation(turn_rad) @ self.vehicle_from_cam_rotation,
@@ -55,7 +55,7 @@ class Mount:
         return np.asarray(cam @ self.vehicle_from_cam_rotation.T)
 
     def project_ground(self, ground_map: FloatArray, map_from_vehicle: FloatArray) -> FloatArray:
-        """Recorded pixels (N, 2) of ground points (N, 2) of the map; nan where the image does not show them."""
+        """Recorded pixels (N, 2) of ground points (N, 2) of the map; nan where they are out of view."""
         cam_from_map = self.cam_from_vehicle @ np.linalg.inv(map_from_vehicle)
         matrix = self.info.intrinsic @ cam_from_map[:3][:, [0, 1, 3]]
         pinhole = ground_map @ matrix[:2, :2].T + matrix[:2, 2]

@@ -20,7 +20,7 @@ def state_sigmas(noise: PoseNoise) -> FloatArray:
     """Standard deviations (6,) of a pose's :data:`STATES`."""
     tilt, position = noise.roll_pitch_rad, noise.position_m
     sigmas = [tilt, tilt, noise.heading_rad, position, position, HEAVE_SIGMA_M]
-    return np.maximum(np.array(sigmas), _LEAST)
+    return np.asarray(np.maximum(np.array(sigmas), _LEAST))
 
 
 def pose_information(noise: PoseNoise, path_m: FloatArray, loosened: FloatArray) -> FloatArray:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
+from v2hdm.ground.results import IntArray
 from v2hdm.records import FloatArray
 
 _ARM_M = 10.0
 """A turn by one radian moves the ground in view by about this."""
 
 
-def spread_pairs(path_m: FloatArray, count: int, shortest_m: float, longest_m: float) -> FloatArray:
+def spread_pairs(path_m: FloatArray, count: int, shortest_m: float, longest_m: float) -> IntArray:
     """Pairs (P, 2) of images, spread evenly along the path, no image used twice where that is possible.
 
     Args:
@@ -49,7 +52,7 @@ def _pair_from(
 
 def changing_pairs(
     path_m: FloatArray, velocity: FloatArray, count: int, shortest_m: float, longest_m: float
-) -> FloatArray:
+) -> IntArray:
     """Pairs (P, 2) of images between which the motion changes most, so that a clock shows.
 
     Args:
@@ -59,16 +62,45 @@ def changing_pairs(
         shortest_m: distance between the images of a pair, at least.
         longest_m: and at most.
     """
+
+    def worth(first: int, second: int) -> float:
+        change = velocity[second] - velocity[first]
+        return float(np.hypot(np.hypot(change[0], change[1]), _ARM_M * change[2]))
+
+    return _best_pairs(path_m, worth, count, shortest_m, longest_m)
+
+
+def turning_pairs(
+    path_m: FloatArray, yaw_rad: FloatArray, count: int, shortest_m: float, longest_m: float
+) -> IntArray:
+    """Pairs (P, 2) of images between which the vehicle turns most, so that a mirrored path shows.
+
+    Args:
+        path_m: (I,) distance driven at each image.
+        yaw_rad: (I,) heading there, without jumps.
+        count: how many pairs are wanted.
+        shortest_m: distance between the images of a pair, at least.
+        longest_m: and at most.
+    """
+
+    def worth(first: int, second: int) -> float:
+        return abs(float(yaw_rad[second] - yaw_rad[first]))
+
+    return _best_pairs(path_m, worth, count, shortest_m, longest_m)
+
+
+def _best_pairs(
+    path_m: FloatArray, worth: Callable[[int, int], float], count: int, shortest_m: float, longest_m: float
+) -> IntArray:
+    """The pairs of most worth, no image used twice."""
     found: list[tuple[float, int, int]] = []
     for first in range(len(path_m)):
         away = path_m - path_m[first]
-        for second in np.flatnonzero((away >= shortest_m) & (away <= longest_m)):
-            change = velocity[second] - velocity[first]
-            worth = float(np.hypot(np.hypot(change[0], change[1]), _ARM_M * change[2]))
-            found.append((worth, first, int(second)))
+        for second in np.flatnonzero((away >= shortest_m) & (away <= longest_m)).tolist():
+            found.append((worth(first, second), first, second))
     found.sort(reverse=True)
     used: set[int] = set()
-    chosen = []
+    chosen: list[tuple[int, int]] = []
     for _, first, second in found:
         if first not in used and second not in used and len(chosen) < count:
             chosen.append((first, second))

@@ -79,8 +79,9 @@ def free_parameters(
             out[name] = replace(clock, sigma=clock.sigma * float(np.sqrt(factor)))
             continue
         value, sigma = _free(name, observations, beliefs, solved)
-        sigma *= float(np.sqrt(factor))
+        # A fault widens the scatter; that it shows must not hang on it.
         told = sigma < _TOLD_SIGMA[name]
+        sigma *= float(np.sqrt(factor))
         if name == "clock_s":
             told = False
         if name == "focal_scale":

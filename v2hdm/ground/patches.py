@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from v2hdm.ground.mount import Mount
 from v2hdm.ground.options import GroundOptions
 from v2hdm.planar import ground_in_vehicle, inside_convex
 from v2hdm.records import BoolArray, FloatArray
+
+ImageArray = NDArray[np.uint8]
+Float32Array = NDArray[np.float32]
 
 _LEAST_CORRELATION = 0.5
 """Normalised cross-correlation below which two patches are not the same ground."""
@@ -46,7 +49,7 @@ _LEAST_OF_A_PAIR = 8
 class View:
     """One image of a pair: ``grey`` (H, W), the camera and the vehicle's pose (4, 4)."""
 
-    grey: FloatArray
+    grey: ImageArray
     mount: Mount
     map_from_vehicle: FloatArray
 
@@ -84,7 +87,7 @@ class Sheet:
         """Map points (N, 2) of grid places (N, 2): rows, columns."""
         return np.asarray(self.corner_map + self.grid_m * np.asarray(cells, dtype=np.float64) @ self.axes)
 
-    def lay(self, view: View) -> tuple[FloatArray, BoolArray]:
+    def lay(self, view: View) -> tuple[Float32Array, BoolArray]:
         """The ground as ``view`` shows it (rows, columns), float32, and where it does."""
         px = view.pixels(self.points()).astype(np.float32).reshape(*self.shape, 2)
         seen = ~np.isnan(px[..., 0])
@@ -92,7 +95,7 @@ class Sheet:
         grey = cv2.remap(view.grey, px[..., 0], px[..., 1], cv2.INTER_LINEAR).astype(np.float32)
         return grey, seen
 
-    def texture(self, view: View) -> tuple[FloatArray, BoolArray]:
+    def texture(self, view: View) -> tuple[Float32Array, BoolArray]:
         """The same without what is wider than the texture of the ground."""
         grey, seen = self.lay(view)
         return grey - cv2.GaussianBlur(grey, (0, 0), _COARSEST_M / self.grid_m), seen
@@ -124,8 +127,10 @@ def patch_centres(
     return np.asarray(centres[near])
 
 
-def match_pair(first: View, second: View, centres_map: FloatArray, search_m: float, options: GroundOptions) -> Matches:
-    """Find the patches around ``centres_map`` (N, 2) of the first image in the second, within ``search_m``."""
+def match_pair(
+    first: View, second: View, centres_map: FloatArray, search_m: float, options: GroundOptions
+) -> Matches:
+    """Find patches around ``centres_map`` (N, 2) of the first image in the second, within ``search_m``."""
     grid_m = options.grid_m
     half = round(options.patch_m / 2 / grid_m)
     reach = max(round(search_m / grid_m), _PEAK_CELLS)
@@ -141,7 +146,11 @@ def match_pair(first: View, second: View, centres_map: FloatArray, search_m: flo
         row, column = cells[number]
         own = np.s_[row - half : row + half + 1, column - half : column + half + 1]
         area = np.s_[row - wide : row + wide + 1, column - wide : column + wide + 1]
-        peak = _peak(cv2.matchTemplate(second_grey[area], first_grey[own], cv2.TM_CCOEFF_NORMED))
+        peak = _peak(
+            np.asarray(
+                cv2.matchTemplate(second_grey[area], first_grey[own], cv2.TM_CCOEFF_NORMED), np.float32
+            )
+        )
         if peak is not None:
             found.append((number, *peak))
     sought = int(in_view.sum())
@@ -154,7 +163,7 @@ def match_pair(first: View, second: View, centres_map: FloatArray, search_m: flo
     return _on_one_plane(Matches(first_px, second_px, table[:, 3], sought))
 
 
-def _mean(values: FloatArray | BoolArray, half: int) -> FloatArray:
+def _mean(values: Float32Array | BoolArray, half: int) -> Float32Array:
     """Means over squares of ``2 half + 1`` cells around each."""
     return np.asarray(cv2.blur(values.astype(np.float32), (2 * half + 1, 2 * half + 1)))
 
@@ -176,7 +185,7 @@ def _sheet_around(
     return Sheet((low - margin * grid_m) @ axes, axes, grid_m, (int(rows), int(columns))), cells
 
 
-def _peak(score: FloatArray) -> tuple[float, float, float] | None:
+def _peak(score: Float32Array) -> tuple[float, float, float] | None:
     """Row, column and height of the best place, refined by a paraboloid; None for no clear one."""
     _, best, _, (column, row) = cv2.minMaxLoc(score)
     rows, columns = score.shape
@@ -197,7 +206,8 @@ def _peak(score: FloatArray) -> tuple[float, float, float] | None:
         return None
     rest = score.copy()
     rest[
-        max(row - _PEAK_CELLS, 0) : row + _PEAK_CELLS + 1, max(column - _PEAK_CELLS, 0) : column + _PEAK_CELLS + 1
+        max(row - _PEAK_CELLS, 0) : row + _PEAK_CELLS + 1,
+        max(column - _PEAK_CELLS, 0) : column + _PEAK_CELLS + 1,
     ] = -1
     if rest.max() > best - _LEAST_LEAD:
         return None
@@ -215,7 +225,3 @@ def _on_one_plane(matches: Matches) -> Matches:
         return _no_matches(matches.sought)
     keep = inlier.ravel().astype(np.bool_)
     return Matches(first[keep], second[keep], matches.correlation[known][keep], matches.sought)
-
-
-ReadGrey = Callable[[int], FloatArray]
-"""Reads the grey image of an index into ``Drive.images``."""

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from v2hdm.ground.matcher import read_grey
 from v2hdm.ground.model import hit_ground
 from v2hdm.ground.mount import Mount, guessed_mount
-from v2hdm.ground.matcher import read_grey
 from v2hdm.ground.patches import Sheet, View
 from v2hdm.ground.results import GroundEstimate, MatchedGround
 from v2hdm.records import Drive, FloatArray
@@ -38,9 +38,9 @@ class _Pair:
 def draw_matched_ground(drive: Drive, estimate: GroundEstimate) -> NDArray[np.uint8] | None:
     """The pair with most matches, under the guess and under the estimate side by side; BGR.
 
-    Both with the estimated errors of the two poses, so that the mounting makes the difference. Orange and blue
-    are the two images: where they agree the ground is grey. An arrow leads from where the
-    first image sees a patch to where the second sees it, five times as long. None without an estimate.
+    Both with the estimated errors of the two poses, so that the mounting makes the difference. Orange and
+    blue are the two images: where they agree the ground is grey. An arrow leads from where the first image
+    sees a patch to where the second sees it, five times as long. None without an estimate.
     """
     if estimate.calibration is None or estimate.patches is None:
         return None
@@ -53,11 +53,11 @@ def draw_matched_ground(drive: Drive, estimate: GroundEstimate) -> NDArray[np.ui
     for title, mount in (("guess", guess), ("estimate", found)):
         panels.append(_panel(drive, pair, mount, title))
     height = max(panel.shape[0] for panel in panels)
-    panels = [
+    padded = [
         cv2.copyMakeBorder(p, 0, height - p.shape[0], 0, _GAP_PX, cv2.BORDER_CONSTANT, value=(255,) * 3)
         for p in panels
     ]
-    return np.hstack(panels)
+    return np.hstack(padded).astype(np.uint8)
 
 
 def _fullest(patches: MatchedGround) -> _Pair:

@@ -11,14 +11,17 @@ from v2hdm.ground.beliefs import Beliefs
 from v2hdm.ground.matcher import Matcher
 from v2hdm.ground.motion import motion_of
 from v2hdm.ground.mount import Mount
-from v2hdm.ground.pairs import spread_pairs
-from v2hdm.ground.results import Reading
+from v2hdm.ground.pairs import spread_pairs, turning_pairs
+from v2hdm.ground.results import IntArray, Reading
 from v2hdm.ground.start import Start, find_start
 from v2hdm.records import Drive
 
 _PAIRS = 10
 _APART_M = (1.2, 2.8)
 """Distance between the images of a pair: poses read wrongly move the ground further than the search."""
+
+_TURN_RAD = np.deg2rad(2)
+"""A turn between the images of a pair that is no noise of the path."""
 
 _SEARCH_M = 0.6
 _GRID_M = 0.06
@@ -42,13 +45,14 @@ class Readings:
 def try_readings(drive: Drive, camera: str, matcher: Matcher, beliefs: Beliefs, others: bool) -> Readings:
     """Find a start and compare the readings of the poses; without ``others`` only the one as given."""
     start = find_start(matcher, beliefs, beliefs.guess)
+    pairs = _telling_pairs(drive, camera)
     shares = {Reading.AS_GIVEN: 0.0}
     if start.mount is not None:
-        shares[Reading.AS_GIVEN] = _share(matcher, beliefs, start.mount)
+        shares[Reading.AS_GIVEN] = _share(matcher, beliefs, start.mount, pairs)
     if others:
         for reading in Reading:
             if reading is not Reading.AS_GIVEN:
-                shares[reading] = _share_under(reading, drive, camera, matcher, beliefs, start.mount)
+                shares[reading] = _share_under(reading, drive, camera, matcher, beliefs, start.mount, pairs)
     best = max(shares, key=lambda reading: shares[reading])
     given = shares[Reading.AS_GIVEN]
     if shares[best] < _CLEAR_SHARE or given >= _RIVAL * shares[best]:
@@ -57,7 +61,13 @@ def try_readings(drive: Drive, camera: str, matcher: Matcher, beliefs: Beliefs, 
 
 
 def _share_under(
-    reading: Reading, drive: Drive, camera: str, matcher: Matcher, beliefs: Beliefs, found: Mount | None
+    reading: Reading,
+    drive: Drive,
+    camera: str,
+    matcher: Matcher,
+    beliefs: Beliefs,
+    found: Mount | None,
+    pairs: IntArray,
 ) -> float:
     motion = motion_of(drive, camera, reading)
     backwards = reading is Reading.BACKWARDS
@@ -66,13 +76,23 @@ def _share_under(
     other = matcher.under(motion, turned=backwards)
     believed = replace(beliefs, motion=motion, guess=guess, surveyed=not backwards)
     if found is not None:
-        return _share(other, believed, guess)
+        return _share(other, believed, guess, pairs)
     start = find_start(other, believed, guess)
-    return 0.0 if start.mount is None else _share(other, believed, start.mount)
+    return 0.0 if start.mount is None else _share(other, believed, start.mount, pairs)
 
 
-def _share(matcher: Matcher, beliefs: Beliefs, mount: Mount) -> float:
-    pairs = spread_pairs(beliefs.path_m(), _PAIRS, *_APART_M)
+def _telling_pairs(drive: Drive, camera: str) -> IntArray:
+    """Those between which the vehicle turns most along its path; evenly spread ones on a straight route."""
+    motion = motion_of(drive, camera, Reading.HEADING_FROM_PATH)
+    poses = motion.poses()
+    yaw = np.unwrap(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
+    pairs = turning_pairs(motion.path_at_images(), yaw, _PAIRS, *_APART_M)
+    if len(pairs) and np.median(np.abs(yaw[pairs[:, 1]] - yaw[pairs[:, 0]])) > _TURN_RAD:
+        return pairs
+    return spread_pairs(motion.path_at_images(), _PAIRS, *_APART_M)
+
+
+def _share(matcher: Matcher, beliefs: Beliefs, mount: Mount, pairs: IntArray) -> float:
     return matcher.match(mount, beliefs.poses(), pairs, _SEARCH_M, _GRID_M).share
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from v2hdm.records import Calibration, FloatArray
 
 IntArray = NDArray[np.int64]
+"""Indices."""
 
 
 class GroundStatus(Enum):

@@ -11,6 +11,7 @@ from v2hdm.ground.beliefs import Beliefs
 from v2hdm.ground.matcher import Matcher
 from v2hdm.ground.mount import Mount
 from v2hdm.ground.pairs import spread_pairs
+from v2hdm.ground.results import IntArray
 from v2hdm.records import FloatArray
 
 _PAIRS = 10
@@ -57,14 +58,16 @@ def find_start(matcher: Matcher, beliefs: Beliefs, guess: Mount) -> Start:
     for turn_deg in _TURNS_DEG:
         # Pitch is about the camera's own sideways axis: a camera may look anywhere.
         sideways = guess.vehicle_from_cam_rotation[:, 0]
-        tried = _settle(matcher, beliefs, pairs, guess.moved(np.deg2rad(turn_deg) * sideways, np.zeros(3)), guess)
+        tried = _settle(
+            matcher, beliefs, pairs, guess.moved(np.deg2rad(turn_deg) * sideways, np.zeros(3)), guess
+        )
         if tried.mount is not None:
             return tried
         best = max(best, tried, key=lambda start: start.share)
     return best
 
 
-def short_pairs(path_m: FloatArray) -> FloatArray:
+def short_pairs(path_m: FloatArray) -> IntArray:
     """Pairs of neighbouring images, or of those next to each other where images are rarer."""
     pairs = spread_pairs(path_m, _PAIRS, *_SHORT_M)
     if len(pairs) < _PAIRS // 2:
@@ -72,7 +75,7 @@ def short_pairs(path_m: FloatArray) -> FloatArray:
     return pairs
 
 
-def _settle(matcher: Matcher, beliefs: Beliefs, pairs: FloatArray, mount: Mount, guess: Mount) -> Start:
+def _settle(matcher: Matcher, beliefs: Beliefs, pairs: IntArray, mount: Mount, guess: Mount) -> Start:
     share, sought = 0.0, 0
     prior = beliefs.camera.centre_prior
     # Between neighbouring images a higher camera and a longer way look alike; the survey tells them apart.

@@ -25,7 +25,9 @@ def estimate_and_write(drive: Drive, output: Path) -> None:
         DriveError: an image cannot be read.
     """
     for number, camera in enumerate(drive.cameras, start=1):
-        print(f"camera {number} of {len(drive.cameras)}: matching the ground of {camera} ...", file=sys.stderr)
+        print(
+            f"camera {number} of {len(drive.cameras)}: matching the ground of {camera} ...", file=sys.stderr
+        )
         estimate = estimate_ground(drive, camera)
         for line in lines(estimate):
             print(line, flush=True)

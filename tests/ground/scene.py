@@ -1,0 +1,124 @@
+"""A drive over a flat, rough floor, small enough for a test: every pixel is looked up where its ray lands."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from v2hdm.detection.camera.lens import undistort_points
+from v2hdm.drive.rotation import rotation_from_euler
+from v2hdm.drive.trajectory import interpolate
+from v2hdm.records import (
+    Calibration,
+    Camera,
+    CameraInfo,
+    CentrePrior,
+    Drive,
+    FloatArray,
+    Image,
+    PoseNoise,
+    Trajectory,
+)
+
+INFO = CameraInfo(
+    "front", 480, 320, np.array([[340.0, 0, 239.5], [0, 340.0, 159.5], [0, 0, 1]]), "plumb_bob",
+    (-0.1, 0.03, 0.0, 0.0, 0.0),
+)  # fmt: skip
+CENTRE = np.array([1.0, 0.1, 2.2])
+NOISE = PoseNoise(position_m=0.005, heading_rad=0.0005, roll_pitch_rad=0.0005)
+ROI = np.array([[4.0, -2.5], [11.0, -2.5], [11.0, 2.5], [4.0, 2.5]])
+
+_TEXEL_M = 0.03
+_FLOOR_M = (-8.0, 46.0, -12.0, 30.0)
+_SPEED_MPS = 5.0
+_EVERY_M = 0.8
+
+
+def extrinsic(roll_deg: float = 0.0, pitch_deg: float = 20.0, yaw_deg: float = 0.0) -> FloatArray:
+    """``cam_from_vehicle`` of a camera at :data:`CENTRE` that looks ahead and down."""
+    turn = rotation_from_euler(*(np.deg2rad([a]) for a in (roll_deg, pitch_deg, yaw_deg)))[0]
+    turn = turn @ np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = turn.T, -turn.T @ CENTRE
+    return out
+
+
+def path(turn_deg: float, length_m: float = 30.0) -> Trajectory:
+    """At constant speed: a third straight, a third that turns, a third straight; 20 poses a second."""
+    at = np.arange(0.0, length_m / _SPEED_MPS, 0.05)
+    third = length_m / 3
+    fine = np.linspace(0.0, length_m, 2000)
+    ramp = np.clip((fine - third) / third, 0, 1)
+    yaw = np.deg2rad(turn_deg) * ramp * ramp * (3 - 2 * ramp)
+    steps = np.diff(fine, prepend=0.0)
+    x, y = np.cumsum(steps * np.cos(yaw)), np.cumsum(steps * np.sin(yaw))
+    along = at * _SPEED_MPS
+    zero = np.zeros(len(at))
+    poses = np.tile(np.eye(4), (len(at), 1, 1))
+    poses[:, :3, :3] = rotation_from_euler(zero, zero, np.interp(along, fine, yaw))
+    poses[:, 0, 3], poses[:, 1, 3] = np.interp(along, fine, x), np.interp(along, fine, y)
+    return Trajectory(at, poses)
+
+
+def make_drive(folder: Path, turn_deg: float, true: FloatArray, contrast: float = 30.0) -> Drive:
+    """Render a drive into ``folder``; its guess is the truth, its poses are exact."""
+    trajectory = path(turn_deg)
+    stamps = np.arange(0.2, trajectory.stamp_s[-1] - 0.2, _EVERY_M / _SPEED_MPS)
+    poses, _ = interpolate(trajectory, stamps, np.inf)
+    floor = _floor(contrast)
+    rays = _rays(true)
+    folder.mkdir(parents=True, exist_ok=True)
+    images = []
+    for k, (stamp, pose) in enumerate(zip(stamps, poses, strict=True)):
+        file = folder / f"{k:03d}.png"
+        cv2.imwrite(str(file), _look(floor, rays, pose))
+        images.append(Image("front", float(stamp), file, pose))
+    camera = Camera(
+        INFO,
+        {"estimated": Calibration(INFO, true).vehicle_from_pinhole_px},
+        "estimated",
+        ROI,
+        CentrePrior(CENTRE, np.full(3, 0.02)),
+    )
+    return Drive("floor", folder, {"front": camera}, tuple(images), NOISE, trajectory=trajectory)
+
+
+def with_guess(drive: Drive, guess: FloatArray) -> Drive:
+    """The drive with another guess of its mounting."""
+    ipm = {"estimated": Calibration(INFO, guess).vehicle_from_pinhole_px}
+    return replace(drive, cameras={"front": replace(drive.cameras["front"], ipm=ipm)})
+
+
+def with_trajectory(drive: Drive, trajectory: Trajectory) -> Drive:
+    """The drive with other poses."""
+    poses, _ = interpolate(trajectory, np.array([i.stamp_s for i in drive.images]), np.inf)
+    images = tuple(replace(i, map_from_vehicle=p) for i, p in zip(drive.images, poses, strict=True))
+    return replace(drive, trajectory=trajectory, images=images)
+
+
+def _floor(contrast: float) -> FloatArray:
+    west, east, south, north = _FLOOR_M
+    shape = (round((north - south) / _TEXEL_M), round((east - west) / _TEXEL_M))
+    noise = np.random.default_rng(5).standard_normal(shape).astype(np.float32)
+    noise = sum(cv2.GaussianBlur(noise, (0, 0), s) * s for s in (1.5, 3.0))
+    return np.asarray(np.clip(128 + contrast * noise / noise.std(), 0, 255), dtype=np.float32)
+
+
+def _rays(true: FloatArray) -> FloatArray:
+    u, v = np.meshgrid(np.arange(INFO.width, dtype=np.float64), np.arange(INFO.height, dtype=np.float64))
+    pinhole = undistort_points(INFO, np.column_stack([u.ravel(), v.ravel()]))
+    cam = np.column_stack([pinhole, np.ones(len(pinhole))]) @ np.linalg.inv(INFO.intrinsic).T
+    return np.asarray(cam @ true[:3, :3])
+
+
+def _look(floor: FloatArray, rays_vehicle: FloatArray, pose: FloatArray) -> FloatArray:
+    rays = rays_vehicle @ pose[:3, :3].T
+    centre = pose[:3, :3] @ CENTRE + pose[:3, 3]
+    far = centre[2] / np.maximum(-rays[:, 2], 1e-3)
+    x, y = centre[0] + far * rays[:, 0], centre[1] + far * rays[:, 1]
+    columns = ((x - _FLOOR_M[0]) / _TEXEL_M).astype(np.float32).reshape(INFO.height, INFO.width)
+    rows = ((y - _FLOOR_M[2]) / _TEXEL_M).astype(np.float32).reshape(INFO.height, INFO.width)
+    return np.asarray(cv2.remap(floor, columns, rows, cv2.INTER_CUBIC).clip(0, 255).astype(np.uint8))

@@ -1,0 +1,121 @@
+"""The ground of a small drive tells its mounting and what is wrong with its poses, clock and lens."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.ground.scene import CENTRE, INFO, extrinsic, make_drive, with_guess, with_trajectory
+from v2hdm.drive.rotation import rotation_from_euler
+from v2hdm.ground import GroundOptions, GroundStatus, Reading, better_start, estimate_ground
+from v2hdm.ground.say import mounting_angles
+from v2hdm.records import Drive, FloatArray, Trajectory
+
+TRUE = extrinsic(roll_deg=0.5, pitch_deg=20.0, yaw_deg=-1.0)
+FEW = GroundOptions(pairs=14, clock_pairs=6, readings=False, free=())
+
+
+@pytest.fixture(scope="module")
+def turning(tmp_path_factory) -> Drive:
+    return make_drive(tmp_path_factory.mktemp("turning"), 70.0, TRUE)
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory) -> Drive:
+    return make_drive(tmp_path_factory.mktemp("straight"), 0.0, TRUE)
+
+
+def angles_off_deg(found: FloatArray) -> FloatArray:
+    return np.rad2deg(mounting_angles(found) - mounting_angles(TRUE))
+
+
+def test_true_poses_give_the_true_mounting_from_a_guess_that_is_4_degrees_off(turning):
+    guessed = with_guess(turning, extrinsic(roll_deg=-3.0, pitch_deg=24.0, yaw_deg=3.0))
+    estimate = estimate_ground(guessed, "front", FEW)
+    assert estimate.status is GroundStatus.FOUND
+    found = estimate.calibration.cam_from_vehicle
+    assert np.abs(angles_off_deg(found)).max() < 0.05
+    assert np.abs(-found[:3, :3].T @ found[:3, 3] - CENTRE)[2] < 0.01
+    assert estimate.median_residual < 0.5
+
+
+def test_a_clock_that_is_60_ms_late_is_found_on_a_turning_route(turning):
+    early = Trajectory(turning.trajectory.stamp_s - 0.06, turning.trajectory.map_from_vehicle)
+    estimate = estimate_ground(with_trajectory(turning, early), "front", replace(FEW, free=("clock_s",)))
+    clock = estimate.parameters["clock_s"]
+    assert clock.told
+    assert clock.value == pytest.approx(-0.06, abs=0.008)
+    assert np.abs(angles_off_deg(estimate.calibration.cam_from_vehicle)).max() < 0.15
+
+
+def test_a_straight_route_at_constant_speed_cannot_tell_its_clock(straight):
+    clock = estimate_ground(straight, "front", replace(FEW, free=("clock_s",))).parameters["clock_s"]
+    assert not clock.told
+    assert "drive a turn" in clock.why_not
+
+
+def test_poses_that_rise_over_the_ground_are_told(straight):
+    poses = straight.trajectory.map_from_vehicle.copy()
+    poses[:, 2, 3] += 0.01 * (poses[:, 0, 3] - 15.0)
+    rising = with_trajectory(straight, Trajectory(straight.trajectory.stamp_s, poses))
+    grade = estimate_ground(rising, "front", replace(FEW, free=("grade",))).parameters["grade"]
+    assert grade.told
+    assert grade.value == pytest.approx(0.01, abs=0.001)
+
+
+def test_a_focal_length_that_is_5_percent_too_long_is_told(turning):
+    camera = turning.cameras["front"]
+    intrinsic = INFO.intrinsic * [[1.05], [1.05], [1.0]]
+    intrinsic[:2, 2] = INFO.intrinsic[:2, 2]
+    info = replace(INFO, intrinsic=intrinsic)
+    longer = with_guess(turning, TRUE)
+    longer = replace(longer, cameras={"front": replace(camera, info=info)})
+    focal = estimate_ground(longer, "front", replace(FEW, free=("focal_scale",))).parameters["focal_scale"]
+    assert focal.told
+    assert focal.value == pytest.approx(1 / 1.05 - 1, abs=0.01)
+
+
+def test_a_lens_without_its_distortion_leaves_larger_residuals(turning):
+    pinhole = replace(turning.cameras["front"], info=replace(INFO, distortion=(0.0,) * 5))
+    bare = replace(turning, cameras={"front": pinhole})
+    plain, wrong = (estimate_ground(d, "front", FEW).median_residual for d in (turning, bare))
+    assert wrong > 1.5 * plain
+
+
+def test_a_mirrored_world_is_told_from_the_one_as_given(turning):
+    poses = turning.trajectory.map_from_vehicle.copy()
+    poses[:, 1, 3] *= -1
+    yaw = -np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
+    zero = np.zeros(len(yaw))
+    poses[:, :3, :3] = rotation_from_euler(zero, zero, yaw)
+    mirrored = with_trajectory(turning, Trajectory(turning.trajectory.stamp_s, poses))
+    given = estimate_ground(turning, "front", replace(FEW, readings=True))
+    swapped = estimate_ground(mirrored, "front", replace(FEW, readings=True))
+    assert given.reading is Reading.AS_GIVEN
+    assert swapped.shares[Reading.MIRRORED] > 1.3 * swapped.shares[Reading.AS_GIVEN]
+
+
+def test_a_heading_measured_from_north_matches_only_along_the_path(straight):
+    poses = straight.trajectory.map_from_vehicle.copy()
+    poses[:, :3, :3] = rotation_from_euler(*(np.full(len(poses), a) for a in (0.0, 0.0, np.pi / 2)))
+    turned = with_trajectory(straight, Trajectory(straight.trajectory.stamp_s, poses))
+    estimate = estimate_ground(turned, "front", replace(FEW, readings=True))
+    assert estimate.status is GroundStatus.NO_MATCH
+    assert estimate.reading is Reading.HEADING_FROM_PATH
+
+
+def test_a_floor_without_texture_tells_too_little(tmp_path):
+    even = make_drive(tmp_path, 0.0, TRUE, contrast=0.0)
+    estimate = estimate_ground(even, "front", FEW)
+    assert estimate.status is GroundStatus.TOO_LITTLE
+    assert estimate.calibration is None
+
+
+def test_the_mapper_starts_from_the_ground_only_where_it_was_found(straight, tmp_path):
+    found = estimate_ground(straight, "front", FEW)
+    started = better_start(straight, {"front": found}).cameras["front"]
+    assert started.initial_ipm == "ground"
+    nothing = replace(found, status=GroundStatus.NO_MATCH, calibration=None)
+    assert better_start(straight, {"front": nothing}).cameras["front"].initial_ipm == "estimated"
