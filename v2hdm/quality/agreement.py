@@ -87,8 +87,8 @@ def _offset(first: str, a: MethodResult, second: str, b: MethodResult, drive: Dr
         OFFSET_LIMIT_SIGMAS,
         "sigmas",
         fine=f"{len(apart)} markings that both saw lie in one place",
-        wrong=f"{second} maps {len(apart)} markings {100 * abs(middle[axis]):.0f} cm {where} where {first} does: "
-        f"{cause[axis]}; synchronise and measure anew",
+        wrong=f"{second} maps {len(apart)} markings {100 * abs(middle[axis]):.0f} cm {where} where {first} "
+        f"does: {cause[axis]}; synchronise and measure anew",
     )
 
 
