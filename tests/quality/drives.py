@@ -9,7 +9,7 @@ import numpy as np
 
 from v2hdm.drive.rotation import rotation_from_euler
 from v2hdm.quality import Finding, Status
-from v2hdm.quality.motion import Motion
+from v2hdm.quality.inputs.motion import Motion
 from v2hdm.records import (
     Calibration,
     Camera,

@@ -12,7 +12,7 @@ from tests.quality.test_ground_findings import estimate
 from tests.quality.test_images import noisy, pictured
 from v2hdm.ground.results import GroundStatus, Reading
 from v2hdm.quality import Finding, Status, check_drive
-from v2hdm.quality.before import HIDES, causes
+from v2hdm.quality.inputs.drive import HIDES, causes
 
 
 def finding(check: str, about: str, status: Status = Status.FAIL) -> Finding:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.quality.drives import CENTRE, camera, raised, with_k
-from v2hdm.quality.cameras import check_camera
+from v2hdm.quality.inputs.cameras import check_camera
 from v2hdm.records import Camera, CentrePrior, FloatArray
 
 Spoil = Callable[[Camera], Camera]

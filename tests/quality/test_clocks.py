@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from tests.quality.drives import drive, motion, poses, raised
-from v2hdm.drive.clocks import why_no_pose
+from v2hdm.drive.stamp_units import why_no_pose
 from v2hdm.quality import Status
-from v2hdm.quality.clocks import check_clocks
+from v2hdm.quality.inputs.clocks import check_clocks
 from v2hdm.records import Trajectory
 
 

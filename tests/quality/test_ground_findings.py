@@ -10,8 +10,8 @@ import pytest
 from tests.quality.drives import CENTRE, camera, drive, poses, raised
 from v2hdm.ground.results import GroundEstimate, GroundStatus, Parameter, Reading
 from v2hdm.quality import Status, clock_corrections
-from v2hdm.quality.ground import CHECKS, check_ground, path_of
-from v2hdm.quality.heading import Path
+from v2hdm.quality.inputs.ground import CHECKS, check_ground, path_of
+from v2hdm.quality.inputs.heading import Path
 from v2hdm.records import Calibration
 
 SIGMA = {

@@ -10,8 +10,8 @@ import pytest
 from tests.quality.drives import motion, poses, raised, trajectory, with_yaw, yaw_of
 from v2hdm.drive.rotation import quaternion_from_rotation, rotation_from_euler, rotation_from_quaternion
 from v2hdm.quality import Status
-from v2hdm.quality.heading import Path, check_heading
-from v2hdm.quality.path import check_attitude
+from v2hdm.quality.inputs.heading import Path, check_heading
+from v2hdm.quality.inputs.path import check_attitude
 from v2hdm.records import FloatArray, Trajectory
 
 Spoil = Callable[[Trajectory], Trajectory]

@@ -12,7 +12,7 @@ import pytest
 
 from tests.quality.drives import drive, poses, raised
 from v2hdm.errors import DriveError
-from v2hdm.quality.images import check_images
+from v2hdm.quality.inputs.images import check_images
 from v2hdm.records import Drive
 
 Paint = Callable[[int], np.ndarray]

@@ -9,7 +9,7 @@ import pytest
 
 from tests.quality.drives import NOISE, motion, poses, raised
 from v2hdm.quality import Status
-from v2hdm.quality.noise import check_noise
+from v2hdm.quality.inputs.noise import check_noise
 from v2hdm.records import PoseNoise
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from tests.quality.drives import drive, poses, raised
 from v2hdm.quality import Status
-from v2hdm.quality.road import check_road
+from v2hdm.quality.inputs.road import check_road
 from v2hdm.records import FloatArray, Road
 
 

@@ -12,7 +12,7 @@ from v2hdm.adjust import Fault
 from v2hdm.mapping.evidence import CameraFit, Contradiction, SolveEvidence
 from v2hdm.mapping.results import Exclusion, MethodResult
 from v2hdm.quality import Finding, Status
-from v2hdm.quality.solution import check_inputs, check_solution
+from v2hdm.quality.results.solution import check_inputs, check_solution
 from v2hdm.records import Calibration, CameraInfo, Drive, HdMap, Marking
 
 INFO = CameraInfo("front", 1280, 720, np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]))

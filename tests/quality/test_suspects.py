@@ -12,8 +12,8 @@ from tests.quality.test_ground_findings import estimate
 from v2hdm.detection.camera.ground import apply_homography
 from v2hdm.detection.camera.lens import undistort_points
 from v2hdm.ground import GroundEstimate, GroundOptions, GroundStatus, Reading
-from v2hdm.quality import suspects
-from v2hdm.quality.suspects import find_suspect, scaled, upside_down
+from v2hdm.quality.inputs import suspects
+from v2hdm.quality.inputs.suspects import find_suspect, scaled, upside_down
 from v2hdm.records import Drive
 
 LOST = replace(estimate(), status=GroundStatus.NO_MATCH, shares={Reading.AS_GIVEN: 0.0})

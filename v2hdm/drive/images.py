@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.drive.clocks import why_no_pose
 from v2hdm.drive.image_header import image_size
+from v2hdm.drive.stamp_units import why_no_pose
 from v2hdm.drive.trajectory import interpolate
 from v2hdm.errors import DriveError
 from v2hdm.records import Camera, FloatArray, Image, Trajectory

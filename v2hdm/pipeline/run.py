@@ -29,7 +29,7 @@ from v2hdm.pipeline.evaluate import CameraSets, evaluate
 from v2hdm.pipeline.inspect import Inspection, inspect
 from v2hdm.pipeline.write import write_results
 from v2hdm.quality import Finding, Status, Verdict
-from v2hdm.quality.after import check_result
+from v2hdm.quality.results.result import check_result
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.outputs import result_folder, write_json
 from v2hdm.simulate import PortConfig, rendered_drive

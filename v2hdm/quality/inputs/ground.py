@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from v2hdm.ground.results import GroundEstimate, GroundStatus, Parameter, Reading
-from v2hdm.quality.heading import Path
+from v2hdm.quality.inputs.heading import Path
 from v2hdm.quality.judgement import judge
 from v2hdm.quality.verdict import Finding, Status
 from v2hdm.records import Drive

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from v2hdm.quality.inputs.motion import Motion, angle_between
 from v2hdm.quality.judgement import judge
-from v2hdm.quality.motion import Motion, angle_between
 from v2hdm.quality.verdict import Finding, Status
 from v2hdm.records import FloatArray, PoseNoise
 

@@ -6,17 +6,17 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 from v2hdm.ground.results import GroundEstimate
-from v2hdm.quality import ground as ground_checks
-from v2hdm.quality.cameras import check_camera
-from v2hdm.quality.clocks import check_clocks
-from v2hdm.quality.ground import check_ground, path_of
-from v2hdm.quality.heading import check_heading
-from v2hdm.quality.images import check_images
-from v2hdm.quality.motion import Motion
-from v2hdm.quality.noise import check_noise
-from v2hdm.quality.path import check_attitude, check_jumps, check_path
-from v2hdm.quality.road import check_road
-from v2hdm.quality.suspects import find_suspect
+from v2hdm.quality.inputs import ground as ground_checks
+from v2hdm.quality.inputs.cameras import check_camera
+from v2hdm.quality.inputs.clocks import check_clocks
+from v2hdm.quality.inputs.ground import check_ground, path_of
+from v2hdm.quality.inputs.heading import check_heading
+from v2hdm.quality.inputs.images import check_images
+from v2hdm.quality.inputs.motion import Motion
+from v2hdm.quality.inputs.noise import check_noise
+from v2hdm.quality.inputs.path import check_attitude, check_jumps, check_path
+from v2hdm.quality.inputs.road import check_road
+from v2hdm.quality.inputs.suspects import find_suspect
 from v2hdm.quality.verdict import Finding, Status
 from v2hdm.records import Drive
 

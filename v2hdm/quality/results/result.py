@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 from v2hdm.ground import GroundEstimate
 from v2hdm.mapping.results import MethodResult
-from v2hdm.quality.against_ground import check_against_ground
-from v2hdm.quality.solution import BEST, check_solution
+from v2hdm.quality.results.against_ground import check_against_ground
+from v2hdm.quality.results.solution import BEST, check_solution
 from v2hdm.quality.verdict import Finding
 from v2hdm.records import Drive
 

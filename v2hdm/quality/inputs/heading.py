@@ -11,9 +11,9 @@ from enum import Enum
 
 import numpy as np
 
-from v2hdm.quality.conventions import AXES_SWAPPED, CONVENTIONS, REFLECTED
+from v2hdm.quality.inputs.conventions import AXES_SWAPPED, CONVENTIONS, REFLECTED
+from v2hdm.quality.inputs.motion import Chords, Motion, angle_between
 from v2hdm.quality.judgement import judge, passed
-from v2hdm.quality.motion import Chords, Motion, angle_between
 from v2hdm.quality.verdict import Finding, Status
 from v2hdm.records import BoolArray, FloatArray
 

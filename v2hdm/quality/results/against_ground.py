@@ -8,7 +8,7 @@ import numpy as np
 
 from v2hdm.ground import GroundEstimate, GroundStatus
 from v2hdm.quality.judgement import judge
-from v2hdm.quality.mountings import mounting_difference, mounting_sigmas
+from v2hdm.quality.results.mountings import mounting_difference, mounting_sigmas
 from v2hdm.quality.verdict import Finding
 from v2hdm.records import Calibration
 

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from v2hdm.mapping.results import MethodResult
 from v2hdm.quality.judgement import judge
-from v2hdm.quality.mountings import centre_sigma_m, mounting_sigmas
+from v2hdm.quality.results.mountings import centre_sigma_m, mounting_sigmas
 from v2hdm.quality.verdict import Finding
 from v2hdm.records import Drive, FloatArray
 

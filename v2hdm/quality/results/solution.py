@@ -17,10 +17,10 @@ from v2hdm.adjust import Fault
 from v2hdm.mapping.evidence import Contradiction, SolveEvidence
 from v2hdm.mapping.remedy import CLOCK_TOLD_S, CONTRADICTED_SIGMAS, TOLD_SIGMA, is_contradicted
 from v2hdm.mapping.results import MethodResult
-from v2hdm.quality.agreement import check_agreement
-from v2hdm.quality.doubles import check_doubles
-from v2hdm.quality.fault_words import CHECKS, remedy_of, wrong_as
 from v2hdm.quality.judgement import judge, passed
+from v2hdm.quality.results.agreement import check_agreement
+from v2hdm.quality.results.doubles import check_doubles
+from v2hdm.quality.results.fault_words import CHECKS, remedy_of, wrong_as
 from v2hdm.quality.verdict import Finding, Status
 from v2hdm.records import Drive
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from v2hdm.quality.inputs.motion import CHORD_M, SLOWEST_MPS, Motion
 from v2hdm.quality.judgement import judge
-from v2hdm.quality.motion import CHORD_M, SLOWEST_MPS, Motion
 from v2hdm.quality.verdict import Finding, Status
 from v2hdm.records import FloatArray, PoseNoise
 

@@ -1,0 +1,1 @@
+"""Checks after the solve: what a result says of its inputs and of itself."""
