@@ -70,10 +70,10 @@ def make_drive(folder: Path, turn_deg: float, true: FloatArray, contrast: float 
     poses, _ = interpolate(trajectory, stamps, np.inf)
     floor = _floor(contrast)
     rays = _rays(true)
-    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "front").mkdir(parents=True, exist_ok=True)
     images = []
     for k, (stamp, pose) in enumerate(zip(stamps, poses, strict=True)):
-        file = folder / f"{k:03d}.png"
+        file = folder / "front" / f"{k:03d}.png"
         cv2.imwrite(str(file), _look(floor, rays, pose))
         images.append(Image("front", float(stamp), file, pose))
     camera = Camera(

@@ -22,7 +22,7 @@ from v2hdm.detection.batch import detect_all
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.drive import ReadOptions, drive_name, read_drive
-from v2hdm.errors import ConfigError, MappingError
+from v2hdm.errors import AdjustError, ConfigError, MappingError, V2hdmError
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.pipeline.evaluate import CameraSets, evaluate
@@ -131,7 +131,7 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
         about = {"name": name, "version": __version__}
         try:
             result = _map_and_judge(config, inspection, folder, about, seconds, progress)
-        except MappingError as failure:
+        except (MappingError, AdjustError) as failure:
             if not inspection.has_failed:
                 raise
             result = _without_map(config, inspection, failure, folder, about)
@@ -166,7 +166,7 @@ def _map_and_judge(
 
 
 def _without_map(
-    config: RunConfig, inspection: Inspection, failure: MappingError, folder: Path, about: Mapping[str, Any]
+    config: RunConfig, inspection: Inspection, failure: V2hdmError, folder: Path, about: Mapping[str, Any]
 ) -> RunResult:
     """The result of a run whose checks failed and of which no map came."""
     failed = Finding("map", Status.FAIL, None, None, "", f"no map came of this drive: {failure}", "map")
