@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from v2hdm.quality import Finding, Status, Verdict
 
 
@@ -40,3 +42,9 @@ def test_a_check_that_the_drive_cannot_answer_is_told_apart_from_one_that_passed
     assert not verdict.passed
     assert verdict.as_json()["untold"][0]["check"] == "clock"
     assert verdict.lines[1].startswith("cannot tell clock (front)")
+
+
+def test_what_several_cameras_have_in_common_is_one_line() -> None:
+    one = finding(Status.WARN)
+    lines = Verdict.of([one, replace(one, about="rear")]).lines
+    assert lines[1:] == ("WARN clock (front, rear): images are 118 ms late; mend the stamps",)

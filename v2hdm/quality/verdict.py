@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -113,4 +113,14 @@ class Verdict:
         """The verdict, what was raised and what this drive cannot tell, one line each, for a terminal."""
         raised = {0: "nothing raised", 1: "1 finding"}.get(len(self.raised), f"{len(self.raised)} findings")
         summary = f"verdict: {self.status.value} ({raised}, {len(self.passed)} checks passed)"
-        return (summary, *(finding.line for finding in (*self.raised, *self.untold)))
+        return (summary, *(finding.line for finding in _joined((*self.raised, *self.untold))))
+
+
+def _joined(findings: Iterable[Finding]) -> list[Finding]:
+    """The findings, those that say the same of several cameras as one."""
+    joined: dict[tuple[str, str], Finding] = {}
+    for finding in findings:
+        key = (finding.check, finding.says)
+        same = joined.get(key)
+        joined[key] = replace(same, about=f"{same.about}, {finding.about}") if same else finding
+    return list(joined.values())
