@@ -1,7 +1,7 @@
 """Wrong inputs, one at a time: is the map right, or is the user told, and of the true cause?
 
-``python -m tests.benchmarks.wrong_inputs [--route turning straight] [--only PATTERN] [--workers 2]`` renders
-a turning and a straight drive, spoils a copy of each in every way of :mod:`tests.benchmarks.wrong`, maps it
+``python -m tests.benchmarks.wrong_inputs [--route turning straight] [--only PATTERN] [--ports port1 port2]
+[--seeds 41 42] [--workers 2]`` renders a turning and a straight drive, spoils a copy of each in every way of :mod:`tests.benchmarks.wrong`, maps it
 as a user would, and compares the map that was written with the truth, which the copies do not hold. A map is
 right if its corners are at most 1.3 times as far off as those of the drive as it was, with no more false
 markings.
@@ -64,9 +64,9 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Row:
-    """What became of one fault on one route."""
+    """What became of one fault on one drive."""
 
-    route: str
+    drive: str
     fault: str
     outcome: Outcome
     right: bool
@@ -80,10 +80,10 @@ class Row:
         return not self.right and not self.told
 
 
-def port_of(route: str, seed: int) -> PortConfig:
-    """The shipped port2 with another route and seed."""
-    shipped = OmegaConf.load(hydra_config.conf_dir() / "run" / "port2.yaml").simulate
-    changes = {"name": f"wrong_{route}", "seed": seed, "route": {"pieces": ROUTES[route]}}
+def port_of(port: str, route: str, seed: int) -> PortConfig:
+    """A shipped port with another route and seed."""
+    shipped = OmegaConf.load(hydra_config.conf_dir() / "run" / f"{port}.yaml").simulate
+    changes = {"name": f"{port}_{route}", "seed": seed, "route": {"pieces": ROUTES[route]}}
     merged = OmegaConf.merge(OmegaConf.structured(PortConfig), shipped, OmegaConf.create(changes))
     port = OmegaConf.to_object(merged)
     assert isinstance(port, PortConfig)
@@ -134,7 +134,7 @@ class _Truth:
     map: Any
 
 
-def judge(route: str, fault: Fault, outcome: Outcome, clean: Outcome) -> Row:
+def judge(drive: str, fault: Fault, outcome: Outcome, clean: Outcome) -> Row:
     """Hold the end of a run against the fault that was put in."""
     right = (
         outcome.status in ("PASS", "WARN", "FAIL")
@@ -145,12 +145,12 @@ def judge(route: str, fault: Fault, outcome: Outcome, clean: Outcome) -> Row:
     said = [f"{finding['check']} {finding['says']}" for finding in outcome.findings] or [outcome.message]
     pattern = fault.cause
     told = outcome.status in ("WARN", "FAIL", _REFUSED)
-    hidden = fault.hidden_on_straight if route == "straight" else None
+    hidden = fault.hidden_on_straight if "straight" in drive else None
     if hidden is not None and not told:
         said = [f"{one['check']} {one['says']}" for one in outcome.untold]
         told, pattern = bool(said), hidden
     named = [pattern is None or re.search(pattern, one, re.IGNORECASE) is not None for one in said]
-    return Row(route, fault.name, outcome, right, told, any(named), bool(named and named[0]))
+    return Row(drive, fault.name, outcome, right, told, any(named), bool(named and named[0]))
 
 
 def clean_fault() -> Fault:
@@ -171,29 +171,27 @@ def _faults() -> list[Fault]:
 
 
 def _work(job: _Job) -> Outcome:
-    route, number, good, scratch = job
+    drive, number, good, scratch = job
     fault = _faults()[number]
-    folder = copy_of(Path(good), Path(scratch) / "drives" / f"{route}-{number:02d}")
+    folder = copy_of(Path(good), Path(scratch) / "drives" / f"{drive}-{number:02d}")
     fault.spoil(folder)
     return map_drive(folder, Path(scratch) / "outputs", fault.mapping(MappingOptions()), Path(good))
 
 
-def measure(
-    routes: Sequence[str], seed: int, only: str, workers: int, cache: Path, scratch: Path
-) -> list[Row]:
-    """Run all faults that match ``only`` on all routes; prints a row as each is finished."""
+def measure(ports: Sequence[PortConfig], only: str, workers: int, cache: Path, scratch: Path) -> list[Row]:
+    """Run all faults that match ``only`` on all drives; prints a row as each is finished."""
     faults, rows = _faults(), []
     wanted = [k for k, fault in enumerate(faults) if k == 0 or re.search(only, fault.name)]
     jobs: list[_Job] = []
-    for route in routes:
-        good = rendered_drive(port_of(route, seed), cache, workers, lambda done, total: None)
-        jobs += [(route, k, str(good.resolve()), str(scratch.resolve())) for k in wanted]
+    for port in ports:
+        good = rendered_drive(port, cache, workers, lambda done, total: None).resolve()
+        jobs += [(f"{port.name}_{port.seed}", k, str(good), str(scratch.resolve())) for k in wanted]
     pending, clean = iter(jobs), {}
 
     def take(outcome: Outcome) -> None:
-        route, number, _, _ = next(pending)
-        clean.setdefault(route, outcome)
-        row = judge(route, faults[number], outcome, clean[route])
+        drive, number, _, _ = next(pending)
+        clean.setdefault(drive, outcome)
+        row = judge(drive, faults[number], outcome, clean[drive])
         rows.append(row)
         print(_line(row), flush=True)
 
@@ -208,7 +206,7 @@ def _line(row: Row) -> str:
     name = name if row.named else "not named"
     first = outcome.message or "; ".join(f["check"] + ": " + f["says"] for f in outcome.findings[:1])
     return (
-        f"{row.route:9}| {row.fault:38}| {outcome.status:8}| {mark:7}| {name:12}| "
+        f"{row.drive:18}| {row.fault:38}| {outcome.status:8}| {mark:7}| {name:12}| "
         f"{100 * outcome.rmse_m:6.1f} cm | {outcome.false:3d} false of {outcome.markings:3d} | "
         f"{outcome.seconds:4.0f} s | {first[:150]}"
     )
@@ -218,13 +216,17 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--route", nargs="+", choices=list(ROUTES), default=list(ROUTES))
-    parser.add_argument("--seed", type=int, default=41)
+    parser.add_argument("--ports", nargs="+", choices=["port1", "port2"], default=["port2"])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[41])
     parser.add_argument("--only", default="", help="pattern of the faults' names")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--cache", type=Path, default=Path("cache"))
     parser.add_argument("--scratch", type=Path, default=Path("cache/wrong_inputs"))
     parsed = parser.parse_args()
-    rows = measure(parsed.route, parsed.seed, parsed.only, parsed.workers, parsed.cache, parsed.scratch)
+    ports = [
+        port_of(port, route, seed) for port in parsed.ports for route in parsed.route for seed in parsed.seeds
+    ]
+    rows = measure(ports, parsed.only, parsed.workers, parsed.cache, parsed.scratch)
     faults = [row for row in rows if row.fault != clean_fault().name]
     wanting = [row for row in faults if not (row.right and row.outcome.status == "PASS")]
     named = sum(row.named for row in wanting)
