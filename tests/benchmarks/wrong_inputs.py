@@ -1,10 +1,10 @@
 """Wrong inputs, one at a time: is the map right, or is the user told, and of the true cause?
 
 ``python -m tests.benchmarks.wrong_inputs [--route turning straight] [--only PATTERN] [--ports port1 port2]
-[--seeds 41 42] [--workers 2]`` renders a turning and a straight drive, spoils a copy of each in every way of :mod:`tests.benchmarks.wrong`, maps it
-as a user would, and compares the map that was written with the truth, which the copies do not hold. A map is
-right if its corners are at most 1.3 times as far off as those of the drive as it was, with no more false
-markings.
+[--seeds 41 42] [--workers 2]`` renders a turning and a straight drive, spoils a copy of each in every way of
+:mod:`tests.benchmarks.wrong`, maps it as a user would, and compares the map that was written with the truth,
+which the copies do not hold. A map is right if its corners are at most 1.3 times as far off as those of the
+drive as it was, with no more false markings. ``--only '^nothing$'`` maps the good drives alone.
 """
 
 from __future__ import annotations

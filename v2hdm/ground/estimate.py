@@ -50,6 +50,11 @@ _CLOCK_APART_M = (0.8, 4.0)
 _LEAST_MATCHES = 60
 """Ten for each of the six quantities of a mounting."""
 
+_FLATNESS_M = 0.003
+"""How far a paved road departs from a plane, m: roads are laid to 3 to 5 mm under a straightedge.
+
+EN 13036-7 measures it."""
+
 _LEAST_PATCHES = 200
 """Fewer in view of all pairs tell nothing, matched or not."""
 
@@ -118,7 +123,8 @@ def _found(camera: str, solved: _Solved, readings: Readings, options: GroundOpti
     mount, matched = solved.adjusted.mount, solved.matched
     seen = matched.observations
     factor = scatter(seen, solved.beliefs, solved.adjusted)
-    covariance = factor * tangent_covariance(mount, solved.adjusted.covariance)
+    own = factor * solved.adjusted.covariance[:6, :6] + _flatness(options)
+    covariance = tangent_covariance(mount, own)
     image = solved.beliefs.motion.image
     return GroundEstimate(
         camera=camera,
@@ -140,6 +146,13 @@ def _found(camera: str, solved: _Solved, readings: Readings, options: GroundOpti
         ),
         seconds=0.0,
     )
+
+
+def _flatness(options: GroundOptions) -> FloatArray:
+    """Covariance (6, 6) of turn and centre from ground that is no plane, tilted and lifted for all pairs."""
+    tilt = _FLATNESS_M / (2 * options.strip_m)
+    pitch = _FLATNESS_M / (2 * options.longest_m)
+    return np.diag(np.square([tilt, pitch, 0.0, 0.0, 0.0, _FLATNESS_M]))
 
 
 def _pulls(adjusted: Adjusted, noise: PoseNoise) -> Mapping[str, float]:

@@ -16,7 +16,7 @@ class GroundOptions:
         longest_m: beyond this the ground changes its looks and leaves the region that both see.
         strip_m: ground so far to either side of the driven path is taken for road.
         patch_m: side of a square patch.
-        step_m: distance of neighbouring patches; as large as a patch, so that no two share their noise.
+        step_m: distance of neighbouring patches, which share a third of their sides.
         grid_m: spacing of the laid-out ground.
         free: names of the parameters to free, one at a time, beside the mounting; see :class:`Parameter`.
         readings: whether to try how else the poses could be read.
