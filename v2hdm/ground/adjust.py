@@ -285,8 +285,9 @@ def _normal(
     gradient[CENTRE] += information * (mount.centre_vehicle - believed.centre_vehicle)
     system[range(6, 6 + 2 * _BENDS), range(6, 6 + 2 * _BENDS)] += _LENS_SIGMA_PX**-2
     gradient[6 : 6 + 2 * _BENDS] += bends / _LENS_SIGMA_PX**2
-    # A start with hardly any matches must not be singular.
+    # Hardly any matches must not make it singular: an angle is known to a radian, a parameter to ten units.
     system[range(3), range(3)] += 1.0
+    system[range(6 + 2 * _BENDS, known), range(6 + 2 * _BENDS, known)] += 0.01
     return system, gradient
 
 

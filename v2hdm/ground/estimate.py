@@ -107,6 +107,8 @@ def _solve(matcher: Matcher, beliefs: Beliefs, mount: Mount, options: GroundOpti
             return None
         used, believed, rows = beliefs.about(matched.observations, stage.loosened)
         adjusted = adjust(used, believed, mount, free, max(stage.loosened / 2, 1.0))
+        if np.count_nonzero(adjusted.weight) < _LEAST_MATCHES:  # rays that miss the ground fix nothing
+            return None
         mount = adjusted.mount
         if free is not None:
             beliefs = beliefs.at_clock(beliefs.clock_s + adjusted.extra)
