@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from tests.quality.drives import NOISE, motion, poses, raised
-from v2hdm.quality import Status
+from v2hdm.quality import Finding, Status
+from v2hdm.quality.inputs.drive import causes
 from v2hdm.quality.inputs.noise import check_noise
 from v2hdm.records import PoseNoise
 
@@ -49,3 +50,10 @@ def test_poses_noisier_than_stated_are_told(factor: float, status: Status) -> No
 def test_slow_poses_say_nothing_of_their_noise() -> None:
     slow = motion(poses(straight_s=40.0, rate_hz=2.0))
     assert not [finding for finding in check_noise(slow, PoseNoise()) if finding.check == "pose scatter"]
+
+
+def test_noise_in_the_wrong_unit_stands_for_ground_that_cannot_be_matched_under_it() -> None:
+    unit = Finding("pose noise", Status.WARN, 0.15, 0.01, "rad", "8.6 deg", "pose_noise.heading_rad")
+    ground = Finding("ground match", Status.FAIL, 0.0, None, "", "no match", "front")
+    told = causes([ground, unit])
+    assert [(one.check, one.status) for one in told] == [("pose noise", Status.FAIL)]

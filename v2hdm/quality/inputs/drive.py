@@ -33,6 +33,7 @@ HIDES: Mapping[str, tuple[str, ...]] = {
     "repeated poses": (*_STEPS, *ground_checks.CHECKS),
     "pose scatter": ("position jumps", *ground_checks.CHECKS),
     "position jumps": ground_checks.CHECKS,
+    "pose noise": ground_checks.CHECKS,
     "height jumps": ("road", "grade", "ground match", "ground residual", "poses against ground"),
     "origin": ("survey forward", "poses against ground"),
     "own images": ("frozen images", *ground_checks.CHECKS),
@@ -115,5 +116,5 @@ def causes(findings: Iterable[Finding]) -> list[Finding]:
 
 
 def _explains(cause: Finding, finding: Finding) -> bool:
-    same = cause.about in ("poses", finding.about)
+    same = cause.about == finding.about or cause.about.startswith("pose")
     return same and finding is not cause and finding.check in HIDES.get(cause.check, ())
