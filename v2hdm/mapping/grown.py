@@ -145,23 +145,9 @@ def conclude_grown(
     poses = _poses(grown, places, taken, seen)
     residual_px = reprojected(rig, poses, taken.sightings, association, seen, corners_map)
     agrees = _agrees(taken, seen, residual_px)
-    share = np.bincount(seen.group[agrees], minlength=association.count)
     scale = max(1.0, chi2_per_dof := grown.variance().all)
     judged = judge_and_mend(
-        solved_places(grown, places, scale),
-        Seen(
-            association=association,
-            kind=np.array([place.kind for place in places], dtype=np.int64),
-            sightings=taken.sightings,
-            rig=rig,
-            views=taken.views,
-            cameras=tuple(taken.cameras.values()),
-            jitter_rad=taken.jitter_rad,
-            row=seen.row,
-            group=seen.group,
-            inlier_share=share / np.maximum(np.bincount(seen.group, minlength=association.count), 1),
-        ),
-        options,
+        solved_places(grown, places, scale), _evidence(places, rig, taken, seen, agrees), options
     )
     markings = _with_relative_sigma(grown, [places[m] for m in judged.accepted], judged.markings(), scale)
     accepted = agrees & np.isin(seen.group, judged.accepted)
@@ -189,6 +175,24 @@ def conclude_grown(
         reprojection_rmse_px=root_mean_square(residual_px[accepted]),
         initial_reprojection_rmse_px=root_mean_square(at_start),
         growth=(*(step for step in growth if len(step.markings) < len(markings)), last),
+    )
+
+
+def _evidence(places: Sequence[Place], rig: Rig, taken: Taken, seen: Observed, agrees: BoolArray) -> Seen:
+    """What was seen of the places, of whose observations (K,) some ``agrees`` with the map."""
+    association = taken.association
+    share = np.bincount(seen.group[agrees], minlength=association.count)
+    return Seen(
+        association=association,
+        kind=np.array([place.kind for place in places], dtype=np.int64),
+        sightings=taken.sightings,
+        rig=rig,
+        views=taken.views,
+        cameras=tuple(taken.cameras.values()),
+        jitter_rad=taken.jitter_rad,
+        row=seen.row,
+        group=seen.group,
+        inlier_share=share / np.maximum(np.bincount(seen.group, minlength=association.count), 1),
     )
 
 

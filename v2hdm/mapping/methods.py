@@ -73,12 +73,9 @@ def run_methods(
     optimiser = Optimiser(sightings, views_of(drive, cameras), drive.cameras, drive.pose_noise, options)
     tracks = optimiser.initial_tracks()
     results: dict[str, MethodResult] = {}
-    for name, ipm_name in NAIVE_IPMS.items():
-        ipm = {c: drive.cameras[c].ipm.get(ipm_name) for c in cameras}
-        known = {c: matrix for c, matrix in ipm.items() if matrix is not None}
-        if len(known) == len(ipm):
-            tell(name)
-            results[name] = run_naive(name, drive, detections, sightings, tracks, known, options)
+    for name, ipm in _given_ipms(drive, cameras).items():
+        tell(name)
+        results[name] = run_naive(name, drive, detections, sightings, tracks, ipm, options)
     begin_s = time.perf_counter()
     if options.mode == INCREMENTAL:
         grown = optimiser.run_incrementally(tell)
@@ -102,6 +99,16 @@ def run_methods(
     oni = run_naive("ONI", drive, detections, sightings, tracks, ipm_found, options)
     results["ONI"] = replace(oni, calibrations=found)
     return results
+
+
+def _given_ipms(drive: Drive, cameras: Sequence[str]) -> dict[str, dict[str, FloatArray]]:
+    """By naive method the IPMs of the cameras, for methods whose IPM every camera has."""
+    given: dict[str, dict[str, FloatArray]] = {}
+    for name, ipm_name in NAIVE_IPMS.items():
+        known = {c: drive.cameras[c].ipm[ipm_name] for c in cameras if ipm_name in drive.cameras[c].ipm}
+        if len(known) == len(cameras):
+            given[name] = known
+    return given
 
 
 def run_naive(
