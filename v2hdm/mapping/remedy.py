@@ -21,10 +21,8 @@ from v2hdm.mapping.fit import (
     along_route,
     camera_fits,
     contradictions,
-    length_of,
     overall_factor,
     point_of,
-    sizes_of,
 )
 from v2hdm.mapping.grown import Grown
 from v2hdm.mapping.markings.conclude import Optimised
@@ -257,10 +255,10 @@ def _remedied(inputs: Inputs, worst: Suspect, settled: Bundle, optimiser: Optimi
         return _without_axis(inputs, names if worst.camera < 0 else (names[worst.camera],), worst.axis)
     options = inputs.options
     if worst.fault is Fault.SIZE:
-        wrong = sizes_of(settled, length_of(settled, worst.item))
-        left = {name: size for name, size in options.known_sizes.by_class_m.items() if name not in wrong}
+        # One wrong size says that the paint is of another standard; the others' corners may only look like
+        # outliers, which a robust loss hides from the tests.
         return replace(
-            inputs, options=replace(options, known_sizes=replace(options.known_sizes, by_class_m=left))
+            inputs, options=replace(options, known_sizes=replace(options.known_sizes, by_class_m={}))
         )
     if worst.fault in (Fault.CONTROL, Fault.DATUM):
         point = point_of(settled, worst.item) if worst.fault is Fault.CONTROL else None

@@ -107,7 +107,7 @@ def _is_told(tested: list[Contradiction]) -> bool:
 
 
 def _corrected(one: Contradiction) -> Finding:
-    done = "the images were posed anew" if one.fault is Fault.CLOCK else "it was left out of the result"
+    done = _DONE.get(one.fault, "it was left out of the result")
     says = f"{wrong_as(one)} ({one.sigmas:.0f} sigmas); {done}: {remedy_of(one)}"
     return Finding(
         CHECKS[one.fault],
@@ -118,6 +118,13 @@ def _corrected(one: Contradiction) -> Finding:
         says,
         ", ".join(one.cameras),
     )
+
+
+_DONE = {
+    Fault.CLOCK: "the images were posed anew",
+    Fault.SIZE: "all known sizes were left out of the result",
+}
+"""How an input was corrected, where it was not just left out."""
 
 
 def _contradicted(one: Contradiction, others: list[Contradiction]) -> Finding:
