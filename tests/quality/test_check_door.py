@@ -77,4 +77,5 @@ def test_a_drive_that_cannot_be_read_is_one_line(tmp_path: Path, capsys: pytest.
 
 def test_the_door_needs_no_torch() -> None:
     blocked = "import sys; sys.modules['torch'] = None; import v2hdm.checkup"
-    subprocess.run([sys.executable, "-c", blocked], cwd=Path(__file__).parents[2], check=True)
+    done = subprocess.run([sys.executable, "-c", blocked], cwd=Path(__file__).parents[2], check=False)
+    assert done.returncode == 0
