@@ -11,7 +11,7 @@ import torch
 
 from export.onnx_file import graph_of, write_labelled
 from models.judge import Judge
-from v2hdm.detection.corners.confidence import JUDGE_INPUTS
+from v2hdm.detection.markings.judge import JUDGE_INPUTS, JUDGE_OUTPUTS
 from v2hdm.errors import DetectorError
 
 _OPSET = 20
@@ -32,16 +32,17 @@ def write_judge(judge: Judge, views_shape: tuple[int, int, int], label: dict[str
         DetectorError: the file's answers would not be the network's.
     """
     rows_of_each = {0: torch.export.Dim("rows", min=1, max=4096)}
-    model = graph_of(judge, _any_rows(judge, views_shape, 5), ["odds"], (rows_of_each,) * 3, _OPSET)
+    model = graph_of(judge, _any_rows(judge, views_shape, 5), list(JUDGE_OUTPUTS), (rows_of_each,) * 3, _OPSET)
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     for rows in _ROWS:
         given = _any_rows(judge, views_shape, rows)
         with torch.no_grad():
-            expected = judge(*given.values()).numpy()
+            expected = judge(*given.values())
         named = {name: part.numpy() for name, part in given.items()}
-        difference = float(np.abs(session.run(None, named)[0] - expected).max())
-        if not difference <= _TOLERANCE:
-            raise DetectorError(f"{path} was not written: its log odds would differ by {difference:.2g}")
+        for name, answer, own in zip(JUDGE_OUTPUTS, session.run(None, named), expected, strict=True):
+            difference = float(np.abs(answer - own.numpy()).max())
+            if not difference <= _TOLERANCE:
+                raise DetectorError(f"{path} was not written: its {name} would differ by {difference:.2g}")
     write_labelled(model, label, path)
 
 

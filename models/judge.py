@@ -16,8 +16,13 @@ _CELLS = 2
 """Rows and columns that convolutions end in: means over parts of a view that overlap in its middle."""
 
 
+_SIDES = 4
+_LOG_SIGMA = (-4.0, 4.0)
+"""Limits of the logarithm of a side's error, px."""
+
+
 class Judge(nn.Module):
-    """Log odds that quadrilaterals are whole markings of their classes.
+    """Log odds that quadrilaterals are whole markings of their classes, and how far their sides may be off.
 
     What convolutions see in the views is weighed with the evidence, for each shape a little otherwise.
 
@@ -61,14 +66,21 @@ class Judge(nn.Module):
             nn.Linear(2 * width * _CELLS**2 + known, hidden),
             nn.ReLU(),
             nn.Dropout(dropout),
-            nn.Linear(hidden, shapes),
+            nn.Linear(hidden, shapes + _SIDES),
         )
         self.hide = nn.Dropout(dropout)
         self.register_buffer("mean", torch.zeros(features))
         self.register_buffer("deviation", torch.ones(features))
 
-    def forward(self, views: Tensor, evidence: Tensor, shape: Tensor) -> Tensor:
-        """Log odds (M,) of ``views`` (M, C, S, S), ``evidence`` (M, F) and ``shape`` (M, K), one-hot."""
+    def forward(self, views: Tensor, evidence: Tensor, shape: Tensor) -> tuple[Tensor, Tensor]:
+        """Log odds (M,), and log of how far each side may be off (M, 4), px.
+
+        Args:
+            views: (M, C, S, S); sides are those at the top, right, bottom and left of a view.
+            evidence: (M, F).
+            shape: (M, K), one-hot.
+        """
         known = torch.cat([(evidence - self.mean) / self.deviation, shape], dim=1)
-        odds = self.weigh(torch.cat([self.hide(self.see(views)), known], dim=1))
-        return (odds * shape).sum(dim=1)
+        answer = self.weigh(torch.cat([self.hide(self.see(views)), known], dim=1))
+        odds, log_sigma = answer[:, : self.shapes], answer[:, self.shapes :]
+        return (odds * shape).sum(dim=1), log_sigma.clamp(*_LOG_SIGMA)

@@ -19,6 +19,8 @@ _LEAST_DEVIATION = 1e-6
 class Quadrilaterals:
     """N of them: ``views`` (N, C, S, S), ``evidence`` (N, F), one-hot ``shape`` (N, K), ``true`` (N,).
 
+    ``side_error`` (N, 4), px, is how far the true side lies outside the fitted one, nan where that is not known,
+    and ``side_variance`` (N, 4), px^2, what the fit says of it; sides are in the order of the views.
     ``claimed_channels`` and ``claimed_features`` are those of views and evidence that are claims of the paint
     network; the others are the image's.
     """
@@ -27,13 +29,16 @@ class Quadrilaterals:
     evidence: NDArray[np.float32]
     shape: NDArray[np.float32]
     true: NDArray[np.bool_]
+    side_error: NDArray[np.float32]
+    side_variance: NDArray[np.float32]
     claimed_channels: tuple[int, ...] = ()
     claimed_features: tuple[int, ...] = ()
 
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> Quadrilaterals:
         """Some of them."""
-        parts = (self.views[rows], self.evidence[rows], self.shape[rows], self.true[rows])
-        return Quadrilaterals(*parts, self.claimed_channels, self.claimed_features)
+        parts = (self.views, self.evidence, self.shape, self.true, self.side_error, self.side_variance)
+        chosen = (part[rows] for part in parts)
+        return Quadrilaterals(*chosen, self.claimed_channels, self.claimed_features)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +48,7 @@ class JudgeConfig:
     What it is shown is varied, as other cameras and roads would: each channel of a view by a factor whose
     logarithm has ``light_sigma``, the evidence by ``evidence_sigma`` of its own deviation. In ``sworn_share``
     of the cases the paint network claims what it claims of markings on average, so that the image has a say
-    of its own where that network is sure and wrong.
+    of its own where that network is sure and wrong. ``side_weight`` is that of the sides' errors in the loss.
     """
 
     epochs: int = 18
@@ -51,6 +56,7 @@ class JudgeConfig:
     weight_decay: float = 2e-2
     width: int = 24
     dropout: float = 0.3
+    side_weight: float = 0.3
     light_sigma: float = 0.4
     evidence_sigma: float = 0.2
     sworn_share: float = 0.2
@@ -67,6 +73,7 @@ def train_judge(known: Quadrilaterals, config: JudgeConfig) -> Judge:
     judge.deviation.copy_(torch.from_numpy(np.maximum(known.evidence.std(axis=0), _LEAST_DEVIATION)))
     parts = [torch.from_numpy(part) for part in (known.views, known.evidence, known.shape)]
     true = torch.from_numpy(known.true.astype(np.float32))
+    side_error, side_variance = torch.from_numpy(known.side_error), torch.from_numpy(known.side_variance)
     claims = _Claims.of(known)
     batches = -(-len(true) // _BATCH)
     optimiser = torch.optim.AdamW(judge.parameters(), config.learning_rate, weight_decay=config.weight_decay)
@@ -77,12 +84,15 @@ def train_judge(known: Quadrilaterals, config: JudgeConfig) -> Judge:
         for batch in np.array_split(rng.permutation(len(true)), batches):
             rows = torch.from_numpy(batch)
             views, evidence, shape = (part[rows] for part in parts)
-            views = _in_other_light(_mirrored(views, rng), config.light_sigma, rng)
+            views, sides = _mirrored(views, rng)
+            views = _in_other_light(views, config.light_sigma, rng)
             sworn = torch.from_numpy(rng.random(len(batch)) < config.sworn_share)
             views, evidence = claims.put(views, evidence, sworn)
             noise = torch.from_numpy(rng.standard_normal(evidence.shape).astype(np.float32))
-            odds = judge(views, evidence + config.evidence_sigma * judge.deviation * noise, shape)
+            odds, log_sigma = judge(views, evidence + config.evidence_sigma * judge.deviation * noise, shape)
+            error, variance = (part[rows].gather(1, sides) for part in (side_error, side_variance))
             loss = binary_cross_entropy_with_logits(odds, true[rows])
+            loss = loss + config.side_weight * _side_loss(error, variance, log_sigma)
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
@@ -90,15 +100,30 @@ def train_judge(known: Quadrilaterals, config: JudgeConfig) -> Judge:
     return judge.eval()
 
 
-def judged(judge: Judge, asked: Quadrilaterals) -> NDArray[np.float64]:
-    """Log odds (N,)."""
-    out = []
+_FREEDOM = 4.0
+"""Degrees of freedom of the t distribution that errors of sides have: a few are of something else altogether."""
+
+
+def _side_loss(error: torch.Tensor, variance: torch.Tensor, log_sigma: torch.Tensor) -> torch.Tensor:
+    """Minus the mean log likelihood of errors (B, 4), nan where unknown, whose formal variance is (B, 4)."""
+    known = torch.isfinite(error)
+    total = variance + torch.exp(2 * log_sigma)
+    square = torch.where(known, error, torch.zeros_like(error)) ** 2 / total
+    loss = 0.5 * torch.log(total) + 0.5 * (_FREEDOM + 1) * torch.log1p(square / _FREEDOM)
+    return (loss * known).sum() / known.sum().clamp(min=1)
+
+
+def judged(judge: Judge, asked: Quadrilaterals) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Log odds (N,), and how far the sides may be off (N, 4), px."""
+    out, sides = [], []
     with torch.no_grad():
         for first in range(0, len(asked.true), 512):
             part = asked.take(np.arange(first, min(first + 512, len(asked.true))))
             given = (torch.from_numpy(array) for array in (part.views, part.evidence, part.shape))
-            out.append(judge(*given).numpy().astype(np.float64))
-    return np.concatenate(out) if out else np.zeros(0)
+            odds, log_sigma = judge(*given)
+            out.append(odds.numpy().astype(np.float64))
+            sides.append(log_sigma.exp().numpy().astype(np.float64))
+    return (np.concatenate(out), np.concatenate(sides)) if out else (np.zeros(0), np.zeros((0, 4)))
 
 
 @dataclass(frozen=True)
@@ -127,12 +152,17 @@ class _Claims:
         return views, evidence
 
 
-def _mirrored(views: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
-    """Half of the views turned about in each direction: which corner is the first means nothing."""
-    for axis in (2, 3):
-        turned = torch.from_numpy(rng.random(len(views)) < 0.5)[:, None, None, None]
-        views = torch.where(turned, views.flip(axis), views)
-    return views
+def _mirrored(views: torch.Tensor, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+    """Half of the views turned about in each direction, and which side (M, 4) is where then.
+
+    Which corner is the first means nothing.
+    """
+    sides = torch.arange(4).expand(len(views), 4)
+    for axis, swapped in ((2, [2, 1, 0, 3]), (3, [0, 3, 2, 1])):
+        turned = torch.from_numpy(rng.random(len(views)) < 0.5)
+        views = torch.where(turned[:, None, None, None], views.flip(axis), views)
+        sides = torch.where(turned[:, None], sides[:, swapped], sides)
+    return views, sides
 
 
 def _in_other_light(views: torch.Tensor, sigma: float, rng: np.random.Generator) -> torch.Tensor:

@@ -21,8 +21,6 @@ import json
 from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from typing import Any
-from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -30,10 +28,13 @@ import numpy as np
 from export.judge_file import write_judge
 from models.judge import Judge
 from tests.benchmarks.detector_quality import polygon_overlap
-from tests.benchmarks.examples import Example, example
+from tests.benchmarks.examples import Example, TrueMarking, example
 from tests.benchmarks.sworn_flecks import Spots, lit, swearing
 from train.judge import JudgeConfig, Quadrilaterals, judged, train_judge
-from v2hdm.detection.corners.confidence import (
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.markings.evidence import CLAIMED, FEATURES
+from v2hdm.detection.markings.find import Readings
+from v2hdm.detection.markings.judge import (
     CONFIDENCE_FILE,
     JUDGE_FILE,
     SHAPES,
@@ -42,14 +43,12 @@ from v2hdm.detection.corners.confidence import (
     shape_of,
     told,
 )
-from v2hdm.detection.corners.evidence import CLAIMED, FEATURES, gather
-from v2hdm.detection.corners.rectified import CHANNELS, CLAIMED_CHANNELS, SIZE
-from v2hdm.detection.detector import Detector
+from v2hdm.detection.markings.quad import following, side_frames
+from v2hdm.detection.markings.rectified import CHANNELS, CLAIMED_CHANNELS, SIZE
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import BoolArray, FloatArray
 
 SEED = 917
-REFINE = "v2hdm.detection.corners.refine"
 EASY = 0.2
 RIDGE = 2.0
 FOLDS = 5
@@ -64,9 +63,9 @@ COUNTS = (10, 20, 40, 80)
 class Gathered:
     """N readings of quadrilaterals as one class, those of one look at an image together.
 
-    Their evidence, what they look like, corners on the ground, classes, whether they are true (None where
-    either will do), the numbers of the images they are from and of the looks, and whether spots of sun were
-    added to these.
+    Their evidence, views, corners on the ground, classes, whether they are true (None where either will do), the
+    errors of their sides, px, nan where unknown, with the formal variances, the numbers of the images they are
+    from and of the looks, and whether spots of sun were added to these.
     """
 
     evidence: list[FloatArray] = field(default_factory=list)
@@ -74,45 +73,60 @@ class Gathered:
     ground: list[FloatArray] = field(default_factory=list)
     kind: list[str] = field(default_factory=list)
     true: list[bool | None] = field(default_factory=list)
+    side_error: list[FloatArray] = field(default_factory=list)
+    side_variance: list[FloatArray] = field(default_factory=list)
     image: list[int] = field(default_factory=list)
     look: list[int] = field(default_factory=list)
     lit: list[bool] = field(default_factory=list)
 
     def add(self, index: int, shown: Example, detector: Detector, spots: Spots | None = None) -> None:
         """What the detector proposes in one image; its network swears that ``spots`` are markings."""
-        corners_px: list[FloatArray] = []
-
-        def gather_spy(*given: Any) -> FloatArray:
-            corners_px.extend(given[3].corners_px)
-            return gather(*given)
-
-        def spy(evidence: FloatArray, views: np.ndarray, kinds: list[str], ground: FloatArray) -> FloatArray:
-            self.evidence.extend(evidence)
-            self.views.extend(views.astype(np.float16))
-            self.kind.extend(kinds)
-            self.ground.extend(ground)
-            return np.ones(len(evidence))
-
-        look, first = 1 + max(self.look, default=-1), len(self.kind)
-        swear = swearing(spots) if spots is not None else nullcontext()
-        with swear, patch(f"{REFINE}.gather", gather_spy), patch(f"{REFINE}.confidence", spy):
-            detector.detect(shown.image, shown.camera)
-        for kind, corners in zip(self.kind[first:], corners_px, strict=True):
-            self.true.append(is_true(shown, kind, corners))
+        with swearing(spots) if spots is not None else nullcontext():
+            seen = detector.see(shown.image, shown.camera)
+        readings = detector.read(shown.image, seen)
+        if readings is None:
+            return
+        look = 1 + max(self.look, default=-1)
+        corners_px, _ = readings.fit.in_image()
+        variance = readings.fit.side_variance()
+        for row, (m, kind) in enumerate(zip(readings.quadrilateral.tolist(), readings.kinds, strict=True)):
+            true, marking = is_true(shown, kind, corners_px[m])
+            order = (np.arange(4) + readings.first_side[row]) % 4
+            self.evidence.append(readings.evidence[row])
+            self.views.append(readings.views[row].astype(np.float16))
+            self.ground.append(readings.ground[row])
+            self.kind.append(kind)
+            self.true.append(true)
+            self.side_error.append(side_errors(readings, m, corners_px[m], marking)[order])
+            self.side_variance.append(variance[m, order])
             self.image.append(index)
             self.look.append(look)
             self.lit.append(spots is not None)
 
 
-def is_true(shown: Example, kind: str, corners_px: FloatArray) -> bool | None:
-    """Whether a quadrilateral (4, 2) is a marking; None where the quality benchmark lets it be."""
+def is_true(shown: Example, kind: str, corners_px: FloatArray) -> tuple[bool | None, TrueMarking | None]:
+    """Whether a quadrilateral (4, 2) is a marking, and which; None where the quality benchmark lets it be."""
     overlaps = [(polygon_overlap(corners_px, true.polygon_px), true) for true in shown.markings]
-    if any(share >= 0.5 and true.kind == kind for share, true in overlaps):
-        return True
+    own = [pair for pair in overlaps if pair[0] >= 0.5 and pair[1].kind == kind]
+    if own:
+        return True, max(own, key=lambda pair: pair[0])[1]
     share, nearest = max(overlaps, key=lambda pair: pair[0], default=(0.0, None))
     if share <= 0.05 or (nearest is not None and nearest.fair and nearest.kind != kind):
-        return False
-    return None
+        return False, None
+    return None, None
+
+
+def side_errors(readings: Readings, m: int, corners_px: FloatArray, true: TrueMarking | None) -> FloatArray:
+    """How far (4,) px the true sides lie outside those of quadrilateral ``m``; nan where nobody knows."""
+    if true is None or len(true.polygon_px) != 4:
+        return np.full(4, np.nan)
+    turned = [np.roll(true.polygon_px[::way], shift, axis=0) for shift in range(4) for way in (1, -1)]
+    nearest = min(turned, key=lambda corners: float(np.abs(corners - corners_px).sum()))
+    corners = readings.fit.corners[m]
+    placed = readings.fit.frames.take(np.array([m])).from_image(nearest[None])[0]
+    _, normal, _ = side_frames(corners)
+    middle, true_middle = ((each + following(each)) / 2 for each in (corners, placed))
+    return np.asarray(((true_middle - middle) * normal).sum(axis=-1))
 
 
 def renders_to_fit(images: int, seed: int) -> Iterator[tuple[int, Example]]:
@@ -186,20 +200,35 @@ def fit_all(gathered: Gathered) -> tuple[Judge, dict[str, dict[str, object]]]:
         np.array(gathered.evidence, dtype=np.float32),
         one_hot(gathered.kind),
         true,
+        np.where(true[:, None], np.array(gathered.side_error), np.nan).astype(np.float32),
+        np.array(gathered.side_variance, dtype=np.float32),
         tuple(CHANNELS.index(name) for name in CLAIMED_CHANNELS),
         tuple(FEATURES.index(name) for name in CLAIMED),
     )
     # What is true of the images with spots has been seen without them, too.
     lessons = known & ~(spotted & true)
     # Each is told of by odds that its own image had no part in.
-    odds = np.zeros(len(true))
+    odds, side_sigma_px = np.zeros(len(true)), np.ones((len(true), 4))
     for k in range(FOLDS):
-        odds[fold == k] = judged(
-            train_judge(asked.take(lessons & (fold != k)), CONFIG), asked.take(fold == k)
-        )
+        judge = train_judge(asked.take(lessons & (fold != k)), CONFIG)
+        odds[fold == k], side_sigma_px[fold == k] = judged(judge, asked.take(fold == k))
+    _print_sides(asked, side_sigma_px)
     seen_through = (odds < 0)[spotted & known & ~true]
     print(f"seen through: {seen_through.mean():.3f} of what is sworn and false", flush=True)
     return train_judge(asked.take(lessons), CONFIG), fit_among(gathered, odds)
+
+
+def _print_sides(asked: Quadrilaterals, side_sigma_px: FloatArray) -> None:
+    """Whether the errors of sides of images left out are as large as stated."""
+    known = np.isfinite(asked.side_error)
+    square = (asked.side_error**2 / (asked.side_variance + side_sigma_px**2))[known]
+    alone = (asked.side_error**2 / asked.side_variance)[known]
+    for name, values in (("by the fit alone", alone), ("with the judge", square)):
+        inner = np.sort(values)[: int(0.95 * len(values))].mean()
+        print(
+            f"sides {name}: normalised squared error median {np.median(values):.2f} (honest: 0.45), mean of "
+            f"the inner 95 % {inner:.2f} (honest: 0.76), beyond 9 {(values > 9).mean():.3f} (honest: 0.003)"
+        )
 
 
 def fit_among(gathered: Gathered, odds: FloatArray) -> dict[str, dict[str, object]]:

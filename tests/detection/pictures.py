@@ -19,10 +19,10 @@ from onnx import TensorProto, helper, numpy_helper
 from v2hdm.detection.camera.ground import apply_homography, ipm_from_extrinsic
 from v2hdm.detection.camera.lens import distort_points, undistort_points
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.corners.foreground import Foreground
-from v2hdm.detection.corners.quad import order_corners
-from v2hdm.detection.corners.rectified import rectified_views
-from v2hdm.detection.corners.straight import Quads
+from v2hdm.detection.markings.foreground import Foreground
+from v2hdm.detection.markings.quad import order_corners
+from v2hdm.detection.markings.rectified import rectified_views
+from v2hdm.detection.markings.frames import Quads
 from v2hdm.records import DIAMOND, PAINT_CLASSES, Camera, CameraInfo
 
 HEIGHT, WIDTH = 360, 640
@@ -81,7 +81,7 @@ def crisp_view(kind: str) -> np.ndarray:
     image = picture(camera, [shape])
     return rectified_views(
         image, view, replace(blank, kinds=kinds), Quads.seen(view, corners_px), ground, [kind]
-    )[0]
+    )[0][0]
 
 
 def diamond(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import bar, brightness_model, diamond, make_camera, picture, to_image
-from v2hdm.detection.corners.quad import signed_area
+from v2hdm.detection.markings.quad import signed_area
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError

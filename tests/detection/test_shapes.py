@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from v2hdm.detection.corners.coverage import blurred_coverage
-from v2hdm.detection.corners.normal import normal_cdf, normal_pdf
-from v2hdm.detection.corners.quad import (
+from v2hdm.detection.markings.coverage import blurred_coverage
+from v2hdm.detection.markings.normal import normal_cdf, normal_pdf
+from v2hdm.detection.markings.quad import (
     interior_angles,
     intersect_sides,
     is_convex,
@@ -16,7 +16,7 @@ from v2hdm.detection.corners.quad import (
     signed_area,
     width,
 )
-from v2hdm.detection.paint.blobs import Blob, find_blobs, outline_polygon, zero_crossings
+from v2hdm.detection.markings.blobs import Blob, find_blobs, outline_polygon, zero_crossings
 from v2hdm.detection.paint.plausible import Heads, head_of
 from v2hdm.detection.sight import Sight
 from v2hdm.records import PAINT_CLASSES

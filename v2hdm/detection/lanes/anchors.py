@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.corners.foreground import Foreground
+from v2hdm.detection.markings.foreground import Foreground
 from v2hdm.detection.lanes.bends import DRAWN_STEP_PX, Seen, beside_guide
 from v2hdm.detection.lanes.curves import Horizon, basis
 from v2hdm.detection.lanes.ends import alone_from, solid_end

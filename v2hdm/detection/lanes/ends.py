@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.corners.foreground import Foreground
+from v2hdm.detection.markings.foreground import Foreground
 from v2hdm.detection.lanes.curves import Horizon, basis
 from v2hdm.detection.lanes.points import IntArray, Line, LinePoints
 from v2hdm.records import FloatArray

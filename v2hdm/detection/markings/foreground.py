@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from v2hdm.records import FloatArray
+from v2hdm.records import BoolArray, FloatArray
 
 _MOST_ODDS = 6.0
 """Log odds beyond this differ by chance only."""
@@ -27,6 +27,12 @@ class Foreground:
     top: int
     kinds: np.ndarray
     classes: tuple[str, ...]
+
+    def others_at(self, u: np.ndarray, v: np.ndarray, first: np.ndarray, last: np.ndarray) -> BoolArray:
+        """Where pixels (N,) of columns ``u`` and rows ``v`` are paint of blobs but ``first`` to ``last`` (N,)."""
+        row = np.clip((v - self.top) // self.stride, 0, self.owner.shape[0] - 1)
+        owner = self.owner[row, np.clip(u // self.stride, 0, self.owner.shape[1] - 1)]
+        return np.asarray((owner > 0) & ((owner < first + 1) | (owner > last + 1)))
 
     def odds_at(self, points_px: FloatArray) -> FloatArray:
         """Log odds of paint, at most 6 either way, at recorded px (..., 2); outside, those of the border."""

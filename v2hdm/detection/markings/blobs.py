@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 
 from v2hdm.detection.odds import as_probability
-from v2hdm.detection.paint.pieces import fills_a_quadrilateral, settle_pieces
 from v2hdm.detection.sight import Sight
 from v2hdm.records import (
     ARROW,
@@ -43,9 +42,6 @@ _SYMBOLS = _GROUPS[-1]
 _LEAST_SHARE = np.array([0.25 if group == _SYMBOLS else 0.15 for group in _GROUPS])
 """Where two groups of classes hold this much of a blob, two markings touch. The head is more of an arrow."""
 
-_LEAST_QUAD_CELLS = 30
-"""A smaller piece of paint shows no shape; it is split where the network says so."""
-
 _OUTLINE_SCALE = 4
 
 
@@ -57,7 +53,8 @@ class Blob:
     (i, j) lies at recorded pixel ``origin_px + stride * (j, i)``. ``outline_px`` (N, 2) are the
     zero crossings between neighbouring elements, recorded px, in no order. ``class_score`` maps
     each class to its mean probability over the blob. ``touches_symbol`` says that it was split
-    off a connected piece of paint another part of which is an arrow, a chevron or other paint.
+    off a connected piece of paint another part of which is an arrow, a chevron or other paint. A piece that may be
+    several markings comes whole, followed by its ``parts``.
     """
 
     class_score: dict[str, float]
@@ -66,6 +63,7 @@ class Blob:
     stride: int
     outline_px: FloatArray
     touches_symbol: bool = False
+    parts: int = 0
 
     @property
     def cells(self) -> int:
@@ -92,7 +90,7 @@ def find_blobs(
 
     Returns:
         The blobs, and a map (h, w) int16 with 1 + the index of the blob that covers each element of
-        ``paint``, 0 for none.
+        ``paint``, that of the part where a piece has parts, 0 for none.
     """
     # A frame of no paint around it lets every outline close.
     level = cv2.copyMakeBorder(sight.paint, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-1.0)
@@ -109,14 +107,15 @@ def find_blobs(
         box = (slice(y - 1, y + h + 1), slice(x - 1, x + w + 1))
         origin_px = corner_px + stride * np.array([x - 1.0, y - 1.0])
         inside = piece[box] == index + 1
-        large = said.cells[index] >= _LEAST_QUAD_CELLS
-        if said.groups[index] < 2 or (large and fills_a_quadrilateral(contour)):
-            scores = dict(zip(classes, said.score[:, index].tolist(), strict=True))
-            outline_px = corner_px + stride * outlines[index]
-            blobs.append(Blob(scores, _signed(inside, level[box]), origin_px, stride, outline_px))
-            owner[box][inside] = len(blobs)
-            continue
-        for part in _split(inside, level[box], sight, box, classes, origin_px, stride):
+        scores = dict(zip(classes, said.score[:, index].tolist(), strict=True))
+        outline_px = corner_px + stride * outlines[index]
+        parts = []
+        if said.groups[index] >= 2:
+            parts = _split(inside, level[box], sight, box, classes, origin_px, stride)
+        signed = _signed(inside, level[box])
+        blobs.append(Blob(scores, signed, origin_px, stride, outline_px, parts=len(parts)))
+        owner[box][inside] = len(blobs)
+        for part in parts:
             blobs.append(part)
             owner[box][part.level > 0] = len(blobs)
     return blobs, owner[1:-1, 1:-1]
@@ -129,7 +128,6 @@ def _connected(level: np.ndarray, least_row: float) -> tuple[np.ndarray, list[np
     """
     contours, _ = cv2.findContours((level > 0).view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     kept = [c for c in contours if len(c) >= 4 and _end_row(c) >= least_row]
-    level, kept = settle_pieces(level, kept)
     piece = np.zeros(level.shape, dtype=np.int16)
     for index, contour in enumerate(kept):
         cv2.drawContours(piece, [contour], -1, index + 1, cv2.FILLED)

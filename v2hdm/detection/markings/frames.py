@@ -8,8 +8,7 @@ import numpy as np
 
 from v2hdm.detection.camera.lens import has_distortion
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.corners.found import block_diagonal
-from v2hdm.detection.corners.quad import following
+from v2hdm.detection.markings.quad import block_diagonal, following
 from v2hdm.records import BoolArray, FloatArray
 
 _SEEN_BOW_PX = 0.25

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import crisp_view
-from v2hdm.detection.corners.company import COMPANY, company
-from v2hdm.detection.corners.confidence import confidence
-from v2hdm.detection.corners.evidence import FEATURES
+from v2hdm.detection.markings.context import COMPANY, company
+from v2hdm.detection.markings.judge import judge_among
+from v2hdm.detection.markings.evidence import FEATURES
 from v2hdm.records import DIAMOND, LANE_DASH, FloatArray
 
 

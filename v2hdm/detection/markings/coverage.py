@@ -18,8 +18,8 @@ from functools import cache
 import cv2
 import numpy as np
 
-from v2hdm.detection.corners.normal import normal_cdf, normal_pdf
-from v2hdm.detection.corners.quad import side_frames
+from v2hdm.detection.markings.normal import normal_cdf, normal_pdf
+from v2hdm.detection.markings.quad import side_frames
 
 _CELLS_PER_BLUR = 32
 _REACH = 4.5
@@ -32,7 +32,7 @@ def blurred_coverage(
     """Coverage of pixels by convex quadrilaterals and its derivative by their sides and by the blur.
 
     Args:
-        corners: (M, 4, 2) px, in the order of :mod:`v2hdm.detection.corners.quad`, from a point near each
+        corners: (M, 4, 2) px, in the order of :mod:`v2hdm.detection.markings.quad`, from a point near each
             quadrilateral, so that float32 keeps a ten-thousandth of a pixel.
         points: (M, 3, N) float32, the pixel centres (u, v, 1) from the same point.
         blur_px: (M,) or one for all, standard deviation of the point spread, pixel aperture included.

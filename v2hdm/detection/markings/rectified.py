@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.corners.foreground import Foreground
-from v2hdm.detection.corners.grey import grey_of, linear_bgr, log_grey
-from v2hdm.detection.corners.quad import following, side_frames
-from v2hdm.detection.corners.straight import Quads
+from v2hdm.detection.markings.foreground import Foreground
+from v2hdm.detection.markings.frames import Quads
+from v2hdm.detection.markings.grey import grey_of, linear_bgr, log_grey
+from v2hdm.detection.markings.quad import following, side_frames
 from v2hdm.records import DIAMOND, LANE_LINE, OTHER_PAINT, OUTLINED_CLASSES, FloatArray
 
 CHANNELS = ("log_grey", "blueness", "paint_odds", "own_share", "line_share", "symbol_share", "outside")
@@ -51,8 +51,8 @@ def rectified_views(
     quads: Quads,
     ground: FloatArray,
     kinds: Sequence[str],
-) -> np.ndarray:
-    """Pictures (M, C, 20, 20) float32, whose channels are :data:`CHANNELS`.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pictures (M, C, 20, 20) float32, whose channels are :data:`CHANNELS`, and the side (M,) at their top.
 
     Args:
         image_bgr: (H, W, 3) uint8.
@@ -77,7 +77,7 @@ def rectified_views(
     lines = shares[:, foreground.classes.index(LANE_LINE)]
     symbols = shares[:, [foreground.classes.index(name) for name in _SYMBOLS]].sum(axis=1)
     planes = (_GREY_GAIN * grey, _COLOUR_GAIN * blueness, _ODDS_GAIN * odds, own, lines, symbols, outside)
-    return np.stack(planes, axis=1).astype(np.float32)
+    return np.stack(planes, axis=1).astype(np.float32), np.where(lengthwise, 0, 1)
 
 
 def _points(corners: FloatArray, diamond: np.ndarray, size: int) -> FloatArray:

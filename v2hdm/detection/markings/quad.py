@@ -95,3 +95,11 @@ def intersect_sides(point: FloatArray, normal: FloatArray) -> FloatArray:
         u = (before_distance * normal[..., 1] - before[..., 1] * distance) / determinant
         v = (before[..., 0] * distance - before_distance * normal[..., 0]) / determinant
     return np.stack([u, v], axis=-1)
+
+
+def block_diagonal(blocks: FloatArray) -> FloatArray:
+    """(M, 4, 2, 2) blocks to (M, 8, 8)."""
+    full = np.zeros((len(blocks), 4, 2, 4, 2))
+    for corner in range(4):
+        full[:, corner, :, corner] = blocks[:, corner]
+    return full.reshape(-1, 8, 8)

@@ -1,0 +1,1 @@
+"""From paint to markings: propose, fit, judge."""

@@ -1,0 +1,522 @@
+"""One fit for every marking, near and far: a quadrilateral in the log of the image's grey values.
+
+In frames in which the lens bends nothing (:mod:`.frames`), the log grey of a pixel is modelled as
+``light(s) + c x + log(1 + (exp(k) - 1) C)``: C is the quadrilateral's coverage blurred by the point spread, k the
+log contrast of paint over ground, ``light`` a piecewise linear function along the marking and c a slope across
+it. A shadow is a factor on paint and ground alike, so it goes into the light and moves no side. Gauss-Newton
+with Cauchy weights finds the ends of the four sides, blur, contrast and light.
+
+Nothing is ever "not found". Every side has the residual variance of its own pixels, the outline that the network
+drew is a weak observation of every side, and a side at the image's border is all but free. A crack along one
+side, clipped paint, an occluder or the border thereby show as a large covariance in the direction that they
+hide.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.markings.correlation import variance_inflation
+from v2hdm.detection.markings.coverage import blurred_coverage
+from v2hdm.detection.markings.frames import StraightFrames
+from v2hdm.detection.markings.lattice import KNOTS, Lattice, Scene, lay_grid, lay_lattice
+from v2hdm.detection.markings.quad import is_convex, preceding, side_frames, signed_area
+from v2hdm.records import BoolArray, FloatArray
+
+TYPICAL_BLUR_PX = 0.75
+"""Point spread of a focused camera, px, pixel aperture included."""
+
+_BLUR_SIGMA_PX = 0.2
+"""How far one marking's blur is from the typical one, px: motion, focus, frayed paint."""
+
+_BLUR_LIMITS_PX = (0.35, 3.0)
+_SEARCH_BLUR, _LEAST_SEARCH_BLUR_PX = 0.6, 1.5
+"""Blur of the first steps, in distances of the grid's points and px: a wide one sees sides from far away."""
+
+_SEARCH_SIGMA = 0.1
+"""How far the network's outline is from the end of a side before the search, in lengths of the marking."""
+
+_PAINT_SIGMA = 0.25
+"""How far the network's probability of paint is from the coverage."""
+
+_CLOSURE_SHARE, _CLOSURE_M = 0.03, 0.005
+"""By how much the sum of a marking's opposite corners differs, in parts of the root of its area, at least in m.
+
+Stencils are true to 5 mm; a guess of the mounting that is 2 degrees off makes 3 % of a parallelogram.
+"""
+
+_BLOOM, _MUCH_CLIPPED = 1.2, 0.15
+"""Where this share of a marking's pixels is clipped, its outline lies about so many blurs outside the paint."""
+
+_MOST_MOVED, _MOST_GROWTH = 0.5, 4.0
+"""A fit that moves its middle by more of its size, or grows or shrinks by more, follows something else."""
+
+_OUTLINE_SIGMA_PX = 2.5
+"""How far the network's outline is from the end of a side, px; measured on renders, where it is 1 to 3."""
+
+_OPEN_SIGMA = 3.0
+"""A side cut by the image's border is unknown within this many lengths of the marking."""
+
+_BEYOND_PX = 6.0
+"""How far beyond the border a side that it cuts is started, px: farther than the blur reaches."""
+
+_CONTRAST, _CONTRAST_SIGMA = 0.95, 1.0
+"""Log contrast of paint over ground: FIT's measurement on asphalt, widened for worn and for fresh paint."""
+
+_MOST_CONTRAST = 4.0
+"""Log contrast of white paint on the blackest ground."""
+
+_LIGHT_STEP = 0.4
+"""By how much the log light differs from one knot to the next: the border of a shadow is a few of that."""
+
+_MIN_SCATTER = 0.01
+"""Least scatter of log grey: quantisation and noise of the best sensor."""
+
+_WIDE_SCATTER, _FINAL_SCATTER = 0.4, 0.1
+"""Least scatter at the first step of search and fit, halved at each: the next may explain what one rejects."""
+
+_SHARED_PIXELS = 20.0
+"""A side's variance is drawn to that of all sides as if by so many pixels."""
+
+_CAUCHY = 2.385
+"""Cauchy's scale for 95 % efficiency (Holland and Welsch, 1977)."""
+
+_MODEL_SIGMA_PX = 0.04
+"""Error of a side along the pixels' rows, px, with no noise at all: a Gaussian is not quite a pixel's aperture."""
+
+_MAX_CORRELATION = 0.7
+_SEARCH_STEPS, _STEPS = 6, 7
+_MAX_STEP = 2.0
+"""Longest step of a side, in blurs."""
+
+_SETTLED_PX = 0.05
+_LEAST_SINE = 1e-3
+
+_BLUR, _K = 8, 9
+_LIGHT = 10
+_SLOPE = _LIGHT + KNOTS
+_UNKNOWNS = _SLOPE + 1
+"""Places among the unknowns: starts of the sides 0 to 3, their ends 4 to 7, blur, contrast, light, slope."""
+
+_CORNER = np.arange(4)
+_END = 4 + (_CORNER - 1) % 4
+"""Each corner is the start of its own side and the end of the one before, in this place among the moves."""
+
+STATISTICS = (
+    "contrast",
+    "fit_scatter",
+    "worst_scatter",
+    "inlier_share",
+    "clipped_share",
+    "blur_px",
+    "log_end_sigma",
+    "log_side_sigma",
+    "log_moved_px",
+    "log_last_step",
+)
+"""Names of the columns of :attr:`Fit.statistics`.
+
+Log contrast of paint over ground; scatter of log grey over contrast, over all and on the worst side; mean robust
+weight; share of clipped pixels; blur, px; log of the standard deviation of the two ends and of the two long
+sides, px; log of the longest way of a corner from the outline and of the last step, px.
+"""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """M quadrilaterals ``corners`` (M, 4, 2) in their ``frames``.
+
+    ``side_covariance`` (M, 8, 8), px^2, is that of the moves of the sides' starts and ends along their outward
+    normals. ``statistics`` (M, len(STATISTICS)) say how well the model explains the pixels. ``open_sides``
+    (M, 4) are those cut by the image's border.
+    """
+
+    frames: StraightFrames
+    corners: FloatArray
+    side_covariance: FloatArray
+    statistics: FloatArray
+    open_sides: BoolArray
+
+    def in_image(self, side_sigma_px: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+        """Corners (M, 4, 2), recorded px, and their covariance (M, 8, 8), px^2.
+
+        Args:
+            side_sigma_px: (M, 4) how far each side as a whole may be off besides, for reasons that residuals
+                do not show, px.
+        """
+        by_side = self.side_covariance
+        if side_sigma_px is not None:
+            by_side = by_side + _whole_sides(side_sigma_px)
+        jacobian = _corner_from_side(self.corners)
+        covariance = jacobian @ by_side @ jacobian.swapaxes(1, 2) + _second_order(self.corners, by_side)
+        return self.frames.to_image(self.corners, covariance)
+
+    def side_variance(self) -> FloatArray:
+        """Variance (M, 4), px^2, of the place of each side's middle along its normal."""
+        start, end = self.side_covariance[:, _CORNER], self.side_covariance[:, _CORNER + 4]
+        own = start[:, _CORNER, _CORNER] + end[:, _CORNER, _CORNER + 4] + 2 * start[:, _CORNER, _CORNER + 4]
+        return np.asarray(own / 4)
+
+
+def fit_quadrilaterals(
+    scene: Scene,
+    view: CameraView,
+    corners_px: FloatArray,
+    open_sides: BoolArray,
+    blur_px: float = TYPICAL_BLUR_PX,
+) -> Fit:
+    """Fit quadrilaterals that start at ``corners_px`` (M, 4, 2), the network's outlines.
+
+    The first steps look at a coarse grid all over each, and at the network's probability of paint there as a
+    second picture of the same shape; the last at the pixels about its sides.
+
+    Args:
+        scene: the image, and which of its paint is each marking's own.
+        view: the camera.
+        corners_px: starting corners, recorded px.
+        open_sides: (M, 4) sides that the image's border cuts.
+        blur_px: the point spread's standard deviation, pixel aperture included.
+    """
+    frames = StraightFrames.about(view, corners_px)
+    drawn = frames.from_image(corners_px)
+    # Out of sight, so that the pixels at the border say nothing of where such a side is.
+    beyond_px = np.tile(np.where(open_sides, _BEYOND_PX, 0.0), 2)
+    start = drawn + (_corner_from_side(drawn) @ beyond_px[..., None]).reshape(-1, 4, 2)
+    corners_px = frames.to_px(start)
+    length_px = side_frames(start)[2].max(axis=1)
+    grid, paint, spacing_px = lay_grid(scene, frames, corners_px)
+    state = _State.at(start, np.maximum(_SEARCH_BLUR * spacing_px, _LEAST_SEARCH_BLUR_PX), blur_px, frames)
+    state.outline_sigma_px = np.tile(np.where(open_sides, _OPEN_SIGMA, _SEARCH_SIGMA) * length_px[:, None], 2)
+    state.settle(grid, _SEARCH_STEPS, paint)
+    lost = ~_sound(state.corners, start)
+    state.corners[lost] = start[lost]
+    searched_px = frames.to_px(state.corners)
+    # Beyond the image a lens model may fold.
+    folded = ~view.inside(searched_px, -_OPEN_SIGMA * _OUTLINE_SIGMA_PX).all(axis=1) & ~open_sides.any(axis=1)
+    folded |= ~(np.ptp(searched_px, axis=1).max(axis=1) < 2 * np.ptp(corners_px, axis=1).max(axis=1))
+    state.corners[folded], searched_px[folded] = start[folded], corners_px[folded]
+    searched = state.corners.copy()
+    lattice = lay_lattice(scene, frames, searched_px)
+    sigma_px = np.where(open_sides, _OPEN_SIGMA * length_px[:, None], _OUTLINE_SIGMA_PX)
+    inward_px = np.repeat(-_BLOOM * blur_px * np.minimum(lattice.clipped / _MUCH_CLIPPED, 1.0)[:, None], 8, axis=1)
+    begun = searched + (_corner_from_side(searched) @ inward_px[..., None]).reshape(-1, 4, 2)
+    state = _State.at(begun, np.full(len(start), blur_px), blur_px, frames)
+    state.outline_sigma_px = np.tile(sigma_px, 2)
+    system = state.settle(lattice, _STEPS)
+    covariance = np.linalg.inv(system.information)[:, :8, :8]
+    last = system.by_side
+    covariance = covariance + last[:, :, None] * last[:, None, :] + _MODEL_SIGMA_PX**2 * np.eye(8)
+    astray = ~_sound(state.corners, searched)
+    state.corners[astray] = searched[astray]
+    covariance[astray] = np.einsum("mi,ij->mij", state.outline_sigma_px[astray] ** 2, np.eye(8))
+    moved_px = np.abs(state.corners - start).max(axis=(1, 2))
+    statistics = _statistics(state, system, lattice, covariance, moved_px)
+    return Fit(frames, state.corners, covariance, statistics, open_sides)
+
+
+def _sound(corners: FloatArray, before: FloatArray) -> BoolArray:
+    """Which quadrilaterals (M, 4, 2) are convex and share about the place and size of those ``before``."""
+    size = np.ptp(before, axis=1).max(axis=1)
+    moved = np.abs(corners.mean(axis=1) - before.mean(axis=1)).max(axis=1)
+    area = np.abs(signed_area(corners)) / np.maximum(np.abs(signed_area(before)), 1e-6)
+    near = (moved < _MOST_MOVED * size + 2 * _OUTLINE_SIGMA_PX) & (area < _MOST_GROWTH) & (area > 1 / _MOST_GROWTH)
+    return np.asarray(is_convex(corners) & np.isfinite(corners).all(axis=(1, 2)) & near)
+
+
+@dataclass
+class _System:
+    """Normal equations at the last linearisation: ``information`` (M, U, U), scatter, weights, last step.
+
+    ``scatter`` (M, 4) of log grey by side, ``inliers`` (M,) mean robust weight, ``by_side`` (M, 8) last step.
+    """
+
+    information: FloatArray
+    scatter: FloatArray
+    inliers: FloatArray
+    by_side: FloatArray
+
+    def put(self, rows: np.ndarray, other: _System) -> None:
+        """Overwrite the markings ``rows`` with those of ``other``."""
+        for name, value in vars(self).items():
+            value[rows] = getattr(other, name)
+
+
+@dataclass
+class _State:
+    """The unknowns of M markings: corners, blur, contrast, light (M, KNOTS) and its slope across.
+
+    ``outline`` (M, 4, 2) are the corners that the network drew, ``outline_sigma_px`` (M, 8) how far its sides'
+    starts and ends are off along their normals. ``closure`` (M, 2, 8) takes the corners to p0 - p1 + p2 - p3 on the
+    ground in its standard deviation, ``gap`` (M, 2) is that of the outline.
+    """
+
+    corners: FloatArray
+    blur_px: FloatArray
+    contrast: FloatArray
+    expected_contrast: FloatArray
+    light: FloatArray
+    slope: FloatArray
+    expected_blur_px: float
+    outline: FloatArray
+    outline_sigma_px: FloatArray
+    closure: FloatArray
+    gap: FloatArray
+
+    @classmethod
+    def at(cls, corners: FloatArray, blur_px: FloatArray, expected_blur_px: float, frames: StraightFrames) -> _State:
+        """Of starting corners (M, 4, 2); light and contrast are not known yet (nan)."""
+        count = len(corners)
+        contrast, slope = np.full(count, _CONTRAST), np.zeros(count)
+        light, sigma = np.full((count, KNOTS), np.nan), np.ones((count, 8))
+        closure, gap = _closure(corners, frames)
+        start = corners.copy(), blur_px.copy(), contrast, contrast.copy(), light, slope, expected_blur_px
+        return cls(*start, corners, sigma, closure, gap)
+
+    def settle(self, lattice: Lattice, steps: int, paint: np.ndarray | None = None) -> _System:
+        """Gauss-Newton until each marking's step is small; the system is that of its last step.
+
+        With the network's probability of ``paint`` (M, N) that is a second picture, and the blur is held.
+        """
+        running = np.arange(len(self.corners))
+        system: _System | None = None
+        wide_scatter = _FINAL_SCATTER if paint is None else _WIDE_SCATTER
+        for number in range(steps):
+            now = self._take(running)
+            part = now.step(lattice, paint, wide_scatter * 0.5**number)
+            self._put(running, now)
+            if system is None:
+                system = part
+            else:
+                system.put(running, part)
+            moving = np.abs(part.by_side).max(axis=1) > _SETTLED_PX
+            lattice, running = lattice.take(moving), running[moving]
+            paint = None if paint is None else paint[moving]
+            if not len(running):
+                break
+        assert system is not None
+        return system
+
+    def _take(self, rows: np.ndarray) -> _State:
+        return _State(
+            *(v[rows] if isinstance(v, np.ndarray) else v for v in vars(self).values())  # type: ignore[arg-type]
+        )
+
+    def _put(self, rows: np.ndarray, other: _State) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                value[rows] = getattr(other, name)
+
+    def step(self, lattice: Lattice, paint: np.ndarray | None, least_scatter: float) -> _System:
+        """One Gauss-Newton step, in place, under which no scatter below ``least_scatter`` makes an outlier."""
+        coverage, by_shape = blurred_coverage(self.corners, lattice.points, self.blur_px)
+        hats, across = lattice.hats, lattice.across
+        if np.isnan(self.light).any():
+            self._first_light(lattice, coverage)
+        gain = np.exp(self.contrast).astype(np.float32)[:, None] - 1
+        ratio = 1 + gain * np.clip(coverage, 0, 1)
+        model = (self.light[:, None].astype(np.float32) @ hats)[:, 0]
+        model += self.slope.astype(np.float32)[:, None] * across + np.log(ratio)
+        # In units of the light on the ground: blur errs by shares of the step, not of the pixel's own value.
+        residual = (lattice.values - model) * ratio
+        # Where the sensor was at its limit the truth is as bright or brighter.
+        use = lattice.use * ~(lattice.limited & (residual < 0))
+        residual *= use
+        weight, scatter, inliers = _weights(residual, use, lattice, least_scatter)
+        design = np.empty((len(coverage), _UNKNOWNS, coverage.shape[1]), dtype=np.float32)
+        np.multiply(by_shape, gain[:, None], out=design[:, :_K])
+        design[:, _K] = (gain + 1) * coverage
+        np.multiply(hats, ratio[:, None], out=design[:, _LIGHT:_SLOPE])
+        design[:, _SLOPE] = across * ratio
+        weighted = design * weight[:, None]
+        information = (weighted @ design.swapaxes(1, 2)).astype(np.float64)
+        gradient = (weighted @ residual[..., None])[..., 0].astype(np.float64)
+        if paint is not None:
+            _add_paint(information, gradient, coverage, by_shape, paint, lattice.use)
+        self._add_priors(information, gradient, hold_blur=paint is not None)
+        moved = np.linalg.solve(information, gradient[..., None])[..., 0]
+        most_px = _MAX_STEP * self.blur_px[:, None]
+        by_side = np.clip(moved[:, :_BLUR], -most_px, most_px)
+        self.corners += (_corner_from_side(self.corners) @ by_side[..., None]).reshape(-1, 4, 2)
+        if paint is None:
+            self.blur_px = np.clip(self.blur_px + moved[:, _BLUR], *_BLUR_LIMITS_PX)
+        self.contrast = self.contrast + np.clip(moved[:, _K], -0.5, 0.5)
+        self.light = self.light + moved[:, _LIGHT:_SLOPE]
+        self.slope = self.slope + moved[:, _SLOPE]
+        return _System(information, scatter, inliers, by_side)
+
+    def _first_light(self, lattice: Lattice, coverage: np.ndarray) -> None:
+        """Light and contrast of least squares, the logarithm taken as linear in the coverage."""
+        basis = np.concatenate([lattice.hats, coverage[:, None]], axis=1)
+        weighted = basis * lattice.use[:, None]
+        matrix = (weighted @ basis.swapaxes(1, 2)).astype(np.float64)
+        target = (weighted @ lattice.values[..., None])[..., 0].astype(np.float64)
+        prior = np.zeros_like(matrix)
+        prior[:, :KNOTS, :KNOTS] = _ROUGHNESS / _LIGHT_STEP**2
+        prior[:, KNOTS, KNOTS] = 1 / _CONTRAST_SIGMA**2
+        found = np.linalg.solve(matrix + prior + 1e-6 * np.eye(KNOTS + 1), target[..., None])[..., 0]
+        contrast = found[:, KNOTS]
+        # Yellow paint is darker than the ground in blue.
+        self.expected_contrast = np.where(contrast < 0, -_CONTRAST, _CONTRAST)
+        self.light, self.contrast = found[:, :KNOTS], np.clip(contrast, -_MOST_CONTRAST, _MOST_CONTRAST)
+
+    def _add_priors(self, information: FloatArray, gradient: FloatArray, *, hold_blur: bool) -> None:
+        """Add the outline, the typical blur and contrast, and that light changes little."""
+        _, normal, _ = side_frames(self.corners)
+        off = self.outline - self.corners
+        start = (off * normal).sum(axis=-1)
+        end = (np.roll(off, -1, axis=1) * normal).sum(axis=-1)
+        stiffness = 1 / self.outline_sigma_px**2
+        place = np.arange(8)
+        information[:, place, place] += stiffness
+        gradient[:, :8] += stiffness * np.concatenate([start, end], axis=1)
+        by_side = self.closure @ _corner_from_side(self.corners)
+        open_ = (self.closure @ (self.corners - self.outline).reshape(-1, 8, 1))[..., 0] + self.gap
+        information[:, :8, :8] += by_side.swapaxes(1, 2) @ by_side
+        gradient[:, :8] -= (by_side.swapaxes(1, 2) @ open_[..., None])[..., 0]
+        blur_stiffness = 1e9 if hold_blur else 1 / _BLUR_SIGMA_PX**2
+        information[:, _BLUR, _BLUR] += blur_stiffness
+        gradient[:, _BLUR] += 0.0 if hold_blur else blur_stiffness * (self.expected_blur_px - self.blur_px)
+        information[:, _K, _K] += 1 / _CONTRAST_SIGMA**2
+        gradient[:, _K] += (self.expected_contrast - self.contrast) / _CONTRAST_SIGMA**2
+        information[:, _LIGHT:_SLOPE, _LIGHT:_SLOPE] += _ROUGHNESS / _LIGHT_STEP**2
+        gradient[:, _LIGHT:_SLOPE] -= self.light @ _ROUGHNESS / _LIGHT_STEP**2
+        information[:, _SLOPE, _SLOPE] += 1 / _LIGHT_STEP**2
+        gradient[:, _SLOPE] -= self.slope / _LIGHT_STEP**2
+
+
+def _closure(corners: FloatArray, frames: StraightFrames) -> tuple[FloatArray, FloatArray]:
+    """The derivative (M, 2, 8) of the gap p0 - p1 + p2 - p3 on the ground, and the gap (M, 2), in its deviation.
+
+    It is 0 for parallelograms, as all markings are painted. 0 where a corner shows no ground.
+    """
+    pinhole = frames.to_pinhole(corners)
+    flat = pinhole.reshape(-1, 2)
+    ground = frames.view.ground(flat).reshape(corners.shape)
+    by_corner = frames.view.ground_jacobian(flat).reshape(-1, 4, 2, 2) @ np.linalg.inv(frames.scale)[:, None]
+    size_m = np.sqrt(np.abs(signed_area(ground)))
+    sigma_m = np.maximum(_CLOSURE_SHARE * size_m, _CLOSURE_M)[:, None, None]
+    derivative = (_ALTERNATING[:, None, None] * by_corner).transpose(0, 2, 1, 3).reshape(-1, 2, 8) / sigma_m
+    gap = _ALTERNATING @ ground / sigma_m[..., 0]
+    known = np.isfinite(derivative).all(axis=(1, 2)) & np.isfinite(gap).all(axis=1)
+    return np.where(known[:, None, None], derivative, 0.0), np.where(known[:, None], gap, 0.0)
+
+
+_ALTERNATING = np.array([1.0, -1.0, 1.0, -1.0])
+
+
+def _add_paint(
+    information: FloatArray,
+    gradient: FloatArray,
+    coverage: np.ndarray,
+    by_shape: np.ndarray,
+    paint: np.ndarray,
+    use: np.ndarray,
+) -> None:
+    """Add that the network's probability of paint (M, N) is the coverage, with Cauchy weights."""
+    residual = paint - coverage
+    weight = use / (_PAINT_SIGMA**2 * (1 + (residual / (_CAUCHY * _PAINT_SIGMA)) ** 2))
+    by_side = by_shape[:, :8]
+    weighted = by_side * weight[:, None]
+    information[:, :8, :8] += weighted @ by_side.swapaxes(1, 2)
+    gradient[:, :8] += (weighted @ residual[..., None])[..., 0]
+
+
+_DIFFERENCE = np.diff(np.eye(KNOTS), axis=0)
+_ROUGHNESS = _DIFFERENCE.T @ _DIFFERENCE + 1e-6 * np.eye(KNOTS)
+
+
+def _weights(
+    residual: np.ndarray, use: np.ndarray, lattice: Lattice, least_scatter: float
+) -> tuple[np.ndarray, FloatArray, FloatArray]:
+    """What every pixel (M, N) weighs, 1 / variance; the scatter (M, 4) by side; the mean robust weight (M,).
+
+    The robust weight is Cauchy's; the variance is that of a side's own pixels, inflated by the correlation of
+    neighbours.
+    """
+    size = np.abs(residual)
+    scale = np.maximum(1.4826 * lattice.median_used(size, use), max(_MIN_SCATTER, least_scatter))
+    robust = use / (1 + (size / (_CAUCHY * scale[:, None])) ** 2)
+    square = robust * residual * residual
+    total, count = square.sum(axis=1), robust.sum(axis=1)
+    shared = total / np.maximum(count, 1)
+    by_side = np.stack([square, robust], axis=1) @ lattice.of_side
+    variance = (by_side[:, 0] + _SHARED_PIXELS * shared[:, None]) / (by_side[:, 1] + _SHARED_PIXELS)
+    variance = np.maximum(variance.astype(np.float64), _MIN_SCATTER**2)
+    inflation = np.ones(len(residual))
+    rows = np.arange(len(residual))[:, None]
+    for neighbour in lattice.neighbours:
+        pair = robust * robust[rows, neighbour] * (neighbour > 0)
+        inflation *= variance_inflation(residual, residual[rows, neighbour], pair, _MAX_CORRELATION)
+    per_pixel = 1 / (variance * inflation[:, None])
+    weight = robust * (per_pixel.astype(np.float32)[:, None] @ lattice.of_side.swapaxes(1, 2))[:, 0]
+    inliers = count / np.maximum(use.sum(axis=1), 1)
+    return weight, np.sqrt(variance), inliers.astype(np.float64)
+
+
+def _corner_from_side(corners: FloatArray) -> FloatArray:
+    """Moves (M, 8) of the sides' starts and ends along their normals to moves (M, 8) of the corners."""
+    tangent, _, _ = side_frames(corners)
+    before = preceding(tangent)
+    determinant = before[..., 0] * tangent[..., 1] - before[..., 1] * tangent[..., 0]
+    determinant = np.where(np.abs(determinant) < _LEAST_SINE, -_LEAST_SINE, determinant)[..., None]
+    jacobian = np.zeros((len(corners), 4, 2, 8))
+    # Each lies along the other's line.
+    jacobian[:, _CORNER, :, _CORNER] = (-before / determinant).swapaxes(0, 1)
+    jacobian[:, _CORNER, :, _END] = (tangent / determinant).swapaxes(0, 1)
+    return jacobian.reshape(-1, 8, 8)
+
+
+def _second_order(corners: FloatArray, by_side: FloatArray) -> FloatArray:
+    """What the error of a side's direction adds where its end is vague: (M, 8, 8), px^2.
+
+    A corner that may lie far along a side is off across it by its way times the error of the side's direction.
+    """
+    _, normal, length = side_frames(corners)
+    start, end = by_side[:, _CORNER, _CORNER], by_side[:, _CORNER + 4, _CORNER + 4]
+    both = by_side[:, _CORNER, _CORNER + 4]
+    tilt = np.maximum(start + end - 2 * both, 0) / np.maximum(length, 1.0) ** 2
+    out = np.zeros((len(corners), 4, 2, 4, 2))
+    # Corner c runs along side c if the end of side c - 1 is vague, and along side c - 1 if the start of c is.
+    for of, slack in ((_CORNER, np.roll(end, 1, axis=1)), (_CORNER - 1, start)):
+        variance = tilt[:, of] * slack
+        outer = normal[:, of, :, None] * normal[:, of, None, :]
+        out[:, _CORNER, :, _CORNER] += (variance[..., None, None] * outer).swapaxes(0, 1)
+    return out.reshape(-1, 8, 8)
+
+
+_TILT_SHARE = 0.5
+"""A side that is off as a whole is askew by this share of that."""
+
+
+def _whole_sides(sigma_px: FloatArray) -> FloatArray:
+    """Covariance (M, 8, 8) of starts and ends of sides that are off as a whole by ``sigma_px`` (M, 4)."""
+    pattern = np.kron([[1.0, 1.0], [1.0, 1.0]], np.eye(4)) + _TILT_SHARE**2 * np.kron([[1.0, -1.0], [-1.0, 1.0]], np.eye(4))
+    sigma = np.tile(sigma_px, 2)
+    return np.asarray(sigma[:, :, None] * pattern * sigma[:, None, :])
+
+
+def _statistics(
+    state: _State, system: _System, lattice: Lattice, covariance: FloatArray, moved_px: FloatArray
+) -> FloatArray:
+    contrast = np.maximum(np.abs(state.contrast), 0.05)
+    side_sigma = np.sqrt(np.maximum(covariance[:, np.arange(8), np.arange(8)], 1e-8)).reshape(-1, 2, 4).mean(axis=1)
+    length = side_frames(state.corners)[2]
+    lengthwise = length[:, 0] + length[:, 2] >= length[:, 1] + length[:, 3]
+    pairs = (side_sigma[:, :2] + side_sigma[:, 2:]) / 2
+    long, end = np.where(lengthwise, pairs[:, 0], pairs[:, 1]), np.where(lengthwise, pairs[:, 1], pairs[:, 0])
+    columns = {
+        "contrast": state.contrast,
+        "fit_scatter": np.log(np.sqrt((system.scatter**2).mean(axis=1)) / contrast),
+        "worst_scatter": np.log(system.scatter.max(axis=1) / contrast),
+        "inlier_share": system.inliers,
+        "clipped_share": lattice.clipped,
+        "blur_px": state.blur_px,
+        "log_end_sigma": np.log(end),
+        "log_side_sigma": np.log(long),
+        "log_moved_px": np.log(moved_px + 0.1),
+        "log_last_step": np.log(np.abs(system.by_side).max(axis=1) + 0.01),
+    }
+    return np.column_stack([columns[name] for name in STATISTICS])

@@ -1,0 +1,333 @@
+"""The pixels that tell where a marking's sides are: a lattice over a band along them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from v2hdm.detection.markings.foreground import Foreground
+from v2hdm.detection.markings.frames import StraightFrames
+from v2hdm.detection.markings.grey import CLIPPED, grey_of, linear_bgr, log_grey
+from v2hdm.detection.markings.quad import following, side_frames, signed_area, width
+from v2hdm.detection.odds import as_probability
+from v2hdm.records import BoolArray, FloatArray
+
+KNOTS = 6
+"""Knots of the light along a marking: its two ends are as many fifths of it apart as a shadow needs."""
+
+_OUTSIDE_PX = 3.0
+_INSIDE_PX = 4.0
+_MEDIAN_STRIDE = 3
+_MAX_PIXELS = 350
+_MAX_BETWEEN, _MAX_AT_ENDS = 160, 260
+_END_PX = 2.0
+_MOST_ENDS = 1 / 3
+"""What has two ends that make up no more than this share of its length is slim; an end reaches so far past
+its corners."""
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Up to N pixels about each of M markings.
+
+    ``points`` (M, 3, N) float32 are (x, y, 1) in the markings' frames; ``values`` (M, N) float32 log grey;
+    ``use`` (M, N) float32 1 where a pixel takes part, else 0; ``limited`` (M, N) where the sensor was at its
+    limit; ``clipped`` (M,) the share of those. ``neighbours`` (2, M, N) is the place in the list of the lattice's
+    next pixel to the right and below, 0 for none as near as any is. ``of_side`` (M, N, 4) float32 is 1 for the
+    side that is nearest. ``hats`` (M, KNOTS, N) interpolate between knots along the marking, ``across`` (M, N)
+    runs from -1 to 1 across it.
+    """
+
+    points: np.ndarray
+    values: np.ndarray
+    use: np.ndarray
+    limited: np.ndarray
+    clipped: FloatArray
+    neighbours: np.ndarray
+    of_side: np.ndarray
+    hats: np.ndarray
+    across: np.ndarray
+
+    def take(self, rows: BoolArray) -> Lattice:
+        """The markings under the mask (M,)."""
+        if rows.all():
+            return self
+        parts = {name: value[rows] for name, value in vars(self).items() if name != "neighbours"}
+        return Lattice(**parts, neighbours=self.neighbours[:, rows])
+
+    def every(self, stride: int) -> Lattice:
+        """Every ``stride``-th pixel, without neighbours."""
+        thin = slice(None, None, stride)
+        return Lattice(
+            np.ascontiguousarray(self.points[..., thin]),
+            np.ascontiguousarray(self.values[:, thin]),
+            np.ascontiguousarray(self.use[:, thin]),
+            np.ascontiguousarray(self.limited[:, thin]),
+            self.clipped,
+            self.neighbours[:0, :, thin],
+            np.ascontiguousarray(self.of_side[:, thin]),
+            np.ascontiguousarray(self.hats[..., thin]),
+            np.ascontiguousarray(self.across[:, thin]),
+        )
+
+    def median_used(self, values: np.ndarray, use: np.ndarray) -> np.ndarray:
+        """Median (M,) of every few values of (M, N) over the pixels of ``use``; 0 where there is none."""
+        there = use[:, ::_MEDIAN_STRIDE] > 0
+        ordered = np.sort(np.where(there, values[:, ::_MEDIAN_STRIDE], np.float32(np.inf)), axis=1)
+        count = there.sum(axis=1)
+        median = ordered[np.arange(len(values)), np.maximum(count // 2 - 1, 0)]
+        return np.asarray(np.where(count > 0, median, np.float32(0)))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The image that markings are fitted to: pixels, the network's word on each, and the blobs of each marking.
+
+    ``image_bgr`` (H, W, 3) uint8; ``first_blob`` and ``last_blob`` (M,) are the blobs that a marking's own paint
+    is of: pixels of all others are left out.
+    """
+
+    image_bgr: np.ndarray
+    foreground: Foreground
+    first_blob: np.ndarray
+    last_blob: np.ndarray
+
+    def look(self, u: np.ndarray, v: np.ndarray, marking: np.ndarray, linear_response: bool) -> _Pixels:
+        """Log grey, red and blue (3, n) of pixels of markings (n,), which take part, which are clipped."""
+        use = (u >= 0) & (u < self.image_bgr.shape[1]) & (v >= 0) & (v < self.image_bgr.shape[0])
+        u, v = np.where(use, u, 0), np.where(use, v, 0)
+        use &= ~self.foreground.others_at(u, v, self.first_blob[marking], self.last_blob[marking])
+        coded = self.image_bgr[v, u]
+        bgr = linear_bgr(coded, linear_response)
+        light = log_grey(np.stack([grey_of(bgr), bgr[:, 2], bgr[:, 0]]))
+        return light, use, use & (coded >= CLIPPED).any(axis=1)
+
+
+_Pixels = tuple[np.ndarray, BoolArray, BoolArray]
+
+
+def lay_lattice(scene: Scene, frames: StraightFrames, corners_px: FloatArray) -> Lattice:
+    """The pixels about the sides of quadrilaterals ``corners_px`` (M, 4, 2), recorded px."""
+    bow_px = frames.bow_px(corners_px)
+    spare = np.ceil(bow_px)[:, None].astype(np.intp) + int(_OUTSIDE_PX)
+    low = np.floor(corners_px.min(axis=1)).astype(np.intp) - spare
+    size = np.ceil(corners_px.max(axis=1)).astype(np.intp) + spare + 1 - low
+    columns, rows = _lattice(corners_px - low[:, None], size)
+    across, down = columns.shape[1], rows.shape[1]
+    band = _in_band(corners_px - low[:, None], bow_px, columns, rows)
+    band[..., -1] = band[:, -1] = False
+    cell = np.flatnonzero(band)
+    marking, within = np.divmod(cell, across * down)
+    i, j = np.divmod(within, across)
+    u, v = low[marking, 0] + columns[marking, j], low[marking, 1] + rows[marking, i]
+    count = np.bincount(marking, minlength=len(low))
+    place = np.arange(len(cell)) - np.repeat(np.cumsum(count) - count, count)
+    shape = len(low), max(1, int(count.max()))
+    pixels = np.repeat(corners_px.mean(axis=1)[:, None], shape[1], axis=1)
+    pixels[marking, place] = np.column_stack([u, v])
+    place_of_cell = np.zeros(band.size, dtype=np.intp)
+    place_of_cell[cell] = place
+    near = _near_the_next(columns, size[:, 0])[marking, j], _near_the_next(rows, size[:, 1])[marking, i]
+    neighbours = np.zeros((2, *shape), dtype=np.intp)
+    for axis, following in ((0, 1), (1, across)):
+        neighbours[axis, marking, place] = np.where(near[axis], place_of_cell[cell + following], 0)
+    light, use, clipped = scene.look(u, v, marking, frames.view.camera.linear_response)
+    planes = np.zeros((3, *shape), dtype=np.float32)
+    planes[:, marking, place] = light
+    used, limited = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.bool_)
+    used[marking, place], limited[marking, place] = use, clipped
+    return _lattice_of(frames, frames.from_image(corners_px), pixels, (planes, used, limited), neighbours)
+
+
+_SEARCH_ALONG, _SEARCH_ACROSS = 40, 12
+"""Rows and columns of the coarse grid on which a fit begins."""
+
+_MARGIN_ALONG, _MARGIN_ACROSS = 0.2, 0.4
+"""How far it reaches beyond a quadrilateral, in its lengths and widths."""
+
+
+def lay_grid(scene: Scene, frames: StraightFrames, corners_px: FloatArray) -> tuple[Lattice, np.ndarray, FloatArray]:
+    """A coarse grid all over quadrilaterals ``corners_px`` (M, 4, 2), recorded px, and beyond them.
+
+    Returns:
+        The lattice, the network's probability of paint there (M, N), and how far apart its points are (M,), px.
+    """
+    corners = frames.from_image(corners_px)
+    length = side_frames(corners)[2]
+    lengthwise = length[:, 0] + length[:, 2] >= length[:, 1] + length[:, 3]
+    ordered = np.where(lengthwise[:, None, None], corners, following(corners))
+    a, b = (
+        (np.linspace(-margin, 1 + margin, count) for margin, count in
+        ((_MARGIN_ALONG, _SEARCH_ALONG), (_MARGIN_ACROSS, _SEARCH_ACROSS)))
+    )
+    a, b = (part.ravel() for part in np.meshgrid(a, b))
+    weight = np.stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b], axis=1)
+    pixels = np.round(frames.to_px(weight @ ordered))
+    pixels = np.clip(pixels, -(10**6), 10**6)
+    shape = pixels.shape[:2]
+    marking = np.repeat(np.arange(shape[0]), shape[1])
+    u, v = pixels.reshape(-1, 2).astype(np.intp).T
+    light, use, clipped = scene.look(u, v, marking, frames.view.camera.linear_response)
+    parts = (light.reshape(3, *shape), use.reshape(shape).astype(np.float32), clipped.reshape(shape))
+    paint = as_probability(scene.foreground.odds_at(pixels)).astype(np.float32)
+    spacing = length.max(axis=1) * (1 + 2 * _MARGIN_ALONG) / _SEARCH_ALONG
+    none = np.zeros((0, *shape), dtype=np.intp)
+    return _lattice_of(frames, corners, pixels, parts, none), paint, spacing
+
+
+def _lattice_of(
+    frames: StraightFrames,
+    corners: FloatArray,
+    pixels: FloatArray,
+    looked: tuple[np.ndarray, np.ndarray, np.ndarray],
+    neighbours: np.ndarray,
+) -> Lattice:
+    """A lattice of pixels (M, N, 2) about quadrilaterals (M, 4, 2) in their frames, whose light was looked up."""
+    light, used, limited = looked
+    points = np.ones((len(pixels), 3, pixels.shape[1]), dtype=np.float32)
+    points[:, :2] = frames.from_image(pixels).swapaxes(1, 2)
+    values = _clearest(light, used, _inside(corners, points))
+    hats, slope = _light_basis(corners, points)
+    of_side = _of_side(corners, points) * used[..., None]
+    clipped = limited.sum(axis=1) / np.maximum(used.sum(axis=1), 1)
+    return Lattice(points, values, used, limited, clipped, neighbours, of_side, hats, slope)
+
+
+_GREY_FIRST = 1.2
+"""By how many times clearer red or blue must be for grey to be left: grey has the least noise."""
+
+
+def _clearest(light: np.ndarray, used: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """Log grey, red or blue (3, M, N) of each marking, whichever tells its inside (M, N) best from the outside.
+
+    Yellow paint on light ground is as bright in grey, but darker in blue.
+    """
+    means, variances = [], []
+    for part in (inside * used, (1 - inside) * used):
+        count = np.maximum(part.sum(axis=1), 1)
+        mean = (light * part).sum(axis=2) / count
+        means.append(mean)
+        variances.append(((light - mean[..., None]) ** 2 * part).sum(axis=2) / count)
+    clear = np.abs(means[0] - means[1]) / np.sqrt(variances[0] + variances[1] + 1e-4)
+    clear[0] *= _GREY_FIRST
+    return np.asarray(light[clear.argmax(axis=0), np.arange(light.shape[1])])
+
+
+def _inside(corners: FloatArray, points: np.ndarray) -> np.ndarray:
+    """Which points (M, 3, N) lie inside quadrilaterals (M, 4, 2), float32 1 or 0."""
+    return np.asarray((_outward(corners) @ points).max(axis=1) < 0, dtype=np.float32)
+
+
+def _outward(corners: FloatArray) -> np.ndarray:
+    """Rows (M, 4, 3) that take (x, y, 1) to the distance outside each side."""
+    _, normal, _ = side_frames(corners)
+    rows = np.concatenate([normal, -(normal * corners).sum(axis=-1)[..., None]], axis=-1)
+    return rows.astype(np.float32)
+
+
+def _of_side(corners: FloatArray, points: np.ndarray) -> np.ndarray:
+    """Which side (M, N, 4), 1 or 0, every point (M, 3, N) is nearest to."""
+    nearest = (_outward(corners) @ points).argmax(axis=1)
+    return np.asarray(nearest[..., None] == np.arange(4), dtype=np.float32)
+
+
+def _light_basis(corners: FloatArray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Hat functions (M, KNOTS, N) along the longest side and a slope (M, N) across it, at points (M, 3, N)."""
+    tangent, _, length = side_frames(corners)
+    along = tangent[np.arange(len(corners)), length.argmax(axis=1)]
+    axes = np.stack([along, along[:, ::-1] * [-1.0, 1.0]], axis=1)
+    within = corners @ axes.swapaxes(1, 2)
+    middle = (within.max(axis=1) + within.min(axis=1)) / 2
+    half = np.ptp(within, axis=1) / 2 + _OUTSIDE_PX
+    rows = np.concatenate([axes / half[..., None], -(middle / half)[..., None]], axis=-1).astype(np.float32)
+    placed = np.clip(rows @ points, -1, 1)
+    at = (placed[:, :1] + 1) * np.float32((KNOTS - 1) / 2)
+    hats = np.maximum(1 - np.abs(at - np.arange(KNOTS, dtype=np.float32)[:, None]), 0)
+    return hats, placed[:, 1]
+
+
+def _near_the_next(places: np.ndarray, size: np.ndarray) -> BoolArray:
+    """Which places (M, n) along an axis, of those up to ``size`` (M,), are as near to the next as any is."""
+    apart = np.diff(places, append=places[:, -1:] + 1)
+    within = places + apart < size[:, None]
+    return np.asarray(apart == np.where(within, apart, apart.max()).min(axis=1, keepdims=True))
+
+
+def _lattice(corners: FloatArray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Columns (M, W) and rows (M, H) that leave about ``_MAX_PIXELS`` of the bands about sides, or some more.
+
+    Neighbouring pixels say nearly the same, so a large marking needs only some of them; columns or rows
+    are left out along the marking's longer extent, the finer sampling staying across it. Of a slim one few
+    are left out at its two ends, which tell how long it is, but more between.
+
+    Args:
+        corners: (M, 4, 2) px from the box's first pixel.
+        size: (M, 2) the box, px.
+    """
+    each = np.arange(len(corners))
+    along = np.where(size[:, 0] >= size[:, 1], 0, 1)
+    step, band = _lattice_steps(corners, along)
+    place, extent = np.sort(corners[each, :, along], axis=1), size[each, along]
+    thick = width(corners)
+    head = np.ceil(np.minimum(place[:, 1], place[:, 0] + thick) + _END_PX).astype(np.intp)
+    tail = np.floor(np.maximum(place[:, 2], place[:, 3] - thick) - _END_PX).astype(np.intp)
+    slim = (step[each, along] > 1) & (head + extent - tail < _MOST_ENDS * extent)
+    per_place = band / extent
+    between = np.ceil(per_place * (tail - head) / _MAX_BETWEEN).astype(np.intp)
+    at_ends = np.ceil(per_place * (head + extent - tail) / _MAX_AT_ENDS).astype(np.intp)
+    step[slim] = 1
+    step[each[slim], along[slim]] = np.maximum(between[slim], 1)
+    outer = np.ones_like(step)
+    outer[each[slim], along[slim]] = at_ends[slim]
+    bounds = np.zeros((len(corners), 2, 2), dtype=np.intp)
+    bounds[..., 1] = size
+    bounds[each[slim], along[slim]] = np.column_stack([head, tail])[slim]
+    columns, rows = (_steps(bounds[:, axis], step[:, axis], outer[:, axis], size[:, axis]) for axis in (0, 1))
+    return columns, rows
+
+
+def _steps(bounds: np.ndarray, step: np.ndarray, outer: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Places (M, n), every ``step``-th (M,) within ``bounds`` (M, 2) and every ``outer``-th without.
+
+    They go up to ``size`` (M,) and one farther, so that the last have no neighbour.
+    """
+    head, tail = bounds.T
+    first, between = -(-head // outer), -(-(tail - head) // step)
+    count = first + between + np.maximum(-(-(size - tail) // outer), 0)
+    k = np.arange(int(count.max()) + 1)
+    head, tail, step, outer = head[:, None], tail[:, None], step[:, None], outer[:, None]
+    first, between = first[:, None], between[:, None]
+    middle, last = head + (k - first) * step, tail + (k - first - between) * outer
+    return np.asarray(np.where(k < first, k * outer, np.where(k < first + between, middle, last)))
+
+
+def _lattice_steps(corners: FloatArray, along: np.ndarray) -> tuple[np.ndarray, FloatArray]:
+    """Steps (M, 2) along u and v that leave about ``_MAX_PIXELS`` of the band (M,) px about the sides."""
+    _, _, length = side_frames(corners)
+    longest, area = length.max(axis=1), np.abs(signed_area(corners))
+    band = area + _OUTSIDE_PX * (length.sum(axis=1) + 4 * _OUTSIDE_PX)
+    band -= np.maximum(longest - 2 * _INSIDE_PX, 0) * np.maximum(area / longest - 2 * _INSIDE_PX, 0)
+    ratio = np.maximum(band / _MAX_PIXELS, 1.0)
+    longer = np.ceil(ratio / np.maximum(ratio / 4, 1))
+    other = np.ceil(ratio / longer)
+    wide = along[:, None] == 0
+    step = np.where(wide, np.stack([longer, other], 1), np.stack([other, longer], 1)).astype(np.intp)
+    return step, band
+
+
+def _in_band(corners: FloatArray, bow_px: FloatArray, columns: np.ndarray, rows: np.ndarray) -> BoolArray:
+    """Which pixels (M, H, W) of a lattice are near the nearest side of quadrilaterals (M, 4, 2).
+
+    The sides are bowed by up to ``bow_px`` (M,).
+    """
+    _, normal, _ = side_frames(corners)
+    offset = (normal * corners).sum(axis=-1).astype(np.float32)
+    normal = normal.astype(np.float32)
+    u, v = columns[:, None, :].astype(np.float32), rows[:, :, None].astype(np.float32)
+    reach = np.full((len(corners), rows.shape[1], columns.shape[1]), -np.inf, dtype=np.float32)
+    for side in range(4):
+        by_row = normal[:, side, 1, None, None] * v - offset[:, side, None, None]
+        np.maximum(reach, normal[:, side, 0, None, None] * u + by_row, out=reach)
+    spare = bow_px.astype(np.float32)[:, None, None]
+    return np.asarray((reach < spare + np.float32(_OUTSIDE_PX)) & (reach > -spare - np.float32(_INSIDE_PX)))

@@ -1,1 +1,0 @@
-"""From what the network says of each pixel to pieces of paint, of which class, about where."""
