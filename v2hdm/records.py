@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
 
 DIAMOND = "diamond"
 LANE_DASH = "lane_dash"

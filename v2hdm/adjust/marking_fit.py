@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from v2hdm.adjust.pose_errors import Frames, Noise
-from v2hdm.adjust.problem import IntArray
 from v2hdm.adjust.rigid import adjoints, exp, hat, left_jacobians
-from v2hdm.records import FloatArray
+from v2hdm.records import FloatArray, IntArray
 
 # A point nearer than this to the plane of the camera cannot be projected, m.
 _MIN_DEPTH_M = 0.05

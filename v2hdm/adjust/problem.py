@@ -24,11 +24,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from v2hdm.records import FloatArray
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import FloatArray, IntArray
 
 POSE_STATES: tuple[str, ...] = ("x", "y", "height", "roll", "pitch", "heading")
 """What a frame can deviate in, in the order of its tangent."""

@@ -8,8 +8,7 @@ import numpy as np
 
 from v2hdm.ground.model import GroundHits, by_lens, by_pixel, hit_ground
 from v2hdm.ground.mount import Mount, rotation
-from v2hdm.ground.results import IntArray
-from v2hdm.records import BoolArray, FloatArray
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
 PIXEL_SIGMA = 0.4
 """What a patch's place in an image is off, px, at the most; the unit of the residuals."""

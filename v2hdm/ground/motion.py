@@ -8,8 +8,8 @@ import numpy as np
 
 from v2hdm.drive.rotation import rotation_from_euler
 from v2hdm.drive.trajectory import interpolate
-from v2hdm.ground.results import IntArray, Reading
-from v2hdm.records import Drive, FloatArray, Trajectory
+from v2hdm.ground.results import Reading
+from v2hdm.records import Drive, FloatArray, IntArray, Trajectory
 
 SMOOTHING_S = 0.5
 """Half width of the parabola fitted to the poses: steering and pedals change the motion no faster."""

@@ -12,9 +12,9 @@ from v2hdm.ground.matcher import Matcher
 from v2hdm.ground.motion import motion_of
 from v2hdm.ground.mount import Mount
 from v2hdm.ground.pairs import spread_pairs, turning_pairs
-from v2hdm.ground.results import IntArray, Reading
+from v2hdm.ground.results import Reading
 from v2hdm.ground.start import Start, find_start
-from v2hdm.records import Drive
+from v2hdm.records import Drive, IntArray
 
 _PAIRS = 10
 _APART_M = (1.2, 2.8)

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from v2hdm.adjust import (
     MODELS,
@@ -33,9 +32,7 @@ from v2hdm.mapping.sightings.location import locate
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.mapping.survey import control_points
-from v2hdm.records import BoolArray, Camera, FloatArray, PoseNoise
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, PoseNoise
 
 UNSURVEYED_CENTRE_SIGMA_M = 0.3
 """How well a camera centre is known that nobody has surveyed, but a coarse IPM implies."""

@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from v2hdm.adjust.incremental import IncrementalMap, RigPrior, State
 from v2hdm.adjust.marking_fit import MarkingObservations
@@ -32,9 +31,7 @@ from v2hdm.mapping.shapes import align, diameters
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.mapping.sightings.views import Views
-from v2hdm.records import BoolArray, Camera, FloatArray, PoseNoise
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, PoseNoise
 
 Link = Callable[[Rig, bool], tuple[Association, BoolArray]]
 """Tracks under a rig, coarse or not, and which corners (S, 4) may be used."""

@@ -14,7 +14,6 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from v2hdm.adjust import Status, select_model
 from v2hdm.errors import AdjustError, MappingError
@@ -39,9 +38,8 @@ from v2hdm.mapping.sightings.location import Located, locate
 from v2hdm.mapping.sightings.rig import Rig, build_rig
 from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.mapping.sightings.views import Views
-from v2hdm.records import BoolArray, Camera, CameraInfo, FloatArray, PoseNoise
+from v2hdm.records import BoolArray, Camera, CameraInfo, FloatArray, IntArray, PoseNoise
 
-IntArray = NDArray[np.int64]
 _log = logging.getLogger(__name__)
 
 SETTLED_MODEL = "heave"

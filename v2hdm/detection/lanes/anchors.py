@@ -19,10 +19,10 @@ from v2hdm.detection.lanes.curves import Horizon, basis
 from v2hdm.detection.lanes.ends import alone_from, solid_end
 from v2hdm.detection.lanes.groups import find_lines
 from v2hdm.detection.lanes.looks import UNKNOWN_LOOKS, Looks
-from v2hdm.detection.lanes.points import NEIGHBOURS, IntArray, Line, LinePoints
+from v2hdm.detection.lanes.points import NEIGHBOURS, Line, LinePoints
 from v2hdm.detection.odds import as_probability
 from v2hdm.detection.sight import AnchorRow
-from v2hdm.records import LANE_BOUNDARY, LANE_LINE, BoolArray, FloatArray, LaneDetection
+from v2hdm.records import LANE_BOUNDARY, LANE_LINE, BoolArray, FloatArray, IntArray, LaneDetection
 
 _MIN_CHAIN = 3
 _CHAIN_ODDS = 0.0

@@ -18,9 +18,9 @@ from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.lanes.company import COMPANY, company
 from v2hdm.detection.lanes.curves import Horizon
 from v2hdm.detection.lanes.looks import LOOKS, Looks
-from v2hdm.detection.lanes.points import IntArray, Line, LinePoints
+from v2hdm.detection.lanes.points import Line, LinePoints
 from v2hdm.detection.odds import as_probability
-from v2hdm.records import FloatArray
+from v2hdm.records import FloatArray, IntArray
 
 SCORE_FILE = Path(__file__).with_name("score.json")
 

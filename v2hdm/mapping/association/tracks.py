@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from v2hdm.mapping.association.groups import Association
@@ -19,9 +18,7 @@ from v2hdm.mapping.shapes import SHIFTS, align, diameters
 from v2hdm.mapping.sightings.location import Located
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import Sightings
-from v2hdm.records import BoolArray, FloatArray
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _REFUSED = 1e9
 

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from v2hdm.detection.camera.lens import undistort_points
 from v2hdm.mapping.sightings.backprojection import (
@@ -28,9 +27,8 @@ from v2hdm.records import (
     Drive,
     FloatArray,
     ImageDetections,
+    IntArray,
 )
-
-IntArray = NDArray[np.int64]
 
 _CENTRE_SIGMA_PX = 1.0
 """Noise of a detected centre point across its line: about a cell of the network's output."""

@@ -16,9 +16,7 @@ from scipy.spatial import cKDTree
 from v2hdm.mapping.options import AcceptanceOptions
 from v2hdm.mapping.shapes import is_convex, signed_area
 from v2hdm.planar import clip_convex
-from v2hdm.records import CORNERED_CLASSES, LANE_DASH, BoolArray, FloatArray
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import CORNERED_CLASSES, LANE_DASH, BoolArray, FloatArray, IntArray
 
 LACKS_A_CORNER = "a corner was never seen twice"
 ODD_SHAPE = "not shaped like the others of its class"

@@ -9,11 +9,8 @@ Both are homographies ``map_from_pinhole_px``, one per sighting.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from v2hdm.records import Camera, FloatArray
-
-IntArray = NDArray[np.int64]
 
 
 def forward_ipm(camera: Camera, ipm: FloatArray) -> FloatArray:

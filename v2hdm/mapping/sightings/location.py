@@ -18,8 +18,6 @@ from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.records import FloatArray
 
-IntArray = NDArray[np.int64]
-
 # Half the trace of a ground covariance beyond which a point is as good as on the horizon, m^2.
 _HORIZON_M2 = 1e4
 

@@ -11,14 +11,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from v2hdm.detection.camera.lens import undistort_points
 from v2hdm.mapping.sightings.backprojection import apply_homographies, posed_homographies
 from v2hdm.mapping.sightings.rig import Rig
-from v2hdm.records import OUTLINED_CLASSES, Drive, FloatArray, ImageDetections
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import OUTLINED_CLASSES, Drive, FloatArray, ImageDetections, IntArray
 
 _MAX_RANGE_M = 16.0
 """Farther from the camera a symbol's place on the ground is too vague to speak against a neighbour."""

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from v2hdm.detection.camera.lens import has_distortion, undistort_points
 from v2hdm.errors import MappingError
@@ -19,9 +18,8 @@ from v2hdm.records import (
     Drive,
     FloatArray,
     ImageDetections,
+    IntArray,
 )
-
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,7 @@ from scipy.spatial import cKDTree
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import frames_of
 from v2hdm.planar import inside_convex
-from v2hdm.records import Camera, Drive, FloatArray
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import Camera, Drive, FloatArray, IntArray
 
 _BORDER_PX = 10.0
 
