@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from models.marking_net import KIND_STRIDE, LANE_STRIDE, MULTIPLE, PAINT_STRIDE
 from train.config import DataConfig
-from v2hdm.detection.camera.ground import apply_homography, ipm_from_extrinsic
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.network import Network, NetworkInfo, NetworkOutput
 from v2hdm.detection.sight import look
+from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
 from v2hdm.records import PAINT_CLASSES, Camera
 from v2hdm.simulate.render.renderer import Renderer
 from v2hdm.simulate.training.hardships import Hardships

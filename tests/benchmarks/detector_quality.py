@@ -24,8 +24,7 @@ from tests.benchmarks.examples import HEIGHT, WIDTH, Example, TrueMarking, examp
 from tests.benchmarks.tusimple import TuSimple, judge
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.mapping.shapes import signed_area
-from v2hdm.planar import clip_convex
+from v2hdm.geometry.planar import clip_convex, signed_area
 from v2hdm.records import CORNERED_CLASSES, LANE_BOUNDARY, FloatArray, MarkingDetection
 
 CORNER_RANGE_M = 15.0

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from v2hdm.detection.camera.ground import apply_homography, ipm_from_extrinsic
-from v2hdm.detection.camera.lens import distort_points
-from v2hdm.planar import clip_convex, clip_half
+from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
+from v2hdm.geometry.lens import distort_points
+from v2hdm.geometry.planar import clip_convex, clip_half
 from v2hdm.records import (
     CORNERED_CLASSES,
     LANE_CLASSES,

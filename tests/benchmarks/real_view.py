@@ -10,8 +10,8 @@ import numpy as np
 
 from tests.benchmarks.real_reference import Painted
 from v2hdm.detection.batch import read_image
-from v2hdm.detection.camera.ground import apply_homography, ipm_from_extrinsic
-from v2hdm.detection.camera.lens import distort_points, undistort_points
+from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
+from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.records import LANE_DASH, CameraInfo, Drive, FloatArray
 
 LIGHT_RANGE_M = 15.0

@@ -12,9 +12,9 @@ from v2hdm.detection.corners.both_sides import painted_parts
 from v2hdm.detection.corners.evidence import Claim
 from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.corners.grey import linear_grey
-from v2hdm.detection.corners.quad import order_corners
 from v2hdm.detection.corners.refine import QuadStart, fit_markings
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.geometry.quadrilateral import order_corners
 from v2hdm.records import LANE_DASH
 
 VIEW = CameraView(make_camera("plumb_bob"))

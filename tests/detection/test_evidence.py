@@ -21,12 +21,12 @@ from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, JUDGE_FILE, SHAP
 from v2hdm.detection.corners.evidence import FEATURES, Steps, grey_steps, whole_ends
 from v2hdm.detection.corners.found import Corners
 from v2hdm.detection.corners.grey import linear_grey
-from v2hdm.detection.corners.quad import order_corners
 from v2hdm.detection.corners.rectified import CHANNELS
 from v2hdm.detection.corners.refine import doubt_corners
 from v2hdm.detection.corners.straight import Quads
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.geometry.quadrilateral import order_corners
 from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, STOP_LINE
 
 

@@ -9,9 +9,9 @@ from tests.detection.pictures import diamond, foreground_of, make_camera, to_ima
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.evidence import Claim
 from v2hdm.detection.corners.outline_fit import fit_outlines
-from v2hdm.detection.corners.quad import order_corners
 from v2hdm.detection.corners.refine import QuadStart, fit_markings
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.geometry.quadrilateral import order_corners
 from v2hdm.records import MarkingDetection
 
 DIAMOND = order_corners(np.array([[300.0, 200.0], [360.0, 180.0], [415.0, 206.0], [350.0, 232.0]]))

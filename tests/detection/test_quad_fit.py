@@ -9,10 +9,10 @@ from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.correlation import variance_inflation
 from v2hdm.detection.corners.covariance import corner_covariance
 from v2hdm.detection.corners.grey import linear_grey
-from v2hdm.detection.corners.quad import intersect_sides, order_corners, side_frames
 from v2hdm.detection.corners.quad_fit import fit_quads
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.geometry.quadrilateral import intersect_sides, order_corners, side_frames
 from v2hdm.records import STOP_LINE
 
 SHAPES = [diamond(x, y, 1.2, 0.7, 9.0 * y) for x in (6.0, 8.0, 10.0) for y in (-1.9, -0.3, 1.4)]

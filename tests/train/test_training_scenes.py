@@ -7,8 +7,8 @@ import pytest
 
 from train.config import DataConfig
 from train.data import RenderStream, validation_pairs
-from v2hdm.detection.camera.lens import undistort_points
-from v2hdm.planar import clip_convex, inside_convex
+from v2hdm.geometry.lens import undistort_points
+from v2hdm.geometry.planar import clip_convex, inside_convex
 from v2hdm.records import (
     DIAMOND,
     LANE_CLASSES,

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from v2hdm.detection.camera.lens import undistort_points
 from v2hdm.detection.camera.view import ASIDE_RAD
+from v2hdm.geometry.lens import undistort_points
 from v2hdm.records import LANE_DASH, PAINT_CLASSES, STOP_LINE
 from v2hdm.simulate.render.scene import Paint, Scene
 from v2hdm.simulate.training import scenes

@@ -1,6 +1,6 @@
 r"""What is estimated from what: the model, as plain numpy records.
 
-Unknown are, in the frames of :mod:`v2hdm.geometry.transform`,
+Unknown are, in the frames of :mod:`v2hdm.geometry`,
 
 - the extrinsic ``cam_from_vehicle`` of every camera,
 - the corners of the markings ``corners_map`` (x, y); the ground is z = 0,

@@ -12,7 +12,6 @@ import numpy as np
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.evidence import Claim
 from v2hdm.detection.corners.foreground import Foreground
-from v2hdm.detection.corners.quad import is_convex
 from v2hdm.detection.corners.refine import QuadStart, fit_markings
 from v2hdm.detection.lanes.anchors import link_anchors
 from v2hdm.detection.lanes.centre_lines import LanePaint, trace_lanes
@@ -35,6 +34,7 @@ from v2hdm.detection.paint.starts import starting_corners
 from v2hdm.detection.sight import look
 from v2hdm.detection.stopwatch import lap
 from v2hdm.errors import DetectorError
+from v2hdm.geometry.quadrilateral import is_convex_px as is_convex
 from v2hdm.records import (
     DIAMOND,
     LANE_CLASSES,

@@ -11,11 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from v2hdm.geometry.ipm import project_ground
+from v2hdm.geometry.quadrilateral import SHIFTS
 from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.mapping.shapes import SHIFTS
 from v2hdm.mapping.sightings.table import Sightings
-from v2hdm.mapping.sightings.views import project_ground
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 # Root mean square distance from which a sighting does not fit as it is, and the share of it that another

@@ -10,7 +10,7 @@ import numpy as np
 from v2hdm.adjust.gating import noise_scale
 from v2hdm.adjust.incremental import IncrementalMap
 from v2hdm.adjust.observability import observed
-from v2hdm.adjust.rigid import exp
+from v2hdm.geometry.rigid import exp
 from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.markings.completion import SolvedCorners, completed_corners
 from v2hdm.mapping.markings.conclude import Observed, reprojected, residuals_under, root_mean_square

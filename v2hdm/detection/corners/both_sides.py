@@ -13,11 +13,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from v2hdm.detection.camera.ground import apply_homography
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.corners.grey import GreyBand, log_grey
-from v2hdm.detection.corners.quad import following
+from v2hdm.geometry.ipm import apply_homography
+from v2hdm.geometry.quadrilateral import following
 from v2hdm.records import BoolArray, FloatArray
 
 LONGEST_DASH_M = 12.0

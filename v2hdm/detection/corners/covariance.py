@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.detection.corners.quad import preceding
+from v2hdm.geometry.quadrilateral import preceding
 from v2hdm.records import BoolArray, FloatArray
 
 

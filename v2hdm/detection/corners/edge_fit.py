@@ -17,7 +17,7 @@ from v2hdm.detection.corners.correlation import variance_inflation
 from v2hdm.detection.corners.covariance import corner_covariance
 from v2hdm.detection.corners.grey import GreyBand
 from v2hdm.detection.corners.normal import normal_cdf, normal_pdf
-from v2hdm.detection.corners.quad import (
+from v2hdm.geometry.quadrilateral import (
     following,
     interior_angles,
     intersect_sides,

@@ -13,8 +13,8 @@ import numpy as np
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.corners.grey import GreyBand, log_grey
-from v2hdm.detection.corners.quad import preceding, side_frames, width
 from v2hdm.detection.corners.straight import Quads
+from v2hdm.geometry.quadrilateral import preceding, side_frames, width
 from v2hdm.records import BoolArray, FloatArray
 
 FEATURES = (

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from v2hdm.detection.corners.covariance import corner_covariance
-from v2hdm.detection.corners.quad import following, intersect_sides, is_convex, preceding, side_frames
+from v2hdm.geometry.quadrilateral import following, intersect_sides, preceding, side_frames
+from v2hdm.geometry.quadrilateral import is_convex_px as is_convex
 from v2hdm.records import BoolArray, FloatArray
 
 _CENTRAL_SHARE = 0.8

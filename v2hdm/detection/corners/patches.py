@@ -8,8 +8,9 @@ from functools import cached_property
 import numpy as np
 
 from v2hdm.detection.corners.grey import GreyBand
-from v2hdm.detection.corners.quad import side_frames, signed_area, width
 from v2hdm.detection.corners.straight import StraightFrames
+from v2hdm.geometry.planar import signed_area
+from v2hdm.geometry.quadrilateral import side_frames, width
 from v2hdm.records import BoolArray, FloatArray
 
 _OUTSIDE_PX = 3.0

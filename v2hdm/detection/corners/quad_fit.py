@@ -18,8 +18,10 @@ from v2hdm.detection.corners.correlation import variance_inflation
 from v2hdm.detection.corners.coverage import blurred_coverage
 from v2hdm.detection.corners.grey import GreyBand
 from v2hdm.detection.corners.patches import Patches, cut_patches
-from v2hdm.detection.corners.quad import is_convex, preceding, side_frames, signed_area
 from v2hdm.detection.corners.straight import StraightFrames
+from v2hdm.geometry.planar import signed_area
+from v2hdm.geometry.quadrilateral import is_convex_px as is_convex
+from v2hdm.geometry.quadrilateral import preceding, side_frames
 from v2hdm.records import BoolArray, FloatArray
 
 _WIDER_BLUR_PX = 0.8

@@ -15,8 +15,8 @@ import numpy as np
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.corners.grey import grey_of, linear_bgr, log_grey
-from v2hdm.detection.corners.quad import following, side_frames
 from v2hdm.detection.corners.straight import Quads
+from v2hdm.geometry.quadrilateral import following, side_frames
 from v2hdm.records import DIAMOND, LANE_LINE, OTHER_PAINT, OUTLINED_CLASSES, FloatArray
 
 CHANNELS = ("log_grey", "blueness", "paint_odds", "own_share", "line_share", "symbol_share", "outside")

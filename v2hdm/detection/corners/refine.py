@@ -19,11 +19,12 @@ from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.corners.found import Corners, block_diagonal, is_cut, largest_sigma
 from v2hdm.detection.corners.grey import GreyBand, linear_grey
 from v2hdm.detection.corners.outline_fit import fit_outlines
-from v2hdm.detection.corners.quad import is_convex, side_frames, width
 from v2hdm.detection.corners.quad_fit import fit_quads
 from v2hdm.detection.corners.rectified import rectified_views
 from v2hdm.detection.corners.straight import Quads
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.geometry.quadrilateral import is_convex_px as is_convex
+from v2hdm.geometry.quadrilateral import side_frames, width
 from v2hdm.records import DIAMOND, LANE_DASH, BoolArray, FloatArray, MarkingDetection
 
 TYPICAL_BLUR_PX = 0.75

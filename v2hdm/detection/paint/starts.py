@@ -5,10 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from v2hdm.detection.camera.ground import apply_homography
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.corners.quad import order_corners, quad_from_hull
 from v2hdm.detection.paint.stripe import stripe_of
+from v2hdm.geometry.ipm import apply_homography
+from v2hdm.geometry.quadrilateral import order_corners, quad_from_hull
 from v2hdm.records import CROSSWALK_BAR, LANE_DASH, STOP_LINE, FloatArray
 
 _RECTANGLES = (LANE_DASH, STOP_LINE, CROSSWALK_BAR)

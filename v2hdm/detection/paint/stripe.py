@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.detection.camera.ground import apply_homography
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.corners.quad import order_corners
+from v2hdm.geometry.ipm import apply_homography
+from v2hdm.geometry.quadrilateral import order_corners
 from v2hdm.records import FloatArray
 
 _BINS = 24

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from v2hdm.geometry.quadrilateral import align, diameters
 from v2hdm.mapping.association.groups import Association, FusedGroups
-from v2hdm.mapping.shapes import align, diameters
 from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.records import FloatArray, IntArray
 

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from v2hdm.geometry.quadrilateral import characteristic_lengths
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.mapping.markings.acceptance import characteristic_lengths, count_peers, least_peers
+from v2hdm.mapping.markings.acceptance import count_peers, least_peers
 from v2hdm.mapping.options import AcceptanceOptions
 from v2hdm.records import BoolArray, FloatArray, IntArray
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from v2hdm.mapping.markings.acceptance import characteristic_lengths
+from v2hdm.geometry.quadrilateral import characteristic_lengths
 from v2hdm.mapping.markings.completion import SolvedCorners
 from v2hdm.mapping.markings.paint_error import PaintError, learn_paint_error
 from v2hdm.records import FloatArray, IntArray

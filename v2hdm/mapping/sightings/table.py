@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.detection.camera.lens import has_distortion, undistort_points
 from v2hdm.errors import MappingError
+from v2hdm.geometry.lens import has_distortion, undistort_points
 from v2hdm.mapping.sightings.symbols import NO_SYMBOLS, Symbols, collect_symbols
 from v2hdm.records import (
     CORNERED_CLASSES,

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from v2hdm.detection.camera.lens import distort_points
+from v2hdm.geometry.lens import distort_points
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, CameraInfo, FloatArray
 from v2hdm.simulate.render.scene import Box
 
@@ -27,7 +28,7 @@ def points_seen(
     info: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray, boxes: Sequence[Box]
 ) -> BoolArray:
     """Which ground points (N, 2) an image shows: inside its border, within 40 m, not behind a box."""
-    centre = -cam_from_map[:3, :3].T @ cam_from_map[:3, 3]
+    centre = camera_centre(cam_from_map)
     seen = np.hypot(*(points_map - centre[:2]).T) < _FARTHEST_M
     seen[seen] = inside_image(info, cam_from_map, points_map[seen])
     near = [b for b in boxes if _may_hide(b, cam_from_map, float(centre[2]))]

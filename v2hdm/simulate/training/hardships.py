@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.planar import inside_convex
+from v2hdm.geometry.planar import inside_convex
 from v2hdm.records import CORNERED_CLASSES, FloatArray
 from v2hdm.simulate.render.optics import Optics
 from v2hdm.simulate.render.scene import Bgr, Box, GroundMarks, Light, Paint, Shadow, box_footprint

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.detection.camera.lens import distort_points, undistort_points
+from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.records import CORNERED_CLASSES, PAINT_CLASSES, SEEN_ACROSS, FloatArray
 from v2hdm.simulate.render.renderer import Renderer
 from v2hdm.simulate.render.scene import Backdrop, Bgr, Dapple, Ground, Light, Scene, Shadow
