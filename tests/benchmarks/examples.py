@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
+from train.scenes.scenes import image_line, image_points, random_scene
+from train.scenes.views import TrainingView, random_view
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import clip_convex, clip_half
@@ -25,8 +27,6 @@ from v2hdm.records import (
 )
 from v2hdm.simulate.render.renderer import Rendered, Renderer
 from v2hdm.simulate.render.scene import Scene
-from v2hdm.simulate.training.scenes import image_line, image_points, random_scene
-from v2hdm.simulate.training.views import TrainingView, random_view
 
 SEED = 771_000_003
 """No training or validation seed, whatever their index: those start from single-digit seeds."""

@@ -7,6 +7,28 @@ import pytest
 
 from train.config import DataConfig
 from train.data import RenderStream, validation_pairs
+from train.scenes.hardships import (
+    Hardships,
+    blue_shade,
+    faint,
+    kerbs,
+    overexposed,
+    things_beside,
+    tight_bend,
+    with_pavements,
+    with_seams,
+)
+from train.scenes.paint import (
+    Bend,
+    RoadPaint,
+    port_paint,
+    random_brush,
+    rectangle,
+    rhombus,
+    street_paint,
+)
+from train.scenes.scenes import image_line, image_points, random_scene, training_sample
+from train.scenes.views import TrainingView, looking
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.planar import clip_convex, inside_convex
 from v2hdm.records import (
@@ -19,28 +41,6 @@ from v2hdm.records import (
 )
 from v2hdm.simulate.render.optics import Motion, Optics
 from v2hdm.simulate.render.scene import Light, box_footprint
-from v2hdm.simulate.training.hardships import (
-    Hardships,
-    blue_shade,
-    faint,
-    kerbs,
-    overexposed,
-    things_beside,
-    tight_bend,
-    with_pavements,
-    with_seams,
-)
-from v2hdm.simulate.training.paint import (
-    Bend,
-    RoadPaint,
-    port_paint,
-    random_brush,
-    rectangle,
-    rhombus,
-    street_paint,
-)
-from v2hdm.simulate.training.scenes import image_line, image_points, random_scene, training_sample
-from v2hdm.simulate.training.views import TrainingView, looking
 
 TINY = DataConfig(width=64, height=32, render_width=80, render_height=48, views_per_render=2, reservoir=3)
 

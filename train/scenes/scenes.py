@@ -11,12 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.geometry.lens import distort_points, undistort_points
-from v2hdm.records import CORNERED_CLASSES, PAINT_CLASSES, SEEN_ACROSS, FloatArray
-from v2hdm.simulate.render.renderer import Renderer
-from v2hdm.simulate.render.scene import Backdrop, Bgr, Dapple, Ground, Light, Scene, Shadow
-from v2hdm.simulate.training.clutter import ground_marks, port_boxes, street_boxes
-from v2hdm.simulate.training.hardships import (
+from train.scenes.clutter import ground_marks, port_boxes, street_boxes
+from train.scenes.hardships import (
     NONE,
     Hardships,
     blue_shade,
@@ -30,8 +26,12 @@ from v2hdm.simulate.training.hardships import (
     with_pavements,
     with_seams,
 )
-from v2hdm.simulate.training.paint import Bend, RoadPaint, port_paint, random_brush, rectangle, street_paint
-from v2hdm.simulate.training.views import TrainingView, random_view, turned_aside
+from train.scenes.paint import Bend, RoadPaint, port_paint, random_brush, rectangle, street_paint
+from train.scenes.views import TrainingView, random_view, turned_aside
+from v2hdm.geometry.lens import distort_points, undistort_points
+from v2hdm.records import CORNERED_CLASSES, PAINT_CLASSES, SEEN_ACROSS, FloatArray
+from v2hdm.simulate.render.renderer import Renderer
+from v2hdm.simulate.render.scene import Backdrop, Bgr, Dapple, Ground, Light, Scene, Shadow
 
 # The renderer keeps one tile per fleck size, so sizes come from a short list.
 _NEAR_M = 0.3
