@@ -18,7 +18,7 @@ import numpy as np
 
 from tests.benchmarks.adjust_ports import port_config
 from tests.benchmarks.detector_quality import counted, summary
-from tests.benchmarks.examples import Example, example_of
+from train.examples import Example, example_of
 from train.scenes.views import TrainingView
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.records import Camera, FloatArray

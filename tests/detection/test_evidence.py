@@ -7,7 +7,6 @@ import numpy as np
 import onnx
 import pytest
 
-from tests.benchmarks.detector_confidence import fit
 from tests.detection.pictures import (
     bar,
     brightness_model,
@@ -17,6 +16,7 @@ from tests.detection.pictures import (
     picture,
     to_image,
 )
+from train.fit_judge import fit
 from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, JUDGE_FILE, SHAPES, TOLD, confidence
 from v2hdm.detection.corners.evidence import FEATURES, Steps, grey_steps, whole_ends
 from v2hdm.detection.corners.found import Corners

@@ -3,7 +3,7 @@
 It is asked twice. First of each one alone: the network in ``judge.onnx`` gets what was measured of it and
 what it looks like. Then of each among the others, as probable as they were alone: a logistic function of what
 they say of it, whose weights are in ``confidence.json``. Both belong to the paint network beside them;
-``python -m tests.benchmarks.detector_confidence`` fits them to renders which no benchmark shows. What speaks
+``python -m train.fit_judge`` fits them to renders which no benchmark shows. What speaks
 for a diamond does not speak for a dash, so each of the :data:`SHAPES` has its own weights.
 """
 

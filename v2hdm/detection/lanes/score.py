@@ -2,7 +2,7 @@
 
 First each line is judged alone, then among the others of its image (:mod:`v2hdm.detection.lanes.company`).
 The weights, in ``score.json`` beside this file, belong to the network; they are those that
-``python -m tests.benchmarks.detector_lanes --write`` fits to renders which no benchmark shows.
+``python -m train.fit_lane_score --write`` fits to renders which no benchmark shows.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Teaches the detector's confidence what claims of the shipped network are worth.
 
-    python -m tests.benchmarks.detector_confidence --write
+    python -m train.fit_judge --write
 
 Run it after another network was put in place; it takes three quarters of an hour. Quadrilaterals that the
 detector proposes on rendered scenes, first two thirds of full difficulty, then a third of easy ones, are true
@@ -29,10 +29,9 @@ import numpy as np
 
 from export.judge_file import write_judge
 from models.judge import Judge
-from tests.benchmarks.detector_quality import polygon_overlap
-from tests.benchmarks.examples import Example, example
-from tests.benchmarks.sworn_flecks import Spots, lit, swearing
+from train.examples import Example, example, polygon_overlap
 from train.judge import JudgeConfig, Quadrilaterals, judged, train_judge
+from train.sworn_flecks import Spots, lit, swearing
 from v2hdm.detection.corners.confidence import (
     CONFIDENCE_FILE,
     JUDGE_FILE,

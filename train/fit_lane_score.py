@@ -1,6 +1,6 @@
 """Fits the weights of the score of lanes' lines, ``v2hdm/detection/lanes/score.json``, to the network.
 
-    python -m tests.benchmarks.detector_lanes --images 450 --write
+    python -m train.fit_lane_score --images 450 --write
 
 Run it after another network was put in place. The lines that the detector proposes on rendered scenes,
 sure or not, two thirds of them of full difficulty and a third easy ones, are true if four fifths of the
@@ -24,9 +24,8 @@ from unittest.mock import patch
 import cv2
 import numpy as np
 
-from tests.benchmarks.detector_confidence import FOLDS, fit, log_loss, renders_to_fit
-from tests.benchmarks.detector_quality import LANE_TOLERANCE_PX
-from tests.benchmarks.examples import Example
+from train.examples import LANE_TOLERANCE_PX, Example
+from train.fit_judge import FOLDS, fit, log_loss, renders_to_fit
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.lanes import anchors, score

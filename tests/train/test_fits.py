@@ -6,11 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.benchmarks.detector_confidence import Gathered
-from tests.benchmarks.detector_lanes import proposed, seen
-from tests.benchmarks.detector_quality import polygon_overlap
-from tests.benchmarks.examples import Example, example
-from tests.benchmarks.sworn_flecks import Spots, lit, swearing
+from train.examples import Example, example, polygon_overlap
+from train.fit_judge import Gathered
+from train.fit_lane_score import proposed, seen
+from train.sworn_flecks import Spots, lit, swearing
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import MarkingDetection
