@@ -17,7 +17,7 @@ from tests.detection.pictures import (
     to_image,
 )
 from train.fit_judge import fit
-from v2hdm.detection.corners.confidence import CONFIDENCE_FILE, JUDGE_FILE, SHAPES, TOLD, confidence
+from v2hdm.detection.corners.confidence import SHAPES, TOLD, confidence
 from v2hdm.detection.corners.evidence import FEATURES, Steps, grey_steps, whole_ends
 from v2hdm.detection.corners.found import Corners
 from v2hdm.detection.corners.grey import linear_grey
@@ -26,6 +26,7 @@ from v2hdm.detection.corners.refine import doubt_corners
 from v2hdm.detection.corners.straight import Quads
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
 from v2hdm.geometry.quadrilateral import order_corners
 from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, STOP_LINE
 

@@ -26,7 +26,7 @@ from v2hdm.records import PAINT_CLASSES
 
 ROOT = Path(__file__).resolve().parents[2]
 CONF = str(ROOT / "conf")
-SHIPPED = ROOT / "v2hdm" / "detection" / "default.onnx"
+SHIPPED = ROOT / "v2hdm" / "detection" / "weights" / "default.onnx"
 
 SMALL = NetConfig(widths=[16, 16, 16, 16], dilations=[1, 2])
 

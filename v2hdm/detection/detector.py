@@ -33,6 +33,7 @@ from v2hdm.detection.paint.plausible import (
 from v2hdm.detection.paint.starts import starting_corners
 from v2hdm.detection.sight import look
 from v2hdm.detection.stopwatch import lap
+from v2hdm.detection.weights import check_weights
 from v2hdm.errors import DetectorError
 from v2hdm.geometry.quadrilateral import is_convex_px as is_convex
 from v2hdm.records import (
@@ -89,9 +90,10 @@ class Detector:
         """Load a model: ``path``, else ``options.model``, else the one that is shipped.
 
         Raises:
-            DetectorError: the model cannot be used.
+            DetectorError: the model cannot be used, or the shipped files do not belong together.
         """
         options = options or DetectorOptions()
+        check_weights()
         path = path if path is not None else options.model
         return cls(Network(None if path is None else Path(path), options.threads), options)
 

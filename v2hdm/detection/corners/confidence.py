@@ -20,10 +20,9 @@ import numpy as np
 from v2hdm.detection.corners.company import COMPANY, company
 from v2hdm.detection.network import open_session
 from v2hdm.detection.odds import as_probability
+from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
 from v2hdm.records import DIAMOND, LANE_DASH, FloatArray
 
-CONFIDENCE_FILE = Path(__file__).parents[1] / "confidence.json"
-JUDGE_FILE = Path(__file__).parents[1] / "judge.onnx"
 JUDGE_INPUTS = ("views", "evidence", "shape")
 
 _Fit = tuple[FloatArray, float]
