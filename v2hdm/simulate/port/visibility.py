@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, CameraInfo, FloatArray
@@ -46,10 +47,8 @@ def _may_hide(box: Box, cam_from_map: FloatArray, height_m: float) -> bool:
 
 def inside_image(info: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray) -> BoolArray:
     """Which ground points (N, 2) fall between the image's borders."""
-    cam = points_map @ cam_from_map[:3, :2].T + cam_from_map[:3, 3]
-    inside = cam[:, 2] > _NEAR_M
-    pinhole = np.full((len(cam), 2), np.inf)
-    pinhole[inside] = (cam[inside] @ info.intrinsic.T)[:, :2] / cam[inside, 2:]
+    pinhole, depth_m = project_ground(info.intrinsic, cam_from_map, points_map)
+    inside = depth_m > _NEAR_M
     # Far outside the image the lens polynomial folds back; only near it are its values meaningful.
     margin = np.array([info.width, info.height]) * 0.25
     inside &= ((pinhole > -margin) & (pinhole < 5.0 * margin)).all(axis=1)
