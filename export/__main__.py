@@ -1,4 +1,4 @@
-"""The door: ``python -m export checkpoint=runs/train/best.pt output=v2hdm/detection/default.onnx``."""
+"""The door: ``python -m export checkpoint=CHECKPOINT output=v2hdm/detection/weights/default.onnx``."""
 
 from __future__ import annotations
 

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from models.marking_net import KIND_STRIDE, LANE_STRIDE, MULTIPLE, PAINT_STRIDE
 from train.config import DataConfig
-from v2hdm.detection.camera.ground import apply_homography, ipm_from_extrinsic
+from train.scenes.hardships import Hardships
+from train.scenes.scenes import random_scene
+from train.scenes.views import TrainingView, random_view
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.network import Network, NetworkInfo, NetworkOutput
 from v2hdm.detection.sight import look
+from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
 from v2hdm.records import PAINT_CLASSES, Camera
 from v2hdm.simulate.render.renderer import Renderer
-from v2hdm.simulate.training.hardships import Hardships
-from v2hdm.simulate.training.scenes import random_scene
-from v2hdm.simulate.training.views import TrainingView, random_view
 
 FRAME_SIZES = ((1280, 720), (1248, 384), (1920, 1088))
 """Widths and heights of the cameras that take turns; multiples of 32 px, so that none of them is padded."""

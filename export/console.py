@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from export.config import ExportConfig, Precision
+from export.manifest import record_network
 from export.onnx_file import Tell, export_float, export_int8
 from export.source import Source, read_source
 
@@ -22,6 +23,10 @@ def run(config: ExportConfig, tell: Tell = lambda share, doing: None) -> str:
     source = read_source(Path(config.checkpoint))
     output = Path(config.output)
     parity = _export(source, output, config, tell)
+    precision = f"precision={config.precision.value}"
+    record_network(
+        output, f"python -m export checkpoint={config.checkpoint} output={config.output} {precision}"
+    )
     size_mb = output.stat().st_size / 1e6
     iou = source.label["metrics"].get("mean_iou", float("nan"))
     return f"{output}: {size_mb:.2f} MB, step {source.label['steps']}, mean IoU {iou:.3f}, {parity}"

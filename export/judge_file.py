@@ -32,7 +32,8 @@ def write_judge(judge: Judge, views_shape: tuple[int, int, int], label: dict[str
         DetectorError: the file's answers would not be the network's.
     """
     rows_of_each = {0: torch.export.Dim("rows", min=1, max=4096)}
-    model = graph_of(judge, _any_rows(judge, views_shape, 5), list(JUDGE_OUTPUTS), (rows_of_each,) * 3, _OPSET)
+    given = _any_rows(judge, views_shape, 5)
+    model = graph_of(judge, given, list(JUDGE_OUTPUTS), (rows_of_each,) * 3, _OPSET)
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     for rows in _ROWS:
         given = _any_rows(judge, views_shape, rows)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.simulate.training.scenes import TrainingSample
+from train.scenes.scenes import TrainingSample
 
 Bytes = NDArray[np.uint8]
 

@@ -15,7 +15,7 @@ class DataConfig:
     oftener the more paint it shows, each time another crop of ``width`` x ``height`` px in other light. Past
     renders to show again are kept in a ``reservoir``. ``easy_samples`` renders pass until scenes are as hard
     as they get. ``shadows_on_paint`` and those that follow it up to ``aside``
-    are the :class:`~v2hdm.simulate.training.hardships.Hardships` of the renders.
+    are the :class:`~train.scenes.hardships.Hardships` of the renders.
 
     ``coco`` and ``tusimple`` are files of users' own labels: polygons of markings in COCO's format, lanes in
     TuSimple's. The images' names in them start from ``coco_images`` and ``tusimple_images``, or else from the

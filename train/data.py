@@ -14,9 +14,9 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 from train.augment import random_crop, random_photometry
 from train.config import DataConfig
 from train.labels import LabelledImages, read_labels
+from train.scenes.hardships import Hardships
+from train.scenes.scenes import TrainingSample, training_sample
 from train.targets import Targets, targets
-from v2hdm.simulate.training.hardships import Hardships
-from v2hdm.simulate.training.scenes import TrainingSample, training_sample
 from v2hdm.workers import undisturbed_starts
 
 _VALIDATION_SEED_OFFSET = 1_000_003

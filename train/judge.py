@@ -19,8 +19,8 @@ _LEAST_DEVIATION = 1e-6
 class Quadrilaterals:
     """N of them: ``views`` (N, C, S, S), ``evidence`` (N, F), one-hot ``shape`` (N, K), ``true`` (N,).
 
-    ``side_error`` (N, 4), px, is how far the true side lies outside the fitted one, nan where that is not known,
-    and ``side_variance`` (N, 4), px^2, what the fit says of it; sides are in the order of the views.
+    ``side_error`` (N, 4), px, is how far the true side lies outside the fitted one, nan where that is not
+    known, and ``side_variance`` (N, 4), px^2, what the fit says of it; sides are in the order of the views.
     ``claimed_channels`` and ``claimed_features`` are those of views and evidence that are claims of the paint
     network; the others are the image's.
     """
@@ -101,7 +101,8 @@ def train_judge(known: Quadrilaterals, config: JudgeConfig) -> Judge:
 
 
 _FREEDOM = 4.0
-"""Degrees of freedom of the t distribution that errors of sides have: a few are of something else altogether."""
+"""Degrees of freedom of the t distribution that errors of sides have: a few are of something else
+altogether."""
 
 
 def _side_loss(error: torch.Tensor, variance: torch.Tensor, log_sigma: torch.Tensor) -> torch.Tensor:

@@ -15,12 +15,12 @@ from train.labels_coco import read_coco
 from train.labels_image import LabelledImage, Shape
 from train.labels_raster import coverage
 from train.labels_tusimple import read_tusimple
+from train.scenes.scenes import TrainingSample
 from train.targets import IGNORE, Targets, targets
 from v2hdm.detection.image_file import read_bgr
 from v2hdm.drive.image_header import image_size
 from v2hdm.errors import ConfigError, DriveError, LabelError
 from v2hdm.records import PAINT_CLASSES
-from v2hdm.simulate.training.scenes import TrainingSample
 
 _NEAR_A_LABEL = 0.75
 """How often a view is taken around something that is labelled; the rest is taken anywhere."""

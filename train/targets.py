@@ -13,8 +13,8 @@ from skimage.measure import label
 from torch import Tensor
 
 from models.marking_net import KIND_STRIDE, LANE_STRIDE, PAINT_STRIDE
+from train.scenes.scenes import TrainingSample
 from v2hdm.records import PAINT_CLASSES, FloatArray
-from v2hdm.simulate.training.scenes import TrainingSample
 
 IGNORE = 255
 """Marks elements that carry no loss."""

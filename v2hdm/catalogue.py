@@ -106,7 +106,9 @@ def _read_class(name: str, entry: Any, path: Path) -> MarkingClass:
     softness = entry.get("softness", _SOFTNESS)
     if not (isinstance(softness, (int, float)) and softness > 0):
         raise ConfigError(f"{path}: softness of {name!r} is {softness!r}; give a positive number")
-    return MarkingClass(name, family, ranges["length_m"], ranges["width_m"], entry.get("group", name), float(softness))
+    return MarkingClass(
+        name, family, ranges["length_m"], ranges["width_m"], entry.get("group", name), float(softness)
+    )
 
 
 def size_of(points_m: FloatArray) -> tuple[float, float]:

@@ -12,10 +12,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from v2hdm.detection.camera.mounting import guessed_extrinsic
 from v2hdm.detection.image_file import read_bgr
 from v2hdm.drive import ReadOptions, read_drive
 from v2hdm.errors import ConfigError
+from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.ground import GroundEstimate
 from v2hdm.ground.rig import estimate_cameras
 from v2hdm.quality import Status, Verdict, check_drive
@@ -73,7 +73,7 @@ def draw(drive: Drive, folder: Path, found: Mapping[str, FloatArray]) -> None:
     save_route(folder / "route.png", drive.recorded or drive.trajectory or _of_images(drive))
     for name, camera in drive.cameras.items():
         images = [image for image in drive.images if image.camera == name]
-        mountings = {"guess": guessed_extrinsic(camera)}
+        mountings = {"guess": extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm])}
         if name in found:
             mountings["ground"] = found[name]
         for number in range(_PICTURES):

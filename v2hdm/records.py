@@ -1,6 +1,6 @@
 """The records that travel between the parts: plain frozen dataclasses over numpy arrays.
 
-Frames are those of :mod:`v2hdm.geometry.transform`: ``map`` (ENU, metres, z up, ground near
+Frames are those of :mod:`v2hdm.geometry`: ``map`` (ENU, metres, z up, ground near
 z = 0), ``vehicle`` (x forward, y left, z up, origin on the ground under the rear axle), ``cam``
 (optical: z forward, x right, y down), ``px`` (u right, v down, the centre of the top-left pixel
 is (0, 0)). Transforms are 4 x 4 float64 matrices named ``dst_from_src``. Image points come in two
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
 
 DIAMOND = "diamond"
 LANE_DASH = "lane_dash"
@@ -344,7 +345,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Where one camera sits: ``cam_from_vehicle`` (4 x 4) and the IPM that follows from it.
+    """Where one camera sits: ``cam_from_vehicle`` (4 x 4).
 
     ``covariance`` (6, 6) is that of the left-perturbation tangent of ``cam_from_vehicle``, in the
     order translation (m), rotation (rad); None where the method has none.
@@ -353,17 +354,3 @@ class Calibration:
     info: CameraInfo
     cam_from_vehicle: FloatArray
     covariance: FloatArray | None = None
-
-    @property
-    def vehicle_from_pinhole_px(self) -> FloatArray:
-        """The IPM (3 x 3, unit norm): pinhole pixels to the ground plane z = 0 of the vehicle.
-
-        Its inverse has the columns K [r1 r2 t] of ``cam_from_vehicle`` (Hartley and Zisserman,
-        Multiple View Geometry, 2nd ed., eq. 8.1).
-
-        Raises:
-            numpy.linalg.LinAlgError: when the camera centre lies on the ground plane.
-        """
-        pinhole_px_from_vehicle = self.info.intrinsic @ self.cam_from_vehicle[:3][:, [0, 1, 3]]
-        ipm = np.linalg.inv(pinhole_px_from_vehicle)
-        return np.asarray(ipm / np.linalg.norm(ipm))

@@ -26,6 +26,7 @@ from v2hdm.detection.json_line import as_record
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.road import Road, RoadDetector
 from v2hdm.detection.stopwatch import Stopwatch, lap
+from v2hdm.detection.weights import unknown_network
 from v2hdm.drive import READERS, read_drive
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.files import forget_stdout, whole_file
@@ -59,6 +60,9 @@ def watch(parsed: argparse.Namespace) -> None:
     if parsed.camera is None:
         options.max_range_m = _ROUGH_RANGE_M
     detector = Detector.load(options=options)
+    unknown = unknown_network(parsed.model) if parsed.model is not None else None
+    if unknown is not None:
+        print(unknown, file=sys.stderr)
     job = _job(parsed, detector)
     stopwatch = Stopwatch()
     failure = None

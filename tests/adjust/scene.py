@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from v2hdm.adjust import Observations, PoseSigma, Problem
-from v2hdm.geometry import transform
+from v2hdm.geometry import tensors as transform
 
 WIDTH, HEIGHT, FOCAL = 1280, 720, 900.0
 PIXEL_SIGMA = 0.7
@@ -28,7 +29,9 @@ class Scene:
 
     def rotation_error_deg(self, cam_from_vehicle: np.ndarray) -> np.ndarray:
         off = cam_from_vehicle[:, :3, :3] @ self.cam_from_vehicle[:, :3, :3].transpose(0, 2, 1)
-        return np.rad2deg(transform.rotation_angle(torch.as_tensor(off)).numpy())
+        return np.rad2deg(
+            np.linalg.norm(Rotation.from_matrix(off.reshape(-1, 3, 3)).as_rotvec(), axis=1)
+        ).reshape(off.shape[:-2])
 
 
 def exp(tangent: np.ndarray) -> np.ndarray:

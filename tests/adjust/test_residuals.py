@@ -25,7 +25,7 @@ from v2hdm.adjust.residuals import (
     wrenches,
 )
 from v2hdm.adjust.robust import loss
-from v2hdm.geometry.transform import exp
+from v2hdm.geometry.tensors import exp
 
 POSES = PoseSigma(position_drift=Drift(0.016, 10.0), heading_drift=Drift(0.0006, 5.0))
 

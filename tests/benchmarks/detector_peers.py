@@ -27,6 +27,8 @@ import onnxruntime
 import pytest
 
 from tests.benchmarks.detector_peer_graphs import PEERS
+from train.scenes.scenes import random_scene
+from train.scenes.views import looking
 from v2hdm.detection.image_file import read_bgr
 from v2hdm.detection.road import RoadDetector
 from v2hdm.detection.stopwatch import Stopwatch, lap
@@ -34,8 +36,6 @@ from v2hdm.hdmap import write_calibration
 from v2hdm.records import Calibration, CameraInfo
 from v2hdm.simulate.render.optics import Motion, Optics
 from v2hdm.simulate.render.renderer import Renderer
-from v2hdm.simulate.training.scenes import random_scene
-from v2hdm.simulate.training.views import looking
 
 WIDTH, HEIGHT = 1280, 720
 OURS = "ours, read to metres"

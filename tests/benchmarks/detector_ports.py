@@ -18,12 +18,12 @@ import numpy as np
 
 from tests.benchmarks.adjust_ports import port_config
 from tests.benchmarks.detector_quality import counted, summary
-from tests.benchmarks.examples import Example, example_of
-from v2hdm.detection.camera.ground import ipm_from_extrinsic
+from train.examples import Example, example_of
+from train.scenes.views import TrainingView
+from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.records import Camera, FloatArray
 from v2hdm.simulate.port.build import Port, build_port
 from v2hdm.simulate.render.optics import Motion, Optics
-from v2hdm.simulate.training.views import TrainingView
 
 SEED = 9001
 """No shipped run has it."""

@@ -20,17 +20,14 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from tests.benchmarks.examples import HEIGHT, WIDTH, Example, TrueMarking, example
 from tests.benchmarks.tusimple import TuSimple, judge
+from train.examples import HEIGHT, LANE_TOLERANCE_PX, WIDTH, Example, TrueMarking, example, polygon_overlap
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.mapping.shapes import signed_area
-from v2hdm.planar import clip_convex
 from v2hdm.records import CORNERED_CLASSES, LANE_BOUNDARY, FloatArray, MarkingDetection
 
 CORNER_RANGE_M = 15.0
 ANY_CONFIDENCE = 0.05
-LANE_TOLERANCE_PX = 20.0
 LANE_MATCH = 0.85
 
 _NARROW_PX = (0.0, 6.0, 14.0, np.inf)
@@ -141,13 +138,6 @@ def _at_rows(line: FloatArray, rows: FloatArray) -> FloatArray:
     """Columns of a line (N, 2) on image rows; nan where it does not reach."""
     order = np.argsort(line[:, 1])
     return np.interp(rows, line[order, 1], line[order, 0], left=np.nan, right=np.nan)
-
-
-def polygon_overlap(first: FloatArray, second: FloatArray) -> float:
-    """Intersection over union of the hulls of two polygons."""
-    a, b = (cv2.convexHull(p.astype(np.float32))[:, 0].astype(np.float64) for p in (first, second))
-    common, first_area, second_area = (abs(float(signed_area(p))) for p in (clip_convex(a, b), a, b))
-    return common / max(first_area + second_area - common, 1e-6)
 
 
 def average_precision(scored: list[tuple[float, bool]], truths: int) -> float:

@@ -18,8 +18,10 @@ import numpy as np
 
 from v2hdm.drive import read_drive
 from v2hdm.drive.truth import read_truth
+from v2hdm.geometry.ipm import ipm_from_extrinsic
+from v2hdm.geometry.rigid import rotation_from_vector
 from v2hdm.ground import GroundOptions, estimate_ground
-from v2hdm.ground.mount import guessed_mount, rotation
+from v2hdm.ground.mount import guessed_mount
 from v2hdm.records import Calibration, Camera, Drive, FloatArray, Trajectory
 
 UNITS = ("roll deg", "pitch deg", "yaw deg", "height cm")
@@ -29,9 +31,10 @@ def disturbed(camera: Camera, off_deg: FloatArray) -> Camera:
     """The camera with its guess turned about its own centre by a rotation vector in its own axes."""
     guess = guessed_mount(camera)
     turned = replace(
-        guess, vehicle_from_cam_rotation=guess.vehicle_from_cam_rotation @ rotation(np.deg2rad(off_deg))
+        guess,
+        vehicle_from_cam_rotation=guess.vehicle_from_cam_rotation @ rotation_from_vector(np.deg2rad(off_deg)),
     )
-    ipm = Calibration(camera.info, turned.cam_from_vehicle).vehicle_from_pinhole_px
+    ipm = ipm_from_extrinsic(camera.info, turned.cam_from_vehicle)
     return replace(camera, ipm={"estimated": ipm}, initial_ipm="estimated")
 
 
@@ -73,7 +76,7 @@ def with_info(drive: Drive, camera: str, focal: float = 1.0, pinhole: bool = Fal
     distortion = (0.0,) * len(old.info.distortion) if pinhole else old.info.distortion
     guess = guessed_mount(old).cam_from_vehicle
     info = replace(old.info, intrinsic=intrinsic, distortion=distortion)
-    ipm = {"estimated": Calibration(info, guess).vehicle_from_pinhole_px}
+    ipm = {"estimated": ipm_from_extrinsic(info, guess)}
     changed = replace(old, info=info, ipm=ipm, initial_ipm="estimated")
     return replace(drive, cameras={**drive.cameras, camera: changed})
 

@@ -10,8 +10,9 @@ import numpy as np
 
 from tests.benchmarks.real_reference import Painted
 from v2hdm.detection.batch import read_image
-from v2hdm.detection.camera.ground import apply_homography, ipm_from_extrinsic
-from v2hdm.detection.camera.lens import distort_points, undistort_points
+from v2hdm.geometry.ipm import apply_in_front, ground_from_pinhole_px, project_ground
+from v2hdm.geometry.lens import distort_points, undistort_points
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import LANE_DASH, CameraInfo, Drive, FloatArray
 
 LIGHT_RANGE_M = 15.0
@@ -29,18 +30,14 @@ class View:
 
     def project(self, points_map: FloatArray) -> FloatArray:
         """Pixels (N, 2) of ground points (N, 2), nan behind the camera."""
-        cam = points_map @ self.cam_from_map[:3, :2].T + self.cam_from_map[:3, 3]
-        cam[cam[:, 2] < _NEAREST_M] = np.nan
-        pinhole = (cam @ self.info.intrinsic.T)[:, :2] / cam[:, 2:]
+        pinhole, depth_m = project_ground(self.info.intrinsic, self.cam_from_map, points_map)
+        pinhole[depth_m < _NEAREST_M] = np.nan
         return distort_points(self.info, pinhole)
 
     def ground(self, points_px: FloatArray) -> FloatArray:
         """Ground points (N, 2) m of pixels (N, 2); nan above the horizon."""
         pinhole = undistort_points(self.info, points_px)
-        ipm = ipm_from_extrinsic(self.info, self.cam_from_map)
-        ground = apply_homography(ipm, pinhole)
-        depth = ground @ self.cam_from_map[2, :2] + self.cam_from_map[2, 3]
-        return np.where((depth > 0)[:, None], ground, np.nan)
+        return apply_in_front(ground_from_pinhole_px(self.info.intrinsic, self.cam_from_map), pinhole)
 
     def range_m(self, point_map: FloatArray) -> float:
         """Distance on the ground of a point (2,) from the camera."""
@@ -48,7 +45,7 @@ class View:
 
     def ranges_m(self, points_map: FloatArray) -> FloatArray:
         """Distances (N,) on the ground of points (N, 2) from the camera."""
-        centre = -self.cam_from_map[:3, :3].T @ self.cam_from_map[:3, 3]
+        centre = camera_centre(self.cam_from_map)
         return np.asarray(np.linalg.norm(points_map - centre[:2], axis=1))
 
     def holds(self, polygon_px: FloatArray) -> bool:

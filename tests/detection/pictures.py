@@ -16,13 +16,13 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from v2hdm.detection.camera.ground import apply_homography, ipm_from_extrinsic
-from v2hdm.detection.camera.lens import distort_points, undistort_points
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.markings.foreground import Foreground
-from v2hdm.detection.markings.quad import order_corners
-from v2hdm.detection.markings.rectified import rectified_views
 from v2hdm.detection.markings.frames import Quads
+from v2hdm.detection.markings.rectified import rectified_views
+from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
+from v2hdm.geometry.lens import distort_points, undistort_points
+from v2hdm.geometry.quadrilateral import order_corners
 from v2hdm.records import DIAMOND, PAINT_CLASSES, Camera, CameraInfo
 
 HEIGHT, WIDTH = 360, 640

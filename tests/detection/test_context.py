@@ -3,10 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.detection.pictures import crisp_view
 from v2hdm.detection.markings.context import COMPANY, company
-from v2hdm.detection.markings.judge import judge_among
-from v2hdm.detection.markings.evidence import FEATURES
 from v2hdm.records import DIAMOND, LANE_DASH, FloatArray
 
 
@@ -85,15 +82,9 @@ def test_one_that_is_alone_or_above_the_horizon_has_no_company() -> None:
 
 
 def test_a_doubtful_diamond_is_believed_among_others_like_it() -> None:
-    evidence = np.zeros((4, len(FEATURES)))
-    evidence[:, FEATURES.index("odds_inside")] = 4.0
-    for name in ("certainty", "share", "support", "sharpness"):
-        evidence[:, FEATURES.index(name)] = 1.0
-    evidence[0, FEATURES.index("odds_inside")] = 1.0
-    kinds = [DIAMOND] * 4
+    odds, kinds = np.array([0.5, 4.0, 4.0, 4.0]), [DIAMOND] * 4
     field = np.stack([diamond(4.0 + 3 * k, 0) for k in range(4)])
     mixed = field.copy()
     mixed[1:] = 4 + 0.4 * (mixed[1:] - 4)
-    views = np.stack([crisp_view(DIAMOND)] * 4)
-    among, apart = (confidence(evidence, views, kinds, ground)[0] for ground in (field, mixed))
-    assert 1 - apart > 5 * (1 - among)
+    among, apart = (judge_among(odds, ground, kinds)[0] for ground in (field, mixed))
+    assert 1 - apart > 2 * (1 - among)

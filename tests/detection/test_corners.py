@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import bar, brightness_model, diamond, make_camera, picture, to_image
-from v2hdm.detection.markings.quad import signed_area
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError
+from v2hdm.geometry.planar import signed_area
 
 NEAR = [diamond(5.4, y, 1.2, 0.7, yaw) for y, yaw in ((-1.1, 12.0), (0.1, -7.0), (1.2, 20.0))]
 FAR = [diamond(x, y, 1.2, 0.7, 9.0 * y) for x in (8.0, 10.0, 12.5, 15.0) for y in (-2.3, -0.4, 1.6)]

@@ -10,7 +10,7 @@ from v2hdm.detection.markings.correlation import variance_inflation
 from v2hdm.detection.markings.fit import fit_quadrilaterals
 from v2hdm.detection.markings.lattice import Scene
 from v2hdm.detection.markings.propose import open_sides
-from v2hdm.detection.markings.quad import order_corners, side_frames
+from v2hdm.geometry.quadrilateral import order_corners, side_frames
 
 
 def fitted(image, camera, shapes, off_px=1.0, seed=0):

@@ -6,11 +6,11 @@ import torch
 
 from tests.detection.pictures import extrinsic, make_camera, to_image
 from v2hdm.detection.camera.footprint import Footprint
-from v2hdm.detection.camera.ground import ipm_from_extrinsic
 from v2hdm.detection.camera.mounting import camera_from_calibration, rough_calibration
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.errors import MapFileError
-from v2hdm.geometry.transform import exp
+from v2hdm.geometry.ipm import ipm_from_extrinsic
+from v2hdm.geometry.tensors import exp
 from v2hdm.records import Calibration, Camera, CameraInfo
 
 CORNERS = np.array([[6.0, 1.0], [7.0, 1.5], [6.5, 2.0], [5.5, 1.5]])

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import LENSES, extrinsic, make_camera
-from v2hdm.detection.camera.ground import (
+from v2hdm.detection.camera.view import FARTHEST_M, CameraView
+from v2hdm.geometry.ipm import (
     apply_homography,
     extrinsic_from_ipm,
     homography_jacobian,
     ipm_from_extrinsic,
 )
-from v2hdm.detection.camera.lens import distort_points, undistort_points
-from v2hdm.detection.camera.view import FARTHEST_M, CameraView
+from v2hdm.geometry.lens import distort_points, undistort_points
 
 GRID_PX = np.stack(np.meshgrid(np.linspace(0, 639, 17), np.linspace(0, 359, 11)), axis=-1).reshape(-1, 2)
 
@@ -47,13 +47,13 @@ def test_the_ipm_takes_the_projection_of_a_ground_point_back_to_it():
 def test_an_extrinsic_comes_back_from_its_ipm_at_any_scale_and_sign(scale):
     info = make_camera("pinhole").info
     ipm = scale * ipm_from_extrinsic(info, extrinsic())
-    np.testing.assert_allclose(extrinsic_from_ipm(info, ipm, np.array([8.0, 0.0])), extrinsic(), atol=1e-9)
+    np.testing.assert_allclose(extrinsic_from_ipm(info, ipm), extrinsic(), atol=1e-9)
 
 
 def test_an_extrinsic_from_a_disturbed_ipm_is_still_a_rigid_motion():
     info = make_camera("pinhole").info
     ipm = ipm_from_extrinsic(info, extrinsic()) * (1 + 1e-3 * np.random.default_rng(0).normal(size=(3, 3)))
-    rotation = extrinsic_from_ipm(info, ipm, np.array([8.0, 0.0]))[:3, :3]
+    rotation = extrinsic_from_ipm(info, ipm)[:3, :3]
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1.0)
 

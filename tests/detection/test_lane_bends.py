@@ -5,12 +5,12 @@ import pytest
 
 from tests.detection.pictures import make_camera, to_image
 from tests.detection.test_anchors import anchors_of
-from v2hdm.detection.camera.ground import ipm_from_extrinsic
+from train.scenes.views import random_view
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.lanes.anchors import link_anchors
 from v2hdm.detection.lanes.bends import Seen, beside_guide
+from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.records import LANE_BOUNDARY, LANE_LINE, Camera, LaneDetection
-from v2hdm.simulate.training.views import random_view
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.lanes import score
 from v2hdm.detection.lanes.anchors import link_anchors
 from v2hdm.detection.sight import AnchorRow
+from v2hdm.detection.weights import LANE_SCORE_FILE
 
 
 @pytest.fixture
@@ -24,7 +25,7 @@ def score_of(view, rows, paint=()):
 
 
 def test_the_file_holds_a_weight_for_each_feature_and_no_other():
-    content = json.loads(score.SCORE_FILE.read_text(encoding="utf-8"))
+    content = json.loads(LANE_SCORE_FILE.read_text(encoding="utf-8"))
     assert tuple(content) == ("alone", "among")
     for part, names in (("alone", score.FEATURES), ("among", score.TOLD)):
         assert tuple(content[part]["weights"]) == names

@@ -3,22 +3,22 @@
 import cv2
 import numpy as np
 import pytest
+from v2hdm.detection.paint.plausible import Heads, head_of
 
+from v2hdm.detection.markings.blobs import Blob, find_blobs, outline_polygon, zero_crossings
 from v2hdm.detection.markings.coverage import blurred_coverage
 from v2hdm.detection.markings.normal import normal_cdf, normal_pdf
-from v2hdm.detection.markings.quad import (
+from v2hdm.detection.sight import Sight
+from v2hdm.geometry.planar import signed_area
+from v2hdm.geometry.quadrilateral import (
     interior_angles,
     intersect_sides,
-    is_convex,
     order_corners,
     quad_from_hull,
     side_frames,
-    signed_area,
     width,
 )
-from v2hdm.detection.markings.blobs import Blob, find_blobs, outline_polygon, zero_crossings
-from v2hdm.detection.paint.plausible import Heads, head_of
-from v2hdm.detection.sight import Sight
+from v2hdm.geometry.quadrilateral import is_convex_px as is_convex
 from v2hdm.records import PAINT_CLASSES
 
 KITE = order_corners(np.array([[20.3, 10.2], [40.1, 14.9], [19.4, 19.3], [3.2, 15.5]]))

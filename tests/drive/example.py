@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 
 from v2hdm.drive import Trajectory, write_drive
-from v2hdm.drive.rotation import rotation_from_euler
 from v2hdm.drive.truth import write_truth
+from v2hdm.geometry.ipm import ipm_from_extrinsic
+from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.records import (
-    Calibration,
     Camera,
     CameraInfo,
     CentrePrior,
@@ -60,12 +60,12 @@ def make_drive(folder: Path, stamps: tuple[float, ...] = (100.05, 100.95, 101.25
     cameras, images = {}, []
     for number, name in enumerate(("front", "rear")):
         info = camera_info(name)
-        ipm = Calibration(info, looking_forward(2.0 + number)).vehicle_from_pinhole_px
+        ipm = ipm_from_extrinsic(info, looking_forward(2.0 + number))
         cameras[name] = Camera(
             info=info,
             ipm={
                 "calibrated": ipm,
-                "estimated": Calibration(info, looking_forward(2.2)).vehicle_from_pinhole_px,
+                "estimated": ipm_from_extrinsic(info, looking_forward(2.2)),
             },
             initial_ipm="estimated",
             roi_vehicle=np.array([[3.0, -3.0], [9.0, -3.0], [9.0, 3.0], [3.0, 3.0]]),

@@ -18,15 +18,15 @@ from export.parity import PARITY_SIZES
 from models import MarkingNet, NetConfig, Prediction
 from train.checkpoint import Checkpoint
 from train.config import DataConfig, TrainConfig
+from train.scenes.scenes import training_sample
 from train.targets import IGNORE, paint_target
 from v2hdm.detection.network import METADATA_KEY
 from v2hdm.errors import DetectorError
 from v2hdm.records import PAINT_CLASSES
-from v2hdm.simulate.training.scenes import training_sample
 
 ROOT = Path(__file__).resolve().parents[2]
 CONF = str(ROOT / "conf")
-SHIPPED = ROOT / "v2hdm" / "detection" / "default.onnx"
+SHIPPED = ROOT / "v2hdm" / "detection" / "weights" / "default.onnx"
 
 SMALL = NetConfig(widths=[16, 16, 16, 16], dilations=[1, 2])
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from v2hdm.detection.camera.lens import undistort_points
-from v2hdm.drive.rotation import rotation_from_euler
 from v2hdm.drive.trajectory import interpolate
+from v2hdm.geometry.ipm import ipm_from_extrinsic
+from v2hdm.geometry.lens import undistort_points
+from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.records import (
-    Calibration,
     Camera,
     CameraInfo,
     CentrePrior,
@@ -78,7 +78,7 @@ def make_drive(folder: Path, turn_deg: float, true: FloatArray, contrast: float 
         images.append(Image("front", float(stamp), file, pose))
     camera = Camera(
         INFO,
-        {"estimated": Calibration(INFO, true).vehicle_from_pinhole_px},
+        {"estimated": ipm_from_extrinsic(INFO, true)},
         "estimated",
         ROI,
         CentrePrior(CENTRE, np.full(3, 0.02)),
@@ -88,7 +88,7 @@ def make_drive(folder: Path, turn_deg: float, true: FloatArray, contrast: float 
 
 def with_guess(drive: Drive, guess: FloatArray) -> Drive:
     """The drive with another guess of its mounting."""
-    ipm = {"estimated": Calibration(INFO, guess).vehicle_from_pinhole_px}
+    ipm = {"estimated": ipm_from_extrinsic(INFO, guess)}
     return replace(drive, cameras={"front": replace(drive.cameras["front"], ipm=ipm)})
 
 

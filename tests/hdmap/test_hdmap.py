@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.drive.example import ORIGIN, camera_info, looking_forward, make_map
-from v2hdm.detection.camera.ground import ipm_from_extrinsic
 from v2hdm.errors import MapFileError
 from v2hdm.hdmap import read_calibration, read_geojson, with_heights, write_calibration, write_geojson
 from v2hdm.hdmap.geodetic import enu_from_geodetic, geodetic_from_enu
@@ -184,13 +183,6 @@ def test_sigmas_are_written_in_metres_and_degrees(tmp_path: Path) -> None:
     text = (tmp_path / "front.yaml").read_text()
     assert "translation_sigma_m: [0.01, 0.02, 0.03]" in text
     assert "rotation_sigma_deg: [0.1" in text
-
-
-def test_the_ipm_of_a_calibration_is_that_of_the_vehicle() -> None:
-    calibration = Calibration(camera_info(), looking_forward())
-    np.testing.assert_allclose(
-        calibration.vehicle_from_pinhole_px, ipm_from_extrinsic(camera_info(), looking_forward()), atol=1e-15
-    )
 
 
 def test_a_calibration_with_a_typo_is_refused(tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from v2hdm.detection.camera.ground import ipm_from_extrinsic
-from v2hdm.detection.camera.lens import distort_points
+from v2hdm.geometry.ipm import ipm_from_extrinsic
+from v2hdm.geometry.lens import distort_points
 from v2hdm.records import (
     Camera,
     CameraInfo,

@@ -6,16 +6,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tests.mapping.scene import MOUNTS, SceneOptions, extrinsic, make_scene
-from v2hdm.detection.camera.ground import ipm_from_extrinsic
-from v2hdm.mapping.sightings.backprojection import (
-    apply_homographies,
+from v2hdm.geometry.ipm import (
+    apply_in_front,
     direction_covariance,
-    forward_ipm,
-    homography_jacobians,
-    plain_homographies,
-    posed_homographies,
+    facing_ipm,
+    flat_motion,
+    ground_from_pinhole_px,
+    homography_jacobian,
+    ipm_from_extrinsic,
+    project_ground,
 )
-from v2hdm.mapping.sightings.views import project_ground
 
 INTRINSIC = np.array([[900.0, 0, 640], [0, 900, 350], [0, 0, 1]])
 
@@ -33,8 +33,8 @@ def test_projecting_and_back_projecting_under_a_tilted_pose_is_the_identity() ->
     points = (np.array([[8.0, 1.0], [12.0, -2.0]]) @ pose[:2, :2].T + pose[:2, 3])[None]
     pixel, depth = project_ground(INTRINSIC[None], (cam_from_vehicle @ np.linalg.inv(pose))[None], points)
     assert (depth > 0).all()
-    back = posed_homographies(INTRINSIC[None], cam_from_vehicle[None], pose[None])
-    np.testing.assert_allclose(apply_homographies(back, pixel), points, atol=1e-9)
+    back = ground_from_pinhole_px(INTRINSIC[None], (cam_from_vehicle @ np.linalg.inv(pose))[None])
+    np.testing.assert_allclose(apply_in_front(back, pixel), points, atol=1e-9)
 
 
 def test_for_a_level_vehicle_the_plain_route_is_the_posed_one() -> None:
@@ -44,29 +44,27 @@ def test_for_a_level_vehicle_the_plain_route_is_the_posed_one() -> None:
     pose[:2, 3] = 3.0, 4.0
     scene = make_scene(SceneOptions(length_m=2.0))
     info = scene.drive.cameras["front"].info
-    ipm = forward_ipm(scene.drive.cameras["front"], -ipm_from_extrinsic(info, cam_from_vehicle))
+    ipm = facing_ipm(-ipm_from_extrinsic(info, cam_from_vehicle), np.array([8.0, 0.0]))
     pixels = np.array([[[500.0, 500.0], [800.0, 420.0]]])
-    posed = posed_homographies(info.intrinsic[None], cam_from_vehicle[None], pose[None])
-    plain = plain_homographies(ipm[None], pose[None])
-    np.testing.assert_allclose(
-        apply_homographies(plain, pixels), apply_homographies(posed, pixels), atol=1e-9
-    )
+    posed = ground_from_pinhole_px(info.intrinsic[None], (cam_from_vehicle @ np.linalg.inv(pose))[None])
+    plain = flat_motion(pose[None]) @ ipm
+    np.testing.assert_allclose(apply_in_front(plain, pixels), apply_in_front(posed, pixels), atol=1e-9)
 
 
 def test_a_pixel_above_the_horizon_has_no_ground_point() -> None:
-    back = posed_homographies(INTRINSIC[None], extrinsic(*MOUNTS["front"])[None], np.eye(4)[None])
-    assert np.isnan(apply_homographies(back, np.array([[[640.0, 10.0]]]))).all()
+    back = ground_from_pinhole_px(INTRINSIC[None], extrinsic(*MOUNTS["front"])[None])
+    assert np.isnan(apply_in_front(back, np.array([[[640.0, 10.0]]]))).all()
 
 
 def test_jacobians_agree_with_differences() -> None:
-    back = posed_homographies(INTRINSIC[None], extrinsic(*MOUNTS["front"])[None], np.eye(4)[None])
+    back = ground_from_pinhole_px(INTRINSIC[None], extrinsic(*MOUNTS["front"])[None])
     pixel, step = np.array([[[600.0, 480.0]]]), 1e-4
-    jacobian = homography_jacobians(back, pixel)[0, 0]
+    jacobian = homography_jacobian(back, pixel)[0, 0]
     for axis in range(2):
         ahead, behind = pixel.copy(), pixel.copy()
         ahead[..., axis] += step
         behind[..., axis] -= step
-        change = (apply_homographies(back, ahead) - apply_homographies(back, behind)) / (2 * step)
+        change = (apply_in_front(back, ahead) - apply_in_front(back, behind)) / (2 * step)
         np.testing.assert_allclose(jacobian[:, axis], change[0, 0], rtol=1e-6)
 
 

@@ -14,9 +14,9 @@ import yaml
 
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.drive import ReadOptions, read_drive
-from v2hdm.drive.rotation import rotation_from_euler
 from v2hdm.drive.tum import read_tum, write_tum
 from v2hdm.errors import ConfigError, DetectorError, DriveError, V2hdmError
+from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.hdmap.calibration import read_calibration
 from v2hdm.hdmap.geojson import read_geojson
 from v2hdm.mapping.options import AcceptanceOptions, LaneOptions, MappingOptions

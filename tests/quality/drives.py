@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.drive.rotation import rotation_from_euler
+from v2hdm.geometry.ipm import ipm_from_extrinsic
+from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.quality import Finding, Status
 from v2hdm.quality.inputs.motion import Motion
 from v2hdm.records import (
-    Calibration,
     Camera,
     CameraInfo,
     CentrePrior,
@@ -76,7 +76,7 @@ def camera(pitch_deg: float = 15.0, centre: FloatArray = CENTRE) -> Camera:
     info = CameraInfo("front", 1280, 720, intrinsic, "plumb_bob", (-0.1, 0.02, 0.0, 0.0, 0.0))
     return Camera(
         info=info,
-        ipm={"estimated": Calibration(info, cam_from_vehicle).vehicle_from_pinhole_px},
+        ipm={"estimated": ipm_from_extrinsic(info, cam_from_vehicle)},
         initial_ipm="estimated",
         roi_vehicle=np.array([[7.0, -3.0], [14.0, -3.0], [14.0, 3.0], [7.0, 3.0]]),
         centre_prior=CentrePrior(CENTRE, np.full(3, 0.02)),

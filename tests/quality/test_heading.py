@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.quality.drives import motion, poses, raised, trajectory, with_yaw, yaw_of
-from v2hdm.drive.rotation import quaternion_from_rotation, rotation_from_euler, rotation_from_quaternion
+from v2hdm.geometry.rigid import quaternion_from_rotation, rotation_from_euler, rotation_from_quaternion
 from v2hdm.quality import Status
 from v2hdm.quality.inputs.heading import Path, check_heading
 from v2hdm.quality.inputs.path import check_attitude

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.quality.drives import NOISE, motion, poses, raised
-from v2hdm.drive.rotation import rotation_from_euler
+from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.quality import Status
 from v2hdm.quality.inputs.path import check_attitude, check_jumps, check_path
 

@@ -9,8 +9,8 @@ import pytest
 
 from tests.quality.drives import camera, drive, poses
 from tests.quality.test_ground_findings import estimate
-from v2hdm.detection.camera.ground import apply_homography
-from v2hdm.detection.camera.lens import undistort_points
+from v2hdm.geometry.ipm import apply_homography
+from v2hdm.geometry.lens import undistort_points
 from v2hdm.ground import GroundEstimate, GroundOptions, GroundStatus, Reading
 from v2hdm.quality.inputs import suspects
 from v2hdm.quality.inputs.suspects import find_suspect, scaled, upside_down

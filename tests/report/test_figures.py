@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from tests.report.scene import diamond_at, make_truth
-from v2hdm.detection.camera.ground import ipm_from_extrinsic
+from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.records import HdMap
 from v2hdm.report.figures import save_birdseye, save_growth, save_overlay
 from v2hdm.report.table import results_table

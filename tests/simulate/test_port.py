@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 
 from tests.simulate.conftest import FRONT, tiny_port
-from v2hdm.detection.camera.ground import apply_homography, ipm_from_extrinsic
-from v2hdm.detection.camera.lens import distort_points
 from v2hdm.drive.trajectory import interpolate
 from v2hdm.errors import ConfigError
+from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic, project_ground
+from v2hdm.geometry.lens import distort_points
 from v2hdm.records import DIAMOND, LANE_DASH, CameraInfo
 from v2hdm.simulate.port.build import Port, build_port
-from v2hdm.simulate.port.calibration import calibrate, cam_from_vehicle, camera_info, project_ground
+from v2hdm.simulate.port.calibration import calibrate, cam_from_vehicle, camera_info
 from v2hdm.simulate.port.config import (
     CalibrationConfig,
     DisturbanceConfig,
@@ -61,7 +61,7 @@ def test_a_camera_pitched_down_looks_at_the_ground_ahead() -> None:
 def test_the_borrowed_ipm_is_decimetres_wrong_and_the_own_one_is_not(port: Port, name: str) -> None:
     camera = port.cameras[name]
     inner = camera.roi_vehicle.mean(axis=0) + 0.95 * (camera.roi_vehicle - camera.roi_vehicle.mean(axis=0))
-    pinhole = project_ground(camera.info, port.cam_from_vehicle[name], inner)
+    pinhole, _ = project_ground(camera.info.intrinsic, port.cam_from_vehicle[name], inner)
     error = {k: np.linalg.norm(apply_homography(m, pinhole) - inner, axis=1) for k, m in camera.ipm.items()}
     assert np.sqrt((error["estimated"] ** 2).mean()) > 0.2
     assert np.sqrt((error["calibrated"] ** 2).mean()) < 0.06
@@ -156,7 +156,7 @@ def test_hidden_points_are_those_the_picture_hides() -> None:
     points = np.random.default_rng(1).uniform((5, -4), (25, 4), (800, 2))
     points = points[inside_image(info, cam_from_map, points)]
     centre = np.array([mount.x_m, mount.y_m, mount.z_m])
-    px = distort_points(info, project_ground(info, cam_from_map, points)).round().astype(int)
+    px = distort_points(info, project_ground(info.intrinsic, cam_from_map, points)[0]).round().astype(int)
     agree = rendered.hidden[px[:, 1], px[:, 0]] == hidden_by([box], centre, points)
     assert agree.mean() > 0.985
     assert not hidden_by([box], centre, points).all()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from v2hdm.detection.camera.lens import distort_points
+from v2hdm.geometry.lens import distort_points
 from v2hdm.records import DIAMOND, CameraInfo
 from v2hdm.simulate.render.optics import Motion, Optics
 from v2hdm.simulate.render.renderer import Rendered, render

@@ -3,7 +3,7 @@
 import numpy as np
 
 from train.augment import random_crop, random_photometry
-from v2hdm.simulate.training.scenes import TrainingSample
+from train.scenes.scenes import TrainingSample
 
 
 def test_crops_keep_image_labels_hidden_and_lanes_together() -> None:

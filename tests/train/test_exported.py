@@ -17,7 +17,7 @@ from train.loop import Trainer
 from v2hdm.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[2]
-SHIPPED = ROOT / "v2hdm" / "detection" / "default.onnx"
+SHIPPED = ROOT / "v2hdm" / "detection" / "weights" / "default.onnx"
 SHIPPED_FLOAT = ROOT / "models" / "marking_net.onnx"
 
 Images = list[torch.Tensor]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from train.scenes.scenes import TrainingSample
 from train.targets import (
     IGNORE,
     kind_target,
@@ -14,7 +15,6 @@ from train.targets import (
     targets,
 )
 from v2hdm.records import PAINT_CLASSES
-from v2hdm.simulate.training.scenes import TrainingSample
 
 
 def test_a_block_is_paint_by_most_of_its_pixels_and_a_tie_is_ignored() -> None:

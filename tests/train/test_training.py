@@ -18,10 +18,10 @@ from train import __main__ as door
 from train.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from train.config import DataConfig, LossConfig, TrainConfig, ValidationConfig
 from train.loop import Trainer
+from train.scenes.scenes import TrainingSample
 from train.targets import Targets, targets
 from v2hdm.config import register
 from v2hdm.errors import ConfigError
-from v2hdm.simulate.training.scenes import TrainingSample
 
 CONF = str(Path(__file__).resolve().parents[2] / "conf")
 

@@ -7,19 +7,7 @@ import pytest
 
 from train.config import DataConfig
 from train.data import RenderStream, validation_pairs
-from v2hdm.detection.camera.lens import undistort_points
-from v2hdm.planar import clip_convex, inside_convex
-from v2hdm.records import (
-    DIAMOND,
-    LANE_CLASSES,
-    LANE_DASH,
-    PAINT_CLASSES,
-    CameraInfo,
-    FloatArray,
-)
-from v2hdm.simulate.render.optics import Motion, Optics
-from v2hdm.simulate.render.scene import Light, box_footprint
-from v2hdm.simulate.training.hardships import (
+from train.scenes.hardships import (
     Hardships,
     blue_shade,
     faint,
@@ -30,7 +18,7 @@ from v2hdm.simulate.training.hardships import (
     with_pavements,
     with_seams,
 )
-from v2hdm.simulate.training.paint import (
+from train.scenes.paint import (
     Bend,
     RoadPaint,
     port_paint,
@@ -39,8 +27,20 @@ from v2hdm.simulate.training.paint import (
     rhombus,
     street_paint,
 )
-from v2hdm.simulate.training.scenes import image_line, image_points, random_scene, training_sample
-from v2hdm.simulate.training.views import TrainingView, looking
+from train.scenes.scenes import image_line, image_points, random_scene, training_sample
+from train.scenes.views import TrainingView, looking
+from v2hdm.geometry.lens import undistort_points
+from v2hdm.geometry.planar import clip_convex, inside_convex
+from v2hdm.records import (
+    DIAMOND,
+    LANE_CLASSES,
+    LANE_DASH,
+    PAINT_CLASSES,
+    CameraInfo,
+    FloatArray,
+)
+from v2hdm.simulate.render.optics import Motion, Optics
+from v2hdm.simulate.render.scene import Light, box_footprint
 
 TINY = DataConfig(width=64, height=32, render_width=80, render_height=48, views_per_render=2, reservoir=3)
 

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from v2hdm.detection.camera.lens import undistort_points
+from train.scenes import scenes
+from train.scenes.hardships import Hardships
+from train.scenes.paint import rectangle
+from train.scenes.scenes import training_sample
+from train.scenes.views import looking, random_view, turned_aside
 from v2hdm.detection.camera.view import ASIDE_RAD
+from v2hdm.geometry.lens import undistort_points
 from v2hdm.records import LANE_DASH, PAINT_CLASSES, STOP_LINE
 from v2hdm.simulate.render.scene import Paint, Scene
-from v2hdm.simulate.training import scenes
-from v2hdm.simulate.training.hardships import Hardships
-from v2hdm.simulate.training.paint import rectangle
-from v2hdm.simulate.training.scenes import training_sample
-from v2hdm.simulate.training.views import looking, random_view, turned_aside
 
 
 def test_a_camera_that_looks_along_x_sees_the_road_ahead_below_its_axis() -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.adjust.problem import LOSSES, POSE_STATES, SOLVERS, IntArray, Problem, SolveOptions
+from v2hdm.adjust.problem import LOSSES, POSE_STATES, SOLVERS, Problem, SolveOptions
 from v2hdm.errors import AdjustError
-from v2hdm.records import FloatArray
+from v2hdm.records import FloatArray, IntArray
 
 # Observations that are checked at once.
 _ROWS = 1 << 18

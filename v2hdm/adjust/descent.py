@@ -25,7 +25,7 @@ from v2hdm.adjust.residuals import (
 )
 from v2hdm.adjust.robust import annealed_scale
 from v2hdm.adjust.whitening import Whitener, Whitening, factorise
-from v2hdm.geometry.transform import exp, left_jacobian
+from v2hdm.geometry.tensors import exp, left_jacobian
 
 # While a robust loss is still being narrowed, there is no point in more digits than this.
 _ANNEALING_TOLERANCE = 1e-3

@@ -8,8 +8,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.adjust.problem import IntArray, Observations
-from v2hdm.records import BoolArray, FloatArray
+from v2hdm.adjust.problem import Observations
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
 VerdictArray = NDArray[np.int8]
 

@@ -30,9 +30,9 @@ from v2hdm.adjust.marking_fit import (
     squared_residuals,
 )
 from v2hdm.adjust.pose_errors import Noise
-from v2hdm.adjust.rigid import exp, left_jacobians
 from v2hdm.adjust.variance import VarianceFactors, variance_factors
 from v2hdm.errors import AdjustError
+from v2hdm.geometry.rigid import exp, left_jacobian
 from v2hdm.records import FloatArray
 
 _MAX_STEPS = 30
@@ -244,7 +244,7 @@ class IncrementalMap:
 
     def _left_covariance(self) -> FloatArray:
         """Covariance (6C, 6C) of the left tangents at the present extrinsics."""
-        turn = block_diag(*left_jacobians(self.state.tangents.reshape(-1, 6)))
+        turn = block_diag(*left_jacobian(self.state.tangents.reshape(-1, 6)))
         return np.asarray(turn @ self._tangent_covariance() @ turn.T)
 
     def _tangent_covariance(self) -> FloatArray:
@@ -328,7 +328,7 @@ def _prior_at(prior: RigPrior, tangents: FloatArray) -> tuple[FloatArray, FloatA
     root = 1 / prior.centre_sigma_m
     information = np.zeros((len(tangents),) * 2)
     vector = np.zeros(len(tangents))
-    for c, chart in enumerate(left_jacobians(tangents.reshape(-1, 6))):
+    for c, chart in enumerate(left_jacobian(tangents.reshape(-1, 6))):
         part = slice(6 * c, 6 * c + 6)
         # A left perturbation moves the centre by minus its translation, turned into the vehicle.
         jacobian = np.zeros((3, 6))
@@ -352,7 +352,7 @@ def _solved(information: FloatArray, vector: FloatArray) -> FloatArray:
 def _eliminated(
     observations: MarkingObservations, normal: Normal, tangents: FloatArray, corners: FloatArray
 ) -> Settled:
-    chart = block_diag(*left_jacobians(tangents.reshape(-1, 6)))
+    chart = block_diag(*left_jacobian(tangents.reshape(-1, 6)))
     factor = cho_factor(normal.V, lower=True)
     gain = cho_solve(factor, normal.W.T)
     best = corners - cho_solve(factor, normal.by_corner).reshape(-1, 2)

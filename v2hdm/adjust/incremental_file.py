@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from v2hdm.adjust.incremental import IncrementalMap, RigPrior, Settled, State
 from v2hdm.adjust.marking_fit import MarkingObservations
 from v2hdm.adjust.pose_errors import Noise
-from v2hdm.adjust.problem import IntArray
 from v2hdm.errors import AdjustError
 from v2hdm.files import whole_file
-from v2hdm.records import FloatArray
+from v2hdm.records import FloatArray, IntArray
 
 _OBSERVED = tuple(field.name for field in fields(MarkingObservations))
 # What markings have in different numbers, flattened end to end; the rest is stacked.

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays, Lengths
 from v2hdm.adjust.pose_prior import state_components, state_prior
-from v2hdm.adjust.problem import IntArray, Problem
+from v2hdm.adjust.problem import Problem
 from v2hdm.errors import AdjustError
-from v2hdm.geometry.transform import inverse
-from v2hdm.records import BoolArray, FloatArray
+from v2hdm.geometry.tensors import inverse
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
 # Rows that are laid out at once.
 _ROWS = 1 << 18

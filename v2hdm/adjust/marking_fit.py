@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from v2hdm.adjust.pose_errors import Frames, Noise
-from v2hdm.adjust.problem import IntArray
-from v2hdm.adjust.rigid import adjoints, exp, hat, left_jacobians
-from v2hdm.records import FloatArray
+from v2hdm.geometry.rigid import adjoint, exp, hat, left_jacobian
+from v2hdm.records import FloatArray, IntArray
 
 # A point nearer than this to the plane of the camera cannot be projected, m.
 _MIN_DEPTH_M = 0.05
@@ -89,7 +88,7 @@ def normal_equations(
     cameras, corners, frames = len(cam_from_vehicle), len(corners_map), len(frame_state)
     camera, corner, rank = seen.camera, seen.corner, seen.frame_rank
     residual, by_pair, by_corner = _linearise(seen, intrinsic, cam_from_vehicle, corners_map, frame_state)
-    by_state = -by_pair @ adjoints(cam_from_vehicle)[camera] @ left_jacobians(-frame_state)[rank]
+    by_state = -by_pair @ adjoint(cam_from_vehicle)[camera] @ left_jacobian(-frame_state)[rank]
     at_rest = residual[..., None] - by_state @ frame_state[rank][..., None]
     root = _root_information(seen, residual, noise)
     pair, place, unit, rest = (root @ j for j in (by_pair, by_corner, by_state, at_rest))

@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from v2hdm.adjust.problem import IntArray
-from v2hdm.records import FloatArray
+from v2hdm.records import FloatArray, IntArray
 
 
 @dataclass(frozen=True)

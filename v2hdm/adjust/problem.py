@@ -1,6 +1,6 @@
 r"""What is estimated from what: the model, as plain numpy records.
 
-Unknown are, in the frames of :mod:`v2hdm.geometry.transform`,
+Unknown are, in the frames of :mod:`v2hdm.geometry`,
 
 - the extrinsic ``cam_from_vehicle`` of every camera,
 - the corners of the markings ``corners_map`` (x, y); the ground is z = 0,
@@ -24,11 +24,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from v2hdm.records import FloatArray
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import FloatArray, IntArray
 
 POSE_STATES: tuple[str, ...] = ("x", "y", "height", "roll", "pitch", "heading")
 """What a frame can deviate in, in the order of its tangent."""

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.adjust.problem import POSE_STATES, IntArray
+from v2hdm.adjust.problem import POSE_STATES
 from v2hdm.adjust.residuals import state_residual
 from v2hdm.adjust.solution import Solution
-from v2hdm.records import FloatArray
+from v2hdm.records import FloatArray, IntArray
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,7 @@ from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays, Run
 from v2hdm.adjust.robust import loss
-from v2hdm.geometry.camera import inverse_depth
-from v2hdm.geometry.transform import adjoint, exp, left_jacobian
+from v2hdm.geometry.tensors import adjoint, exp, inverse_depth, left_jacobian
 
 
 @dataclass(frozen=True)

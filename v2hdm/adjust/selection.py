@@ -18,7 +18,7 @@ from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.solve import solve
 from v2hdm.adjust.subset import restrict
 from v2hdm.errors import AdjustError
-from v2hdm.geometry.transform import exp
+from v2hdm.geometry.tensors import exp
 from v2hdm.records import BoolArray, FloatArray
 
 

@@ -11,9 +11,9 @@ import torch
 
 from v2hdm.adjust.covariance import Covariance
 from v2hdm.adjust.gating import Excluded, Verdict, VerdictArray, excluded
-from v2hdm.adjust.problem import IntArray, Observations
+from v2hdm.adjust.problem import Observations
 from v2hdm.adjust.robust import loss
-from v2hdm.records import BoolArray, FloatArray
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
 
 class Status(Enum):

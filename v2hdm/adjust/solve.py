@@ -24,8 +24,7 @@ from v2hdm.adjust.start import back_project
 from v2hdm.adjust.variance import VarianceFactors, variance_factors
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.errors import AdjustError
-from v2hdm.geometry.camera import NEAR_M
-from v2hdm.geometry.transform import exp
+from v2hdm.geometry.tensors import NEAR_M, exp
 from v2hdm.records import BoolArray, FloatArray
 
 

@@ -9,7 +9,7 @@ from v2hdm.adjust.arrays import Arrays, Run
 from v2hdm.adjust.corner_factor import CornerFactor, cholesky_2x2
 from v2hdm.adjust.linear import corner_blocks, jacobians
 from v2hdm.adjust.residuals import Estimate, of_each, pair_table, project
-from v2hdm.geometry.transform import inverse
+from v2hdm.geometry.tensors import inverse
 
 # Below this sine of the depression a ray meets the ground too far away to say where.
 _MIN_DEPRESSION_SINE = 0.01

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2hdm.adjust.problem import ControlPoints, IntArray, KnownLengths, Observations, Problem
-from v2hdm.records import BoolArray
+from v2hdm.adjust.problem import ControlPoints, KnownLengths, Observations, Problem
+from v2hdm.records import BoolArray, IntArray
 
 
 def restrict(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:

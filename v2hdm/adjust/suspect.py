@@ -34,7 +34,7 @@ from v2hdm.adjust.residuals import (
 )
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.whitening import Whitening
-from v2hdm.geometry.transform import exp, inverse
+from v2hdm.geometry.tensors import exp, inverse
 
 _STEP = 1e-3
 """Step of central differences, in the unit of the fault (s or rad): millimetres of motion."""

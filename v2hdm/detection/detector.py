@@ -22,13 +22,14 @@ from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.sight import Sight, look
 from v2hdm.detection.stopwatch import lap
+from v2hdm.detection.weights import check_weights
 from v2hdm.errors import DetectorError
 from v2hdm.records import Camera, LaneDetection, MarkingDetection
 
 
 @dataclass(frozen=True)
 class Seen:
-    """One image between network and judge: the ``view``, the network's ``sight``, proposals and foreground."""
+    """One image between network and judge: what the network says of it, and what is proposed."""
 
     view: CameraView
     sight: Sight
@@ -54,9 +55,10 @@ class Detector:
         """Load a model: ``path``, else ``options.model``, else the one that is shipped.
 
         Raises:
-            DetectorError: the model cannot be used.
+            DetectorError: the model cannot be used, or the shipped files do not belong together.
         """
         options = options or DetectorOptions()
+        check_weights()
         path = path if path is not None else options.model
         return cls(Network(None if path is None else Path(path), options.threads), options)
 
@@ -75,7 +77,9 @@ class Detector:
             readings = self.read(image_bgr, seen)
         with lap("judge"):
             markings = find_markings(readings, seen.view, self.options)
-        symbols = [self._symbol(proposal, seen.view) for proposal in seen.proposals if not proposal.blob.parts]
+        symbols = [
+            self._symbol(proposal, seen.view) for proposal in seen.proposals if not proposal.blob.parts
+        ]
         markings += [s for s in symbols if s is not None and not _is_among(s, markings)]
         return tuple(markings), tuple(lanes)
 

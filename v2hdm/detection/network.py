@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 import onnxruntime
 
+from v2hdm.detection.weights import NETWORK_FILE
 from v2hdm.errors import DetectorError
 from v2hdm.records import PAINT_CLASSES
 
-DEFAULT_MODEL = Path(__file__).with_name("default.onnx")
+DEFAULT_MODEL = NETWORK_FILE
 
 METADATA_KEY = "v2hdm"
 """Under which key of the file's ``metadata_props`` its label is, as JSON."""

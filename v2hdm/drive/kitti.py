@@ -18,12 +18,12 @@ from v2hdm.drive.images import ImageFiles, check_image_files, count_unposed, pos
 from v2hdm.drive.kitti_calibration import KittiCamera, read_kitti_camera
 from v2hdm.drive.options import KittiOptions, ReadOptions
 from v2hdm.drive.road import lay_flat, tell
-from v2hdm.drive.rotation import rotation_from_euler
 from v2hdm.errors import DriveError
 from v2hdm.files import read_text
+from v2hdm.geometry.ipm import ipm_from_extrinsic
+from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.hdmap.geodetic import enu_from_geodetic, geodetic_from_enu
 from v2hdm.records import (
-    Calibration,
     Camera,
     CentrePrior,
     Drive,
@@ -176,7 +176,7 @@ def _mount(calibration: KittiCamera, vehicle_from_imu: FloatArray, options: Kitt
     roi = np.array([[near, -half], [far, -half], [far, half], [near, half]]) + centre_vehicle[:2]
     return Camera(
         info=calibration.info,
-        ipm={"estimated": Calibration(calibration.info, cam_from_vehicle).vehicle_from_pinhole_px},
+        ipm={"estimated": ipm_from_extrinsic(calibration.info, cam_from_vehicle)},
         initial_ipm="estimated",
         roi_vehicle=roi,
         centre_prior=CentrePrior(centre_vehicle, np.full(3, options.centre_sigma_m)),

@@ -9,7 +9,9 @@ import numpy as np
 from v2hdm.errors import DriveError
 from v2hdm.fields import recorded_distance
 from v2hdm.files import take_array, take_mapping, take_text
-from v2hdm.records import BoolArray, Calibration, CameraInfo, CentrePrior, FloatArray
+from v2hdm.geometry.ipm import ipm_from_extrinsic
+from v2hdm.geometry.rigid import camera_centre
+from v2hdm.records import BoolArray, CameraInfo, CentrePrior, FloatArray
 
 IPM_NAMES = ("calibrated", "estimated")
 
@@ -41,13 +43,13 @@ def ipm_from_guess(info: CameraInfo, cam_from_vehicle: object, where: str) -> Fl
         DriveError: when the guess is no rigid transform or puts the camera on the ground.
     """
     guess = take_rigid(cam_from_vehicle, where)
-    centre_vehicle = -guess[:3, :3].T @ guess[:3, 3]
+    centre_vehicle = camera_centre(guess)
     if centre_vehicle[2] < 0.05:
         raise DriveError(
             f"{where}: puts the camera {centre_vehicle[2]:.3g} m above the ground; "
             "give cam_from_vehicle (vehicle points to camera points), not its inverse"
         )
-    return Calibration(info=info, cam_from_vehicle=guess).vehicle_from_pinhole_px
+    return ipm_from_extrinsic(info, guess)
 
 
 def take_rigid(content: object, where: str) -> FloatArray:

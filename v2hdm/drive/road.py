@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.drive.rotation import rotation_from_euler
 from v2hdm.drive.stations import STATION_M, Stations, along_route, local_lines, local_planes
 from v2hdm.drive.unevenness import Unevenness, unevenness
+from v2hdm.geometry.rigid import heading_rad, rotation_from_euler
 from v2hdm.records import BoolArray, FloatArray, Road, Trajectory
 
 __all__ = ["Laid", "Unevenness", "lay_flat", "tell", "unevenness"]
@@ -96,7 +96,7 @@ def lay_flat(recorded: Trajectory, position_sigma_m: float) -> Laid:
         return Laid(recorded, None, np.zeros(2))
     stations = along_route(poses[:, :2, 3])
     height_m = stations.mean(poses[:, 2, 3])
-    yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
+    yaw = heading_rad(poses)
     lean = _turned(slope, -yaw)
     measured = np.abs(lean).max(axis=0) > _ROUNDING
     if not measured.any() and not poses[:, 2, 3].any():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.drive.rotation import quaternion_from_rotation, rotation_from_quaternion, slerp
+from v2hdm.geometry.rigid import quaternion_from_rotation, rotation_from_quaternion, slerp
 from v2hdm.records import BoolArray, FloatArray, Trajectory
 
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.drive.rotation import quaternion_from_rotation, rotation_from_quaternion
 from v2hdm.errors import DriveError
 from v2hdm.files import read_text, replace_text
+from v2hdm.geometry.rigid import quaternion_from_rotation, rotation_from_quaternion
 from v2hdm.records import FloatArray, Trajectory
 
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from v2hdm.geometry.rigid import rotation_from_vector
 from v2hdm.ground.model import GroundHits, by_lens, by_pixel, hit_ground
-from v2hdm.ground.mount import Mount, rotation
-from v2hdm.ground.results import IntArray
-from v2hdm.records import BoolArray, FloatArray
+from v2hdm.ground.mount import Mount
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
 PIXEL_SIGMA = 0.4
 """What a patch's place in an image is off, px, at the most; the unit of the residuals."""
@@ -239,7 +239,7 @@ def moved_poses(believed: Believed, errors: FloatArray, extra: float, free: str 
     if free == "grade":
         shift[:, 2] -= extra * believed.climb_m
     out = believed.poses.copy()
-    turns = np.array([rotation(vector) for vector in turn])
+    turns = np.array([rotation_from_vector(vector) for vector in turn])
     out[:, :3, 3] += (believed.poses[:, :3, :3] @ shift[:, :, None])[..., 0]
     out[:, :3, :3] = believed.poses[:, :3, :3] @ turns
     return out

@@ -10,8 +10,7 @@ from v2hdm.ground.adjust import Believed, Observations
 from v2hdm.ground.motion import Motion
 from v2hdm.ground.mount import Mount
 from v2hdm.ground.noise import pose_information
-from v2hdm.ground.results import IntArray
-from v2hdm.records import Camera, Drive, FloatArray
+from v2hdm.records import Camera, Drive, FloatArray, IntArray
 
 _FORWARD_LOOSENED = 2.0
 """At most so much for the place along the path: with more, distance and height slide together."""

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.ground.results import GroundEstimate, GroundStatus, Reading
 from v2hdm.records import Camera, Drive
 
@@ -34,5 +35,5 @@ def _started(camera: Camera, estimate: GroundEstimate) -> Camera:
         return camera
     if np.sqrt(np.diag(calibration.covariance)[3:].max()) > _SURE_RAD:
         return camera
-    ipm = {**camera.ipm, GROUND_IPM: replace(calibration, info=camera.info).vehicle_from_pinhole_px}
+    ipm = {**camera.ipm, GROUND_IPM: ipm_from_extrinsic(camera.info, calibration.cam_from_vehicle)}
     return replace(camera, ipm=ipm, initial_ipm=GROUND_IPM)

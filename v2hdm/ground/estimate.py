@@ -18,9 +18,9 @@ from v2hdm.ground.options import GroundOptions
 from v2hdm.ground.pairs import changing_pairs, spread_pairs
 from v2hdm.ground.parameters import clock_shows, free_parameters
 from v2hdm.ground.readings import Readings, try_readings
-from v2hdm.ground.results import GroundEstimate, GroundStatus, IntArray, MatchedGround, Parameter, Reading
+from v2hdm.ground.results import GroundEstimate, GroundStatus, MatchedGround, Parameter, Reading
 from v2hdm.ground.scatter import scatter
-from v2hdm.records import Calibration, Drive, FloatArray, PoseNoise
+from v2hdm.records import Calibration, Drive, FloatArray, IntArray, PoseNoise
 
 
 @dataclass(frozen=True)

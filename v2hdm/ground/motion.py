@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.drive.rotation import rotation_from_euler
 from v2hdm.drive.trajectory import interpolate
-from v2hdm.ground.results import IntArray, Reading
-from v2hdm.records import Drive, FloatArray, Trajectory
+from v2hdm.geometry.rigid import heading_rad, rotation_from_euler
+from v2hdm.ground.results import Reading
+from v2hdm.records import Drive, FloatArray, IntArray, Trajectory
 
 SMOOTHING_S = 0.5
 """Half width of the parabola fitted to the poses: steering and pedals change the motion no faster."""
@@ -83,7 +83,7 @@ def _read_as(trajectory: Trajectory, reading: Reading) -> Trajectory:
 
 def _velocity(trajectory: Trajectory) -> FloatArray:
     poses = trajectory.map_from_vehicle
-    yaw = np.unwrap(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
+    yaw = np.unwrap(heading_rad(poses))
     rate = _slopes(trajectory.stamp_s, np.column_stack([poses[:, :2, 3], yaw]))
     c, s = np.cos(yaw), np.sin(yaw)
     return np.column_stack([c * rate[:, 0] + s * rate[:, 1], c * rate[:, 1] - s * rate[:, 0], rate[:, 2]])

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
-from v2hdm.detection.camera.ground import extrinsic_from_ipm
-from v2hdm.detection.camera.lens import distort_points, undistort_points
+from v2hdm.geometry.ipm import extrinsic_from_ipm, project_ground
+from v2hdm.geometry.lens import distort_points, undistort_points
+from v2hdm.geometry.rigid import rotation_from_vector
 from v2hdm.records import Camera, CameraInfo, FloatArray
 
 
@@ -32,7 +32,7 @@ class Mount:
         """Turned about its centre by a rotation vector (3,) in vehicle axes, and shifted (3,) m."""
         return replace(
             self,
-            vehicle_from_cam_rotation=rotation(turn_rad) @ self.vehicle_from_cam_rotation,
+            vehicle_from_cam_rotation=rotation_from_vector(turn_rad) @ self.vehicle_from_cam_rotation,
             centre_vehicle=self.centre_vehicle + shift_m,
         )
 
@@ -57,16 +57,13 @@ class Mount:
     def project_ground(self, ground_map: FloatArray, map_from_vehicle: FloatArray) -> FloatArray:
         """Recorded pixels (N, 2) of ground points (N, 2) of the map; nan where they are out of view."""
         cam_from_map = self.cam_from_vehicle @ np.linalg.inv(map_from_vehicle)
-        matrix = self.info.intrinsic @ cam_from_map[:3][:, [0, 1, 3]]
-        pinhole = ground_map @ matrix[:2, :2].T + matrix[:2, 2]
-        depth = ground_map @ matrix[2, :2] + matrix[2, 2]
+        pinhole, depth_m = project_ground(self.info.intrinsic, cam_from_map, ground_map)
         size = np.array([self.info.width, self.info.height])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            pinhole /= depth[:, None]
+        with np.errstate(invalid="ignore"):
             # A lens model bends back what lies far outside the view.
             low, high = -0.5 * size, 1.5 * size
             far = (pinhole < low) | (pinhole > high)
-            hidden = (depth <= 0) | far[:, 0] | far[:, 1]
+            hidden = (depth_m <= 0) | far[:, 0] | far[:, 1]
             pinhole[hidden] = size / 2
             px = distort_points(self.info, pinhole)
             outside = (px < 0) | (px > size - 1)
@@ -79,14 +76,8 @@ class Mount:
         return float(np.arcsin(-self.vehicle_from_cam_rotation[2, 2]))
 
 
-def rotation(vector_rad: FloatArray) -> FloatArray:
-    """The rotation matrix (3, 3) of a rotation vector (3,)."""
-    return np.asarray(cv2.Rodrigues(np.asarray(vector_rad, dtype=np.float64))[0])
-
-
 def guessed_mount(camera: Camera) -> Mount:
     """The mounting that a camera's initial IPM stands for."""
-    seen_vehicle = np.asarray(camera.roi_vehicle).mean(axis=0)
-    matrix = extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm], seen_vehicle)
+    matrix = extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm])
     turn = matrix[:3, :3].T
     return Mount(camera.info, turn, -turn @ matrix[:3, 3])

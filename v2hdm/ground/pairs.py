@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from v2hdm.ground.results import IntArray
-from v2hdm.records import FloatArray
+from v2hdm.records import FloatArray, IntArray
 
 _ARM_M = 10.0
 """A turn by one radian moves the ground in view by about this."""

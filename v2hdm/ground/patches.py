@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from v2hdm.geometry.planar import inside_convex
+from v2hdm.geometry.rigid import ground_in_vehicle
 from v2hdm.ground.mount import Mount
 from v2hdm.ground.options import GroundOptions
-from v2hdm.planar import ground_in_vehicle, inside_convex
 from v2hdm.records import BoolArray, FloatArray
 
 ImageArray = NDArray[np.uint8]

@@ -7,14 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from v2hdm.geometry.rigid import heading_rad
 from v2hdm.ground.beliefs import Beliefs
 from v2hdm.ground.matcher import Matcher
 from v2hdm.ground.motion import motion_of
 from v2hdm.ground.mount import Mount
 from v2hdm.ground.pairs import spread_pairs, turning_pairs
-from v2hdm.ground.results import IntArray, Reading
+from v2hdm.ground.results import Reading
 from v2hdm.ground.start import Start, find_start
-from v2hdm.records import Drive
+from v2hdm.records import Drive, IntArray
 
 _PAIRS = 10
 _APART_M = (1.2, 2.8)
@@ -85,7 +86,7 @@ def _telling_pairs(drive: Drive, camera: str) -> IntArray:
     """Those between which the vehicle turns most along its path; evenly spread ones on a straight route."""
     motion = motion_of(drive, camera, Reading.HEADING_FROM_PATH)
     poses = motion.poses()
-    yaw = np.unwrap(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
+    yaw = np.unwrap(heading_rad(poses))
     pairs = turning_pairs(motion.path_at_images(), yaw, _PAIRS, *_APART_M)
     if len(pairs) and np.median(np.abs(yaw[pairs[:, 1]] - yaw[pairs[:, 0]])) > _TURN_RAD:
         return pairs

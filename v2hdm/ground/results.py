@@ -6,12 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
-import numpy as np
-from numpy.typing import NDArray
+from v2hdm.records import Calibration, FloatArray, IntArray
 
-from v2hdm.records import Calibration, FloatArray
-
-IntArray = NDArray[np.int64]
 """Indices."""
 
 

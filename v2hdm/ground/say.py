@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.ground.results import GroundEstimate, GroundStatus, Reading
 from v2hdm.records import FloatArray
 
@@ -67,7 +68,7 @@ def lines(estimate: GroundEstimate) -> Iterator[str]:
     matrix = calibration.cam_from_vehicle
     angles = np.rad2deg(mounting_angles(matrix))
     sigmas = np.rad2deg(angle_sigmas(matrix, calibration.covariance))
-    height_m = -(matrix[:3, :3].T @ matrix[:3, 3])[2]
+    height_m = camera_centre(matrix)[2]
     up = matrix[:3, 2]
     height_sigma_m = float(np.sqrt(up @ calibration.covariance[:3, :3] @ up))
     parts = [

@@ -11,8 +11,7 @@ from v2hdm.ground.beliefs import Beliefs
 from v2hdm.ground.matcher import Matcher
 from v2hdm.ground.mount import Mount
 from v2hdm.ground.pairs import spread_pairs
-from v2hdm.ground.results import IntArray
-from v2hdm.records import FloatArray
+from v2hdm.records import FloatArray, IntArray
 
 _PAIRS = 10
 _SHORT_M = (0.3, 1.6)

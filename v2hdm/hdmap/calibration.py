@@ -11,6 +11,7 @@ import numpy as np
 from v2hdm.errors import MapFileError
 from v2hdm.fields import check_camera, take_covariance, take_size_px
 from v2hdm.files import check_keys, dump_yaml, load_yaml, replace_text, take_array, take_text
+from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.records import DISTORTION_COEFFICIENTS, Calibration, CameraInfo
 
 _REQUIRED = (
@@ -61,7 +62,9 @@ def write_calibration(
         "distortion_model": info.distortion_model,
         "distortion_coefficients": list(info.distortion),
         "cam_from_vehicle": calibration.cam_from_vehicle.tolist(),
-        "vehicle_from_pinhole_px": calibration.vehicle_from_pinhole_px.tolist(),
+        "vehicle_from_pinhole_px": ipm_from_extrinsic(
+            calibration.info, calibration.cam_from_vehicle
+        ).tolist(),
     }
     if calibration.covariance is not None:
         sigma = np.sqrt(np.diag(calibration.covariance))

@@ -21,6 +21,7 @@ import numpy as np
 from v2hdm.errors import MapFileError
 from v2hdm.fields import take_covariance, take_origin, take_whole
 from v2hdm.files import load_json, replace_text, take_array, take_mapping, take_number, take_text
+from v2hdm.geometry.planar import signed_area
 from v2hdm.hdmap.geodetic import geodetic_from_enu
 from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, Lane, Marking
 
@@ -104,9 +105,7 @@ def read_geojson(path: Path) -> HdMap:
 
 def _marking_feature(number: int, marking: Marking, origin: GeodeticOrigin | None) -> dict[str, Any]:
     corners = marking.corners_map
-    x, y = corners.T
-    counter_clockwise = float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) >= 0.0
-    turn = slice(None) if counter_clockwise else slice(None, None, -1)
+    turn = slice(None) if signed_area(corners) >= 0 else slice(None, None, -1)
     heights = marking.heights_m
     ring = geojson_positions(corners[turn], None if heights is None else heights[turn], origin)
     properties: dict[str, Any] = {

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from v2hdm.adjust import (
     MODELS,
@@ -23,19 +22,17 @@ from v2hdm.adjust import (
     with_model,
 )
 from v2hdm.errors import MappingError
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.mapping.association.groups import Association, fuse_groups
 from v2hdm.mapping.association.merge import group_kinds
 from v2hdm.mapping.known_sizes import known_lengths
 from v2hdm.mapping.motion import vehicle_twists
 from v2hdm.mapping.options import MappingOptions, SizeOptions, SurveyOptions
-from v2hdm.mapping.sightings.backprojection import camera_centres
 from v2hdm.mapping.sightings.location import locate
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.mapping.survey import control_points
-from v2hdm.records import BoolArray, Camera, FloatArray, PoseNoise
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, PoseNoise
 
 UNSURVEYED_CENTRE_SIGMA_M = 0.3
 """How well a camera centre is known that nobody has surveyed, but a coarse IPM implies."""
@@ -294,7 +291,7 @@ def _observed_corners(
 
 def centre_priors(cameras: Sequence[Camera], cam_from_vehicle: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Prior camera centres and sigmas (C, 3): surveyed, or else implied by the starting extrinsic."""
-    centre = camera_centres(cam_from_vehicle)
+    centre = camera_centre(cam_from_vehicle)
     sigma = np.full_like(centre, UNSURVEYED_CENTRE_SIGMA_M)
     for c, camera in enumerate(cameras):
         prior = camera.centre_prior

@@ -10,16 +10,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v2hdm.geometry.ipm import project_ground
+from v2hdm.geometry.quadrilateral import SHIFTS
 from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.mapping.shapes import SHIFTS
 from v2hdm.mapping.sightings.table import Sightings
-from v2hdm.mapping.sightings.views import project_ground
-from v2hdm.records import BoolArray, FloatArray
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
 # Root mean square distance from which a sighting does not fit as it is, and the share of it that another
 # order must leave at most.

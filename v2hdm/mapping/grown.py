@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from v2hdm.adjust.gating import noise_scale
 from v2hdm.adjust.incremental import IncrementalMap
 from v2hdm.adjust.observability import observed
-from v2hdm.adjust.rigid import exp
+from v2hdm.geometry.rigid import exp
 from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.markings.completion import SolvedCorners, completed_corners
 from v2hdm.mapping.markings.conclude import Observed, reprojected, residuals_under, root_mean_square
@@ -22,9 +21,7 @@ from v2hdm.mapping.results import Exclusion, GrowthStep
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.mapping.sightings.views import Views
-from v2hdm.records import CORNERED_CLASSES, BoolArray, Calibration, Camera, FloatArray, Marking
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import CORNERED_CLASSES, BoolArray, Calibration, Camera, FloatArray, IntArray, Marking
 
 # Squared distance that one sound observation in ten thousand exceeds (2 degrees of freedom).
 _INLIER_SQUARED = 18.4

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.markings.completion import solved_corners
@@ -14,9 +13,7 @@ from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.markings.shape_prior import with_class_shapes
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.results import GrowthStep
-from v2hdm.records import CORNERED_CLASSES, Marking
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import CORNERED_CLASSES, IntArray, Marking
 
 
 def grow_map(

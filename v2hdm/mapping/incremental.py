@@ -15,26 +15,23 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from v2hdm.adjust.incremental import IncrementalMap, RigPrior, State
 from v2hdm.adjust.marking_fit import MarkingObservations
 from v2hdm.adjust.pose_errors import Noise
-from v2hdm.adjust.rigid import exp
 from v2hdm.errors import AdjustError
+from v2hdm.geometry.quadrilateral import align, diameters
+from v2hdm.geometry.rigid import exp
 from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.association.merge import group_kinds
 from v2hdm.mapping.bundle import LEAST_OBSERVATIONS, VARIANCE_FACTORS, centre_priors, pose_sigma_of
 from v2hdm.mapping.grown import Grown, Place, Taken, conclude_grown, corners_of, growth_step
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import GrowthStep
-from v2hdm.mapping.shapes import align, diameters
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.mapping.sightings.views import Views
-from v2hdm.records import BoolArray, Camera, FloatArray, PoseNoise
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, PoseNoise
 
 Link = Callable[[Rig, bool], tuple[Association, BoolArray]]
 """Tracks under a rig, coarse or not, and which corners (S, 4) may be used."""

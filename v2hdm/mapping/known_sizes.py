@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from v2hdm.adjust import KnownLengths
 from v2hdm.mapping.options import SizeOptions
-from v2hdm.records import CORNERED_CLASSES, DIAMOND, FloatArray
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import CORNERED_CLASSES, DIAMOND, FloatArray, IntArray
 
 _DIAGONALS = (((0, 2),), ((1, 3),))
 _SIDES = (((0, 1), (3, 2)), ((1, 2), (0, 3)))

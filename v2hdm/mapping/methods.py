@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from v2hdm.adjust import Status, observability
-from v2hdm.detection.camera.ground import ipm_from_extrinsic
+from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.grown import Grown
@@ -21,7 +21,7 @@ from v2hdm.mapping.lanes.fuse import map_lanes
 from v2hdm.mapping.lanes.points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
 from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.naive import naive_markings
-from v2hdm.mapping.optimise import Optimiser, nearest_extrinsic
+from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
 from v2hdm.mapping.outputs import adjusted_poses, clock_offsets
 from v2hdm.mapping.remedy import Inputs, Outcome, judge_grown, optimise
@@ -124,7 +124,7 @@ def run_naive(
     begin_s = time.perf_counter()
     cameras = {c: camera_of(drive, c) for c in sightings.cameras}
     markings, excluded = naive_markings(sightings, tracks, cameras, ipm, options)
-    extrinsic = {c: nearest_extrinsic(cameras[c].info, matrix) for c, matrix in ipm.items()}
+    extrinsic = {c: extrinsic_from_ipm(cameras[c].info, matrix) for c, matrix in ipm.items()}
     lanes = _lanes(drive, detections, ground_by_ipm(drive, ipm, extrinsic), options)
     return MethodResult(
         name=name,

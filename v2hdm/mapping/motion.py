@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
-from v2hdm.geometry.transform import log
+from v2hdm.geometry.rigid import inverse, log
 from v2hdm.records import FloatArray
 
 
@@ -16,7 +15,6 @@ def vehicle_twists(map_from_vehicle: FloatArray, stamp_s: FloatArray) -> FloatAr
     """
     count = len(stamp_s)
     before, after = np.maximum(np.arange(count) - 1, 0), np.minimum(np.arange(count) + 1, count - 1)
-    moved = np.linalg.inv(map_from_vehicle[before]) @ map_from_vehicle[after]
-    tangent = log(torch.as_tensor(moved)).detach().numpy()
+    moved = inverse(map_from_vehicle[before]) @ map_from_vehicle[after]
     elapsed_s = stamp_s[after] - stamp_s[before]
-    return np.asarray(tangent / np.where(elapsed_s > 0, elapsed_s, 1.0)[:, None])
+    return np.asarray(log(moved) / np.where(elapsed_s > 0, elapsed_s, 1.0)[:, None])

@@ -10,18 +10,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from v2hdm.geometry.ipm import apply_in_front, facing_ipm, flat_motion
+from v2hdm.geometry.planar import inside_convex
+from v2hdm.geometry.quadrilateral import is_convex
 from v2hdm.mapping.association.groups import Association, FusedGroups, keep_rows
 from v2hdm.mapping.association.merge import group_kinds, merge_groups
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import Exclusion
-from v2hdm.mapping.shapes import is_convex
-from v2hdm.mapping.sightings.backprojection import (
-    apply_homographies,
-    forward_ipm,
-    plain_homographies,
-)
 from v2hdm.mapping.sightings.table import Sightings
-from v2hdm.planar import inside_convex
 from v2hdm.records import CORNERED_CLASSES, BoolArray, Camera, FloatArray, Marking
 
 
@@ -64,11 +60,13 @@ def ipm_corners(
 
     Corners that the IPM puts above the horizon are nan.
     """
-    forward = np.stack([forward_ipm(cameras[name], ipm[name]) for name in sightings.cameras])
+    forward = np.stack(
+        [facing_ipm(ipm[name], cameras[name].roi_vehicle.mean(axis=0)) for name in sightings.cameras]
+    )
     homographies = forward[sightings.camera]
-    corners_vehicle = apply_homographies(homographies, sightings.corners_pinhole_px)
-    to_map = plain_homographies(homographies, sightings.map_from_vehicle[sightings.frame])
-    return apply_homographies(to_map, sightings.corners_pinhole_px), corners_vehicle
+    corners_vehicle = apply_in_front(homographies, sightings.corners_pinhole_px)
+    to_map = flat_motion(sightings.map_from_vehicle[sightings.frame]) @ homographies
+    return apply_in_front(to_map, sightings.corners_pinhole_px), corners_vehicle
 
 
 def _inside_roi(

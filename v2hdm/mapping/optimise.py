@@ -13,12 +13,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
 from v2hdm.adjust import Status, select_model
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.geometry.ground import extrinsic_from_ipm
+from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.mapping.association.groups import Association, fuse_groups, same_groups
 from v2hdm.mapping.association.merge import merge_groups
 from v2hdm.mapping.association.tracks import Uncertainty, build_tracks
@@ -39,9 +37,8 @@ from v2hdm.mapping.sightings.location import Located, locate
 from v2hdm.mapping.sightings.rig import Rig, build_rig
 from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.mapping.sightings.views import Views
-from v2hdm.records import BoolArray, Camera, CameraInfo, FloatArray, PoseNoise
+from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, PoseNoise
 
-IntArray = NDArray[np.int64]
 _log = logging.getLogger(__name__)
 
 SETTLED_MODEL = "heave"
@@ -251,16 +248,10 @@ class Optimiser:
 def initial_rig(cameras: Mapping[str, Camera], map_from_vehicle: FloatArray) -> Rig:
     """The extrinsics nearest to each camera's initial IPM, with the recorded poses (F, 4, 4)."""
     start = {
-        name: nearest_extrinsic(camera.info, camera.ipm[camera.initial_ipm])
+        name: extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm])
         for name, camera in cameras.items()
     }
     return build_rig({name: camera.info for name, camera in cameras.items()}, start, map_from_vehicle)
-
-
-def nearest_extrinsic(info: CameraInfo, ipm: FloatArray) -> FloatArray:
-    """The rigid ``cam_from_vehicle`` (4 x 4) that comes closest to an IPM (3 x 3)."""
-    matrix = torch.from_numpy(np.asarray(ipm, dtype=np.float64))
-    return np.asarray(extrinsic_from_ipm(torch.from_numpy(info.intrinsic), matrix).numpy())
 
 
 def _silent(step: str) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from v2hdm.adjust import Fault, Suspect, pose_pulls, suspects
 from v2hdm.drive.clock import with_clock_offsets
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.evidence import Contradiction, SolveEvidence
 from v2hdm.mapping.fit import (
@@ -28,7 +29,6 @@ from v2hdm.mapping.grown import Grown
 from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.mapping.sightings.backprojection import camera_centres
 from v2hdm.mapping.sightings.table import Sightings, collect_sightings
 from v2hdm.mapping.sightings.views import views_of
 from v2hdm.records import Drive, ImageDetections
@@ -181,7 +181,7 @@ def _as_solved(one: Contradiction, bundle: Bundle) -> Contradiction:
     if one.fault not in (Fault.SURVEY, Fault.LEVER) or bundle.problem.centre_vehicle is None:
         return one
     rows = [bundle.camera_index[name] for name in one.cameras if name in bundle.camera_index]
-    off = camera_centres(bundle.solution.cam_from_vehicle)[rows] - bundle.problem.centre_vehicle[rows]
+    off = camera_centre(bundle.solution.cam_from_vehicle)[rows] - bundle.problem.centre_vehicle[rows]
     return replace(one, value=float(off[:, one.axis].mean()))
 
 

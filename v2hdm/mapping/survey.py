@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from v2hdm.adjust import ControlPoints
 from v2hdm.mapping.options import SurveyOptions
-from v2hdm.records import FloatArray
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import FloatArray, IntArray
 
 
 def control_points(

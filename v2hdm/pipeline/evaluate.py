@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.detection.camera.ground import ipm_from_extrinsic
 from v2hdm.drive.truth import read_truth
+from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.mapping.methods import run_naive
-from v2hdm.mapping.optimise import Optimiser, nearest_extrinsic
+from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.sightings.table import collect_sightings
@@ -137,7 +137,7 @@ def _extrinsics(drive: Drive, methods: CameraSets, truth: Truth | None) -> dict[
         for name, calibration in optimised.calibrations.items():
             found: dict[str, Any] = extrinsic_figures(
                 calibration.cam_from_vehicle,
-                nearest_extrinsic(
+                extrinsic_from_ipm(
                     drive.cameras[name].info, drive.cameras[name].ipm[drive.cameras[name].initial_ipm]
                 ),
                 truth.cam_from_vehicle[name] if truth else None,

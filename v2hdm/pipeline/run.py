@@ -21,6 +21,7 @@ from v2hdm import __version__
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.detection.weights import unknown_network
 from v2hdm.drive import ReadOptions, drive_name, read_drive
 from v2hdm.errors import AdjustError, ConfigError, MappingError, V2hdmError
 from v2hdm.mapping.methods import run_methods
@@ -122,6 +123,9 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
         logging_to(_log_file(folder / "run.log")),
     ):
         log.info("v2hdm %s, run %s", __version__, name)
+        unknown = unknown_network(config.detector.model) if config.detector.model is not None else None
+        if unknown is not None:
+            log.warning("%s", unknown)
         (folder / "config.yaml").write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
         drive_folder = _drive_folder(config, seconds, progress)
         drive = read_drive(drive_folder, config.drive)

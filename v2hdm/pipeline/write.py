@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm.detection.batch import read_image
+from v2hdm.geometry.ipm import facing_ipm, flat_motion, pinhole_px_from_ground
 from v2hdm.hdmap.calibration import write_calibration
 from v2hdm.hdmap.exclusions import ExcludedMarking, write_exclusions
 from v2hdm.hdmap.geojson import write_geojson
@@ -94,10 +95,11 @@ def _save_overlay(path: Path, drive: Drive, image: Image, best: MethodResult) ->
     adjusted = image.map_from_vehicle if best.poses is None else best.poses.of_image(image)
     initial = {"calibrated": "CNI", "estimated": "ENI"}.get(camera.initial_ipm, camera.initial_ipm)
     cam_from_map = best.calibrations[image.camera].cam_from_vehicle @ np.linalg.inv(adjusted)
-    planar = np.linalg.inv(image.map_from_vehicle)[[0, 1, 3]][:, [0, 1, 3]]
+    ipm = facing_ipm(camera.ipm[camera.initial_ipm], camera.roi_vehicle.mean(axis=0))
+    vehicle_from_map = np.asarray(np.linalg.inv(image.map_from_vehicle), dtype=np.float64)
     views = {
-        initial: np.linalg.inv(camera.ipm[camera.initial_ipm]) @ planar,
-        BEST: camera.info.intrinsic @ cam_from_map[:3][:, [0, 1, 3]],
+        initial: np.linalg.inv(ipm) @ flat_motion(vehicle_from_map),
+        BEST: pinhole_px_from_ground(camera.info.intrinsic, cam_from_map),
     }
     position_map = adjusted[:2, 3]
     save_overlay(path, read_image(image, camera), camera.info, best.hd_map, position_map, views)

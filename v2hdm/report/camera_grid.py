@@ -9,8 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from v2hdm.detection.camera.lens import distort_points
 from v2hdm.files import whole_file
+from v2hdm.geometry.ipm import project_ground
+from v2hdm.geometry.lens import distort_points
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import Camera, CameraInfo, FloatArray
 
 _FARTHEST_M = 40.0
@@ -63,10 +65,8 @@ def project_line(
     info: CameraInfo, cam_from_vehicle: FloatArray, line_vehicle: FloatArray
 ) -> list[FloatArray]:
     """The pieces (N, 2), recorded px, of a dense ground line (M, 2) that lie in and near the image."""
-    points = line_vehicle @ cam_from_vehicle[:3, :2].T + cam_from_vehicle[:3, 3]
-    visible = points[:, 2] > _NEAREST_M
-    with np.errstate(divide="ignore", invalid="ignore"):
-        pinhole = (points @ info.intrinsic.T)[:, :2] / points[:, 2:]
+    pinhole, depth_m = project_ground(info.intrinsic, cam_from_vehicle, line_vehicle)
+    visible = depth_m > _NEAREST_M
     margin = 0.15 * np.array([info.width, info.height])
     size = np.array([info.width, info.height])
     visible &= ((pinhole > -margin) & (pinhole < size + margin)).all(axis=1)
@@ -77,7 +77,7 @@ def project_line(
 
 def _axes(cam_from_vehicle: FloatArray) -> tuple[FloatArray, int, float]:
     """The camera's foot, the vehicle axis (0 or 1) that it looks along most, and to which side."""
-    foot = -(cam_from_vehicle[:3, :3].T @ cam_from_vehicle[:3, 3])[:2]
+    foot = camera_centre(cam_from_vehicle)[:2]
     view = cam_from_vehicle[2, :2]
     along = int(np.argmax(np.abs(view)))
     return foot, along, float(np.sign(view[along]) or 1.0)

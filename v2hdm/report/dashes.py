@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from v2hdm.geometry.quadrilateral import long_axis
 from v2hdm.records import LANE_DASH, FloatArray, HdMap
 
 MAX_CYCLE_M = 15.0
@@ -39,19 +40,10 @@ def _successor_distances(dashes: FloatArray) -> FloatArray:
     """Distance (P,) from each dash (J, 4, 2) to the nearest one ahead of it along its own axis."""
     if len(dashes) < 2:
         return np.empty(0)
-    centres, axes = dashes.mean(axis=1), np.array([_axis(corners) for corners in dashes])
+    centres, axes = dashes.mean(axis=1), np.array([long_axis(corners) for corners in dashes])
     offset = centres[None] - centres[:, None]
     along = (offset * axes[:, None]).sum(axis=2)
     across = offset[..., 0] * axes[:, None, 1] - offset[..., 1] * axes[:, None, 0]
     ahead = (along > 0.5) & (along <= MAX_CYCLE_M) & (np.abs(across) <= MAX_OFFSET_M)
     nearest = np.where(ahead, along, np.inf).min(axis=1)
     return np.asarray(nearest[np.isfinite(nearest)])
-
-
-def _axis(corners: FloatArray) -> FloatArray:
-    """Unit direction (2,) of a quadrilateral's longer sides, pointing into the eastern half plane."""
-    sides = np.roll(corners, -1, axis=0) - corners
-    first, second = sides[0] - sides[2], sides[1] - sides[3]
-    axis = max(first, second, key=lambda side: float(side @ side))
-    axis = axis / np.linalg.norm(axis)
-    return np.asarray(axis if (axis[0], axis[1]) > (0.0, 0.0) else -axis)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import CORNERED_CLASSES, DIAMOND, BoolArray, FloatArray, HdMap, Truth
 from v2hdm.report.dashes import dash_spacing
 from v2hdm.report.lane_metrics import lane_metrics
@@ -44,7 +45,7 @@ def extrinsic_figures(estimate: FloatArray, initial: FloatArray, true: FloatArra
     """
     turn_vehicle = estimate[:3, :3].T @ initial[:3, :3]
     yaw, pitch, roll = Rotation.from_matrix(turn_vehicle).as_euler("ZYX", degrees=True)
-    centres = [-t[:3, :3].T @ t[:3, 3] for t in (estimate, initial)]
+    centres = [camera_centre(t) for t in (estimate, initial)]
     shift_m = centres[0] - centres[1]
     figures = {"yaw_change_deg": yaw, "pitch_change_deg": pitch, "roll_change_deg": roll}
     figures |= {f"{axis}_change_m": float(value) for axis, value in zip("xyz", shift_m, strict=True)}

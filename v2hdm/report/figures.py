@@ -11,9 +11,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 
-from v2hdm.detection.camera.ground import apply_homography
-from v2hdm.detection.camera.lens import distort_points
 from v2hdm.files import whole_file
+from v2hdm.geometry.ipm import apply_in_front
+from v2hdm.geometry.lens import distort_points
 from v2hdm.records import CameraInfo, FloatArray, HdMap, Truth
 from v2hdm.report import metrics, style
 
@@ -89,7 +89,8 @@ def save_overlay(
         info: its camera.
         hd_map: what is drawn.
         position_map: (2,) the vehicle's; what lies far from it is not drawn.
-        views: by name the homography ``pinhole_px_from_map`` (3 x 3) of the ground.
+        views: by name the homography ``pinhole_px_from_map`` (3 x 3) of the ground, whose third
+            coordinate is positive in front of the camera.
     """
     canvas = image.copy()
     for row, (name, pinhole_px_from_map) in enumerate(views.items()):
@@ -189,18 +190,11 @@ def _project_line(
     """The visible pieces (N, 2), recorded px, of a ground line; densified, so lenses bend it."""
     ends = np.vstack([line_map, line_map[:1]]) if closed else line_map
     dense = np.concatenate([np.linspace(a, b, 8) for a, b in itertools.pairwise(ends)])
-    # The homography's sign is free: the side of the horizon that holds the image's bottom is in front.
-    bottom = np.linalg.inv(pinhole_px_from_map) @ [info.width / 2, info.height - 1.0, 1.0]
-    ahead = np.sign((pinhole_px_from_map @ (bottom / bottom[2]))[2])
-    depth = np.column_stack([dense, np.ones(len(dense))]) @ pinhole_px_from_map[2] * ahead
-    points_pinhole_px = apply_homography(pinhole_px_from_map, dense)
+    points_pinhole_px = apply_in_front(pinhole_px_from_map, dense)
     margin = np.array([info.width, info.height]) * 0.1
     size = np.array([info.width, info.height])
-    visible = (
-        (depth > 0)
-        & (np.linalg.norm(dense - position_map, axis=1) < _OVERLAY_RANGE_M)
-        & ((points_pinhole_px > -margin) & (points_pinhole_px < size + margin)).all(axis=1)
-    )
+    near = np.linalg.norm(dense - position_map, axis=1) < _OVERLAY_RANGE_M
+    visible = near & ((points_pinhole_px > -margin) & (points_pinhole_px < size + margin)).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], visible.astype(int), [0]])))
     pieces = [points_pinhole_px[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
     return [distort_points(info, piece) for piece in pieces]

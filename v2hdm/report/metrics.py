@@ -13,7 +13,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
-from v2hdm.planar import ground_in_vehicle, inside_convex
+from v2hdm.geometry.planar import inside_convex
+from v2hdm.geometry.rigid import camera_centre, ground_in_vehicle
 from v2hdm.records import BoolArray, Drive, FloatArray, HdMap, Marking, Truth
 
 MATCH_GATE_M = 2.0
@@ -123,7 +124,7 @@ def corner_errors(mapped: Sequence[Marking], true: Sequence[Marking]) -> FloatAr
 def extrinsic_metrics(cam_from_vehicle: FloatArray, true_cam_from_vehicle: FloatArray) -> ExtrinsicMetrics:
     """Compare two extrinsics (4 x 4 each)."""
     difference = cam_from_vehicle[:3, :3] @ true_cam_from_vehicle[:3, :3].T
-    centres = [-t[:3, :3].T @ t[:3, 3] for t in (cam_from_vehicle, true_cam_from_vehicle)]
+    centres = [camera_centre(t) for t in (cam_from_vehicle, true_cam_from_vehicle)]
     return ExtrinsicMetrics(
         rotation_error_deg=float(np.rad2deg(Rotation.from_matrix(difference).magnitude())),
         translation_error_m=float(np.linalg.norm(centres[0] - centres[1])),

@@ -10,9 +10,9 @@ import numpy as np
 
 from tests.benchmarks.wrong.fault import CAMERAS, Fault, edit, edit_poses
 from v2hdm.drive.folder import POSES_FILE
-from v2hdm.drive.rotation import rotation_from_euler
 from v2hdm.drive.tum import read_image_list, write_image_list
 from v2hdm.files import replace_text
+from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.records import FloatArray
 
 

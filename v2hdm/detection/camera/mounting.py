@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.detection.camera.ground import apply_homography, extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.errors import MapFileError
+from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import DISTORTION_COEFFICIENTS, Calibration, Camera, CameraInfo, FloatArray
 
 _ROTATION_TOLERANCE = 1e-6
@@ -51,20 +52,6 @@ def rough_calibration(
     return Calibration(CameraInfo(name, width, height, intrinsic), cam_from_vehicle)
 
 
-def guessed_extrinsic(camera: Camera) -> FloatArray:
-    """The ``cam_from_vehicle`` (4 x 4) nearest to the initial IPM, its centre above the ground.
-
-    A homography has two solutions, one of them below the ground: a region of interest behind the camera would
-    settle on that one.
-    """
-    guess = extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm], camera.roi_vehicle.mean(axis=0))
-    if (guess[:3, :3].T @ guess[:3, 3])[2] < 0:
-        return guess
-    guess[:3] *= -1
-    guess[:3, 2] *= -1
-    return guess
-
-
 def _seen_ground(calibration: Calibration) -> FloatArray:
     """A small square on the ground that the camera sees: around what the image's lowest row shows."""
     ipm = ipm_from_extrinsic(calibration.info, calibration.cam_from_vehicle)
@@ -100,7 +87,7 @@ def _check(calibration: Calibration) -> None:
         or not np.array_equal(cam_from_vehicle[3], [0, 0, 0, 1])
     ):
         problem = "cam_from_vehicle is no rotation and translation; write it again with `python -m v2hdm.map`"
-    elif (-rotation.T @ cam_from_vehicle[:3, 3])[2] <= 0:
+    elif camera_centre(cam_from_vehicle)[2] <= 0:
         problem = "cam_from_vehicle puts the camera on or under the ground; mend it"
     if problem:
         raise MapFileError(f"calibration of camera {info.name!r}: {problem}")

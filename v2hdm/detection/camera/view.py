@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.detection.camera.ground import apply_homography, extrinsic_from_ipm
-from v2hdm.detection.camera.lens import distort_points, has_distortion, undistort_points
+from v2hdm.geometry.ipm import apply_in_front, extrinsic_from_ipm, facing_ipm, homography_jacobian
+from v2hdm.geometry.lens import distort_points, has_distortion, undistort_points
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, Camera, FloatArray
 
 _LUT_STEP_PX = 4
@@ -41,13 +42,13 @@ class CameraView:
         self.vehicle_from_pinhole_px: FloatArray = camera.ipm[camera.initial_ipm]
         self.pinhole_px_from_vehicle: FloatArray = np.asarray(np.linalg.inv(self.vehicle_from_pinhole_px))
         self._pinhole_lut = _build_pinhole_lut(camera) if has_distortion(camera.info) else None
-        seen_vehicle = np.asarray(camera.roi_vehicle, dtype=np.float64).mean(axis=0)
-        cam_from_vehicle = extrinsic_from_ipm(self.info, self.vehicle_from_pinhole_px, seen_vehicle)
+        self._ground_from_pinhole_px = facing_ipm(
+            self.vehicle_from_pinhole_px, camera.roi_vehicle.mean(axis=0)
+        )
+        cam_from_vehicle = extrinsic_from_ipm(self.info, self.vehicle_from_pinhole_px)
         ahead, left, _ = cam_from_vehicle[2, :3]
         self.aside = bool(np.arctan2(abs(left), abs(ahead)) > ASIDE_RAD)
-        self.foot_vehicle = -(cam_from_vehicle[:3, :3].T @ cam_from_vehicle[:3, 3])[:2]
-        seen_px = apply_homography(self.pinhole_px_from_vehicle, seen_vehicle[None])
-        self._ground_sign = np.sign(self._ground_depth(seen_px))[0]
+        self.foot_vehicle = camera_centre(cam_from_vehicle)[:2]
         self.top, self.height = self._band_rows(multiple)
         spare = max(self.first_row_within(FARTHEST_M) - _SURROUNDINGS_PX - self.top, 0)
         self.far_row = self.top + spare // multiple * multiple
@@ -85,17 +86,12 @@ class CameraView:
     def ground(self, points_pinhole_px: FloatArray) -> FloatArray:
         """Where pinhole pixels (N, 2) meet the ground, vehicle frame, m; NaN at and above the horizon."""
         points = np.asarray(points_pinhole_px, dtype=np.float64).reshape(-1, 2)
-        homography = self.vehicle_from_pinhole_px
-        homogeneous = points @ homography.T[:2] + homography.T[2]
-        depth = homogeneous[:, 2:]
-        return np.asarray(homogeneous[:, :2] / np.where(depth * self._ground_sign > 0, depth, np.nan))
+        return apply_in_front(self._ground_from_pinhole_px, points)
 
     def ground_jacobian(self, points_pinhole_px: FloatArray) -> FloatArray:
         """Derivative (N, 2, 2) of :meth:`ground`, m per px; NaN where that is NaN."""
         points = np.asarray(points_pinhole_px, dtype=np.float64).reshape(-1, 2)
-        homography = self.vehicle_from_pinhole_px
-        slope = homography[:2, :2] - self.ground(points)[..., None] * homography[2, :2]
-        return np.asarray(slope / self._ground_depth(points)[:, None, None])
+        return homography_jacobian(self._ground_from_pinhole_px, points)
 
     def range_m(self, points_vehicle: FloatArray) -> FloatArray:
         """Distance on the ground from below the camera; NaN stays NaN."""
@@ -111,10 +107,6 @@ class CameraView:
         u, v = points_px[..., 0], points_px[..., 1]
         across = (u >= border_px) & (u <= self.info.width - 1 - border_px)
         return np.asarray(across & (v >= border_px) & (v <= self.info.height - 1 - border_px))
-
-    def _ground_depth(self, points_pinhole_px: FloatArray) -> FloatArray:
-        row = self.vehicle_from_pinhole_px[2]
-        return np.asarray(points_pinhole_px @ row[:2] + row[2])
 
     def first_row_within(self, range_m: float) -> int:
         """The uppermost row of the band that shows ground within ``range_m`` of the camera's foot."""

@@ -13,16 +13,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.markings.foreground import Foreground
 from v2hdm.detection.lanes.bends import DRAWN_STEP_PX, Seen, beside_guide
 from v2hdm.detection.lanes.curves import Horizon, basis
 from v2hdm.detection.lanes.ends import alone_from, solid_end
 from v2hdm.detection.lanes.groups import find_lines
 from v2hdm.detection.lanes.looks import UNKNOWN_LOOKS, Looks
-from v2hdm.detection.lanes.points import NEIGHBOURS, IntArray, Line, LinePoints
+from v2hdm.detection.lanes.points import NEIGHBOURS, Line, LinePoints
+from v2hdm.detection.markings.foreground import Foreground
 from v2hdm.detection.odds import as_probability
 from v2hdm.detection.sight import AnchorRow
-from v2hdm.records import LANE_BOUNDARY, LANE_LINE, BoolArray, FloatArray, LaneDetection
+from v2hdm.records import LANE_BOUNDARY, LANE_LINE, BoolArray, FloatArray, IntArray, LaneDetection
 
 _MIN_CHAIN = 3
 _CHAIN_ODDS = 0.0

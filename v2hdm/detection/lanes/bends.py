@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from v2hdm.detection.camera.ground import apply_homography
 from v2hdm.detection.camera.view import CameraView
+from v2hdm.geometry.ipm import apply_homography
 from v2hdm.records import BoolArray, FloatArray, LaneDetection
 
 _STEP_M = 0.5

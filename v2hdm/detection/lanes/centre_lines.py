@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.detection.camera.ground import apply_homography
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.markings.blobs import Blob
+from v2hdm.geometry.ipm import apply_homography
 from v2hdm.records import FloatArray, LaneDetection
 
 _CAP_WIDTH_RATIO = 0.7

@@ -11,10 +11,10 @@ from __future__ import annotations
 import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.markings.foreground import Foreground
 from v2hdm.detection.lanes.curves import Horizon, basis
-from v2hdm.detection.lanes.points import IntArray, Line, LinePoints
-from v2hdm.records import FloatArray
+from v2hdm.detection.lanes.points import Line, LinePoints
+from v2hdm.detection.markings.foreground import Foreground
+from v2hdm.records import FloatArray, IntArray
 
 _LONGEST_DASH_M = 6.5
 _LEAST_GAP_M = 1.2

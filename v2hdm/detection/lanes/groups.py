@@ -14,11 +14,11 @@ import numpy as np
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.lanes.curves import Evidence, Horizon
 from v2hdm.detection.lanes.looks import Looks
-from v2hdm.detection.lanes.points import IntArray, Line, LinePoints
+from v2hdm.detection.lanes.points import Line, LinePoints
 from v2hdm.detection.lanes.road import Road, find_road
 from v2hdm.detection.lanes.score import log_odds, log_odds_alone
 from v2hdm.detection.lanes.strands import boundaries
-from v2hdm.records import BoolArray, FloatArray
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _GATE_SIGMAS = 3.0
 _GATE_PX = 16.0

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.markings.foreground import Foreground
 from v2hdm.detection.lanes.curves import Horizon, basis
 from v2hdm.detection.lanes.points import Line, LinePoints
+from v2hdm.detection.markings.foreground import Foreground
 from v2hdm.records import BoolArray, FloatArray
 
 LOOKS = ("paint_along", "colour_change")

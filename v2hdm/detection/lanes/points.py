@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.lanes.curves import Curve, Evidence, Horizon, Prior, basis
-from v2hdm.records import BoolArray, FloatArray
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
 NEIGHBOURS = 3.0
 """Points of one line err together: that many tell as much as one."""

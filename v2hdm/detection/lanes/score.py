@@ -1,8 +1,8 @@
 """How probable it is that a line is one of a lane: a logistic function of what speaks for it.
 
 First each line is judged alone, then among the others of its image (:mod:`v2hdm.detection.lanes.company`).
-The weights, in ``score.json`` beside this file, belong to the network; they are those that
-``python -m tests.benchmarks.detector_lanes --write`` fits to renders which no benchmark shows.
+The weights, in ``lane_score.json``, belong to the network; they are those that
+``python -m train.fit_lane_score --write`` fits to renders which no benchmark shows.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 
@@ -18,11 +17,10 @@ from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.lanes.company import COMPANY, company
 from v2hdm.detection.lanes.curves import Horizon
 from v2hdm.detection.lanes.looks import LOOKS, Looks
-from v2hdm.detection.lanes.points import IntArray, Line, LinePoints
+from v2hdm.detection.lanes.points import Line, LinePoints
 from v2hdm.detection.odds import as_probability
-from v2hdm.records import FloatArray
-
-SCORE_FILE = Path(__file__).with_name("score.json")
+from v2hdm.detection.weights import LANE_SCORE_FILE
+from v2hdm.records import FloatArray, IntArray
 
 FEATURES = (
     "best_crossings",
@@ -124,7 +122,7 @@ def _best_crossings(odds: FloatArray, begins: IntArray, count: IntArray) -> Floa
 @cache
 def fitted() -> dict[str, tuple[FloatArray, float]]:
     """Weights and bias of the logistic functions of a line ``alone`` and ``among`` others, from the file."""
-    content = json.loads(SCORE_FILE.read_text(encoding="utf-8"))
+    content = json.loads(LANE_SCORE_FILE.read_text(encoding="utf-8"))
     return {
         name: (np.array([content[name]["weights"][key] for key in keys]), float(content[name]["bias"]))
         for name, keys in (("alone", FEATURES), ("among", TOLD))

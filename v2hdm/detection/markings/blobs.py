@@ -53,8 +53,8 @@ class Blob:
     (i, j) lies at recorded pixel ``origin_px + stride * (j, i)``. ``outline_px`` (N, 2) are the
     zero crossings between neighbouring elements, recorded px, in no order. ``class_score`` maps
     each class to its mean probability over the blob. ``touches_symbol`` says that it was split
-    off a connected piece of paint another part of which is an arrow, a chevron or other paint. A piece that may be
-    several markings comes whole, followed by its ``parts``.
+    off a connected piece of paint another part of which is an arrow, a chevron or other paint. A piece that
+    may be several markings comes whole, followed by its ``parts``.
     """
 
     class_score: dict[str, float]

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from v2hdm.detection.markings.quad import side_frames
+from v2hdm.geometry.quadrilateral import side_frames
 from v2hdm.records import DIAMOND, LANE_DASH, FloatArray
 
 COMPANY = ("alike", "most_alike", "unlike", "surest_other", "in_line")

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from v2hdm.detection.markings.normal import normal_cdf, normal_pdf
-from v2hdm.detection.markings.quad import side_frames
+from v2hdm.geometry.quadrilateral import side_frames
 
 _CELLS_PER_BLUR = 32
 _REACH = 4.5

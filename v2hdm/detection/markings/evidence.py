@@ -11,7 +11,7 @@ from v2hdm.detection.markings.fit import STATISTICS, Fit
 from v2hdm.detection.markings.foreground import Foreground
 from v2hdm.detection.markings.frames import Quads
 from v2hdm.detection.markings.propose import Proposal, symbol_share
-from v2hdm.detection.markings.quad import side_frames, width
+from v2hdm.geometry.quadrilateral import side_frames, width
 from v2hdm.records import FloatArray
 
 CLAIMED = (
@@ -27,9 +27,9 @@ CLAIMED = (
 )
 """The features that are claims of the network.
 
-Log odds of paint inside, their mean and ninth decile, and their mean beside the side where they are highest; mean
-probability of paint over the piece; share of the class by the network alone, and by network and size; shares of
-lines and of symbols; whether the piece was split off a symbol.
+Log odds of paint inside, their mean and ninth decile, and their mean beside the side where they are highest;
+mean probability of paint over the piece; share of the class by the network alone, and by network and size;
+shares of lines and of symbols; whether the piece was split off a symbol.
 """
 
 FEATURES = (
@@ -45,8 +45,8 @@ FEATURES = (
 """Names of the columns of :func:`gather`, in order.
 
 Besides the claims and the fit's statistics: how much of the starting quadrilateral the piece fills, how many
-sides the border cuts, log of the width in px, log of length and width on the ground, m, and log of how much longer
-the longest side is than the shortest.
+sides the border cuts, log of the width in px, log of length and width on the ground, m, and log of how much
+longer the longest side is than the shortest.
 """
 
 _GRID = (np.arange(6) + 0.5) / 6

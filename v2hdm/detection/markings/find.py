@@ -26,9 +26,9 @@ class Readings:
     """R readings of M fitted quadrilaterals, each of one as one class: what the judge is asked about.
 
     ``quadrilateral`` (R,) is the index of each, ``kinds`` its class; ``evidence`` (R, F) and ``views``
-    (R, C, S, S) are what the judge sees, ``ground`` (R, 4, 2) the corners, m. The first side in a view is side
-    ``first_side`` (R,) of the quadrilateral. ``parts`` lists, by quadrilateral around a whole piece of paint, those
-    around its parts: either the one or the others are markings.
+    (R, C, S, S) are what the judge sees, ``ground`` (R, 4, 2) the corners, m. The first side in a view is
+    side ``first_side`` (R,) of the quadrilateral. ``parts`` lists, by quadrilateral around a whole piece of
+    paint, those around its parts: either the one or the others are markings.
     """
 
     fit: Fit
@@ -41,7 +41,9 @@ class Readings:
     parts: Mapping[int, Sequence[int]]
 
 
-def find_markings(readings: Readings | None, view: CameraView, options: DetectorOptions) -> list[MarkingDetection]:
+def find_markings(
+    readings: Readings | None, view: CameraView, options: DetectorOptions
+) -> list[MarkingDetection]:
     """The quadrilaterals that are likely enough to be whole markings, each as its likeliest class."""
     if readings is None:
         return []
@@ -72,7 +74,7 @@ def read_markings(
     catalogue: Catalogue,
     blur_px: float | None,
 ) -> Readings | None:
-    """Fit the proposals with four corners, and gather the evidence for each of their classes; None for none."""
+    """Fit the proposals with four corners and gather the evidence for their classes; None for none."""
     tried = [(proposal, kinds) for proposal in proposals if (kinds := proposal.kinds(catalogue))]
     if not tried:
         return None
@@ -96,11 +98,13 @@ def read_markings(
         for m, p in enumerate(chosen)
         if p.blob.parts
     }
-    return Readings(fit, at, kinds, evidence, views, ground[at], first_side, {m: k for m, k in parts.items() if k})
+    return Readings(
+        fit, at, kinds, evidence, views, ground[at], first_side, {m: k for m, k in parts.items() if k}
+    )
 
 
 def _best_of_each(quadrilateral: np.ndarray, score: FloatArray) -> np.ndarray:
-    """The reading (M,) of each quadrilateral with the highest score, the likelier by the network of equals."""
+    """The reading (M,) of each quadrilateral with the highest score; of equals the likelier."""
     order = np.lexsort((-np.arange(len(score)), score))
     best = np.zeros(int(quadrilateral.max()) + 1, dtype=np.intp)
     best[quadrilateral[order]] = order

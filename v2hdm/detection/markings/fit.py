@@ -1,15 +1,15 @@
 """One fit for every marking, near and far: a quadrilateral in the log of the image's grey values.
 
 In frames in which the lens bends nothing (:mod:`.frames`), the log grey of a pixel is modelled as
-``light(s) + c x + log(1 + (exp(k) - 1) C)``: C is the quadrilateral's coverage blurred by the point spread, k the
-log contrast of paint over ground, ``light`` a piecewise linear function along the marking and c a slope across
-it. A shadow is a factor on paint and ground alike, so it goes into the light and moves no side. Gauss-Newton
-with Cauchy weights finds the ends of the four sides, blur, contrast and light.
+``light(s) + c x + log(1 + (exp(k) - 1) C)``: C is the quadrilateral's coverage blurred by the point spread, k
+the log contrast of paint over ground, ``light`` a piecewise linear function along the marking and c a slope
+across it. A shadow is a factor on paint and ground alike, so it goes into the light and moves no side.
+Gauss-Newton with Cauchy weights finds the ends of the four sides, blur, contrast and light.
 
-Nothing is ever "not found". Every side has the residual variance of its own pixels, the outline that the network
-drew is a weak observation of every side, and a side at the image's border is all but free. A crack along one
-side, clipped paint, an occluder or the border thereby show as a large covariance in the direction that they
-hide.
+Nothing is ever "not found". Every side has the residual variance of its own pixels, the outline that the
+network drew is a weak observation of every side, and a side at the image's border is all but free. A crack
+along one side, clipped paint, an occluder or the border thereby show as a large covariance in the direction
+that they hide.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from v2hdm.detection.markings.correlation import variance_inflation
 from v2hdm.detection.markings.coverage import blurred_coverage
 from v2hdm.detection.markings.frames import StraightFrames
 from v2hdm.detection.markings.lattice import KNOTS, Lattice, Scene, lay_grid, lay_lattice
-from v2hdm.detection.markings.quad import is_convex, preceding, side_frames, signed_area
+from v2hdm.geometry.planar import signed_area
+from v2hdm.geometry.quadrilateral import is_convex_px, preceding, side_frames
 from v2hdm.records import BoolArray, FloatArray
 
 TYPICAL_BLUR_PX = 0.75
@@ -43,13 +44,15 @@ _PAINT_SIGMA = 0.25
 """How far the network's probability of paint is from the coverage."""
 
 _CLOSURE_SHARE, _CLOSURE_M = 0.03, 0.005
-"""By how much the sum of a marking's opposite corners differs, in parts of the root of its area, at least in m.
+"""By how much the sum of a marking's opposite corners differs, in parts of the root of its area, at least in
+m.
 
 Stencils are true to 5 mm; a guess of the mounting that is 2 degrees off makes 3 % of a parallelogram.
 """
 
 _BLOOM, _MUCH_CLIPPED = 1.2, 0.15
-"""Where this share of a marking's pixels is clipped, its outline lies about so many blurs outside the paint."""
+"""Where this share of a marking's pixels is clipped, its outline lies about so many blurs outside the
+paint."""
 
 _MOST_MOVED, _MOST_GROWTH = 0.5, 4.0
 """A fit that moves its middle by more of its size, or grows or shrinks by more, follows something else."""
@@ -76,7 +79,8 @@ _MIN_SCATTER = 0.01
 """Least scatter of log grey: quantisation and noise of the best sensor."""
 
 _WIDE_SCATTER, _FINAL_SCATTER = 0.4, 0.1
-"""Least scatter at the first step of search and fit, halved at each: the next may explain what one rejects."""
+"""Least scatter at the first step of search and fit, halved at each: the next may explain what one
+rejects."""
 
 _SHARED_PIXELS = 20.0
 """A side's variance is drawn to that of all sides as if by so many pixels."""
@@ -85,7 +89,8 @@ _CAUCHY = 2.385
 """Cauchy's scale for 95 % efficiency (Holland and Welsch, 1977)."""
 
 _MODEL_SIGMA_PX = 0.04
-"""Error of a side along the pixels' rows, px, with no noise at all: a Gaussian is not quite a pixel's aperture."""
+"""Error of a side along the pixels' rows, px, with no noise at all: a Gaussian is not quite a pixel's
+aperture."""
 
 _MAX_CORRELATION = 0.7
 _SEARCH_STEPS, _STEPS = 6, 7
@@ -119,9 +124,9 @@ STATISTICS = (
 )
 """Names of the columns of :attr:`Fit.statistics`.
 
-Log contrast of paint over ground; scatter of log grey over contrast, over all and on the worst side; mean robust
-weight; share of clipped pixels; blur, px; log of the standard deviation of the two ends and of the two long
-sides, px; log of the longest way of a corner from the outline and of the last step, px.
+Log contrast of paint over ground; scatter of log grey over contrast, over all and on the worst side; mean
+robust weight; share of clipped pixels; blur, px; log of the standard deviation of the two ends and of the two
+long sides, px; log of the longest way of a corner from the outline and of the last step, px.
 """
 
 
@@ -129,9 +134,9 @@ sides, px; log of the longest way of a corner from the outline and of the last s
 class Fit:
     """M quadrilaterals ``corners`` (M, 4, 2) in their ``frames``.
 
-    ``side_covariance`` (M, 8, 8), px^2, is that of the moves of the sides' starts and ends along their outward
-    normals. ``statistics`` (M, len(STATISTICS)) say how well the model explains the pixels. ``open_sides``
-    (M, 4) are those cut by the image's border.
+    ``side_covariance`` (M, 8, 8), px^2, is that of the moves of the sides' starts and ends along their
+    outward normals. ``statistics`` (M, len(STATISTICS)) say how well the model explains the pixels.
+    ``open_sides`` (M, 4) are those cut by the image's border.
     """
 
     frames: StraightFrames
@@ -201,7 +206,9 @@ def fit_quadrilaterals(
     searched = state.corners.copy()
     lattice = lay_lattice(scene, frames, searched_px)
     sigma_px = np.where(open_sides, _OPEN_SIGMA * length_px[:, None], _OUTLINE_SIGMA_PX)
-    inward_px = np.repeat(-_BLOOM * blur_px * np.minimum(lattice.clipped / _MUCH_CLIPPED, 1.0)[:, None], 8, axis=1)
+    inward_px = np.repeat(
+        -_BLOOM * blur_px * np.minimum(lattice.clipped / _MUCH_CLIPPED, 1.0)[:, None], 8, axis=1
+    )
     begun = searched + (_corner_from_side(searched) @ inward_px[..., None]).reshape(-1, 4, 2)
     state = _State.at(begun, np.full(len(start), blur_px), blur_px, frames)
     state.outline_sigma_px = np.tile(sigma_px, 2)
@@ -222,8 +229,12 @@ def _sound(corners: FloatArray, before: FloatArray) -> BoolArray:
     size = np.ptp(before, axis=1).max(axis=1)
     moved = np.abs(corners.mean(axis=1) - before.mean(axis=1)).max(axis=1)
     area = np.abs(signed_area(corners)) / np.maximum(np.abs(signed_area(before)), 1e-6)
-    near = (moved < _MOST_MOVED * size + 2 * _OUTLINE_SIGMA_PX) & (area < _MOST_GROWTH) & (area > 1 / _MOST_GROWTH)
-    return np.asarray(is_convex(corners) & np.isfinite(corners).all(axis=(1, 2)) & near)
+    near = (
+        (moved < _MOST_MOVED * size + 2 * _OUTLINE_SIGMA_PX)
+        & (area < _MOST_GROWTH)
+        & (area > 1 / _MOST_GROWTH)
+    )
+    return np.asarray(is_convex_px(corners) & np.isfinite(corners).all(axis=(1, 2)) & near)
 
 
 @dataclass
@@ -248,9 +259,9 @@ class _System:
 class _State:
     """The unknowns of M markings: corners, blur, contrast, light (M, KNOTS) and its slope across.
 
-    ``outline`` (M, 4, 2) are the corners that the network drew, ``outline_sigma_px`` (M, 8) how far its sides'
-    starts and ends are off along their normals. ``closure`` (M, 2, 8) takes the corners to p0 - p1 + p2 - p3 on the
-    ground in its standard deviation, ``gap`` (M, 2) is that of the outline.
+    ``outline`` (M, 4, 2) are the corners that the network drew, ``outline_sigma_px`` (M, 8) how far its
+    sides' starts and ends are off along their normals. ``closure`` (M, 2, 8) takes the corners to p0 - p1 +
+    p2 - p3 on the ground in its standard deviation, ``gap`` (M, 2) is that of the outline.
     """
 
     corners: FloatArray
@@ -266,7 +277,9 @@ class _State:
     gap: FloatArray
 
     @classmethod
-    def at(cls, corners: FloatArray, blur_px: FloatArray, expected_blur_px: float, frames: StraightFrames) -> _State:
+    def at(
+        cls, corners: FloatArray, blur_px: FloatArray, expected_blur_px: float, frames: StraightFrames
+    ) -> _State:
         """Of starting corners (M, 4, 2); light and contrast are not known yet (nan)."""
         count = len(corners)
         contrast, slope = np.full(count, _CONTRAST), np.zeros(count)
@@ -300,9 +313,7 @@ class _State:
         return system
 
     def _take(self, rows: np.ndarray) -> _State:
-        return _State(
-            *(v[rows] if isinstance(v, np.ndarray) else v for v in vars(self).values())  # type: ignore[arg-type]
-        )
+        return _State(*(v[rows] if isinstance(v, np.ndarray) else v for v in vars(self).values()))
 
     def _put(self, rows: np.ndarray, other: _State) -> None:
         for name, value in vars(self).items():
@@ -310,7 +321,7 @@ class _State:
                 value[rows] = getattr(other, name)
 
     def step(self, lattice: Lattice, paint: np.ndarray | None, least_scatter: float) -> _System:
-        """One Gauss-Newton step, in place, under which no scatter below ``least_scatter`` makes an outlier."""
+        """One Gauss-Newton step, in place; the robust scale is ``least_scatter`` or more."""
         coverage, by_shape = blurred_coverage(self.corners, lattice.points, self.blur_px)
         hats, across = lattice.hats, lattice.across
         if np.isnan(self.light).any():
@@ -388,7 +399,7 @@ class _State:
 
 
 def _closure(corners: FloatArray, frames: StraightFrames) -> tuple[FloatArray, FloatArray]:
-    """The derivative (M, 2, 8) of the gap p0 - p1 + p2 - p3 on the ground, and the gap (M, 2), in its deviation.
+    """The gap p0 - p1 + p2 - p3 on the ground, in its deviation: derivative (M, 2, 8) and value (M, 2).
 
     It is 0 for parallelograms, as all markings are painted. 0 where a corner shows no ground.
     """
@@ -397,7 +408,7 @@ def _closure(corners: FloatArray, frames: StraightFrames) -> tuple[FloatArray, F
     ground = frames.view.ground(flat).reshape(corners.shape)
     by_corner = frames.view.ground_jacobian(flat).reshape(-1, 4, 2, 2) @ np.linalg.inv(frames.scale)[:, None]
     size_m = np.sqrt(np.abs(signed_area(ground)))
-    sigma_m = np.maximum(_CLOSURE_SHARE * size_m, _CLOSURE_M)[:, None, None]
+    sigma_m = np.asarray(np.maximum(_CLOSURE_SHARE * size_m, _CLOSURE_M))[:, None, None]
     derivative = (_ALTERNATING[:, None, None] * by_corner).transpose(0, 2, 1, 3).reshape(-1, 2, 8) / sigma_m
     gap = _ALTERNATING @ ground / sigma_m[..., 0]
     known = np.isfinite(derivative).all(axis=(1, 2)) & np.isfinite(gap).all(axis=1)
@@ -472,7 +483,8 @@ def _corner_from_side(corners: FloatArray) -> FloatArray:
 def _second_order(corners: FloatArray, by_side: FloatArray) -> FloatArray:
     """What the error of a side's direction adds where its end is vague: (M, 8, 8), px^2.
 
-    A corner that may lie far along a side is off across it by its way times the error of the side's direction.
+    A corner that may lie far along a side is off across it by its way times the error of the side's
+    direction.
     """
     _, normal, length = side_frames(corners)
     start, end = by_side[:, _CORNER, _CORNER], by_side[:, _CORNER + 4, _CORNER + 4]
@@ -493,7 +505,9 @@ _TILT_SHARE = 0.5
 
 def _whole_sides(sigma_px: FloatArray) -> FloatArray:
     """Covariance (M, 8, 8) of starts and ends of sides that are off as a whole by ``sigma_px`` (M, 4)."""
-    pattern = np.kron([[1.0, 1.0], [1.0, 1.0]], np.eye(4)) + _TILT_SHARE**2 * np.kron([[1.0, -1.0], [-1.0, 1.0]], np.eye(4))
+    pattern = np.kron([[1.0, 1.0], [1.0, 1.0]], np.eye(4)) + _TILT_SHARE**2 * np.kron(
+        [[1.0, -1.0], [-1.0, 1.0]], np.eye(4)
+    )
     sigma = np.tile(sigma_px, 2)
     return np.asarray(sigma[:, :, None] * pattern * sigma[:, None, :])
 
@@ -502,7 +516,9 @@ def _statistics(
     state: _State, system: _System, lattice: Lattice, covariance: FloatArray, moved_px: FloatArray
 ) -> FloatArray:
     contrast = np.maximum(np.abs(state.contrast), 0.05)
-    side_sigma = np.sqrt(np.maximum(covariance[:, np.arange(8), np.arange(8)], 1e-8)).reshape(-1, 2, 4).mean(axis=1)
+    side_sigma = (
+        np.sqrt(np.maximum(covariance[:, np.arange(8), np.arange(8)], 1e-8)).reshape(-1, 2, 4).mean(axis=1)
+    )
     length = side_frames(state.corners)[2]
     lengthwise = length[:, 0] + length[:, 2] >= length[:, 1] + length[:, 3]
     pairs = (side_sigma[:, :2] + side_sigma[:, 2:]) / 2

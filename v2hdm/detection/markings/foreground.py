@@ -29,7 +29,7 @@ class Foreground:
     classes: tuple[str, ...]
 
     def others_at(self, u: np.ndarray, v: np.ndarray, first: np.ndarray, last: np.ndarray) -> BoolArray:
-        """Where pixels (N,) of columns ``u`` and rows ``v`` are paint of blobs but ``first`` to ``last`` (N,)."""
+        """Where pixels (N,) at ``u``, ``v`` are paint of other blobs than ``first`` to ``last`` (N,)."""
         row = np.clip((v - self.top) // self.stride, 0, self.owner.shape[0] - 1)
         owner = self.owner[row, np.clip(u // self.stride, 0, self.owner.shape[1] - 1)]
         return np.asarray((owner > 0) & ((owner < first + 1) | (owner > last + 1)))

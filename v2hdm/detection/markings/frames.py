@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.detection.camera.lens import has_distortion
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.markings.quad import block_diagonal, following
+from v2hdm.geometry.lens import has_distortion
+from v2hdm.geometry.quadrilateral import block_diagonal, following
 from v2hdm.records import BoolArray, FloatArray
 
 _SEEN_BOW_PX = 0.25

@@ -1,10 +1,10 @@
 """The judge: how probable it is that a quadrilateral is a whole marking, and which of its sides to trust.
 
-It is asked twice. First of each reading alone: the network in ``judge.onnx`` gets the :mod:`.evidence` and the
-view of the quadrilateral in its own frame (:mod:`.rectified`). It answers with log odds, and with how far each
-side may be off for reasons that the fit's residuals do not show: worn ends, seams along a side, shadows, something
-in front. Then of each among the others of its image: a logistic function of :mod:`.context`, whose weights are in
-``confidence.json``. Both files belong to the paint network beside them.
+It is asked twice. First of each reading alone: the network in ``judge.onnx`` gets the :mod:`.evidence` and
+the view of the quadrilateral in its own frame (:mod:`.rectified`). It answers with log odds, and with how far
+each side may be off for reasons that the fit's residuals do not show: worn ends, seams along a side, shadows,
+something in front. Then of each among the others of its image: a logistic function of :mod:`.context`, whose
+weights are in ``confidence.json``. Both files belong to the paint network beside them.
 """
 
 from __future__ import annotations
@@ -20,10 +20,9 @@ import numpy as np
 from v2hdm.detection.markings.context import COMPANY, company
 from v2hdm.detection.network import open_session
 from v2hdm.detection.odds import as_probability
+from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
 from v2hdm.records import DIAMOND, LANE_DASH, FloatArray
 
-CONFIDENCE_FILE = Path(__file__).parents[1] / "confidence.json"
-JUDGE_FILE = Path(__file__).parents[1] / "judge.onnx"
 JUDGE_INPUTS = ("views", "evidence", "shape")
 JUDGE_OUTPUTS = ("odds", "log_side_sigma")
 

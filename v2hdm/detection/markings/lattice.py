@@ -9,8 +9,9 @@ import numpy as np
 from v2hdm.detection.markings.foreground import Foreground
 from v2hdm.detection.markings.frames import StraightFrames
 from v2hdm.detection.markings.grey import CLIPPED, grey_of, linear_bgr, log_grey
-from v2hdm.detection.markings.quad import following, side_frames, signed_area, width
 from v2hdm.detection.odds import as_probability
+from v2hdm.geometry.planar import signed_area
+from v2hdm.geometry.quadrilateral import following, side_frames, width
 from v2hdm.records import BoolArray, FloatArray
 
 KNOTS = 6
@@ -33,10 +34,10 @@ class Lattice:
 
     ``points`` (M, 3, N) float32 are (x, y, 1) in the markings' frames; ``values`` (M, N) float32 log grey;
     ``use`` (M, N) float32 1 where a pixel takes part, else 0; ``limited`` (M, N) where the sensor was at its
-    limit; ``clipped`` (M,) the share of those. ``neighbours`` (2, M, N) is the place in the list of the lattice's
-    next pixel to the right and below, 0 for none as near as any is. ``of_side`` (M, N, 4) float32 is 1 for the
-    side that is nearest. ``hats`` (M, KNOTS, N) interpolate between knots along the marking, ``across`` (M, N)
-    runs from -1 to 1 across it.
+    limit; ``clipped`` (M,) the share of those. ``neighbours`` (2, M, N) is the place in the list of the
+    lattice's next pixel to the right and below, 0 for none as near as any is. ``of_side`` (M, N, 4) float32
+    is 1 for the side that is nearest. ``hats`` (M, KNOTS, N) interpolate between knots along the marking,
+    ``across`` (M, N) runs from -1 to 1 across it.
     """
 
     points: np.ndarray
@@ -82,10 +83,10 @@ class Lattice:
 
 @dataclass(frozen=True)
 class Scene:
-    """The image that markings are fitted to: pixels, the network's word on each, and the blobs of each marking.
+    """The image that markings are fitted to, the network's word on it, and which paint is whose.
 
-    ``image_bgr`` (H, W, 3) uint8; ``first_blob`` and ``last_blob`` (M,) are the blobs that a marking's own paint
-    is of: pixels of all others are left out.
+    ``image_bgr`` (H, W, 3) uint8; ``first_blob`` and ``last_blob`` (M,) are the blobs that a marking's own
+    paint is of: pixels of all others are left out.
     """
 
     image_bgr: np.ndarray
@@ -130,8 +131,8 @@ def lay_lattice(scene: Scene, frames: StraightFrames, corners_px: FloatArray) ->
     place_of_cell[cell] = place
     near = _near_the_next(columns, size[:, 0])[marking, j], _near_the_next(rows, size[:, 1])[marking, i]
     neighbours = np.zeros((2, *shape), dtype=np.intp)
-    for axis, following in ((0, 1), (1, across)):
-        neighbours[axis, marking, place] = np.where(near[axis], place_of_cell[cell + following], 0)
+    for axis, step in ((0, 1), (1, across)):
+        neighbours[axis, marking, place] = np.where(near[axis], place_of_cell[cell + step], 0)
     light, use, clipped = scene.look(u, v, marking, frames.view.camera.linear_response)
     planes = np.zeros((3, *shape), dtype=np.float32)
     planes[:, marking, place] = light
@@ -147,19 +148,22 @@ _MARGIN_ALONG, _MARGIN_ACROSS = 0.2, 0.4
 """How far it reaches beyond a quadrilateral, in its lengths and widths."""
 
 
-def lay_grid(scene: Scene, frames: StraightFrames, corners_px: FloatArray) -> tuple[Lattice, np.ndarray, FloatArray]:
+def lay_grid(
+    scene: Scene, frames: StraightFrames, corners_px: FloatArray
+) -> tuple[Lattice, np.ndarray, FloatArray]:
     """A coarse grid all over quadrilaterals ``corners_px`` (M, 4, 2), recorded px, and beyond them.
 
     Returns:
-        The lattice, the network's probability of paint there (M, N), and how far apart its points are (M,), px.
+        The lattice, the network's probability of paint there (M, N), and how far apart its points are (M,),
+        px.
     """
     corners = frames.from_image(corners_px)
     length = side_frames(corners)[2]
     lengthwise = length[:, 0] + length[:, 2] >= length[:, 1] + length[:, 3]
     ordered = np.where(lengthwise[:, None, None], corners, following(corners))
     a, b = (
-        (np.linspace(-margin, 1 + margin, count) for margin, count in
-        ((_MARGIN_ALONG, _SEARCH_ALONG), (_MARGIN_ACROSS, _SEARCH_ACROSS)))
+        np.linspace(-margin, 1 + margin, count)
+        for margin, count in ((_MARGIN_ALONG, _SEARCH_ALONG), (_MARGIN_ACROSS, _SEARCH_ACROSS))
     )
     a, b = (part.ravel() for part in np.meshgrid(a, b))
     weight = np.stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b], axis=1)
@@ -183,7 +187,7 @@ def _lattice_of(
     looked: tuple[np.ndarray, np.ndarray, np.ndarray],
     neighbours: np.ndarray,
 ) -> Lattice:
-    """A lattice of pixels (M, N, 2) about quadrilaterals (M, 4, 2) in their frames, whose light was looked up."""
+    """A lattice of pixels (M, N, 2) about quadrilaterals (M, 4, 2) in their frames."""
     light, used, limited = looked
     points = np.ones((len(pixels), 3, pixels.shape[1]), dtype=np.float32)
     points[:, :2] = frames.from_image(pixels).swapaxes(1, 2)
@@ -199,7 +203,7 @@ _GREY_FIRST = 1.2
 
 
 def _clearest(light: np.ndarray, used: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Log grey, red or blue (3, M, N) of each marking, whichever tells its inside (M, N) best from the outside.
+    """Of log grey, red and blue (3, M, N) the one (M, N) that tells a marking's inside best from its outside.
 
     Yellow paint on light ground is as bright in grey, but darker in blue.
     """
@@ -233,7 +237,7 @@ def _of_side(corners: FloatArray, points: np.ndarray) -> np.ndarray:
 
 
 def _light_basis(corners: FloatArray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Hat functions (M, KNOTS, N) along the longest side and a slope (M, N) across it, at points (M, 3, N)."""
+    """Hat functions (M, KNOTS, N) along the longest side, and a slope (M, N) across it."""
     tangent, _, length = side_frames(corners)
     along = tangent[np.arange(len(corners)), length.argmax(axis=1)]
     axes = np.stack([along, along[:, ::-1] * [-1.0, 1.0]], axis=1)

@@ -1,7 +1,8 @@
 """Proposals: of every piece of paint, the classes whose size it may have, and a quadrilateral around it.
 
 The class of a proposal is a matter of odds, never of a rule: the network's share of each class times how well
-the size on the ground suits it. All classes with four corners that are not negligible are handed to the judge.
+the size on the ground suits it. All classes with four corners that are not negligible are handed to the
+judge.
 """
 
 from __future__ import annotations
@@ -14,10 +15,10 @@ import cv2
 import numpy as np
 
 from v2hdm.catalogue import LINE, OTHER, SYMBOL, Catalogue, size_of
-from v2hdm.detection.camera.ground import apply_homography
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.markings.blobs import Blob
-from v2hdm.detection.markings.quad import following, is_convex, order_corners, quad_from_hull
+from v2hdm.geometry.ipm import apply_homography
+from v2hdm.geometry.quadrilateral import following, is_convex_px, order_corners, quad_from_hull
 from v2hdm.records import BoolArray, FloatArray
 
 _LEAST_CERTAINTY = 0.3
@@ -40,9 +41,9 @@ _BORDER_PX = 3.0
 class Proposal:
     """A piece of paint: ``blob`` and its ``index``, the ``share`` of each class by network and size.
 
-    ``length_m`` and ``width_m`` are those of the smallest rectangle around it on the ground, nan where it shows
-    none. ``outline_vehicle`` (N, 2), m. ``corners_pinhole_px`` (4, 2) is the tightest quadrilateral around it, of
-    which it fills ``fill``; None where there is none.
+    ``length_m`` and ``width_m`` are those of the smallest rectangle around it on the ground, nan where it
+    shows none. ``outline_vehicle`` (N, 2), m. ``corners_pinhole_px`` (4, 2) is the tightest quadrilateral
+    around it, of which it fills ``fill``; None where there is none.
     """
 
     blob: Blob
@@ -68,11 +69,15 @@ class Proposal:
         """The classes with four corners that it may be of, the likeliest first."""
         if self.corners_pinhole_px is None or self.fill < _LEAST_FILL:
             return []
-        found = [n for n, share in self.share.items() if catalogue.classes[n].cornered and share >= _LEAST_SHARE]
+        found = [
+            n for n, share in self.share.items() if catalogue.classes[n].cornered and share >= _LEAST_SHARE
+        ]
         return sorted(found, key=lambda name: -self.share[name])
 
 
-def propose(blobs: Sequence[Blob], view: CameraView, catalogue: Catalogue, max_range_m: float) -> list[Proposal]:
+def propose(
+    blobs: Sequence[Blob], view: CameraView, catalogue: Catalogue, max_range_m: float
+) -> list[Proposal]:
     """The proposals of one image's pieces of paint."""
     if not blobs:
         return []
@@ -100,7 +105,9 @@ def open_sides(corners_px: FloatArray, view: CameraView) -> BoolArray:
     return ~view.inside((corners_px + following(corners_px)) / 2, _BORDER_PX)
 
 
-def _shares(blob: Blob, length_m: float, width_m: float, catalogue: Catalogue, *, whole: bool) -> dict[str, float]:
+def _shares(
+    blob: Blob, length_m: float, width_m: float, catalogue: Catalogue, *, whole: bool
+) -> dict[str, float]:
     """Share of each class that the catalogue maps or tells apart."""
     certainty = max(sum(blob.class_score.values()), 1e-9)
     doubt = _CLASS_DOUBT / len(blob.class_score)
@@ -116,7 +123,7 @@ def _shares(blob: Blob, length_m: float, width_m: float, catalogue: Catalogue, *
 
 def _within(corners: FloatArray, view: CameraView, max_range_m: float) -> bool:
     """Whether a quadrilateral (4, 2), pinhole px, is convex, on the ground and in range."""
-    if not is_convex(corners):
+    if not is_convex_px(corners):
         return False
     ground = view.ground(corners)
     return bool(np.isfinite(ground).all() and view.range_m(ground.mean(axis=0)) <= max_range_m)

@@ -16,7 +16,7 @@ from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.markings.foreground import Foreground
 from v2hdm.detection.markings.frames import Quads
 from v2hdm.detection.markings.grey import grey_of, linear_bgr, log_grey
-from v2hdm.detection.markings.quad import following, side_frames
+from v2hdm.geometry.quadrilateral import following, side_frames
 from v2hdm.records import DIAMOND, LANE_LINE, OTHER_PAINT, OUTLINED_CLASSES, FloatArray
 
 CHANNELS = ("log_grey", "blueness", "paint_odds", "own_share", "line_share", "symbol_share", "outside")

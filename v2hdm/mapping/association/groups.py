@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.mapping.sightings.location import Located
-from v2hdm.records import BoolArray, FloatArray
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
-IntArray = NDArray[np.int64]
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 

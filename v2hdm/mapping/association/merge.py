@@ -7,15 +7,12 @@ extrinsic that can be trusted they coincide in the map, up to their covariances.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from v2hdm.geometry.quadrilateral import align, diameters
 from v2hdm.mapping.association.groups import Association, FusedGroups
-from v2hdm.mapping.shapes import align, diameters
 from v2hdm.mapping.sightings.table import Sightings
-from v2hdm.records import FloatArray
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import FloatArray, IntArray
 
 
 def merge_groups(

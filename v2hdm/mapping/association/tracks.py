@@ -10,18 +10,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from v2hdm.geometry.quadrilateral import SHIFTS, align, diameters
+from v2hdm.geometry.rigid import heading_rad
 from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.options import AssociationOptions
-from v2hdm.mapping.shapes import SHIFTS, align, diameters
 from v2hdm.mapping.sightings.location import Located
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import Sightings
-from v2hdm.records import BoolArray, FloatArray
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _REFUSED = 1e9
 
@@ -108,7 +106,7 @@ class _Linker:
         pose = rig.map_from_vehicle
         steps_m = np.linalg.norm(np.diff(pose[:, :2, 3], axis=0), axis=1)
         self._odometer_m = np.concatenate([[0.0], np.cumsum(steps_m)])
-        self._heading_rad = np.unwrap(np.arctan2(pose[:, 1, 0], pose[:, 0, 0]))
+        self._heading_rad = np.unwrap(heading_rad(pose))
         self._noise_m2 = _noise_covariances(located, uncertainty)
         self._ray_map, self._range_m = _mean_rays(located)
 

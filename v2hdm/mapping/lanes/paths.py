@@ -6,14 +6,11 @@ import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from v2hdm.mapping.lanes.ridges import Nodes
 from v2hdm.mapping.options import LaneOptions
-from v2hdm.records import BoolArray, FloatArray
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _SAME_DIRECTION = np.cos(np.deg2rad(25.0))
 _MAX_LINK_SPACINGS = 2.5

@@ -6,18 +6,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from v2hdm.detection.camera.lens import undistort_points
-from v2hdm.mapping.sightings.backprojection import (
-    apply_homographies,
-    camera_centres,
+from v2hdm.geometry.ipm import (
+    apply_in_front,
     direction_covariance,
-    forward_ipm,
-    homography_jacobians,
-    plain_homographies,
-    posed_homographies,
+    facing_ipm,
+    flat_motion,
+    ground_from_pinhole_px,
+    homography_jacobian,
 )
+from v2hdm.geometry.lens import undistort_points
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import frames_of
 from v2hdm.records import (
@@ -28,9 +27,8 @@ from v2hdm.records import (
     Drive,
     FloatArray,
     ImageDetections,
+    IntArray,
 )
-
-IntArray = NDArray[np.int64]
 
 _CENTRE_SIGMA_PX = 1.0
 """Noise of a detected centre point across its line: about a cell of the network's output."""
@@ -88,8 +86,10 @@ def ground_by_ipm(
 ) -> ImageGround:
     """By an IPM per camera and the recorded poses; extrinsics only tell where the cameras are."""
     rows, names, poses = _rows(drive, list(ipm))
-    forward = {name: forward_ipm(drive.cameras[name], matrix) for name, matrix in ipm.items()}
-    homographies = plain_homographies(np.stack([forward[name] for name in names]), poses)
+    forward = {
+        name: facing_ipm(matrix, drive.cameras[name].roi_vehicle.mean(axis=0)) for name, matrix in ipm.items()
+    }
+    homographies = flat_motion(poses) @ np.stack([forward[name] for name in names])
     extrinsic = np.stack([cam_from_vehicle[name] for name in names])
     return _image_ground(len(drive.images), rows, homographies, extrinsic, poses)
 
@@ -100,7 +100,7 @@ def ground_by_rig(drive: Drive, cameras: Sequence[str], rig: Rig) -> ImageGround
     camera = np.array([list(cameras).index(name) for name in names])
     poses = rig.map_from_vehicle[frames_of(drive).frame_of_image[rows]]
     extrinsic = rig.cam_from_vehicle[camera]
-    homographies = posed_homographies(rig.intrinsic[camera], extrinsic, poses)
+    homographies = ground_from_pinhole_px(rig.intrinsic[camera], extrinsic @ np.linalg.inv(poses))
     return _image_ground(len(drive.images), rows, homographies, extrinsic, poses)
 
 
@@ -134,9 +134,9 @@ def collect_lane_points(
     image = np.array([i for i, _, _ in pieces])[piece]
     points_px = _undistort(drive, image, np.concatenate([points for _, _, points in pieces]))
     homographies = ground.map_from_pinhole_px[image]
-    points_map = apply_homographies(homographies, points_px[:, None])[:, 0]
+    points_map = apply_in_front(homographies, points_px[:, None])[:, 0]
     tangent = _tangents(points_map, piece, length)
-    jacobian = homography_jacobians(homographies, points_px[:, None])[:, 0]
+    jacobian = homography_jacobian(homographies, points_px[:, None])[:, 0]
     centre = ground.centre_map[image]
     ray = points_map - centre[:, :2]
     covariance = _CENTRE_SIGMA_PX**2 * jacobian @ np.swapaxes(jacobian, 1, 2)
@@ -172,7 +172,7 @@ def _guides(
     line = np.repeat(np.arange(len(lines)), [len(points_px) for _, points_px in lines])
     image = image_of_line[line]
     points_px = _undistort(drive, image, np.concatenate([points_px for _, points_px in lines]))
-    points_map = apply_homographies(ground.map_from_pinhole_px[image], points_px[:, None])[:, 0]
+    points_map = apply_in_front(ground.map_from_pinhole_px[image], points_px[:, None])[:, 0]
     with np.errstate(invalid="ignore"):
         near = np.linalg.norm(points_map - ground.centre_map[image, :2], axis=1) <= max_range_m
     return Guides(points_map[near], line[near].astype(np.int64), image_of_line)
@@ -188,7 +188,7 @@ def _rows(drive: Drive, cameras: Sequence[str]) -> tuple[IntArray, list[str], Fl
 def _image_ground(
     count: int, rows: IntArray, homographies: FloatArray, extrinsic: FloatArray, poses: FloatArray
 ) -> ImageGround:
-    centre = (poses[:, :3, :3] @ camera_centres(extrinsic)[..., None])[..., 0] + poses[:, :3, 3]
+    centre = (poses[:, :3, :3] @ camera_centre(extrinsic)[..., None])[..., 0] + poses[:, :3, 3]
     all_homographies = np.full((count, 3, 3), np.nan)
     all_centres = np.full((count, 3), np.nan)
     all_homographies[rows], all_centres[rows] = homographies, centre

@@ -10,14 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from v2hdm.mapping.lanes.points import LaneCloud
 from v2hdm.mapping.options import LaneOptions
-from v2hdm.records import FloatArray
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import FloatArray, IntArray
 
 _SEED_CELL_M = 0.25
 _DIRECTION_BINS = 8

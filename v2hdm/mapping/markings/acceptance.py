@@ -13,12 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from v2hdm.geometry.planar import clip_convex, signed_area
+from v2hdm.geometry.quadrilateral import characteristic_lengths, is_convex
 from v2hdm.mapping.options import AcceptanceOptions
-from v2hdm.mapping.shapes import is_convex, signed_area
-from v2hdm.planar import clip_convex
-from v2hdm.records import CORNERED_CLASSES, LANE_DASH, BoolArray, FloatArray
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import CORNERED_CLASSES, LANE_DASH, BoolArray, FloatArray, IntArray
 
 LACKS_A_CORNER = "a corner was never seen twice"
 ODD_SHAPE = "not shaped like the others of its class"
@@ -193,17 +191,6 @@ def count_peers(lengths: FloatArray, others: FloatArray, options: AcceptanceOpti
 def least_peers(members: int) -> float:
     """Peers that establish a shape in a class of so many members."""
     return max(MIN_PEERS, PEER_SHARE * members)
-
-
-def characteristic_lengths(corners: FloatArray) -> FloatArray:
-    """Mean lengths of the two pairs of opposite sides, and the diagonals (G, 4), each pair sorted.
-
-    They do not depend on which corner comes first.
-    """
-    side = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
-    pairs = np.sort(0.5 * (side[:, :2] + side[:, 2:]), axis=1)
-    diagonals = np.sort(np.linalg.norm(corners[:, 2:] - corners[:, :2], axis=2), axis=1)
-    return np.asarray(np.concatenate([pairs, diagonals], axis=1))
 
 
 def _covered(candidates: Candidates, verdict: list[str | None]) -> BoolArray:

@@ -11,14 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v2hdm.geometry.quadrilateral import characteristic_lengths
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.mapping.markings.acceptance import characteristic_lengths, count_peers, least_peers
+from v2hdm.mapping.markings.acceptance import count_peers, least_peers
 from v2hdm.mapping.options import AcceptanceOptions
-from v2hdm.records import BoolArray, FloatArray
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True)

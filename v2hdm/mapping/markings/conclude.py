@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v2hdm.geometry.ipm import project_ground
 from v2hdm.mapping.association.groups import Association, fuse_groups
 from v2hdm.mapping.association.merge import group_kinds
 from v2hdm.mapping.bundle import Bundle
@@ -19,10 +19,8 @@ from v2hdm.mapping.results import Exclusion
 from v2hdm.mapping.sightings.location import locate
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import Sightings
-from v2hdm.mapping.sightings.views import Views, project_ground
-from v2hdm.records import BoolArray, Calibration, Camera, FloatArray, Marking
-
-IntArray = NDArray[np.int64]
+from v2hdm.mapping.sightings.views import Views
+from v2hdm.records import BoolArray, Calibration, Camera, FloatArray, IntArray, Marking
 
 
 @dataclass(frozen=True)

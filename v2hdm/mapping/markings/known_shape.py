@@ -10,14 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from v2hdm.mapping.association.groups import FusedGroups
 from v2hdm.mapping.markings.completion import SolvedCorners
 from v2hdm.mapping.markings.shape_prior import SHAPE_SIGMA_M, class_shapes, miss_limit_m, rigid_onto
-from v2hdm.records import FloatArray
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import FloatArray, IntArray
 
 _LEAST_SEEN = 6
 _LEAST_SEEN_OF_TWO = 8

@@ -6,12 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from v2hdm.records import FloatArray, Marking
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import FloatArray, IntArray, Marking
 
 JointCovariance = Callable[[IntArray], FloatArray]
 """Covariances (P, 8, 8), m^2, of the stacked corners of pairs of diagonals (P, 4): two corners of either."""

@@ -17,15 +17,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from v2hdm.mapping.markings.acceptance import characteristic_lengths
+from v2hdm.geometry.quadrilateral import characteristic_lengths
 from v2hdm.mapping.markings.completion import SolvedCorners
 from v2hdm.mapping.markings.paint_error import PaintError, learn_paint_error
-from v2hdm.records import FloatArray
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import FloatArray, IntArray
 
 _COMMON_SHARE = 0.6
 """A class has one shape if this share of its markings has it."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from v2hdm.errors import MappingError
 from v2hdm.mapping.association.groups import Association, fuse_groups, vague_corners
@@ -27,9 +26,7 @@ from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.symbols import images_with_symbol
 from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.mapping.sightings.views import Views, easy_views
-from v2hdm.records import CORNERED_CLASSES, Camera, FloatArray, Marking
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import CORNERED_CLASSES, Camera, FloatArray, IntArray, Marking
 
 
 @dataclass(frozen=True, kw_only=True)

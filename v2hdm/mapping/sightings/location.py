@@ -7,18 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.mapping.sightings.backprojection import (
-    apply_homographies,
-    camera_centres,
+from v2hdm.geometry.ipm import (
+    apply_in_front,
     direction_covariance,
-    homography_jacobians,
-    posed_homographies,
+    ground_from_pinhole_px,
+    homography_jacobian,
 )
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.records import FloatArray
-
-IntArray = NDArray[np.int64]
 
 # Half the trace of a ground covariance beyond which a point is as good as on the horizon, m^2.
 _HORIZON_M2 = 1e4
@@ -57,13 +55,12 @@ class Located:
 def locate(sightings: Sightings, rig: Rig) -> Located:
     """Back-project every corner of ``sightings`` to z = 0 of the map under ``rig``."""
     camera, frame = sightings.camera, sightings.frame
-    homographies = posed_homographies(
-        rig.intrinsic[camera], rig.cam_from_vehicle[camera], rig.map_from_vehicle[frame]
-    )
-    corners_map = apply_homographies(homographies, sightings.corners_pinhole_px)
-    jacobian = homography_jacobians(homographies, sightings.corners_pinhole_px)
+    cam_from_map = rig.cam_from_vehicle[camera] @ np.linalg.inv(rig.map_from_vehicle[frame])
+    homographies = ground_from_pinhole_px(rig.intrinsic[camera], cam_from_map)
+    corners_map = apply_in_front(homographies, sightings.corners_pinhole_px)
+    jacobian = homography_jacobian(homographies, sightings.corners_pinhole_px)
     covariance = jacobian @ sightings.covariance_px @ np.swapaxes(jacobian, -1, -2)
-    centre_vehicle = camera_centres(rig.cam_from_vehicle)[camera]
+    centre_vehicle = camera_centre(rig.cam_from_vehicle)[camera]
     poses = rig.map_from_vehicle[frame]
     centre_map = (poses[:, :3, :3] @ centre_vehicle[..., None])[..., 0] + poses[:, :3, 3]
     with np.errstate(invalid="ignore"):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.mapping.sightings.backprojection import camera_centres
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import CameraInfo, FloatArray
 
 
@@ -25,7 +25,7 @@ class Rig:
     @property
     def height_m(self) -> FloatArray:
         """Heights (C,) of the camera centres above the ground of the vehicle."""
-        return np.asarray(np.maximum(camera_centres(self.cam_from_vehicle)[:, 2], 0.1))
+        return np.asarray(np.maximum(camera_centre(self.cam_from_vehicle)[:, 2], 0.1))
 
 
 def build_rig(

@@ -11,14 +11,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from v2hdm.detection.camera.lens import undistort_points
-from v2hdm.mapping.sightings.backprojection import apply_homographies, posed_homographies
+from v2hdm.geometry.ipm import apply_in_front, ground_from_pinhole_px
+from v2hdm.geometry.lens import undistort_points
 from v2hdm.mapping.sightings.rig import Rig
-from v2hdm.records import OUTLINED_CLASSES, Drive, FloatArray, ImageDetections
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import OUTLINED_CLASSES, Drive, FloatArray, ImageDetections, IntArray
 
 _MAX_RANGE_M = 16.0
 """Farther from the camera a symbol's place on the ground is too vague to speak against a neighbour."""
@@ -61,14 +58,14 @@ def images_with_symbol(symbols: Symbols, rig: Rig, points_map: FloatArray) -> In
     count = np.zeros(len(points_map), dtype=np.int64)
     if not len(symbols.camera):
         return count
-    cam_from_vehicle = rig.cam_from_vehicle[symbols.camera]
     map_from_vehicle = rig.map_from_vehicle[symbols.frame]
-    homographies = posed_homographies(rig.intrinsic[symbols.camera], cam_from_vehicle, map_from_vehicle)
+    cam_from_map = rig.cam_from_vehicle[symbols.camera] @ np.linalg.inv(map_from_vehicle)
+    homographies = ground_from_pinhole_px(rig.intrinsic[symbols.camera], cam_from_map)
     known = np.flatnonzero(np.isfinite(points_map).all(axis=1))
     for homography, pose, outline in zip(
         homographies, map_from_vehicle, symbols.outlines_pinhole_px, strict=True
     ):
-        ground = apply_homographies(np.repeat(homography[None], len(outline), axis=0), outline[:, None])[:, 0]
+        ground = apply_in_front(homography, outline)
         if not np.isfinite(ground).all() or np.linalg.norm(ground - pose[:2, 3], axis=1).max() > _MAX_RANGE_M:
             continue
         size_m = float(np.ptp(ground, axis=0).max())

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from v2hdm.detection.camera.lens import has_distortion, undistort_points
 from v2hdm.errors import MappingError
+from v2hdm.geometry.lens import has_distortion, undistort_points
 from v2hdm.mapping.sightings.symbols import NO_SYMBOLS, Symbols, collect_symbols
 from v2hdm.records import (
     CORNERED_CLASSES,
@@ -19,9 +18,8 @@ from v2hdm.records import (
     Drive,
     FloatArray,
     ImageDetections,
+    IntArray,
 )
-
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from v2hdm.geometry.ipm import apply_homography, flat_motion, project_ground
+from v2hdm.geometry.planar import inside_convex
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import frames_of
-from v2hdm.planar import inside_convex
-from v2hdm.records import Camera, Drive, FloatArray
-
-IntArray = NDArray[np.int64]
+from v2hdm.records import Camera, Drive, FloatArray, IntArray
 
 _BORDER_PX = 10.0
 
@@ -69,27 +68,11 @@ def easy_views(
     return np.concatenate(groups or empty), np.concatenate(images or empty)
 
 
-def project_ground(
-    intrinsic: FloatArray, cam_from_map: FloatArray, points_map: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Pinhole pixels (S, N, 2) and depths (S, N) of ground points (S, N, 2) by cameras (S, ...)."""
-    points = np.concatenate([points_map, np.ones_like(points_map[..., :1])], axis=-1)
-    pinhole_px_from_map = (intrinsic @ cam_from_map[:, :3])[..., [0, 1, 3]]
-    homogeneous = points @ np.swapaxes(pinhole_px_from_map, -1, -2)
-    depth = homogeneous[..., 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(homogeneous[..., :2] / depth[..., None]), np.asarray(depth)
-
-
 def _sees(
     camera: Camera, cam_from_vehicle: FloatArray, vehicle_from_map: FloatArray, corners_map: FloatArray
 ) -> NDArray[np.bool_]:
     """Whether views (P, ...) hold the whole quadrilaterals (P, 4, 2), away from the image border."""
-    flat = np.zeros((len(corners_map), 3, 3))
-    flat[:, :2] = vehicle_from_map[:, :2][:, :, [0, 1, 3]]
-    flat[:, 2, 2] = 1.0
-    ones = np.ones((len(corners_map), 4, 1))
-    corners_vehicle = (np.concatenate([corners_map, ones], axis=-1) @ np.swapaxes(flat, 1, 2))[..., :2]
+    corners_vehicle = apply_homography(flat_motion(vehicle_from_map), corners_map)
     inside = inside_convex(camera.roi_vehicle, corners_vehicle).all(axis=1)
     pixel, depth = project_ground(camera.info.intrinsic, cam_from_vehicle @ vehicle_from_map, corners_map)
     limit = np.array([camera.info.width, camera.info.height]) - _BORDER_PX

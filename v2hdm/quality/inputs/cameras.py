@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.detection.camera.ground import apply_homography
-from v2hdm.detection.camera.lens import distort_points, undistort_points
-from v2hdm.detection.camera.mounting import guessed_extrinsic
-from v2hdm.planar import inside_convex
+from v2hdm.geometry.ipm import apply_homography, extrinsic_from_ipm
+from v2hdm.geometry.lens import distort_points, undistort_points
+from v2hdm.geometry.planar import inside_convex, signed_area
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.quality.judgement import judge, judge_between, passed
 from v2hdm.quality.verdict import Finding, Status
 from v2hdm.records import Camera, CameraInfo, CentrePrior, FloatArray
@@ -53,14 +53,14 @@ _LOWEST_M = 0.3
 def check_camera(name: str, camera: Camera) -> list[Finding]:
     """All checks of one camera's description."""
     findings = check_intrinsics(name, camera.info)
-    cam_from_vehicle = guessed_extrinsic(camera)
+    cam_from_vehicle = extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm])
     findings += check_roi(name, camera, cam_from_vehicle)
     findings += [
         _shape(name, camera.info, camera.ipm[camera.initial_ipm]),
         *_mounting(name, cam_from_vehicle),
     ]
     if camera.centre_prior is not None:
-        findings += check_survey(name, camera.centre_prior, _centre(cam_from_vehicle))
+        findings += check_survey(name, camera.centre_prior, camera_centre(cam_from_vehicle))
     return findings
 
 
@@ -118,7 +118,7 @@ def check_roi(name: str, camera: Camera, cam_from_vehicle: FloatArray) -> list[F
             "mend roi_vehicle or the guess"
         )
         return [Finding("roi", Status.FAIL, seen, _ROI_SEEN, "", says, name)]
-    area = _area(roi)
+    area = abs(float(signed_area(roi)))
     if area < _ROI_AREA_M2:
         says = f"roi_vehicle covers {area:.2g} m2, less than a marking; enlarge it (metres, not kilometres)"
         return [Finding("roi", Status.FAIL, area, _ROI_AREA_M2, "m2", says, name)]
@@ -165,7 +165,7 @@ def _survey_cause(survey: FloatArray, guess: FloatArray) -> str:
 
 def _mounting(name: str, cam_from_vehicle: FloatArray) -> list[Finding]:
     """Height, tilt and direction of the guess."""
-    height = float(_centre(cam_from_vehicle)[2])
+    height = float(camera_centre(cam_from_vehicle)[2])
     right = cam_from_vehicle[0, :3]
     tilt_deg = float(np.rad2deg(np.arcsin(np.clip(-right[2], -1, 1))))
     upside_down = cam_from_vehicle[1, 2] > 0
@@ -217,7 +217,7 @@ def _lens(name: str, info: CameraInfo) -> list[Finding]:
 
 def _farthest(name: str, camera: Camera, cam_from_vehicle: FloatArray, grid: FloatArray) -> Finding:
     """Metres of ground along the view that one pixel shows at the far end: range^2 / (height focal)."""
-    centre = _centre(cam_from_vehicle)
+    centre = camera_centre(cam_from_vehicle)
     range_m = float(np.linalg.norm(grid - centre[:2], axis=1).max())
     focal = float(camera.info.intrinsic[1, 1])
     coarse = (range_m**2 + centre[2] ** 2) / (max(centre[2], 0.1) * focal)
@@ -252,12 +252,3 @@ def _grid(polygon: FloatArray) -> FloatArray:
     axes = [np.linspace(*bounds, 15) for bounds in zip(polygon.min(axis=0), polygon.max(axis=0), strict=True)]
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     return np.vstack([polygon, grid[inside_convex(polygon, grid)]])
-
-
-def _area(polygon: FloatArray) -> float:
-    following = np.roll(polygon, -1, axis=0)
-    return float(abs((polygon[:, 0] * following[:, 1] - polygon[:, 1] * following[:, 0]).sum()) / 2)
-
-
-def _centre(cam_from_vehicle: FloatArray) -> FloatArray:
-    return np.asarray(-cam_from_vehicle[:3, :3].T @ cam_from_vehicle[:3, 3])

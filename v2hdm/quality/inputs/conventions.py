@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.drive.rotation import quaternion_from_rotation, rotation_from_quaternion
+from v2hdm.geometry.rigid import quaternion_from_rotation, rotation_from_quaternion
 from v2hdm.records import FloatArray
 
 Undo = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]

@@ -10,9 +10,9 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from v2hdm.detection.camera.ground import apply_homography
-from v2hdm.detection.camera.lens import distort_points
 from v2hdm.errors import DriveError
+from v2hdm.geometry.ipm import apply_homography
+from v2hdm.geometry.lens import distort_points
 from v2hdm.quality.judgement import judge
 from v2hdm.quality.verdict import Finding, Status
 from v2hdm.records import Camera, Drive, Image

@@ -6,11 +6,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from v2hdm.records import BoolArray, Drive, FloatArray, Trajectory
-
-IntArray = NDArray[np.intp]
+from v2hdm.records import BoolArray, Drive, FloatArray, IntArray, Trajectory
 
 CHORD_M = 2.0
 """Length of the chords whose direction is the course: RTK noise of 2 cm turns one by less than a degree."""

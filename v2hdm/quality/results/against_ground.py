@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.ground import GroundEstimate, GroundStatus
 from v2hdm.quality.judgement import judge
 from v2hdm.quality.results.mountings import mounting_difference, mounting_sigmas
@@ -39,7 +40,7 @@ def _compare(name: str, mapped: Calibration, ground: Calibration) -> Finding:
     off = mounting_difference(ground, mapped)
     rotation = mapped.cam_from_vehicle[:3, :3]
     turn_deg = np.rad2deg(rotation.T @ off[3:])
-    up_m = float(_centre(mapped)[2] - _centre(ground)[2])
+    up_m = float(camera_centre(mapped.cam_from_vehicle)[2] - camera_centre(ground.cam_from_vehicle)[2])
     small = np.abs(turn_deg).max() < LEAST_TURN_DEG and abs(up_m) < LEAST_HEIGHT_M
     sigmas = mounting_sigmas(ground, mapped, of_both=True)
     roll, pitch, yaw = turn_deg
@@ -56,7 +57,3 @@ def _compare(name: str, mapped: Calibration, ground: Calibration) -> Finding:
         f"look at "
         "the overlay",
     )
-
-
-def _centre(calibration: Calibration) -> np.ndarray:
-    return -calibration.cam_from_vehicle[:3, :3].T @ calibration.cam_from_vehicle[:3, 3]

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
-from v2hdm.geometry.transform import log
+from v2hdm.geometry.rigid import inverse, log
 from v2hdm.records import Calibration, FloatArray
 
 _LEAST_VARIANCE = np.array([1e-8] * 3 + [1e-10] * 3)
@@ -32,8 +31,7 @@ def mounting_sigmas(one: Calibration, other: Calibration, of_both: bool = False)
 
 def mounting_difference(one: Calibration, other: Calibration) -> FloatArray:
     """The left tangent (6,) from ``other`` to ``one``: translation m, rotation rad."""
-    moved = one.cam_from_vehicle @ np.linalg.inv(other.cam_from_vehicle)
-    return np.asarray(log(torch.as_tensor(moved)).detach().numpy())
+    return log(one.cam_from_vehicle @ inverse(other.cam_from_vehicle))
 
 
 def centre_sigma_m(calibration: Calibration) -> FloatArray:

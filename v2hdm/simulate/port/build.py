@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v2hdm.errors import ConfigError, DriveError
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import Camera, FloatArray, GeodeticOrigin, HdMap
 from v2hdm.simulate.port.calibration import cam_from_vehicle, survey_camera
 from v2hdm.simulate.port.config import PortConfig
@@ -87,7 +88,7 @@ class Port:
         station = self.route.station_at(stamp)
         yaw_rate = speed * float(np.interp(station[0], self.route.station_m, self.route.curvature))
         extrinsic = self.cam_from_vehicle[camera]
-        centre = -extrinsic[:3, :3].T @ extrinsic[:3, 3]
+        centre = camera_centre(extrinsic)
         turning = np.array([0.0, 0.0, yaw_rate])
         velocity = extrinsic[:3, :3] @ (np.array([speed, 0.0, 0.0]) + np.cross(turning, centre))
         return Motion(

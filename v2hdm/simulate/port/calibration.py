@@ -5,9 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from v2hdm.detection.camera.lens import distort_points, undistort_points
-from v2hdm.drive.rotation import rotation_from_euler
 from v2hdm.errors import ConfigError
+from v2hdm.geometry.ipm import project_ground
+from v2hdm.geometry.lens import distort_points, undistort_points
+from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.records import Camera, CameraInfo, CentrePrior, FloatArray
 from v2hdm.simulate.port.config import CalibrationConfig, CameraConfig, MountConfig
 from v2hdm.simulate.render.scene import convex_hull
@@ -67,7 +68,8 @@ def calibrate(
         ConfigError: when a point lies outside the image, or the points do not determine a homography.
     """
     points = ground_points(mount, config)
-    clicked_px = distort_points(info, project_ground(info, cam_from_vehicle(mount), points))
+    pinhole_px, _ = project_ground(info.intrinsic, cam_from_vehicle(mount), points)
+    clicked_px = distort_points(info, pinhole_px)
     clicked_px = clicked_px + rng.normal(0.0, config.click_sigma_px, points.shape)
     surveyed = points + rng.normal(0.0, config.survey_sigma_m, points.shape)
     outside = (clicked_px < 0).any(axis=1) | (clicked_px > (info.width - 1, info.height - 1)).any(axis=1)
@@ -83,13 +85,6 @@ def calibrate(
         raise ConfigError("calibration.points_ahead_m: these points do not fix a homography; spread them out")
     ipm = np.linalg.inv(pinhole_from_vehicle)
     return np.asarray(ipm / np.linalg.norm(ipm)), convex_hull(surveyed)
-
-
-def project_ground(info: CameraInfo, extrinsic: FloatArray, points_vehicle: FloatArray) -> FloatArray:
-    """Pinhole pixels (N, 2) of ground points (N, 2) in the vehicle frame, seen at ``cam_from_vehicle``."""
-    homogeneous = np.column_stack([points_vehicle, np.ones(len(points_vehicle))])
-    px = homogeneous @ (info.intrinsic @ extrinsic[:3][:, [0, 1, 3]]).T
-    return np.asarray(px[:, :2] / px[:, 2:])
 
 
 def survey_camera(

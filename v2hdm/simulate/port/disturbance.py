@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.drive.rotation import rotation_from_euler
 from v2hdm.drive.trajectory import interpolate
+from v2hdm.geometry.rigid import heading_rad, rotation_from_euler
 from v2hdm.records import FloatArray, PoseNoise, Trajectory
 from v2hdm.simulate.port.config import DisturbanceConfig, RouteConfig
 from v2hdm.simulate.port.route import Route
@@ -116,7 +116,7 @@ def measured_disturbances(config: DisturbanceConfig, driven: DrivenPoses) -> dic
     """The configured standard deviations, per axis, and under ``actual_`` their values at the images."""
     recorded, _ = interpolate(driven.recorded, driven.stamp_s, np.inf)
     true = driven.map_from_vehicle
-    yaw = [np.arctan2(pose[:, 1, 0], pose[:, 0, 0]) for pose in (recorded, true)]
+    yaw = [heading_rad(pose) for pose in (recorded, true)]
     tilt = np.stack([true[:, 2, 0], true[:, 2, 1]])
     error = recorded[:, :2, 3] - true[:, :2, 3]
     turned = np.angle(np.exp(1j * (yaw[0] - yaw[1])))

@@ -20,7 +20,8 @@ from v2hdm.drive.folder import DRIVE_FILE, TRUTH_FOLDER
 from v2hdm.drive.truth import write_truth
 from v2hdm.errors import DriveError
 from v2hdm.files import whole_file
-from v2hdm.planar import ground_in_vehicle, inside_convex
+from v2hdm.geometry.planar import inside_convex
+from v2hdm.geometry.rigid import ground_in_vehicle
 from v2hdm.records import Drive, Image, Truth
 from v2hdm.simulate.port.build import Port, build_port
 from v2hdm.simulate.port.config import PortConfig

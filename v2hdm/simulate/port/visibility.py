@@ -6,7 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from v2hdm.detection.camera.lens import distort_points
+from v2hdm.geometry.ipm import project_ground
+from v2hdm.geometry.lens import distort_points
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, CameraInfo, FloatArray
 from v2hdm.simulate.render.scene import Box
 
@@ -27,7 +29,7 @@ def points_seen(
     info: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray, boxes: Sequence[Box]
 ) -> BoolArray:
     """Which ground points (N, 2) an image shows: inside its border, within 40 m, not behind a box."""
-    centre = -cam_from_map[:3, :3].T @ cam_from_map[:3, 3]
+    centre = camera_centre(cam_from_map)
     seen = np.hypot(*(points_map - centre[:2]).T) < _FARTHEST_M
     seen[seen] = inside_image(info, cam_from_map, points_map[seen])
     near = [b for b in boxes if _may_hide(b, cam_from_map, float(centre[2]))]
@@ -45,10 +47,8 @@ def _may_hide(box: Box, cam_from_map: FloatArray, height_m: float) -> bool:
 
 def inside_image(info: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray) -> BoolArray:
     """Which ground points (N, 2) fall between the image's borders."""
-    cam = points_map @ cam_from_map[:3, :2].T + cam_from_map[:3, 3]
-    inside = cam[:, 2] > _NEAR_M
-    pinhole = np.full((len(cam), 2), np.inf)
-    pinhole[inside] = (cam[inside] @ info.intrinsic.T)[:, :2] / cam[inside, 2:]
+    pinhole, depth_m = project_ground(info.intrinsic, cam_from_map, points_map)
+    inside = depth_m > _NEAR_M
     # Far outside the image the lens polynomial folds back; only near it are its values meaningful.
     margin = np.array([info.width, info.height]) * 0.25
     inside &= ((pinhole > -margin) & (pinhole < 5.0 * margin)).all(axis=1)

@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.detection.camera.lens import distort_points, undistort_points
+from v2hdm.geometry.lens import distort_points, undistort_points
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import CameraInfo, FloatArray
 from v2hdm.simulate.render.textures import Float32
 
@@ -74,7 +75,7 @@ class View:
     @property
     def centre_map(self) -> FloatArray:
         """The camera's centre (3,) in the map."""
-        return np.asarray(-self.cam_from_map[:3, :3].T @ self.cam_from_map[:3, 3])
+        return camera_centre(self.cam_from_map)
 
     def homogeneous_px(self, points_map: FloatArray) -> FloatArray:
         """Map points (..., 3) as homogeneous pinhole pixels (..., 3), the last element their depth in m."""

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from v2hdm.mapping.shapes import signed_area
-from v2hdm.planar import clip_convex, ground_in_vehicle, inside_convex
+from v2hdm.geometry.planar import clip_convex, inside_convex, signed_area
+from v2hdm.geometry.rigid import ground_in_vehicle
 
 
 def area(polygon: np.ndarray) -> float:

@@ -1,6 +1,6 @@
-"""Fits the weights of the score of lanes' lines, ``v2hdm/detection/lanes/score.json``, to the network.
+"""Fits the weights of the score of lanes' lines, ``lane_score.json``, to the network.
 
-    python -m tests.benchmarks.detector_lanes --images 450 --write
+    python -m train.fit_lane_score --images 450 --write
 
 Run it after another network was put in place. The lines that the detector proposes on rendered scenes,
 sure or not, two thirds of them of full difficulty and a third easy ones, are true if four fifths of the
@@ -19,14 +19,15 @@ import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from unittest.mock import patch
 
 import cv2
 import numpy as np
 
-from tests.benchmarks.detector_confidence import FOLDS, fit, log_loss, renders_to_fit
-from tests.benchmarks.detector_quality import LANE_TOLERANCE_PX
-from tests.benchmarks.examples import Example
+from export.manifest import record
+from train.examples import LANE_TOLERANCE_PX, Example
+from train.fit_judge import FOLDS, fit, log_loss, renders_to_fit
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.lanes import anchors, score
@@ -35,6 +36,8 @@ from v2hdm.detection.lanes.looks import Looks
 from v2hdm.detection.lanes.points import Line, LinePoints
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.sight import AnchorRow
+from v2hdm.detection.weights import FOLDER, LANE_SCORE_FILE, being_fitted
+from v2hdm.files import replace_text
 from v2hdm.records import BoolArray, FloatArray, LaneDetection
 
 SEED = 921
@@ -189,12 +192,19 @@ def main() -> None:
     parsed = parser.parse_args()
     cv2.setNumThreads(1)
     options = DetectorOptions(model=parsed.model, max_range_m=24.0)
-    detector = Detector.load(options=options)
+    with being_fitted():
+        detector = Detector.load(options=options)
     images = [seen(shown, detector) for _, shown in renders_to_fit(parsed.images, SEED)]
     weights = fit_to(images, options.lane_step_m)
     if parsed.write:
-        named = {name: _named(*weights[name], keys) for name, keys in KEYS.items()}
-        score.SCORE_FILE.write_text(json.dumps(named, indent=1) + "\n")
+        write(weights, parsed.images)
+
+
+def write(weights: Weights, images: int, folder: Path = FOLDER) -> None:
+    """Put the weights where the detector looks for them, and in the manifest."""
+    named = {name: _named(*weights[name], keys) for name, keys in KEYS.items()}
+    replace_text(folder / LANE_SCORE_FILE.name, json.dumps(named, indent=1) + "\n")
+    record([LANE_SCORE_FILE.name], f"python -m train.fit_lane_score --images {images} --write", folder)
 
 
 def fit_to(images: Sequence[Seen], paint_step_m: float) -> Weights:
@@ -219,7 +229,7 @@ def fit_to(images: Sequence[Seen], paint_step_m: float) -> Weights:
 
 
 def _named(weights: FloatArray, bias: float, keys: Sequence[str]) -> dict[str, object]:
-    """Weights and bias as ``score.json`` holds them."""
+    """Weights and bias as ``lane_score.json`` holds them."""
     return {"bias": round(bias, 4), "weights": dict(zip(keys, weights.round(4).tolist(), strict=True))}
 
 

@@ -12,9 +12,12 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from v2hdm.detection.camera.ground import apply_homography, ipm_from_extrinsic
-from v2hdm.detection.camera.lens import distort_points
-from v2hdm.planar import clip_convex, clip_half
+from train.scenes.scenes import image_line, image_points, random_scene
+from train.scenes.views import TrainingView, random_view
+from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
+from v2hdm.geometry.lens import distort_points
+from v2hdm.geometry.planar import clip_convex, clip_half, signed_area
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import (
     CORNERED_CLASSES,
     LANE_CLASSES,
@@ -25,8 +28,6 @@ from v2hdm.records import (
 )
 from v2hdm.simulate.render.renderer import Rendered, Renderer
 from v2hdm.simulate.render.scene import Scene
-from v2hdm.simulate.training.scenes import image_line, image_points, random_scene
-from v2hdm.simulate.training.views import TrainingView, random_view
 
 SEED = 771_000_003
 """No training or validation seed, whatever their index: those start from single-digit seeds."""
@@ -48,6 +49,9 @@ MIN_HEIGHT_PX = 4.0
 LEAST_SHOWN_M = 1.0
 """A line shows if so much of its paint is in the image and in front of what stands there; who labels images
 cannot know of others. Those parts of such a line that are hidden or between its dashes are asked for."""
+
+LANE_TOLERANCE_PX = 20.0
+"""A point of a line is on a true line within this, across it."""
 
 _STATION_M = 0.5
 _BESIDE_M = np.linspace(-0.5, 0.5, 21)
@@ -122,7 +126,7 @@ def _camera(view: TrainingView) -> Camera:
 
 def _markings(scene: Scene, view: TrainingView, rendered: Rendered) -> list[TrueMarking]:
     """The scene's paint by piece; pieces that belong together (arrows, chevrons) are judged as one."""
-    centre = -view.cam_from_map[:3, :3].T @ view.cam_from_map[:3, 3]
+    centre = camera_centre(view.cam_from_map)
     out = []
     for paint in scene.paints:
         if paint.kind not in CORNERED_CLASSES + OUTLINED_CLASSES:
@@ -174,3 +178,10 @@ def _share(mask: np.ndarray, low: np.ndarray, rendered: Rendered, labels: Iterab
     if not len(u) or not inside.all():
         return 0.0
     return float(np.isin(rendered.labels[v, u], list(labels)).mean())
+
+
+def polygon_overlap(first: FloatArray, second: FloatArray) -> float:
+    """Intersection over union of the hulls of two polygons."""
+    a, b = (cv2.convexHull(p.astype(np.float32))[:, 0].astype(np.float64) for p in (first, second))
+    common, first_area, second_area = (abs(float(signed_area(p))) for p in (clip_convex(a, b), a, b))
+    return common / max(first_area + second_area - common, 1e-6)

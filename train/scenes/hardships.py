@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.planar import inside_convex
+from train.scenes.clutter import kerb_colours, plain_marks, thing_to_stand_beside
+from train.scenes.paint import Bend, rectangle
+from v2hdm.geometry.planar import inside_convex
 from v2hdm.records import CORNERED_CLASSES, FloatArray
 from v2hdm.simulate.render.optics import Optics
 from v2hdm.simulate.render.scene import Bgr, Box, GroundMarks, Light, Paint, Shadow, box_footprint
-from v2hdm.simulate.training.clutter import kerb_colours, plain_marks, thing_to_stand_beside
-from v2hdm.simulate.training.paint import Bend, rectangle
 
 _CROSSED_M = 22.0
 _LONGEST_LEVEL = 0.9
@@ -45,7 +45,7 @@ class Hardships:
             in stretches as long as dashes.
         aside: share of cameras that look to the side of the vehicle. What they see is another scene's worth,
             and its dashes and stop lines have changed names: see
-            :func:`~v2hdm.simulate.training.scenes.training_sample`.
+            :func:`~train.scenes.scenes.training_sample`.
     """
 
     shadows_on_paint: float = 0.0

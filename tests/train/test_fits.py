@@ -1,17 +1,23 @@
 """What teaches the detector its scores runs against the detector as it is."""
 
+import shutil
 from collections.abc import Sequence
 
 import cv2
 import numpy as np
 import pytest
 
-from tests.benchmarks.detector_confidence import Gathered
-from tests.benchmarks.detector_lanes import proposed, seen
-from tests.benchmarks.detector_quality import polygon_overlap
-from tests.benchmarks.examples import Example, example
-from tests.benchmarks.sworn_flecks import Spots, lit, swearing
+from models.judge import Judge
+from train import fit_judge, fit_lane_score
+from train.examples import Example, example, polygon_overlap
+from train.fit_judge import Gathered
+from train.fit_lane_score import proposed, seen
+from train.sworn_flecks import Spots, lit, swearing
+from v2hdm.detection import weights
 from v2hdm.detection.detector import Detector
+from v2hdm.detection.markings.evidence import FEATURES
+from v2hdm.detection.markings.judge import SHAPES, TOLD
+from v2hdm.detection.markings.rectified import CHANNELS
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import MarkingDetection
 
@@ -90,3 +96,17 @@ def test_lines_of_lanes_are_proposed_with_their_truth(shown, detector):
     assert found is not None
     assert len(found.lines) == len(found.evidence) == len(found.true)
     assert found.true.any()
+
+
+def test_judge_and_lane_score_are_written_with_a_manifest_that_the_detector_accepts(tmp_path):
+    folder = tmp_path / "weights"
+    shutil.copytree(weights.FOLDER, folder, ignore=shutil.ignore_patterns("__pycache__", "*.py"))
+    judge = Judge(len(CHANNELS), len(FEATURES), len(SHAPES), width=4, dropout=0.0).eval()
+    fitted = {name: {"bias": 0.0, "weights": dict.fromkeys(TOLD, 0.5)} for name in SHAPES}
+    fit_judge.write_both(judge, fitted, 3, folder)
+    fit_lane_score.write({n: (np.ones(len(k)), 0.0) for n, k in fit_lane_score.KEYS.items()}, 4, folder)
+    weights.check_weights(folder)
+    files = weights.read_manifest(folder)["files"]
+    assert files["judge.onnx"]["command"] == "python -m train.fit_judge --images 3 --write"
+    assert files["lane_score.json"]["command"] == "python -m train.fit_lane_score --images 4 --write"
+    assert weights.digest(folder / "judge.onnx") != weights.digest(weights.JUDGE_FILE)

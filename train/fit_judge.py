@@ -1,17 +1,17 @@
 """Teaches the detector's confidence what claims of the shipped network are worth.
 
-    python -m tests.benchmarks.detector_confidence --write
+    python -m train.fit_judge --write
 
 Run it after another network was put in place; it takes three quarters of an hour. Quadrilaterals that the
 detector proposes on rendered scenes, first two thirds of full difficulty, then a third of easy ones, are true
 if they overlap a marking of their class by half, and false where the quality benchmark would say so. The
-judge, ``v2hdm/detection/judge.onnx``, learns to tell them apart; what the others in an image say of each is
-then weighed by logistic regressions with a weak ridge, one for each shape,
-``v2hdm/detection/confidence.json``. Each scene is looked at as on the vehicle and as in the mapping; every
-other one once more with spots of sun of which the paint network swears that they are markings, which the
-judge learns to see through. Its seed is neither that of the quality benchmark nor one of training. Printed:
-what each of the others' features adds to the log odds per standard deviation; log loss, and true ones among
-so many false ones, on the images of each fifth by what learnt from the others.
+judge, ``judge.onnx``, learns to tell them apart; the claims of the others in an image are then weighed by
+logistic regressions with a weak ridge, one for each shape, ``confidence.json``; the manifest beside them in
+:mod:`v2hdm.detection.weights` is brought up to date. Each scene is looked at as on the vehicle and as in the
+mapping; every other one once more with spots of sun of which the paint network swears that they are
+markings, which the judge learns to see through. Its seed is neither that of the quality benchmark nor one of
+training. Printed: the log odds that each of the others' features adds per standard deviation; log loss, and
+the count of true ones at given counts of false ones, on the images of each fifth by a fit to the others.
 """
 
 from __future__ import annotations
@@ -21,31 +21,32 @@ import json
 from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from export.judge_file import write_judge
+from export.manifest import record
 from models.judge import Judge
-from tests.benchmarks.detector_quality import polygon_overlap
-from tests.benchmarks.examples import Example, TrueMarking, example
-from tests.benchmarks.sworn_flecks import Spots, lit, swearing
+from train.examples import Example, TrueMarking, example, polygon_overlap
 from train.judge import JudgeConfig, Quadrilaterals, judged, train_judge
+from train.sworn_flecks import Spots, lit, swearing
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.markings.evidence import CLAIMED, FEATURES
 from v2hdm.detection.markings.find import Readings
 from v2hdm.detection.markings.judge import (
-    CONFIDENCE_FILE,
-    JUDGE_FILE,
     SHAPES,
     TOLD,
     one_hot,
     shape_of,
     told,
 )
-from v2hdm.detection.markings.quad import following, side_frames
 from v2hdm.detection.markings.rectified import CHANNELS, CLAIMED_CHANNELS, SIZE
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.detection.weights import CONFIDENCE_FILE, FOLDER, JUDGE_FILE, being_fitted
+from v2hdm.files import replace_text
+from v2hdm.geometry.quadrilateral import following, side_frames
 from v2hdm.records import BoolArray, FloatArray
 
 SEED = 917
@@ -63,9 +64,9 @@ COUNTS = (10, 20, 40, 80)
 class Gathered:
     """N readings of quadrilaterals as one class, those of one look at an image together.
 
-    Their evidence, views, corners on the ground, classes, whether they are true (None where either will do), the
-    errors of their sides, px, nan where unknown, with the formal variances, the numbers of the images they are
-    from and of the looks, and whether spots of sun were added to these.
+    Their evidence, views, corners on the ground, classes, whether they are true (None where either will do),
+    the errors of their sides, px, nan where unknown, with the formal variances, the numbers of the images
+    they are from and of the looks, and whether spots of sun were added to these.
     """
 
     evidence: list[FloatArray] = field(default_factory=list)
@@ -166,7 +167,8 @@ def main() -> None:
     parsed = parser.parse_args()
     cv2.setNumThreads(1)
     options = DetectorOptions(model=parsed.model, max_range_m=24.0, min_confidence=0.0)
-    detectors = [Detector.load(options=replace(options, mirrored=twice)) for twice in (False, True)]
+    with being_fitted():
+        detectors = [Detector.load(options=replace(options, mirrored=twice)) for twice in (False, True)]
     gathered = Gathered()
     for done, (index, shown) in enumerate(renders_to_fit(parsed.images, SEED)):
         for detector in detectors:
@@ -182,11 +184,15 @@ def main() -> None:
         write_both(judge, fitted, parsed.images)
 
 
-def write_both(judge: Judge, fitted: dict[str, dict[str, object]], images: int) -> None:
-    """Put the judge and the weights among others where the detector looks for them."""
+def write_both(
+    judge: Judge, fitted: dict[str, dict[str, object]], images: int, folder: Path = FOLDER
+) -> None:
+    """Put the judge and the weights among others where the detector looks for them, and in the manifest."""
     label = {"channels": CHANNELS, "features": FEATURES, "shapes": SHAPES, "images": images, "seed": SEED}
-    write_judge(judge, (len(CHANNELS), SIZE, SIZE), label, JUDGE_FILE)
-    CONFIDENCE_FILE.write_text(json.dumps(fitted, indent=1) + "\n")
+    write_judge(judge, (len(CHANNELS), SIZE, SIZE), label, folder / JUDGE_FILE.name)
+    replace_text(folder / CONFIDENCE_FILE.name, json.dumps(fitted, indent=1) + "\n")
+    command = f"python -m train.fit_judge --images {images} --write"
+    record([JUDGE_FILE.name, CONFIDENCE_FILE.name], command, folder)
 
 
 def fit_all(gathered: Gathered) -> tuple[Judge, dict[str, dict[str, object]]]:

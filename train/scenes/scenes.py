@@ -11,12 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.detection.camera.lens import distort_points, undistort_points
-from v2hdm.records import CORNERED_CLASSES, PAINT_CLASSES, SEEN_ACROSS, FloatArray
-from v2hdm.simulate.render.renderer import Renderer
-from v2hdm.simulate.render.scene import Backdrop, Bgr, Dapple, Ground, Light, Scene, Shadow
-from v2hdm.simulate.training.clutter import ground_marks, port_boxes, street_boxes
-from v2hdm.simulate.training.hardships import (
+from train.scenes.clutter import ground_marks, port_boxes, street_boxes
+from train.scenes.hardships import (
     NONE,
     Hardships,
     blue_shade,
@@ -30,8 +26,13 @@ from v2hdm.simulate.training.hardships import (
     with_pavements,
     with_seams,
 )
-from v2hdm.simulate.training.paint import Bend, RoadPaint, port_paint, random_brush, rectangle, street_paint
-from v2hdm.simulate.training.views import TrainingView, random_view, turned_aside
+from train.scenes.paint import Bend, RoadPaint, port_paint, random_brush, rectangle, street_paint
+from train.scenes.views import TrainingView, random_view, turned_aside
+from v2hdm.geometry.ipm import project_ground
+from v2hdm.geometry.lens import distort_points, undistort_points
+from v2hdm.records import CORNERED_CLASSES, PAINT_CLASSES, SEEN_ACROSS, FloatArray
+from v2hdm.simulate.render.renderer import Renderer
+from v2hdm.simulate.render.scene import Backdrop, Bgr, Dapple, Ground, Light, Scene, Shadow
 
 # The renderer keeps one tile per fleck size, so sizes come from a short list.
 _NEAR_M = 0.3
@@ -119,9 +120,9 @@ def image_line(view: TrainingView, line_map: FloatArray) -> FloatArray:
 
 def _in_image(view: TrainingView, points_map: FloatArray) -> tuple[FloatArray, NDArray[np.intp]]:
     """Recorded pixels (M, 2) of the points (N, 2, map) in and about the image, and which they are."""
-    cam = points_map @ view.cam_from_map[:3, :2].T + view.cam_from_map[:3, 3]
-    index = np.flatnonzero(cam[:, 2] > _NEAR_M)
-    pinhole = (cam[index] @ view.info.intrinsic.T)[:, :2] / cam[index, 2:]
+    pinhole, depth_m = project_ground(view.info.intrinsic, view.cam_from_map, points_map)
+    index = np.flatnonzero(depth_m > _NEAR_M)
+    pinhole = pinhole[index]
     pixels = distort_points(view.info, pinhole)
     reach = np.array([view.info.width, view.info.height])
     about = ((pixels > -0.5 * reach) & (pixels < 1.5 * reach)).all(axis=1)

@@ -1,4 +1,4 @@
-"""Small plane geometry that every floor needs: what lies inside or on each other, and where on the ground."""
+"""Polygons in a plane: their area, the points inside them, and the part that two of them share."""
 
 from __future__ import annotations
 
@@ -15,10 +15,14 @@ def inside_convex(polygon: FloatArray, points: FloatArray) -> BoolArray:
     return np.asarray((cross >= 0).all(axis=-1) | (cross <= 0).all(axis=-1))
 
 
-def ground_in_vehicle(map_from_vehicle: FloatArray, points_map: FloatArray) -> FloatArray:
-    """Ground points (..., 2) m of the map as (x, y) in the frame of a vehicle at a pose (4 x 4)."""
-    offset = np.concatenate([points_map, np.zeros((*np.shape(points_map)[:-1], 1))], axis=-1)
-    return np.asarray(((offset - map_from_vehicle[:3, 3]) @ map_from_vehicle[:3, :3])[..., :2])
+def signed_area(polygon: FloatArray) -> FloatArray:
+    """Shoelace area (...) of polygons (..., N, 2): positive where they turn from the x towards the y axis.
+
+    That is counter-clockwise in the map and clockwise on the screen, whose v axis points down.
+    """
+    ahead = np.concatenate([polygon[..., 1:, :], polygon[..., :1, :]], axis=-2)
+    cross = polygon[..., 0] * ahead[..., 1] - polygon[..., 1] * ahead[..., 0]
+    return np.asarray(cross.sum(axis=-1) / 2)
 
 
 def clip_convex(polygon: FloatArray, window: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from unittest.mock import patch
 import cv2
 import numpy as np
 
-from tests.benchmarks.examples import MAX_RANGE_M, Example
+from train.examples import MAX_RANGE_M, Example
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.network import Network
 from v2hdm.detection.sight import Sight, look

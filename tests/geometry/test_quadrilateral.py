@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from v2hdm.mapping.shapes import align, diameters, is_convex, signed_area
+from v2hdm.geometry.planar import signed_area
+from v2hdm.geometry.quadrilateral import align, diameters, is_convex
 
 DIAMOND = np.array([[0.6, 0.0], [0.0, 0.3], [-0.6, 0.0], [0.0, -0.3]])
 OFFSET = np.array([0.1, -0.05])

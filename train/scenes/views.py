@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from v2hdm.detection.camera.lens import distort_points, undistort_points
 from v2hdm.detection.camera.view import ASIDE_RAD
+from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.records import CameraInfo, FloatArray
 from v2hdm.simulate.render.optics import Motion, Optics
 

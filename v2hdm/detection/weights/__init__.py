@@ -1,0 +1,117 @@
+"""The four fitted files of the detector, and the manifest that says that they belong together.
+
+``default.onnx`` is the network. Three files were fitted to the claims of that network: ``judge.onnx`` and
+``confidence.json`` give a marking its probability, ``lane_score.json`` a line of a lane. ``manifest.json``
+holds one commit id and, for each file, its SHA-256, the SHA-256 of the network that it goes with, the day and
+the command that made it. :mod:`export.manifest` writes it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from v2hdm.errors import DetectorError
+
+FOLDER = Path(__file__).parent
+NETWORK_FILE = FOLDER / "default.onnx"
+JUDGE_FILE = FOLDER / "judge.onnx"
+CONFIDENCE_FILE = FOLDER / "confidence.json"
+LANE_SCORE_FILE = FOLDER / "lane_score.json"
+MANIFEST_FILE = FOLDER / "manifest.json"
+
+COMMANDS: Mapping[str, str] = {
+    NETWORK_FILE.name: f"python -m export checkpoint=... output=v2hdm/detection/weights/{NETWORK_FILE.name}",
+    JUDGE_FILE.name: "python -m train.fit_judge --write",
+    CONFIDENCE_FILE.name: "python -m train.fit_judge --write",
+    LANE_SCORE_FILE.name: "python -m train.fit_lane_score --write",
+}
+"""The command that makes each file."""
+
+_being_fitted = False
+
+
+def check_weights(folder: Path = FOLDER) -> None:
+    """Refuse fitted files that do not belong together. Files are read once per process.
+
+    Raises:
+        DetectorError: a file is missing, is not the one of the manifest, or goes with another network.
+    """
+    problem = None if _being_fitted else _problem(folder)
+    if problem is not None:
+        raise DetectorError(problem)
+
+
+@contextmanager
+def being_fitted() -> Iterator[None]:
+    """Within, :func:`check_weights` lets pass: the fits to a new network need that network's detector."""
+    global _being_fitted
+    before, _being_fitted = _being_fitted, True
+    try:
+        yield
+    finally:
+        _being_fitted = before
+
+
+def unknown_network(model: str | Path, folder: Path = FOLDER) -> str | None:
+    """One line for the user of a network that the judge was not fitted to; None for the shipped one.
+
+    Raises:
+        DetectorError: there is no such file.
+    """
+    path = Path(model)
+    if not path.is_file():
+        raise DetectorError(f"{path}: no such detector model; give the path of an ONNX file")
+    if digest(path) == read_manifest(folder)["files"][NETWORK_FILE.name]["sha256"]:
+        return None
+    return (
+        f"{path}: scores come from the judge of the shipped network, which was not fitted to this one; "
+        f"`{COMMANDS[JUDGE_FILE.name]}` fits it"
+    )
+
+
+def read_manifest(folder: Path = FOLDER) -> dict[str, Any]:
+    """The content of ``manifest.json``: ``commit``, and ``files`` by name.
+
+    Raises:
+        DetectorError: it is missing or damaged.
+    """
+    path = folder / MANIFEST_FILE.name
+    try:
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        for name in COMMANDS:
+            content["files"][name]["sha256"], content["files"][name]["network"]
+    except (OSError, ValueError, TypeError, KeyError) as failure:
+        raise DetectorError(
+            f"{path}: missing or damaged; install v2hdm again, or restore the folder from version control"
+        ) from failure
+    return content
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@cache
+def _problem(folder: Path) -> str | None:
+    """What is wrong with the files of a folder, in one line; None if they belong together."""
+    files = read_manifest(folder)["files"]
+    network = files[NETWORK_FILE.name]["sha256"]
+    for name, command in COMMANDS.items():
+        path = folder / name
+        if not path.is_file():
+            return f"{path}: no such file; install v2hdm again, or make it with `{command}`"
+        if digest(path) != files[name]["sha256"]:
+            return (
+                f"{path}: not the file of the manifest beside it; restore both from one commit, or make it "
+                f"with `{command}`"
+            )
+        if files[name]["network"] != network:
+            return f"{path}: was fitted to another network than {NETWORK_FILE.name}; run `{command}`"
+    return None

@@ -1,0 +1,152 @@
+"""The camera over the ground plane: inverse perspective mapping (IPM), projection, and both back again.
+
+``vehicle_from_pinhole_px`` (3 x 3) is the paper's H: it takes pinhole pixels to the plane z = 0 of the
+vehicle. Its inverse has the columns K [r1 r2 t] of ``cam_from_vehicle`` (Hartley and Zisserman, Multiple
+View Geometry, 2nd ed., eq. 8.1). A homography has no sign of its own. Those of
+:func:`pinhole_px_from_ground` and :func:`ground_from_pinhole_px` have a positive third coordinate for
+ground in front of the camera: the depth in m, or its inverse.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from v2hdm.records import CameraInfo, FloatArray
+
+
+def pinhole_px_from_ground(intrinsic: FloatArray, cam_from_ground: FloatArray) -> FloatArray:
+    """The homography (..., 3, 3) from the plane z = 0 of a frame to pinhole pixels: K [r1 r2 t].
+
+    Args:
+        intrinsic: K, (..., 3, 3), px.
+        cam_from_ground: the camera's pose in that frame, (..., 4, 4).
+    """
+    return np.asarray(intrinsic @ cam_from_ground[..., :3, :][..., [0, 1, 3]])
+
+
+def ground_from_pinhole_px(intrinsic: FloatArray, cam_from_ground: FloatArray) -> FloatArray:
+    """The inverse (..., 3, 3) of :func:`pinhole_px_from_ground`.
+
+    Raises:
+        numpy.linalg.LinAlgError: the camera centre lies on the ground plane.
+    """
+    return np.asarray(np.linalg.inv(pinhole_px_from_ground(intrinsic, cam_from_ground)), dtype=np.float64)
+
+
+def ipm_from_extrinsic(info: CameraInfo, cam_from_vehicle: FloatArray) -> FloatArray:
+    """The IPM ``vehicle_from_pinhole_px`` (3 x 3, unit norm) of a camera at ``cam_from_vehicle`` (4 x 4).
+
+    Raises:
+        numpy.linalg.LinAlgError: the camera centre lies on the ground plane.
+    """
+    ipm = ground_from_pinhole_px(info.intrinsic, cam_from_vehicle)
+    return np.asarray(ipm / np.linalg.norm(ipm))
+
+
+def extrinsic_from_ipm(info: CameraInfo, ipm: FloatArray) -> FloatArray:
+    """The rigid ``cam_from_vehicle`` (4 x 4) nearest to an IPM (3 x 3), its camera above the ground.
+
+    A homography solved from clicked points is not exactly K [r1 r2 t]. Its first two columns are replaced
+    by their polar factor, the orthonormal pair nearest to them in the Frobenius norm (Zhang, A flexible
+    new technique for camera calibration, 2000, appendix C). The scale is the one that brings the two
+    nearest: the mean of their singular values. Of the two solutions, one has its camera below the ground.
+    """
+    columns = np.linalg.solve(info.intrinsic, np.linalg.inv(ipm))
+    left, singular, right = np.linalg.svd(columns[:, :2], full_matrices=False)
+    plane, translation = left @ right, columns[:, 2] / singular.mean()
+    normal = np.cross(plane[:, 0], plane[:, 1])
+    sign = -1.0 if normal @ translation > 0 else 1.0
+    cam_from_vehicle = np.eye(4)
+    cam_from_vehicle[:3] = np.column_stack([sign * plane, normal, sign * translation])
+    return cam_from_vehicle
+
+
+def facing_ipm(ipm: FloatArray, seen_vehicle: FloatArray) -> FloatArray:
+    """The IPM (3 x 3), of that sign whose third coordinate is positive for ground in front of the camera.
+
+    Args:
+        ipm: ``vehicle_from_pinhole_px``, of any sign.
+        seen_vehicle: a ground point (2,) m that lies in front of the camera.
+    """
+    # With ipm @ (u, v, 1) = w * ground, the solution is (u, v, 1) / w.
+    in_front = np.linalg.solve(ipm, np.append(seen_vehicle, 1.0))[2] > 0
+    return np.asarray(ipm if in_front else -ipm)
+
+
+def flat_motion(dst_from_src: FloatArray) -> FloatArray:
+    """A rigid motion (..., 4, 4) of the ground plane taken as planar: a homography (..., 3, 3)."""
+    return np.asarray(dst_from_src[..., [0, 1, 3], :][..., [0, 1, 3]])
+
+
+def apply_homography(dst_from_src: FloatArray, points_src: FloatArray) -> FloatArray:
+    """Points (..., N, 2) mapped by a homography (..., 3, 3); points at infinity come out as inf or nan."""
+    homogeneous = _homogeneous(dst_from_src, points_src)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(homogeneous[..., :2] / homogeneous[..., 2:])
+
+
+def apply_in_front(dst_from_src: FloatArray, points_src: FloatArray) -> FloatArray:
+    """Points (..., N, 2) mapped by a homography (..., 3, 3); nan where the third coordinate is not positive.
+
+    Of the homographies of this module those are the points at, above and behind the camera's horizon.
+    """
+    homogeneous = _homogeneous(dst_from_src, points_src)
+    third = homogeneous[..., 2:]
+    return np.asarray(homogeneous[..., :2] / np.where(third > 0, third, np.nan))
+
+
+def homography_jacobian(dst_from_src: FloatArray, points_src: FloatArray) -> FloatArray:
+    """Derivative (..., N, 2, 2) of :func:`apply_in_front` with respect to the points; nan where that is."""
+    homogeneous = _homogeneous(dst_from_src, points_src)
+    third = np.where(homogeneous[..., 2:] > 0, homogeneous[..., 2:], np.nan)
+    mapped = (homogeneous[..., :2] / third)[..., None]
+    return np.asarray(
+        (dst_from_src[..., None, :2, :2] - mapped * dst_from_src[..., None, 2:, :2]) / third[..., None]
+    )
+
+
+def project_ground(
+    intrinsic: FloatArray, cam_from_ground: FloatArray, points_ground: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Pinhole pixels (..., N, 2) and depths (..., N), m, of ground points (..., N, 2).
+
+    The pixels of points behind the camera, whose depth is negative, are those of their mirror images; at
+    depth zero they are inf or nan.
+
+    Args:
+        intrinsic: K, (..., 3, 3), px.
+        cam_from_ground: the camera's pose in the frame of the points, (..., 4, 4).
+        points_ground: points of the plane z = 0 of that frame, m.
+    """
+    homogeneous = _homogeneous(pinhole_px_from_ground(intrinsic, cam_from_ground), points_ground)
+    depth_m = homogeneous[..., 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(homogeneous[..., :2] / depth_m[..., None]), np.asarray(depth_m)
+
+
+def direction_covariance(ray_ground: FloatArray, height_m: FloatArray, sigma_rad: float) -> FloatArray:
+    """Covariance (..., 2, 2), m^2, of a ground point whose viewing direction is uncertain.
+
+    A change of pitch by d moves a point at range r along the ray by (r^2 + h^2) / h * d, one of yaw across
+    it by r * d.
+
+    Args:
+        ray_ground: (..., 2) m, from below the camera to the point.
+        height_m: h, (...), of the camera.
+        sigma_rad: standard deviation of pitch and yaw.
+    """
+    range_m = np.linalg.norm(ray_ground, axis=-1)
+    along = ray_ground / np.maximum(range_m, 1e-9)[..., None]
+    across = np.stack([-along[..., 1], along[..., 0]], axis=-1)
+    sigma_along = (range_m**2 + height_m**2) / height_m * sigma_rad
+    sigma_across = range_m * sigma_rad
+    return np.asarray(
+        sigma_along[..., None, None] ** 2 * along[..., :, None] * along[..., None, :]
+        + sigma_across[..., None, None] ** 2 * across[..., :, None] * across[..., None, :]
+    )
+
+
+def _homogeneous(dst_from_src: FloatArray, points_src: FloatArray) -> FloatArray:
+    """Points (..., N, 2) mapped by a homography (..., 3, 3), before the division: (..., N, 3)."""
+    transposed = np.swapaxes(dst_from_src, -1, -2)
+    return np.asarray(points_src @ transposed[..., :2, :] + transposed[..., 2:, :])

@@ -1,0 +1,184 @@
+"""Quadrilaterals (..., 4, 2): their order, sides, convexity, and the comparison of two of them.
+
+Corners run counter-clockwise as seen from above the ground, in the map as on the screen; the first is
+arbitrary. In the map, where y points up, their shoelace area is positive. In an image, where v points down,
+it is negative: there :func:`order_corners` and :func:`is_convex_px` apply, in the map :func:`is_convex`.
+The other functions hold for both. Side ``e`` runs from corner ``e`` to corner ``e + 1``.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from v2hdm.geometry.planar import signed_area
+from v2hdm.records import BoolArray, FloatArray, IntArray
+
+# Faster than np.roll by far, and there are many of them in the fit of a few markings.
+_NEXT, _LAST = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])
+_TURN = np.array([-1.0, 1.0])
+
+SHIFTS = (np.arange(4)[:, None] + np.arange(4)[None, :]) % 4
+"""Row s lists, for corner c of one quadrilateral, corner (c + s) mod 4 of the other."""
+
+
+class Alignment(NamedTuple):
+    """How quadrilaterals b lie against quadrilaterals a under the best cyclic shift.
+
+    ``shift``: corner c of a matches corner (c + shift) mod 4 of b; ``offset`` (..., 2) is the mean
+    displacement of b's corners; ``deformation_m`` the largest deviation of a corner from that mean;
+    ``common`` the number of corners valid in both (fewer than two: nothing can be said, the
+    deformation is infinite).
+    """
+
+    shift: IntArray
+    offset: FloatArray
+    deformation_m: FloatArray
+    common: IntArray
+
+
+def quad_from_hull(hull: np.ndarray) -> FloatArray | None:
+    """The quadrilateral (4, 2) that encloses a convex hull (N, 1, 2) most tightly; None where there is none.
+
+    Sides of the hull are merged until four are left (Low and Ilie, Computer Vision and Graphics, 2003, in
+    OpenCV's approxPolyN).
+    """
+    if len(hull) < 4 or cv2.contourArea(hull) < 1.0:
+        return None
+    quad = np.asarray(cv2.approxPolyN(hull, 4), dtype=np.float64).reshape(-1, 2)
+    if len(quad) != 4 or not np.isfinite(quad).all():
+        return None
+    return order_corners(quad)
+
+
+def order_corners(corners: FloatArray) -> FloatArray:
+    """Corners (4, 2) of a convex quadrilateral of an image, counter-clockwise on the screen."""
+    outward = corners - corners.mean(axis=0)
+    return np.asarray(corners[np.argsort(np.arctan2(-outward[:, 1], outward[:, 0]))])
+
+
+def following(values: np.ndarray, axis: int = -2) -> np.ndarray:
+    """Values of four corners or sides, each replaced by that of the next one round the quadrilateral."""
+    return np.asarray(values.take(_NEXT, axis=axis))
+
+
+def preceding(values: np.ndarray, axis: int = -2) -> np.ndarray:
+    """Values of four corners or sides, each replaced by that of the one before."""
+    return np.asarray(values.take(_LAST, axis=axis))
+
+
+def side_frames(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Tangent (..., 4, 2), normal (..., 4, 2) and length (..., 4) of each side.
+
+    The normal is (-t_y, t_x) of the tangent t: it points outwards in an image and inwards in the map.
+    """
+    along = following(corners) - corners
+    length = np.hypot(along[..., 0], along[..., 1])
+    tangent = along / np.maximum(length, 1e-9)[..., None]
+    normal = tangent[..., ::-1] * _TURN
+    return tangent, normal, length
+
+
+def interior_angles(corners: FloatArray) -> FloatArray:
+    """Interior angle (..., 4) rad at each corner of convex quadrilaterals (..., 4, 2)."""
+    tangent, _, _ = side_frames(corners)
+    cosine = -(tangent * preceding(tangent)).sum(axis=-1)
+    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def width(corners: FloatArray) -> FloatArray:
+    """Mean extent (...) of quadrilaterals (..., 4, 2) across their longest side."""
+    _, _, length = side_frames(corners)
+    return np.asarray(np.abs(signed_area(corners)) / length.max(axis=-1))
+
+
+def long_axis(corners: FloatArray) -> FloatArray:
+    """Unit direction (2,) of the longer sides of a quadrilateral (4, 2), pointing to positive x (or y)."""
+    sides = following(corners) - corners
+    first, second = sides[0] - sides[2], sides[1] - sides[3]
+    axis = max(first, second, key=lambda side: float(side @ side))
+    axis = axis / np.linalg.norm(axis)
+    return np.asarray(axis if (axis[0], axis[1]) > (0.0, 0.0) else -axis)
+
+
+def characteristic_lengths(corners: FloatArray) -> FloatArray:
+    """Mean lengths of the two pairs of opposite sides, and the diagonals (G, 4), each pair sorted.
+
+    The lengths (m or px) do not depend on which corner comes first.
+    """
+    _, _, side = side_frames(corners)
+    pairs = np.sort(0.5 * (side[:, :2] + side[:, 2:]), axis=1)
+    diagonals = np.sort(np.linalg.norm(corners[:, 2:] - corners[:, :2], axis=2), axis=1)
+    return np.asarray(np.concatenate([pairs, diagonals], axis=1))
+
+
+def is_convex(corners_map: FloatArray) -> BoolArray:
+    """Whether quadrilaterals (..., 4, 2) of the map are convex and counter-clockwise."""
+    return np.asarray((_turns(corners_map) > 0).all(axis=-1))
+
+
+def is_convex_px(corners_px: FloatArray) -> BoolArray:
+    """Whether quadrilaterals (..., 4, 2) of an image are convex and counter-clockwise on the screen."""
+    return np.asarray((_turns(corners_px) < 0).all(axis=-1))
+
+
+def intersect_sides(point: FloatArray, normal: FloatArray) -> FloatArray:
+    """Corners (..., 4, 2) of quadrilaterals whose sides pass through ``point`` (..., 4, 2) with ``normal``.
+
+    Corner ``e`` is where sides ``e - 1`` and ``e`` meet; it is inf or nan where they are parallel.
+    """
+    distance = (point * normal).sum(axis=-1)
+    before, before_distance = preceding(normal), preceding(distance, -1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        determinant = before[..., 0] * normal[..., 1] - before[..., 1] * normal[..., 0]
+        u = (before_distance * normal[..., 1] - before[..., 1] * distance) / determinant
+        v = (before[..., 0] * distance - before_distance * normal[..., 0]) / determinant
+    return np.stack([u, v], axis=-1)
+
+
+def align(a: FloatArray, valid_a: BoolArray, b: FloatArray, valid_b: BoolArray) -> Alignment:
+    """Align quadrilaterals ``b`` (..., 4, 2) to ``a`` (..., 4, 2); leading dimensions broadcast.
+
+    The shift is the one with the least mean squared distance over the common valid corners: sense
+    of rotation is known, so there are four candidates and no mirror images.
+    """
+    both = valid_a[..., None, :] & valid_b[..., SHIFTS]
+    difference = np.where(both[..., None], b[..., SHIFTS, :] - a[..., None, :, :], 0.0)
+    common = both.sum(axis=-1)
+    count = np.maximum(common, 1)
+    squared = np.sum(difference**2, axis=(-1, -2)) / count
+    shift = np.argmin(np.where(common >= 2, squared, np.inf), axis=-1)
+    chosen = shift[..., None]
+    mean = difference.sum(axis=-2) / count[..., None]
+    offset = np.take_along_axis(mean, chosen[..., None], axis=-2)[..., 0, :]
+    deviation = np.linalg.norm(difference - mean[..., None, :], axis=-1)
+    worst = np.max(np.where(both, deviation, 0.0), axis=-1)
+    common = np.take_along_axis(common, chosen, axis=-1)[..., 0]
+    worst = np.take_along_axis(worst, chosen, axis=-1)[..., 0]
+    return Alignment(shift, offset, np.where(common >= 2, worst, np.inf), common)
+
+
+def diameters(corners: FloatArray, valid: BoolArray) -> FloatArray:
+    """Largest distance (...) between two valid corners of quadrilaterals (..., 4, 2)."""
+    difference = corners[..., :, None, :] - corners[..., None, :, :]
+    distance = np.linalg.norm(difference, axis=-1)
+    return np.asarray(
+        np.max(np.where(valid[..., :, None] & valid[..., None, :], distance, 0.0), axis=(-1, -2))
+    )
+
+
+def _turns(corners: FloatArray) -> FloatArray:
+    """Cross product (..., 4) of each side with the next: positive where they turn from x towards y."""
+    side = following(corners) - corners
+    ahead = following(side)
+    return np.asarray(side[..., 0] * ahead[..., 1] - side[..., 1] * ahead[..., 0])
+
+
+def block_diagonal(blocks: FloatArray) -> FloatArray:
+    """(M, 4, 2, 2) blocks, one a corner, to (M, 8, 8)."""
+    full = np.zeros((len(blocks), 4, 2, 4, 2))
+    for corner in range(4):
+        full[:, corner, :, corner] = blocks[:, corner]
+    return full.reshape(-1, 8, 8)

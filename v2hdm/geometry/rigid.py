@@ -1,0 +1,210 @@
+"""Rigid motions in numpy: transforms, their tangents, and the angles and quaternions of rotations.
+
+Frames, names and tangents are those of :mod:`v2hdm.geometry`; unit quaternions are in the order x, y, z, w
+(TUM's and ROS'). :mod:`v2hdm.geometry.tensors` has the differentiable twins.
+"""
+
+from __future__ import annotations
+
+from math import factorial
+
+import cv2
+import numpy as np
+
+from v2hdm.records import FloatArray
+
+SERIES_TERMS = 15
+"""Terms of the power series of theta^2, enough for float64 up to theta = pi: pi^(2 * 15) / 31! < 1e-18."""
+
+EXP_SERIES = tuple(tuple(1 / factorial(2 * n + offset) for offset in (1, 2, 3)) for n in range(SERIES_TERMS))
+"""Coefficients (terms, 3) of (-theta^2)^n in sin(theta) / theta, (1 - cos(theta)) / theta^2 and
+(theta - sin(theta)) / theta^3."""
+
+LEFT_JACOBIAN_SERIES = tuple(
+    tuple((1 - n) / factorial(2 * n + offset) for offset in (2, 3))
+    + tuple((n + 1) / factorial(2 * n + 2 + offset) for offset in (2, 3))
+    for n in range(SERIES_TERMS)
+)
+"""Coefficients (terms, 4) of (-theta^2)^n with the powers ad, ad^2, ad^3, ad^4 in the sum of
+ad^n / (n + 1)!, see :func:`left_jacobian`."""
+
+
+def inverse(dst_from_src: FloatArray) -> FloatArray:
+    """The inverse (..., 4, 4) of rigid transforms, by transposing their rotation."""
+    src_from_dst = np.zeros_like(dst_from_src)
+    src_from_dst[..., :3, :3] = np.swapaxes(dst_from_src[..., :3, :3], -1, -2)
+    src_from_dst[..., :3, 3] = camera_centre(dst_from_src)
+    src_from_dst[..., 3, 3] = 1.0
+    return src_from_dst
+
+
+def camera_centre(cam_from_frame: FloatArray) -> FloatArray:
+    """Where the origin of ``cam`` lies in the other frame: (..., 3), m."""
+    rotation = cam_from_frame[..., :3, :3]
+    return np.asarray(-(np.swapaxes(rotation, -1, -2) @ cam_from_frame[..., :3, 3:])[..., 0])
+
+
+def apply(dst_from_src: FloatArray, points_src: FloatArray) -> FloatArray:
+    """Points (..., N, 3) of ``src`` in ``dst``."""
+    rotation = np.swapaxes(dst_from_src[..., :3, :3], -1, -2)
+    return np.asarray(points_src @ rotation + dst_from_src[..., None, :3, 3])
+
+
+def ground_in_vehicle(map_from_vehicle: FloatArray, points_map: FloatArray) -> FloatArray:
+    """Ground points (..., 2) m of the map as (x, y) in the frame of a vehicle at a pose (4 x 4)."""
+    offset = np.concatenate([points_map, np.zeros((*np.shape(points_map)[:-1], 1))], axis=-1)
+    return np.asarray(((offset - map_from_vehicle[:3, 3]) @ map_from_vehicle[:3, :3])[..., :2])
+
+
+def heading_rad(map_from_vehicle: FloatArray) -> FloatArray:
+    """Headings (...), to the left of the map's x axis, of poses (..., 4, 4)."""
+    return np.asarray(np.arctan2(map_from_vehicle[..., 1, 0], map_from_vehicle[..., 0, 0]))
+
+
+def hat(vectors: FloatArray) -> FloatArray:
+    """Skew matrices (..., 3, 3) of vectors (..., 3): ``hat(a) @ b == cross(a, b)``."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    o = np.zeros_like(x)
+    return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1).reshape(*np.shape(x), 3, 3)
+
+
+def exp(tangents: FloatArray) -> FloatArray:
+    """The rigid motions (..., 4, 4) of tangents (..., 6), for rotations up to pi.
+
+    Rodrigues' formula with its coefficients as power series of theta^2.
+    """
+    omega = hat(tangents[..., 3:])
+    squared = omega @ omega
+    sine, cosine, third = _even_series(tangents[..., 3:], EXP_SERIES)
+    moved = (np.eye(3) + cosine * omega + third * squared) @ tangents[..., :3, None]
+    return _transform(np.eye(3) + sine * omega + cosine * squared, moved[..., 0])
+
+
+def log(dst_from_src: FloatArray) -> FloatArray:
+    """The tangents (..., 6) of rigid motions (..., 4, 4), with rotations of at most pi."""
+    matrices = dst_from_src.reshape(-1, 4, 4)
+    quaternion = quaternion_from_rotation(matrices[:, :3, :3])
+    half_sine = np.linalg.norm(quaternion[:, :3], axis=1, keepdims=True)
+    half_angle = np.arctan2(half_sine, quaternion[:, 3:])
+    scale = np.where(half_sine > 0, 2 * half_angle / np.where(half_sine > 0, half_sine, 1.0), 2.0)
+    rotation = scale * quaternion[:, :3]
+    omega = hat(rotation)
+    _, cosine, third = _even_series(rotation, EXP_SERIES)
+    by_translation = np.eye(3) + cosine * omega + third * omega @ omega
+    translation = np.linalg.solve(by_translation, matrices[:, :3, 3:])[..., 0]
+    return np.concatenate([translation, rotation], axis=1).reshape(*dst_from_src.shape[:-2], 6)
+
+
+def adjoint(dst_from_src: FloatArray) -> FloatArray:
+    """The matrices (..., 6, 6) that take tangents of ``src`` to ``dst``.
+
+    ``dst_from_src @ exp(x) == exp(adjoint(dst_from_src) @ x) @ dst_from_src``.
+    """
+    rotation = dst_from_src[..., :3, :3]
+    out = np.zeros((*dst_from_src.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = rotation
+    out[..., :3, 3:] = hat(dst_from_src[..., :3, 3]) @ rotation
+    return out
+
+
+def left_jacobian(tangents: FloatArray) -> FloatArray:
+    """Derivatives (..., 6, 6) of :func:`exp`: ``exp(x + dx) = exp(left_jacobian(x) @ dx) @ exp(x)``.
+
+    The series sum of ad^n / (n + 1)!, closed by ad^5 = -2 theta^2 ad^3 - theta^4 ad (Barfoot, State
+    Estimation for Robotics, 2nd ed., section 8.1.5), for rotations up to pi.
+    """
+    ad = np.zeros((*tangents.shape[:-1], 6, 6))
+    ad[..., :3, :3] = ad[..., 3:, 3:] = hat(tangents[..., 3:])
+    ad[..., :3, 3:] = hat(tangents[..., :3])
+    first, second, third, fourth = _even_series(tangents[..., 3:], LEFT_JACOBIAN_SERIES)
+    eye = np.eye(6)
+    return np.asarray(eye + ad @ (first * eye + ad @ (second * eye + ad @ (third * eye + fourth * ad))))
+
+
+def rotation_from_vector(vector_rad: FloatArray) -> FloatArray:
+    """The rotation matrix (3, 3) of a rotation vector (3,)."""
+    return np.asarray(cv2.Rodrigues(np.asarray(vector_rad, dtype=np.float64))[0])
+
+
+def rotation_from_quaternion(quaternion: FloatArray) -> FloatArray:
+    """Rotation matrices (N, 3, 3) of unit quaternions (N, 4), xyzw."""
+    x, y, z, w = quaternion.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
+    """Unit quaternions (N, 4), xyzw with w >= 0, of rotation matrices (N, 3, 3).
+
+    Shepperd's method (Journal of Guidance and Control 1, 1978): of the four equivalent formulas,
+    each matrix takes the one that divides by its largest component.
+    """
+    diagonal = np.diagonal(rotation, axis1=1, axis2=2)
+    trace = diagonal.sum(axis=1)
+    candidates = np.empty((len(rotation), 4, 4))
+    for axis in range(3):
+        second, third = (axis + 1) % 3, (axis + 2) % 3
+        candidates[:, axis, axis] = 1 + 2 * diagonal[:, axis] - trace
+        candidates[:, axis, second] = rotation[:, second, axis] + rotation[:, axis, second]
+        candidates[:, axis, third] = rotation[:, third, axis] + rotation[:, axis, third]
+        candidates[:, axis, 3] = rotation[:, third, second] - rotation[:, second, third]
+    candidates[:, 3, :3] = candidates[:, :3, 3]
+    candidates[:, 3, 3] = 1 + trace
+    best = np.argmax(np.column_stack([diagonal, trace]), axis=1)
+    quaternion = candidates[np.arange(len(rotation)), best]
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    return np.asarray(np.where(quaternion[:, 3:] < 0, -quaternion, quaternion))
+
+
+def slerp(first: FloatArray, second: FloatArray, fraction: FloatArray) -> FloatArray:
+    """Unit quaternions (N, 4) at ``fraction`` (N,) of the shorter way from ``first`` to ``second``.
+
+    Shoemake, Animating rotation with quaternion curves, SIGGRAPH 1985.
+    """
+    cosine = np.sum(first * second, axis=1, keepdims=True)
+    second = np.where(cosine < 0, -second, second)
+    # atan2 of chord and sum keeps full precision for angles near zero, where arccos does not.
+    angle = 2 * np.arctan2(
+        np.linalg.norm(second - first, axis=1, keepdims=True),
+        np.linalg.norm(second + first, axis=1, keepdims=True),
+    )
+    t = fraction[:, None]
+    # sin(t a) / sin(a) as a ratio of sincs, which is t at a = 0.
+    sinc = np.sinc(angle / np.pi)
+    mixed = (
+        first * (1 - t) * np.sinc((1 - t) * angle / np.pi) / sinc
+        + second * t * np.sinc(t * angle / np.pi) / sinc
+    )
+    return np.asarray(mixed / np.linalg.norm(mixed, axis=1, keepdims=True))
+
+
+def rotation_from_euler(roll_rad: FloatArray, pitch_rad: FloatArray, yaw_rad: FloatArray) -> FloatArray:
+    """Rotation matrices (N, 3, 3) Rz(yaw) Ry(pitch) Rx(roll): REP-103's fixed-axis convention."""
+    (cr, sr), (cp, sp), (cy, sy) = ((np.cos(a), np.sin(a)) for a in (roll_rad, pitch_rad, yaw_rad))
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def _transform(rotation: FloatArray, translation: FloatArray) -> FloatArray:
+    """The transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
+    out = np.zeros((*translation.shape[:-1], 4, 4))
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = rotation, translation, 1.0
+    return out
+
+
+def _even_series(rotation: FloatArray, coefficients: tuple[tuple[float, ...], ...]) -> list[FloatArray]:
+    """Power series in -theta^2 by Horner's rule, theta = |rotation|, each (..., 1, 1)."""
+    x = -np.square(rotation).sum(axis=-1)[..., None, None, None]
+    terms = np.array(coefficients)
+    total = terms[-1]
+    for term in terms[-2::-1]:
+        total = term + total * x
+    return list(np.moveaxis(total, -1, 0))
