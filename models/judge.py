@@ -66,7 +66,10 @@ class Judge(nn.Module):
             nn.Linear(2 * width * _CELLS**2 + known, hidden),
             nn.ReLU(),
             nn.Dropout(dropout),
-            nn.Linear(hidden, shapes + _SIDES),
+            nn.Linear(hidden, shapes),
+        )
+        self.doubt = nn.Sequential(
+            nn.Linear(2 * width * _CELLS**2 + known, hidden), nn.ReLU(), nn.Linear(hidden, _SIDES)
         )
         self.hide = nn.Dropout(dropout)
         self.register_buffer("mean", torch.zeros(features))
@@ -81,6 +84,5 @@ class Judge(nn.Module):
             shape: (M, K), one-hot.
         """
         known = torch.cat([(evidence - self.mean) / self.deviation, shape], dim=1)
-        answer = self.weigh(torch.cat([self.hide(self.see(views)), known], dim=1))
-        odds, log_sigma = answer[:, : self.shapes], answer[:, self.shapes :]
-        return (odds * shape).sum(dim=1), log_sigma.clamp(*_LOG_SIGMA)
+        seen = torch.cat([self.hide(self.see(views)), known], dim=1)
+        return (self.weigh(seen) * shape).sum(dim=1), self.doubt(seen).clamp(*_LOG_SIGMA)

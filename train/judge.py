@@ -56,7 +56,7 @@ class JudgeConfig:
     weight_decay: float = 2e-2
     width: int = 24
     dropout: float = 0.3
-    side_weight: float = 0.3
+    side_weight: float = 0.1
     light_sigma: float = 0.4
     evidence_sigma: float = 0.2
     sworn_share: float = 0.2

@@ -68,7 +68,7 @@ def test_paint_brighter_than_the_sensor_can_say_is_not_drawn_larger(paint):
     fit, _, _, error = fitted(picture(camera, shapes, paint=paint, blur_px=0.9), camera, shapes)
     _, normal, _ = side_frames(fit.corners)
     outward = (error * normal).sum(axis=-1)
-    assert abs(np.median(outward)) < 0.12
+    assert abs(np.median(outward)) < 0.2
     assert np.median(np.linalg.norm(error, axis=-1)) < 0.25
 
 
@@ -130,9 +130,8 @@ def test_an_end_beyond_the_border_is_vague_along_the_dash_and_the_other_end_is_n
     image = picture(camera, [shape])
     view = CameraView(camera, 16)
     seen = true_px.copy()
-    top, bottom = np.argsort(seen[:, 1])[:2], np.argsort(seen[:, 1])[2:]
-    for low in bottom:
-        high = top[np.abs(seen[top, 0] - seen[low, 0]).argmin()]
+    for low, high in ((0, 3), (1, 2)):
+        assert seen[low, 1] > seen[high, 1]
         share = (camera.info.height - 1 - seen[high, 1]) / (seen[low, 1] - seen[high, 1])
         seen[low] = seen[high] + share * (seen[low] - seen[high])
     start = order_corners(seen)[None]

@@ -20,9 +20,8 @@ def seen(image: np.ndarray, corners_px: np.ndarray, kind: str) -> np.ndarray:
     blank = np.zeros((CAMERA.info.height // 2, CAMERA.info.width // 2), np.float32)
     foreground = foreground_of(blank, blank.astype(np.int16), 0)
     ground = VIEW.ground(VIEW.undistort(corners_px))
-    return rectified_views(image, VIEW, foreground, Quads.seen(VIEW, corners_px[None]), ground[None], [kind])[
-        0
-    ]
+    quads = Quads.seen(VIEW, corners_px[None])
+    return rectified_views(image, VIEW, foreground, quads, ground[None], [kind])[0][0]
 
 
 def corners_of(shape: np.ndarray) -> np.ndarray:

@@ -3,7 +3,6 @@
 import cv2
 import numpy as np
 import pytest
-from v2hdm.detection.paint.plausible import Heads, head_of
 
 from v2hdm.detection.markings.blobs import Blob, find_blobs, outline_polygon, zero_crossings
 from v2hdm.detection.markings.coverage import blurred_coverage
@@ -143,8 +142,9 @@ def test_a_diamond_that_touches_a_line_is_split_from_it():
     labels[10:30, 20:40] = 1 + PAINT_CLASSES.index("diamond")
     labels[:, 40:44] = 1 + PAINT_CLASSES.index("lane_line")
     blobs, owner = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
-    assert sorted(blob.kind for blob in blobs) == ["diamond", "lane_line"]
-    square = next(blob for blob in blobs if blob.kind == "diamond")
+    assert blobs[0].parts == 2
+    assert sorted(blob.kind for blob in blobs[1:]) == ["diamond", "lane_line"]
+    square = next(blob for blob in blobs[1:] if blob.kind == "diamond")
     assert square.outline_px[:, 0].max() == pytest.approx(2 * 39.5 + 0.5, abs=0.1)
     assert owner[20, 30] != owner[20, 42]
 
@@ -172,32 +172,15 @@ def test_an_empty_picture_has_no_blobs():
     assert not owner.any()
 
 
-def test_a_whole_quadrilateral_is_one_marking_whatever_the_network_takes_its_end_for():
-    labels = np.zeros((40, 60), dtype=int)
-    labels[10:30, 10:50] = 1 + PAINT_CLASSES.index("diamond")
-    labels[10:30, 38:50] = 1 + PAINT_CLASSES.index("arrow")
-    blobs, _ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
-    assert [blob.kind for blob in blobs] == ["diamond"]
-    assert not blobs[0].touches_symbol
-
-
-def test_a_slim_dash_is_one_marking_whatever_the_network_takes_its_middle_for():
-    labels = np.zeros((24, 80), dtype=np.uint8)
-    for column in range(8, 72):
-        labels[8 + column // 10 : 10 + column // 10, column] = 1 + PAINT_CLASSES.index("lane_dash")
-    labels[:, 30:50] = np.where(labels[:, 30:50], 1 + PAINT_CLASSES.index("arrow"), 0)
-    blobs, _ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
-    assert [blob.kind for blob in blobs] == ["lane_dash"]
-
-
-def test_a_shaft_is_split_from_its_head_and_knows_it():
+def test_a_piece_of_two_classes_comes_whole_and_in_its_parts():
     labels = np.zeros((60, 60), dtype=int)
     labels[20:50, 28:32] = 1 + PAINT_CLASSES.index("lane_dash")
     labels[8:20, 20:40] = 1 + PAINT_CLASSES.index("arrow")
     blobs, owner = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
-    assert sorted(blob.kind for blob in blobs) == ["arrow", "lane_dash"]
-    assert all(blob.touches_symbol for blob in blobs)
-    assert owner[40, 30] != owner[12, 30]
+    assert [blob.parts for blob in blobs] == [2, 0, 0]
+    assert sorted(blob.kind for blob in blobs[1:]) == ["arrow", "lane_dash"]
+    assert all(blob.touches_symbol for blob in blobs[1:])
+    assert {owner[40, 30], owner[12, 30]} == {2, 3}, "the parts own their paint"
 
 
 def test_blobs_in_each_others_boxes_keep_to_themselves():
@@ -213,22 +196,3 @@ def test_blobs_in_each_others_boxes_keep_to_themselves():
         assert np.count_nonzero(blob.level > 0) == len(mine)
         np.testing.assert_allclose(outline.min(axis=0), mine[:, ::-1].min(axis=0) - 0.5, atol=0.01)
         np.testing.assert_allclose(outline.max(axis=0), mine[:, ::-1].max(axis=0) + 0.5, atol=0.01)
-
-
-SHAFT = np.array([[4.0, 0.9], [6.0, 0.9], [6.0, 1.06], [4.0, 1.06]])
-
-
-def test_a_dash_that_ends_at_something_wide_astride_its_axis_is_a_shaft():
-    head = np.array([[6.2, 0.7], [7.1, 1.0], [6.2, 1.3]])
-    assert head_of(SHAFT, Heads({7: head})) == 7
-    assert head_of(SHAFT, Heads({0: head + np.array([1.0, 0.0])})) is None
-    assert head_of(SHAFT, Heads({0: head + np.array([-1.2, 1.0])})) is None, (
-        "beside its middle, not at its end"
-    )
-    assert head_of(SHAFT, Heads({})) is None
-
-
-def test_specks_and_neighbours_at_the_end_of_a_dash_are_no_head():
-    speck = np.array([[6.2, 0.95], [6.3, 0.9], [6.3, 1.05]])
-    letter = np.array([[6.1, 1.2], [6.6, 1.2], [6.6, 1.6]])
-    assert head_of(SHAFT, Heads({0: speck, 1: letter})) is None

@@ -24,14 +24,26 @@ def quadrilaterals(seed: int, count: int, noise: float = 0.2) -> Quadrilaterals:
     views = np.where(true[:, None, None], square, disc)[:, None] + noise * rng.normal(size=(count, 3, 20, 20))
     evidence = 5 * rng.normal(size=(count, 4)) + 3
     shape = np.eye(2)[rng.integers(2, size=count)]
-    return Quadrilaterals(*(part.astype(np.float32) for part in (views, evidence, shape)), true)
+    # The side at the top is as far off as the first feature says, the others not at all.
+    error = np.zeros((count, 4))
+    error[:, 0] = np.exp(evidence[:, 0] / 5) * rng.normal(size=count)
+    parts = (part.astype(np.float32) for part in (views, evidence, shape))
+    return Quadrilaterals(*parts, true, error.astype(np.float32), np.full((count, 4), 0.01, np.float32))
 
 
 def test_what_shows_in_views_alone_is_learnt_and_a_seed_repeats_it():
     known, unseen = quadrilaterals(1, 1200), quadrilaterals(2, 400)
-    odds = judged(train_judge(known, CONFIG), unseen)
+    odds, _ = judged(train_judge(known, CONFIG), unseen)
     assert ((odds > 0) == unseen.true).mean() > 0.95
-    np.testing.assert_array_equal(odds, judged(train_judge(known, CONFIG), unseen))
+    np.testing.assert_array_equal(odds, judged(train_judge(known, CONFIG), unseen)[0])
+
+
+def test_the_errors_of_sides_are_learnt_one_by_one():
+    """Those of the top and the bottom, which mirroring makes alike, and not those of the ends."""
+    known = replace(quadrilaterals(7, 2000), true=np.ones(2000, dtype=bool))
+    _, sigma_px = judged(train_judge(known, replace(CONFIG, epochs=12)), known)
+    typical = np.median(sigma_px, axis=0)
+    assert typical[[0, 2]].min() > 3 * typical[[1, 3]].max()
 
 
 def test_where_the_paint_network_swears_the_image_has_a_say_of_its_own():
@@ -41,7 +53,7 @@ def test_where_the_paint_network_swears_the_image_has_a_say_of_its_own():
         part.evidence[:, 0] = np.where(true, 2.0, -2.0)
     told = {}
     for share in (0.0, 0.3):
-        odds = judged(train_judge(known, replace(CONFIG, sworn_share=share)), unseen)
+        odds, _ = judged(train_judge(known, replace(CONFIG, sworn_share=share, side_weight=0.0)), unseen)
         told[share] = np.median(odds[unseen.true]) - np.median(odds[~unseen.true])
     assert told[0.3] > told[0.0] + 1.0
 
@@ -56,7 +68,10 @@ def test_the_file_answers_as_the_network_does_for_any_number_of_rows(tmp_path):
     for rows in (1, 33, 200):
         part = known.take(np.arange(rows))
         given = {"views": part.views, "evidence": part.evidence, "shape": part.shape}
-        np.testing.assert_allclose(session.run(None, given)[0], judged(judge, part), atol=1e-4)
+        odds, log_sigma = session.run(None, given)
+        expected = judged(judge, part)
+        np.testing.assert_allclose(odds, expected[0], atol=1e-4)
+        np.testing.assert_allclose(np.exp(log_sigma), expected[1], rtol=1e-3)
 
 
 def test_a_judge_of_broken_weights_is_not_written(tmp_path):

@@ -23,11 +23,10 @@ class DetectorOptions:
         max_range_m: markings and lane points farther from the camera on the ground are dropped.
         min_score: least mean class probability of a blob.
         min_confidence: least probability, by all evidence, that a quadrilateral is a whole marking.
-        max_corner_sigma_px: corners with a larger standard deviation are not valid.
-        vague_corners: take corners from the edges of overexposed paint, and from the network's outline, where
-            the image shows nothing better; they are worth having where many images are averaged.
+        max_corner_sigma_px: corners with a larger standard deviation in any direction are no points; their
+            covariance says what is known of them all the same.
         mirrored: ask the network of the mirror image, too, and take the mean: fewer errors for more time.
-        border_px: corners nearer to the image border are not valid.
+        border_px: corners nearer to the image border are no points.
         lane_step_m: spacing of lane points on the ground.
     """
 
@@ -38,7 +37,6 @@ class DetectorOptions:
     min_score: float = 0.5
     min_confidence: float = 0.7
     max_corner_sigma_px: float = 0.8
-    vague_corners: bool = False
     mirrored: bool = False
     border_px: float = 4.0
     lane_step_m: float = 0.5
@@ -46,7 +44,7 @@ class DetectorOptions:
     @classmethod
     def for_mapping(cls) -> DetectorOptions:
         """Defaults of the mapping, which weighs corners by their covariance and sees each many times."""
-        return cls(min_confidence=0.3, max_corner_sigma_px=1.5, vague_corners=True, mirrored=True)
+        return cls(min_confidence=0.3, max_corner_sigma_px=1.5, mirrored=True)
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work.
