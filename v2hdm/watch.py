@@ -61,8 +61,6 @@ def watch(parsed: argparse.Namespace) -> None:
         options.max_range_m = _ROUGH_RANGE_M
     detector = Detector.load(options=options)
     unknown = unknown_network(parsed.model) if parsed.model is not None else None
-    if unknown is not None:
-        print(unknown, file=sys.stderr)
     job = _job(parsed, detector)
     stopwatch = Stopwatch()
     failure = None
@@ -82,6 +80,8 @@ def watch(parsed: argparse.Namespace) -> None:
                 raise
             failure = error  # hours of a camera that was unplugged are kept
     _report(stopwatch)
+    if unknown is not None:
+        print(unknown, file=sys.stderr)
     if failure:
         raise failure
 

@@ -78,6 +78,7 @@ def test_a_folder_gives_a_line_an_image_in_pixels_and_metres_and_pictures(bench,
     assert report.startswith("2 images, peak memory")
     for stage in ("read", "all"):
         assert re.search(rf"^{stage}( +\d+\.\d){{3}}$", report, re.MULTILINE)
+    assert report.count("scores come from the judge of the shipped network") == 1
 
 
 def test_an_uncertain_calibration_shows_in_metres_and_not_in_pixels(bench, tmp_path, capsys):

@@ -10,14 +10,9 @@ from v2hdm.detection.markings.normal import normal_cdf, normal_pdf
 from v2hdm.detection.sight import Sight
 from v2hdm.geometry.planar import signed_area
 from v2hdm.geometry.quadrilateral import (
-    interior_angles,
-    intersect_sides,
     order_corners,
-    quad_from_hull,
     side_frames,
-    width,
 )
-from v2hdm.geometry.quadrilateral import is_convex_px as is_convex
 from v2hdm.records import PAINT_CLASSES
 
 KITE = order_corners(np.array([[20.3, 10.2], [40.1, 14.9], [19.4, 19.3], [3.2, 15.5]]))
@@ -29,46 +24,6 @@ def sight_of(labels: np.ndarray) -> Sight:
     kinds = np.stack([np.where(labels == 1 + c, 5.0, -5.0) for c in range(len(PAINT_CLASSES))])
     coarse = kinds.reshape(len(kinds), labels.shape[0] // 2, 2, labels.shape[1] // 2, 2).mean(axis=(2, 4))
     return Sight(paint, coarse.astype(np.float32), [])
-
-
-def test_ordered_corners_run_counter_clockwise_on_the_screen():
-    assert signed_area(KITE) < 0
-    assert is_convex(KITE)
-    assert not is_convex(KITE[::-1])
-
-
-def test_normals_point_outwards():
-    _, normal, _ = side_frames(KITE)
-    middle = (KITE + np.roll(KITE, -1, axis=0)) / 2
-    assert (((middle - KITE.mean(axis=0)) * normal).sum(axis=1) > 0).all()
-
-
-def test_the_angles_of_a_quadrilateral_add_up_to_a_full_turn():
-    assert interior_angles(KITE).sum() == pytest.approx(2 * np.pi)
-
-
-def test_lines_through_the_sides_meet_in_the_corners():
-    _, normal, _ = side_frames(KITE)
-    middle = (KITE + np.roll(KITE, -1, axis=0)) / 2
-    np.testing.assert_allclose(intersect_sides(middle, normal), KITE, atol=1e-9)
-
-
-def test_the_width_of_a_bar_is_its_breadth():
-    assert width(order_corners(np.array([[0, 0], [30, 0], [30, 4], [0, 4.0]]))) == pytest.approx(4.0)
-
-
-def test_a_quadrilateral_is_found_again_from_points_on_its_outline():
-    along = np.linspace(0, 1, 40, endpoint=False)[:, None]
-    outline = np.concatenate([KITE[e] * (1 - along) + KITE[(e + 1) % 4] * along for e in range(4)])
-    found = quad_from_hull(cv2.convexHull(outline.astype(np.float32)))
-    assert found is not None
-    distance = np.linalg.norm(found[:, None] - KITE, axis=-1).min(axis=1)
-    assert distance.max() < 0.05
-
-
-@pytest.mark.parametrize("outline", [np.zeros((3, 2)), np.zeros((9, 2)), np.arange(18.0).reshape(9, 2)])
-def test_points_that_enclose_nothing_give_no_quadrilateral(outline):
-    assert quad_from_hull(cv2.convexHull(outline.astype(np.float32))) is None
 
 
 def test_the_normal_distribution_is_right_to_four_digits():

@@ -1,14 +1,29 @@
-"""Cyclic alignment of quadrilaterals."""
+"""Quadrilaterals of image and map: their order, sides and shape, and the cyclic alignment of two of them."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
 from v2hdm.geometry.planar import signed_area
-from v2hdm.geometry.quadrilateral import align, diameters, is_convex
+from v2hdm.geometry.quadrilateral import (
+    align,
+    characteristic_lengths,
+    diameters,
+    interior_angles,
+    intersect_sides,
+    is_convex,
+    is_convex_px,
+    long_axis,
+    order_corners,
+    quad_from_hull,
+    side_frames,
+    width,
+)
 
 DIAMOND = np.array([[0.6, 0.0], [0.0, 0.3], [-0.6, 0.0], [0.0, -0.3]])
+KITE = order_corners(np.array([[20.3, 10.2], [40.1, 14.9], [19.4, 19.3], [3.2, 15.5]]))
 OFFSET = np.array([0.1, -0.05])
 ALL = np.ones(4, dtype=bool)
 
@@ -53,3 +68,67 @@ def test_area_sense_and_diameter_of_a_diamond() -> None:
     assert is_convex(DIAMOND)
     assert not is_convex(DIAMOND[::-1])
     assert diameters(DIAMOND, ALL) == pytest.approx(1.2)
+
+
+def test_ordered_corners_run_counter_clockwise_on_the_screen() -> None:
+    assert signed_area(KITE) < 0
+    assert is_convex_px(KITE)
+    assert not is_convex_px(KITE[::-1])
+
+
+def test_normals_of_image_corners_point_outwards() -> None:
+    _, normal, _ = side_frames(KITE)
+    middle = (KITE + np.roll(KITE, -1, axis=0)) / 2
+    assert (((middle - KITE.mean(axis=0)) * normal).sum(axis=1) > 0).all()
+
+
+def test_the_angles_of_a_quadrilateral_add_up_to_a_full_turn() -> None:
+    assert interior_angles(KITE).sum() == pytest.approx(2 * np.pi)
+
+
+def test_lines_through_the_sides_meet_in_the_corners() -> None:
+    _, normal, _ = side_frames(KITE)
+    middle = (KITE + np.roll(KITE, -1, axis=0)) / 2
+    np.testing.assert_allclose(intersect_sides(middle, normal), KITE, atol=1e-9)
+
+
+def test_the_width_of_a_bar_is_its_breadth() -> None:
+    assert width(order_corners(np.array([[0, 0], [30, 0], [30, 4], [0, 4.0]]))) == pytest.approx(4.0)
+
+
+def test_a_quadrilateral_is_found_again_from_points_on_its_outline() -> None:
+    along = np.linspace(0, 1, 40, endpoint=False)[:, None]
+    outline = np.concatenate([KITE[e] * (1 - along) + KITE[(e + 1) % 4] * along for e in range(4)])
+    found = quad_from_hull(cv2.convexHull(outline.astype(np.float32)))
+    assert found is not None
+    distance = np.linalg.norm(found[:, None] - KITE, axis=-1).min(axis=1)
+    assert distance.max() < 0.05
+
+
+@pytest.mark.parametrize("outline", [np.zeros((3, 2)), np.zeros((9, 2)), np.arange(18.0).reshape(9, 2)])
+def test_points_that_enclose_nothing_give_no_quadrilateral(outline: np.ndarray) -> None:
+    assert quad_from_hull(cv2.convexHull(outline.astype(np.float32))) is None
+
+
+def test_corners_of_the_map_become_those_of_an_image_when_the_second_axis_turns_down() -> None:
+    in_image = DIAMOND * [1, -1]
+    assert is_convex(DIAMOND)
+    assert not is_convex_px(DIAMOND)
+    assert is_convex_px(in_image)
+    assert not is_convex(in_image)
+    assert signed_area(in_image) == pytest.approx(-signed_area(DIAMOND))
+
+
+def test_normals_of_map_corners_point_inwards() -> None:
+    _, normal, _ = side_frames(DIAMOND)
+    middle = (DIAMOND + np.roll(DIAMOND, -1, axis=0)) / 2
+    assert ((middle * normal).sum(axis=1) < 0).all()
+
+
+@pytest.mark.parametrize("shift", range(4))
+def test_axis_and_lengths_of_a_dash_do_not_depend_on_its_first_corner(shift: int) -> None:
+    dash = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 0.12], [0.0, 0.12]])
+    turned = np.roll(dash, shift, axis=0)
+    np.testing.assert_allclose(long_axis(turned), [1.0, 0.0], atol=1e-12)
+    diagonal = np.hypot(3.0, 0.12)
+    np.testing.assert_allclose(characteristic_lengths(turned[None])[0], [0.12, 3.0, diagonal, diagonal])

@@ -10,6 +10,7 @@ import numpy as np
 
 from v2hdm.detection.batch import read_image
 from v2hdm.geometry.ipm import facing_ipm, flat_motion, pinhole_px_from_ground
+from v2hdm.geometry.rigid import inverse
 from v2hdm.hdmap.calibration import write_calibration
 from v2hdm.hdmap.exclusions import ExcludedMarking, write_exclusions
 from v2hdm.hdmap.geojson import write_geojson
@@ -96,9 +97,8 @@ def _save_overlay(path: Path, drive: Drive, image: Image, best: MethodResult) ->
     initial = {"calibrated": "CNI", "estimated": "ENI"}.get(camera.initial_ipm, camera.initial_ipm)
     cam_from_map = best.calibrations[image.camera].cam_from_vehicle @ np.linalg.inv(adjusted)
     ipm = facing_ipm(camera.ipm[camera.initial_ipm], camera.roi_vehicle.mean(axis=0))
-    vehicle_from_map = np.asarray(np.linalg.inv(image.map_from_vehicle), dtype=np.float64)
     views = {
-        initial: np.linalg.inv(ipm) @ flat_motion(vehicle_from_map),
+        initial: np.linalg.inv(ipm) @ flat_motion(inverse(image.map_from_vehicle)),
         BEST: pinhole_px_from_ground(camera.info.intrinsic, cam_from_map),
     }
     position_map = adjusted[:2, 3]

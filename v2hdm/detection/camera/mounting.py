@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from v2hdm.errors import MapFileError
-from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
+from v2hdm.geometry.ipm import apply_in_front, ground_from_pinhole_px, ipm_from_extrinsic
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import DISTORTION_COEFFICIENTS, Calibration, Camera, CameraInfo, FloatArray
 
@@ -54,13 +54,13 @@ def rough_calibration(
 
 def _seen_ground(calibration: Calibration) -> FloatArray:
     """A small square on the ground that the camera sees: around what the image's lowest row shows."""
-    ipm = ipm_from_extrinsic(calibration.info, calibration.cam_from_vehicle)
-    below_px = np.array([[calibration.info.intrinsic[0, 2], calibration.info.height - 1.0]])
-    seen_vehicle = apply_homography(ipm, below_px)[0]
-    depth_m = calibration.cam_from_vehicle[2] @ [*seen_vehicle, 0.0, 1.0]
-    if not (np.isfinite(depth_m) and depth_m > 0):
+    info = calibration.info
+    below_px = np.array([[info.intrinsic[0, 2], info.height - 1.0]])
+    ground = ground_from_pinhole_px(info.intrinsic, calibration.cam_from_vehicle)
+    seen_vehicle = apply_in_front(ground, below_px)[0]
+    if not np.isfinite(seen_vehicle).all():
         raise MapFileError(
-            f"calibration of camera {calibration.info.name!r}: the image's lowest row is above the horizon; "
+            f"calibration of camera {info.name!r}: the image's lowest row is above the horizon; "
             "mend cam_from_vehicle"
         )
     return np.asarray(seen_vehicle + _BELOW_M * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]))

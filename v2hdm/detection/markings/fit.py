@@ -97,7 +97,9 @@ _SEARCH_STEPS, _STEPS = 6, 7
 _MAX_STEP = 2.0
 """Longest step of a side, in blurs."""
 
-_SETTLED_PX = 0.05
+_SETTLED_PX, _FOUND_PX = 0.05, 0.3
+"""Steps of fit and of search that are shorter than this are the last, px."""
+
 _LEAST_SINE = 1e-3
 
 _BLUR, _K = 8, 9
@@ -304,7 +306,7 @@ class _State:
                 system = part
             else:
                 system.put(running, part)
-            moving = np.abs(part.by_side).max(axis=1) > _SETTLED_PX
+            moving = np.abs(part.by_side).max(axis=1) > (_SETTLED_PX if paint is None else _FOUND_PX)
             lattice, running = lattice.take(moving), running[moving]
             paint = None if paint is None else paint[moving]
             if not len(running):

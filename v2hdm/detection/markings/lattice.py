@@ -21,6 +21,9 @@ _OUTSIDE_PX = 3.0
 _INSIDE_PX = 4.0
 _MEDIAN_STRIDE = 3
 _MAX_PIXELS = 350
+_MOST_PIXELS = 600
+"""A band that the lattice leaves more pixels of is thinned: all markings of an image are padded to the most."""
+
 _MAX_BETWEEN, _MAX_AT_ENDS = 160, 260
 _END_PX = 2.0
 _MOST_ENDS = 1 / 3
@@ -124,15 +127,22 @@ def lay_lattice(scene: Scene, frames: StraightFrames, corners_px: FloatArray) ->
     u, v = low[marking, 0] + columns[marking, j], low[marking, 1] + rows[marking, i]
     count = np.bincount(marking, minlength=len(low))
     place = np.arange(len(cell)) - np.repeat(np.cumsum(count) - count, count)
+    thin = -(-count // _MOST_PIXELS)
+    kept = place % thin[marking] == 0
+    cell, marking, i, j, u, v = (part[kept] for part in (cell, marking, i, j, u, v))
+    place, count = place[kept] // thin[marking], -(-count // thin)
     shape = len(low), max(1, int(count.max()))
     pixels = np.repeat(corners_px.mean(axis=1)[:, None], shape[1], axis=1)
     pixels[marking, place] = np.column_stack([u, v])
     place_of_cell = np.zeros(band.size, dtype=np.intp)
-    place_of_cell[cell] = place
+    place_of_cell[cell] = np.where(thin[marking] == 1, place, 0)
     near = _near_the_next(columns, size[:, 0])[marking, j], _near_the_next(rows, size[:, 1])[marking, i]
     neighbours = np.zeros((2, *shape), dtype=np.intp)
     for axis, step in ((0, 1), (1, across)):
         neighbours[axis, marking, place] = np.where(near[axis], place_of_cell[cell + step], 0)
+    # Where a band is thinned, the next in its row is the neighbour.
+    thinned = np.flatnonzero((thin[marking[:-1]] > 1) & (marking[1:] == marking[:-1]) & (i[1:] == i[:-1]))
+    neighbours[0, marking[thinned], place[thinned]] = place[thinned] + 1
     light, use, clipped = scene.look(u, v, marking, frames.view.camera.linear_response)
     planes = np.zeros((3, *shape), dtype=np.float32)
     planes[:, marking, place] = light

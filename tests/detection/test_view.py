@@ -1,4 +1,4 @@
-"""The IPM and the lens: laws, and the fast table against the exact model."""
+"""The camera as the detector sees it: the lens, its fast table, and the ground in view."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,6 @@ from tests.detection.pictures import LENSES, extrinsic, make_camera
 from v2hdm.detection.camera.view import FARTHEST_M, CameraView
 from v2hdm.geometry.ipm import (
     apply_homography,
-    extrinsic_from_ipm,
-    homography_jacobian,
     ipm_from_extrinsic,
 )
 from v2hdm.geometry.lens import distort_points, undistort_points
@@ -34,40 +32,6 @@ def test_the_principal_point_is_left_alone_by_a_radial_lens():
     info = make_camera("equidistant").info
     centre = info.intrinsic[None, :2, 2]
     np.testing.assert_allclose(undistort_points(info, centre), centre, atol=1e-9)
-
-
-def test_the_ipm_takes_the_projection_of_a_ground_point_back_to_it():
-    camera, cam_from_vehicle = make_camera("pinhole"), extrinsic()
-    point_cam = cam_from_vehicle @ [7.0, 1.5, 0.0, 1.0]
-    px = (camera.info.intrinsic @ point_cam[:3])[:2] / point_cam[2]
-    np.testing.assert_allclose(apply_homography(camera.ipm["calibrated"], px[None]), [[7.0, 1.5]], atol=1e-9)
-
-
-@pytest.mark.parametrize("scale", [1.0, -3.0])
-def test_an_extrinsic_comes_back_from_its_ipm_at_any_scale_and_sign(scale):
-    info = make_camera("pinhole").info
-    ipm = scale * ipm_from_extrinsic(info, extrinsic())
-    np.testing.assert_allclose(extrinsic_from_ipm(info, ipm), extrinsic(), atol=1e-9)
-
-
-def test_an_extrinsic_from_a_disturbed_ipm_is_still_a_rigid_motion():
-    info = make_camera("pinhole").info
-    ipm = ipm_from_extrinsic(info, extrinsic()) * (1 + 1e-3 * np.random.default_rng(0).normal(size=(3, 3)))
-    rotation = extrinsic_from_ipm(info, ipm)[:3, :3]
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(rotation) == pytest.approx(1.0)
-
-
-def test_the_homography_jacobian_is_the_slope_of_the_homography():
-    ipm, points, step = make_camera().ipm["calibrated"], np.array([[300.0, 250.0], [500.0, 340.0]]), 1e-4
-    numeric = np.stack(
-        [
-            (apply_homography(ipm, points + d) - apply_homography(ipm, points - d)) / (2 * step)
-            for d in step * np.eye(2)
-        ],
-        axis=2,
-    )
-    np.testing.assert_allclose(homography_jacobian(ipm, points), numeric, rtol=1e-6, atol=1e-9)
 
 
 def test_points_above_the_horizon_have_no_place_on_the_ground():
