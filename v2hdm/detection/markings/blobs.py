@@ -22,6 +22,7 @@ from v2hdm.records import (
     STOP_LINE,
     BoolArray,
     FloatArray,
+    IntArray,
 )
 
 _MIN_CELLS = 5
@@ -41,6 +42,18 @@ _SYMBOLS = _GROUPS[-1]
 
 _LEAST_SHARE = np.array([0.25 if group == _SYMBOLS else 0.15 for group in _GROUPS])
 """Where two groups of classes hold this much of a blob, two markings touch. The head is more of an arrow."""
+
+_SURE, _DOUBTFUL = 2.0, -2.0
+"""Log odds at which paint is sure, and down to which it is in doubt.
+
+Markings that nearly touch come apart in sure paint; doubtful paint joins parts of one that a shadow divides.
+"""
+
+_LEAST_SURE, _MOST_SURE = 0.2, 0.6
+"""A piece of doubtful paint is of use if this much of it is likely, and news if no more than that."""
+
+_MOST_PARTS = 12
+"""Parts that are looked at of one piece: more are the grains of bad light."""
 
 _OUTLINE_SCALE = 4
 
@@ -100,25 +113,57 @@ def find_blobs(
     outlines = _outlines(level, piece, len(contours))
     owner = np.zeros_like(piece)
     blobs: list[Blob] = []
-    for index, contour in enumerate(contours):
+    wholes, stats, whole_of = _doubtful(level, contours, said.cells)
+    first_of_whole: dict[int, int] = {}
+    for index in np.argsort(whole_of, kind="stable").tolist():
         if said.cells[index] < _MIN_CELLS:
             continue
-        x, y, w, h = cv2.boundingRect(contour)
+        label = int(whole_of[index])
+        if label and label not in first_of_whole:
+            first_of_whole[label] = len(blobs)
+            x, y, w, h = stats[label, : cv2.CC_STAT_AREA].tolist()
+            box = (slice(y - 1, y + h + 1), slice(x - 1, x + w + 1))
+            first_px = corner_px + stride * np.array([x - 1.0, y - 1.0])
+            mask, raised = wholes[box] == label, level[box] - np.float32(_DOUBTFUL)
+            blobs.append(_blob(mask, raised, sight, (y - 1, x - 1), classes, first_px, stride))
+        x, y, w, h = cv2.boundingRect(contours[index])
         box = (slice(y - 1, y + h + 1), slice(x - 1, x + w + 1))
         origin_px = corner_px + stride * np.array([x - 1.0, y - 1.0])
         inside = piece[box] == index + 1
         scores = dict(zip(classes, said.score[:, index].tolist(), strict=True))
         outline_px = corner_px + stride * outlines[index]
-        parts = []
-        if said.groups[index] >= 2:
-            parts = _split(inside, level[box], sight, box, classes, origin_px, stride)
+        parts = _split(inside, level[box], sight, box, classes, origin_px, stride)
         signed = _signed(inside, level[box])
         blobs.append(Blob(scores, signed, origin_px, stride, outline_px, parts=len(parts)))
         owner[box][inside] = len(blobs)
         for part in parts:
             blobs.append(part)
             owner[box][part.level > 0] = len(blobs)
+        if label:
+            first = first_of_whole[label]
+            blobs[first] = replace(blobs[first], parts=len(blobs) - 1 - first)
     return blobs, owner[1:-1, 1:-1]
+
+
+def _doubtful(
+    level: np.ndarray, contours: Sequence[np.ndarray], cells: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, IntArray]:
+    """Labels (h, w) of doubtful paint, their statistics, and which of them each piece (B,) is a part of.
+
+    0 for pieces that are all of theirs but for a rim.
+    """
+    doubtful = (level > _DOUBTFUL).view(np.uint8)
+    doubtful[[0, -1]], doubtful[:, [0, -1]] = 0, 0
+    # Labels of 16 bits take a third of the time.
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(doubtful, ltype=cv2.CV_16U)
+    if not contours:
+        return labels, stats, np.zeros(0, dtype=np.int64)
+    at = np.array([contour[0, 0] for contour in contours])
+    own = labels[at[:, 1], at[:, 0]].astype(np.int64)
+    sure = np.bincount(own, cells, len(stats)) / np.maximum(stats[:, cv2.CC_STAT_AREA], 1)
+    several = np.bincount(own, minlength=len(stats)) > 1
+    asked = (several | (sure < _MOST_SURE)) & (sure > _LEAST_SURE)
+    return labels, stats, np.where(asked[own], own, 0)
 
 
 def _connected(level: np.ndarray, least_row: float) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
@@ -144,13 +189,11 @@ def _end_row(contour: np.ndarray) -> int:
 class _Hearsay:
     """What the network says of B pieces of paint.
 
-    ``cells`` (B,) are their sizes, ``score`` (K, B) the mean probability of each class, ``groups`` (B,) how
-    many groups of classes hold a notable part of each piece.
+    ``cells`` (B,) are their sizes, ``score`` (K, B) the mean probability of each class.
     """
 
     cells: np.ndarray
     score: FloatArray
-    groups: np.ndarray
 
 
 def _hearsay(
@@ -164,11 +207,7 @@ def _hearsay(
     i, j = np.divmod(at, piece.shape[1])
     probability = _class_probability(sight, i - 1, j - 1)
     score = np.stack([np.bincount(own, plane, count) for plane in probability]) * share
-    group_of = np.array([_group_index(name) for name in classes])
-    groups = len(_GROUPS)
-    votes = np.bincount(own * groups + group_of[probability.argmax(axis=0)], minlength=count * groups)
-    present = votes.reshape(count, groups) * share[:, None] >= _LEAST_SHARE
-    return _Hearsay(cells, certainty * score, present.sum(axis=1))
+    return _Hearsay(cells, certainty * score)
 
 
 def _outlines(level: np.ndarray, piece: np.ndarray, count: int) -> list[FloatArray]:
@@ -198,28 +237,46 @@ def _split(
     origin_px: FloatArray,
     stride: int,
 ) -> list[Blob]:
-    """The parts of a piece (h, w) that belong to different groups of classes."""
+    """The parts that a piece (h, w) may be: those of different groups of classes, or else of sure paint."""
     rows, columns = np.nonzero(inside)
     probability = _class_probability(sight, rows + box[0].start - 1, columns + box[1].start - 1)
     group_of = np.array([_group_index(name) for name in classes])
     votes = np.bincount(group_of[probability.argmax(axis=0)], minlength=len(_GROUPS)) / len(rows)
+    present = np.flatnonzero(votes >= _LEAST_SHARE)
+    levels = [level - _SURE]
+    if len(present) > 1:
+        levels = [np.minimum(level, _lead(sight, group_of == group, box)) for group in present]
+    corner = (box[0].start, box[1].start)
     parts = []
-    for group in np.flatnonzero(votes >= _LEAST_SHARE):
-        own_level = np.minimum(level, _lead(sight, group_of == group, box))
+    for own_level in levels:
         _, labels, stats, _ = cv2.connectedComponentsWithStats(((own_level > 0) & inside).view(np.uint8))
-        for label, (x, y, w, h, cells) in enumerate(stats.tolist()):
-            if label == 0 or cells < _MIN_CELLS:
-                continue
-            mask = labels == label
-            scores = probability.take(np.flatnonzero(mask[rows, columns]), axis=1).mean(axis=1)
-            scores *= as_probability(level[mask]).mean()
-            signed = _signed(mask, own_level)
-            first = np.array([max(x - 1, 0), max(y - 1, 0)])
-            outline = first + zero_crossings(signed[first[1] : y + h + 1, first[0] : x + w + 1])
-            class_score = dict(zip(classes, scores.tolist(), strict=True))
-            parts.append(Blob(class_score, signed, origin_px, stride, origin_px + stride * outline))
+        for label in np.flatnonzero(stats[:, cv2.CC_STAT_AREA] >= _MIN_CELLS)[:_MOST_PARTS].tolist():
+            if label:
+                parts.append(_blob(labels == label, own_level, sight, corner, classes, origin_px, stride))
+    if len(parts) < 2:
+        return []
     touches = any(part.kind in _SYMBOLS for part in parts)
     return [replace(part, touches_symbol=touches) for part in parts]
+
+
+def _blob(
+    mask: BoolArray,
+    level: np.ndarray,
+    sight: Sight,
+    corner: tuple[int, int],
+    classes: Sequence[str],
+    origin_px: FloatArray,
+    stride: int,
+) -> Blob:
+    """The blob of a mask (h, w), a piece of the frame from row and column ``corner`` on."""
+    rows, columns = np.nonzero(mask)
+    probability = _class_probability(sight, rows + corner[0] - 1, columns + corner[1] - 1)
+    scores = probability.mean(axis=1) * as_probability(level[mask]).mean()
+    signed = _signed(mask, level)
+    top, left = max(int(rows.min()) - 1, 0), max(int(columns.min()) - 1, 0)
+    near = signed[top : int(rows.max()) + 2, left : int(columns.max()) + 2]
+    outline_px = origin_px + stride * (np.array([left, top]) + zero_crossings(near))
+    return Blob(dict(zip(classes, scores.tolist(), strict=True)), signed, origin_px, stride, outline_px)
 
 
 def _class_probability(sight: Sight, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:

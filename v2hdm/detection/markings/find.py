@@ -57,6 +57,8 @@ def find_markings(
     valid &= view.inside(corners_px, options.border_px)
     left_out: set[int] = set()
     for whole, parts in readings.parts.items():
+        if whole in left_out:
+            continue
         surest = max(score[best[m]] for m in parts)
         left_out.update(parts if score[best[whole]] >= surest else [whole])
     return [

@@ -22,7 +22,7 @@ _INSIDE_PX = 4.0
 _MEDIAN_STRIDE = 3
 _MAX_PIXELS = 350
 _MOST_PIXELS = 600
-"""A band that the lattice leaves more pixels of is thinned: all markings of an image are padded to the most."""
+"""A band of more pixels is thinned: all markings of an image are padded to the most."""
 
 _MAX_BETWEEN, _MAX_AT_ENDS = 160, 260
 _END_PX = 2.0
