@@ -244,9 +244,9 @@ class MarkingDetection:
     ``corners_px`` (4, 2) run counter-clockwise as seen from above the ground, which is also how
     they run on the screen (in (u, v) coordinates their shoelace area is negative, since v points
     down); which corner comes first is arbitrary.
-    ``covariance_px`` (8, 8) is that of the stacked corners (u0, v0, u1, ...), px^2: of a direction that the image
-    hides it is large, as along a dash whose end lies beyond the image's border. ``corner_valid`` (4,) says which
-    corners are points: known well in every direction.
+    ``covariance_px`` (8, 8) is that of the stacked corners (u0, v0, u1, ...), px^2: of a direction that the
+    image hides it is large, as along a dash whose end lies beyond the image's border. ``corner_valid`` (4,)
+    says which corners are points: known well in every direction.
 
     Arrows and chevrons are no quadrilaterals: of their corners, all nan, none is valid, and ``outline_px``
     (N, 2) is their polygon; it is empty for quadrilaterals.

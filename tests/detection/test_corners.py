@@ -119,7 +119,7 @@ def test_worn_gaps_in_the_sides_do_not_move_near_corners(models):
     assert np.linalg.norm(errors, axis=1).max() < 0.4
 
 
-def test_corners_cut_off_by_the_image_border_are_not_valid(models):
+def test_corners_cut_off_by_the_image_border_are_no_points(models):
     camera = make_camera("pinhole")
     shape = diamond(3.35, 0.0, 1.2, 0.8)
     corners_px = to_image(camera, shape)

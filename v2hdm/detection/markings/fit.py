@@ -123,12 +123,14 @@ STATISTICS = (
     "log_side_sigma",
     "log_moved_px",
     "log_last_step",
+    "log_gap",
 )
 """Names of the columns of :attr:`Fit.statistics`.
 
 Log contrast of paint over ground; scatter of log grey over contrast, over all and on the worst side; mean
 robust weight; share of clipped pixels; blur, px; log of the standard deviation of the two ends and of the two
-long sides, px; log of the longest way of a corner from the outline and of the last step, px.
+long sides, px; log of the longest way of a corner from the outline and of the last step, px; log of how far
+it is from a parallelogram on the ground, in the deviation that is expected.
 """
 
 
@@ -375,6 +377,10 @@ class _State:
         self.expected_contrast = np.where(contrast < 0, -_CONTRAST, _CONTRAST)
         self.light, self.contrast = found[:, :KNOTS], np.clip(contrast, -_MOST_CONTRAST, _MOST_CONTRAST)
 
+    def open_gap(self) -> FloatArray:
+        """The sum p0 - p1 + p2 - p3 of the corners on the ground (M, 2), in its deviation."""
+        return np.asarray((self.closure @ (self.corners - self.outline).reshape(-1, 8, 1))[..., 0] + self.gap)
+
     def _add_priors(self, information: FloatArray, gradient: FloatArray, *, hold_blur: bool) -> None:
         """Add the outline, the typical blur and contrast, and that light changes little."""
         _, normal, _ = side_frames(self.corners)
@@ -386,7 +392,7 @@ class _State:
         information[:, place, place] += stiffness
         gradient[:, :8] += stiffness * np.concatenate([start, end], axis=1)
         by_side = self.closure @ _corner_from_side(self.corners)
-        open_ = (self.closure @ (self.corners - self.outline).reshape(-1, 8, 1))[..., 0] + self.gap
+        open_ = self.open_gap()
         information[:, :8, :8] += by_side.swapaxes(1, 2) @ by_side
         gradient[:, :8] -= (by_side.swapaxes(1, 2) @ open_[..., None])[..., 0]
         blur_stiffness = 1e9 if hold_blur else 1 / _BLUR_SIGMA_PX**2
@@ -536,5 +542,6 @@ def _statistics(
         "log_side_sigma": np.log(long),
         "log_moved_px": np.log(moved_px + 0.1),
         "log_last_step": np.log(np.abs(system.by_side).max(axis=1) + 0.01),
+        "log_gap": np.log(np.linalg.norm(state.open_gap(), axis=1) + 0.1),
     }
     return np.column_stack([columns[name] for name in STATISTICS])

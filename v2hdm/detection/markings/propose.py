@@ -30,6 +30,9 @@ _LEAST_SHARE = 0.02
 _CLASS_DOUBT = 0.05
 """Share of its certainty about classes that the network may give to wrong ones."""
 
+_GROUP_DOUBT = 0.1
+"""Share of a group's certainty that each of its classes may have: seen from near by a dash is like a line."""
+
 _LEAST_FILL = 0.5
 """Least share of a quadrilateral that its piece of paint fills: a triangle fills half."""
 
@@ -110,12 +113,19 @@ def _shares(
 ) -> dict[str, float]:
     """Share of each class that the catalogue maps or tells apart."""
     certainty = max(sum(blob.class_score.values()), 1e-9)
-    doubt = _CLASS_DOUBT / len(blob.class_score)
+    known = {name: score for name, score in blob.class_score.items() if name in catalogue.classes}
+    groups: dict[str, float] = {}
+    for name, score in known.items():
+        group = catalogue.classes[name].group
+        groups[group] = groups.get(group, 0.0) + score
     likely = {
-        name: (score / certainty + doubt)
+        name: (
+            score / certainty
+            + _CLASS_DOUBT / len(known)
+            + _GROUP_DOUBT * groups[catalogue.classes[name].group] / certainty
+        )
         * float(np.exp(catalogue.classes[name].size_log_likelihood(length_m, width_m, whole=whole)))
-        for name, score in blob.class_score.items()
-        if name in catalogue.classes
+        for name, score in known.items()
     }
     total = max(sum(likely.values()), 1e-12)
     return {name: value / total for name, value in likely.items()}
