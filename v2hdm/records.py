@@ -102,7 +102,8 @@ class Camera:
     borrowed from another vehicle) to a coarse IPM homography ``vehicle_from_pinhole_px`` (3 x 3).
     ``initial_ipm`` names the one that the mapping starts from. ``roi_vehicle`` (N x 2, m) is the
     convex polygon on the ground within which the IPM is trusted. ``linear_response`` says that the
-    grey values are proportional to radiance; otherwise sRGB coding is assumed.
+    grey values are proportional to radiance; otherwise sRGB coding is assumed. ``own_vehicle`` (height,
+    width) says which pixels show the vehicle itself, None where nobody has told.
     """
 
     info: CameraInfo
@@ -111,6 +112,7 @@ class Camera:
     roi_vehicle: FloatArray
     centre_prior: CentrePrior | None = None
     linear_response: bool = False
+    own_vehicle: BoolArray | None = None
 
 
 @dataclass(frozen=True)

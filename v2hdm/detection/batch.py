@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -11,10 +12,12 @@ import numpy as np
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.image_file import read_bgr
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.detection.own_vehicle import learn_own_vehicle
 from v2hdm.errors import DriveError
 from v2hdm.records import Camera, Drive, Image, ImageDetections
 from v2hdm.workers import share_out
 
+_log = logging.getLogger(__name__)
 _worker: tuple[Detector, Drive] | None = None
 _FEW_IMAGES = 8
 """Fewer are looked at before a process has started."""
@@ -58,6 +61,8 @@ def detect_all(
         WorkerError: a process died.
     """
     options = replace(options) if options else DetectorOptions()
+    detector = Detector.load(options=options)  # a bad model is refused here, once, not in every worker
+    drive = with_own_vehicle(drive, detector)
     total = len(drive.images)
     results: list[ImageDetections] = []
 
@@ -67,13 +72,24 @@ def detect_all(
             progress(len(results), total)
 
     if workers <= 1 or total < _FEW_IMAGES:
-        detector = Detector.load(options=options)
         for index in range(total):
             collect(_detect_image(detector, drive, index))
         return results
-    Detector.load(options=options)  # a bad model is refused here, once, not in every worker
     share_out(_work, range(total), workers, _start_worker, (drive, options), collect)
     return results
+
+
+def with_own_vehicle(drive: Drive, detector: Detector) -> Drive:
+    """The drive with masks of the vehicle itself, learnt for the cameras that have none."""
+    cameras = dict(drive.cameras)
+    for name, camera in drive.cameras.items():
+        if camera.own_vehicle is not None:
+            continue
+        mask = learn_own_vehicle(detector, [image for image in drive.images if image.camera == name], camera)
+        if mask is not None:
+            cameras[name] = replace(camera, own_vehicle=mask)
+            _log.info("camera %s: %.1f %% of the image is the vehicle itself", name, 100 * mask.mean())
+    return replace(drive, cameras=cameras)
 
 
 def _start_worker(drive: Drive, options: DetectorOptions) -> None:

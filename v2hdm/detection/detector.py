@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -24,7 +24,10 @@ from v2hdm.detection.sight import Sight, look
 from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.weights import check_weights
 from v2hdm.errors import DetectorError
-from v2hdm.records import Camera, LaneDetection, MarkingDetection
+from v2hdm.records import BoolArray, Camera, LaneDetection, MarkingDetection
+
+_NO_PAINT = -20.0
+"""Log odds of paint where the vehicle itself is."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,8 @@ class Detector:
         self.network = network
         self.options = options
         self.catalogue = catalogue or load_catalogue()
+        groups = {self.catalogue.classes[name].group for name in self.catalogue.of_family(LINE)}
+        self._lane_classes = {name for name, one in self.catalogue.classes.items() if one.group in groups}
         self._views: dict[str, CameraView] = {}
         self._reach_px: dict[str, int] = {}
 
@@ -94,6 +99,7 @@ class Detector:
         info = self.network.info
         with lap("net"):
             sight = look(self.network, image_bgr, view, self.options.mirrored)
+        sight = self._without_own_vehicle(sight, view)
         with lap("propose"):
             reach_px = self._reach_px[camera.info.name]
             blobs, owner = find_blobs(sight, info.classes, info.paint_stride, view.far_row, reach_px)
@@ -102,6 +108,32 @@ class Detector:
             sight.paint, owner, info.paint_stride, view.far_row, sight.kinds, info.classes
         )
         return Seen(view, sight, proposals, foreground)
+
+    def markings_paint(self, image_bgr: np.ndarray, camera: Camera) -> BoolArray:
+        """Where (h, w) the network sees paint of markings, not of lanes, a cell every ``paint_stride`` px.
+
+        The first row of cells is at the image row ``view(camera).far_row``.
+        """
+        view, info = self.view(camera), self.network.info
+        sight = look(self.network, image_bgr, view)
+        lanes = [name in self._lane_classes for name in info.classes]
+        lead = sight.kinds[~np.array(lanes)].max(axis=0) - sight.kinds[np.array(lanes)].max(axis=0)
+        size = sight.paint.shape[1], sight.paint.shape[0]
+        return np.asarray((sight.paint > 0) & (cv2.resize(lead, size, interpolation=cv2.INTER_LINEAR) > 0))
+
+    def _without_own_vehicle(self, sight: Sight, view: CameraView) -> Sight:
+        """What the network says, but of the vehicle itself."""
+        mask = view.camera.own_vehicle
+        if mask is None:
+            return sight
+        rows, columns = (
+            np.minimum(stride * np.arange(count) + stride // 2 + first, last - 1)
+            for stride, count, first, last in (
+                (self.network.info.paint_stride, sight.paint.shape[0], view.far_row, mask.shape[0]),
+                (self.network.info.paint_stride, sight.paint.shape[1], 0, mask.shape[1]),
+            )
+        )
+        return replace(sight, paint=np.where(mask[np.ix_(rows, columns)], np.float32(_NO_PAINT), sight.paint))
 
     def read(self, image_bgr: np.ndarray, seen: Seen) -> Readings | None:
         """Fit an image's proposals, and gather the evidence for each; None where there is none."""
@@ -126,18 +158,13 @@ class Detector:
         return lanes + link_anchors(seen.sight.anchors, view, lanes, step_m, looks, stride)
 
     def _lane_paint(self, proposals: Sequence[Proposal]) -> list[LanePaint]:
-        lanes = {self.catalogue.classes[name].group for name in self.catalogue.of_family(LINE)}
         found = []
         for proposal in proposals:
             if proposal.blob.parts:
                 continue
-            marking = self.catalogue.classes[proposal.kind]
-            own = sum(
-                score
-                for name, score in proposal.blob.class_score.items()
-                if name in self.catalogue.classes and self.catalogue.classes[name].group == marking.group
-            )
-            if marking.group in lanes and own >= self.options.min_score and not proposal.blob.touches_symbol:
+            own = sum(proposal.blob.class_score.get(name, 0.0) for name in self._lane_classes)
+            is_lane = proposal.kind in self._lane_classes and own >= self.options.min_score
+            if is_lane and not proposal.blob.touches_symbol:
                 found.append(LanePaint(proposal.blob, proposal.kind, own))
         return found
 

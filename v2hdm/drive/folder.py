@@ -9,6 +9,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from v2hdm.drive.camera_info import read_camera_info, write_camera_info
@@ -29,7 +30,7 @@ from v2hdm.drive.tum import read_image_list, read_tum, write_image_list, write_t
 from v2hdm.errors import DriveError
 from v2hdm.fields import take_origin
 from v2hdm.files import check_keys, dump_yaml, load_yaml, replace_text, take_mapping, take_number, take_text
-from v2hdm.records import DRIFTS, Camera, Drive, PoseNoise, Trajectory
+from v2hdm.records import DRIFTS, BoolArray, Camera, CameraInfo, Drive, PoseNoise, Trajectory
 
 DRIVE_FILE = "drive.yaml"
 POSES_FILE = "poses.tum"
@@ -38,7 +39,7 @@ TRUTH_FOLDER = "truth"
 _DRIVE_KEYS = (("cameras",), ("name", "poses", "pose_noise", "origin", "truth"))
 _CAMERA_KEYS = (
     ("camera_info", "images", "roi_vehicle"),
-    ("linear_response", "initial_ipm", "ipm", "cam_from_vehicle", "centre_prior"),
+    ("linear_response", "initial_ipm", "ipm", "cam_from_vehicle", "centre_prior", "mask"),
 )
 
 
@@ -157,7 +158,23 @@ def _read_camera(entry: dict[str, Any], root: Path, where: str) -> Camera:
         roi_vehicle=roi_vehicle,
         centre_prior=None if prior is None else take_centre_prior(prior, f"{where}, centre_prior"),
         linear_response=linear,
+        own_vehicle=_read_mask(entry, root, info, where),
     )
+
+
+def _read_mask(entry: dict[str, Any], root: Path, info: CameraInfo, where: str) -> BoolArray | None:
+    """Where images show the vehicle itself: not black in the file of the key ``mask``; None without."""
+    if "mask" not in entry:
+        return None
+    path = root / take_text(entry["mask"], f"{where}, mask", DriveError)
+    data = np.fromfile(path, dtype=np.uint8) if path.is_file() else np.zeros(0, dtype=np.uint8)
+    mask = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
+    if mask is None or mask.shape != (info.height, info.width):
+        raise DriveError(
+            f"{where}, mask: {path} is no image of {info.width} x {info.height} px; draw the vehicle white "
+            "on black over one of the camera's images"
+        )
+    return np.asarray(mask > 0)
 
 
 def _list_images(camera: str, path: Path) -> ImageFiles:
