@@ -3,6 +3,7 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -82,3 +83,19 @@ def test_a_drift_that_is_not_stated_takes_half_of_its_variance() -> None:
     assert noise.position_drift_m == pytest.approx(0.01 / np.sqrt(2))
     assert noise.heading_drift_rad == 0.0
     assert noise.roll_pitch_drift_rad == pytest.approx(0.003 / np.sqrt(2))
+
+
+def test_a_mask_of_the_vehicle_is_read_and_one_of_another_size_refused(tmp_path: Path) -> None:
+    make_drive(tmp_path)
+    mask = np.zeros((48, 64), dtype=np.uint8)
+    mask[40:] = 255
+    cv2.imwrite(str(tmp_path / "front" / "bonnet.png"), mask)
+    description = tmp_path / "drive.yaml"
+    text = description.read_text()
+    description.write_text(text.replace("  front:\n", "  front:\n    mask: front/bonnet.png\n"))
+    camera = read_drive(tmp_path).cameras["front"]
+    assert camera.own_vehicle is not None
+    np.testing.assert_array_equal(camera.own_vehicle, mask > 0)
+    cv2.imwrite(str(tmp_path / "front" / "bonnet.png"), mask[:10])
+    with pytest.raises(DriveError, match="mask: .*bonnet.png is no image of 64 x 48 px"):
+        read_drive(tmp_path)
