@@ -14,9 +14,9 @@ from v2hdm.detection.corners.evidence import Claim
 from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.corners.quad import is_convex
 from v2hdm.detection.corners.refine import QuadStart, fit_markings
-from v2hdm.detection.lanes.anchors import link_anchors
+from v2hdm.detection.lanes.lines import link_anchors
 from v2hdm.detection.lanes.centre_lines import LanePaint, trace_lanes
-from v2hdm.detection.lanes.looks import Looks
+from v2hdm.detection.lanes.score import Appearance
 from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.paint.blobs import Blob, find_blobs, outline_polygon
@@ -116,12 +116,12 @@ class Detector:
             sight.paint, owner, info.paint_stride, view.far_row, sight.kinds, info.classes
         )
         with lap("lanes"):
-            looks = Looks.of(image_bgr, foreground)
+            appearance = Appearance.of(image_bgr, foreground)
             lanes = trace_lanes(
                 self._lane_paint(candidates), view, self.options.lane_step_m, self.options.max_range_m
             )
             lanes += link_anchors(
-                sight.anchors, view, lanes, self.options.lane_step_m, looks, info.lane_stride
+                sight.anchors, view, lanes, self.options.lane_step_m, appearance, info.lane_stride
             )
         with lap("corners"):
             starts = self._starts(candidates, view)

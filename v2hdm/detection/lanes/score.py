@@ -1,30 +1,36 @@
-"""How probable it is that a line is one of a lane: a logistic function of what speaks for it.
+"""How probable it is that a line is one of a lane: a logistic function of features of the line.
 
-First each line is judged alone, then among the others of its image (:mod:`v2hdm.detection.lanes.company`).
-The weights, in ``score.json`` beside this file, belong to the network; they are those that
-``python -m tests.benchmarks.detector_lanes --write`` fits to renders which no benchmark shows.
+First each line is judged alone, then with its span and among the others of its image. A line is painted on
+ground that goes on beside it: a kerb or the foot of a wall has ground of another colour on its other side. A
+road's lines run beside each other, a lane apart: kerbs, joints and edges of shadows run closer. The weights, in
+``score.json`` beside this file, belong to the network; ``python -m tests.benchmarks.detector_lanes --write`` fits
+them to renders which no benchmark shows.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.lanes.company import COMPANY, company
-from v2hdm.detection.lanes.curves import Horizon
-from v2hdm.detection.lanes.looks import LOOKS, Looks
-from v2hdm.detection.lanes.points import IntArray, Line, LinePoints
+from v2hdm.detection.corners.foreground import Foreground
+from v2hdm.detection.lanes.curve import Horizon, IntArray, Line, LinePoints, basis
 from v2hdm.detection.odds import as_probability
-from v2hdm.records import FloatArray
+from v2hdm.records import LANE_CLASSES, BoolArray, FloatArray
 
 SCORE_FILE = Path(__file__).with_name("score.json")
 
-FEATURES = (
+APPEARANCE = ("paint_along", "lane_share", "colour_change")
+"""Names of the columns of :meth:`Appearance.along`, in order: the mean log odds of paint along the line, the share
+of that paint which the network takes for a lane's, and the log ratio of the colours of its sides."""
+
+ALONE = (
     "best_crossings",
     "log_length_m",
     "log_length_px",
@@ -34,55 +40,154 @@ FEATURES = (
     "paint_odds",
     "paint_share",
     "solid",
-    *LOOKS,
+    *APPEARANCE,
 )
-"""In this order: log odds of the three surest crossings; how long the line is on the ground, in the image
-and down the image (upright things are as tall as they are long); how much likelier it is along the road;
-whether it shows paint, the log odds of its surest paint, for how much of its length, how much of that is
-solid; and what the image shows along it."""
+"""Features of a line by itself, in this order: log odds of the three surest crossings; how long the line is on the
+ground, in the image and down the image (upright things are as tall as they are long); how much likelier it is
+along the road; whether it shows paint, the log odds of its surest paint, for how much of its length, how much of
+that is solid; and its appearance."""
 
-TOLD = ("alone", "faint_crossings", *COMPANY)
-"""What tells of a line among others: its log odds alone, how many crossings too unlikely by themselves lie on
-it, and its company."""
+AMONG = ("alone", "faint_crossings", "likelihood", "near_horizon", "a_lane_apart", "too_near")
+"""Features of a line among others: its log odds alone, how many crossings too unlikely by themselves lie on it, the
+root of the log likelihood of its span, how far from the horizon it begins; and of the others that run beside it,
+weighed by their probability, how much so is the likest one a lane away and how many are nearer than a lane can be."""
 
 _BEST = 3
 _MOST_LOG_RATIO = 6.0
-
-
 _MOST_PAINT_SHARE = 2.0
 """Of a double line there is twice as much paint as the line is long."""
 
+_UNKNOWN = (2.3, 0.9, 0.002)
+"""Appearance of a line of which nothing is known: the median of true lines. Nothing speaks against it."""
+
+_PLACES = 24
+_ON_M = np.linspace(-0.25, 0.25, 7)
+"""Paint of a line, be it a double one, is within such a distance of where it is drawn."""
+
+_BESIDE_M = np.linspace(0.25, 0.6, 5)
+"""The ground beside its paint: nearer than what else is on the road."""
+
+_LEAST_PX_PER_M = 6.0
+"""Farther away its sides are not seen apart from it."""
+
+_LEAST_WEIGHT = 0.05
+_LEAST_PLACES = 3
+_MOST_CHANGE = 0.05
+"""Kerbs and verges differ by this and more; the verge beside the line of a road's edge does, too."""
+
+_DARK = 8.0
+"""Grey levels below this differ by noise."""
+
+_LANE_M, _LANE_SIGMA_M = 3.2, 0.65
+"""Lanes of roads are 2.5 to 4 m wide."""
+
+_TOO_NEAR_M = 1.8
+_MOST_NEAR = 2.0
+"""More lines than this add nothing."""
+
+_CHANGE_M, _CHANGE_SHARE = 0.15, 0.06
+"""The distance between lines that run beside each other changes by so much and by this share of it."""
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """An image at half its size (h, w, 3) uint8 BGR and what the network says of paint, each if known."""
+
+    half_bgr: np.ndarray | None = None
+    foreground: Foreground | None = None
+
+    @classmethod
+    def of(cls, image_bgr: np.ndarray, foreground: Foreground) -> Appearance:
+        """Those of an image (H, W, 3) uint8 BGR."""
+        height, width = image_bgr.shape[:2]
+        return cls(cv2.resize(image_bgr, (width // 2, height // 2), interpolation=cv2.INTER_AREA), foreground)
+
+    def along(
+        self, lines: Sequence[Line], points: LinePoints, view: CameraView, horizon: Horizon
+    ) -> FloatArray:
+        """The :data:`APPEARANCE` (N, 3) of N lines, where each is seen."""
+        out = np.tile(_UNKNOWN, (len(lines), 1))
+        if not lines or (self.half_bgr is None and self.foreground is None):
+            return out
+        ends = np.array(
+            [[points.below[line.certain].min(), points.below[line.certain].max()] for line in lines]
+        )
+        below = ends[:, :1] + np.diff(ends) * np.linspace(0, 1, _PLACES)
+        phi = basis(below.ravel()).reshape(len(lines), _PLACES, 3)
+        along = np.einsum("npk,nk->np", phi, np.array([line.curve.parameters for line in lines]))
+        offsets_m = np.concatenate([_ON_M, -_BESIDE_M, _BESIDE_M])
+        px_per_m = horizon.px_per_m * below
+        across = along[..., None] + px_per_m[..., None] * offsets_m
+        pinhole = horizon.pinhole_px(across.ravel(), np.repeat(below.ravel(), len(offsets_m)))
+        places_px = view.distort(pinhole).reshape(*across.shape, 2)
+        if self.foreground is not None:
+            paint = self.foreground.odds_at(places_px[:, :, : len(_ON_M)]).max(axis=2)
+            shares = self.foreground.shares_at(places_px[:, :, len(_ON_M) // 2])
+            of_lanes = [self.foreground.classes.index(name) for name in LANE_CLASSES]
+            weight = as_probability(paint) + _LEAST_WEIGHT
+            out[:, 0] = paint.mean(axis=1)
+            out[:, 1] = (shares[:, of_lanes].sum(axis=1) * weight).sum(axis=1) / weight.sum(axis=1)
+        if self.half_bgr is not None:
+            inside = np.asarray(view.inside(places_px, 0).all(axis=2), dtype=np.bool_)
+            out[:, 2] = self._colour_change(places_px[:, :, len(_ON_M) :], inside, px_per_m)
+        return out
+
+    def _colour_change(self, places_px: FloatArray, inside: BoolArray, px_per_m: FloatArray) -> FloatArray:
+        """How much (N,) the colours beside N lines differ, seen at places (N, P, 2 S, 2) left, then right."""
+        assert self.half_bgr is not None
+        u, v = np.moveaxis(places_px.reshape(len(places_px), -1, 2) / 2 - 0.25, -1, 0).astype(np.float32)
+        bgr = cv2.remap(self.half_bgr, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        level = np.log(bgr.reshape(*places_px.shape[:-1], 3) + _DARK)
+        left, right = np.split(level, 2, axis=2)
+        change = right.mean(axis=2) - left.mean(axis=2)
+        change -= change.mean(axis=2, keepdims=True)
+        out = np.empty(len(change))
+        for k, (each, seen, wide) in enumerate(zip(change, inside, px_per_m > _LEAST_PX_PER_M, strict=True)):
+            use = seen & wide if (seen & wide).sum() >= _LEAST_PLACES else seen
+            use = use if use.sum() >= _LEAST_PLACES else np.ones_like(use)
+            out[k] = min(float(np.linalg.norm(np.median(each[use], axis=0))), _MOST_CHANGE)
+        return out
+
+
+UNKNOWN = Appearance()
+"""That of lines of which no image is at hand."""
+
 
 def log_odds_alone(
-    lines: Sequence[Line], points: LinePoints, view: CameraView, horizon: Horizon, looks: Looks
+    lines: Sequence[Line], points: LinePoints, view: CameraView, horizon: Horizon, appearance: Appearance
 ) -> FloatArray:
     """Log odds (N,) of N lines through an image's points, each by itself."""
     weights, bias = fitted()["alone"]
-    return np.asarray(evidence(lines, points, view, horizon, looks) @ weights + bias)
+    return np.asarray(features_alone(lines, points, view, horizon, appearance) @ weights + bias)
 
 
-def log_odds(
-    lines: Sequence[Line], points: LinePoints, view: CameraView, horizon: Horizon, looks: Looks
-) -> FloatArray:
-    """Log odds (N,) of N lines, all there are in an image."""
+def log_odds(lines: Sequence[Line], points: LinePoints, horizon: Horizon) -> FloatArray:
+    """Log odds (N,) of N lines, all there are in an image; they have their spans and their log odds alone."""
     weights, bias = fitted()["among"]
-    alone = log_odds_alone(lines, points, view, horizon, looks)
-    return np.asarray(told(lines, points, horizon, alone) @ weights + bias)
+    return np.asarray(features_among(lines, points, horizon) @ weights + bias)
 
 
-def told(lines: Sequence[Line], points: LinePoints, horizon: Horizon, alone: FloatArray) -> FloatArray:
-    """What tells of N lines (N, T) of such log odds (N,) by themselves, in the order of :data:`TOLD`."""
-    faint = np.log1p([len(line.perhaps) for line in lines])
-    others = company(points, lines, horizon, as_probability(alone))
-    return np.column_stack([alone, faint, others])
-
-
-def evidence(
-    lines: Sequence[Line], points: LinePoints, view: CameraView, horizon: Horizon, looks: Looks
-) -> FloatArray:
-    """What speaks for N lines by themselves (N, F), in the order of :data:`FEATURES`."""
+def features_among(lines: Sequence[Line], points: LinePoints, horizon: Horizon) -> FloatArray:
+    """The features (N, F) of N lines, all there are in an image, in the order of :data:`AMONG`."""
     if not lines:
-        return np.empty((0, len(FEATURES)))
+        return np.empty((0, len(AMONG)))
+    spans = [line.span for line in lines if line.span is not None]
+    columns = (
+        [line.log_odds for line in lines],
+        np.log1p([len(line.perhaps) for line in lines]),
+        np.sqrt(np.maximum([span.log_likelihood for span in spans], 0.0)),
+        np.log([points.below[line.certain].min() for line in lines]),
+        _company(points, lines, horizon),
+    )
+    return np.column_stack(columns)
+
+
+def features_alone(
+    lines: Sequence[Line], points: LinePoints, view: CameraView, horizon: Horizon, appearance: Appearance
+) -> FloatArray:
+    """The features (N, F) of N lines by themselves, in the order of :data:`ALONE`."""
+    if not lines:
+        return np.empty((0, len(ALONE)))
     members = np.concatenate([line.certain for line in lines])
     count = np.array([len(line.certain) for line in lines])
     begins = np.cumsum(count) - count
@@ -107,7 +212,7 @@ def evidence(
         np.where(paint > 0, paint_odds, 0.0),
         np.minimum(paint_m / np.maximum(length_m, 1.0), _MOST_PAINT_SHARE),
         solid / np.maximum(paint, 1),
-        looks.along(lines, points, view, horizon),
+        appearance.along(lines, points, view, horizon),
     )
     return np.column_stack(columns).astype(np.float64)
 
@@ -121,11 +226,36 @@ def _best_crossings(odds: FloatArray, begins: IntArray, count: IntArray) -> Floa
     return np.asarray(np.where(there, best, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1))
 
 
+def _company(points: LinePoints, lines: Sequence[Line], horizon: Horizon) -> FloatArray:
+    """How much the likest other line is a lane away, and how many are too near (N, 2)."""
+    if len(lines) < 2:
+        return np.zeros((len(lines), 2))
+    apart = _apart_m(points, lines, horizon)
+    gap = np.abs(apart[1])
+    change = np.ptp(apart, axis=0) / (_CHANGE_M + _CHANGE_SHARE * gap)
+    beside = as_probability(np.array([line.log_odds for line in lines])) * np.exp(-0.5 * change**2)
+    np.fill_diagonal(beside, 0.0)
+    lane = beside * np.exp(-0.5 * ((gap - _LANE_M) / _LANE_SIGMA_M) ** 2)
+    near = np.where(gap < _TOO_NEAR_M, beside, 0.0).sum(axis=1)
+    return np.column_stack([lane.max(axis=1), np.minimum(near, _MOST_NEAR)])
+
+
+def _apart_m(points: LinePoints, lines: Sequence[Line], horizon: Horizon) -> FloatArray:
+    """How far lines are apart along the horizon (3, N, N), m, at the far end, middle and near end of each."""
+    parameters = np.array([line.curve.parameters for line in lines])
+    spans = np.array([np.ptp(points.below[line.certain]) for line in lines])
+    low = np.array([points.below[line.certain].min() for line in lines])
+    below = (low + spans * np.array([[0.0], [0.5], [1.0]])).ravel()
+    # Each line's own rows, at which all the others are looked at.
+    rows = (basis(below) / (horizon.px_per_m * below)[:, None]).reshape(3, len(lines), 3)
+    return np.asarray(np.einsum("sik,ijk->sij", rows, parameters[:, None] - parameters))
+
+
 @cache
 def fitted() -> dict[str, tuple[FloatArray, float]]:
     """Weights and bias of the logistic functions of a line ``alone`` and ``among`` others, from the file."""
     content = json.loads(SCORE_FILE.read_text(encoding="utf-8"))
     return {
         name: (np.array([content[name]["weights"][key] for key in keys]), float(content[name]["bias"]))
-        for name, keys in (("alone", FEATURES), ("among", TOLD))
+        for name, keys in (("alone", ALONE), ("among", AMONG))
     }
