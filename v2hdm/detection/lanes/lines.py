@@ -81,7 +81,7 @@ def propose(
     )
     lines = with_strays(points, lines, horizon)
     lines = with_spans(lines, points, view, horizon, appearance.foreground, row_step_px)
-    lines = boundaries(lines, horizon)
+    lines = boundaries(lines, points, horizon)
     return points, _surest(lines, log_odds(lines, points, horizon), least_log_odds)
 
 

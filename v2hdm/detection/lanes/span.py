@@ -173,12 +173,12 @@ def _forward_backward(likelihood: FloatArray, step_m: FloatArray) -> tuple[Float
     return forward, np.log(scale).sum(axis=1)
 
 
-def boundaries(lines: Sequence[Line], horizon: Horizon) -> list[Line]:
+def boundaries(lines: Sequence[Line], points: LinePoints, horizon: Horizon) -> list[Line]:
     """The lines, best first, without those that repeat or cross a better one; those that double it are its strand."""
     kept: list[Line] = []
     for line in lines:
         for k, other in enumerate(kept):
-            relation = _relation(line, other, horizon)
+            relation = _relation(line, other, points, horizon)
             if relation == _DOUBLES and other.strand is None:
                 kept[k] = replace(other, strand=line)
             if relation != _APART:
@@ -191,23 +191,32 @@ def boundaries(lines: Sequence[Line], horizon: Horizon) -> list[Line]:
 _APART, _REPEATS, _DOUBLES = range(3)
 
 
-def _relation(line: Line, other: Line, horizon: Horizon) -> int:
+def _relation(line: Line, other: Line, points: LinePoints, horizon: Horizon) -> int:
     """Whether a line is apart from another one, repeats (or crosses) it, or is the second strand of a double one."""
     assert line.span is not None and other.span is not None
     phi, px_per_m = basis(line.span.below), horizon.px_per_m * line.span.below
     sigma_m, other_sigma_m = (each.curve.sigma(phi) / px_per_m for each in (line, other))
     offset_m = (line.curve.along(phi) - other.curve.along(phi)) / px_per_m
-    present, other_present = (each.span.present > _EVEN for each in (line, other) if each.span)
-    known = (sigma_m < _CERTAIN_SIGMA_M) & (other_sigma_m < _CERTAIN_SIGMA_M) & (present | other_present)
-    if (offset_m[known] < -_CROSSING_M).any() and (offset_m[known] > _CROSSING_M).any():
+    known = (sigma_m < _CERTAIN_SIGMA_M) & (other_sigma_m < _CERTAIN_SIGMA_M)
+    seen, other_seen = (_seen(each, points, line.span.below) for each in (line, other))
+    crossed = known & (seen | other_seen) & (line.span.below >= line.span.below[seen][0]) & (line.span.below >= line.span.below[other_seen][0])
+    if (offset_m[crossed] < -_CROSSING_M).any() and (offset_m[crossed] > _CROSSING_M).any():
         return _REPEATS
-    there = present & other_present
-    there = there if there.any() else present & (other_sigma_m < _CERTAIN_SIGMA_M)
+    there = seen & other_seen if (seen & other_seen).any() else seen
+    there = there & (other_sigma_m < _CERTAIN_SIGMA_M)
     if not there.any() or np.abs(offset_m[there]).max() > _DOUBLE_M:
         return _APART
     abreast_m = float((line.span.length_m * line.span.painted) @ other.span.painted)
+    abreast_m = min(abreast_m, line.paint_m, other.paint_m)
     is_double = abreast_m >= _LEAST_ABREAST_M and abs(np.median(offset_m[there])) > _ONE_LINE_M
     return _DOUBLES if is_double else _REPEATS
+
+
+def _seen(line: Line, points: LinePoints, below: FloatArray) -> BoolArray:
+    """Which rows (T,) lie between the nearest and the farthest point of a line; one at least."""
+    own = points.below[line.certain]
+    first, last = np.searchsorted(below, (own.min(), own.max()))
+    return (np.arange(len(below)) >= min(first, len(below) - 1)) & (np.arange(len(below)) <= last)
 
 
 def draw(line: Line, points: LinePoints, view: CameraView, horizon: Horizon) -> LaneDetection | None:
