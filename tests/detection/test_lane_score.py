@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import make_camera, to_image
-from tests.detection.test_anchors import anchors_of, off_px, painted, straight
+from tests.detection.test_lane_lines import anchors_of, off_px, painted, straight
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.lanes import score
-from v2hdm.detection.lanes.anchors import link_anchors
+from v2hdm.detection.lanes.lines import link_anchors
 from v2hdm.detection.sight import AnchorRow
 
 
@@ -26,7 +26,7 @@ def score_of(view, rows, paint=()):
 def test_the_file_holds_a_weight_for_each_feature_and_no_other():
     content = json.loads(score.SCORE_FILE.read_text(encoding="utf-8"))
     assert tuple(content) == ("alone", "among")
-    for part, names in (("alone", score.FEATURES), ("among", score.TOLD)):
+    for part, names in (("alone", score.ALONE), ("among", score.AMONG)):
         assert tuple(content[part]["weights"]) == names
         assert np.isfinite([content[part]["bias"], *content[part]["weights"].values()]).all()
 

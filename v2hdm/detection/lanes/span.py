@@ -44,7 +44,7 @@ Dashes are 3.8 m and gaps 5.3 m long on average (RMS-1 and the renders' own); th
 _CROSSING_WEIGHT, _CROSSING_EVEN, _CROSSING_RANGE = 0.05, -2.7, (-3.0, 6.7)
 """A crossing of log odds x, kept within the range, adds weight * (x - even) to the log likelihood of a line."""
 
-_PAINT_WEIGHT, _PAINT_EVEN, _PAINT_RANGE = 0.13, -0.5, (-4.0, 4.0)
+_PAINT_WEIGHT, _PAINT_EVEN, _PAINT_RANGE = 0.44, -1.0, (-4.0, 4.0)
 """The same for paint, and the log likelihood of *solid* and *dash*. Rows err together: hence small weights."""
 
 _HALF_WIDTH_M, _LEAST_HALF_WIDTH_PX = 0.06, 4.0
@@ -111,7 +111,8 @@ def with_spans(
         paint = foreground.odds_at(places_px).max(axis=2)
         paint = _evidence(paint, _PAINT_WEIGHT, _PAINT_EVEN, _PAINT_RANGE)
         likelihood[..., [_SOLID, _DASH]] += paint[..., None]
-    likelihood *= view.inside(places_px[:, :, len(_ACROSS) // 2], 0)[..., None]
+    middle_px = places_px[:, :, len(_ACROSS) // 2]
+    likelihood *= view.inside(middle_px, 0)[..., None]
     states, total = _forward_backward(likelihood, step_m)
     length_m = (np.pad(step_m, [(0, 0), (0, 1)]) + np.pad(step_m, [(0, 0), (1, 0)])) / 2
     present, painted = 1 - states[..., _ENDED], states[..., _SOLID] + states[..., _DASH]

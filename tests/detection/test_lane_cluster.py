@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import foreground_of, make_camera, to_image
-from tests.detection.test_anchors import anchors_of, off_px, painted, straight
+from tests.detection.test_lane_lines import anchors_of, off_px, painted, straight
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.lanes.anchors import link_anchors
-from v2hdm.detection.lanes.curves import Horizon, Prior
-from v2hdm.detection.lanes.looks import Looks
-from v2hdm.detection.lanes.points import LinePoints
-from v2hdm.detection.lanes.road import find_road
+from v2hdm.detection.lanes.lines import link_anchors
+from v2hdm.detection.lanes.curve import Horizon, Prior
+from v2hdm.detection.lanes.score import Appearance
+from v2hdm.detection.lanes.curve import LinePoints
+from v2hdm.detection.lanes.cluster import find_road
 from v2hdm.detection.sight import AnchorRow
 from v2hdm.records import LANE_DASH, LANE_LINE, LaneDetection
 
@@ -160,7 +160,7 @@ def test_paint_tells_whether_crossings_carry_a_solid_line_on(view, paint_to_m, e
     for u, v in (on / 2).astype(int):
         odds[max(v - 4, 0) : v + 5, max(u - 2, 0) : u + 3] = 6.0
     foreground = foreground_of(odds, np.zeros(odds.shape, dtype=np.int32), 0)
-    (lane,) = link_anchors([*near, *sure], view, [solid], looks=Looks(foreground=foreground))
+    (lane,) = link_anchors([*near, *sure], view, [solid], appearance=Appearance(foreground=foreground))
     ends_px = solid.points_px[0, 1]
     assert lane.points_px[0, 1] > near[0].v_px - 20 if not ends else lane.points_px[0, 1] < ends_px + 20
 

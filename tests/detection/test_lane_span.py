@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import foreground_of, make_camera
-from tests.detection.test_anchors import anchors_of, off_px, painted, straight
+from tests.detection.test_lane_lines import anchors_of, off_px, painted, straight
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.lanes.anchors import link_anchors
-from v2hdm.detection.lanes.looks import Looks
+from v2hdm.detection.lanes.lines import link_anchors
+from v2hdm.detection.lanes.score import Appearance
 from v2hdm.records import LANE_DASH, LANE_LINE
 
 LEFT_M, RIGHT_M = 1.9, 1.5
@@ -44,12 +44,12 @@ def painted_on(view, lines_px):
         ):
             if 0 <= u < view.info.width and 0 <= v < view.info.height:
                 odds[int(v / 2), max(int(u / 2) - 2, 0) : int(u / 2) + 3] = 5.0
-    return Looks(None, foreground_of(odds, np.zeros(odds.shape, dtype=np.int32), 0))
+    return Appearance(None, foreground_of(odds, np.zeros(odds.shape, dtype=np.int32), 0))
 
 
 def test_where_one_strand_has_ended_the_line_passes_to_the_other(view):
     rows, paint, lines = as_seen(view, ENDS_M, LANE_LINE)
-    (lane,) = link_anchors(rows, view, paint, looks=painted_on(view, lines))
+    (lane,) = link_anchors(rows, view, paint, appearance=painted_on(view, lines))
     away_m = distance_m(view, lane)
     near, far = away_m < ENDS_M - 3, (away_m > ENDS_M + 3) & (away_m < 24)
     assert np.abs(off_px(lane, straight(view, RIGHT_M))[near]).max() < 2
@@ -62,7 +62,7 @@ def test_strand_that_goes_on_unseen_keeps_the_line_in_the_middle(view, kind, rea
     """Be it that the image shows its paint farther than its points, or that it is dashes."""
     rows, paint, lines = as_seen(view, ENDS_M, kind)
     looks = painted_on(view, [lines[0], as_seen(view, reaches_m, kind)[2][1]])
-    (lane,) = link_anchors(rows, view, paint, looks=looks)
+    (lane,) = link_anchors(rows, view, paint, appearance=looks)
     near = distance_m(view, lane) < ENDS_M - 3
     assert np.abs(off_px(lane, straight(view, (LEFT_M + RIGHT_M) / 2))[near]).max() < 2
 

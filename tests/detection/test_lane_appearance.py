@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import foreground_of, make_camera
-from tests.detection.test_anchors import anchors_of, straight
+from tests.detection.test_lane_lines import anchors_of, straight
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.lanes.anchors import link_anchors
-from v2hdm.detection.lanes.curves import Horizon
-from v2hdm.detection.lanes.looks import LOOKS, UNKNOWN_LOOKS, Looks
-from v2hdm.detection.lanes.points import Line, LinePoints
-from v2hdm.detection.lanes.road import find_road
+from v2hdm.detection.lanes.lines import link_anchors
+from v2hdm.detection.lanes.curve import Horizon
+from v2hdm.detection.lanes.score import APPEARANCE, UNKNOWN, Appearance
+from v2hdm.detection.lanes.curve import Line, LinePoints
+from v2hdm.detection.lanes.cluster import find_road
 
 ASPHALT, GRASS = (90, 90, 92), (40, 110, 60)
 
@@ -44,8 +44,8 @@ def fine(line_px):
     return np.column_stack([np.interp(at, np.arange(len(line_px)), line_px[:, k]) for k in (0, 1)])
 
 
-def looks_along(view, line_px, looks):
-    """The looks of a line through its crossings, by name."""
+def appearance_along(view, line_px, appearance):
+    """The appearance of a line through its crossings, by name."""
     horizon = Horizon(view)
     rows = anchors_of(view, [line_px])
     at = np.array([[row.u_px[0], row.v_px] for row in rows])
@@ -53,7 +53,7 @@ def looks_along(view, line_px, looks):
     group = [np.arange(len(at))]
     evidence = points.evidence(horizon, group, points.slopes(group))
     line = Line.through(group[0], evidence, horizon, find_road(evidence, horizon).free, 0.0, 0.0)
-    return dict(zip(LOOKS, looks.along([line], points, view, horizon)[0], strict=True))
+    return dict(zip(APPEARANCE, appearance.along([line], points, view, horizon)[0], strict=True))
 
 
 def test_one_ground_in_light_and_in_shade_has_one_colour_and_grass_has_another(view):
@@ -63,8 +63,8 @@ def test_one_ground_in_light_and_in_shade_has_one_colour_and_grass_has_another(v
     grounds = {"same": ASPHALT, "shade": shade, "grass": GRASS}
     change = {}
     for name, left in grounds.items():
-        looks = Looks.of(beside(view, line, left, ASPHALT), nothing)
-        change[name] = looks_along(view, line, looks)["colour_change"]
+        appearance = Appearance.of(beside(view, line, left, ASPHALT), nothing)
+        change[name] = appearance_along(view, line, appearance)["colour_change"]
     assert change["same"] == 0
     assert change["shade"] < 0.02
     assert change["grass"] == pytest.approx(0.05), "no more than that is told"
@@ -75,7 +75,7 @@ def test_paint_is_seen_along_the_line(view):
     rows = [row.v_px for row in anchors_of(view, [line])]
     image = np.full((view.info.height, view.info.width, 3), 90, dtype=np.uint8)
     whole, half, none = (
-        looks_along(view, line, Looks.of(image, painted_from(view, line, row)))
+        appearance_along(view, line, Appearance.of(image, painted_from(view, line, row)))
         for row in (np.inf, np.mean([min(rows), max(rows)]), 0)
     )
     assert whole["paint_along"] == pytest.approx(5, abs=0.5)
@@ -84,7 +84,7 @@ def test_paint_is_seen_along_the_line(view):
 
 
 def test_without_an_image_nothing_is_known(view):
-    first, second = (looks_along(view, straight(view, left), UNKNOWN_LOOKS) for left in (1.6, -2.0))
+    first, second = (appearance_along(view, straight(view, left), UNKNOWN) for left in (1.6, -2.0))
     assert first == second
 
 
@@ -93,7 +93,7 @@ def test_another_ground_on_the_other_side_makes_a_line_less_sure(view):
     foreground = painted_from(view, line[:0], 0)
     kerb, joint = (
         link_anchors(
-            anchors_of(view, [line]), view, looks=Looks.of(beside(view, line, left, ASPHALT), foreground)
+            anchors_of(view, [line]), view, appearance=Appearance.of(beside(view, line, left, ASPHALT), foreground)
         )
         for left in (GRASS, ASPHALT)
     )
@@ -104,7 +104,7 @@ def test_paint_that_the_network_sees_along_it_makes_a_line_surer(view):
     line = fine(straight(view, 1.6))
     image = beside(view, line, ASPHALT, ASPHALT)
     painted, bare = (
-        link_anchors(anchors_of(view, [line]), view, looks=Looks.of(image, painted_from(view, line, row)))
+        link_anchors(anchors_of(view, [line]), view, appearance=Appearance.of(image, painted_from(view, line, row)))
         for row in (np.inf, 0)
     )
     assert painted[0].score > max((lane.score for lane in bare), default=0) + 0.03

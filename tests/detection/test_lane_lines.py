@@ -5,7 +5,7 @@ import pytest
 
 from tests.detection.pictures import make_camera, to_image
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.lanes.anchors import link_anchors
+from v2hdm.detection.lanes.lines import link_anchors
 from v2hdm.detection.sight import AnchorRow
 from v2hdm.records import LANE_DASH, LaneDetection
 
