@@ -166,7 +166,7 @@ def _found(
 def _rough_road(
     frame: Frame, parsed: argparse.Namespace, detector: Detector, seen_pitch_deg: float | None = None
 ) -> RoadDetector:
-    """A detector for a camera of which only the image size is known, and its pitch once lines showed it; it says so."""
+    """A detector for a camera of unknown mounting; it says what it takes that to be."""
     height_m, pitch_deg, fov_deg = parsed.mounting or parsed.rough_mounting
     if not (0 < height_m < np.inf and -45 < pitch_deg < 85 and 10 <= fov_deg <= 150):
         raise ConfigError(

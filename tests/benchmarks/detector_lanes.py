@@ -8,10 +8,10 @@ rows that they were seen on lie on one true line, by the tolerance of the qualit
 was drawn on from there does not count. A logistic regression with a weak ridge tells them apart by the
 features of each alone; a second one tells each from its log odds, by weights that its own image had no part
 in, from its span and from the others. Which lines are proposed depends a little on the score itself, so that
-the fit is made twice. Its seed is neither that of the quality benchmark nor one of training. Printed: by how
-much each feature changes the log odds per standard deviation, the log loss on the images of each fifth by
-weights that were fitted to the others, alone and among the others, and how many lines given are true and false.
-"""
+the fit is made twice. Its seed is neither that of the quality benchmark nor one of training. Printed: by
+how much each feature changes the log odds per standard deviation, the log loss on the images of each fifth by
+weights that were fitted to the others, alone and among the others, and how many lines given are true and
+false."""
 
 from __future__ import annotations
 
@@ -116,7 +116,14 @@ def proposed(image: Seen, paint_step_m: float) -> Proposed | None:
     """The lines that are proposed in an image; None where there is nothing to make any of."""
     horizon = Horizon(image.view)
     points, lines = lane_lines.propose(
-        image.rows, image.view, horizon, image.paint, paint_step_m, image.appearance, image.row_step_px, -np.inf
+        image.rows,
+        image.view,
+        horizon,
+        image.paint,
+        paint_step_m,
+        image.appearance,
+        image.row_step_px,
+        -np.inf,
     )
     return Proposed(image, points, lines, horizon) if lines else None
 

@@ -6,11 +6,10 @@ import pytest
 from tests.detection.pictures import foreground_of, make_camera
 from tests.detection.test_lane_lines import anchors_of, straight
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.lanes.lines import link_anchors
-from v2hdm.detection.lanes.curve import Horizon
-from v2hdm.detection.lanes.score import APPEARANCE, UNKNOWN, Appearance
-from v2hdm.detection.lanes.curve import Line, LinePoints
 from v2hdm.detection.lanes.cluster import find_road
+from v2hdm.detection.lanes.curve import Horizon, Line, LinePoints
+from v2hdm.detection.lanes.lines import link_anchors
+from v2hdm.detection.lanes.score import APPEARANCE, UNKNOWN, Appearance
 
 ASPHALT, GRASS = (90, 90, 92), (40, 110, 60)
 
@@ -52,7 +51,8 @@ def appearance_along(view, line_px, appearance):
     points = LinePoints.of(view, horizon, at, np.full(len(at), 4.0), np.full(len(at), 0.5))
     group = [np.arange(len(at))]
     evidence = points.evidence(horizon, group, points.slopes(group))
-    line = Line.through(group[0], evidence, horizon, find_road(evidence, horizon).free, 0.0, 0.0)
+    prior, none = find_road(evidence, horizon).free, np.empty(0, dtype=np.int64)
+    line = Line(evidence.curve(prior, horizon.centre_px), group[0], none, 0.0, prior, 0.0)
     return dict(zip(APPEARANCE, appearance.along([line], points, view, horizon)[0], strict=True))
 
 
@@ -90,10 +90,12 @@ def test_without_an_image_nothing_is_known(view):
 
 def test_another_ground_on_the_other_side_makes_a_line_less_sure(view):
     line = straight(view, 1.6)
-    foreground = painted_from(view, line[:0], 0)
+    foreground = painted_from(view, fine(line), np.inf)
     kerb, joint = (
         link_anchors(
-            anchors_of(view, [line]), view, appearance=Appearance.of(beside(view, line, left, ASPHALT), foreground)
+            anchors_of(view, [line]),
+            view,
+            appearance=Appearance.of(beside(view, line, left, ASPHALT), foreground),
         )
         for left in (GRASS, ASPHALT)
     )
@@ -104,7 +106,9 @@ def test_paint_that_the_network_sees_along_it_makes_a_line_surer(view):
     line = fine(straight(view, 1.6))
     image = beside(view, line, ASPHALT, ASPHALT)
     painted, bare = (
-        link_anchors(anchors_of(view, [line]), view, appearance=Appearance.of(image, painted_from(view, line, row)))
+        link_anchors(
+            anchors_of(view, [line]), view, appearance=Appearance.of(image, painted_from(view, line, row))
+        )
         for row in (np.inf, 0)
     )
     assert painted[0].score > max((lane.score for lane in bare), default=0) + 0.03

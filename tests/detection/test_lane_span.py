@@ -1,15 +1,17 @@
-"""Double lines: one boundary, along the middle where both strands run and else along the one that goes on."""
+"""Spans of lines: where each is painted, runs on and has ended, and what becomes of double lines."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 
-from tests.detection.pictures import foreground_of, make_camera
-from tests.detection.test_lane_lines import anchors_of, off_px, painted, straight
+from tests.detection.pictures import make_camera
+from tests.detection.test_lane_lines import anchors_of, off_px, painted, painted_on, straight
 from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.lanes import span
 from v2hdm.detection.lanes.lines import link_anchors
-from v2hdm.detection.lanes.score import Appearance
+from v2hdm.detection.sight import AnchorRow
 from v2hdm.records import LANE_DASH, LANE_LINE
 
 LEFT_M, RIGHT_M = 1.9, 1.5
@@ -21,56 +23,93 @@ def view() -> CameraView:
     return CameraView(make_camera())
 
 
-def distance_m(view, lane):
-    return view.ground(view.undistort(lane.points_px))[:, 0]
+def distance_m(view, line_px):
+    return view.ground(view.undistort(line_px))[:, 0]
+
+
+def part_of(view, line_px, near_m, far_m):
+    """The part of a line (N, 2) between two distances."""
+    away_m = distance_m(view, line_px)
+    return line_px[(away_m >= near_m) & (away_m <= far_m)]
 
 
 def as_seen(view, from_m, kind):
     """A line seen from 4 m on, all of it solid, and its second strand, seen from a distance on."""
-    whole, part = straight(view, RIGHT_M), straight(view, LEFT_M)
-    part = part[view.ground(view.undistort(part))[:, 0] >= from_m]
+    whole, part = straight(view, RIGHT_M), part_of(view, straight(view, LEFT_M), from_m, 40)
     rows = anchors_of(view, [whole, part])
     paint = [(painted(whole, view, 4, 26), LANE_LINE), (painted(part, view, from_m, 26), kind)]
     return rows, [replace(lane, kind=name) for lane, name in paint], [whole, part]
 
 
-def painted_on(view, lines_px):
-    """What the network says of paint: log odds of 5 on lines (N, 2) and -5 elsewhere."""
-    odds = np.full((view.info.height // 2, view.info.width // 2), -5.0, dtype=np.float32)
-    for line_px in lines_px:
-        at = np.linspace(0, len(line_px) - 1, 16 * len(line_px))
-        for u, v in zip(
-            *(np.interp(at, np.arange(len(line_px)), line_px[:, k]) for k in (0, 1)), strict=True
-        ):
-            if 0 <= u < view.info.width and 0 <= v < view.info.height:
-                odds[int(v / 2), max(int(u / 2) - 2, 0) : int(u / 2) + 3] = 5.0
-    return Appearance(None, foreground_of(odds, np.zeros(odds.shape, dtype=np.int32), 0))
+def test_the_states_are_as_probable_as_all_sequences_of_them_say():
+    """Against the sum over all sequences of four, the matrix exponential of the rates summed up as a
+    series."""
+    rng, rates = np.random.default_rng(3), span._rates()
+    count = len(rates)
+    likelihood, step_m = rng.normal(0, 1, (1, 4, count)), rng.uniform(0.1, 3, (1, 3))
+
+    def moved(by_m):
+        term, total = np.eye(count), np.eye(count)
+        for k in range(1, 40):
+            term = term @ rates * by_m / k
+            total = total + term
+        return total
+
+    start = moved(2.0)
+    for _ in range(9):
+        start = start @ start
+    moves = [moved(by_m) for by_m in step_m[0]]
+    states, total = np.zeros((4, count)), 0.0
+    for path in product(range(count), repeat=4):
+        chance = start[0, path[0]] * np.exp(likelihood[0, range(4), path].sum())
+        for t in range(3):
+            chance *= moves[t][path[t], path[t + 1]]
+        total += chance
+        states[range(4), path] += chance
+    found, log_likelihood = span._forward_backward(likelihood, step_m)
+    np.testing.assert_allclose(found[0], states / total, rtol=1e-3)
+    assert log_likelihood[0] == pytest.approx(np.log(total), abs=1e-3)
 
 
 def test_where_one_strand_has_ended_the_line_passes_to_the_other(view):
     rows, paint, lines = as_seen(view, ENDS_M, LANE_LINE)
     (lane,) = link_anchors(rows, view, paint, appearance=painted_on(view, lines))
-    away_m = distance_m(view, lane)
-    near, far = away_m < ENDS_M - 3, (away_m > ENDS_M + 3) & (away_m < 24)
-    assert np.abs(off_px(lane, straight(view, RIGHT_M))[near]).max() < 2
-    assert np.abs(off_px(lane, straight(view, (LEFT_M + RIGHT_M) / 2))[far]).max() < 1
+    middle = straight(view, (LEFT_M + RIGHT_M) / 2)
+    near, far = part_of(view, straight(view, RIGHT_M), 4, ENDS_M - 3), part_of(view, middle, ENDS_M + 3, 24)
+    assert np.abs(off_px(lane, near)).max() < 10, "the middle is 26 px away"
+    assert np.abs(off_px(lane, far)).max() < 1
     assert np.abs(np.diff(lane.points_px[:, 0], 2)).max() < 12, "without a step"
 
 
-@pytest.mark.parametrize(("kind", "reaches_m"), [(LANE_LINE, 4.0), (LANE_DASH, ENDS_M)])
-def test_strand_that_goes_on_unseen_keeps_the_line_in_the_middle(view, kind, reaches_m):
-    """Be it that the image shows its paint farther than its points, or that it is dashes."""
-    rows, paint, lines = as_seen(view, ENDS_M, kind)
-    looks = painted_on(view, [lines[0], as_seen(view, reaches_m, kind)[2][1]])
-    (lane,) = link_anchors(rows, view, paint, appearance=looks)
-    near = distance_m(view, lane) < ENDS_M - 3
-    assert np.abs(off_px(lane, straight(view, (LEFT_M + RIGHT_M) / 2))[near]).max() < 2
+def test_strand_whose_paint_goes_on_unseen_keeps_the_line_in_the_middle(view):
+    rows, paint, lines = as_seen(view, ENDS_M, LANE_LINE)
+    appearance = painted_on(view, [lines[0], as_seen(view, 4.0, LANE_LINE)[2][1]])
+    (lane,) = link_anchors(rows, view, paint, appearance=appearance)
+    middle = straight(view, (LEFT_M + RIGHT_M) / 2)
+    assert np.abs(off_px(lane, part_of(view, middle, 4, ENDS_M - 3))).max() < 2
 
 
-def test_sure_dash_beside_an_unsure_solid_line_makes_a_double_one(view):
-    rows, paint, _ = as_seen(view, ENDS_M, LANE_DASH)
-    unsure = [replace(paint[0], score=0.5), painted(straight(view, LEFT_M), view, ENDS_M, 17)]
-    rows = [replace(row, odds=np.where(np.arange(len(row.odds)) == 0, 0.3, 4.0)) for row in rows]
-    (lane,) = link_anchors(rows, view, unsure)
-    near = distance_m(view, lane) < ENDS_M
-    assert np.abs(off_px(lane, straight(view, (LEFT_M + RIGHT_M) / 2))[near]).max() < 2
+@pytest.mark.parametrize(("paint_to_m", "ends"), [(12, True), (4, False)])
+def test_solid_line_ends_where_its_paint_does(view, paint_to_m, ends):
+    """A faint crossing on each row: beyond the end of a line the network fades out slowly."""
+    line = straight(view, 1.6)
+    solid = replace(painted(line, view, 12, 26), kind=LANE_LINE)
+    sure = anchors_of(view, [part_of(view, line, 12, 40)])
+    near = [row for row in anchors_of(view, [line]) if row.v_px > sure[0].v_px]
+    near = [AnchorRow(row.v_px, row.u_px, np.array([-2.5])) for row in near]
+    appearance = painted_on(view, [part_of(view, line, paint_to_m, 40)])
+    (lane,) = link_anchors([*near, *sure], view, [solid], appearance=appearance)
+    if ends:
+        assert lane.points_px[0, 1] < solid.points_px[0, 1] + 20
+    else:
+        assert lane.points_px[0, 1] > near[0].v_px - 20
+
+
+@pytest.mark.parametrize("kind", [LANE_LINE, LANE_DASH])
+def test_dash_is_one_of_many_however_it_is_called(view, kind):
+    line = straight(view, 1.6)
+    dash = replace(painted(line, view, 12, 15), kind=kind)
+    appearance = painted_on(view, [part_of(view, line, 12, 15), part_of(view, line, 21, 24)])
+    rows = anchors_of(view, [line])
+    (lane,) = link_anchors(rows, view, [dash], appearance=appearance)
+    assert lane.points_px[0, 1] > dash.points_px[0, 1] + 60

@@ -14,8 +14,8 @@ from v2hdm.detection.corners.evidence import Claim
 from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.corners.quad import is_convex
 from v2hdm.detection.corners.refine import QuadStart, fit_markings
-from v2hdm.detection.lanes.lines import link_anchors
 from v2hdm.detection.lanes.centre_lines import LanePaint, trace_lanes
+from v2hdm.detection.lanes.lines import link_anchors
 from v2hdm.detection.lanes.score import Appearance
 from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions

@@ -2,10 +2,10 @@
 
 Crossings are linked from row to row into chains, near ones first: near the vehicle lines are far apart, so
 that each is known by the time they run together. Chains and pieces of paint are then joined as long as they
-are more likely one line than two, the likeliest pair first (Bayesian hierarchical clustering). A far dash joins
-a near one by the curve that both suggest and by the road that they lie along. Lines painted along a road are
-parallel: of u = a + b v + c / v (:mod:`v2hdm.detection.lanes.curve`) they share a, their vanishing point, and
-c; only b, the place beside the camera, is each one's own.
+are more likely one line than two, the likeliest pair first (Bayesian hierarchical clustering). A far dash
+joins a near one by the curve that both suggest and by the road that they lie along. Lines painted along a
+road are parallel: of u = a + b v + c / v (:mod:`v2hdm.detection.lanes.curve`) they share a, their vanishing
+point, and c; only b, the place beside the camera, is each one's own.
 """
 
 from __future__ import annotations

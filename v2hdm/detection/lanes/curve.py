@@ -79,7 +79,7 @@ class Horizon:
         return np.asarray(self._units[0] / (self.px_per_m * np.maximum(below, _LEAST_BELOW_PX)))
 
     def below_px(self, depth_m: float) -> float:
-        """How far below the horizon, px, the ground is so far ahead of the camera: inverts :meth:`depth_m`."""
+        """How far below the horizon, px, the ground at a depth is: the inverse of :meth:`depth_m`."""
         return float(self._units[0] / (self.px_per_m * depth_m))
 
     def coordinates(self, pinhole_px: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -222,8 +222,7 @@ class LinePoints:
     ``points_px`` (N, 2) recorded px; ``along`` and ``below`` (N,) their place about the horizon and ``phi``
     (N, 3) the basis of curves there;
     ``sigma_px`` (N,) of each along the horizon; ``odds`` (N,) log odds; ``ground`` (N, 2), vehicle frame;
-    ``is_paint`` (N,): on the centre line of a piece of paint, not a crossing of a row anchor; ``is_solid``
-    (N,): and that piece is no dash.
+    ``is_paint`` (N,): on the centre line of a piece of paint, not a crossing of a row anchor.
     """
 
     points_px: FloatArray
@@ -234,7 +233,6 @@ class LinePoints:
     odds: FloatArray
     ground: FloatArray
     is_paint: BoolArray
-    is_solid: BoolArray
 
     @classmethod
     def of(
@@ -245,7 +243,7 @@ class LinePoints:
         along, below = horizon.coordinates(pinhole_px)
         sigma = np.hypot(sigma_px, _MODEL_SIGMA_M * horizon.px_per_m * np.maximum(below, 0))
         none = np.zeros(len(odds), dtype=np.bool_)
-        return cls(points_px, along, below, basis(below), sigma, odds, view.ground(pinhole_px), none, none)
+        return cls(points_px, along, below, basis(below), sigma, odds, view.ground(pinhole_px), none)
 
     def where(self, kept: BoolArray) -> LinePoints:
         """Some of the points."""

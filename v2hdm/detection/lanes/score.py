@@ -2,9 +2,9 @@
 
 First each line is judged alone, then with its span and among the others of its image. A line is painted on
 ground that goes on beside it: a kerb or the foot of a wall has ground of another colour on its other side. A
-road's lines run beside each other, a lane apart: kerbs, joints and edges of shadows run closer. The weights, in
-``score.json`` beside this file, belong to the network; ``python -m tests.benchmarks.detector_lanes --write`` fits
-them to renders which no benchmark shows.
+road's lines run beside each other, a lane apart: kerbs, joints and edges of shadows run closer. The weights,
+in ``score.json`` beside this file, belong to the network. ``python -m tests.benchmarks.detector_lanes
+--write`` fits them to renders which no benchmark shows.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.lanes.curve import Horizon, IntArray, Line, LinePoints, basis
 from v2hdm.detection.odds import as_probability
-from v2hdm.records import LANE_CLASSES, BoolArray, FloatArray
+from v2hdm.records import LANE_DASH, BoolArray, FloatArray
 
 SCORE_FILE = Path(__file__).with_name("score.json")
 
-APPEARANCE = ("paint_along", "lane_share", "colour_change")
-"""Names of the columns of :meth:`Appearance.along`, in order: the mean log odds of paint along the line, the share
-of that paint which the network takes for a lane's, and the log ratio of the colours of its sides."""
+APPEARANCE = ("paint_along", "dash_share", "colour_change")
+"""Columns of :meth:`Appearance.along`: the mean log odds of paint along the line, the share of that paint
+which the network takes for dashes, and the log ratio of the colours of its two sides."""
 
 ALONE = (
     "best_crossings",
@@ -36,28 +36,28 @@ ALONE = (
     "log_length_px",
     "log_rows",
     "along_road",
-    "painted",
     "paint_odds",
-    "paint_share",
-    "solid",
     *APPEARANCE,
 )
-"""Features of a line by itself, in this order: log odds of the three surest crossings; how long the line is on the
-ground, in the image and down the image (upright things are as tall as they are long); how much likelier it is
-along the road; whether it shows paint, the log odds of its surest paint, for how much of its length, how much of
-that is solid; and its appearance."""
+"""Features of a line by itself: log odds of its three surest crossings; its length on the ground, in the
+image and down the image (upright things are as tall as they are long); the log ratio of its being along the
+road; the log odds of its surest paint; its appearance."""
 
-AMONG = ("alone", "faint_crossings", "likelihood", "near_horizon", "a_lane_apart", "too_near")
-"""Features of a line among others: its log odds alone, how many crossings too unlikely by themselves lie on it, the
-root of the log likelihood of its span, how far from the horizon it begins; and of the others that run beside it,
-weighed by their probability, how much so is the likest one a lane away and how many are nearer than a lane can be."""
+SPAN = ("likelihood", "present_m", "painted_m", "painted_share")
+"""Features of a line's span: the root of its log likelihood, the length of ground on which it is present,
+that on which it shows paint between its points, and the share of rows there that do."""
+
+AMONG = ("alone", "near_horizon", *SPAN, "a_lane_apart", "too_near")
+"""Features of a line among others: its log odds alone, how far from the horizon it begins, its span; and of
+the others that run beside it, weighed by their probability, the likest one a lane away and the number of
+those nearer than a lane can be."""
+
+_NO_PAINT = -3.0
+"""Log odds of the surest paint of a line that shows none."""
 
 _BEST = 3
 _MOST_LOG_RATIO = 6.0
-_MOST_PAINT_SHARE = 2.0
-"""Of a double line there is twice as much paint as the line is long."""
-
-_UNKNOWN = (2.3, 0.9, 0.002)
+_UNKNOWN = (2.3, 0.4, 0.002)
 """Appearance of a line of which nothing is known: the median of true lines. Nothing speaks against it."""
 
 _PLACES = 24
@@ -123,10 +123,10 @@ class Appearance:
         if self.foreground is not None:
             paint = self.foreground.odds_at(places_px[:, :, : len(_ON_M)]).max(axis=2)
             shares = self.foreground.shares_at(places_px[:, :, len(_ON_M) // 2])
-            of_lanes = [self.foreground.classes.index(name) for name in LANE_CLASSES]
             weight = as_probability(paint) + _LEAST_WEIGHT
+            dashes = shares[:, self.foreground.classes.index(LANE_DASH)]
             out[:, 0] = paint.mean(axis=1)
-            out[:, 1] = (shares[:, of_lanes].sum(axis=1) * weight).sum(axis=1) / weight.sum(axis=1)
+            out[:, 1] = (dashes * weight).sum(axis=1) / weight.sum(axis=1)
         if self.half_bgr is not None:
             inside = np.asarray(view.inside(places_px, 0).all(axis=2), dtype=np.bool_)
             out[:, 2] = self._colour_change(places_px[:, :, len(_ON_M) :], inside, px_per_m)
@@ -171,15 +171,23 @@ def features_among(lines: Sequence[Line], points: LinePoints, horizon: Horizon) 
     """The features (N, F) of N lines, all there are in an image, in the order of :data:`AMONG`."""
     if not lines:
         return np.empty((0, len(AMONG)))
-    spans = [line.span for line in lines if line.span is not None]
-    columns = (
-        [line.log_odds for line in lines],
-        np.log1p([len(line.perhaps) for line in lines]),
-        np.sqrt(np.maximum([span.log_likelihood for span in spans], 0.0)),
-        np.log([points.below[line.certain].min() for line in lines]),
-        _company(points, lines, horizon),
+    far = [points.below[line.certain].min() for line in lines]
+    spans = [_span_features(line, points) for line in lines]
+    return np.column_stack(
+        [[line.log_odds for line in lines], np.log(far), spans, _company(points, lines, horizon)]
     )
-    return np.column_stack(columns)
+
+
+def _span_features(line: Line, points: LinePoints) -> tuple[float, float, float, float]:
+    span, own = line.span, points.below[line.certain]
+    assert span is not None
+    seen = (span.below >= own.min()) & (span.below <= own.max())
+    return (
+        float(np.sqrt(max(span.log_likelihood, 0.0))),
+        float(span.length_m @ span.present),
+        float(span.length_m[seen] @ span.painted[seen]),
+        float(span.painted[seen].sum() / max(seen.sum(), 1)),
+    )
 
 
 def features_alone(
@@ -197,21 +205,15 @@ def features_alone(
     size = np.maximum.reduceat(at_px, begins) - np.minimum.reduceat(at_px, begins)
     size = size / view.info.width
     length_m = np.hypot(*size_m.T)
-    paint = np.add.reduceat(is_paint.astype(np.float64), begins)
-    solid = np.add.reduceat(points.is_solid[members].astype(np.float64), begins)
     paint_odds = np.maximum.reduceat(np.where(is_paint, odds, -np.inf), begins)
     ratio = np.array([line.log_ratio for line in lines])
-    paint_m = np.array([line.paint_m for line in lines])
     columns = (
         _best_crossings(np.where(is_paint, -np.inf, odds), begins, count),
         np.log(length_m + 0.1),
         np.log(np.hypot(*size.T) + 0.005),
         np.log(size[:, 1] + 0.005),
         np.clip(ratio, -_MOST_LOG_RATIO, _MOST_LOG_RATIO),
-        paint > 0,
-        np.where(paint > 0, paint_odds, 0.0),
-        np.minimum(paint_m / np.maximum(length_m, 1.0), _MOST_PAINT_SHARE),
-        solid / np.maximum(paint, 1),
+        np.where(np.isfinite(paint_odds), paint_odds, _NO_PAINT),
         appearance.along(lines, points, view, horizon),
     )
     return np.column_stack(columns).astype(np.float64)

@@ -1,10 +1,12 @@
 """Along each line: where it is painted, where it runs on through gaps, and where it has ended.
 
-A hidden Markov model on rows of the image, from far to near. Its states are *ended*, *solid*, *dash* and *gap*;
-the rates at which one becomes another are per metre of ground. On each row it sees two log odds of the network:
-of the surest crossing on the line and of the surest paint about it. The forward and backward pass (L. Rabiner,
-"A tutorial on hidden Markov models", Proc. IEEE 77, 1989) gives the probability of each state on each row and
-the likelihood of the line over that of ground without one. Two painted lines side by side are one double line.
+A hidden Markov model on rows of the image, from far to near. Its states are *ended*, *gap*, *solid* and
+*dash*; the rates at which one becomes another are per metre of ground. The evidence of a row is two log odds
+of the network: of the surest crossing on the line and of the surest paint about it. The forward and backward
+pass (L. Rabiner, "A tutorial on hidden Markov models", Proc. IEEE 77, 1989) gives the probability of each
+state on each row and the likelihood of the line over that of ground without one. Two lines that are painted
+side by side are the strands of one double line: it runs along their middle where both are present, else
+along the one that is.
 """
 
 from __future__ import annotations
@@ -24,28 +26,24 @@ from v2hdm.records import LANE_BOUNDARY, BoolArray, FloatArray, LaneDetection
 DRAWN_STEP_PX = 8.0
 """Rows of the image from one point of a line to the next, px."""
 
-_ENDED, _SOLID, _DASH, _GAP = range(4)
+_ENDED, _GAP, _SOLID, _DASH = range(4)
+_DASH_STAGES = 3
+"""Stages of a dash: its length is Erlang's distribution, which scatters about the mean by 58 %."""
 
-_RATES = {
-    (_ENDED, _SOLID): 1 / 120,
-    (_ENDED, _DASH): 1 / 290,
-    (_ENDED, _GAP): 1 / 205,
-    (_SOLID, _ENDED): 1 / 100,
-    (_DASH, _GAP): 1 / 3.8,
-    (_GAP, _DASH): 1 / 5.3,
-    (_DASH, _ENDED): 1 / 120,
-    (_GAP, _ENDED): 1 / 120,
-}
-"""Changes from one state to another per metre of ground.
+_STATES = _DASH + _DASH_STAGES
+_DASH_M, _GAP_M = 3.8, 5.3
+"""Mean lengths of dashes and of the gaps between them, m; those of the renders, and close to RMS-1's."""
 
-Dashes are 3.8 m and gaps 5.3 m long on average (RMS-1 and the renders' own); the others are fitted to renders.
-"""
+_SOLID_M, _DASHED_M, _ENDED_M = 100.0, 120.0, 60.0
+"""Mean lengths, m, of solid lines, of rows of dashes, and of bare ground from one line to the next on a
+curve; fitted to renders. After the ground a solid line is as likely as a row of dashes."""
 
 _CROSSING_WEIGHT, _CROSSING_EVEN, _CROSSING_RANGE = 0.05, -2.7, (-3.0, 6.7)
-"""A crossing of log odds x, kept within the range, adds weight * (x - even) to the log likelihood of a line."""
+"""A crossing of log odds x, clipped to the range, adds weight * (x - even) to a line's log likelihood.
+Weights are small because rows err together; all six numbers are fitted to renders."""
 
-_PAINT_WEIGHT, _PAINT_EVEN, _PAINT_RANGE = 0.44, -1.0, (-4.0, 4.0)
-"""The same for paint, and the log likelihood of *solid* and *dash*. Rows err together: hence small weights."""
+_PAINT_WEIGHT, _PAINT_EVEN, _PAINT_RANGE = 0.3, -1.0, (-4.0, 4.0)
+"""The same for paint and the log likelihoods of *solid* and *dash*."""
 
 _HALF_WIDTH_M, _LEAST_HALF_WIDTH_PX = 0.06, 4.0
 _ACROSS = np.linspace(-1.0, 1.0, 7)
@@ -102,20 +100,18 @@ def with_spans(
     across = along[..., None] + half_px[:, None] * _ACROSS
     rows = np.broadcast_to(below[:, None], across.shape)
     places_px = view.distort(horizon.pinhole_px(across.ravel(), rows.ravel())).reshape(*across.shape, 2)
-    likelihood = np.zeros((*along.shape, 4))
+    likelihood = np.zeros((*along.shape, _STATES))
     crossing = _crossings(lines, points, view, below, row_step_px)
-    likelihood[..., _SOLID:] = _evidence(crossing, _CROSSING_WEIGHT, _CROSSING_EVEN, _CROSSING_RANGE)[
-        ..., None
-    ]
+    likelihood[..., _GAP:] = _evidence(crossing, _CROSSING_WEIGHT, _CROSSING_EVEN, _CROSSING_RANGE)[..., None]
     if foreground is not None:
         paint = foreground.odds_at(places_px).max(axis=2)
         paint = _evidence(paint, _PAINT_WEIGHT, _PAINT_EVEN, _PAINT_RANGE)
-        likelihood[..., [_SOLID, _DASH]] += paint[..., None]
+        likelihood[..., _SOLID:] += paint[..., None]
     middle_px = places_px[:, :, len(_ACROSS) // 2]
     likelihood *= view.inside(middle_px, 0)[..., None]
     states, total = _forward_backward(likelihood, step_m)
     length_m = (np.pad(step_m, [(0, 0), (0, 1)]) + np.pad(step_m, [(0, 0), (1, 0)])) / 2
-    present, painted = 1 - states[..., _ENDED], states[..., _SOLID] + states[..., _DASH]
+    present, painted = 1 - states[..., _ENDED], states[..., _SOLID:].sum(axis=2)
     each = zip(lines, present, painted, length_m, total.tolist(), strict=True)
     return [replace(line, span=Span(below, *rest)) for line, *rest in each]
 
@@ -137,28 +133,36 @@ def _crossings(
     return out
 
 
+def _rates() -> FloatArray:
+    """Changes of state per metre of ground (S, S); rows sum up to nought."""
+    rates = np.zeros((_STATES, _STATES))
+    rates[_ENDED, _SOLID] = rates[_ENDED, _GAP] = 0.5 / _ENDED_M
+    rates[_GAP:, _ENDED] = 1 / _DASHED_M
+    rates[_SOLID, _ENDED] = 1 / _SOLID_M
+    rates[_GAP, _DASH] = 1 / _GAP_M
+    stages = [*range(_DASH, _STATES), _GAP]
+    rates[stages[:-1], stages[1:]] = _DASH_STAGES / _DASH_M
+    return np.asarray(rates - np.diag(rates.sum(axis=1)))
+
+
 @cache
-def _modes() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Eigenvalues (4,), right and left eigenvectors (4, 4) of the rates, and the states' shares (4,) in the long run."""
-    rates = np.zeros((4, 4))
-    for change, rate in _RATES.items():
-        rates[change] = rate
-    rates -= np.diag(rates.sum(axis=1))
-    values, right = np.linalg.eig(rates)
+def _modes() -> tuple[np.ndarray, np.ndarray, np.ndarray, FloatArray]:
+    """Eigenvalues (S,), right and left eigenvectors (S, S) of the rates; shares (S,) of the states."""
+    values, right = np.linalg.eig(_rates())
     left = np.linalg.inv(right)
     shares = left[np.argmax(values.real)].real
-    return values.real, right.real, left.real, shares / shares.sum()
+    return values, right, left, shares / shares.sum()
 
 
 def _forward_backward(likelihood: FloatArray, step_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Probability of each state (N, T, 4) and log likelihood (N,) of all rows.
+    """Probability of each state (N, T, S) and log likelihood (N,) of all rows.
 
     Args:
-        likelihood: Logarithms of those of each row in each state (N, T, 4).
+        likelihood: Logarithms of those of each row in each state (N, T, S).
         step_m: Ground from each row to the next (N, T - 1).
     """
     values, right, left, shares = _modes()
-    move = (right * np.exp(values * step_m[..., None])[..., None, :]) @ left
+    move = np.maximum(((right * np.exp(values * step_m[..., None])[..., None, :]) @ left).real, 0.0)
     seen = np.exp(likelihood)
     forward, scale = np.empty_like(seen), np.empty(seen.shape[:2])
     state = np.broadcast_to(shares, seen[:, 0].shape)
@@ -175,7 +179,7 @@ def _forward_backward(likelihood: FloatArray, step_m: FloatArray) -> tuple[Float
 
 
 def boundaries(lines: Sequence[Line], points: LinePoints, horizon: Horizon) -> list[Line]:
-    """The lines, best first, without those that repeat or cross a better one; those that double it are its strand."""
+    """The lines, best first, without those that repeat or cross a better one; a double one has a strand."""
     kept: list[Line] = []
     for line in lines:
         for k, other in enumerate(kept):
@@ -193,14 +197,20 @@ _APART, _REPEATS, _DOUBLES = range(3)
 
 
 def _relation(line: Line, other: Line, points: LinePoints, horizon: Horizon) -> int:
-    """Whether a line is apart from another one, repeats (or crosses) it, or is the second strand of a double one."""
-    assert line.span is not None and other.span is not None
+    """Whether a line is apart from another, repeats or crosses it, or is the other strand of a double one."""
+    assert line.span is not None
+    assert other.span is not None
     phi, px_per_m = basis(line.span.below), horizon.px_per_m * line.span.below
     sigma_m, other_sigma_m = (each.curve.sigma(phi) / px_per_m for each in (line, other))
     offset_m = (line.curve.along(phi) - other.curve.along(phi)) / px_per_m
     known = (sigma_m < _CERTAIN_SIGMA_M) & (other_sigma_m < _CERTAIN_SIGMA_M)
     seen, other_seen = (_seen(each, points, line.span.below) for each in (line, other))
-    crossed = known & (seen | other_seen) & (line.span.below >= line.span.below[seen][0]) & (line.span.below >= line.span.below[other_seen][0])
+    crossed = (
+        known
+        & (seen | other_seen)
+        & (line.span.below >= line.span.below[seen][0])
+        & (line.span.below >= line.span.below[other_seen][0])
+    )
     if (offset_m[crossed] < -_CROSSING_M).any() and (offset_m[crossed] > _CROSSING_M).any():
         return _REPEATS
     there = seen & other_seen if (seen & other_seen).any() else seen
