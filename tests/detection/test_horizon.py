@@ -3,10 +3,12 @@
 from dataclasses import replace
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 
 from tests.benchmarks.examples import Example, example
+from v2hdm.detect import main
 from v2hdm.detection.camera.mounting import camera_from_calibration, guessed_extrinsic, rough_calibration
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.detector import Detector
@@ -101,3 +103,18 @@ def test_rendered_views_are_corrected_to_within_a_degree_or_left_alone(detector,
             corrected += 1
             assert abs(told.pitch_rad - pitch_rad) < np.deg2rad(1.0)
     assert corrected
+
+
+def test_a_stream_without_a_calibration_takes_the_pitch_that_its_lines_show(tmp_path, capsys):
+    """Said once, and from then on the horizon of the detector is the one of the images."""
+    shown = rendered(RENDERED[0])
+    for n in range(5):
+        cv2.imwrite(str(tmp_path / f"{n}.png"), shown.image)
+    pitch_deg = np.rad2deg(guessed_pitch_rad(CameraView(shown.camera)))
+    fov_deg = np.rad2deg(2 * np.arctan(640 / shown.camera.info.intrinsic[0, 0]))
+    mounting = [f"{value:.2f}" for value in (HEIGHT_M, pitch_deg + 4, fov_deg)]
+    assert main([str(tmp_path), "--mounting", *mounting, "--output", str(tmp_path / "out.jsonl")]) == 0
+    said = [text for text in capsys.readouterr().err.splitlines() if "meet on a horizon" in text]
+    assert len(said) == 1
+    assert "the lines of 2 " in said[0]
+    assert float(said[0].split("look ")[1].split()[0]) == pytest.approx(pitch_deg, abs=1.0)

@@ -56,8 +56,13 @@ _DOUBLE_M = 0.75
 """Lines nearer than this are one boundary: two strands if both show paint abreast, else one line twice."""
 
 _LEAST_ABREAST_M = 1.0
+"""Both strands of a double line show paint on so much ground abreast."""
+
 _ONE_LINE_M = 0.12
+"""Lines nearer to each other than this are one."""
+
 _CERTAIN_SIGMA_M = 0.3
+"""Rows on which a line is known worse than this tell nothing of its place beside others."""
 
 _EVEN = 0.5
 """A line is where it is present rather than not."""
@@ -205,13 +210,9 @@ def _relation(line: Line, other: Line, points: LinePoints, horizon: Horizon) -> 
     offset_m = (line.curve.along(phi) - other.curve.along(phi)) / px_per_m
     known = (sigma_m < _CERTAIN_SIGMA_M) & (other_sigma_m < _CERTAIN_SIGMA_M)
     seen, other_seen = (_seen(each, points, line.span.below) for each in (line, other))
-    crossed = (
-        known
-        & (seen | other_seen)
-        & (line.span.below >= line.span.below[seen][0])
-        & (line.span.below >= line.span.below[other_seen][0])
-    )
-    if (offset_m[crossed] < -_CROSSING_M).any() and (offset_m[crossed] > _CROSSING_M).any():
+    from_row = max(int(np.argmax(seen)), int(np.argmax(other_seen)))
+    crossed = offset_m[from_row:][(known & (seen | other_seen))[from_row:]]
+    if (crossed < -_CROSSING_M).any() and (crossed > _CROSSING_M).any():
         return _REPEATS
     there = seen & other_seen if (seen & other_seen).any() else seen
     there = there & (other_sigma_m < _CERTAIN_SIGMA_M)
@@ -226,8 +227,9 @@ def _relation(line: Line, other: Line, points: LinePoints, horizon: Horizon) -> 
 def _seen(line: Line, points: LinePoints, below: FloatArray) -> BoolArray:
     """Which rows (T,) lie between the nearest and the farthest point of a line; one at least."""
     own = points.below[line.certain]
+    rows = np.arange(len(below))
     first, last = np.searchsorted(below, (own.min(), own.max()))
-    return (np.arange(len(below)) >= min(first, len(below) - 1)) & (np.arange(len(below)) <= last)
+    return np.asarray((rows >= min(first, len(below) - 1)) & (rows <= last), dtype=np.bool_)
 
 
 def draw(line: Line, points: LinePoints, view: CameraView, horizon: Horizon) -> LaneDetection | None:
