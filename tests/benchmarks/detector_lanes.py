@@ -28,11 +28,11 @@ from tests.benchmarks.detector_confidence import FOLDS, fit, log_loss, renders_t
 from tests.benchmarks.detector_quality import LANE_TOLERANCE_PX
 from tests.benchmarks.examples import Example
 from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.lanes import lines as lane_lines
 from v2hdm.detection.lanes import score
 from v2hdm.detection.lanes.curve import Horizon, Line, LinePoints
-from v2hdm.detection.lanes.score import Appearance
 from v2hdm.detection.lanes.span import draw
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.sight import AnchorRow
@@ -56,7 +56,7 @@ class Seen:
     rows: list[AnchorRow]
     paint: list[LaneDetection]
     view: CameraView
-    appearance: Appearance
+    foreground: Foreground
     row_step_px: float
     lanes_px: list[FloatArray]
 
@@ -70,10 +70,10 @@ def seen(shown: Example, detector: Detector) -> Seen:
         view: CameraView,
         paint: list[LaneDetection],
         _: float,
-        appearance: Appearance,
+        foreground: Foreground,
         row_step_px: float,
     ) -> list[LaneDetection]:
-        kept.append(Seen(rows, list(paint), view, appearance, row_step_px, shown.lanes_px))
+        kept.append(Seen(rows, list(paint), view, foreground, row_step_px, shown.lanes_px))
         return []
 
     with patch("v2hdm.detection.detector.link_anchors", spy):
@@ -93,8 +93,8 @@ class Proposed:
     true: BoolArray = field(init=False)
 
     def __post_init__(self) -> None:
-        view, appearance = self.image.view, self.image.appearance
-        self.alone = score.features_alone(self.lines, self.points, view, self.horizon, appearance)
+        view, foreground = self.image.view, self.image.foreground
+        self.alone = score.features_alone(self.lines, self.points, view, self.horizon, foreground)
         self.true = np.array([self._is_true(line) for line in self.lines], dtype=np.bool_)
 
     def among(self, odds: FloatArray) -> FloatArray:
@@ -106,7 +106,7 @@ class Proposed:
         drawn = draw(line, self.points, self.image.view, self.horizon)
         if drawn is None:
             return False
-        own = self.points.points_px[line.certain, 1]
+        own = self.points.points_px[line.members, 1]
         seen = (drawn.points_px[:, 1] >= own.min()) & (drawn.points_px[:, 1] <= own.max())
         line_px = drawn.points_px[seen] if seen.any() else drawn.points_px
         return max((share_on(lane, line_px) for lane in self.image.lanes_px), default=0.0) >= LEAST_SHARE
@@ -121,7 +121,7 @@ def proposed(image: Seen, paint_step_m: float) -> Proposed | None:
         horizon,
         image.paint,
         paint_step_m,
-        image.appearance,
+        image.foreground,
         image.row_step_px,
         -np.inf,
     )

@@ -110,8 +110,11 @@ def test_a_stream_without_a_calibration_takes_the_pitch_that_its_lines_show(tmp_
     shown = rendered(RENDERED[0])
     for n in range(5):
         cv2.imwrite(str(tmp_path / f"{n}.png"), shown.image)
-    pitch_deg = np.rad2deg(guessed_pitch_rad(CameraView(shown.camera)))
-    fov_deg = np.rad2deg(2 * np.arctan(640 / shown.camera.info.intrinsic[0, 0]))
+    (focal_px, _, _), (_, _, centre_px), _ = shown.camera.info.intrinsic
+    horizon_px = centre_px - focal_px * np.tan(guessed_pitch_rad(CameraView(shown.camera)))
+    # A rough camera has its principal point in the middle of the image.
+    pitch_deg = np.rad2deg(np.arctan((359.5 - horizon_px) / focal_px))
+    fov_deg = np.rad2deg(2 * np.arctan(640 / focal_px))
     mounting = [f"{value:.2f}" for value in (HEIGHT_M, pitch_deg + 4, fov_deg)]
     assert main([str(tmp_path), "--mounting", *mounting, "--output", str(tmp_path / "out.jsonl")]) == 0
     said = [text for text in capsys.readouterr().err.splitlines() if "meet on a horizon" in text]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import make_camera, to_image
-from tests.detection.test_lane_lines import anchors_of, off_px, painted, straight
+from tests.detection.test_lane_lines import anchors_of, off_px, painted, painted_on, straight
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.lanes.cluster import find_road
 from v2hdm.detection.lanes.curve import Horizon, LinePoints, Prior
@@ -79,11 +79,12 @@ def test_the_road_is_what_most_lines_agree_on_not_the_longest_other_one(view, cu
 def test_short_dashes_far_away_point_where_the_line_beside_them_does(view):
     line, beside = straight(view, 1.6), straight(view, -1.8)
     dashes = [tilted(painted(line, view, *span), 0.7) for span in ((12, 14), (17, 19))]
-    (alone,) = link_anchors([], view, dashes)
-    found = link_anchors(anchors_of(view, [beside]), view, dashes)
+    seen_paint = painted_on(view, [beside, *(dash.points_px for dash in dashes)])
+    both = anchors_of(view, [beside, *(dash.points_px for dash in dashes)])
+    found = link_anchors(both, view, dashes, foreground=seen_paint)
     (lane,) = [lane for lane in found if lane.identity == 1]
     assert np.abs(off_px(lane, line)).max() < 8
-    assert lane.points_px[0, 1] > alone.points_px[0, 1] + 50, "it is known farther towards the vehicle"
+    assert lane.points_px[0, 1] > max(dash.points_px[0, 1] for dash in dashes) + 50, "towards the vehicle"
 
 
 def tilted(lane: LaneDetection, by_px: float) -> LaneDetection:

@@ -6,7 +6,6 @@ import pytest
 from tests.detection.pictures import foreground_of, make_camera, to_image
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.lanes.lines import link_anchors
-from v2hdm.detection.lanes.score import Appearance
 from v2hdm.detection.sight import AnchorRow
 from v2hdm.records import LANE_DASH, LaneDetection
 
@@ -59,7 +58,7 @@ def painted_on(view, lines_px):
         ):
             if 0 <= u < view.info.width and 0 <= v < view.info.height:
                 odds[int(v / 2), max(int(u / 2) - 2, 0) : int(u / 2) + 3] = 5.0
-    return Appearance(None, foreground_of(odds, np.zeros(odds.shape, dtype=np.int32), 0))
+    return foreground_of(odds, np.zeros(odds.shape, dtype=np.int32), 0)
 
 
 @pytest.fixture
@@ -133,8 +132,8 @@ def test_two_dashes_make_a_line_that_runs_on_towards_the_vehicle(view):
     line = straight(view, 1.0)
     paint = [painted(line, view, 7, 10), painted(line, view, 13, 16)]
     rows = anchors_of(view, [part.points_px for part in paint])
-    appearance = painted_on(view, [part.points_px for part in paint])
-    (lane,) = link_anchors(rows, view, paint, appearance=appearance)
+    foreground = painted_on(view, [part.points_px for part in paint])
+    (lane,) = link_anchors(rows, view, paint, foreground=foreground)
     assert lane.points_px[0, 1] > paint[0].points_px[0, 1] + 60
     assert np.abs(off_px(lane, line)).max() < 1.0
     assert lane.sigma_px[0] > 1.5 * lane.sigma_px.min(), "less is known where nothing was seen"

@@ -16,7 +16,6 @@ from v2hdm.detection.corners.quad import is_convex
 from v2hdm.detection.corners.refine import QuadStart, fit_markings
 from v2hdm.detection.lanes.centre_lines import LanePaint, trace_lanes
 from v2hdm.detection.lanes.lines import link_anchors
-from v2hdm.detection.lanes.score import Appearance
 from v2hdm.detection.network import Network
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.paint.blobs import Blob, find_blobs, outline_polygon
@@ -116,12 +115,11 @@ class Detector:
             sight.paint, owner, info.paint_stride, view.far_row, sight.kinds, info.classes
         )
         with lap("lanes"):
-            appearance = Appearance.of(image_bgr, foreground)
             lanes = trace_lanes(
                 self._lane_paint(candidates), view, self.options.lane_step_m, self.options.max_range_m
             )
             lanes += link_anchors(
-                sight.anchors, view, lanes, self.options.lane_step_m, appearance, info.lane_stride
+                sight.anchors, view, lanes, self.options.lane_step_m, foreground, info.lane_stride
             )
         with lap("corners"):
             starts = self._starts(candidates, view)

@@ -10,17 +10,17 @@ point, and c; only b, the place beside the camera, is each one's own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from v2hdm.detection.lanes.curve import Evidence, Horizon, IntArray, Line, LinePoints, Prior
-from v2hdm.records import BoolArray, FloatArray
+from v2hdm.records import FloatArray
 
 _MIN_CHAIN = 3
 _CHAIN_ODDS = 0.0
-"""Chains are made of crossings more likely than not; what is less likely may join a line that is known."""
+"""Chains are made of crossings more likely than not."""
 
 _MAX_GAP_PX = 40.0
 _SLOPE_POINTS = 6
@@ -28,12 +28,6 @@ _SLOPE_POINTS = 6
 
 _MAX_SLOPE = 4.5
 _GATE_PX = 12.0
-
-_STRAY_SIGMAS = 3.0
-_STRAY_PX = 16.0
-"""Crossings on no line yet join one that passes so near."""
-
-_NONE = np.empty(0, dtype=np.int64)
 
 _FREE_SIGMAS = (0.5, 8.0, 0.008)
 """Lines of any kind: direction about the camera's, rad, place beside it, m, and curvature, 1/m."""
@@ -190,22 +184,7 @@ def find_lines(
     priors = [road.drawn_by(log_ratio) for log_ratio in along]
     curves = evidence.curves(priors, horizon.centre_px)
     paint_m = [paint_step_m * float(points.is_paint[group].sum()) for group in groups]
-    return [
-        Line(curve, group, _NONE, *rest)
-        for curve, group, *rest in zip(curves, groups, paint_m, priors, along, strict=True)
-    ]
-
-
-def with_strays(points: LinePoints, lines: list[Line], horizon: Horizon) -> list[Line]:
-    """The lines, each with the crossings of no other that lie on it; the first lines take first."""
-    free = ~points.is_paint
-    for line in lines:
-        free[line.certain] = False
-    out = []
-    for line in lines:
-        out.append(_gathered(points, line, free, horizon))
-        free[out[-1].perhaps] = False
-    return out
+    return [Line(*parts) for parts in zip(curves, groups, paint_m, along, strict=True)]
 
 
 def _join(evidence: Evidence, groups: list[IntArray], road: Road) -> list[IntArray]:
@@ -235,25 +214,3 @@ def _join(evidence: Evidence, groups: list[IntArray], road: Road) -> list[IntArr
         low, high = np.minimum(others, a), np.maximum(others, a)
         gain[low, high] = together[others] - alone[a] - alone[others]
     return [groups[k] for k in np.flatnonzero(left)]
-
-
-def _gathered(points: LinePoints, line: Line, free: BoolArray, horizon: Horizon) -> Line:
-    """The line with the free crossings on it, at most one of each row."""
-    slope = points.slopes([line.certain])
-    group, row = line.certain, points.points_px[:, 1]
-    rows = row.astype(np.intp)  # they are some px apart
-    has_one = np.zeros(rows.max() + 1, dtype=np.bool_)
-    has_one[rows[group[~points.is_paint[group]]]] = True
-    candidates = np.flatnonzero(free & ~has_one[rows])
-    phi = points.phi[candidates]
-    off = np.abs(points.along[candidates] - line.curve.along(phi))
-    sigma = np.hypot(line.curve.sigma(phi), points.sigma_px[candidates])
-    misfit = off / np.minimum(_STRAY_SIGMAS * sigma, _STRAY_PX * np.hypot(1, slope[0]))
-    order = np.argsort(misfit)
-    order = order[misfit[order] < 1]
-    _, nearest = np.unique(row[candidates[order]], return_index=True)
-    perhaps = candidates[order[nearest]]
-    if not len(perhaps):
-        return line
-    evidence = points.evidence(horizon, [line.certain], slope) + points.evidence(horizon, [perhaps], slope)
-    return replace(line, curve=evidence.curve(line.prior, horizon.centre_px), perhaps=perhaps)

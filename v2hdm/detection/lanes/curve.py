@@ -220,9 +220,9 @@ class LinePoints:
     """N points of an image that lines may run through.
 
     ``points_px`` (N, 2) recorded px; ``along`` and ``below`` (N,) their place about the horizon and ``phi``
-    (N, 3) the basis of curves there;
-    ``sigma_px`` (N,) of each along the horizon; ``odds`` (N,) log odds; ``ground`` (N, 2), vehicle frame;
-    ``is_paint`` (N,): on the centre line of a piece of paint, not a crossing of a row anchor.
+    (N, 3) the basis of curves there; ``sigma_px`` (N,) of each along the horizon; ``odds`` (N,) log odds;
+    ``ground`` (N, 2), vehicle frame; ``is_paint`` (N,): on the centre line of a piece of paint, not a
+    crossing of a row anchor.
     """
 
     points_px: FloatArray
@@ -285,23 +285,16 @@ class Span:
 
 @dataclass(frozen=True)
 class Line:
-    """A line: its curve and the indices of the points that ``certain``ly and ``perhaps`` are on it.
+    """A line: its curve and the indices of its ``members`` among the points.
 
-    ``prior`` is what the curve was drawn with, ``log_ratio`` how much likelier the line is along the road
-    than anyhow; there is ``paint_m`` of paint on it. ``strand`` is the other line of a double one.
+    ``paint_m`` is the paint on it, ``log_ratio`` that of its probabilities along the road and anyhow, and
+    ``strand`` the other line of a double one.
     """
 
     curve: Curve
-    certain: IntArray
-    perhaps: IntArray
+    members: IntArray
     paint_m: float
-    prior: Prior
     log_ratio: float
     log_odds: float = 0.0
     span: Span | None = None
     strand: Line | None = None
-
-    @property
-    def members(self) -> IntArray:
-        """All its points."""
-        return np.concatenate([self.certain, self.perhaps])

@@ -1,7 +1,6 @@
 """How probable it is that a line is one of a lane: a logistic function of features of the line.
 
-First each line is judged alone, then with its span and among the others of its image. A line is painted on
-ground that goes on beside it: a kerb or the foot of a wall has ground of another colour on its other side. A
+First each line is judged alone, then with its span and among the others of its image. A
 road's lines run beside each other, a lane apart: kerbs, joints and edges of shadows run closer. The weights,
 in ``score.json`` beside this file, belong to the network. ``python -m tests.benchmarks.detector_lanes
 --write`` fits them to renders which no benchmark shows.
@@ -11,24 +10,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.corners.foreground import Foreground
 from v2hdm.detection.lanes.curve import Horizon, IntArray, Line, LinePoints, basis
 from v2hdm.detection.odds import as_probability
-from v2hdm.records import LANE_DASH, BoolArray, FloatArray
+from v2hdm.records import LANE_DASH, FloatArray
 
 SCORE_FILE = Path(__file__).with_name("score.json")
-
-APPEARANCE = ("paint_along", "dash_share", "colour_change")
-"""Columns of :meth:`Appearance.along`: the mean log odds of paint along the line, the share of that paint
-which the network takes for dashes, and the log ratio of the colours of its two sides."""
 
 ALONE = (
     "best_crossings",
@@ -37,11 +30,13 @@ ALONE = (
     "log_rows",
     "along_road",
     "paint_odds",
-    *APPEARANCE,
+    "paint_along",
+    "dash_share",
 )
 """Features of a line by itself: log odds of its three surest crossings; its length on the ground, in the
 image and down the image (upright things are as tall as they are long); the log ratio of its being along the
-road; the log odds of its surest paint; its appearance."""
+road; the log odds of its surest paint; the mean log odds of paint along it, and the share of that which the
+network takes for dashes."""
 
 SPAN = ("likelihood", "present_m", "painted_m", "painted_share")
 """Features of a line's span: the root of its log likelihood, the length of ground on which it is present,
@@ -57,26 +52,15 @@ _NO_PAINT = -3.0
 
 _BEST = 3
 _MOST_LOG_RATIO = 6.0
-_UNKNOWN = (2.3, 0.4, 0.002)
-"""Appearance of a line of which nothing is known: the median of true lines. Nothing speaks against it."""
+_UNKNOWN = (2.3, 0.4)
+"""The last two of a line in an image of which the paint is not known: the median of true lines."""
 
 _PLACES = 24
 _ON_M = np.linspace(-0.25, 0.25, 7)
 """Paint of a line, be it a double one, is within such a distance of where it is drawn."""
 
-_BESIDE_M = np.linspace(0.25, 0.6, 5)
-"""The ground beside its paint: nearer than what else is on the road."""
-
-_LEAST_PX_PER_M = 6.0
-"""Farther away its sides are not seen apart from it."""
-
 _LEAST_WEIGHT = 0.05
-_LEAST_PLACES = 3
-_MOST_CHANGE = 0.05
-"""Kerbs and verges differ by this and more; the verge beside the line of a road's edge does, too."""
-
-_DARK = 8.0
-"""Grey levels below this differ by noise."""
+"""Places without paint have this weight, that of paint being one."""
 
 _LANE_M, _LANE_SIGMA_M = 3.2, 0.65
 """Lanes of roads are 2.5 to 4 m wide."""
@@ -89,76 +73,16 @@ _CHANGE_M, _CHANGE_SHARE = 0.15, 0.06
 """The distance between lines that run beside each other changes by so much and by this share of it."""
 
 
-@dataclass(frozen=True)
-class Appearance:
-    """An image at half its size (h, w, 3) uint8 BGR and what the network says of paint, each if known."""
-
-    half_bgr: np.ndarray | None = None
-    foreground: Foreground | None = None
-
-    @classmethod
-    def of(cls, image_bgr: np.ndarray, foreground: Foreground) -> Appearance:
-        """Those of an image (H, W, 3) uint8 BGR."""
-        height, width = image_bgr.shape[:2]
-        return cls(cv2.resize(image_bgr, (width // 2, height // 2), interpolation=cv2.INTER_AREA), foreground)
-
-    def along(
-        self, lines: Sequence[Line], points: LinePoints, view: CameraView, horizon: Horizon
-    ) -> FloatArray:
-        """The :data:`APPEARANCE` (N, 3) of N lines, where each is seen."""
-        out = np.tile(_UNKNOWN, (len(lines), 1))
-        if not lines or (self.half_bgr is None and self.foreground is None):
-            return out
-        ends = np.array(
-            [[points.below[line.certain].min(), points.below[line.certain].max()] for line in lines]
-        )
-        below = ends[:, :1] + np.diff(ends) * np.linspace(0, 1, _PLACES)
-        phi = basis(below.ravel()).reshape(len(lines), _PLACES, 3)
-        along = np.einsum("npk,nk->np", phi, np.array([line.curve.parameters for line in lines]))
-        offsets_m = np.concatenate([_ON_M, -_BESIDE_M, _BESIDE_M])
-        px_per_m = horizon.px_per_m * below
-        across = along[..., None] + px_per_m[..., None] * offsets_m
-        pinhole = horizon.pinhole_px(across.ravel(), np.repeat(below.ravel(), len(offsets_m)))
-        places_px = view.distort(pinhole).reshape(*across.shape, 2)
-        if self.foreground is not None:
-            paint = self.foreground.odds_at(places_px[:, :, : len(_ON_M)]).max(axis=2)
-            shares = self.foreground.shares_at(places_px[:, :, len(_ON_M) // 2])
-            weight = as_probability(paint) + _LEAST_WEIGHT
-            dashes = shares[:, self.foreground.classes.index(LANE_DASH)]
-            out[:, 0] = paint.mean(axis=1)
-            out[:, 1] = (dashes * weight).sum(axis=1) / weight.sum(axis=1)
-        if self.half_bgr is not None:
-            inside = np.asarray(view.inside(places_px, 0).all(axis=2), dtype=np.bool_)
-            out[:, 2] = self._colour_change(places_px[:, :, len(_ON_M) :], inside, px_per_m)
-        return out
-
-    def _colour_change(self, places_px: FloatArray, inside: BoolArray, px_per_m: FloatArray) -> FloatArray:
-        """How much (N,) the colours beside N lines differ, seen at places (N, P, 2 S, 2) left, then right."""
-        assert self.half_bgr is not None
-        u, v = np.moveaxis(places_px.reshape(len(places_px), -1, 2) / 2 - 0.25, -1, 0).astype(np.float32)
-        bgr = cv2.remap(self.half_bgr, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        level = np.log(bgr.reshape(*places_px.shape[:-1], 3) + _DARK)
-        left, right = np.split(level, 2, axis=2)
-        change = right.mean(axis=2) - left.mean(axis=2)
-        change -= change.mean(axis=2, keepdims=True)
-        out = np.empty(len(change))
-        for k, (each, seen, wide) in enumerate(zip(change, inside, px_per_m > _LEAST_PX_PER_M, strict=True)):
-            use = seen & wide if (seen & wide).sum() >= _LEAST_PLACES else seen
-            use = use if use.sum() >= _LEAST_PLACES else np.ones_like(use)
-            out[k] = min(float(np.linalg.norm(np.median(each[use], axis=0))), _MOST_CHANGE)
-        return out
-
-
-UNKNOWN = Appearance()
-"""That of lines of which no image is at hand."""
-
-
 def log_odds_alone(
-    lines: Sequence[Line], points: LinePoints, view: CameraView, horizon: Horizon, appearance: Appearance
+    lines: Sequence[Line],
+    points: LinePoints,
+    view: CameraView,
+    horizon: Horizon,
+    foreground: Foreground | None,
 ) -> FloatArray:
     """Log odds (N,) of N lines through an image's points, each by itself."""
     weights, bias = fitted()["alone"]
-    return np.asarray(features_alone(lines, points, view, horizon, appearance) @ weights + bias)
+    return np.asarray(features_alone(lines, points, view, horizon, foreground) @ weights + bias)
 
 
 def log_odds(lines: Sequence[Line], points: LinePoints, horizon: Horizon) -> FloatArray:
@@ -171,7 +95,7 @@ def features_among(lines: Sequence[Line], points: LinePoints, horizon: Horizon) 
     """The features (N, F) of N lines, all there are in an image, in the order of :data:`AMONG`."""
     if not lines:
         return np.empty((0, len(AMONG)))
-    far = [points.below[line.certain].min() for line in lines]
+    far = [points.below[line.members].min() for line in lines]
     spans = [_span_features(line, points) for line in lines]
     return np.column_stack(
         [[line.log_odds for line in lines], np.log(far), spans, _company(points, lines, horizon)]
@@ -179,7 +103,7 @@ def features_among(lines: Sequence[Line], points: LinePoints, horizon: Horizon) 
 
 
 def _span_features(line: Line, points: LinePoints) -> tuple[float, float, float, float]:
-    span, own = line.span, points.below[line.certain]
+    span, own = line.span, points.below[line.members]
     assert span is not None
     seen = (span.below >= own.min()) & (span.below <= own.max())
     return (
@@ -191,13 +115,17 @@ def _span_features(line: Line, points: LinePoints) -> tuple[float, float, float,
 
 
 def features_alone(
-    lines: Sequence[Line], points: LinePoints, view: CameraView, horizon: Horizon, appearance: Appearance
+    lines: Sequence[Line],
+    points: LinePoints,
+    view: CameraView,
+    horizon: Horizon,
+    foreground: Foreground | None,
 ) -> FloatArray:
     """The features (N, F) of N lines by themselves, in the order of :data:`ALONE`."""
     if not lines:
         return np.empty((0, len(ALONE)))
-    members = np.concatenate([line.certain for line in lines])
-    count = np.array([len(line.certain) for line in lines])
+    members = np.concatenate([line.members for line in lines])
+    count = np.array([len(line.members) for line in lines])
     begins = np.cumsum(count) - count
     is_paint, odds = points.is_paint[members], points.odds[members]
     at_px, ground = points.points_px[members], points.ground[members]
@@ -214,7 +142,7 @@ def features_alone(
         np.log(size[:, 1] + 0.005),
         np.clip(ratio, -_MOST_LOG_RATIO, _MOST_LOG_RATIO),
         np.where(np.isfinite(paint_odds), paint_odds, _NO_PAINT),
-        appearance.along(lines, points, view, horizon),
+        _paint_along(lines, points, view, horizon, foreground),
     )
     return np.column_stack(columns).astype(np.float64)
 
@@ -226,6 +154,29 @@ def _best_crossings(odds: FloatArray, begins: IntArray, count: IntArray) -> Floa
     best = odds[order[first]]
     there = np.isfinite(best) & (np.arange(_BEST) < count[:, None])
     return np.asarray(np.where(there, best, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1))
+
+
+def _paint_along(
+    lines: Sequence[Line],
+    points: LinePoints,
+    view: CameraView,
+    horizon: Horizon,
+    foreground: Foreground | None,
+) -> FloatArray:
+    """Mean log odds of paint along each line where it is seen, and the share of dashes in that (N, 2)."""
+    if foreground is None:
+        return np.tile(_UNKNOWN, (len(lines), 1))
+    own = [points.below[line.members] for line in lines]
+    below = np.linspace([b.min() for b in own], [b.max() for b in own], _PLACES, axis=1)
+    phi = basis(below.ravel()).reshape(len(lines), _PLACES, 3)
+    along = np.einsum("npk,nk->np", phi, np.array([line.curve.parameters for line in lines]))
+    across = along[..., None] + horizon.px_per_m * below[..., None] * _ON_M
+    rows = np.broadcast_to(below[..., None], across.shape)
+    places_px = view.distort(horizon.pinhole_px(across.ravel(), rows.ravel())).reshape(*across.shape, 2)
+    paint = foreground.odds_at(places_px).max(axis=2)
+    weight = as_probability(paint) + _LEAST_WEIGHT
+    dashes = foreground.shares_at(places_px[:, :, len(_ON_M) // 2])[:, foreground.classes.index(LANE_DASH)]
+    return np.column_stack([paint.mean(axis=1), (dashes * weight).sum(axis=1) / weight.sum(axis=1)])
 
 
 def _company(points: LinePoints, lines: Sequence[Line], horizon: Horizon) -> FloatArray:
@@ -245,8 +196,8 @@ def _company(points: LinePoints, lines: Sequence[Line], horizon: Horizon) -> Flo
 def _apart_m(points: LinePoints, lines: Sequence[Line], horizon: Horizon) -> FloatArray:
     """How far lines are apart along the horizon (3, N, N), m, at the far end, middle and near end of each."""
     parameters = np.array([line.curve.parameters for line in lines])
-    spans = np.array([np.ptp(points.below[line.certain]) for line in lines])
-    low = np.array([points.below[line.certain].min() for line in lines])
+    spans = np.array([np.ptp(points.below[line.members]) for line in lines])
+    low = np.array([points.below[line.members].min() for line in lines])
     below = (low + spans * np.array([[0.0], [0.5], [1.0]])).ravel()
     # Each line's own rows, at which all the others are looked at.
     rows = (basis(below) / (horizon.px_per_m * below)[:, None]).reshape(3, len(lines), 3)

@@ -226,7 +226,7 @@ def _relation(line: Line, other: Line, points: LinePoints, horizon: Horizon) -> 
 
 def _seen(line: Line, points: LinePoints, below: FloatArray) -> BoolArray:
     """Which rows (T,) lie between the nearest and the farthest point of a line; one at least."""
-    own = points.below[line.certain]
+    own = points.below[line.members]
     rows = np.arange(len(below))
     first, last = np.searchsorted(below, (own.min(), own.max()))
     return np.asarray((rows >= min(first, len(below) - 1)) & (rows <= last), dtype=np.bool_)
@@ -250,7 +250,7 @@ def draw(line: Line, points: LinePoints, view: CameraView, horizon: Horizon) -> 
     if not len(drawn):
         return None
     points_px = view.distort(horizon.pinhole_px(along, below))
-    own = points.below[line.certain]
+    own = points.below[line.members]
     kept = (rows >= drawn[0]) & (rows <= drawn[-1]) & view.inside(points_px, -DRAWN_STEP_PX)
     kept &= (sigma < _EXTENSION_SIGMA * view.info.width) | ((below >= own.min()) & (below <= own.max()))
     if kept.sum() < 2:
@@ -268,7 +268,7 @@ def _followed(
     """
     phi = basis(at)
     curve_sigma, along = line.curve.sigma(phi), line.curve.along(phi)
-    members = line.certain
+    members = line.members
     off = points.along[members] - line.curve.along(points.phi[members])
     near = np.maximum(1 - np.abs(at[:, None] - points.below[members]) / _SMOOTH_PX, 0)
     weight = near / (NEIGHBOURS * points.sigma_px[members] ** 2)
