@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import make_camera, to_image
-from tests.detection.test_lane_lines import anchors_of, off_px, painted, painted_on, straight
+from tests.detection.test_lane_lines import anchors_of, off_px, painted, straight
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.lanes.cluster import find_road
-from v2hdm.detection.lanes.curve import Horizon, LinePoints, Prior
-from v2hdm.detection.lanes.lines import link_anchors
+from v2hdm.detection.lanes.curve import Horizon, LinePoints, Prior, basis
+from v2hdm.detection.lanes.lines import link_anchors, propose
 from v2hdm.detection.sight import AnchorRow
 from v2hdm.records import LANE_LINE, LaneDetection
 
@@ -77,14 +77,19 @@ def test_the_road_is_what_most_lines_agree_on_not_the_longest_other_one(view, cu
 
 
 def test_short_dashes_far_away_point_where_the_line_beside_them_does(view):
-    line, beside = straight(view, 1.6), straight(view, -1.8)
+    line, horizon = straight(view, 1.6), Horizon(view)
     dashes = [tilted(painted(line, view, *span), 0.7) for span in ((12, 14), (17, 19))]
-    seen_paint = painted_on(view, [beside, *(dash.points_px for dash in dashes)])
-    both = anchors_of(view, [beside, *(dash.points_px for dash in dashes)])
-    found = link_anchors(both, view, dashes, foreground=seen_paint)
-    (lane,) = [lane for lane in found if lane.identity == 1]
-    assert np.abs(off_px(lane, line)).max() < 8
-    assert lane.points_px[0, 1] > max(dash.points_px[0, 1] for dash in dashes) + 50, "towards the vehicle"
+    near = line[(line[:, 1] > 200) & view.inside(line, 0)]
+    off = []
+    for beside in ([], [straight(view, -1.8)]):
+        points, lines = propose(
+            anchors_of(view, beside), view, horizon, dashes, 0.5, None, 8.0, least_log_odds=-np.inf
+        )
+        along, below = horizon.coordinates(view.undistort(near))
+        curves = [each.curve.along(basis(below)) for each in lines if points.is_paint[each.members].all()]
+        off.append(min(np.abs(curve - along).max() for curve in curves))
+    assert off[1] < 8
+    assert off[1] < 0.6 * off[0], "by themselves they do not"
 
 
 def tilted(lane: LaneDetection, by_px: float) -> LaneDetection:
