@@ -31,8 +31,8 @@ _DASH_STAGES = 3
 """Stages of a dash: its length is Erlang's distribution, which scatters about the mean by 58 %."""
 
 _STATES = _DASH + _DASH_STAGES
-_DASH_M, _GAP_M = 3.8, 5.3
-"""Mean lengths of dashes and of the gaps between them, m; those of the renders, and close to RMS-1's."""
+_DASH_M, _GAP_M = 3.6, 5.1
+"""Mean lengths of dashes and of the gaps between them, m, in the renders (simulate/training/paint)."""
 
 _SOLID_M, _DASHED_M, _ENDED_M = 100.0, 120.0, 60.0
 """Mean lengths, m, of solid lines, of rows of dashes, and of bare ground from one line to the next on a
