@@ -5,12 +5,13 @@
 Run it after another network was put in place. The lines that the detector proposes on rendered scenes,
 sure or not, two thirds of them of full difficulty and a third easy ones, are true if four fifths of the
 rows that they were seen on lie on one true line, by the tolerance of the quality benchmark; how far a line
-was drawn on from there does not count. A logistic regression with a weak ridge tells them apart by what
-speaks for each alone; a second one tells each from its log odds, by weights that its own image had no part
-in, and from the others. Which lines are proposed depends a little on the score itself, so that the fit is
-made twice. Its seed is neither that of the quality benchmark nor one of training. Printed: what each feature
-adds to the log odds per standard deviation, the log loss on the images of each fifth by weights that were
-fitted to the others, alone and among the others, and how many lines given are true and false.
+was drawn on from there does not count. A logistic regression with a weak ridge tells them apart by the
+features of each alone; a second one tells each from its log odds, by weights that its own image had no part
+in, from its span and from the others. Which lines are proposed depends a little on the score itself, so that
+the fit is made twice. Its seed is neither that of the quality benchmark nor one of training. Printed: by
+how much each feature changes the log odds per standard deviation, the log loss on the images of each fifth by
+weights that were fitted to the others, alone and among the others, and how many lines given are true and
+false.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from unittest.mock import patch
 
@@ -30,10 +31,11 @@ from train.examples import LANE_TOLERANCE_PX, Example
 from train.fit_judge import FOLDS, fit, log_loss, renders_to_fit
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.lanes import anchors, score
-from v2hdm.detection.lanes.curves import Horizon, basis
-from v2hdm.detection.lanes.looks import Looks
-from v2hdm.detection.lanes.points import Line, LinePoints
+from v2hdm.detection.lanes import lines as lane_lines
+from v2hdm.detection.lanes import score
+from v2hdm.detection.lanes.curve import Horizon, Line, LinePoints
+from v2hdm.detection.lanes.span import draw
+from v2hdm.detection.markings.foreground import Foreground
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.sight import AnchorRow
 from v2hdm.detection.weights import FOLDER, LANE_SCORE_FILE, being_fitted
@@ -43,10 +45,9 @@ from v2hdm.records import BoolArray, FloatArray, LaneDetection
 SEED = 921
 ROUNDS = 2
 LEAST_SHARE = 0.8
-_ROWS = 30
 _MOST_SLOPE = 10.0
 
-KEYS = {"alone": score.FEATURES, "among": score.TOLD}
+KEYS = {"alone": score.ALONE, "among": score.AMONG}
 
 Weights = dict[str, tuple[FloatArray, float]]
 """Those of :func:`v2hdm.detection.lanes.score.fitted`."""
@@ -59,7 +60,7 @@ class Seen:
     rows: list[AnchorRow]
     paint: list[LaneDetection]
     view: CameraView
-    looks: Looks
+    foreground: Foreground
     row_step_px: float
     lanes_px: list[FloatArray]
 
@@ -73,10 +74,10 @@ def seen(shown: Example, detector: Detector) -> Seen:
         view: CameraView,
         paint: list[LaneDetection],
         _: float,
-        looks: Looks,
+        foreground: Foreground,
         row_step_px: float,
     ) -> list[LaneDetection]:
-        kept.append(Seen(rows, list(paint), view, looks, row_step_px, shown.lanes_px))
+        kept.append(Seen(rows, list(paint), view, foreground, row_step_px, shown.lanes_px))
         return []
 
     with patch("v2hdm.detection.detector.link_anchors", spy):
@@ -86,49 +87,49 @@ def seen(shown: Example, detector: Detector) -> Seen:
 
 @dataclass
 class Proposed:
-    """The lines that are proposed in one image, their evidence (N, F), and which of them are true."""
+    """The lines that are proposed in one image, and which of them (N,) are true."""
 
     image: Seen
     points: LinePoints
     lines: list[Line]
     horizon: Horizon
-    evidence: FloatArray = field(init=False)
+    alone: FloatArray = field(init=False)
     true: BoolArray = field(init=False)
 
     def __post_init__(self) -> None:
-        self.evidence = score.evidence(
-            self.lines, self.points, self.image.view, self.horizon, self.image.looks
-        )
+        view, foreground = self.image.view, self.image.foreground
+        self.alone = score.features_alone(self.lines, self.points, view, self.horizon, foreground)
         self.true = np.array([self._is_true(line) for line in self.lines], dtype=np.bool_)
 
-    def told(self, alone: FloatArray) -> FloatArray:
-        """What tells of the lines (N, T), which have such log odds (N,) by themselves."""
-        return score.told(self.lines, self.points, self.horizon, alone)
+    def among(self, odds: FloatArray) -> FloatArray:
+        """The features (N, F) of the lines among each other, of such log odds (N,) alone."""
+        lines = [replace(line, log_odds=float(o)) for line, o in zip(self.lines, odds, strict=True)]
+        return score.features_among(lines, self.points, self.horizon)
 
     def _is_true(self, line: Line) -> bool:
-        below = self.points.below[line.certain]
-        at = np.linspace(below.min(), below.max(), _ROWS)
-        line_px = self.image.view.distort(self.horizon.pinhole_px(line.curve.along(basis(at)), at))
+        drawn = draw(line, self.points, self.image.view, self.horizon)
+        if drawn is None:
+            return False
+        own = self.points.points_px[line.members, 1]
+        seen = (drawn.points_px[:, 1] >= own.min()) & (drawn.points_px[:, 1] <= own.max())
+        line_px = drawn.points_px[seen] if seen.any() else drawn.points_px
         return max((share_on(lane, line_px) for lane in self.image.lanes_px), default=0.0) >= LEAST_SHARE
 
 
 def proposed(image: Seen, paint_step_m: float) -> Proposed | None:
     """The lines that are proposed in an image; None where there is nothing to make any of."""
-    found: list[Proposed] = []
-    find_lines = anchors.find_lines
-
-    def spy(
-        points: LinePoints, groups: list[np.ndarray], view: CameraView, horizon: Horizon, *_: object
-    ) -> list[Line]:
-        lines = find_lines(points, groups, view, horizon, paint_step_m, image.looks, -np.inf)
-        found.append(Proposed(image, points, lines, horizon))
-        return []
-
-    with patch.object(anchors, "find_lines", spy):
-        anchors.link_anchors(
-            image.rows, image.view, image.paint, paint_step_m, image.looks, image.row_step_px
-        )
-    return found[0] if found and found[0].lines else None
+    horizon = Horizon(image.view)
+    points, lines = lane_lines.propose(
+        image.rows,
+        image.view,
+        horizon,
+        image.paint,
+        paint_step_m,
+        image.foreground,
+        image.row_step_px,
+        -np.inf,
+    )
+    return Proposed(image, points, lines, horizon) if lines else None
 
 
 def share_on(lane_px: FloatArray, points_px: FloatArray) -> float:
@@ -146,32 +147,32 @@ class Gathered:
 
     def __init__(self, images: Sequence[Seen], paint_step_m: float):
         self._images = [found for image in images if (found := proposed(image, paint_step_m)) is not None]
-        self._evidence = np.concatenate([image.evidence for image in self._images])
+        self._alone = np.concatenate([image.alone for image in self._images])
         self._count = [len(image.lines) for image in self._images]
         self._fold = np.repeat(np.arange(len(self._count)) % FOLDS, self._count)
         self.true = np.concatenate([image.true for image in self._images])
 
     def odds(self, weights: Weights) -> FloatArray:
         """Log odds (N,) by such weights, among the others."""
-        told = self._told(self._evidence @ weights["alone"][0] + weights["alone"][1])
-        return np.asarray(told @ weights["among"][0] + weights["among"][1])
+        among = self._among(self._alone @ weights["alone"][0] + weights["alone"][1])
+        return np.asarray(among @ weights["among"][0] + weights["among"][1])
 
     def fit(self) -> tuple[Weights, FloatArray, FloatArray]:
         """Weights, and the log odds (N,) alone and among others by those of the other images."""
-        alone = self._left_out(self._evidence)
-        told = self._told(alone)
-        weights = {"alone": fit(self._evidence, self.true), "among": fit(told, self.true)}
-        return weights, alone, self._left_out(told)
+        alone = self._left_out(self._alone)
+        among = self._among(alone)
+        weights = {"alone": fit(self._alone, self.true), "among": fit(among, self.true)}
+        return weights, alone, self._left_out(among)
 
     def effects(self, weights: Weights) -> Weights:
         """What each feature adds to the log odds per standard deviation."""
-        told = self._told(self._evidence @ weights["alone"][0] + weights["alone"][1])
-        columns = {"alone": self._evidence, "among": told}
+        among = self._among(self._alone @ weights["alone"][0] + weights["alone"][1])
+        columns = {"alone": self._alone, "among": among}
         return {name: (weights[name][0] * columns[name].std(axis=0), 0.0) for name in weights}
 
-    def _told(self, alone: FloatArray) -> FloatArray:
+    def _among(self, alone: FloatArray) -> FloatArray:
         parts = np.split(alone, np.cumsum(self._count)[:-1])
-        return np.concatenate([image.told(part) for image, part in zip(self._images, parts, strict=True)])
+        return np.concatenate([image.among(part) for image, part in zip(self._images, parts, strict=True)])
 
     def _left_out(self, features: FloatArray) -> FloatArray:
         """Log odds (N,) of the lines of each fifth of the images, by a fit to the others."""
@@ -223,7 +224,7 @@ def fit_to(images: Sequence[Seen], paint_step_m: float) -> Weights:
     _, alone, among = gathered.fit()
     losses = [log_loss(odds, gathered.true) for odds in (alone, among)]
     print(f"log loss of images left out: alone {losses[0]:.3f}, among the others {losses[1]:.3f}")
-    given = gathered.odds(weights) > anchors.LEAST_LOG_ODDS
+    given = gathered.odds(weights) > lane_lines.LEAST_LOG_ODDS
     print(f"given: {(given & gathered.true).sum()} true, {(given & ~gathered.true).sum()} false")
     return weights
 

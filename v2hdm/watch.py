@@ -21,6 +21,7 @@ from v2hdm.detection.camera.mounting import camera_from_calibration, rough_calib
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.draw import draw_detections
 from v2hdm.detection.frames import Frame, camera_frames, image_frames, list_images, video_frames
+from v2hdm.detection.horizon import PitchVote
 from v2hdm.detection.image_file import IMAGE_SUFFIXES
 from v2hdm.detection.json_line import as_record
 from v2hdm.detection.options import DetectorOptions
@@ -146,6 +147,7 @@ def _found(
     """Every frame with what it shows."""
     frames = iter(job.frames if parsed.limit is None else islice(job.frames, parsed.limit))
     rough: RoadDetector | None = None
+    vote = PitchVote()
     while True:
         with stopwatch.image():
             with lap("read"):
@@ -158,17 +160,31 @@ def _found(
             _check_size(frame, road)
             found = road.detect(frame.pixels)
         yield frame, road, found
+        if road is not rough:
+            continue
+        pitch_rad = vote.add([lane.image for lane in found.lanes], detector.view(road.camera))
+        if pitch_rad is not None:
+            rough = _rough_road(frame, parsed, detector, float(np.rad2deg(pitch_rad)))
 
 
-def _rough_road(frame: Frame, parsed: argparse.Namespace, detector: Detector) -> RoadDetector:
-    """A detector for a camera of which only the image size is known; it says so."""
+def _rough_road(
+    frame: Frame, parsed: argparse.Namespace, detector: Detector, seen_pitch_deg: float | None = None
+) -> RoadDetector:
+    """A detector for a camera of unknown mounting; it says what it takes that to be."""
     height_m, pitch_deg, fov_deg = parsed.mounting or parsed.rough_mounting
     if not (0 < height_m < np.inf and -45 < pitch_deg < 85 and 10 <= fov_deg <= 150):
         raise ConfigError(
             f"--mounting {height_m:g} {pitch_deg:g} {fov_deg:g}: give a height above 0 m, a pitch "
             "of -45 to 85 deg (down is positive) and a field of view of 10 to 150 deg"
         )
-    if parsed.mounting is None:
+    if seen_pitch_deg is not None:
+        print(
+            f"the lines of {frame.name} and images before it meet on a horizon: taking the camera to look "
+            f"{seen_pitch_deg:.1f} deg down, not {pitch_deg:g}, from here on",
+            file=sys.stderr,
+        )
+        pitch_deg = seen_pitch_deg
+    elif parsed.mounting is None:
         print(
             f"no --camera: taking it to be {height_m:g} m up, {pitch_deg:g} deg down, {fov_deg:g} deg wide "
             "(--mounting says otherwise); positions in px only",

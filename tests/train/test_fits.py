@@ -94,7 +94,7 @@ def test_spots_of_sun_that_the_network_swears_are_markings_are_not_reported(show
 def test_lines_of_lanes_are_proposed_with_their_truth(shown, detector):
     found = proposed(seen(shown, detector), detector.options.lane_step_m)
     assert found is not None
-    assert len(found.lines) == len(found.evidence) == len(found.true)
+    assert len(found.lines) == len(found.alone) == len(found.true)
     assert found.true.any()
 
 

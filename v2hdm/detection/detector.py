@@ -11,9 +11,8 @@ import numpy as np
 
 from v2hdm.catalogue import LINE, SYMBOL, Catalogue, load_catalogue
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.lanes.anchors import link_anchors
 from v2hdm.detection.lanes.centre_lines import LanePaint, trace_lanes
-from v2hdm.detection.lanes.looks import Looks
+from v2hdm.detection.lanes.lines import link_anchors
 from v2hdm.detection.markings.blobs import find_blobs, outline_polygon
 from v2hdm.detection.markings.find import Readings, find_markings, read_markings
 from v2hdm.detection.markings.foreground import Foreground
@@ -77,7 +76,7 @@ class Detector:
         """
         seen = self.see(image_bgr, camera)
         with lap("lanes"):
-            lanes = self._lanes(image_bgr, seen)
+            lanes = self._lanes(seen)
         with lap("fit"):
             readings = self.read(image_bgr, seen)
         with lap("judge"):
@@ -150,12 +149,11 @@ class Detector:
             self._reach_px[camera.info.name] = view.first_row_within(self.options.max_range_m)
         return view
 
-    def _lanes(self, image_bgr: np.ndarray, seen: Seen) -> list[LaneDetection]:
+    def _lanes(self, seen: Seen) -> list[LaneDetection]:
         step_m, view = self.options.lane_step_m, seen.view
-        looks = Looks.of(image_bgr, seen.foreground)
         lanes = trace_lanes(self._lane_paint(seen.proposals), view, step_m, self.options.max_range_m)
         stride = self.network.info.lane_stride
-        return lanes + link_anchors(seen.sight.anchors, view, lanes, step_m, looks, stride)
+        return lanes + link_anchors(seen.sight.anchors, view, lanes, step_m, seen.foreground, stride)
 
     def _lane_paint(self, proposals: Sequence[Proposal]) -> list[LanePaint]:
         found = []

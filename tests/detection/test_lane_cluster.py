@@ -5,16 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.detection.pictures import foreground_of, make_camera, to_image
-from tests.detection.test_anchors import anchors_of, off_px, painted, straight
+from tests.detection.pictures import make_camera, to_image
+from tests.detection.test_lane_lines import anchors_of, off_px, painted, straight
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.lanes.anchors import link_anchors
-from v2hdm.detection.lanes.curves import Horizon, Prior
-from v2hdm.detection.lanes.looks import Looks
-from v2hdm.detection.lanes.points import LinePoints
-from v2hdm.detection.lanes.road import find_road
+from v2hdm.detection.lanes.cluster import find_road
+from v2hdm.detection.lanes.curve import Horizon, LinePoints, Prior, basis
+from v2hdm.detection.lanes.lines import link_anchors, propose
 from v2hdm.detection.sight import AnchorRow
-from v2hdm.records import LANE_DASH, LANE_LINE, LaneDetection
+from v2hdm.records import LANE_LINE, LaneDetection
 
 
 @pytest.fixture
@@ -79,13 +77,19 @@ def test_the_road_is_what_most_lines_agree_on_not_the_longest_other_one(view, cu
 
 
 def test_short_dashes_far_away_point_where_the_line_beside_them_does(view):
-    line, beside = straight(view, 1.6), straight(view, -1.8)
+    line, horizon = straight(view, 1.6), Horizon(view)
     dashes = [tilted(painted(line, view, *span), 0.7) for span in ((12, 14), (17, 19))]
-    (alone,) = link_anchors([], view, dashes)
-    found = link_anchors(anchors_of(view, [beside]), view, dashes)
-    (lane,) = [lane for lane in found if lane.identity == 1]
-    assert np.abs(off_px(lane, line)).max() < 8
-    assert lane.points_px[0, 1] > alone.points_px[0, 1] + 50, "it is known farther towards the vehicle"
+    near = line[(line[:, 1] > 200) & view.inside(line, 0)]
+    off = []
+    for beside in ([], [straight(view, -1.8)]):
+        points, lines = propose(
+            anchors_of(view, beside), view, horizon, dashes, 0.5, None, 8.0, least_log_odds=-np.inf
+        )
+        along, below = horizon.coordinates(view.undistort(near))
+        curves = [each.curve.along(basis(below)) for each in lines if points.is_paint[each.members].all()]
+        off.append(min(np.abs(curve - along).max() for curve in curves))
+    assert off[1] < 8
+    assert off[1] < 0.6 * off[0], "by themselves they do not"
 
 
 def tilted(lane: LaneDetection, by_px: float) -> LaneDetection:
@@ -110,61 +114,6 @@ def test_a_stroke_across_a_line_does_not_draw_it_to_the_middle(view):
     assert np.abs(off_px(lane, line)).max() < 1
 
 
-@pytest.mark.parametrize("kind", [LANE_LINE, LANE_DASH])
-@pytest.mark.parametrize(("length_m", "runs_on"), [(10, False), (3, True), (6, True)])
-def test_a_solid_line_ends_where_its_paint_does_and_a_dash_is_one_of_many(view, kind, length_m, runs_on):
-    """However it is called: no dash is as long as that."""
-    line = straight(view, 1.6)
-    ground = view.ground(view.undistort(line))
-    far = anchors_of(view, [line[ground[:, 0] > 12]])
-    dash = painted(line, view, 12, 12 + length_m)
-    (lane,) = link_anchors(far, view, [LaneDetection(kind, 0.9, dash.points_px)])
-    ends_px = dash.points_px[0, 1]
-    assert (lane.points_px[0, 1] > ends_px + 60) == runs_on
-
-
-def test_a_few_doubtful_crossings_far_beyond_its_paint_do_not_carry_a_solid_line_on(view):
-    line = straight(view, 1.6)
-    ground = view.ground(view.undistort(line))
-    rows = anchors_of(view, [line[ground[:, 0] > 12]])
-    strays = [AnchorRow(r.v_px, r.u_px, np.array([-2.0])) for r in anchors_of(view, [line])[4:40:12]]
-    solid = LaneDetection(LANE_LINE, 0.9, painted(line, view, 12, 22).points_px)
-    near = [row for row in strays if row.v_px > rows[0].v_px + 40]
-    assert near
-    (lane,) = link_anchors([*near, *rows], view, [solid])
-    assert lane.points_px[0, 1] < rows[0].v_px + 20
-
-
-def test_doubtful_crossings_row_by_row_carry_a_solid_line_on(view):
-    line = straight(view, 1.6)
-    ground = view.ground(view.undistort(line))
-    solid = LaneDetection(LANE_LINE, 0.9, painted(line, view, 12, 22).points_px)
-    sure = anchors_of(view, [line[ground[:, 0] > 12]])
-    faint = [AnchorRow(r.v_px, r.u_px, np.array([-0.5])) for r in anchors_of(view, [line])]
-    near = [row for row in faint if row.v_px > sure[0].v_px]
-    (lane,) = link_anchors([*near, *sure], view, [solid])
-    assert lane.points_px[0, 1] > near[0].v_px - 20
-
-
-@pytest.mark.parametrize(("paint_to_m", "ends"), [(12, True), (4, False)])
-def test_paint_tells_whether_crossings_carry_a_solid_line_on(view, paint_to_m, ends):
-    """A crossing on each row, surer than not: beyond the end of a line the network fades out as slowly."""
-    line = straight(view, 1.6)
-    ground = view.ground(view.undistort(line))
-    solid = LaneDetection(LANE_LINE, 0.9, painted(line, view, 12, 22).points_px)
-    sure = anchors_of(view, [line[ground[:, 0] > 12]])
-    near = [row for row in anchors_of(view, [line]) if row.v_px > sure[0].v_px]
-    near = [AnchorRow(row.v_px, row.u_px, np.array([0.5])) for row in near]
-    on = line[(ground[:, 0] > paint_to_m) & view.inside(line, 0)]
-    odds = np.full((view.info.height // 2, view.info.width // 2), -6.0, dtype=np.float32)
-    for u, v in (on / 2).astype(int):
-        odds[max(v - 4, 0) : v + 5, max(u - 2, 0) : u + 3] = 6.0
-    foreground = foreground_of(odds, np.zeros(odds.shape, dtype=np.int32), 0)
-    (lane,) = link_anchors([*near, *sure], view, [solid], looks=Looks(foreground=foreground))
-    ends_px = solid.points_px[0, 1]
-    assert lane.points_px[0, 1] > near[0].v_px - 20 if not ends else lane.points_px[0, 1] < ends_px + 20
-
-
 def test_a_line_whose_far_half_bends_away_a_little_stays_one(view):
     near = straight(view, 1.6)
     rows = anchors_of(view, [near])
@@ -172,17 +121,3 @@ def test_a_line_whose_far_half_bends_away_a_little_stays_one(view):
     bent = [AnchorRow(r.v_px, r.u_px + (4.0 if r.v_px < split else 0.0), r.odds) for r in rows]
     (lane,) = link_anchors(bent, view)
     assert np.ptp(lane.points_px[:, 1]) > 0.9 * (rows[0].v_px - rows[-1].v_px)
-
-
-@pytest.mark.parametrize(("odds", "carried"), [(-2.8, False), (-1.5, True)])
-def test_faint_crossings_carry_a_line_on_away_from_the_vehicle_as_far_as_they_speak_for_it(
-    view, odds, carried
-):
-    line = straight(view, 1.6)
-    ground = view.ground(view.undistort(line))
-    near = anchors_of(view, [line[ground[:, 0] < 15]])
-    far = [row for row in anchors_of(view, [line]) if row.v_px < near[-1].v_px]
-    far = [AnchorRow(row.v_px, row.u_px, np.array([odds])) for row in far]
-    (lane,) = link_anchors([*near, *far], view, [painted(line, view, 5, 14)])
-    ends_px = far[-1].v_px if carried else near[-1].v_px
-    assert lane.points_px[-1, 1] == pytest.approx(ends_px, abs=9)

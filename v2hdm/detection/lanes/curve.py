@@ -16,7 +16,13 @@ from functools import cached_property
 import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.records import FloatArray
+from v2hdm.records import BoolArray, FloatArray, IntArray
+
+NEIGHBOURS = 3.0
+"""Points of one line err together: that many tell as much as one."""
+
+_MODEL_SIGMA_M = 0.02
+"""By how much painted lines leave the curve."""
 
 _LEAST_BELOW_PX = 4.0
 """Nearer to the horizon than this nothing is known of the ground."""
@@ -68,6 +74,10 @@ class Horizon:
     def depth_m(self, below: FloatArray) -> FloatArray:
         """How far ahead of the camera the ground is (N,), m, at distances (N,) below the horizon, px."""
         return np.asarray(self._units[0] / (self.px_per_m * np.maximum(below, _LEAST_BELOW_PX)))
+
+    def below_px(self, depth_m: float) -> float:
+        """How far below the horizon, px, the ground at a depth is: the inverse of :meth:`depth_m`."""
+        return float(self._units[0] / (self.px_per_m * depth_m))
 
     def coordinates(self, pinhole_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Position along (N,) and below (N,) the horizon, px, of pinhole pixels (N, 2)."""
@@ -178,11 +188,6 @@ class Curve:
         return np.asarray(np.sqrt(((phi @ self.covariance) * phi).sum(axis=1)))
 
 
-def middle_of(first: Curve, second: Curve) -> Curve:
-    """The curve half way between two."""
-    return Curve((first.parameters + second.parameters) / 2, (first.covariance + second.covariance) / 2)
-
-
 def basis(below: FloatArray) -> FloatArray:
     """What (a, b, c) are multiplied by (N, 3) at distances (N,) below the horizon, px."""
     v = np.maximum(below, _LEAST_BELOW_PX) / _UNIT_PX
@@ -205,3 +210,88 @@ def _completed_square(information: FloatArray, moment: FloatArray) -> tuple[Floa
     m1 = moment[..., 1] - l10 * m0
     m2 = moment[..., 2] - l20 * m0 - l21 * m1
     return m0**2 / pivot0 + m1**2 / pivot1 + m2**2 / pivot2, np.log(pivot0 * pivot1 * pivot2)
+
+
+@dataclass(frozen=True)
+class LinePoints:
+    """N points of an image that lines may run through.
+
+    ``points_px`` (N, 2) recorded px; ``along`` and ``below`` (N,) their place about the horizon and ``phi``
+    (N, 3) the basis of curves there; ``sigma_px`` (N,) of each along the horizon; ``odds`` (N,) log odds;
+    ``ground`` (N, 2), vehicle frame; ``is_paint`` (N,): on the centre line of a piece of paint, not a
+    crossing of a row anchor.
+    """
+
+    points_px: FloatArray
+    along: FloatArray
+    below: FloatArray
+    phi: FloatArray
+    sigma_px: FloatArray
+    odds: FloatArray
+    ground: FloatArray
+    is_paint: BoolArray
+
+    @classmethod
+    def of(
+        cls, view: CameraView, horizon: Horizon, points_px: FloatArray, odds: FloatArray, sigma_px: FloatArray
+    ) -> LinePoints:
+        """Crossings of row anchors (N, 2) with standard deviations (N,)."""
+        pinhole_px = view.undistort(points_px)
+        along, below = horizon.coordinates(pinhole_px)
+        sigma = np.hypot(sigma_px, _MODEL_SIGMA_M * horizon.px_per_m * np.maximum(below, 0))
+        none = np.zeros(len(odds), dtype=np.bool_)
+        return cls(points_px, along, below, basis(below), sigma, odds, view.ground(pinhole_px), none)
+
+    def where(self, kept: BoolArray) -> LinePoints:
+        """Some of the points."""
+        return LinePoints(**{name: value[kept] for name, value in vars(self).items()})
+
+    def slopes(self, groups: list[IntArray]) -> FloatArray:
+        """Px along the horizon per px down (N,) of groups of points that are roughly a line each."""
+        members, ends = np.concatenate(groups), np.cumsum([len(group) for group in groups])
+        count, begins = np.diff(ends, prepend=0), [0, *ends[:-1]]
+        along, below = self.along[members], self.below[members]
+        down = below - np.repeat(np.add.reduceat(below, begins) / count, count)
+        return np.asarray(
+            np.add.reduceat(down * along, begins) / np.maximum(np.add.reduceat(down**2, begins), 1)
+        )
+
+    def evidence(self, horizon: Horizon, groups: list[IntArray], slopes: FloatArray) -> Evidence:
+        """What each of N groups of points, on lines of such ``slopes`` (N,), says of its line."""
+        members, count = np.concatenate(groups), [len(group) for group in groups]
+        sigma = self.sigma_px[members] * np.repeat(np.hypot(1, slopes), count) * np.sqrt(NEIGHBOURS)
+        u = self.along[members] - horizon.centre_px
+        return Evidence.of(self.phi[members], u, sigma, np.cumsum(count).tolist())
+
+
+@dataclass(frozen=True)
+class Span:
+    """A line on T rows of the image, ``below`` (T,) px below the horizon, from far to near.
+
+    ``present`` and ``painted`` (T,) are probabilities that it has not ended and that it shows paint there,
+    ``length_m`` (T,) is the ground that each row stands for and ``log_likelihood`` that of the line over that
+    of ground without one.
+    """
+
+    below: FloatArray
+    present: FloatArray
+    painted: FloatArray
+    length_m: FloatArray
+    log_likelihood: float
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line: its curve and the indices of its ``members`` among the points.
+
+    ``paint_m`` is the paint on it, ``log_ratio`` that of its probabilities along the road and anyhow, and
+    ``strand`` the other line of a double one.
+    """
+
+    curve: Curve
+    members: IntArray
+    paint_m: float
+    log_ratio: float
+    log_odds: float = 0.0
+    span: Span | None = None
+    strand: Line | None = None

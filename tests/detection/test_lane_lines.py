@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from tests.detection.pictures import make_camera, to_image
+from tests.detection.pictures import foreground_of, make_camera, to_image
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.lanes.anchors import link_anchors
+from v2hdm.detection.lanes.lines import link_anchors
 from v2hdm.detection.sight import AnchorRow
 from v2hdm.records import LANE_DASH, LaneDetection
 
@@ -41,9 +41,24 @@ def painted(line_px: np.ndarray, view: CameraView, near_m: float, far_m: float) 
 
 
 def off_px(lane: LaneDetection, line_px: np.ndarray) -> np.ndarray:
-    """How far the points of a lane are from a true line along their rows."""
+    """How far the points of a lane are from a true line along their rows, as far as that goes."""
     order = np.argsort(line_px[:, 1])
-    return np.interp(lane.points_px[:, 1], line_px[order, 1], line_px[order, 0]) - lane.points_px[:, 0]
+    u, v = lane.points_px.T
+    off = np.interp(v, line_px[order, 1], line_px[order, 0], left=np.nan, right=np.nan) - u
+    return off[np.isfinite(off)]
+
+
+def painted_on(view, lines_px):
+    """Log odds of paint of 5 on lines (N, 2) and of -5 elsewhere."""
+    odds = np.full((view.info.height // 2, view.info.width // 2), -5.0, dtype=np.float32)
+    for line_px in lines_px:
+        at = np.linspace(0, len(line_px) - 1, 16 * len(line_px))
+        for u, v in zip(
+            *(np.interp(at, np.arange(len(line_px)), line_px[:, k]) for k in (0, 1)), strict=True
+        ):
+            if 0 <= u < view.info.width and 0 <= v < view.info.height:
+                odds[int(v / 2), max(int(u / 2) - 2, 0) : int(u / 2) + 3] = 5.0
+    return foreground_of(odds, np.zeros(odds.shape, dtype=np.int32), 0)
 
 
 @pytest.fixture
@@ -100,7 +115,8 @@ def test_lines_that_run_side_by_side_are_not_joined_across_a_gap(view):
         for row in anchors_of(view, [line])
         if part(row.v_px)
     ]
-    assert len(link_anchors(rows, view)) == 2
+    paint = [painted(near, view, 4, 7), painted(far, view, 12, 16)]
+    assert len(link_anchors(rows, view, paint)) == 2
 
 
 def test_a_dash_nearby_and_one_far_away_are_one_line_where_one_curve_holds_both(view):
@@ -112,10 +128,12 @@ def test_a_dash_nearby_and_one_far_away_are_one_line_where_one_curve_holds_both(
     assert np.abs(off_px(lane, line)).max() < 5
 
 
-def test_paint_alone_makes_a_line_that_runs_on_towards_the_vehicle(view):
+def test_two_dashes_make_a_line_that_runs_on_towards_the_vehicle(view):
     line = straight(view, 1.0)
     paint = [painted(line, view, 7, 10), painted(line, view, 13, 16)]
-    (lane,) = link_anchors([], view, paint)
+    rows = anchors_of(view, [part.points_px for part in paint])
+    foreground = painted_on(view, [part.points_px for part in paint])
+    (lane,) = link_anchors(rows, view, paint, foreground=foreground)
     assert lane.points_px[0, 1] > paint[0].points_px[0, 1] + 60
     assert np.abs(off_px(lane, line)).max() < 1.0
     assert lane.sigma_px[0] > 1.5 * lane.sigma_px.min(), "less is known where nothing was seen"
@@ -132,7 +150,7 @@ def test_what_is_seen_about_the_horizon_bends_no_line(view):
     beyond = np.arange(rows[-1].v_px - STRIDE, rows[-1].v_px - 40, -STRIDE)
     hook = [AnchorRow(v, rows[-1].u_px + 30.0 * n, np.array([3.0])) for n, v in enumerate(beyond)]
     (lane,) = link_anchors(rows + hook, view)
-    assert lane.points_px[-1, 1] > beyond[0] - 2
+    assert np.abs(off_px(lane, line)).max() < 1.5
 
 
 def test_crossings_too_unlikely_by_themselves_carry_a_known_line_on(view):
@@ -147,16 +165,16 @@ def test_crossings_too_unlikely_by_themselves_carry_a_known_line_on(view):
 def test_a_double_line_is_one_boundary_along_its_middle(view):
     pair = [straight(view, 1.5), straight(view, 1.9)]
     (lane,) = link_anchors(anchors_of(view, pair), view, [painted(line, view, 5, 15) for line in pair])
-    near = lane.points_px[:, 1] > 200
-    assert np.abs(off_px(lane, straight(view, 1.7))[near]).max() < 2
+    near = straight(view, 1.7)
+    assert np.abs(off_px(lane, near[near[:, 1] > 200])).max() < 2
 
 
 def test_a_single_dash_beside_a_long_solid_line_makes_a_double_one(view):
     pair = [straight(view, 1.5), straight(view, 1.9)]
     paint = [painted(pair[0], view, 5, 20), painted(pair[1], view, 7, 9.5)]
     (lane,) = link_anchors(anchors_of(view, pair), view, paint)
-    near = lane.points_px[:, 1] > 200
-    assert np.abs(off_px(lane, straight(view, 1.7))[near]).max() < 2
+    near = straight(view, 1.7)
+    assert np.abs(off_px(lane, near[near[:, 1] > 200])).max() < 2
 
 
 def test_what_a_point_errs_by_is_within_its_stated_sigma(view):
@@ -168,5 +186,6 @@ def test_what_a_point_errs_by_is_within_its_stated_sigma(view):
         noise = np.repeat(rng.normal(0, 0.45, len(rows) // 3 + 1), 3)
         noisy = [AnchorRow(r.v_px, r.u_px + n, r.odds) for r, n in zip(rows, noise, strict=False)]
         (lane,) = link_anchors(noisy, view)
-        normalised.append(np.abs(off_px(lane, line) / lane.sigma_px))
+        on = (lane.points_px[:, 1] >= line[:, 1].min()) & (lane.points_px[:, 1] <= line[:, 1].max())
+        normalised.append(np.abs(off_px(lane, line) / lane.sigma_px[on]))
     assert 0.2 < np.quantile(np.concatenate(normalised), 0.95) < 2

@@ -1,0 +1,277 @@
+"""Along each line: where it is painted, where it runs on through gaps, and where it has ended.
+
+A hidden Markov model on rows of the image, from far to near. Its states are *ended*, *gap*, *solid* and
+*dash*; the rates at which one becomes another are per metre of ground. The evidence of a row is two log odds
+of the network: of the surest crossing on the line and of the surest paint about it. The forward and backward
+pass (L. Rabiner, "A tutorial on hidden Markov models", Proc. IEEE 77, 1989) gives the probability of each
+state on each row and the likelihood of the line over that of ground without one. Two lines that are painted
+side by side are the strands of one double line: it runs along their middle where both are present, else
+along the one that is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from v2hdm.detection.camera.view import FARTHEST_M, CameraView
+from v2hdm.detection.lanes.curve import NEIGHBOURS, Horizon, Line, LinePoints, Span, basis
+from v2hdm.detection.markings.foreground import Foreground
+from v2hdm.detection.odds import as_probability
+from v2hdm.records import LANE_BOUNDARY, BoolArray, FloatArray, LaneDetection
+
+DRAWN_STEP_PX = 8.0
+"""Rows of the image from one point of a line to the next, px."""
+
+_ENDED, _GAP, _SOLID, _DASH = range(4)
+_DASH_STAGES = 3
+"""Stages of a dash: its length is Erlang's distribution, which scatters about the mean by 58 %."""
+
+_STATES = _DASH + _DASH_STAGES
+_DASH_M, _GAP_M = 3.6, 5.1
+"""Mean lengths of dashes and of the gaps between them, m, in the renders (train/scenes/paint)."""
+
+_SOLID_M, _DASHED_M, _ENDED_M = 100.0, 120.0, 60.0
+"""Mean lengths, m, of solid lines, of rows of dashes, and of bare ground from one line to the next on a
+curve; fitted to renders. After the ground a solid line is as likely as a row of dashes."""
+
+_CROSSING_WEIGHT, _CROSSING_EVEN, _CROSSING_RANGE = 0.05, -2.7, (-3.0, 6.7)
+"""A crossing of log odds x, clipped to the range, adds weight * (x - even) to a line's log likelihood.
+Weights are small because rows err together; all six numbers are fitted to renders."""
+
+_PAINT_WEIGHT, _PAINT_EVEN, _PAINT_RANGE = 0.3, -1.0, (-4.0, 4.0)
+"""The same for paint and the log likelihoods of *solid* and *dash*."""
+
+_HALF_WIDTH_M, _LEAST_HALF_WIDTH_PX = 0.06, 4.0
+_ACROSS = np.linspace(-1.0, 1.0, 7)
+"""Paint of a line is looked for so far to either side of its curve, at so many places."""
+
+_CROSSING_M = 0.3
+"""Lines that lie so far to the left of another one here and so far to its right there cross it."""
+
+_DOUBLE_M = 0.75
+"""Lines nearer than this are one boundary: two strands if both show paint abreast, else one line twice."""
+
+_LEAST_ABREAST_M = 1.0
+"""Both strands of a double line show paint on so much ground abreast."""
+
+_ONE_LINE_M = 0.12
+"""Lines nearer to each other than this are one."""
+
+_CERTAIN_SIGMA_M = 0.3
+"""Rows on which a line is known worse than this tell nothing of its place beside others."""
+
+_EVEN = 0.5
+"""A line is where it is present rather than not."""
+
+_SMOOTH_PX = 24.0
+_FREEDOM_M = 0.03
+"""A line follows its points within such a distance, and by so much."""
+
+_EXTENSION_SIGMA = 0.03
+"""Beyond its own points a line is drawn while it is known within this share of the image's width."""
+
+
+def with_spans(
+    lines: Sequence[Line],
+    points: LinePoints,
+    view: CameraView,
+    horizon: Horizon,
+    foreground: Foreground | None,
+    row_step_px: float,
+) -> list[Line]:
+    """The lines with their :class:`Span`.
+
+    Args:
+        lines: Those lines.
+        points: The points of the image.
+        view: The camera.
+        horizon: Its horizon.
+        foreground: The network's log odds of paint, if they are known.
+        row_step_px: How far apart row anchors are, twice as far where half the resolution is looked at.
+    """
+    if not lines:
+        return []
+    corners = np.array([[0.0, view.info.height - 1.0], [view.info.width - 1.0, view.info.height - 1.0]])
+    lowest = float(horizon.coordinates(view.undistort(corners))[1].max())
+    below = np.arange(horizon.below_px(FARTHEST_M), lowest + DRAWN_STEP_PX, DRAWN_STEP_PX)
+    along = np.array([line.curve.parameters for line in lines]) @ basis(below).T
+    beside_m = (along - horizon.centre_px) / (horizon.px_per_m * below)
+    step_m = np.hypot(np.diff(horizon.depth_m(below)), np.diff(beside_m, axis=1))
+    half_px = np.maximum(_HALF_WIDTH_M * horizon.px_per_m * below, _LEAST_HALF_WIDTH_PX)
+    across = along[..., None] + half_px[:, None] * _ACROSS
+    rows = np.broadcast_to(below[:, None], across.shape)
+    places_px = view.distort(horizon.pinhole_px(across.ravel(), rows.ravel())).reshape(*across.shape, 2)
+    likelihood = np.zeros((*along.shape, _STATES))
+    crossing = _crossings(lines, points, view, below, row_step_px)
+    likelihood[..., _GAP:] = _evidence(crossing, _CROSSING_WEIGHT, _CROSSING_EVEN, _CROSSING_RANGE)[..., None]
+    if foreground is not None:
+        paint = foreground.odds_at(places_px).max(axis=2)
+        paint = _evidence(paint, _PAINT_WEIGHT, _PAINT_EVEN, _PAINT_RANGE)
+        likelihood[..., _SOLID:] += paint[..., None]
+    middle_px = places_px[:, :, len(_ACROSS) // 2]
+    likelihood *= view.inside(middle_px, 0)[..., None]
+    states, total = _forward_backward(likelihood, step_m)
+    length_m = (np.pad(step_m, [(0, 0), (0, 1)]) + np.pad(step_m, [(0, 0), (1, 0)])) / 2
+    present, painted = 1 - states[..., _ENDED], states[..., _SOLID:].sum(axis=2)
+    each = zip(lines, present, painted, length_m, total.tolist(), strict=True)
+    return [replace(line, span=Span(below, *rest)) for line, *rest in each]
+
+
+def _evidence(odds: FloatArray, weight: float, even: float, bounds: tuple[float, float]) -> FloatArray:
+    return np.asarray(weight * (np.clip(odds, *bounds) - even))
+
+
+def _crossings(
+    lines: Sequence[Line], points: LinePoints, view: CameraView, below: FloatArray, row_step_px: float
+) -> FloatArray:
+    """Log odds (N, T) of the surest crossing of each line near each row; -inf where there is none."""
+    out = np.full((len(lines), len(below)), -np.inf)
+    for k, line in enumerate(lines):
+        own = line.members[~points.is_paint[line.members]]
+        reach_px = np.where(view.coarse(points.points_px[own, 1]), row_step_px, row_step_px / 2)
+        near = np.abs(below[:, None] - points.below[own]) <= reach_px + 1
+        out[k] = np.where(near, points.odds[own], -np.inf).max(axis=1, initial=-np.inf)
+    return out
+
+
+def _rates() -> FloatArray:
+    """Changes of state per metre of ground (S, S); rows sum up to nought."""
+    rates = np.zeros((_STATES, _STATES))
+    rates[_ENDED, _SOLID] = rates[_ENDED, _GAP] = 0.5 / _ENDED_M
+    rates[_GAP:, _ENDED] = 1 / _DASHED_M
+    rates[_SOLID, _ENDED] = 1 / _SOLID_M
+    rates[_GAP, _DASH] = 1 / _GAP_M
+    stages = [*range(_DASH, _STATES), _GAP]
+    rates[stages[:-1], stages[1:]] = _DASH_STAGES / _DASH_M
+    return np.asarray(rates - np.diag(rates.sum(axis=1)))
+
+
+@cache
+def _modes() -> tuple[np.ndarray, np.ndarray, np.ndarray, FloatArray]:
+    """Eigenvalues (S,), right and left eigenvectors (S, S) of the rates; shares (S,) of the states."""
+    values, right = np.linalg.eig(_rates())
+    left = np.linalg.inv(right)
+    shares = left[np.argmax(values.real)].real
+    return values, right, left, shares / shares.sum()
+
+
+def _forward_backward(likelihood: FloatArray, step_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Probability of each state (N, T, S) and log likelihood (N,) of all rows.
+
+    Args:
+        likelihood: Logarithms of those of each row in each state (N, T, S).
+        step_m: Ground from each row to the next (N, T - 1).
+    """
+    values, right, left, shares = _modes()
+    move = np.maximum(((right * np.exp(values * step_m[..., None])[..., None, :]) @ left).real, 0.0)
+    seen = np.exp(likelihood)
+    forward, scale = np.empty_like(seen), np.empty(seen.shape[:2])
+    state = np.broadcast_to(shares, seen[:, 0].shape)
+    for t in range(seen.shape[1]):
+        state = (state if t == 0 else (state[:, None] @ move[:, t - 1])[:, 0]) * seen[:, t]
+        scale[:, t] = state.sum(axis=1)
+        state = state / scale[:, t, None]
+        forward[:, t] = state
+    after = np.ones_like(state)
+    for t in range(seen.shape[1] - 2, -1, -1):
+        after = (move[:, t] @ (after * seen[:, t + 1])[..., None])[..., 0] / scale[:, t + 1, None]
+        forward[:, t] *= after
+    return forward, np.log(scale).sum(axis=1)
+
+
+def boundaries(lines: Sequence[Line], points: LinePoints, horizon: Horizon) -> list[Line]:
+    """The lines, best first, without those that repeat or cross a better one; a double one has a strand."""
+    kept: list[Line] = []
+    for line in lines:
+        for k, other in enumerate(kept):
+            relation = _relation(line, other, points, horizon)
+            if relation == _DOUBLES and other.strand is None:
+                kept[k] = replace(other, strand=line)
+            if relation != _APART:
+                break
+        else:
+            kept.append(line)
+    return kept
+
+
+_APART, _REPEATS, _DOUBLES = range(3)
+
+
+def _relation(line: Line, other: Line, points: LinePoints, horizon: Horizon) -> int:
+    """Whether a line is apart from another, repeats or crosses it, or is the other strand of a double one."""
+    assert line.span is not None
+    assert other.span is not None
+    phi, px_per_m = basis(line.span.below), horizon.px_per_m * line.span.below
+    sigma_m, other_sigma_m = (each.curve.sigma(phi) / px_per_m for each in (line, other))
+    offset_m = (line.curve.along(phi) - other.curve.along(phi)) / px_per_m
+    known = (sigma_m < _CERTAIN_SIGMA_M) & (other_sigma_m < _CERTAIN_SIGMA_M)
+    seen, other_seen = (_seen(each, points, line.span.below) for each in (line, other))
+    from_row = max(int(np.argmax(seen)), int(np.argmax(other_seen)))
+    crossed = offset_m[from_row:][(known & (seen | other_seen))[from_row:]]
+    if (crossed < -_CROSSING_M).any() and (crossed > _CROSSING_M).any():
+        return _REPEATS
+    there = seen & other_seen if (seen & other_seen).any() else seen
+    there = there & (other_sigma_m < _CERTAIN_SIGMA_M)
+    if not there.any() or np.abs(offset_m[there]).max() > _DOUBLE_M:
+        return _APART
+    abreast_m = float((line.span.length_m * line.span.painted) @ other.span.painted)
+    abreast_m = min(abreast_m, line.paint_m, other.paint_m)
+    is_double = abreast_m >= _LEAST_ABREAST_M and abs(np.median(offset_m[there])) > _ONE_LINE_M
+    return _DOUBLES if is_double else _REPEATS
+
+
+def _seen(line: Line, points: LinePoints, below: FloatArray) -> BoolArray:
+    """Which rows (T,) lie between the nearest and the farthest point of a line; one at least."""
+    own = points.below[line.members]
+    rows = np.arange(len(below))
+    first, last = np.searchsorted(below, (own.min(), own.max()))
+    return np.asarray((rows >= min(first, len(below) - 1)) & (rows <= last), dtype=np.bool_)
+
+
+def draw(line: Line, points: LinePoints, view: CameraView, horizon: Horizon) -> LaneDetection | None:
+    """A line's points in the image, near to far, with their standard deviations; None if it has not two.
+
+    A double line is drawn along its middle where both strands are present, and along the one that goes on.
+    """
+    assert line.span is not None
+    below, present = line.span.below, line.span.present
+    along, sigma = _followed(points, line, horizon, below)
+    if line.strand is not None and line.strand.span is not None:
+        other = line.strand.span.present
+        beside, beside_sigma = _followed(points, line.strand, horizon, below)
+        share = other / np.maximum(present + other, 1e-9)
+        along, sigma = along + share * (beside - along), sigma + share * (beside_sigma - sigma)
+        present = np.maximum(present, other)
+    rows, drawn = np.arange(len(below)), np.flatnonzero(present > _EVEN)
+    if not len(drawn):
+        return None
+    points_px = view.distort(horizon.pinhole_px(along, below))
+    own = points.below[line.members]
+    kept = (rows >= drawn[0]) & (rows <= drawn[-1]) & view.inside(points_px, -DRAWN_STEP_PX)
+    kept &= (sigma < _EXTENSION_SIGMA * view.info.width) | ((below >= own.min()) & (below <= own.max()))
+    if kept.sum() < 2:
+        return None
+    score = float(as_probability(np.array(line.log_odds)))
+    return LaneDetection(LANE_BOUNDARY, score, points_px[kept][::-1], sigma_px=sigma[kept][::-1])
+
+
+def _followed(
+    points: LinePoints, line: Line, horizon: Horizon, at: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Where a line is along the horizon and its standard deviation (N,), px, ``at`` (N,) px below it.
+
+    The mean of the points around, weighted, and of the curve, as good as lines follow curves.
+    """
+    phi = basis(at)
+    curve_sigma, along = line.curve.sigma(phi), line.curve.along(phi)
+    members = line.members
+    off = points.along[members] - line.curve.along(points.phi[members])
+    near = np.maximum(1 - np.abs(at[:, None] - points.below[members]) / _SMOOTH_PX, 0)
+    weight = near / (NEIGHBOURS * points.sigma_px[members] ** 2)
+    own = 1 / (curve_sigma**2 + (_FREEDOM_M * horizon.px_per_m * at) ** 2)
+    total = weight.sum(axis=1) + own
+    return along + weight @ off / total, np.sqrt(1 / total)
