@@ -9,10 +9,11 @@ import pytest
 
 from train.examples import Example, example
 from v2hdm.detect import main
-from v2hdm.detection.camera.mounting import camera_from_calibration, guessed_extrinsic, rough_calibration
+from v2hdm.detection.camera.mounting import camera_from_calibration, rough_calibration
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.horizon import PitchVote, estimate_pitch, guessed_pitch_rad
+from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.records import LANE_BOUNDARY, LANE_LINE, LaneDetection
 
 HEIGHT_M, FOV_DEG = 1.5, 60.0
@@ -90,7 +91,7 @@ def test_rendered_views_are_corrected_to_within_a_degree_or_left_alone(detector,
     corrected = 0
     for index in RENDERED:
         shown = rendered(index)
-        true = guessed_extrinsic(shown.camera)
+        true = extrinsic_from_ipm(shown.camera.info, shown.camera.ipm[shown.camera.initial_ipm])
         pitch_rad = guessed_pitch_rad(CameraView(shown.camera))
         height_m = float(-(true[:3, :3].T @ true[:3, 3])[2])
         guess = rough_calibration("c", 1280, 720, height_m, np.rad2deg(pitch_rad) + off_deg, FOV_DEG)
