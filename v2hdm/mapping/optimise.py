@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from v2hdm.adjust import Status, select_model
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.geometry.ground import extrinsic_from_ipm
-from v2hdm.mapping.association.groups import Association, fuse_groups, same_groups
+from v2hdm.mapping.association.groups import Association, fuse_groups, in_view, same_groups
 from v2hdm.mapping.association.merge import merge_groups
 from v2hdm.mapping.association.tracks import Uncertainty, build_tracks
 from v2hdm.mapping.bundle import (
@@ -100,9 +100,9 @@ class Optimiser:
             association = self._associate(bundle.rig)
             if same_groups(association, bundle.association):
                 break
-            bundle = self._solve(association, self._locate(bundle.rig).valid, bundle.rig)
+            bundle = self._solve(association, self._usable(association, bundle.rig), bundle.rig)
             self._reweigh(bundle)
-        usable = self._locate(bundle.rig).valid
+        usable = self._usable(bundle.association, bundle.rig)
         settled = settle_corner_order(bundle, self._sightings, usable)
         if settled is not bundle.association:
             tell("joint solve with settled corners")
@@ -130,7 +130,7 @@ class Optimiser:
         """Each camera's clock offset by a solve that expects none in particular, from ``bundle``."""
         model = full_model(self._pose_noise, self._options, "clock", bundle.model.variance_factor)
         model = replace(model, clock_sigma_s=LOOSE_CLOCK_SIGMA_S)
-        usable = self._locate(bundle.rig).valid
+        usable = self._usable(bundle.association, bundle.rig)
         solved = solve_bundle(
             self._sightings, bundle.association, usable, bundle.rig, self._cameras, model
         ).solution
@@ -142,7 +142,8 @@ class Optimiser:
         def link(rig: Rig, coarse: bool) -> tuple[Association, BoolArray]:
             located, options = self._locate(rig), self._options.association
             direction_rad = options.ipm_sigma_rad if coarse else options.refined_sigma_rad
-            return self._track(rig, located, direction_rad), located.valid
+            tracks = self._track(rig, located, direction_rad)
+            return tracks, self._usable(tracks, rig)
 
         mapper = IncrementalMapper(
             self._sightings, self.initial_rig, self._cameras, self._pose_noise, self._options, link
@@ -166,8 +167,13 @@ class Optimiser:
         """Ground positions, restricted to the range within which observations are used."""
         located = locate(self._sightings, rig)
         with np.errstate(invalid="ignore"):
-            located.valid[:] &= located.range_m <= self._options.max_range_m
-        return located
+            near = located.range_m <= self._options.max_range_m
+        return replace(located, valid=located.valid & near, informs=located.informs & near)
+
+    def _usable(self, association: Association, rig: Rig) -> BoolArray:
+        """Corners (S, 4) that a joint solve may use, given where their groups are."""
+        jitter_rad = self._pose_noise.roll_pitch_rad
+        return in_view(association, self._locate(rig), self._sightings, rig, jitter_rad)
 
     def _track(self, rig: Rig, located: Located, direction_rad: float) -> Association:
         noise = self._pose_noise
