@@ -70,7 +70,7 @@ def noise_scale(mahalanobis2: FloatArray) -> float:
 
 
 def as_of_point(squared_of_line: FloatArray) -> FloatArray:
-    """Squared residuals of lines, chi-square of one degree of freedom, as equally likely ones of points (two)."""
+    """Squared residuals of lines, chi-square of one degree of freedom, as equally likely ones of points."""
     return np.asarray(-2 * chi2.logsf(squared_of_line, 1))
 
 

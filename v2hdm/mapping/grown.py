@@ -53,8 +53,8 @@ class Grown:
 
     ``rig`` holds the final extrinsics and poses; ``grown`` goes on with the next drive. Sightings are part
     of markings as ``association`` says, as far as their corners are ``usable`` (S, 4). Reprojection errors
-    are root mean squares over the points among the accepted ``observations`` of accepted markings, under the final and the
-    initial extrinsics.
+    are root mean squares over the points among the accepted ``observations`` of accepted markings, under the
+    final and the initial extrinsics.
     """
 
     grown: IncrementalMap

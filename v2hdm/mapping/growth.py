@@ -76,8 +76,10 @@ def _order_of_sight(optimised: Optimised) -> IntArray:
 def _markings(bundle: Bundle, optimised: Optimised, chosen: IntArray) -> tuple[Marking, ...]:
     """The map so far; markings of too few corners, which the whole map's shapes would place, are left out."""
     solved = solved_places(bundle).subset(optimised.groups[chosen])
-    whole = solved.known.all(axis=1)
-    kind = np.array([CORNERED_CLASSES.index(optimised.markings[m].kind) for m in chosen[whole]], dtype=np.int64)
+    whole = np.flatnonzero(solved.known.all(axis=1))
+    kind = np.array(
+        [CORNERED_CLASSES.index(optimised.markings[m].kind) for m in chosen[whole]], dtype=np.int64
+    )
     nothing_counted = Counts(*np.zeros((6, len(kind)), dtype=np.int64))
     shaped = posterior(solved.subset(whole), kind, nothing_counted).places
     return tuple(

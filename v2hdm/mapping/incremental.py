@@ -223,7 +223,7 @@ class IncrementalMapper:
             self._settle()
             self._corner_counts.append(0)
             newest += 1
-        known = np.isfinite(track.corners_map).all(axis=1)
+        known = np.asarray(np.isfinite(track.corners_map).all(axis=1))
         return Place(newest, np.full(4, -1, dtype=np.int64), track.kind, set(), known, track.corners_map)
 
     def _settle(self) -> None:

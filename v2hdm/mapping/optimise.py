@@ -30,7 +30,6 @@ from v2hdm.mapping.bundle import (
     full_model,
     solve_bundle,
 )
-from v2hdm.mapping.corner_order import settle_corner_order
 from v2hdm.mapping.grown import Grown
 from v2hdm.mapping.incremental import IncrementalMapper
 from v2hdm.mapping.markings.conclude import Evidence, Optimised, conclude
@@ -101,12 +100,6 @@ class Optimiser:
             if same_groups(association, bundle.association):
                 break
             bundle = self._solve(association, self._usable(association, bundle.rig), bundle.rig)
-            self._reweigh(bundle)
-        usable = self._usable(bundle.association, bundle.rig)
-        settled = settle_corner_order(bundle, self._sightings, usable)
-        if settled is not bundle.association:
-            tell("joint solve with settled corners")
-            bundle = self._solve(settled, usable, bundle.rig)
             self._reweigh(bundle)
         return bundle
 

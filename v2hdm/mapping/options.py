@@ -14,8 +14,8 @@ BATCH = "batch"
 INCREMENTAL = "incremental"
 AUTO = "auto"
 LEAST_SIGHTINGS = 3
-"""Images that must show a marking where nothing else is weighed: in the naive methods, and of a track that the
-incremental map takes up."""
+"""Images that must show a marking where nothing else is weighed: in the naive methods, and of a track before
+the incremental map takes it up."""
 
 POSE_MODELS: tuple[str, ...] = (AUTO, "paper", "roll_pitch", "full", "heave", "clock")
 """What ``mapping.pose_model`` may be: those of :data:`v2hdm.adjust.MODELS`, or ``auto``."""

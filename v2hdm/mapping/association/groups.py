@@ -115,14 +115,18 @@ def fuse_groups(association: Association, located: Located, jitter_rad: float) -
     )
 
 
-def in_view(association: Association, located: Located, sightings: Sightings, rig: Rig, jitter_rad: float) -> BoolArray:
-    """Which corners (S, 4) the adjustment may use: points, and those on lines whose corner the camera can see.
+def in_view(
+    association: Association, located: Located, sightings: Sightings, rig: Rig, jitter_rad: float
+) -> BoolArray:
+    """Which corners (S, 4) the adjustment may use: points, and those on lines that the camera can see.
 
     A dash that passes under the vehicle is cut by the image's border; its side is a line of the image, but
     where its corner lies behind the camera the line cannot be had by projecting the corner.
     """
     fused = fuse_groups(association, located, jitter_rad)
-    cam_from_map = rig.cam_from_vehicle[sightings.camera] @ np.linalg.inv(rig.map_from_vehicle[sightings.frame])
+    cam_from_map = rig.cam_from_vehicle[sightings.camera] @ np.linalg.inv(
+        rig.map_from_vehicle[sightings.frame]
+    )
     group = np.maximum(association.group, 0)
     corners = fused.corners_map[group] if association.count else np.full(located.corners_map.shape, np.nan)
     _, depth_m = project_ground(rig.intrinsic[sightings.camera], cam_from_map, corners)

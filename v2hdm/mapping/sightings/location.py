@@ -68,7 +68,7 @@ def locate(sightings: Sightings, rig: Rig) -> Located:
     centre_vehicle = camera_centres(rig.cam_from_vehicle)[camera]
     poses = rig.map_from_vehicle[frame]
     centre_map = (poses[:, :3, :3] @ centre_vehicle[..., None])[..., 0] + poses[:, :3, 3]
-    finite = np.isfinite(corners_map).all(axis=-1) & np.isfinite(covariance).all(axis=(-1, -2))
+    finite = np.asarray(np.isfinite(corners_map).all(axis=-1) & np.isfinite(covariance).all(axis=(-1, -2)))
     smallest = np.linalg.eigvalsh(np.where(finite[..., None, None], covariance, np.eye(2)))[..., 0]
     informs = sightings.informs & finite & (smallest < _HORIZON_M2)
     return Located(

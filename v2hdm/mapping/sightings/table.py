@@ -64,7 +64,8 @@ class Sightings:
         The end of a dash that the image's border cuts is such a corner: its sigma is small across the dash
         and large along it. A corner that is no point, but claims to be small in every direction, is neither.
         """
-        finite = np.isfinite(self.covariance_px).all(axis=(2, 3)) & np.isfinite(self.corners_pinhole_px).all(2)
+        finite = np.asarray(np.isfinite(self.covariance_px).all(axis=(2, 3)))
+        finite &= np.isfinite(self.corners_pinhole_px).all(axis=2)
         variance = np.linalg.eigvalsh(np.where(finite[..., None, None], self.covariance_px, np.eye(2)))
         line = (variance[..., 0] <= SIDE_SIGMA_PX**2) & (variance[..., 1] > POINT_SIGMA_PX**2)
         return np.asarray(finite & (self.valid | line))

@@ -1,7 +1,7 @@
 """The shapes that the markings of a class have in common, learned from the drive.
 
-The diamonds of a yard are painted with one stencil, the dashes of a road with one roller: a marking seen well a
-hundred times over says how large the next one is, which was seen four times, one of its corners under a puddle
+The diamonds of a yard are painted with one stencil, the dashes of a road with one roller. A hundred markings
+that were seen well say how large the next one is, which was seen four times, one corner under a puddle
 (empirical Bayes: Efron and Morris, Stein's estimation rule and its competitors, JASA 1973). All classes are
 parallelograms: half the diagonals say all of a shape.
 """
@@ -74,7 +74,9 @@ class Laid:
     @property
     def directions(self) -> FloatArray:
         """Orthonormal directions (N, 5, 8)."""
-        return np.asarray(np.swapaxes(np.linalg.qr(_rigid(self.corners_map), mode="complete")[0][:, :, 3:], 1, 2))
+        return np.asarray(
+            np.swapaxes(np.linalg.qr(_rigid(self.corners_map), mode="complete")[0][:, :, 3:], 1, 2)
+        )
 
     def in_frame_of_shape(self, corners_map: FloatArray) -> FloatArray:
         """Corners (N, 4, 2) in the frame and order of the shape."""
@@ -95,11 +97,13 @@ def lay(shape: FloatArray, sigma_m: float, places: Places) -> tuple[Laid, Laid]:
     A parallelogram looks the same from both ends, so that one shift by a corner is all there is to try: the
     better of the two ways comes first.
     """
-    information = np.linalg.inv(places.covariance_m2 + sigma_m**2 * np.eye(8))
+    information = np.asarray(np.linalg.inv(places.covariance_m2 + sigma_m**2 * np.eye(8)), np.float64)
     ways = [_lay(np.roll(shape, -shift, axis=0), places, information) for shift in (0, 1)]
     best = np.argmin(np.stack([way[3] for way in ways]), axis=0)
+    rows = np.arange(len(places))
+    placed, rotation, centre = (np.stack([way[k] for way in ways]) for k in range(3))
     first, second = (
-        Laid(*(np.stack([way[k] for way in ways])[shift, np.arange(len(places))] for k in range(3)), shift)
+        Laid(placed[shift, rows], rotation[shift, rows], centre[shift, rows], shift)
         for shift in (best, 1 - best)
     )
     return first, second

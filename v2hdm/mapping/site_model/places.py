@@ -32,7 +32,7 @@ class Places:
     @classmethod
     def seen(cls, corners_map: FloatArray, covariance_m2: FloatArray) -> Places:
         """Places of corners (G, 4, 2) and covariances (G, 8, 8) that are nan where a corner was not seen."""
-        unseen = np.isnan(corners_map).any(axis=2)
+        unseen = np.asarray(np.isnan(corners_map).any(axis=2))
         count = np.maximum((~unseen).sum(axis=1), 1)
         centre = np.where(unseen[..., None], 0.0, corners_map).sum(axis=1) / count[:, None]
         rows = np.repeat(unseen, 2, axis=1)

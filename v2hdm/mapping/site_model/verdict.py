@@ -76,7 +76,7 @@ class Seen:
 
 @dataclass(frozen=True)
 class Judged:
-    """G places with their corners, and of each the reason why it is no marking of the map, None if it is one."""
+    """G places, and of each the reason why it is no marking of the map, None if it is one."""
 
     kind: IntArray
     places: Places
