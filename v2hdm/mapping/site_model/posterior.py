@@ -2,10 +2,10 @@
 
 A hypothesis says how the painted corners scatter about a laid shape (covariance N), and how the solved
 corners scatter about the painted ones: P of the adjustment, and O for edges that all images misplace alike.
-In the five directions other than rigid motions, about which no hypothesis says anything, the deviation r of the
-solved corners from the laid shape has the marginal likelihood N(r; 0, P + O + N). A hypothesis of more freedom
-spreads over a larger volume, so that all compare fairly. How often each kind of hypothesis holds is learned
-from the drive, class by class (expectation maximisation with a Dirichlet prior).
+No hypothesis says anything about rigid motions. In the five other directions the deviation r of the solved
+corners from the laid shape has the marginal likelihood N(r; 0, P + O + N). A hypothesis of more freedom
+spreads over a larger volume, so that all compare fairly. How often each kind holds is learned from the drive,
+class by class (expectation maximisation with a Dirichlet prior).
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from scipy.special import betaln, logsumexp
 from scipy.stats import norm
 
-from v2hdm.mapping.markings.paint_error import PaintError, learn_paint_error
 from v2hdm.mapping.site_model.class_shapes import (
     SHAPE_SIGMA_M,
     Laid,
@@ -27,6 +26,7 @@ from v2hdm.mapping.site_model.class_shapes import (
     learn_shapes,
     parallelograms,
 )
+from v2hdm.mapping.site_model.paint_error import PaintError, learn_paint_error
 from v2hdm.mapping.site_model.places import Counts, Places
 from v2hdm.records import FloatArray
 
