@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from tests.mapping.scene import Scene, SceneOptions, make_scene
 from tests.mapping.test_methods import MATCH_M, match
+from v2hdm.mapping.association.attach import attach
 from v2hdm.mapping.association.groups import fuse_groups, in_view
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.optimise import Optimiser, initial_rig
@@ -39,16 +41,27 @@ def cut_short(seen: MarkingDetection, rng: np.random.Generator) -> MarkingDetect
     return replace(seen, corners_px=corners, covariance_px=covariance, corner_valid=valid)
 
 
-def with_cut_dashes(scene: Scene, share: float) -> list[ImageDetections]:
+def both_ends_hidden(seen: MarkingDetection, rng: np.random.Generator) -> MarkingDetection:
+    """A dash of which nothing but the sides is known."""
+    sides = np.roll(seen.corners_px, -1, axis=0) - seen.corners_px
+    along = sides[np.argmax(np.linalg.norm(sides, axis=1))]
+    along = along / np.linalg.norm(along)
+    covariance = seen.covariance_px + rng.uniform(100, 1000) ** 2 * np.kron(np.eye(4), np.outer(along, along))
+    return replace(seen, covariance_px=covariance, corner_valid=np.zeros(4, dtype=bool))
+
+
+def with_cut_dashes(
+    scene: Scene,
+    share: float,
+    cut: Callable[[MarkingDetection, np.random.Generator], MarkingDetection] = cut_short,
+) -> list[ImageDetections]:
     """The detections of a scene, so many of whose whole dashes are cut."""
     rng = np.random.default_rng(0)
     return [
         replace(
             found,
             markings=tuple(
-                cut_short(m, rng)
-                if m.kind == "lane_dash" and m.corner_valid.all() and rng.random() < share
-                else m
+                cut(m, rng) if m.kind == "lane_dash" and m.corner_valid.all() and rng.random() < share else m
                 for m in found.markings
             ),
         )
@@ -146,3 +159,29 @@ def test_the_naive_methods_use_whole_sightings_only(scene: Scene) -> None:
     )
     naive: HdMap = results["CNI"].hd_map
     assert not [marking for marking in naive.markings if marking.kind == "lane_dash"]
+
+
+def test_sides_without_ends_are_attached_to_the_dash_that_they_are_of(scene: Scene) -> None:
+    whole = collect_sightings(scene.drive, scene.detections, CAMERAS)
+    sightings = collect_sightings(scene.drive, with_cut_dashes(scene, 0.4, both_ends_hidden), CAMERAS)
+    assert len(sightings) == len(whole)
+    truth = np.stack([scene.cam_from_vehicle[name] for name in CAMERAS])
+    rig = replace(initial_rig(scene.drive.cameras, sightings.map_from_vehicle), cam_from_vehicle=truth)
+    optimiser = Optimiser(
+        sightings,
+        views_of(scene.drive, CAMERAS),
+        scene.drive.cameras,
+        scene.drive.pose_noise,
+        MappingOptions(),
+    )
+    tracks, located = optimiser.initial_tracks(), locate(sightings, rig)
+    fused = fuse_groups(tracks, located, 0.002)
+    found = attach(tracks, sightings, located, rig, fused, 0.002)
+    new = np.flatnonzero((found.group >= 0) & (tracks.group < 0))
+    lines = np.flatnonzero((sightings.informs & ~sightings.valid).all(axis=1))
+    assert np.isin(lines, new).mean() > 0.3
+    centres = locate(whole, rig).corners_map[new].mean(axis=1)
+    apart = np.linalg.norm(fused.corners_map[found.group[new]].mean(axis=1) - centres, axis=1)
+    assert (apart < 1.0).mean() > 0.98
+    shown = np.stack([found.group, sightings.image])[:, found.group >= 0]
+    assert len(np.unique(shown, axis=1).T) == len(shown.T)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from v2hdm.adjust import Status, select_model
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.geometry.ground import extrinsic_from_ipm
+from v2hdm.mapping.association.attach import attach
 from v2hdm.mapping.association.groups import Association, fuse_groups, in_view, same_groups
 from v2hdm.mapping.association.merge import merge_groups
 from v2hdm.mapping.association.tracks import Uncertainty, build_tracks
@@ -181,7 +182,7 @@ class Optimiser:
         fused = fuse_groups(tracks, located, self._pose_noise.roll_pitch_rad)
         range_m = float(np.median(located.range_m[located.valid]))
         direction_m = options.refined_sigma_rad * range_m**2 / float(np.median(rig.height_m))
-        return merge_groups(
+        merged = merge_groups(
             tracks,
             self._sightings,
             fused,
@@ -190,6 +191,8 @@ class Optimiser:
             max_distance_m=options.max_gate_m,
             shape_tolerance=options.shape_tolerance,
         )
+        fused = fuse_groups(merged, located, self._pose_noise.roll_pitch_rad)
+        return attach(merged, self._sightings, located, rig, fused, self._pose_noise.roll_pitch_rad)
 
     def _solve_steep(self, tracks: Association) -> Bundle:
         located = self._locate(self.initial_rig)

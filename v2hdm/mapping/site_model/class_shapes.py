@@ -9,6 +9,7 @@ parallelograms: half the diagonals say all of a shape.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +72,7 @@ class Laid:
     centre: FloatArray
     shift: IntArray
 
-    @property
+    @cached_property
     def directions(self) -> FloatArray:
         """Orthonormal directions (N, 5, 8)."""
         return np.asarray(
@@ -119,11 +120,12 @@ def _lay(
     common = np.einsum("naibi->n", apart) / 32
     weight = 1 / np.maximum(places.sigma_m**2 / 2 - common[:, None], 1e-6)
     total = weight.sum(axis=1, keepdims=True)
-    target_centre = np.einsum("nc,ncx->nx", weight, corners) / total
-    own_centre = weight @ shape / total
-    a, b = shape - own_centre[:, None], corners - target_centre[:, None]
-    cross = np.einsum("nc,nc->n", weight, a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
-    turn = np.arctan2(cross, np.einsum("nc,ncx,ncx->n", weight, a, b))
+    target_centre, own_centre = np.einsum("nc,ncx->nx", weight, corners) / total, weight @ shape / total
+    # As complex numbers: the turn is the argument of the weighted sum of targets over shapes.
+    a, b = (
+        (one - middle[:, None]) @ [1, 1j] for one, middle in ((shape, own_centre), (corners, target_centre))
+    )
+    turn = np.angle(np.sum(weight * b * a.conj(), axis=1))
     centre = target_centre - (_turned(turn) @ own_centre[..., None])[..., 0]
     for _ in range(_GAUSS_NEWTON_STEPS):
         placed = shape @ np.swapaxes(_turned(turn), 1, 2) + centre[:, None]

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,7 @@ from v2hdm.mapping.site_model.class_shapes import (
 )
 from v2hdm.mapping.site_model.paint_error import PaintError, learn_paint_error
 from v2hdm.mapping.site_model.places import Counts, Places
-from v2hdm.records import FloatArray
+from v2hdm.records import BoolArray, FloatArray
 
 IntArray = NDArray[np.int64]
 
@@ -71,7 +72,6 @@ _UNDER_SYMBOL = (0.02, 0.5)
 _PASSES = 2
 """Rounds of expectation maximisation; a third changes no figure of six drives by a hundredth."""
 
-_CLOSURE = np.kron(np.array([[0.5, -0.5, 0.5, -0.5]]), np.eye(2))
 _FIRST, _SECOND = np.array([-0.5, 0.5, 0.5, -0.5]), np.array([-0.5, -0.5, 0.5, 0.5])
 """Of a parallelogram with the sides u and v corner k lies at its centre plus first[k] u + second[k] v."""
 
@@ -122,12 +122,12 @@ def _of_class(places: Places, counts: Counts) -> Posterior:
         weight = probability[:, :PART_OF_SYMBOL].sum(axis=1)
         share = _PRIOR_COUNT + probability.sum(axis=0)
         share /= share.sum()
-        paint = _paint_error(places, hypotheses, each)
+        paint = _paint_error(hypotheses, each, np.asarray(places.known.all(axis=1)))
     marking = by_kind < PART_OF_SYMBOL
     log_odds = logsumexp(joint[marking], axis=0) - logsumexp(joint[~marking], axis=0)
     by_shape = shaped[marking].max(axis=0) - shaped[by_kind == CLUTTER][0]
     evidence = np.column_stack([by_shape, *(sources[:, :, 0] - sources[:, :, 2])])
-    return Posterior(probability, log_odds, _mixture(places, hypotheses, joint, paint), evidence)
+    return Posterior(probability, log_odds, _mixture(hypotheses, joint, paint), evidence)
 
 
 def _weight_before(places: Places, counts: Counts) -> FloatArray:
@@ -168,27 +168,27 @@ def _rates(counts: Counts, found: float, missed: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Hypothesis:
-    """One hypothesis on N places.
+    """One hypothesis on N ``places``.
 
     In the ``directions`` (N, 5, 8) the solved corners deviate by ``residual`` (N, 5) from where a shape was
-    laid, the painted ones by ``scatter`` (N, 8, 8); all images may misplace these by ``misplaced`` (N, 8, 8),
-    if ``inwards`` (N, 8) is given only that way, which is how paint wears.
+    laid, the painted ones by ``scatter`` (..., 8, 8); all images may misplace these by ``misplaced``
+    (..., 8, 8), if ``inwards`` (N, 8) is given only that way, which is how paint wears.
     """
 
     kind: int
     log_prior: float
+    places: Places
     directions: FloatArray
     residual: FloatArray
-    covariance_m2: FloatArray
     scatter: FloatArray
     misplaced: FloatArray
     paint_m2: float
     inwards: FloatArray | None
 
-    @property
+    @cached_property
     def formal(self) -> FloatArray:
         """Covariance (N, 5, 5) of the residual by that of the solved corners alone."""
-        return _within(self.directions, self.covariance_m2)
+        return _within(self.directions, self.places.covariance_m2)
 
     @property
     def log_likelihood(self) -> FloatArray:
@@ -205,9 +205,9 @@ class _Hypothesis:
         held = np.sum(moved * np.linalg.solve(innovation, moved[..., None])[..., 0], axis=1) * _MISPLACED_M**2
         return np.asarray(both_ways + norm.logcdf(mean / np.sqrt(np.maximum(1 - held, 1e-9))) + np.log(2))
 
-    def corners(self, places: Places, paint_m2: FloatArray) -> Places:
+    def corners(self, paint_m2: FloatArray) -> Places:
         """The corners under the hypothesis (a Kalman update), where edges err by ``paint_m2`` (N,)."""
-        covariance = self.covariance_m2 + self.misplaced + paint_m2[:, None, None] * np.eye(8)
+        covariance = self.places.covariance_m2 + self.misplaced + paint_m2[:, None, None] * np.eye(8)
         noise = _within(self.directions, self.scatter)
         seen = self.directions @ covariance
         innovation = seen @ np.swapaxes(self.directions, 1, 2) + noise
@@ -215,7 +215,7 @@ class _Hypothesis:
         # Joseph's form: a sum of squares, so that what is nearly known keeps its small variance.
         left = np.eye(8) - gain @ self.directions
         after = left @ covariance @ np.swapaxes(left, 1, 2) + gain @ noise @ np.swapaxes(gain, 1, 2)
-        corners = places.corners_map - (gain @ self.residual[..., None]).reshape(-1, 4, 2)
+        corners = self.places.corners_map - (gain @ self.residual[..., None]).reshape(-1, 4, 2)
         return Places(corners, (after + np.swapaxes(after, 1, 2)) / 2)
 
 
@@ -228,7 +228,7 @@ def _hypotheses(
 ) -> list[_Hypothesis]:
     """All that N places may be, given the shapes of their class."""
     out: list[_Hypothesis] = []
-    count, nothing = len(places), np.zeros((8, 8))
+    nothing = np.zeros((8, 8))
 
     def add(
         kind: int,
@@ -238,21 +238,11 @@ def _hypotheses(
         misplaced: FloatArray = nothing,
         inwards: FloatArray | None = None,
     ) -> None:
-        off = (places.corners_map - laid.corners_map).reshape(count, 8, 1)
-        directions = laid.directions
-        residual = (directions @ off)[..., 0]
+        off = (places.corners_map - laid.corners_map).reshape(-1, 8, 1)
+        residual = (laid.directions @ off)[..., 0]
+        prior, paint_m2 = float(np.log(part * share[kind])), paint.sigma_m**2
         out.append(
-            _Hypothesis(
-                kind,
-                float(np.log(part * share[kind])),
-                directions,
-                residual,
-                places.covariance_m2,
-                np.broadcast_to(scatter, (count, 8, 8)),
-                np.broadcast_to(misplaced, (count, 8, 8)),
-                paint.sigma_m**2,
-                inwards,
-            )
+            _Hypothesis(kind, prior, places, laid.directions, residual, scatter, misplaced, paint_m2, inwards)
         )
 
     total = sum(shape.share for shape in shapes)
@@ -282,9 +272,8 @@ def _as_seen(places: Places) -> Laid:
     """Every place's own parallelogram."""
     centre = places.corners_map.mean(axis=1)
     corners = parallelograms(places.corners_map) + centre[:, None]
-    return Laid(
-        corners, np.tile(np.eye(2), (len(places), 1, 1)), centre, np.zeros(len(places), dtype=np.int64)
-    )
+    unturned, unshifted = np.tile(np.eye(2), (len(places), 1, 1)), np.zeros(len(places), dtype=np.int64)
+    return Laid(corners, unturned, centre, unshifted)
 
 
 def _inwards(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -303,40 +292,33 @@ def _outer(vectors: FloatArray) -> FloatArray:
     return np.asarray(vectors[:, :, None] * vectors[:, None, :])
 
 
-def _paint_error(places: Places, hypotheses: Sequence[_Hypothesis], each: FloatArray) -> PaintError:
-    """What the deviations of whole places from the shapes of their class say about errors of the paint."""
-    residual: list[FloatArray] = []
-    formal: list[FloatArray] = []
-    whole = places.known.all(axis=1)
-    for hypothesis, probability in zip(hypotheses, each, strict=True):
-        if hypothesis.kind == OF_CLASS:
-            members = np.flatnonzero(whole & (probability > 0.5))
-            residual.extend(hypothesis.residual[members])
-            formal.extend(hypothesis.formal[members])
-    return learn_paint_error(residual, formal)
+def _paint_error(hypotheses: Sequence[_Hypothesis], each: FloatArray, whole: BoolArray) -> PaintError:
+    """What the deviations of ``whole`` places (N,) from the shapes of their class say about the paint."""
+    members = [
+        (one.residual[k], one.formal[k])
+        for one, probability in zip(hypotheses, each, strict=True)
+        if one.kind == OF_CLASS
+        for k in np.flatnonzero(whole & (probability > 0.5))
+    ]
+    return learn_paint_error([residual for residual, _ in members], [formal for _, formal in members])
 
 
-def _mixture(
-    places: Places, hypotheses: Sequence[_Hypothesis], joint: FloatArray, paint: PaintError
-) -> Places:
+def _mixture(hypotheses: Sequence[_Hypothesis], joint: FloatArray, paint: PaintError) -> Places:
     """The corners as the hypotheses that are markings have them, by mean and covariance of their mixture."""
     markings = [k for k, one in enumerate(hypotheses) if one.kind < PART_OF_SYMBOL]
     weight = np.exp(joint[markings] - logsumexp(joint[markings], axis=0))
-    each = [hypotheses[k].corners(places, _paint_m2(places, hypotheses[k], paint)) for k in markings]
+    each = [hypotheses[k].corners(_paint_m2(hypotheses[k], paint)) for k in markings]
     mean = sum(w[:, None, None] * one.corners_map for w, one in zip(weight, each, strict=True))
-    covariance = np.zeros_like(places.covariance_m2)
-    for w, one in zip(weight, each, strict=True):
-        off = (one.corners_map - mean).reshape(-1, 8)
-        covariance += w[:, None, None] * (one.covariance_m2 + _outer(off))
-    return Places(np.asarray(mean), covariance)
+    covariance = sum(
+        w[:, None, None] * (one.covariance_m2 + _outer((one.corners_map - mean).reshape(-1, 8)))
+        for w, one in zip(weight, each, strict=True)
+    )
+    return Places(np.asarray(mean), np.asarray(covariance))
 
 
-def _paint_m2(places: Places, hypothesis: _Hypothesis, paint: PaintError) -> FloatArray:
+def _paint_m2(hypothesis: _Hypothesis, paint: PaintError) -> FloatArray:
     """Variance (N,) of the errors that all images share, given how a place deviates from its shape."""
-    residual, formal = hypothesis.residual, hypothesis.formal
-    if hypothesis.kind == OWN_SHAPE:
-        residual = (_CLOSURE @ places.corners_map.reshape(-1, 8, 1))[..., 0]
-        formal = _CLOSURE @ places.covariance_m2 @ _CLOSURE.T
-    elif hypothesis.kind != OF_CLASS:
-        return np.full(len(places), paint.sigma_m**2)
-    return np.array([paint.variance_m2(r, f) for r, f in zip(residual, formal, strict=True)])
+    if hypothesis.kind != OF_CLASS:
+        return np.full(len(hypothesis.residual), paint.sigma_m**2)
+    pairs = zip(hypothesis.residual, hypothesis.formal, strict=True)
+    return np.array([paint.variance_m2(residual, formal) for residual, formal in pairs])
