@@ -252,11 +252,11 @@ def _hypotheses(
         scatter: FloatArray = shape.sigma_m**2 * np.eye(8)
         add(OF_CLASS, part / 2, laid, scatter)
         add(OF_CLASS, part / 2, otherwise, scatter)
+        ends = _inwards(laid.corners_map, shape.is_elongated)
         if shape.is_elongated:
-            ends = _inwards(laid.corners_map)
             add(OTHER_LENGTH, part, laid, scatter + _LENGTH_SIGMA_M**2 * _outer((ends[0] + ends[1]) / 2))
-            for end in ends:
-                add(WORN_END, part / 2, laid, scatter, _MISPLACED_M**2 * _outer(end), end)
+        for end in ends:
+            add(WORN_END, part / len(ends), laid, scatter, _MISPLACED_M**2 * _outer(end), end)
         for corner in range(4):
             block = _MISPLACED_M**2 * np.kron(np.diag(np.eye(4)[corner]), np.eye(2))
             add(WRONG_CORNER, part / 4, laid, scatter, np.asarray(block, np.float64))
@@ -276,16 +276,20 @@ def _as_seen(places: Places) -> Laid:
     return Laid(corners, unturned, centre, unshifted)
 
 
-def _inwards(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """How the corners (N, 8) move as either end of a parallelogram (N, 4, 2) moves inwards by 1."""
-    first = corners[:, 1] - corners[:, 0]
-    second = corners[:, 2] - corners[:, 1]
-    is_first = np.linalg.norm(first, axis=1) > np.linalg.norm(second, axis=1)
-    along = np.where(is_first[:, None], first, second)
-    along = along / np.linalg.norm(along, axis=1, keepdims=True)
-    side = np.where(is_first[:, None], _FIRST, _SECOND)
-    near, far = (-sign * (side * sign > 0)[..., None] * along[:, None] for sign in (-1, 1))
-    return near.reshape(-1, 8), far.reshape(-1, 8)
+def _inwards(corners: FloatArray, elongated: bool) -> list[FloatArray]:
+    """How the corners (N, 8) move as a side of parallelograms (N, 4, 2) moves inwards by 1; two, or all four.
+
+    Of what is ``elongated`` these are the two ends.
+    """
+    ways = []
+    for along, side in ((corners[:, 1] - corners[:, 0], _FIRST), (corners[:, 2] - corners[:, 1], _SECOND)):
+        unit = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+        both = [-np.sign(sign) * (side * sign > 0)[:, None] * unit[:, None] for sign in (-1, 1)]
+        ways.append([one.reshape(-1, 8) for one in both])
+    if not elongated:
+        return [*ways[0], *ways[1]]
+    first, second = (np.linalg.norm(corners[:, k + 1] - corners[:, k], axis=1) for k in (0, 1))
+    return [np.where((first > second)[:, None], a, b) for a, b in zip(*ways, strict=True)]
 
 
 def _outer(vectors: FloatArray) -> FloatArray:
