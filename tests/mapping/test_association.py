@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -46,7 +48,8 @@ def true_marking(scene: Scene, sightings: Sightings) -> np.ndarray:
 
 def tracks_under(rig: Rig, sightings: Sightings, sigma_rad: float) -> tuple[Association, Located]:
     located = locate(sightings, rig)
-    located.valid[:] &= located.range_m <= MAX_RANGE_M
+    near = located.range_m <= MAX_RANGE_M
+    located = replace(located, valid=located.valid & near, informs=located.informs & near)
     return build_tracks(
         sightings, located, rig, Uncertainty(sigma_rad, 0.0017, 0.01), AssociationOptions()
     ), located
@@ -113,6 +116,7 @@ def test_two_markings_of_one_image_are_never_merged(sightings: Sightings) -> Non
         rig_corners + 5,
         np.full(2, 2.4),
         np.ones((2, 4), bool),
+        np.ones((2, 4), bool),
     )
     merged = merge_groups(
         association,
@@ -146,8 +150,9 @@ def test_a_far_sighting_cannot_ruin_the_mean_of_near_ones() -> None:
     corners[3] += 0.8
     ray = np.full((4, 4, 2), 4.0)
     ray[3] = 14.0
+    everywhere = np.ones((4, 4), bool)
     located = Located(
-        corners, np.tile(np.eye(2) * 1e-4, (4, 4, 1, 1)), ray, np.full(4, 2.4), np.ones((4, 4), bool)
+        corners, np.tile(np.eye(2) * 1e-4, (4, 4, 1, 1)), ray, np.full(4, 2.4), everywhere, everywhere
     )
     fused = fuse_groups(Association(np.zeros(4, int), np.zeros(4, int), 1), located, 0.002)
     assert np.abs(fused.corners_map[0] - corners[0]).max() < 0.02

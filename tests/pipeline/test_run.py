@@ -223,8 +223,8 @@ def test_a_drive_past_nothing_fails_and_says_that_no_marking_was_found(
             "mapping.lanes.max_range_m is nan",
         ),
         (
-            {"mapping": MappingOptions(acceptance=AcceptanceOptions(min_inlier_share=50))},
-            "mapping.acceptance.min_inlier_share is 50",
+            {"mapping": MappingOptions(acceptance=AcceptanceOptions(min_probability=50))},
+            "mapping.acceptance.min_probability is 50",
         ),
         ({"detector": DetectorOptions(model="no such.onnx")}, "no such.onnx"),
     ],

@@ -7,6 +7,7 @@ from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from v2hdm.adjust.problem import Observations
 from v2hdm.records import BoolArray, FloatArray, IntArray
@@ -66,6 +67,11 @@ def noise_scale(mahalanobis2: FloatArray) -> float:
     # Seven digits are plenty, and half the memory.
     median = np.median(mahalanobis2.astype(np.float32), overwrite_input=True)
     return max(1.0, float(median) / _MEDIAN_SQUARED)
+
+
+def as_of_point(squared_of_line: FloatArray) -> FloatArray:
+    """Squared residuals of lines, chi-square of one degree of freedom, as equally likely ones of points."""
+    return np.asarray(-2 * chi2.logsf(squared_of_line, 1))
 
 
 def judge(

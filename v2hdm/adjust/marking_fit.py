@@ -11,7 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from v2hdm.adjust.gating import as_of_point
 from v2hdm.adjust.pose_errors import Frames, Noise
+from v2hdm.adjust.problem import on_line
 from v2hdm.geometry.rigid import adjoint, exp, hat, left_jacobian
 from v2hdm.records import FloatArray, IntArray
 
@@ -141,10 +143,13 @@ def squared_residuals(
     corners_map: FloatArray,
     frame_state: FloatArray,
 ) -> FloatArray:
-    """Squared residuals (K,) of ``seen`` in standard deviations, as :func:`normal_equations` has them."""
+    """Squared residuals (K,) of ``seen`` in standard deviations; of lines scaled to those of points."""
     residual = _linearise(seen, intrinsic, cam_from_vehicle, corners_map, frame_state)[0]
     white = np.linalg.solve(seen.covariance_px, residual[..., None])[..., 0]
-    return np.asarray(np.sum(residual * white, axis=1))
+    squared = np.asarray(np.sum(residual * white, axis=1))
+    line = on_line(seen.covariance_px)
+    squared[line] = as_of_point(squared[line])
+    return squared
 
 
 def _root_information(seen: MarkingObservations, residual: FloatArray, noise: Noise) -> FloatArray:

@@ -25,10 +25,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.records import FloatArray, IntArray
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
 POSE_STATES: tuple[str, ...] = ("x", "y", "height", "roll", "pitch", "heading")
 """What a frame can deviate in, in the order of its tangent."""
+
+_LINE_RATIO = 1e3
+"""Ratio of an observation's two variances from which it is one of a line: a point's is below 200."""
 
 LOSSES: tuple[str, ...] = ("none", "huber", "cauchy", "geman_mcclure")
 SOLVERS: tuple[str, ...] = ("lbfgs", "lm")
@@ -47,6 +50,18 @@ class Observations:
     corner: IntArray
     pinhole_px: FloatArray
     covariance_px: FloatArray
+
+    @property
+    def on_line(self) -> BoolArray:
+        """Which observations (K,) say on which line of the image their corner lies, and not where on it."""
+        return on_line(self.covariance_px)
+
+
+def on_line(covariance_px: FloatArray) -> BoolArray:
+    """Whether covariances (K, 2, 2) are as good as those of a line of the image."""
+    xx, yx, yy = covariance_px[:, 0, 0], covariance_px[:, 1, 0], covariance_px[:, 1, 1]
+    # With the variances a > b: a b = det, a + b = trace, so a / b > q where trace^2 > det (q + 2 + 1 / q).
+    return np.asarray((xx + yy) ** 2 > (xx * yy - yx**2) * (_LINE_RATIO + 2 + 1 / _LINE_RATIO))
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ class Solution:
         corners_map: (N, 2) m.
         residual_px: projected minus observed, (K, 2).
         mahalanobis2: squared residual in standard deviations (K,), chi-square with 2 degrees of
-            freedom where model and covariances are right.
+            freedom where model and covariances are right (what was seen of a line is scaled to that).
         verdict: a :class:`v2hdm.adjust.Verdict` on each observation (K,).
         loss, loss_scale: the robust loss, as in :class:`v2hdm.adjust.SolveOptions`.
         clock_offset_s: (C,) how much later than stated each camera's images were taken; 0 where that is

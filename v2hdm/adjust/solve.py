@@ -14,7 +14,7 @@ from v2hdm.adjust.checks import check_model, check_options, check_problem
 from v2hdm.adjust.coarse import coarse_extrinsics
 from v2hdm.adjust.covariance import Covariance
 from v2hdm.adjust.descent import Descent, descend
-from v2hdm.adjust.gating import judge, noise_scale
+from v2hdm.adjust.gating import as_of_point, judge, noise_scale
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.origin import nearby_origin, shifted
 from v2hdm.adjust.problem import Problem, SolveOptions
@@ -139,6 +139,8 @@ def _seen(problem: Problem, whitening: Whitening) -> _Seen:
         out.residual_px[rows] = view.off.T.cpu().numpy() * focal
         out.mahalanobis2[rows] = view.squared.cpu().numpy()
         out.behind[rows] = (view.point[2] <= NEAR_M).cpu().numpy()
+    on_line = problem.observations.on_line
+    out.mahalanobis2[on_line] = as_of_point(out.mahalanobis2[on_line])
     return out
 
 

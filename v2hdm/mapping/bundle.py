@@ -264,12 +264,13 @@ def _known(
     if not model.sizes.by_class_m and not model.survey.points_map:
         return None, None
     located = locate(sightings, rig)
-    located.valid[:] &= usable
+    located = replace(located, valid=located.valid & usable, informs=located.informs & usable)
     fused = fuse_groups(association, located, jitter_rad=0.0)
+    points_map = np.where(fused.valid[..., None], fused.corners_map, np.nan)
     kinds = group_kinds(association, sightings)
     return (
-        known_lengths(model.sizes, kinds, fused.corners_map, corner_index),
-        control_points(model.survey, fused.corners_map, corner_index),
+        known_lengths(model.sizes, kinds, points_map, corner_index),
+        control_points(model.survey, points_map, corner_index),
     )
 
 

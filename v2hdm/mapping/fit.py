@@ -56,16 +56,14 @@ def point_of(bundle: Bundle, item: int) -> FloatArray:
 def camera_fits(bundle: Bundle) -> dict[str, CameraFit]:
     """How well each camera's observations fit ``bundle``, a solve before anything was left out."""
     seen, solution = bundle.problem.observations, bundle.solution
-    fits = {}
+    points, fits = bundle.inliers & ~seen.on_line, {}
     for name, c in bundle.camera_index.items():
         own = seen.camera == c
         fits[name] = CameraFit(
             observations=int(own.sum()),
             variance_factor=_factor(bundle, solution.mahalanobis2[own]),
             rejected_share=float(1 - bundle.inliers[own].mean()),
-            bias_px=_cell_bias(
-                seen.pinhole_px[own & bundle.inliers], solution.residual_px[own & bundle.inliers]
-            ),
+            bias_px=_cell_bias(seen.pinhole_px[own & points], solution.residual_px[own & points]),
         )
     return fits
 

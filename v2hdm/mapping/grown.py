@@ -7,20 +7,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.adjust.gating import noise_scale
+from v2hdm.adjust.gating import as_of_point, noise_scale
 from v2hdm.adjust.incremental import IncrementalMap
 from v2hdm.adjust.observability import observed
+from v2hdm.adjust.problem import on_line
 from v2hdm.geometry.rigid import exp
 from v2hdm.mapping.association.groups import Association
-from v2hdm.mapping.markings.completion import SolvedCorners, completed_corners
 from v2hdm.mapping.markings.conclude import Observed, reprojected, residuals_under, root_mean_square
 from v2hdm.mapping.markings.relative import with_relative_sigma
-from v2hdm.mapping.markings.verdict import Seen, judge_and_mend
 from v2hdm.mapping.options import AcceptanceOptions
 from v2hdm.mapping.results import Exclusion, GrowthStep
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.mapping.sightings.views import Views
+from v2hdm.mapping.site_model.places import Places
+from v2hdm.mapping.site_model.verdict import Seen, judge
 from v2hdm.records import CORNERED_CLASSES, BoolArray, Calibration, Camera, FloatArray, IntArray, Marking
 
 # Squared distance that one sound observation in ten thousand exceeds (2 degrees of freedom).
@@ -31,13 +32,15 @@ _INLIER_SQUARED = 18.4
 class Place:
     """Where a marking is kept: the unit, and which of its corners (4,) are the marking's, -1 if none.
 
-    ``images`` are those that showed it; ``preview`` (4, 2) is where it lay before its unit was solved.
+    ``images`` are those that showed it, ``point`` (4,) the corners that they showed as points; ``preview``
+    (4, 2) is where these lay before its unit was solved.
     """
 
     unit: int
     corner: IntArray
     kind: int
     images: set[int]
+    point: BoolArray
     preview: FloatArray
 
 
@@ -47,8 +50,8 @@ class Grown:
 
     ``rig`` holds the final extrinsics and poses; ``grown`` goes on with the next drive. Sightings are part
     of markings as ``association`` says, as far as their corners are ``usable`` (S, 4). Reprojection errors
-    are root mean squares over the accepted ``observations`` of accepted markings, under the final and the
-    initial extrinsics.
+    are root mean squares over the points among the accepted ``observations`` of accepted markings, under the
+    final and the initial extrinsics.
     """
 
     grown: IncrementalMap
@@ -94,8 +97,8 @@ def corners_of(grown: IncrementalMap, place: Place) -> FloatArray:
     return out
 
 
-def solved_places(grown: IncrementalMap, places: Sequence[Place], scale: float = 1.0) -> SolvedCorners:
-    """All corners and their covariances, times ``scale``; a missing fourth corner completed."""
+def solved_places(grown: IncrementalMap, places: Sequence[Place], scale: float = 1.0) -> Places:
+    """All corners and their covariances, times ``scale``."""
     corners, covariance = np.full((len(places), 4, 2), np.nan), np.full((len(places), 8, 8), np.nan)
     by_unit = {unit: scale * one for unit, one in grown.corner_covariances().items()}
     for marking, place in enumerate(places):
@@ -104,13 +107,13 @@ def solved_places(grown: IncrementalMap, places: Sequence[Place], scale: float =
         rows, own = (2 * at[:, None] + np.arange(2) for at in (known, place.corner[known]))
         block = by_unit[place.unit][np.ix_(own.ravel(), own.ravel())]
         covariance[marking][np.ix_(rows.ravel(), rows.ravel())] = block
-    return completed_corners(corners, covariance)
+    return Places.seen(corners, covariance)
 
 
 def growth_step(grown: IncrementalMap, places: Sequence[Place], names: Sequence[str]) -> GrowthStep:
-    """The map as it is now; markings of which less than three corners are known are left out."""
+    """The map as it is now; markings of which a corner is not known are left out."""
     solved = solved_places(grown, places)
-    whole = np.flatnonzero(np.isfinite(solved.corners_map).all(axis=(1, 2))).tolist()
+    whole = np.flatnonzero(solved.known.all(axis=1)).tolist()
     markings = tuple(
         Marking(
             kind=CORNERED_CLASSES[places[m].kind],
@@ -143,13 +146,13 @@ def conclude_grown(
     residual_px = reprojected(rig, poses, taken.sightings, association, seen, corners_map)
     agrees = _agrees(taken, seen, residual_px)
     scale = max(1.0, chi2_per_dof := grown.variance().all)
-    judged = judge_and_mend(
-        solved_places(grown, places, scale), _evidence(places, rig, taken, seen, agrees), options
-    )
+    judged = judge(solved_places(grown, places, scale), _evidence(places, rig, taken, seen, agrees), options)
     markings = _with_relative_sigma(grown, [places[m] for m in judged.accepted], judged.markings(), scale)
     accepted = agrees & np.isin(seen.group, judged.accepted)
+    own_corner = association.corner_order()[seen.row, seen.corner]
+    point = accepted & taken.sightings.valid[seen.row, own_corner]
     at_start = residuals_under(
-        taken.initial_rig, taken.sightings, association, seen.only(accepted), taken.jitter_rad
+        taken.initial_rig, taken.sightings, association, seen.only(point), taken.jitter_rad
     )
     covariance = grown.extrinsic_covariance
     known = observed(rig.cam_from_vehicle, covariance, grown.prior.centre_sigma_m)
@@ -169,7 +172,7 @@ def conclude_grown(
             for c, (name, camera) in enumerate(taken.cameras.items())
         },
         certainty={name: known[c].sentence(name) for c, name in enumerate(names)},
-        reprojection_rmse_px=root_mean_square(residual_px[accepted]),
+        reprojection_rmse_px=root_mean_square(residual_px[point]),
         initial_reprojection_rmse_px=root_mean_square(at_start),
         growth=(*(step for step in growth if len(step.markings) < len(markings)), last),
     )
@@ -177,19 +180,15 @@ def conclude_grown(
 
 def _evidence(places: Sequence[Place], rig: Rig, taken: Taken, seen: Observed, agrees: BoolArray) -> Seen:
     """What was seen of the places, of whose observations (K,) some ``agrees`` with the map."""
-    association = taken.association
-    share = np.bincount(seen.group[agrees], minlength=association.count)
     return Seen(
-        association=association,
         kind=np.array([place.kind for place in places], dtype=np.int64),
         sightings=taken.sightings,
         rig=rig,
         views=taken.views,
         cameras=tuple(taken.cameras.values()),
-        jitter_rad=taken.jitter_rad,
         row=seen.row,
         group=seen.group,
-        inlier_share=share / np.maximum(np.bincount(seen.group, minlength=association.count), 1),
+        accepted=agrees,
     )
 
 
@@ -239,4 +238,6 @@ def _agrees(taken: Taken, seen: Observed, residual_px: FloatArray) -> BoolArray:
     noise = taken.sightings.covariance_px[seen.row, own] + taken.floor_px**2 * np.eye(2)
     noise = taken.variance_factor * noise
     squared = np.sum(residual_px * np.linalg.solve(noise, residual_px[..., None])[..., 0], axis=1)
+    line = on_line(noise)
+    squared[line] = as_of_point(squared[line])
     return np.asarray(squared < _INLIER_SQUARED * noise_scale(squared))

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.mapping.markings.completion import solved_corners
 from v2hdm.mapping.markings.conclude import Optimised
-from v2hdm.mapping.markings.shape_prior import with_class_shapes
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.results import GrowthStep
+from v2hdm.mapping.site_model.places import Counts, solved_places
+from v2hdm.mapping.site_model.posterior import posterior
 from v2hdm.records import CORNERED_CLASSES, IntArray, Marking
 
 
@@ -72,13 +72,16 @@ def _order_of_sight(optimised: Optimised) -> IntArray:
 
 def _markings(bundle: Bundle, optimised: Optimised, chosen: IntArray) -> tuple[Marking, ...]:
     """The map so far; markings of too few corners, which the whole map's shapes would place, are left out."""
-    solved = solved_corners(bundle)
-    groups = optimised.groups[chosen]
-    whole = np.isfinite(solved.corners_map[groups]).all(axis=(1, 2))
-    kind = np.zeros(bundle.association.count, dtype=np.int64)
-    kind[optimised.groups] = [CORNERED_CLASSES.index(marking.kind) for marking in optimised.markings]
-    fused = with_class_shapes(solved, kind, groups[whole])
+    solved = solved_places(bundle).subset(optimised.groups[chosen])
+    whole = np.flatnonzero(solved.known.all(axis=1))
+    kind = np.array(
+        [CORNERED_CLASSES.index(optimised.markings[m].kind) for m in chosen[whole]], dtype=np.int64
+    )
+    nothing_counted = Counts(*np.zeros((6, len(kind)), dtype=np.int64))
+    shaped = posterior(solved.subset(whole), kind, nothing_counted).places
     return tuple(
-        replace(optimised.markings[m], corners_map=fused.corners_map[g], covariance_m2=fused.covariance_m2[g])
-        for m, g in zip(chosen[whole], groups[whole], strict=True)
+        replace(optimised.markings[m], corners_map=corners, covariance_m2=covariance)
+        for m, corners, covariance in zip(
+            chosen[whole], shaped.corners_map, shaped.covariance_m2, strict=True
+        )
     )

@@ -26,7 +26,7 @@ from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.association.merge import group_kinds
 from v2hdm.mapping.bundle import LEAST_OBSERVATIONS, VARIANCE_FACTORS, centre_priors, pose_sigma_of
 from v2hdm.mapping.grown import Grown, Place, Taken, conclude_grown, corners_of, growth_step
-from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.options import LEAST_SIGHTINGS, MappingOptions
 from v2hdm.mapping.results import GrowthStep
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import Sightings
@@ -51,7 +51,10 @@ _GROWTH_STEP = 1.5
 
 @dataclass(frozen=True)
 class _Track:
-    """The sightings ``rows`` of one track, what they say of the corners 0 to 3, and where these lie alone."""
+    """The sightings ``rows`` of one track, what they say of the corners 0 to 3, and where these lie alone.
+
+    Corners that none of them shows as a point are nan.
+    """
 
     rows: IntArray
     kind: int
@@ -201,6 +204,7 @@ class IncrementalMapper:
                 return False
         self._corner_counts[place.unit] += len(further)
         place.corner = numbers
+        place.point |= np.isfinite(track.corners_map).all(axis=1)
         place.images |= set(self._sightings.image[track.rows].tolist())
         if marking is None:
             self._places.append(place)
@@ -216,7 +220,8 @@ class IncrementalMapper:
             self._settle()
             self._corner_counts.append(0)
             newest += 1
-        return Place(newest, np.full(4, -1, dtype=np.int64), track.kind, set(), track.corners_map)
+        known = np.asarray(np.isfinite(track.corners_map).all(axis=1))
+        return Place(newest, np.full(4, -1, dtype=np.int64), track.kind, set(), known, track.corners_map)
 
     def _settle(self) -> None:
         """Solve for what waits for its unit to be full."""
@@ -228,18 +233,18 @@ class IncrementalMapper:
             self.grown.observe(len(self._corner_counts) - 1, joined)
 
     def _corners(self, marking: int) -> FloatArray:
-        """Corners (4, 2) of a marking under the present extrinsics, nan where unknown."""
+        """Corners (4, 2) of a marking under the present extrinsics, nan where none was seen as a point."""
         place = self._places[marking]
         if self._waiting and place.unit == len(self._corner_counts) - 1:
             return place.preview
-        return corners_of(self.grown, place)
+        return np.where(place.point[:, None], corners_of(self.grown, place), np.nan)
 
     def _track(self, rows: IntArray, kind: int, tracks: Association, usable: BoolArray) -> _Track | None:
         """What ``rows`` saw of corners that they saw twice; None where that fixes no marking."""
         order = tracks.corner_order()[rows]
         which, corner = np.nonzero(np.take_along_axis(usable[rows], order, axis=1))
         twice = np.bincount(corner, minlength=4) >= 2
-        if len(rows) < self._options.acceptance.min_sightings or np.count_nonzero(twice) < _LEAST_CORNERS:
+        if len(rows) < LEAST_SIGHTINGS or np.count_nonzero(twice) < _LEAST_CORNERS:
             return None
         which, corner = which[twice[corner]], corner[twice[corner]]
         row, own = rows[which], order[which, corner]
@@ -260,6 +265,10 @@ class IncrementalMapper:
             corners[known] = self.grown.preview(seen)
         except AdjustError:
             return None
+        points = np.bincount(corner[sightings.valid[row, own]], minlength=4) > 0
+        if np.count_nonzero(points) < 2:
+            return None
+        corners[~points] = np.nan
         return _Track(rows, kind, replace(seen, corner=corner), corners)
 
     def _same_as(self, track: _Track) -> tuple[int | None, int]:

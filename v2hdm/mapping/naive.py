@@ -15,7 +15,7 @@ from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.quadrilateral import is_convex
 from v2hdm.mapping.association.groups import Association, FusedGroups, keep_rows
 from v2hdm.mapping.association.merge import group_kinds, merge_groups
-from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.options import LEAST_SIGHTINGS, MappingOptions
 from v2hdm.mapping.results import Exclusion
 from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.records import CORNERED_CLASSES, BoolArray, Camera, FloatArray, Marking
@@ -50,7 +50,7 @@ def naive_markings(
         max_distance_m=options.association.naive_merge_m,
         shape_tolerance=2 * options.association.shape_tolerance,
     )
-    return _accept(association, sightings, _average(association, corners_map[0]), options)
+    return _accept(association, sightings, _average(association, corners_map[0]))
 
 
 def ipm_corners(
@@ -95,7 +95,7 @@ def _average(association: Association, corners_map: FloatArray) -> FusedGroups:
 
 
 def _accept(
-    association: Association, sightings: Sightings, average: FusedGroups, options: MappingOptions
+    association: Association, sightings: Sightings, average: FusedGroups
 ) -> tuple[list[Marking], list[Exclusion]]:
     markings: list[Marking] = []
     excluded: list[Exclusion] = []
@@ -105,7 +105,7 @@ def _accept(
         kind = CORNERED_CLASSES[kinds[group]]
         corners = average.corners_map[group]
         count = int(average.seen[group, 0])
-        if count < options.acceptance.min_sightings:
+        if count < LEAST_SIGHTINGS:
             excluded.append(Exclusion(kind, corners.mean(axis=0), count, "too few sightings"))
         elif not convex[group]:
             excluded.append(Exclusion(kind, corners.mean(axis=0), count, "not a convex quadrilateral"))

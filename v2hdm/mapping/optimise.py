@@ -17,7 +17,8 @@ import numpy as np
 from v2hdm.adjust import Status, select_model
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.geometry.ipm import extrinsic_from_ipm
-from v2hdm.mapping.association.groups import Association, fuse_groups, same_groups
+from v2hdm.mapping.association.attach import attach
+from v2hdm.mapping.association.groups import Association, fuse_groups, in_view, same_groups
 from v2hdm.mapping.association.merge import merge_groups
 from v2hdm.mapping.association.tracks import Uncertainty, build_tracks
 from v2hdm.mapping.bundle import (
@@ -28,7 +29,6 @@ from v2hdm.mapping.bundle import (
     full_model,
     solve_bundle,
 )
-from v2hdm.mapping.corner_order import settle_corner_order
 from v2hdm.mapping.grown import Grown
 from v2hdm.mapping.incremental import IncrementalMapper
 from v2hdm.mapping.markings.conclude import Evidence, Optimised, conclude
@@ -97,13 +97,7 @@ class Optimiser:
             association = self._associate(bundle.rig)
             if same_groups(association, bundle.association):
                 break
-            bundle = self._solve(association, self._locate(bundle.rig).valid, bundle.rig)
-            self._reweigh(bundle)
-        usable = self._locate(bundle.rig).valid
-        settled = settle_corner_order(bundle, self._sightings, usable)
-        if settled is not bundle.association:
-            tell("joint solve with settled corners")
-            bundle = self._solve(settled, usable, bundle.rig)
+            bundle = self._solve(association, self._usable(association, bundle.rig), bundle.rig)
             self._reweigh(bundle)
         return bundle
 
@@ -127,7 +121,7 @@ class Optimiser:
         """Each camera's clock offset by a solve that expects none in particular, from ``bundle``."""
         model = full_model(self._pose_noise, self._options, "clock", bundle.model.variance_factor)
         model = replace(model, clock_sigma_s=LOOSE_CLOCK_SIGMA_S)
-        usable = self._locate(bundle.rig).valid
+        usable = self._usable(bundle.association, bundle.rig)
         solved = solve_bundle(
             self._sightings, bundle.association, usable, bundle.rig, self._cameras, model
         ).solution
@@ -139,7 +133,8 @@ class Optimiser:
         def link(rig: Rig, coarse: bool) -> tuple[Association, BoolArray]:
             located, options = self._locate(rig), self._options.association
             direction_rad = options.ipm_sigma_rad if coarse else options.refined_sigma_rad
-            return self._track(rig, located, direction_rad), located.valid
+            tracks = self._track(rig, located, direction_rad)
+            return tracks, self._usable(tracks, rig)
 
         mapper = IncrementalMapper(
             self._sightings, self.initial_rig, self._cameras, self._pose_noise, self._options, link
@@ -163,8 +158,13 @@ class Optimiser:
         """Ground positions, restricted to the range within which observations are used."""
         located = locate(self._sightings, rig)
         with np.errstate(invalid="ignore"):
-            located.valid[:] &= located.range_m <= self._options.max_range_m
-        return located
+            near = located.range_m <= self._options.max_range_m
+        return replace(located, valid=located.valid & near, informs=located.informs & near)
+
+    def _usable(self, association: Association, rig: Rig) -> BoolArray:
+        """Corners (S, 4) that a joint solve may use, given where their groups are."""
+        jitter_rad = self._pose_noise.roll_pitch_rad
+        return in_view(association, self._locate(rig), self._sightings, rig, jitter_rad)
 
     def _track(self, rig: Rig, located: Located, direction_rad: float) -> Association:
         noise = self._pose_noise
@@ -179,7 +179,7 @@ class Optimiser:
         fused = fuse_groups(tracks, located, self._pose_noise.roll_pitch_rad)
         range_m = float(np.median(located.range_m[located.valid]))
         direction_m = options.refined_sigma_rad * range_m**2 / float(np.median(rig.height_m))
-        return merge_groups(
+        merged = merge_groups(
             tracks,
             self._sightings,
             fused,
@@ -188,6 +188,8 @@ class Optimiser:
             max_distance_m=options.max_gate_m,
             shape_tolerance=options.shape_tolerance,
         )
+        fused = fuse_groups(merged, located, self._pose_noise.roll_pitch_rad)
+        return attach(merged, self._sightings, located, rig, fused, self._pose_noise.roll_pitch_rad)
 
     def _solve_steep(self, tracks: Association) -> Bundle:
         located = self._locate(self.initial_rig)

@@ -13,6 +13,10 @@ from v2hdm.records import CORNERED_CLASSES
 BATCH = "batch"
 INCREMENTAL = "incremental"
 AUTO = "auto"
+LEAST_SIGHTINGS = 3
+"""Images that must show a marking where nothing else is weighed: in the naive methods, and of a track before
+the incremental map takes it up."""
+
 POSE_MODELS: tuple[str, ...] = (AUTO, "paper", "roll_pitch", "full", "heave", "clock")
 """What ``mapping.pose_model`` may be: those of :data:`v2hdm.adjust.MODELS`, or ``auto``."""
 
@@ -41,22 +45,14 @@ class AssociationOptions:
 
 @dataclass(kw_only=True)
 class AcceptanceOptions:
-    """What a marking must show to enter the map.
+    """What a place must show to enter the map.
 
-    ``min_sightings`` images with accepted corners; ``min_inlier_share`` of its corner observations
-    agreeing with the solution; a worst corner less certain than the best one of the map by at most
-    ``max_sigma_m``; in a class of at least ``consensus_count`` markings, sides and diagonals that
-    others have too, within ``shape_tolerance`` of their length; and, unless its shape is thereby
-    known, detections in ``min_detection_share`` of the images that had it in easy view, as a share
-    of what is usual for its class.
+    ``min_probability`` of being a marking, given its shape, how often it was seen and where it was not; and
+    a worst corner less certain than the best one of the map by at most ``max_sigma_m``.
     """
 
-    min_sightings: int = 3
-    min_inlier_share: float = 0.5
-    min_detection_share: float = 0.2
-    max_sigma_m: float = 0.15
-    consensus_count: int = 8
-    shape_tolerance: float = 0.15
+    min_probability: float = 0.9
+    max_sigma_m: float = 0.12
 
 
 @dataclass(kw_only=True)
@@ -153,7 +149,7 @@ def check_options(options: MappingOptions) -> None:
         "association.refined_sigma_rad": options.association.refined_sigma_rad,
         "association.gate_sigmas": options.association.gate_sigmas,
         "association.max_gate_m": options.association.max_gate_m,
-        "acceptance.min_sightings": options.acceptance.min_sightings,
+        "acceptance.min_probability": options.acceptance.min_probability,
         "lanes.node_spacing_m": options.lanes.node_spacing_m,
         "lanes.half_width_m": options.lanes.half_width_m,
         "lanes.half_length_m": options.lanes.half_length_m,
@@ -181,8 +177,9 @@ def check_options(options: MappingOptions) -> None:
     for key, value in _numbers(options):
         if not value >= 0:
             raise ConfigError(f"mapping.{key} is {value}; it must be a number, zero or greater.")
-        if key.endswith("_share") and value > 1:
-            raise ConfigError(f"mapping.{key} is {value}; a share is one at most.")
+    if options.acceptance.min_probability >= 1:
+        value = options.acceptance.min_probability
+        raise ConfigError(f"mapping.acceptance.min_probability is {value}; it must be less than one.")
     _check_sizes(options)
     _check_survey(options)
 

@@ -8,10 +8,16 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from v2hdm.geometry.ipm import project_ground
 from v2hdm.mapping.sightings.location import Located
+from v2hdm.mapping.sightings.rig import Rig
+from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
+
+_LEAST_DEPTH_M = 1.0
+"""Depth, m, from which a corner on a line may be projected: nearer, the line leaves the image steeply."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +62,8 @@ def same_groups(a: Association, b: Association) -> bool:
 class FusedGroups:
     """Where G groups lie: ``corners_map`` (G, 4, 2) m with ``covariance_m2`` (G, 4, 2, 2).
 
-    ``seen`` (G, 4) counts the sightings of each corner; where it is 0 the corner is nan.
+    ``seen`` (G, 4) counts the sightings that show a corner as a point. A corner without any may still lie on
+    a known line, and says so by its covariance; if nothing is known of it, it is nan.
     """
 
     corners_map: FloatArray
@@ -65,7 +72,7 @@ class FusedGroups:
 
     @property
     def valid(self) -> BoolArray:
-        """Which corners (G, 4) were seen at all."""
+        """Which corners (G, 4) were seen as points."""
         return np.asarray(self.seen > 0)
 
 
@@ -76,14 +83,16 @@ def fuse_groups(association: Association, located: Located, jitter_rad: float) -
     makes of it at its range, so that one far sighting cannot ruin the mean of near ones.
     """
     corners = association.in_group_order(located.corners_map)
-    valid = association.in_group_order(located.valid) & (association.group >= 0)[:, None]
+    grouped = (association.group >= 0)[:, None]
+    informs = association.in_group_order(located.informs) & grouped
+    point = association.in_group_order(located.valid) & grouped
     noise = located.covariance_m2 + located.direction_covariance_m2(jitter_rad)
     covariance = association.in_group_order(noise) + 1e-6 * np.eye(2)
-    information = np.linalg.inv(np.where(valid[..., None, None], covariance, np.eye(2)))
-    corner = np.where(valid, association.group[:, None] * 4 + np.arange(4), association.count * 4)
-    points = np.where(valid[..., None], corners, 0.0)
+    information = np.linalg.inv(np.where(informs[..., None, None], covariance, np.eye(2)))
+    corner = np.where(informs, association.group[:, None] * 4 + np.arange(4), association.count * 4)
+    points = np.where(informs[..., None], corners, 0.0)
     size = association.count * 4 + 1
-    weight = valid.astype(float)
+    weight = informs.astype(float)
     for _ in range(3):
         total = np.zeros((size, 2, 2))
         vector = np.zeros((size, 2))
@@ -95,8 +104,8 @@ def fuse_groups(association: Association, located: Located, jitter_rad: float) -
         mean = (spread @ vector[..., None])[..., 0]
         miss = points - mean[corner]
         distance = np.sqrt(np.maximum(np.einsum("sci,scij,scj->sc", miss, information, miss), 1e-12))
-        weight = valid * np.minimum(1.0, 2.0 / distance)
-    seen = np.bincount(corner.ravel(), minlength=size)[:-1]
+        weight = informs * np.minimum(1.0, 2.0 / distance)
+    seen = np.bincount(corner[point], minlength=size)[:-1]
     mean[~solvable] = np.nan
     return FusedGroups(
         corners_map=mean[:-1].reshape(-1, 4, 2),
@@ -105,13 +114,23 @@ def fuse_groups(association: Association, located: Located, jitter_rad: float) -
     )
 
 
-def vague_corners(association: Association, located: Located) -> FloatArray:
-    """Median (G, 4, 2) of each group's corners, be they ones that may not be used as points; nan for none."""
-    corners = association.in_group_order(located.corners_map)
-    out = np.full((association.count, 4, 2), np.nan)
-    members = np.flatnonzero((association.group >= 0) & np.isfinite(corners).all(axis=(1, 2)))
-    members = members[np.argsort(association.group[members], kind="stable")]
-    groups, begins = np.unique(association.group[members], return_index=True)
-    for group, rows in zip(groups, np.split(members, begins[1:]), strict=True):
-        out[group] = np.median(corners[rows], axis=0)
-    return out
+def in_view(
+    association: Association, located: Located, sightings: Sightings, rig: Rig, jitter_rad: float
+) -> BoolArray:
+    """Which corners (S, 4) the adjustment may use: points, and those on lines that the camera can see.
+
+    A dash that passes under the vehicle is cut by the image's border; its side is a line of the image, but
+    where its corner lies behind the camera the line cannot be had by projecting the corner.
+    """
+    fused = fuse_groups(association, located, jitter_rad)
+    cam_from_map = rig.cam_from_vehicle[sightings.camera] @ np.linalg.inv(
+        rig.map_from_vehicle[sightings.frame]
+    )
+    group = np.maximum(association.group, 0)
+    corners = fused.corners_map[group] if association.count else np.full(located.corners_map.shape, np.nan)
+    _, depth_m = project_ground(rig.intrinsic[sightings.camera], cam_from_map, corners)
+    order = association.corner_order()
+    in_front = np.zeros_like(located.valid)
+    with np.errstate(invalid="ignore"):
+        np.put_along_axis(in_front, order, depth_m > _LEAST_DEPTH_M, axis=1)
+    return np.asarray(located.valid | (located.informs & in_front))

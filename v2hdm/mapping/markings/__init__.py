@@ -1,1 +1,1 @@
-"""From solved corners to the markings of the map: completed, compared with their class, judged."""
+"""From the site model to the outcome: markings, calibrations and how sure they are."""

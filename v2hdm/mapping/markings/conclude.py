@@ -11,15 +11,15 @@ from v2hdm.geometry.ipm import project_ground
 from v2hdm.mapping.association.groups import Association, fuse_groups
 from v2hdm.mapping.association.merge import group_kinds
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.mapping.markings.completion import solved_corners
 from v2hdm.mapping.markings.relative import with_relative_sigma
-from v2hdm.mapping.markings.verdict import Seen, judge_and_mend
 from v2hdm.mapping.options import AcceptanceOptions
 from v2hdm.mapping.results import Exclusion
 from v2hdm.mapping.sightings.location import locate
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.mapping.sightings.views import Views
+from v2hdm.mapping.site_model.places import solved_places
+from v2hdm.mapping.site_model.verdict import Seen, judge
 from v2hdm.records import BoolArray, Calibration, Camera, FloatArray, IntArray, Marking
 
 
@@ -59,7 +59,7 @@ class Optimised:
 
     ``bundle`` holds the adjusted extrinsics and poses; marking m is its group ``groups[m]``;
     ``usable`` (S, 4) are the accepted corner observations. Reprojection errors are root mean squares
-    over the observations of the accepted markings, under the optimised and the initial extrinsics.
+    over the points seen of the accepted markings, under the optimised and the initial extrinsics.
     """
 
     bundle: Bundle
@@ -81,29 +81,25 @@ def conclude(
         MappingError: No candidate is accepted.
     """
     final, ungated = evidence.final, evidence.ungated
-    count = final.association.count
-    total = np.bincount(ungated.group, minlength=count)
-    agreeing = np.bincount(ungated.group[evidence.inlier], minlength=count)
     seen = Seen(
-        association=final.association,
         kind=group_kinds(final.association, evidence.sightings),
         sightings=evidence.sightings,
         rig=final.rig,
         views=evidence.views,
         cameras=tuple(evidence.cameras.values()),
-        jitter_rad=jitter_rad,
-        row=final.row,
-        group=final.group,
-        inlier_share=agreeing / np.maximum(total, 1),
+        row=ungated.row,
+        group=ungated.group,
+        accepted=evidence.inlier,
     )
-    judged = judge_and_mend(solved_corners(final), seen, options)
+    judged = judge(solved_places(final), seen, options)
     scale = max(1.0, final.solution.chi2_per_dof)
     markings = with_relative_sigma(
         judged.markings(),
         final.corner_index[judged.accepted],
         lambda pairs: scale * final.solution.corner_covariance(pairs),
     )
-    used = np.isin(final.group, judged.accepted)
+    own_corner = final.association.corner_order()[final.row, final.corner]
+    used = np.isin(final.group, judged.accepted) & evidence.sightings.valid[final.row, own_corner]
     observed = Observed(final.row, final.group, final.corner)
     at_start = residuals_under(initial_rig, evidence.sightings, final.association, observed, jitter_rad)
     return Optimised(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from v2hdm.geometry.ipm import (
     apply_in_front,
@@ -16,9 +15,9 @@ from v2hdm.geometry.ipm import (
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import Sightings
-from v2hdm.records import FloatArray
+from v2hdm.records import BoolArray, FloatArray
 
-# Half the trace of a ground covariance beyond which a point is as good as on the horizon, m^2.
+# Variance of a ground point, in its better direction, beyond which it is as good as on the horizon, m^2.
 _HORIZON_M2 = 1e4
 
 
@@ -28,14 +27,16 @@ class Located:
 
     ``corners_map`` (S, 4, 2) m with the covariance ``covariance_m2`` (S, 4, 2, 2) that the pixel
     noise alone gives them; ``ray_map`` (S, 4, 2) from below the camera to the corner; ``height_m``
-    (S,) of the camera. ``valid`` (S, 4) excludes corners that miss the ground.
+    (S,) of the camera. ``valid`` (S, 4) are points and ``informs`` (S, 4) all corners that say something,
+    as :class:`~v2hdm.mapping.sightings.table.Sightings` has them, without those that miss the ground.
     """
 
     corners_map: FloatArray
     covariance_m2: FloatArray
     ray_map: FloatArray
     height_m: FloatArray
-    valid: NDArray[np.bool_]
+    valid: BoolArray
+    informs: BoolArray
 
     @property
     def range_m(self) -> FloatArray:
@@ -63,13 +64,14 @@ def locate(sightings: Sightings, rig: Rig) -> Located:
     centre_vehicle = camera_centre(rig.cam_from_vehicle)[camera]
     poses = rig.map_from_vehicle[frame]
     centre_map = (poses[:, :3, :3] @ centre_vehicle[..., None])[..., 0] + poses[:, :3, 3]
-    with np.errstate(invalid="ignore"):
-        near = np.trace(covariance, axis1=-2, axis2=-1) < _HORIZON_M2
-    valid = sightings.valid & np.isfinite(corners_map).all(axis=-1) & near
+    finite = np.asarray(np.isfinite(corners_map).all(axis=-1) & np.isfinite(covariance).all(axis=(-1, -2)))
+    smallest = np.linalg.eigvalsh(np.where(finite[..., None, None], covariance, np.eye(2)))[..., 0]
+    informs = sightings.informs & finite & (smallest < _HORIZON_M2)
     return Located(
         corners_map=corners_map,
         covariance_m2=covariance,
         ray_map=corners_map - centre_map[:, None, :2],
         height_m=np.maximum(centre_map[:, 2], 0.1),
-        valid=valid,
+        valid=sightings.valid & informs,
+        informs=informs,
     )

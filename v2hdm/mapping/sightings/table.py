@@ -21,6 +21,12 @@ from v2hdm.records import (
     IntArray,
 )
 
+SIDE_SIGMA_PX = 3.0
+"""Largest sigma across, px, of a corner that is known to lie on a line; a vaguer one says next to nothing."""
+
+POINT_SIGMA_PX = 10.0
+"""Largest sigma, px, that a detector states for a corner that it takes for a point."""
+
 
 @dataclass(frozen=True)
 class Sightings:
@@ -29,8 +35,9 @@ class Sightings:
     ``image`` indexes ``Drive.images``, ``camera`` indexes ``cameras``, ``frame`` indexes the
     F distinct time stamps ``stamp_s`` (F,) whose recorded poses are ``map_from_vehicle`` (F, 4, 4), so that
     images taken together share a frame. ``kind`` indexes :data:`v2hdm.records.CORNERED_CLASSES`.
-    ``corners_pinhole_px`` (S, 4, 2) have covariances ``covariance_px`` (S, 4, 2, 2), px^2;
-    ``valid`` (S, 4) says which of them may be used. ``symbols`` are the same images' arrows and chevrons.
+    ``corners_pinhole_px`` (S, 4, 2) have covariances ``covariance_px`` (S, 4, 2, 2), px^2; ``valid`` (S, 4)
+    says which of them are points, small in every direction. ``symbols`` are the same images' arrows and
+    chevrons.
     """
 
     cameras: tuple[str, ...]
@@ -47,6 +54,19 @@ class Sightings:
 
     def __len__(self) -> int:
         return len(self.image)
+
+    @property
+    def informs(self) -> BoolArray:
+        """Which corners (S, 4) the adjustment may use: points, and corners that lie on a known line.
+
+        The end of a dash that the image's border cuts is such a corner: its sigma is small across the dash
+        and large along it. A corner that is no point, but claims to be small in every direction, is neither.
+        """
+        finite = np.asarray(np.isfinite(self.covariance_px).all(axis=(2, 3)))
+        finite &= np.isfinite(self.corners_pinhole_px).all(axis=2)
+        variance = np.linalg.eigvalsh(np.where(finite[..., None, None], self.covariance_px, np.eye(2)))
+        line = (variance[..., 0] <= SIDE_SIGMA_PX**2) & (variance[..., 1] > POINT_SIGMA_PX**2)
+        return np.asarray(finite & (self.valid | line))
 
     def subset(self, rows: IntArray | BoolArray) -> Sightings:
         """The sightings at ``rows`` (indices or a mask), over the same cameras and frames."""
@@ -104,13 +124,14 @@ def collect_sightings(
         for found in sorted(detections, key=lambda one: one.image)
         if drive.images[found.image].camera in camera_index
         for marking in found.markings
-        if marking.kind in CORNERED_CLASSES and np.count_nonzero(marking.corner_valid) >= 2
+        if marking.kind in CORNERED_CLASSES
     ]
+    nothing = (
+        f"no marking was found in the images of {', '.join(cameras)} of drive {drive.name}; check "
+        "that the detector knows this kind of paint and that the images show it within range."
+    )
     if not rows:
-        raise MappingError(
-            f"no marking was found in the images of {', '.join(cameras)} of drive {drive.name}; check "
-            "that the detector knows this kind of paint and that the images show it within range."
-        )
+        raise MappingError(nothing)
     image = np.array([i for i, _ in rows], dtype=np.int64)
     camera = np.array([camera_index[drive.images[i].camera] for i in image], dtype=np.int64)
     corners = np.stack([marking.corners_px for _, marking in rows]).astype(np.float64)
@@ -120,7 +141,7 @@ def collect_sightings(
         corners[own], covariance[own] = _undistort(drive.cameras[name].info, corners[own], covariance[own])
     valid = np.stack([marking.corner_valid for _, marking in rows]).astype(bool)
     valid &= np.isfinite(corners).all(axis=2) & np.isfinite(covariance).all(axis=(2, 3))
-    return Sightings(
+    sightings = Sightings(
         cameras=tuple(cameras),
         stamp_s=frames.stamp_s,
         map_from_vehicle=frames.map_from_vehicle,
@@ -133,6 +154,10 @@ def collect_sightings(
         valid=valid,
         symbols=collect_symbols(drive, detections, camera_index, frames.frame_of_image),
     )
+    sightings = sightings.subset(sightings.informs.sum(axis=1) >= 2)
+    if not len(sightings):
+        raise MappingError(nothing)
+    return sightings
 
 
 def camera_of(drive: Drive, name: str) -> Camera:

@@ -1,0 +1,187 @@
+"""Sightings that show a marking in part: one end and both sides, where a border or a car hides the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.mapping.scene import Scene, SceneOptions, make_scene
+from tests.mapping.test_methods import MATCH_M, match
+from v2hdm.mapping.association.attach import attach
+from v2hdm.mapping.association.groups import fuse_groups, in_view
+from v2hdm.mapping.methods import run_methods
+from v2hdm.mapping.optimise import Optimiser, initial_rig
+from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.sightings.location import locate
+from v2hdm.mapping.sightings.table import Sightings, collect_sightings
+from v2hdm.mapping.sightings.views import views_of
+from v2hdm.records import HdMap, ImageDetections, MarkingDetection
+
+CAMERAS = ("front", "rear")
+
+
+def cut_short(seen: MarkingDetection, rng: np.random.Generator) -> MarkingDetection:
+    """A dash of which one end is hidden: it seems to end earlier, where nothing is known along it."""
+    corners, covariance, valid = seen.corners_px.copy(), seen.covariance_px.copy(), seen.corner_valid.copy()
+    sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+    k = int(np.argmax(sides[:2] + sides[2:]))
+    ends = [(k, (k + 1) % 4), ((k + 3) % 4, (k + 2) % 4)]
+    share, turned = rng.uniform(0.2, 0.8), bool(rng.integers(2))
+    for pair in ends:
+        hidden, kept = pair[::-1] if turned else pair
+        along = corners[hidden] - corners[kept]
+        corners[hidden] = corners[kept] + share * along
+        along = along / np.linalg.norm(along)
+        rows = slice(2 * hidden, 2 * hidden + 2)
+        covariance[rows, rows] += rng.uniform(100, 1000) ** 2 * np.outer(along, along)
+        valid[hidden] = False
+    return replace(seen, corners_px=corners, covariance_px=covariance, corner_valid=valid)
+
+
+def both_ends_hidden(seen: MarkingDetection, rng: np.random.Generator) -> MarkingDetection:
+    """A dash of which nothing but the sides is known."""
+    sides = np.roll(seen.corners_px, -1, axis=0) - seen.corners_px
+    along = sides[np.argmax(np.linalg.norm(sides, axis=1))]
+    along = along / np.linalg.norm(along)
+    covariance = seen.covariance_px + rng.uniform(100, 1000) ** 2 * np.kron(np.eye(4), np.outer(along, along))
+    return replace(seen, covariance_px=covariance, corner_valid=np.zeros(4, dtype=bool))
+
+
+def with_cut_dashes(
+    scene: Scene,
+    share: float,
+    cut: Callable[[MarkingDetection, np.random.Generator], MarkingDetection] = cut_short,
+) -> list[ImageDetections]:
+    """The detections of a scene, so many of whose whole dashes are cut."""
+    rng = np.random.default_rng(0)
+    return [
+        replace(
+            found,
+            markings=tuple(
+                cut(m, rng) if m.kind == "lane_dash" and m.corner_valid.all() and rng.random() < share else m
+                for m in found.markings
+            ),
+        )
+        for found in scene.detections
+    ]
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """A short street, seen by detectors that err by their noise alone."""
+    return make_scene(
+        SceneOptions(length_m=45.0, seed=3, false_rate=0.0, wild_rate=0.0, hidden_corner_rate=0.0)
+    )
+
+
+@pytest.fixture(scope="module")
+def sightings(scene: Scene) -> Sightings:
+    return collect_sightings(scene.drive, with_cut_dashes(scene, 1.0), CAMERAS)
+
+
+def test_corners_on_a_line_inform_and_are_no_points(sightings: Sightings) -> None:
+    lines = sightings.informs & ~sightings.valid
+    assert lines.any()
+    assert set(np.unique(lines.sum(axis=1))) == {0, 2}
+    assert (sightings.informs >= sightings.valid).all()
+
+
+def test_a_corner_that_contradicts_itself_informs_nobody(sightings: Sightings) -> None:
+    claimed = np.broadcast_to(0.3**2 * np.eye(2), sightings.covariance_px.shape)
+    assert not (replace(sightings, covariance_px=claimed).informs & ~sightings.valid).any()
+
+
+def test_a_dash_of_which_every_image_hides_an_end_is_mapped_as_a_whole(scene: Scene) -> None:
+    detections = with_cut_dashes(scene, 0.6)
+    whole, cut = (
+        run_methods(scene.drive, found, CAMERAS, MappingOptions(pose_model="heave"))["Opt"]
+        for found in (scene.detections, detections)
+    )
+    dashes = [len([m for m in result.hd_map.markings if m.kind == "lane_dash"]) for result in (whole, cut)]
+    assert dashes[1] >= dashes[0] - 1
+    pairs, rmse_m = match(cut.hd_map, scene.markings, MATCH_M)
+    assert len(pairs) == len(cut.hd_map.markings)
+    assert rmse_m < match(whole.hd_map, scene.markings, MATCH_M)[1] + 0.01
+    assert cut.reprojection_rmse_px == pytest.approx(whole.reprojection_rmse_px, rel=0.3)
+    incremental = run_methods(scene.drive, detections, CAMERAS, MappingOptions(mode="incremental"))["Opt"]
+    found, grown_rmse_m = match(incremental.hd_map, scene.markings, MATCH_M)
+    assert len(found) >= len(pairs) - 3
+    assert grown_rmse_m < rmse_m + 0.03
+
+
+def test_a_line_that_no_image_ends_is_known_across_and_not_along(scene: Scene, sightings: Sightings) -> None:
+    drive = scene.drive
+    optimiser = Optimiser(
+        sightings,
+        views_of(drive, CAMERAS),
+        drive.cameras,
+        drive.pose_noise,
+        MappingOptions(rounds=1, pose_model="heave"),
+    )
+    bundle = optimiser.settle(optimiser.initial_tracks())
+    order = bundle.association.corner_order()
+    point = np.zeros((bundle.association.count, 4), dtype=bool)
+    shown = sightings.valid[bundle.row, order[bundle.row, bundle.corner]]
+    np.logical_or.at(point, (bundle.group, bundle.corner), shown)
+    index = bundle.corner_index[(bundle.corner_index >= 0) & ~point]
+    variance = np.linalg.eigvalsh(bundle.solution.corner_covariance(index[:, None]))
+    assert np.isfinite(variance).all()
+    assert bundle.solution.observation_factor == pytest.approx(1.0, abs=0.3)
+    assert len(index)
+    assert (np.sqrt(variance[:, 1]) > 0.3).all()
+    assert (np.sqrt(variance[:, 0]) < 0.2).all()
+
+
+def test_a_corner_behind_the_camera_is_not_observed_by_its_line(scene: Scene, sightings: Sightings) -> None:
+    rig = initial_rig(scene.drive.cameras, sightings.map_from_vehicle)
+    optimiser = Optimiser(
+        sightings,
+        views_of(scene.drive, CAMERAS),
+        scene.drive.cameras,
+        scene.drive.pose_noise,
+        MappingOptions(),
+    )
+    tracks, located = optimiser.initial_tracks(), locate(sightings, rig)
+    usable = in_view(tracks, located, sightings, rig, 0.003)
+    assert (usable <= located.informs).all()
+    assert (usable >= located.valid).all()
+    assert usable.sum() > located.valid.sum()
+    fused = fuse_groups(tracks, located, 0.003)
+    assert (fused.seen > 0).sum() < np.isfinite(fused.corners_map).all(axis=2).sum()
+
+
+def test_the_naive_methods_use_whole_sightings_only(scene: Scene) -> None:
+    results = run_methods(
+        scene.drive, with_cut_dashes(scene, 1.0), CAMERAS, MappingOptions(pose_model="heave", rounds=1)
+    )
+    naive: HdMap = results["CNI"].hd_map
+    assert not [marking for marking in naive.markings if marking.kind == "lane_dash"]
+
+
+def test_sides_without_ends_are_attached_to_the_dash_that_they_are_of(scene: Scene) -> None:
+    whole = collect_sightings(scene.drive, scene.detections, CAMERAS)
+    sightings = collect_sightings(scene.drive, with_cut_dashes(scene, 0.4, both_ends_hidden), CAMERAS)
+    assert len(sightings) == len(whole)
+    truth = np.stack([scene.cam_from_vehicle[name] for name in CAMERAS])
+    rig = replace(initial_rig(scene.drive.cameras, sightings.map_from_vehicle), cam_from_vehicle=truth)
+    optimiser = Optimiser(
+        sightings,
+        views_of(scene.drive, CAMERAS),
+        scene.drive.cameras,
+        scene.drive.pose_noise,
+        MappingOptions(),
+    )
+    tracks, located = optimiser.initial_tracks(), locate(sightings, rig)
+    fused = fuse_groups(tracks, located, 0.002)
+    found = attach(tracks, sightings, located, rig, fused, 0.002)
+    new = np.flatnonzero((found.group >= 0) & (tracks.group < 0))
+    lines = np.flatnonzero((sightings.informs & ~sightings.valid).all(axis=1))
+    assert np.isin(lines, new).mean() > 0.3
+    centres = locate(whole, rig).corners_map[new].mean(axis=1)
+    apart = np.linalg.norm(fused.corners_map[found.group[new]].mean(axis=1) - centres, axis=1)
+    assert (apart < 1.0).mean() > 0.98
+    shown = np.stack([found.group, sightings.image])[:, found.group >= 0]
+    assert len(np.unique(shown, axis=1).T) == len(shown.T)

@@ -1,0 +1,260 @@
+"""What a class has in common, and how often a place was seen, say what lies there and where."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from v2hdm.mapping.options import AcceptanceOptions
+from v2hdm.mapping.site_model.class_shapes import learn_shapes
+from v2hdm.mapping.site_model.places import Counts, Places
+from v2hdm.mapping.site_model.posterior import CLUTTER, OF_CLASS, PART_OF_SYMBOL, Posterior, posterior
+from v2hdm.mapping.site_model.verdict import Judged, judge
+
+DIAMOND = np.array([[0.6, 0.0], [0.0, 0.35], [-0.6, 0.0], [0.0, -0.35]])
+DASH = np.array([[1.5, 0.06], [-1.5, 0.06], [-1.5, -0.06], [1.5, -0.06]])
+END = [1, 2]
+"""Two corners of DASH at one end."""
+
+
+def painted(shapes: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
+    """Markings (N, 4, 2) of these shapes, in a row, turned any way, beginning with any corner."""
+    turn = rng.uniform(0, 2 * np.pi, len(shapes))
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]).transpose(2, 0, 1)
+    placed = np.stack(shapes) @ rotation.transpose(0, 2, 1) + np.arange(len(shapes))[:, None, None] * [5.0, 0]
+    return np.stack([np.roll(one, int(rng.integers(4)), axis=0) for one in placed])
+
+
+def solved(true: np.ndarray, rng: np.random.Generator, sigma_m: float = 0.01) -> Places:
+    """The markings as a drive would map them: each corner off by ``sigma_m``, all of it by 2 cm more."""
+    corners = true + 0.02 * rng.standard_normal((len(true), 1, 2)) + sigma_m * rng.standard_normal(true.shape)
+    block = sigma_m**2 * np.eye(8) + 0.02**2 * np.kron(np.ones((4, 4)), np.eye(2))
+    return Places(corners, np.tile(block, (len(true), 1, 1)))
+
+
+def well_seen(count: int) -> Counts:
+    """Each place in ten images, in all of its easy views, and never as part of a symbol."""
+    ten = np.full(count, 10)
+    return Counts(ten, 4 * ten, 4 * ten, ten - 2, ten - 2, 0 * ten)
+
+
+def of_one_class(places: Places, counts: Counts | None = None) -> Posterior:
+    return posterior(places, np.zeros(len(places), dtype=np.int64), counts or well_seen(len(places)))
+
+
+def without(places: Places, place: int, corners: list[int]) -> Places:
+    """The places, of which one has ``corners`` that nobody saw."""
+    seen, covariance = places.corners_map.copy(), places.covariance_m2.copy()
+    seen[place, corners] = np.nan
+    return Places.seen(seen, covariance)
+
+
+def shape_rmse(corners: np.ndarray, true: np.ndarray) -> float:
+    """Root mean square distance of corners, common shifts of a marking taken out."""
+    error = corners - true
+    return float(np.sqrt(np.mean(np.sum((error - error.mean(axis=1, keepdims=True)) ** 2, axis=2))))
+
+
+def normalised(found: Posterior, true: np.ndarray) -> np.ndarray:
+    """Squared errors (N,) of all eight coordinates, in the stated covariance."""
+    error = (found.places.corners_map - true).reshape(-1, 8, 1)
+    return (error.transpose(0, 2, 1) @ np.linalg.solve(found.places.covariance_m2, error))[:, 0, 0]
+
+
+@pytest.mark.parametrize("shape", [DIAMOND, DASH])
+def test_markings_of_one_stencil_lend_one_another_their_accuracy(shape: np.ndarray) -> None:
+    rng = np.random.default_rng(0)
+    true = painted([shape] * 60, rng)
+    places = solved(true, rng, 0.02)
+    found = of_one_class(places)
+    assert shape_rmse(found.places.corners_map, true) < 0.7 * shape_rmse(places.corners_map, true)
+    assert normalised(found, true).mean() / 8 < 1.1
+    assert (found.log_odds > 5).all()
+
+
+def test_a_corner_that_nobody_saw_is_where_the_class_has_it() -> None:
+    rng = np.random.default_rng(1)
+    true = painted([DIAMOND] * 30, rng)
+    found = of_one_class(without(solved(true, rng), 4, [2]))
+    assert np.linalg.norm(found.places.corners_map[4] - true[4], axis=1).max() < 0.08
+    assert normalised(found, true)[4] < 20
+
+
+def test_a_corner_on_a_known_line_is_found_along_it() -> None:
+    rng = np.random.default_rng(2)
+    true = painted([DASH] * 30, rng)
+    places = solved(true, rng)
+    side = true[4, 1] - true[4, 0]
+    long = [0, 1, 2, 3] if np.linalg.norm(side) > 1 else [1, 2, 3, 0]
+    along = (true[4, long[1]] - true[4, long[0]]) / 3.0
+    for corner in (long[1], long[2]):
+        places.corners_map[4, corner] -= 1.2 * along
+        rows = slice(2 * corner, 2 * corner + 2)
+        places.covariance_m2[4, rows, rows] += 5.0**2 * np.outer(along, along)
+    found = of_one_class(places)
+    assert np.linalg.norm(found.places.corners_map[4] - true[4], axis=1).max() < 0.08
+    assert found.probability[4, OF_CLASS] > 0.5
+
+
+def test_a_corner_taken_for_another_edge_is_put_where_the_shape_has_it() -> None:
+    rng = np.random.default_rng(3)
+    true = painted([DIAMOND] * 40, rng)
+    places = solved(true, rng)
+    places.corners_map[7, 2] += 0.4 * (true[7, 2] - true[7].mean(axis=0))
+    found = of_one_class(places)
+    assert np.linalg.norm(found.places.corners_map[7] - true[7], axis=1).max() < 0.08
+
+
+def test_a_dash_of_another_length_keeps_it_where_longer_ones_tell_that_lengths_differ() -> None:
+    rng = np.random.default_rng(4)
+    lengths = [1.0] * 34 + [0.9, 0.92, 0.94, 1.06, 1.08, 1.1]
+    true = painted([DASH * [length, 1.0] for length in lengths], rng)
+    found = of_one_class(solved(true, rng, 0.005))
+    sides = np.linalg.norm(np.diff(found.places.corners_map, axis=1), axis=2).max(axis=1)
+    np.testing.assert_allclose(sides, 3.0 * np.array(lengths), atol=0.08)
+    assert (normalised(found, true) < 25).all()
+
+
+def test_a_worn_end_is_not_taken_for_the_end_of_the_paint() -> None:
+    rng = np.random.default_rng(5)
+    true = painted([DASH] * 60, rng)
+    places = solved(true, rng, 0.005)
+    for worn in (10, 20, 30, 40):
+        k = int(np.argmax(np.linalg.norm(np.roll(true[worn], -1, axis=0) - true[worn], axis=1)))
+        for corner, other in ((k, (k + 1) % 4), ((k + 3) % 4, (k + 2) % 4)):
+            places.corners_map[worn, corner] += 0.12 * (true[worn, other] - true[worn, corner])
+    found = of_one_class(places)
+    error = np.linalg.norm(found.places.corners_map - true, axis=2)
+    assert (error < 3 * found.places.sigma_m).all()
+    assert (found.log_odds > 5).all()
+
+
+def test_two_neighbouring_corners_of_a_rhombus_leave_two_places_for_it() -> None:
+    rng = np.random.default_rng(6)
+    true = painted([DIAMOND] * 30, rng)
+    found = of_one_class(without(solved(true, rng), 4, [0, 1]))
+    assert found.places.sigma_m[4].max() > 0.15
+    assert found.places.sigma_m[[3, 5]].max() < 0.1
+
+
+def test_one_end_says_nothing_of_the_other_where_lengths_differ() -> None:
+    rng = np.random.default_rng(7)
+    true = painted([DASH * [(1.0, 0.8)[k % 2], 1.0] for k in range(40)], rng)
+    ends = np.argsort(np.linalg.norm(true[4] - true[4, 0], axis=1))[2:].tolist()
+    found = of_one_class(without(solved(true, rng, 0.005), 4, ends))
+    assert found.places.sigma_m[4].max() > 0.15
+
+
+def test_a_class_may_have_several_shapes() -> None:
+    rng = np.random.default_rng(8)
+    true = painted([DIAMOND * (1.0, 1.4)[k % 2] for k in range(40)], rng)
+    shapes = learn_shapes(solved(true, rng))
+    assert len(shapes) == 2
+    assert sum(shape.share for shape in shapes) == pytest.approx(1.0)
+
+
+def test_a_class_of_many_shapes_is_left_as_it_was_seen_but_for_being_parallelograms() -> None:
+    rng = np.random.default_rng(9)
+    true = painted([DIAMOND * rng.uniform(0.5, 2.0) for _ in range(12)], rng)
+    places = solved(true, rng, 0.02)
+    found = of_one_class(places)
+    corners = found.places.corners_map
+    closure = corners[:, 0] - corners[:, 1] + corners[:, 2] - corners[:, 3]
+    assert np.linalg.norm(closure, axis=1).max() < 0.05
+    assert shape_rmse(corners, true) < shape_rmse(places.corners_map, true)
+    assert (found.log_odds > 3).all()
+
+
+def test_a_worn_marking_of_known_shape_is_one_although_few_images_show_it() -> None:
+    rng = np.random.default_rng(10)
+    places, counts = solved(painted([DIAMOND] * 40, rng), rng), well_seen(40)
+    counts.found[7], counts.images[7] = 1, 3
+    assert of_one_class(places, counts).log_odds[7] > 2
+
+
+def odd_and_seldom() -> tuple[Places, Counts]:
+    """Forty places, of which number 7 is of no marking's shape and seen in three images of many."""
+    rng = np.random.default_rng(11)
+    places, counts = solved(painted([DIAMOND] * 40, rng), rng), well_seen(40)
+    places.corners_map[7] += rng.normal(0, 0.25, (4, 2))
+    counts.found[7], counts.images[7], counts.easy_views[7] = 1, 3, 15
+    counts.observations[7], counts.agreeing[7] = 12, 8
+    return places, counts
+
+
+def test_what_has_no_shape_and_is_seldom_found_is_clutter() -> None:
+    found = of_one_class(*odd_and_seldom())
+    assert found.probability[7, CLUTTER] > 0.8
+    assert (np.delete(found.log_odds, 7) > 5).all()
+
+
+def test_what_many_images_show_as_an_arrow_is_part_of_one() -> None:
+    rng = np.random.default_rng(12)
+    true = painted([DASH * [(0.6 if k == 7 else 1.0), 1.0] for k in range(40)], rng)
+    counts = well_seen(40)
+    counts.as_symbol[7] = 8
+    assert of_one_class(solved(true, rng), counts).probability[7, PART_OF_SYMBOL] > 0.9
+
+
+def test_what_one_image_shows_as_an_arrow_stays_a_marking() -> None:
+    rng = np.random.default_rng(13)
+    counts = well_seen(40)
+    counts.as_symbol[7] = 1
+    assert of_one_class(solved(painted([DIAMOND] * 40, rng), rng), counts).log_odds[7] > 5
+
+
+@dataclass(frozen=True)
+class Told:
+    """Counts that are known beforehand, in the place of images."""
+
+    kind: np.ndarray
+    known: Counts
+
+    def counts(self, corners_map: np.ndarray) -> Counts:
+        return self.known
+
+
+def verdict(places: Places, counts: Counts | None = None) -> Judged:
+    told = Told(np.zeros(len(places), dtype=np.int64), counts or well_seen(len(places)))
+    return judge(places, told, AcceptanceOptions())
+
+
+def test_reasons_name_what_has_won() -> None:
+    places, counts = odd_and_seldom()
+    counts.as_symbol[3] = 40
+    judged = verdict(without(places, 5, [0, 1, 2]), counts)
+    reasons = {place: reason for place, reason in enumerate(judged.verdict) if reason is not None}
+    assert set(reasons) == {3, 5, 7}
+    assert reasons[3] == "part of an arrow or a chevron"
+    assert reasons[5] == "a corner was never seen twice"
+    assert reasons[7] in ("found in too few of its images", "not shaped like a marking of its class")
+    assert len(judged.markings()) == 37
+    assert [one.reason for one in judged.exclusions()] == list(reasons.values())
+
+
+def test_of_two_markings_on_one_spot_the_likelier_stays() -> None:
+    rng = np.random.default_rng(14)
+    places, counts = solved(painted([DIAMOND] * 20, rng), rng), well_seen(20)
+    places.corners_map[2] = places.corners_map[1] + [0.1, 0.0]
+    counts.images[2] = 4
+    judged = verdict(places, counts)
+    assert [k for k, reason in enumerate(judged.verdict) if reason] == [2]
+    assert judged.verdict[2] == "lies on a better supported marking"
+
+
+def test_a_shift_that_all_markings_share_speaks_against_none() -> None:
+    rng = np.random.default_rng(15)
+    places = solved(painted([DIAMOND] * 20, rng), rng)
+    shared = replace(
+        places, covariance_m2=places.covariance_m2 + 0.4**2 * np.kron(np.ones((4, 4)), np.eye(2))
+    )
+    assert not any(verdict(shared).verdict)
+
+
+def test_a_place_less_certain_than_allowed_is_left_out() -> None:
+    rng = np.random.default_rng(16)
+    places = solved(painted([DIAMOND] * 20, rng), rng)
+    places.covariance_m2[3] += 0.3**2 * np.kron(np.ones((4, 4)), np.eye(2))
+    assert verdict(places).verdict[3] == "its position is too uncertain"
