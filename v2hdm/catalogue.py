@@ -1,4 +1,4 @@
-"""The catalogue of painted markings: families of shapes and sizes by class, a file that users extend."""
+"""The catalogue of painted markings: families of shapes and sizes by class."""
 
 from __future__ import annotations
 
@@ -9,11 +9,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
 from v2hdm.errors import ConfigError
-from v2hdm.records import FloatArray
 
 CATALOGUE_FILE = Path(__file__).with_name("catalogue.yaml")
 
@@ -109,14 +107,3 @@ def _read_class(name: str, entry: Any, path: Path) -> MarkingClass:
     return MarkingClass(
         name, family, ranges["length_m"], ranges["width_m"], entry.get("group", name), float(softness)
     )
-
-
-def size_of(points_m: FloatArray) -> tuple[float, float]:
-    """Length and width, m, of the smallest rectangle around points (N, 2); nan for fewer than three."""
-    import cv2
-
-    seen = points_m[np.isfinite(points_m[:, 0])]
-    if len(seen) < 3:
-        return math.nan, math.nan
-    _, size, _ = cv2.minAreaRect(seen.astype(np.float32))
-    return float(max(size)), float(min(size))

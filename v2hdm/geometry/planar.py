@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from v2hdm.records import BoolArray, FloatArray
@@ -52,3 +53,15 @@ def clip_half(polygon: FloatArray, depth: FloatArray) -> FloatArray:
         if depth[k] >= 0:
             kept.append(polygon[k])
     return np.array(kept).reshape(-1, 2)
+
+
+def rectangle_size(points: FloatArray) -> tuple[float, float]:
+    """Length and width of the smallest rectangle around points (N, 2), those that are nan left out.
+
+    They are nan for fewer than three points.
+    """
+    seen = points[np.isfinite(points[:, 0])]
+    if len(seen) < 3:
+        return float("nan"), float("nan")
+    _, size, _ = cv2.minAreaRect(seen.astype(np.float32))
+    return float(max(size)), float(min(size))

@@ -14,10 +14,11 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from v2hdm.catalogue import LINE, OTHER, SYMBOL, Catalogue, size_of
+from v2hdm.catalogue import LINE, OTHER, SYMBOL, Catalogue
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.markings.blobs import Blob
 from v2hdm.geometry.ipm import apply_homography
+from v2hdm.geometry.planar import rectangle_size
 from v2hdm.geometry.quadrilateral import following, is_convex_px, order_corners, quad_from_hull
 from v2hdm.records import BoolArray, FloatArray
 
@@ -92,7 +93,7 @@ def propose(
         if sum(blob.class_score.values()) < _LEAST_CERTAINTY:
             continue
         ground = on_ground[begin:end]
-        length_m, width_m = size_of(ground)
+        length_m, width_m = rectangle_size(ground)
         whole = bool(view.inside(blob.outline_px, _BORDER_PX).all())
         share = _shares(blob, length_m, width_m, catalogue, whole=whole)
         start = _tightest(outlines[begin:end], ground, view)
