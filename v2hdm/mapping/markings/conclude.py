@@ -18,7 +18,7 @@ from v2hdm.mapping.sightings.location import locate
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.mapping.sightings.views import Views
-from v2hdm.mapping.site_model.places import solved_places
+from v2hdm.mapping.site_model.places import solved_places, with_shared_errors
 from v2hdm.mapping.site_model.verdict import Seen, judge
 from v2hdm.records import BoolArray, Calibration, Camera, FloatArray, IntArray, Marking
 
@@ -91,7 +91,10 @@ def conclude(
         group=ungated.group,
         accepted=evidence.inlier,
     )
-    judged = judge(solved_places(final), seen, options)
+    located = locate(evidence.sightings, final.rig)
+    located.informs[:] &= evidence.usable
+    fused = fuse_groups(final.association, located, jitter_rad=0.0)
+    judged = judge(with_shared_errors(solved_places(final), fused), seen, options)
     scale = max(1.0, final.solution.chi2_per_dof)
     markings = with_relative_sigma(
         judged.markings(),

@@ -30,10 +30,10 @@ from v2hdm.mapping.site_model.paint_error import PaintError, learn_paint_error
 from v2hdm.mapping.site_model.places import Counts, Places
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-OF_CLASS, OTHER_LENGTH, WORN_END, WRONG_CORNER, OWN_SHAPE, PART_OF_SYMBOL, CLUTTER = range(7)
+OF_CLASS, OTHER_LENGTH, WRONG_END, WRONG_CORNER, OWN_SHAPE, PART_OF_SYMBOL, CLUTTER = range(7)
 """What a place may be: the first five are markings."""
 
-_PRIOR_COUNT = np.array([14.0, 0.5, 0.1, 0.5, 2.0, 1.0, 1.5])
+_PRIOR_COUNT = np.array([14.0, 0.5, 0.5, 0.5, 2.0, 1.0, 1.5])
 """Dirichlet prior: about how many of twenty places of a class are what, before the drive says."""
 
 _SIZE_SIGMA_M = 1.0
@@ -44,6 +44,9 @@ _LENGTH_SIGMA_M = 0.3
 
 _MISPLACED_M = 0.3
 """Sigma, m, of an end that is worn or of a corner taken from another edge (17 worn ends: .08 to .74 m)."""
+
+_RUN_ON_M = 1.0
+"""Sigma, m, of an end that runs on into other paint: letters and lines are about as long."""
 
 _RATE_STRENGTH = 4.0
 """Images that the common rate of a class is worth: how alike its markings are in how often they are found."""
@@ -169,7 +172,7 @@ class _Hypothesis:
 
     In the ``directions`` (N, 5, 8) the solved corners deviate by ``residual`` (N, 5) from where a shape was
     laid, the painted ones by ``scatter`` (..., 8, 8); all images may misplace these by ``misplaced``
-    (..., 8, 8), if ``inwards`` (N, 8) is given only that way, which is how paint wears.
+    (..., 8, 8), if a ``one_way`` (N, 8) is given only that way: paint wears inwards, and runs on outwards.
     """
 
     kind: int
@@ -180,7 +183,7 @@ class _Hypothesis:
     scatter: FloatArray
     misplaced: FloatArray
     paint_m2: float
-    inwards: FloatArray | None
+    one_way: FloatArray | None
 
     @cached_property
     def formal(self) -> FloatArray:
@@ -195,11 +198,11 @@ class _Hypothesis:
         solved = np.linalg.solve(innovation, self.residual[..., None])[..., 0]
         squared = np.sum(self.residual * solved, axis=1)
         both_ways = -0.5 * (squared + np.linalg.slogdet(innovation)[1] + 5 * np.log(2 * np.pi))
-        if self.inwards is None:
+        if self.one_way is None:
             return np.asarray(both_ways)
-        moved = (self.directions @ self.inwards[..., None])[..., 0]
-        mean = np.sum(moved * solved, axis=1) * _MISPLACED_M
-        held = np.sum(moved * np.linalg.solve(innovation, moved[..., None])[..., 0], axis=1) * _MISPLACED_M**2
+        moved = (self.directions @ self.one_way[..., None])[..., 0]
+        mean = np.sum(moved * solved, axis=1)
+        held = np.sum(moved * np.linalg.solve(innovation, moved[..., None])[..., 0], axis=1)
         return np.asarray(both_ways + norm.logcdf(mean / np.sqrt(np.maximum(1 - held, 1e-9))) + np.log(2))
 
     def corners(self, paint_m2: FloatArray) -> Places:
@@ -233,13 +236,13 @@ def _hypotheses(
         laid: Laid,
         scatter: FloatArray,
         misplaced: FloatArray = nothing,
-        inwards: FloatArray | None = None,
+        one_way: FloatArray | None = None,
     ) -> None:
         off = (places.corners_map - laid.corners_map).reshape(-1, 8, 1)
         residual = (laid.directions @ off)[..., 0]
         prior, paint_m2 = float(np.log(part * share[kind])), paint.sigma_m**2
         out.append(
-            _Hypothesis(kind, prior, places, laid.directions, residual, scatter, misplaced, paint_m2, inwards)
+            _Hypothesis(kind, prior, places, laid.directions, residual, scatter, misplaced, paint_m2, one_way)
         )
 
     total = sum(shape.share for shape in shapes)
@@ -253,7 +256,8 @@ def _hypotheses(
         if shape.is_elongated:
             add(OTHER_LENGTH, part, laid, scatter + _LENGTH_SIGMA_M**2 * _outer((ends[0] + ends[1]) / 2))
         for end in ends:
-            add(WORN_END, part / len(ends), laid, scatter, _MISPLACED_M**2 * _outer(end), end)
+            for way in (_MISPLACED_M * end, -_RUN_ON_M * end):
+                add(WRONG_END, part / 2 / len(ends), laid, scatter, _outer(way), way)
         for corner in range(4):
             block = _MISPLACED_M**2 * np.kron(np.diag(np.eye(4)[corner]), np.eye(2))
             add(WRONG_CORNER, part / 4, laid, scatter, np.asarray(block, np.float64))
