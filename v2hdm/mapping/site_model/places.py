@@ -95,7 +95,8 @@ def with_shared_errors(places: Places, fused: FusedGroups) -> Places:
         fused: the same corners by their images' own covariances.
     """
     single = np.maximum(fused.seen, 1)[..., None, None] * fused.covariance_m2
-    shared = np.where(np.isnan(fused.corners_map).any(axis=2)[..., None, None], 0.0, _CORRELATION * single)
+    unseen = np.asarray(np.isnan(fused.corners_map).any(axis=2))[..., None, None]
+    shared = np.where(unseen, 0.0, _CORRELATION * single)
     return Places(places.corners_map, places.covariance_m2 + block_diagonal(shared))
 
 
