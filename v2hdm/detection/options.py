@@ -36,7 +36,7 @@ class DetectorOptions:
     max_range_m: float = 22.0
     min_score: float = 0.5
     min_confidence: float = 0.7
-    max_corner_sigma_px: float = 0.8
+    max_corner_sigma_px: float = 0.5
     mirrored: bool = False
     border_px: float = 4.0
     lane_step_m: float = 0.5
