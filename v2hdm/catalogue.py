@@ -24,8 +24,8 @@ _SOFTNESS = 0.25
 _TINY_M = 1e-3
 """Least size that is told from nothing, m."""
 
-_STRIPE_ASPECT = 3.0
-"""A stripe or a line is at least this many times as long as wide."""
+_STRIPE_ASPECT, _ASPECT_SOFTNESS = 3.0, 0.1
+"""A stripe or a line is at least this many times as long as wide; the deviation of the logarithm of that."""
 
 
 @dataclass(frozen=True)
@@ -52,12 +52,12 @@ class MarkingClass:
         if not (math.isfinite(length_m) and math.isfinite(width_m)):
             return 0.0
         sizes = ((max(length_m, _TINY_M), self.length_m), (max(width_m, _TINY_M), self.width_m))
-        off = [max(math.log(size / high), 0.0) if high < math.inf else 0.0 for size, (_, high) in sizes]
+        off = [math.log(size / high) / self.softness for size, (_, high) in sizes if high < math.inf]
         if whole:
-            off += [max(math.log(max(low, _TINY_M) / size), 0.0) for size, (low, _) in sizes]
+            off += [math.log(max(low, _TINY_M) / size) / self.softness for size, (low, _) in sizes]
             if self.family in (STRIPE, LINE):
-                off.append(max(math.log(_STRIPE_ASPECT * sizes[1][0] / sizes[0][0]), 0.0))
-        return -0.5 * sum((one / self.softness) ** 2 for one in off)
+                off.append(math.log(_STRIPE_ASPECT * sizes[1][0] / sizes[0][0]) / _ASPECT_SOFTNESS)
+        return -0.5 * sum(max(one, 0.0) ** 2 for one in off)
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,7 @@ _MODEL_SIGMA_PX = 0.04
 aperture."""
 
 _MAX_CORRELATION = 0.7
-_SEARCH_STEPS, _STEPS = 4, 5
+_SEARCH_STEPS, _STEPS = 4, 8
 _MAX_STEP = 2.0
 """Longest step of a side, in blurs."""
 

@@ -33,7 +33,7 @@ from v2hdm.records import BoolArray, FloatArray, IntArray
 OF_CLASS, OTHER_LENGTH, WRONG_END, WRONG_CORNER, OWN_SHAPE, PART_OF_SYMBOL, CLUTTER = range(7)
 """What a place may be: the first five are markings."""
 
-_PRIOR_COUNT = np.array([14.0, 0.5, 0.5, 0.5, 2.0, 1.0, 1.5])
+_PRIOR_COUNT = np.array([14.0, 0.5, 0.2, 0.5, 2.0, 1.0, 1.5])
 """Dirichlet prior: about how many of twenty places of a class are what, before the drive says."""
 
 _SIZE_SIGMA_M = 1.0
