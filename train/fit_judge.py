@@ -47,7 +47,7 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import CONFIDENCE_FILE, FOLDER, JUDGE_FILE, being_fitted
 from v2hdm.files import replace_text
 from v2hdm.geometry.quadrilateral import following, side_frames
-from v2hdm.records import BoolArray, FloatArray
+from v2hdm.records import OUTLINED_CLASSES, BoolArray, FloatArray
 
 SEED = 917
 EASY = 0.2
@@ -112,8 +112,11 @@ def is_true(shown: Example, kind: str, corners_px: FloatArray) -> tuple[bool | N
     if own:
         return True, max(own, key=lambda pair: pair[0])[1]
     share, nearest = max(overlaps, key=lambda pair: pair[0], default=(0.0, None))
-    if share <= 0.05 or (nearest is not None and nearest.fair and nearest.kind != kind):
+    if share <= 0.05 or nearest is None:
         return False, None
+    of_own = max((share for share, true in overlaps if true.kind == kind), default=0.0)
+    if nearest.kind != kind and (nearest.fair or (nearest.kind in OUTLINED_CLASSES and of_own <= 0.05)):
+        return False, None  # the head of an arrow is no diamond
     return None, None
 
 

@@ -35,7 +35,7 @@ from v2hdm.files import forget_stdout, whole_file
 _ROUGH_RANGE_M = 40.0
 """Without a calibration distances may be wrong by a factor of two: nothing may be dropped for being far."""
 
-_STAGES = ("read", "net", "blobs", "corners", "lanes")
+_STAGES = ("read", "net", "propose", "lanes", "fit", "judge")
 
 
 class _Job(NamedTuple):
