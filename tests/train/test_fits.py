@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Sequence
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -9,8 +10,8 @@ import pytest
 
 from models.judge import Judge
 from train import fit_judge, fit_lane_score
-from train.examples import Example, example, polygon_overlap
-from train.fit_judge import Gathered
+from train.examples import Example, TrueMarking, example, polygon_overlap
+from train.fit_judge import Gathered, is_true
 from train.fit_lane_score import proposed, seen
 from train.sworn_flecks import Spots, lit, swearing
 from v2hdm.detection import weights
@@ -19,7 +20,7 @@ from v2hdm.detection.markings.evidence import FEATURES
 from v2hdm.detection.markings.judge import SHAPES, TOLD
 from v2hdm.detection.markings.rectified import CHANNELS
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.records import MarkingDetection
+from v2hdm.records import ARROW, DIAMOND, LANE_DASH, MarkingDetection
 
 SEED = 4711
 
@@ -110,3 +111,16 @@ def test_judge_and_lane_score_are_written_with_a_manifest_that_the_detector_acce
     assert files["judge.onnx"]["command"] == "python -m train.fit_judge --images 3 --write"
     assert files["lane_score.json"]["command"] == "python -m train.fit_lane_score --images 4 --write"
     assert weights.digest(folder / "judge.onnx") != weights.digest(weights.JUDGE_FILE)
+
+
+def test_the_head_of_an_arrow_is_no_diamond_and_a_hidden_dash_is_neither_true_nor_false():
+    head = np.array([[100.0, 100], [130, 160], [160, 100]])
+    hidden = np.array([[300.0, 100], [310, 100], [310, 200], [300, 200]])
+    shown = SimpleNamespace(
+        markings=[TrueMarking(ARROW, head, 5.0, False), TrueMarking(LANE_DASH, hidden, 5.0, False)]
+    )
+    over_head = np.array([[130.0, 90], [105, 115], [130, 140], [155, 115]])
+    assert is_true(shown, DIAMOND, over_head) == (False, None)
+    assert is_true(shown, LANE_DASH, hidden)[0] is True
+    assert is_true(shown, LANE_DASH, hidden - [0, 70])[0] is None
+    assert is_true(shown, LANE_DASH, [*hidden, 200, 0]) == (False, None)
