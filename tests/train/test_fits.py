@@ -123,4 +123,4 @@ def test_the_head_of_an_arrow_is_no_diamond_and_a_hidden_dash_is_neither_true_no
     assert is_true(shown, DIAMOND, over_head) == (False, None)
     assert is_true(shown, LANE_DASH, hidden)[0] is True
     assert is_true(shown, LANE_DASH, hidden - [0, 70])[0] is None
-    assert is_true(shown, LANE_DASH, [*hidden, 200, 0]) == (False, None)
+    assert is_true(shown, LANE_DASH, hidden + np.array([200.0, 0.0])) == (False, None)
