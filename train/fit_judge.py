@@ -4,11 +4,12 @@
 
 Run it after another network was put in place; it takes three quarters of an hour. Quadrilaterals that the
 detector proposes on rendered scenes, first two thirds of full difficulty, then a third of easy ones, are true
-if they overlap a marking of their class by half, and false where the quality benchmark would say so. The
-judge, ``judge.onnx``, learns to tell them apart; the claims of the others in an image are then weighed by
+if they overlap a marking of their class by half, and false where the quality benchmark would say so or where
+they lie on an arrow. The judge, ``judge.onnx``, learns to tell them apart, and how far the sides of the true
+ones are off; the claims of the others in an image are then weighed by
 logistic regressions with a weak ridge, one for each shape, ``confidence.json``; the manifest beside them in
-:mod:`v2hdm.detection.weights` is brought up to date. Each scene is looked at as on the vehicle and as in the
-mapping; every other one once more with spots of sun of which the paint network swears that they are
+:mod:`v2hdm.detection.weights` is brought up to date. Each scene is looked at as on the vehicle, every
+third as in the mapping, too, and every other one once more with spots of sun of which the paint network swears that they are
 markings, which the judge learns to see through. Its seed is neither that of the quality benchmark nor one of
 training. Printed: the log odds that each of the others' features adds per standard deviation; log loss, and
 the count of true ones at given counts of false ones, on the images of each fifth by a fit to the others.
@@ -54,7 +55,9 @@ EASY = 0.2
 RIDGE = 2.0
 FOLDS = 5
 CONFIG = JudgeConfig()
-LIT_EVERY = 2
+LIT_EVERY, MIRRORED_EVERY = 2, 3
+"""Which images are looked at once more, with spots of sun and as in the mapping."""
+
 _TOLD_EVERY = 100
 COUNTS = (10, 20, 40, 80)
 """Of false ones, at which those true are counted."""
@@ -174,8 +177,9 @@ def main() -> None:
         detectors = [Detector.load(options=replace(options, mirrored=twice)) for twice in (False, True)]
     gathered = Gathered()
     for done, (index, shown) in enumerate(renders_to_fit(parsed.images, SEED)):
-        for detector in detectors:
-            gathered.add(index, shown, detector)
+        gathered.add(index, shown, detectors[0])
+        if done % MIRRORED_EVERY == 0:
+            gathered.add(index, shown, detectors[1])
         if done % LIT_EVERY == 0:
             rng = np.random.default_rng([SEED, done])
             spotted, spots = lit(shown, detectors[0].view(shown.camera), rng)
