@@ -9,10 +9,11 @@ they lie on an arrow. The judge, ``judge.onnx``, learns to tell them apart, and 
 ones are off; the claims of the others in an image are then weighed by
 logistic regressions with a weak ridge, one for each shape, ``confidence.json``; the manifest beside them in
 :mod:`v2hdm.detection.weights` is brought up to date. Each scene is looked at as on the vehicle, every
-third as in the mapping, too, and every other one once more with spots of sun of which the paint network swears that they are
-markings, which the judge learns to see through. Its seed is neither that of the quality benchmark nor one of
-training. Printed: the log odds that each of the others' features adds per standard deviation; log loss, and
-the count of true ones at given counts of false ones, on the images of each fifth by a fit to the others.
+third as in the mapping, too, and every other one once more with spots of sun of which the paint network
+swears that they are markings, which the judge learns to see through. Its seed is neither that of the quality
+benchmark nor one of training. Printed: the log odds that each of the others' features adds per standard
+deviation; log loss, and the count of true ones at given counts of false ones, on the images of each fifth by
+a fit to the others.
 """
 
 from __future__ import annotations
