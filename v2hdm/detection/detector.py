@@ -158,7 +158,7 @@ class Detector:
     def _lane_paint(self, proposals: Sequence[Proposal]) -> list[LanePaint]:
         found = []
         for proposal in proposals:
-            if proposal.blob.parts:
+            if not proposal.blob.traced:
                 continue
             own = sum(proposal.blob.class_score.get(name, 0.0) for name in self._lane_classes)
             is_lane = proposal.kind in self._lane_classes and own >= self.options.min_score

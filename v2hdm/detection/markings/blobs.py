@@ -67,7 +67,8 @@ class Blob:
     zero crossings between neighbouring elements, recorded px, in no order. ``class_score`` maps
     each class to its mean probability over the blob. ``touches_symbol`` says that it was split
     off a connected piece of paint another part of which is an arrow, a chevron or other paint. A piece that
-    may be several markings comes whole, followed by its ``parts``.
+    may be several markings comes whole, followed by its ``parts``. Lanes are ``traced`` in pieces of likely
+    paint, or in their parts of different classes.
     """
 
     class_score: dict[str, float]
@@ -77,6 +78,7 @@ class Blob:
     outline_px: FloatArray
     touches_symbol: bool = False
     parts: int = 0
+    traced: bool = True
 
     @property
     def cells(self) -> int:
@@ -125,7 +127,8 @@ def find_blobs(
             box = (slice(y - 1, y + h + 1), slice(x - 1, x + w + 1))
             first_px = corner_px + stride * np.array([x - 1.0, y - 1.0])
             mask, raised = wholes[box] == label, level[box] - np.float32(_DOUBTFUL)
-            blobs.append(_blob(mask, raised, sight, (y - 1, x - 1), classes, first_px, stride))
+            whole = _blob(mask, raised, sight, (y - 1, x - 1), classes, first_px, stride)
+            blobs.append(replace(whole, traced=False))
         x, y, w, h = cv2.boundingRect(contours[index])
         box = (slice(y - 1, y + h + 1), slice(x - 1, x + w + 1))
         origin_px = corner_px + stride * np.array([x - 1.0, y - 1.0])
@@ -134,7 +137,10 @@ def find_blobs(
         outline_px = corner_px + stride * outlines[index]
         parts = _split(inside, level[box], sight, box, classes, origin_px, stride)
         signed = _signed(inside, level[box])
-        blobs.append(Blob(scores, signed, origin_px, stride, outline_px, parts=len(parts)))
+        by_class = any(part.traced for part in parts)
+        blobs.append(
+            Blob(scores, signed, origin_px, stride, outline_px, parts=len(parts), traced=not by_class)
+        )
         owner[box][inside] = len(blobs)
         for part in parts:
             blobs.append(part)
@@ -256,7 +262,7 @@ def _split(
     if len(parts) < 2:
         return []
     touches = any(part.kind in _SYMBOLS for part in parts)
-    return [replace(part, touches_symbol=touches) for part in parts]
+    return [replace(part, touches_symbol=touches, traced=len(present) > 1) for part in parts]
 
 
 def _blob(
