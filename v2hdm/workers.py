@@ -154,9 +154,6 @@ def _serve(
     except Exception as failure:
         failure.add_note(f"in a worker process:\n{traceback.format_exc()}")
         line.send((None, failure))
-    finally:
-        # It ends by itself from here on; an exception while libraries tidy up would be noise on the terminal.
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
 
 def _next(line: Connection) -> tuple[Any] | None:
