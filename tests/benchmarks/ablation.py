@@ -48,7 +48,6 @@ def parts() -> Iterator[Part]:
     yield "the judge's doubt of sides", _without_side_doubt
     yield "the others of the image", _without_context
     yield "size in the odds of classes", _without_sizes
-    yield "rectangles on the ground as starts", lambda: patch.object(propose, "_ground_rectangle", _nothing)
     yield "parts beside whole pieces", _without_parts
 
 

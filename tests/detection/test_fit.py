@@ -68,7 +68,7 @@ def test_paint_brighter_than_the_sensor_can_say_is_not_drawn_larger(paint):
     fit, _, _, error = fitted(picture(camera, shapes, paint=paint, blur_px=0.9), camera, shapes)
     _, normal, _ = side_frames(fit.corners)
     outward = (error * normal).sum(axis=-1)
-    assert abs(np.median(outward)) < 0.2
+    assert abs(np.median(outward)) < 0.12
     assert np.median(np.linalg.norm(error, axis=-1)) < 0.25
 
 

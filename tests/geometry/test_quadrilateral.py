@@ -11,8 +11,6 @@ from v2hdm.geometry.quadrilateral import (
     align,
     characteristic_lengths,
     diameters,
-    interior_angles,
-    intersect_sides,
     is_convex,
     is_convex_px,
     long_axis,
@@ -80,16 +78,6 @@ def test_normals_of_image_corners_point_outwards() -> None:
     _, normal, _ = side_frames(KITE)
     middle = (KITE + np.roll(KITE, -1, axis=0)) / 2
     assert (((middle - KITE.mean(axis=0)) * normal).sum(axis=1) > 0).all()
-
-
-def test_the_angles_of_a_quadrilateral_add_up_to_a_full_turn() -> None:
-    assert interior_angles(KITE).sum() == pytest.approx(2 * np.pi)
-
-
-def test_lines_through_the_sides_meet_in_the_corners() -> None:
-    _, normal, _ = side_frames(KITE)
-    middle = (KITE + np.roll(KITE, -1, axis=0)) / 2
-    np.testing.assert_allclose(intersect_sides(middle, normal), KITE, atol=1e-9)
 
 
 def test_the_width_of_a_bar_is_its_breadth() -> None:

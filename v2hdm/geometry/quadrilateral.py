@@ -81,13 +81,6 @@ def side_frames(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray
     return tangent, normal, length
 
 
-def interior_angles(corners: FloatArray) -> FloatArray:
-    """Interior angle (..., 4) rad at each corner of convex quadrilaterals (..., 4, 2)."""
-    tangent, _, _ = side_frames(corners)
-    cosine = -(tangent * preceding(tangent)).sum(axis=-1)
-    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
-
-
 def width(corners: FloatArray) -> FloatArray:
     """Mean extent (...) of quadrilaterals (..., 4, 2) across their longest side."""
     _, _, length = side_frames(corners)
@@ -122,20 +115,6 @@ def is_convex(corners_map: FloatArray) -> BoolArray:
 def is_convex_px(corners_px: FloatArray) -> BoolArray:
     """Whether quadrilaterals (..., 4, 2) of an image are convex and counter-clockwise on the screen."""
     return np.asarray((_turns(corners_px) < 0).all(axis=-1))
-
-
-def intersect_sides(point: FloatArray, normal: FloatArray) -> FloatArray:
-    """Corners (..., 4, 2) of quadrilaterals whose sides pass through ``point`` (..., 4, 2) with ``normal``.
-
-    Corner ``e`` is where sides ``e - 1`` and ``e`` meet; it is inf or nan where they are parallel.
-    """
-    distance = (point * normal).sum(axis=-1)
-    before, before_distance = preceding(normal), preceding(distance, -1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        determinant = before[..., 0] * normal[..., 1] - before[..., 1] * normal[..., 0]
-        u = (before_distance * normal[..., 1] - before[..., 1] * distance) / determinant
-        v = (before[..., 0] * distance - before_distance * normal[..., 0]) / determinant
-    return np.stack([u, v], axis=-1)
 
 
 def align(a: FloatArray, valid_a: BoolArray, b: FloatArray, valid_b: BoolArray) -> Alignment:

@@ -52,7 +52,7 @@ class AcceptanceOptions:
     """
 
     min_probability: float = 0.9
-    max_sigma_m: float = 0.12
+    max_sigma_m: float = 0.06
 
 
 @dataclass(kw_only=True)

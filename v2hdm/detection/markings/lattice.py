@@ -60,21 +60,6 @@ class Lattice:
         parts = {name: value[rows] for name, value in vars(self).items() if name != "neighbours"}
         return Lattice(**parts, neighbours=self.neighbours[:, rows])
 
-    def every(self, stride: int) -> Lattice:
-        """Every ``stride``-th pixel, without neighbours."""
-        thin = slice(None, None, stride)
-        return Lattice(
-            np.ascontiguousarray(self.points[..., thin]),
-            np.ascontiguousarray(self.values[:, thin]),
-            np.ascontiguousarray(self.use[:, thin]),
-            np.ascontiguousarray(self.limited[:, thin]),
-            self.clipped,
-            self.neighbours[:0, :, thin],
-            np.ascontiguousarray(self.of_side[:, thin]),
-            np.ascontiguousarray(self.hats[..., thin]),
-            np.ascontiguousarray(self.across[:, thin]),
-        )
-
     def median_used(self, values: np.ndarray, use: np.ndarray) -> np.ndarray:
         """Median (M,) of every few values of (M, N) over the pixels of ``use``; 0 where there is none."""
         there = use[:, ::_MEDIAN_STRIDE] > 0

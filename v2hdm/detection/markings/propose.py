@@ -14,12 +14,11 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from v2hdm.catalogue import LINE, OTHER, SYMBOL, Catalogue
+from v2hdm.catalogue import OTHER, SYMBOL, Catalogue
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.markings.blobs import Blob
-from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.planar import rectangle_size
-from v2hdm.geometry.quadrilateral import following, is_convex_px, order_corners, quad_from_hull
+from v2hdm.geometry.quadrilateral import following, is_convex_px, quad_from_hull
 from v2hdm.records import BoolArray, FloatArray
 
 _LEAST_CERTAINTY = 0.3
@@ -96,7 +95,7 @@ def propose(
         length_m, width_m = rectangle_size(ground)
         whole = bool(view.inside(blob.outline_px, _BORDER_PX).all())
         share = _shares(blob, length_m, width_m, catalogue, whole=whole)
-        start = _tightest(outlines[begin:end], ground, view)
+        start = _tightest(outlines[begin:end])
         if start is not None and not _within(start[0], view, max_range_m):
             start = None
         corners, fill = start or (None, 0.0)
@@ -140,45 +139,15 @@ def _within(corners: FloatArray, view: CameraView, max_range_m: float) -> bool:
     return bool(np.isfinite(ground).all() and view.range_m(ground.mean(axis=0)) <= max_range_m)
 
 
-def _tightest(
-    outline_pinhole_px: FloatArray, outline_vehicle: FloatArray, view: CameraView
-) -> tuple[FloatArray, float] | None:
-    """The tighter of the quadrilateral around the hull and the rectangle on the ground, and how full it is.
-
-    The hull of a bar a few px wide says little of its corners; its direction on the ground says much.
-    """
+def _tightest(outline_pinhole_px: FloatArray) -> tuple[FloatArray, float] | None:
+    """The tightest quadrilateral around the hull of an outline (N, 2), and how much of it the hull fills."""
     first = outline_pinhole_px[0]
-    points = (outline_pinhole_px - first).astype(np.float32)
-    outermost = cv2.convexHull(points, returnPoints=False)[:, 0]
-    hull = points[outermost, None]
-    hull_px2 = cv2.contourArea(hull)
+    hull = cv2.convexHull((outline_pinhole_px - first).astype(np.float32))
     quad = quad_from_hull(hull)
-    candidates = [] if quad is None else [quad + first]
-    if np.isfinite(outline_vehicle).all():
-        # All before the camera, so that what is outermost in the image is so on the ground.
-        rectangle = _ground_rectangle(outline_vehicle[outermost], view)
-        candidates += [] if rectangle is None else [rectangle]
-    if not candidates:
+    if quad is None:
         return None
-    areas = [float(cv2.contourArea((corners - first).astype(np.float32))) for corners in candidates]
-    best = int(np.argmin(areas))
-    return candidates[best], hull_px2 / max(areas[best], 1e-6)
-
-
-def _ground_rectangle(outline_vehicle: FloatArray, view: CameraView) -> FloatArray | None:
-    """The smallest rectangle on the ground around an outline (N, 2), m, as corners (4, 2) in pinhole px."""
-    if len(outline_vehicle) < 3:
-        return None
-    centre = outline_vehicle.mean(axis=0)
-    box = cv2.boxPoints(cv2.minAreaRect((outline_vehicle - centre).astype(np.float32)))
-    corners = apply_homography(view.pinhole_px_from_vehicle, box.astype(np.float64) + centre)
-    return order_corners(corners) if np.isfinite(corners).all() else None
-
-
-def lane_share(proposal: Proposal, catalogue: Catalogue) -> float:
-    """Share of the classes that make up lanes' lines: dashes and lines."""
-    groups = {catalogue.classes[name].group for name in catalogue.of_family(LINE)}
-    return sum(share for name, share in proposal.share.items() if catalogue.classes[name].group in groups)
+    area_px2 = float(cv2.contourArea(quad.astype(np.float32)))
+    return quad + first, cv2.contourArea(hull) / max(area_px2, 1e-6)
 
 
 def symbol_share(proposal: Proposal, catalogue: Catalogue) -> float:

@@ -14,9 +14,9 @@ from v2hdm.records import BoolArray, FloatArray, IntArray
 UNSEEN_M2 = 1e4
 """Variance of a corner that was not seen, m^2: as good as infinite, beside the size of a site."""
 
-_CORRELATION = 0.3
-"""Correlation of the errors of one corner in several images: of 0, .1 and .3 the stated sigmas hold best with
-it."""
+_CORRELATION = 0.2
+"""Correlation of the errors of one corner in several images: .3 states sides too large, .1 corners too
+small."""
 
 _KNOWN_SIGMA_M = 0.5
 """Sigma, m, below which a corner counts as known: a fraction of any marking's length."""
