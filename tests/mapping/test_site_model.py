@@ -131,6 +131,43 @@ def test_a_worn_end_is_not_taken_for_the_end_of_the_paint() -> None:
     assert (found.log_odds > 5).all()
 
 
+def moved_end(places: Places, place: int, along: float, slant: float = 0.0) -> None:
+    """Move one end of a dash outwards by ``along`` of its length, one of its corners by ``slant`` more."""
+    corners = places.corners_map[place]
+    k = int(np.argmax(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)))
+    for corner, other, part in ((k, (k + 1) % 4, along), ((k + 3) % 4, (k + 2) % 4, along + slant)):
+        corners[corner] += part * (corners[corner] - corners[other])
+
+
+def test_a_piece_of_a_dash_is_not_taken_for_a_short_dash() -> None:
+    rng = np.random.default_rng(15)
+    true = painted([DASH] * 30, rng)
+    places = solved(true, rng, 0.005)
+    moved_end(places, 12, -0.7)
+    found = of_one_class(places)
+    assert (np.linalg.norm(found.places.corners_map - true, axis=2) < 3 * found.places.sigma_m).all()
+
+
+def test_an_end_that_runs_on_into_a_slanted_stroke_is_no_end() -> None:
+    rng = np.random.default_rng(16)
+    true = painted([DASH] * 30, rng)
+    places = solved(true, rng, 0.005)
+    moved_end(places, 12, 0.15, 0.04)
+    found = of_one_class(places)
+    assert (np.linalg.norm(found.places.corners_map - true, axis=2) < 3 * found.places.sigma_m).all()
+
+
+def test_two_opposite_corners_in_a_shadow_do_not_make_another_shape() -> None:
+    rng = np.random.default_rng(17)
+    true = painted([DIAMOND] * 60, rng)
+    places = solved(true, rng, 0.01)
+    shift = 0.1 * (true[12, 1] - true[12, 0])
+    places.corners_map[12, 0] += shift
+    places.corners_map[12, 2] -= shift
+    found = of_one_class(places)
+    assert (np.linalg.norm(found.places.corners_map - true, axis=2) < 3 * found.places.sigma_m).all()
+
+
 def test_two_neighbouring_corners_of_a_rhombus_leave_two_places_for_it() -> None:
     rng = np.random.default_rng(6)
     true = painted([DIAMOND] * 30, rng)

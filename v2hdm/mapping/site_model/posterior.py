@@ -10,6 +10,7 @@ class by class (expectation maximisation with a Dirichlet prior).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -33,7 +34,7 @@ from v2hdm.records import BoolArray, FloatArray, IntArray
 OF_CLASS, OTHER_LENGTH, WRONG_END, WRONG_CORNER, OWN_SHAPE, PART_OF_SYMBOL, CLUTTER = range(7)
 """What a place may be: the first five are markings."""
 
-_PRIOR_COUNT = np.array([14.0, 0.5, 0.2, 0.5, 2.0, 1.0, 1.5])
+_PRIOR_COUNT = np.array([14.0, 0.5, 0.5, 0.5, 2.0, 1.0, 1.5])
 """Dirichlet prior: about how many of twenty places of a class are what, before the drive says."""
 
 _SIZE_SIGMA_M = 1.0
@@ -44,6 +45,9 @@ _LENGTH_SIGMA_M = 0.3
 
 _MISPLACED_M = 0.3
 """Sigma, m, of an end that is worn or of a corner taken from another edge (17 worn ends: .08 to .74 m)."""
+
+_WORN_SHARE = 0.5
+"""The same as a share of the length, where a whole stretch is worn away: any part of a marking may be."""
 
 _RUN_ON_M = 1.0
 """Sigma, m, of an end that runs on into other paint: letters and lines are about as long."""
@@ -74,6 +78,12 @@ _PASSES = 2
 
 _FIRST, _SECOND = np.array([-0.5, 0.5, 0.5, -0.5]), np.array([-0.5, -0.5, 0.5, 0.5])
 """Of a parallelogram with the sides u and v corner k lies at its centre plus first[k] u + second[k] v."""
+
+_CORNERS_MOVED = np.concatenate([np.eye(4), np.eye(4)[:2] - np.eye(4)[2:]])
+"""How corners (6, 4) are taken wrongly: one alone, or two opposite ones by opposite ways.
+
+The shape that is fitted to an image is nearly a parallelogram, so that one wrong corner takes another along.
+"""
 
 _OWN_SIZE = _SIZE_SIGMA_M**2 * np.kron(np.outer(_FIRST, _FIRST) + np.outer(_SECOND, _SECOND), np.eye(2))
 
@@ -253,14 +263,21 @@ def _hypotheses(
         add(OF_CLASS, part / 2, laid, scatter)
         add(OF_CLASS, part / 2, otherwise, scatter)
         ends = _inwards(laid.corners_map, shape.is_elongated)
+        lengths, angles = [(1.0, scatter)], [[nothing]] * len(ends)
         if shape.is_elongated:
-            add(OTHER_LENGTH, part, laid, scatter + _LENGTH_SIGMA_M**2 * _outer((ends[0] + ends[1]) / 2))
-        for end in ends:
-            for way in (_MISPLACED_M * end, -_RUN_ON_M * end):
-                add(WRONG_END, part / 2 / len(ends), laid, scatter, _outer(way), way)
-        for corner in range(4):
-            block = _MISPLACED_M**2 * np.kron(np.diag(np.eye(4)[corner]), np.eye(2))
-            add(WRONG_CORNER, part / 4, laid, scatter, np.asarray(block, np.float64))
+            longer = scatter + _LENGTH_SIGMA_M**2 * _outer((ends[0][0] + ends[1][0]) / 2)
+            add(OTHER_LENGTH, part, laid, longer)
+            other = share[OTHER_LENGTH] / (share[OF_CLASS] + share[OTHER_LENGTH])
+            lengths = [(1 - other, scatter), (other, longer)]
+            angles = [[nothing, _slanted(laid.corners_map, end)] for end, _ in ends]
+        for (end, extent_m), cuts in zip(ends, angles, strict=True):
+            ways = (_MISPLACED_M * end, _WORN_SHARE * extent_m * end, -_RUN_ON_M * end)
+            for way, cut, (likely, size) in itertools.product(ways, cuts, lengths):
+                weight = part * likely / len(ends) / len(ways) / len(cuts)
+                add(WRONG_END, weight, laid, size, _outer(way) + cut, way)
+        for moved in _CORNERS_MOVED:
+            block = _MISPLACED_M**2 * np.kron(np.outer(moved, moved), np.eye(2))
+            add(WRONG_CORNER, part / len(_CORNERS_MOVED), laid, scatter, np.asarray(block, np.float64))
     own = lay(shapes[0].corners, SHAPE_SIGMA_M, places)[0] if shapes else _as_seen(places)
     any_size = SHAPE_SIGMA_M**2 * np.eye(8) + _OWN_SIZE
     add(OWN_SHAPE, 1.0, own, any_size)
@@ -277,20 +294,30 @@ def _as_seen(places: Places) -> Laid:
     return Laid(corners, unturned, centre, unshifted)
 
 
-def _inwards(corners: FloatArray, elongated: bool) -> list[FloatArray]:
-    """How the corners (N, 8) move as a side of parallelograms (N, 4, 2) moves inwards by 1; two, or all four.
+def _inwards(corners: FloatArray, elongated: bool) -> list[tuple[FloatArray, FloatArray]]:
+    """How corners (N, 8) move as a side of (N, 4, 2) moves inwards by 1 m, and how far (N, 1) it can, m.
 
-    Of what is ``elongated`` these are the two ends.
+    Of what is ``elongated`` these are the two ends, of others all four sides.
     """
     ways = []
     for along, side in ((corners[:, 1] - corners[:, 0], _FIRST), (corners[:, 2] - corners[:, 1], _SECOND)):
-        unit = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-        both = [-np.sign(sign) * (side * sign > 0)[:, None] * unit[:, None] for sign in (-1, 1)]
-        ways.append([one.reshape(-1, 8) for one in both])
+        extent_m = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+        both = [-np.sign(sign) * (side * sign > 0)[:, None] * (along / extent_m)[:, None] for sign in (-1, 1)]
+        ways.append([(one.reshape(-1, 8), extent_m) for one in both])
     if not elongated:
         return [*ways[0], *ways[1]]
-    first, second = (np.linalg.norm(corners[:, k + 1] - corners[:, k], axis=1) for k in (0, 1))
-    return [np.where((first > second)[:, None], a, b) for a, b in zip(*ways, strict=True)]
+    first = ways[0][0][1] > ways[1][0][1]
+    return [(np.where(first, a[0], b[0]), np.where(first, a[1], b[1])) for a, b in zip(*ways, strict=True)]
+
+
+def _slanted(corners: FloatArray, end: FloatArray) -> FloatArray:
+    """Covariance (N, 8, 8), m^2, of an ``end`` that wear, or the edge of other paint, cuts off at any angle.
+
+    At 45 degrees its two corners lie half the breadth of the paint before and behind its middle.
+    """
+    breadth_m = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).min(axis=1)
+    each = (end.reshape(-1, 4, 1, 2) * np.eye(4)[:, :, None]).reshape(-1, 4, 8)
+    return np.asarray((breadth_m / 2)[:, None, None] ** 2 * (np.swapaxes(each, 1, 2) @ each))
 
 
 def _outer(vectors: FloatArray) -> FloatArray:
