@@ -84,8 +84,9 @@ class TrainConfig:
     nothing as a half cosine, by the share of the run that has passed. The weights that are validated, kept
     and exported are averages over about the last ``ema_updates`` updates, over fewer near the start.
     ``bfloat16`` has convolutions computed in that where the device is faster so. ``resume`` goes on with
-    what ``output`` holds. ``start`` is a checkpoint of another run, or an exported file, whose averaged weights and place
-    in the sequence of renders this one starts from: to learn on, or to learn users' own labels.
+    what ``output`` holds. ``start`` is a checkpoint of another run, or an exported file, whose averaged
+    weights and place in the sequence of renders this one starts from: to learn on, or to learn users' own
+    labels.
     """
 
     output: str = "runs/train"
