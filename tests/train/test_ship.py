@@ -86,6 +86,17 @@ def test_a_training_is_shipped_with_a_manifest_that_the_detector_accepts(into, r
     assert not list(Path("runs").iterdir()), "what was kept to go on from is gone"
 
 
+def test_without_another_folder_the_detectors_own_files_and_the_float32_file_are_replaced(
+    into, run, quick, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(weights, "FOLDER", into)
+    monkeypatch.setattr(shipment, "_FLOAT_FILE", tmp_path / "models" / "marking_net.onnx")
+    shipped(Order(source=run, precision="float32"))
+    weights.check_weights(into)
+    assert read_exported(tmp_path / "models" / "marking_net.onnx").label["precision"] == "float32"
+    assert not (into / "marking_net.onnx").exists()
+
+
 def test_a_killed_shipment_goes_on_and_until_its_end_the_files_are_as_they_were(
     into, run, quick, monkeypatch
 ):
