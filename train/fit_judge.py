@@ -15,7 +15,7 @@ a fit to the others.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -215,8 +215,13 @@ def write_both(judge: Judge, fitted: dict[str, dict[str, object]], images: int, 
     write_judge(judge, (len(CHANNELS), SIZE, SIZE), label, folder / JUDGE_FILE.name)
 
 
-def fit_all(gathered: Gathered) -> tuple[Judge, dict[str, dict[str, object]]]:
-    """The judge, and what ``confidence.json`` is to hold; prints what both are worth on images left out."""
+def fit_all(
+    gathered: Gathered, tell: Callable[[float], None] = lambda share: None
+) -> tuple[Judge, dict[str, dict[str, object]]]:
+    """The judge, and what ``confidence.json`` is to hold; prints what both are worth on images left out.
+
+    ``tell`` is told what share of the work is done.
+    """
     known = np.array([true is not None for true in gathered.true])
     true = np.array([true is True for true in gathered.true])
     fold, spotted = np.array(gathered.image) % FOLDS, np.array(gathered.lit)
@@ -238,6 +243,7 @@ def fit_all(gathered: Gathered) -> tuple[Judge, dict[str, dict[str, object]]]:
     for k in range(FOLDS):
         judge = train_judge(asked.take(lessons & (fold != k)), CONFIG)
         odds[fold == k], side_sigma_px[fold == k] = judged(judge, asked.take(fold == k))
+        tell((k + 1) / (FOLDS + 1))
     _print_sides(asked, side_sigma_px)
     seen_through = (odds < 0)[spotted & known & ~true]
     print(f"seen through: {seen_through.mean():.3f} of what is sworn and false", flush=True)

@@ -177,8 +177,12 @@ def _fit_judge(order: Order, folder: Path, tell: Tell) -> None:
 
     tell(_EXPORTED, "judge: looking at renders")
     share_out(fit_judge.gather, left, _workers(order), cv2.setNumThreads, (1,), take)
-    tell(_GATHERED, "judge: learning")
-    judge, confidence = fit_judge.fit_all(Gathered.load([part.path for part in parts]))
+
+    def learnt(share: float) -> None:
+        tell(_GATHERED + (_JUDGED - _GATHERED) * share, "judge: learning")
+
+    learnt(0.0)
+    judge, confidence = fit_judge.fit_all(Gathered.load([part.path for part in parts]), learnt)
     fit_judge.write_both(judge, confidence, order.judge_images, folder)
 
 

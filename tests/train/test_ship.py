@@ -53,7 +53,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> list[range]:
     lines = {name: (np.ones(len(keys)), 0.0) for name, keys in fit_lane_score.KEYS.items()}
     monkeypatch.setattr(shipment, "share_out", in_this_process)
     monkeypatch.setattr(fit_judge, "gather", gather)
-    monkeypatch.setattr(fit_judge, "fit_all", lambda _: (judge, among))
+    monkeypatch.setattr(fit_judge, "fit_all", lambda gathered, tell: (tell(0.5), (judge, among))[1])
     monkeypatch.setattr(fit_lane_score, "see", lambda part: [None] * len(part.numbers))
     monkeypatch.setattr(fit_lane_score, "fit_to", lambda images, step_m: lines)
     return gathered
@@ -103,7 +103,7 @@ def test_a_killed_shipment_goes_on_and_until_its_end_the_files_are_as_they_were(
     order = Order(source=run, into=into, precision="float32", judge_images=100, lane_images=100)
     before = digests(into)
 
-    def killed(gathered: fit_judge.Gathered) -> None:
+    def killed(gathered: fit_judge.Gathered, tell: shipment.Tell) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
