@@ -1,23 +1,14 @@
-"""Keeps the manifest of the detector's fitted files.
-
-    python -m export.manifest lane_score.json
-
-The commands that make these files call :func:`record`. Run this door for a file that was put there by hand,
-or that is kept under another network because it does better than one fitted anew.
-"""
+"""Writes the manifest of the detector's fitted files: ``train.ship`` and ``export`` call it."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import subprocess
-import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
 from v2hdm.detection import weights
-from v2hdm.door import open_door
 from v2hdm.errors import DetectorError
 from v2hdm.files import replace_text
 
@@ -64,16 +55,3 @@ def _commit() -> str | None:
     except (OSError, subprocess.CalledProcessError):
         return None
     return answer.stdout.strip()
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the door; the exit code is 0, or 2 with one line on stderr for what a user got wrong."""
-    parser = argparse.ArgumentParser(prog="python -m export.manifest", description=__doc__.split("\n")[0])
-    parser.add_argument("names", nargs="+", help=f"of {', '.join(weights.COMMANDS)}")
-    names = parser.parse_args(arguments).names
-    command = f"kept by python -m export.manifest {' '.join(names)}"
-    return open_door("export.manifest", "train", "interrupted", lambda: record(names, command))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

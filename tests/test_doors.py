@@ -39,6 +39,7 @@ def run_door(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     [
         (("v2hdm.map", "+run=port2"), "torch"),
         (("train",), "torch"),
+        (("train.ship", "runs/gpu"), "onnx"),
         (("export", "checkpoint=a", "output=b"), "onnx"),
         (("v2hdm.detect", "images"), "cv2"),
         (("v2hdm.check", "drive"), "cv2"),
@@ -61,6 +62,7 @@ def test_an_interruption_while_libraries_are_loaded_is_one_line(
         (("v2hdm.map", "+run=port2"), "kornia", "map"),
         (("v2hdm.check", "drive"), "matplotlib", "map"),
         (("train",), "tensorboard", "train"),
+        (("train.ship", "runs/gpu"), "onnx", "train"),
         (("export", "checkpoint=a", "output=b"), "onnx", "train"),
     ],
 )

@@ -15,7 +15,8 @@ class DataConfig:
     oftener the more paint it shows, each time another crop of ``width`` x ``height`` px in other light. Past
     renders to show again are kept in a ``reservoir``. ``easy_samples`` renders pass until scenes are as hard
     as they get. ``shadows_on_paint`` and those that follow it up to ``aside``
-    are the :class:`~train.scenes.hardships.Hardships` of the renders.
+    are the :class:`~train.scenes.hardships.Hardships` of the renders. ``workers`` processes render; None is
+    one for each core but the trainer's, shared among the processes of a team.
 
     ``coco`` and ``tusimple`` are files of users' own labels: polygons of markings in COCO's format, lanes in
     TuSimple's. The images' names in them start from ``coco_images`` and ``tusimple_images``, or else from the
@@ -34,13 +35,17 @@ class DataConfig:
     things_beside: float = 0.8
     faint: float = 0.25
     seams: float = 0.25
+    side_seams: float = 1.5
     pavements: float = 0.3
+    bleached: float = 0.08
     overexposed: float = 0.15
     blue_shade: float = 0.3
     tight_bends: float = 0.15
     kerbs: float = 0.2
+    junctions: float = 0.12
+    mountings: float = 0.15
     aside: float = 0.08
-    workers: int = 1
+    workers: int | None = 1
     coco: str | None = None
     coco_images: str | None = None
     coco_classes: dict[str, str] = field(default_factory=dict)
@@ -77,10 +82,11 @@ class TrainConfig:
 
     The learning rate rises to ``learning_rate`` over the first ``warmup`` of the run, then falls to
     nothing as a half cosine, by the share of the run that has passed. The weights that are validated, kept
-    and exported are averages over about ``ema_updates`` updates. ``bfloat16`` has convolutions computed in
-    that where the device is faster so. ``resume`` goes on with what ``output``
-    holds. ``start`` is a checkpoint of another run, or an exported file, whose averaged weights and place
-    in the sequence of renders this one starts from: to learn on, or to learn users' own labels.
+    and exported are averages over about the last ``ema_updates`` updates, over fewer near the start.
+    ``bfloat16`` has convolutions computed in that where the device is faster so. ``resume`` goes on with
+    what ``output`` holds. ``start`` is a checkpoint of another run, or an exported file, whose averaged
+    weights and place in the sequence of renders this one starts from: to learn on, or to learn users' own
+    labels.
     """
 
     output: str = "runs/train"

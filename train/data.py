@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import fields
 
@@ -102,13 +103,16 @@ def training_batches(
         LabelError: The users' own labels cannot be used.
     """
     stream = RenderStream(config, seed, first_render, part, read_labels(config))
+    workers = config.workers
+    if workers is None:
+        workers = max(1, ((os.cpu_count() or 2) - 1) // part[1])
     loader = DataLoader(
         stream,
         batch_size=batch,
-        num_workers=config.workers,
-        prefetch_factor=6 if config.workers else None,
-        worker_init_fn=_single_thread if config.workers else None,
-        multiprocessing_context="spawn" if config.workers else None,
+        num_workers=workers,
+        prefetch_factor=6 if workers else None,
+        worker_init_fn=_single_thread if workers else None,
+        multiprocessing_context="spawn" if workers else None,
     )
     with undisturbed_starts():
         return iter(loader)

@@ -1,35 +1,28 @@
-"""Teaches the detector's confidence what claims of the shipped network are worth.
+"""Teaches the detector's judge and confidence what the claims of its network are worth.
 
-    python -m train.fit_judge --write
-
-Run it after another network was put in place; it takes three quarters of an hour. Quadrilaterals that the
-detector proposes on rendered scenes, first two thirds of full difficulty, then a third of easy ones, are true
-if they overlap a marking of their class by half, and false where the quality benchmark would say so or where
-they lie on an arrow. The judge, ``judge.onnx``, learns to tell them apart, and how far the sides of the true
-ones are off; the claims of the others in an image are then weighed by
-logistic regressions with a weak ridge, one for each shape, ``confidence.json``; the manifest beside them in
-:mod:`v2hdm.detection.weights` is brought up to date. Each scene is looked at as on the vehicle, every
-third as in the mapping, too, and every other one once more with spots of sun of which the paint network
-swears that they are markings, which the judge learns to see through. Its seed is neither that of the quality
-benchmark nor one of training. Printed: the log odds that each of the others' features adds per standard
+``python -m train.ship`` runs it. Quadrilaterals that the detector proposes on rendered scenes, first two
+thirds of full difficulty, then a third of easy ones, are true if they overlap a marking of their class by
+half. They are false where the quality benchmark would say so, and on arrows. The judge, ``judge.onnx``,
+learns to tell them apart, and how far the sides of the true ones are off. Logistic regressions with a weak
+ridge, one for each shape, then weigh the claims of the others in an image: ``confidence.json``. Each scene
+is looked at as on the vehicle; every third as in the mapping, too; every other one once more with spots of
+sun of which the paint network swears that they are markings. The seed is neither that of the quality
+benchmark nor one of training. Printed: the log odds that each feature of the others adds per standard
 deviation; log loss, and the count of true ones at given counts of false ones, on the images of each fifth by
 a fit to the others.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from export.judge_file import write_judge
-from export.manifest import record
 from models.judge import Judge
 from train.examples import Example, TrueMarking, example, polygon_overlap
 from train.judge import JudgeConfig, Quadrilaterals, judged, train_judge
@@ -46,8 +39,8 @@ from v2hdm.detection.markings.judge import (
 )
 from v2hdm.detection.markings.rectified import CHANNELS, CLAIMED_CHANNELS, SIZE
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.weights import CONFIDENCE_FILE, FOLDER, JUDGE_FILE, being_fitted
-from v2hdm.files import replace_text
+from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE, being_fitted
+from v2hdm.files import replace_text, whole_file
 from v2hdm.geometry.quadrilateral import following, side_frames
 from v2hdm.records import OUTLINED_CLASSES, BoolArray, FloatArray
 
@@ -59,7 +52,6 @@ CONFIG = JudgeConfig()
 LIT_EVERY, MIRRORED_EVERY = 2, 3
 """Which images are looked at once more, with spots of sun and as in the mapping."""
 
-_TOLD_EVERY = 100
 COUNTS = (10, 20, 40, 80)
 """Of false ones, at which those true are counted."""
 
@@ -108,6 +100,29 @@ class Gathered:
             self.look.append(look)
             self.lit.append(spots is not None)
 
+    def save(self, path: Path) -> None:
+        """Write it to ``path``, which appears whole or not at all."""
+        columns = {item.name: np.array(getattr(self, item.name)) for item in fields(self)}
+        columns["true"] = np.array([-1 if true is None else int(true) for true in self.true], dtype=np.int8)
+        with whole_file(path) as partial, partial.open("wb") as file:
+            np.savez(file, **columns)
+
+    @classmethod
+    def load(cls, paths: Sequence[Path]) -> Gathered:
+        """What several files of :meth:`save` hold, one after the other."""
+        whole = cls()
+        for path in paths:
+            first_look = 1 + max(whole.look, default=-1)
+            with np.load(path) as columns:
+                for item in fields(cls):
+                    values = columns[item.name]
+                    if item.name == "true":
+                        values = [None if value < 0 else bool(value) for value in values]
+                    elif values.ndim == 1:
+                        values = (values + first_look if item.name == "look" else values).tolist()
+                    getattr(whole, item.name).extend(values)
+        return whole
+
 
 def is_true(shown: Example, kind: str, corners_px: FloatArray) -> tuple[bool | None, TrueMarking | None]:
     """Whether a quadrilateral (4, 2) is a marking, and which; None where the quality benchmark lets it be."""
@@ -137,12 +152,11 @@ def side_errors(readings: Readings, m: int, corners_px: FloatArray, true: TrueMa
     return np.asarray(((true_middle - middle) * normal).sum(axis=-1))
 
 
-def renders_to_fit(images: int, seed: int) -> Iterator[tuple[int, Example]]:
-    """Scenes and their numbers: two thirds of full difficulty, then a third of easy ones."""
-    easy = images // 3
-    for count, difficulty in ((images - easy, 1.0), (easy, EASY)):
-        for index in range(count):
-            yield index, example(index, difficulty, seed)
+def render_to_fit(number: int, images: int, seed: int) -> tuple[int, Example]:
+    """Scene ``number`` of ``images`` and what it is called: two thirds are hard, then a third is easy."""
+    hard = images - images // 3
+    index, difficulty = (number, 1.0) if number < hard else (number - hard, EASY)
+    return index, example(index, difficulty, seed)
 
 
 def fit(evidence: FloatArray, true: BoolArray) -> tuple[FloatArray, float]:
@@ -165,46 +179,49 @@ def log_loss(odds: FloatArray, true: BoolArray) -> float:
     return float(np.log1p(np.exp(-np.where(true, 1.0, -1.0) * odds)).mean())
 
 
-def main() -> None:
-    """Gather, fit, print, and write if asked to."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--images", type=int, default=1650)
-    parser.add_argument("--model")
-    parser.add_argument("--write", action="store_true")
-    parsed = parser.parse_args()
-    cv2.setNumThreads(1)
-    options = DetectorOptions(model=parsed.model, max_range_m=24.0, min_confidence=0.0)
+@dataclass(frozen=True)
+class Part:
+    """Scenes ``numbers`` of ``images``, seen with the network ``model``; their readings go to ``path``."""
+
+    numbers: range
+    images: int
+    model: Path
+    path: Path
+
+
+def gather(part: Part) -> Part:
+    """Write the readings of a part of the scenes to its file, which appears whole or not at all."""
+    options = DetectorOptions(model=str(part.model), max_range_m=24.0, min_confidence=0.0)
     with being_fitted():
         detectors = [Detector.load(options=replace(options, mirrored=twice)) for twice in (False, True)]
     gathered = Gathered()
-    for done, (index, shown) in enumerate(renders_to_fit(parsed.images, SEED)):
+    for number in part.numbers:
+        index, shown = render_to_fit(number, part.images, SEED)
         gathered.add(index, shown, detectors[0])
-        if done % MIRRORED_EVERY == 0:
+        if number % MIRRORED_EVERY == 0:
             gathered.add(index, shown, detectors[1])
-        if done % LIT_EVERY == 0:
-            rng = np.random.default_rng([SEED, done])
+        if number % LIT_EVERY == 0:
+            rng = np.random.default_rng([SEED, number])
             spotted, spots = lit(shown, detectors[0].view(shown.camera), rng)
             gathered.add(index, spotted, detectors[0], spots)
-        if done % _TOLD_EVERY == 0:
-            print(f"{done} of {parsed.images} images", flush=True)
-    judge, fitted = fit_all(gathered)
-    if parsed.write:
-        write_both(judge, fitted, parsed.images)
+    gathered.save(part.path)
+    return part
 
 
-def write_both(
-    judge: Judge, fitted: dict[str, dict[str, object]], images: int, folder: Path = FOLDER
-) -> None:
-    """Put the judge and the weights among others where the detector looks for them, and in the manifest."""
+def write_both(judge: Judge, fitted: dict[str, dict[str, object]], images: int, folder: Path) -> None:
+    """Write the judge, and the weights among others, to a folder."""
     label = {"channels": CHANNELS, "features": FEATURES, "shapes": SHAPES, "images": images, "seed": SEED}
-    write_judge(judge, (len(CHANNELS), SIZE, SIZE), label, folder / JUDGE_FILE.name)
     replace_text(folder / CONFIDENCE_FILE.name, json.dumps(fitted, indent=1) + "\n")
-    command = f"python -m train.fit_judge --images {images} --write"
-    record([JUDGE_FILE.name, CONFIDENCE_FILE.name], command, folder)
+    write_judge(judge, (len(CHANNELS), SIZE, SIZE), label, folder / JUDGE_FILE.name)
 
 
-def fit_all(gathered: Gathered) -> tuple[Judge, dict[str, dict[str, object]]]:
-    """The judge, and what ``confidence.json`` is to hold; prints what both are worth on images left out."""
+def fit_all(
+    gathered: Gathered, tell: Callable[[float], None] = lambda share: None
+) -> tuple[Judge, dict[str, dict[str, object]]]:
+    """The judge, and what ``confidence.json`` is to hold; prints what both are worth on images left out.
+
+    ``tell`` is told what share of the work is done.
+    """
     known = np.array([true is not None for true in gathered.true])
     true = np.array([true is True for true in gathered.true])
     fold, spotted = np.array(gathered.image) % FOLDS, np.array(gathered.lit)
@@ -226,6 +243,7 @@ def fit_all(gathered: Gathered) -> tuple[Judge, dict[str, dict[str, object]]]:
     for k in range(FOLDS):
         judge = train_judge(asked.take(lessons & (fold != k)), CONFIG)
         odds[fold == k], side_sigma_px[fold == k] = judged(judge, asked.take(fold == k))
+        tell((k + 1) / (FOLDS + 1))
     _print_sides(asked, side_sigma_px)
     seen_through = (odds < 0)[spotted & known & ~true]
     print(f"seen through: {seen_through.mean():.3f} of what is sworn and false", flush=True)
@@ -294,7 +312,3 @@ def _print_worth(name: str, odds: FloatArray, true: BoolArray) -> None:
     print(
         f"{name}: log loss of images left out {log_loss(odds, true):.3f}; true ones at {counts}", flush=True
     )
-
-
-if __name__ == "__main__":
-    main()

@@ -1,34 +1,28 @@
 """Fits the weights of the score of lanes' lines, ``lane_score.json``, to the network.
 
-    python -m train.fit_lane_score --images 450 --write
-
-Run it after another network was put in place. The lines that the detector proposes on rendered scenes,
-sure or not, two thirds of them of full difficulty and a third easy ones, are true if four fifths of the
-rows that they were seen on lie on one true line, by the tolerance of the quality benchmark; how far a line
-was drawn on from there does not count. A logistic regression with a weak ridge tells them apart by the
-features of each alone; a second one tells each from its log odds, by weights that its own image had no part
-in, from its span and from the others. Which lines are proposed depends a little on the score itself, so that
-the fit is made twice. Its seed is neither that of the quality benchmark nor one of training. Printed: by
-how much each feature changes the log odds per standard deviation, the log loss on the images of each fifth by
-weights that were fitted to the others, alone and among the others, and how many lines given are true and
-false.
+``python -m train.ship`` runs it. The lines that the detector proposes on rendered scenes, sure or not, two
+thirds of them of full difficulty and a third easy ones, are true if four fifths of the rows that they were
+seen on lie on one true line, by the tolerance of the quality benchmark; how far a line was drawn on from
+there does not count. A logistic regression with a weak ridge tells them apart by the features of each alone;
+a second one tells each from its log odds, by weights that its own image had no part in, from its span and
+from the others. Which lines are proposed depends a little on the score itself, so the fit is made twice. The
+seed is neither that of the quality benchmark nor one of training. Printed: by how much each feature changes
+the log odds per standard deviation, the log loss on the images of each fifth by weights that were fitted to
+the others, alone and among the others, and how many lines given are true and false.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from unittest.mock import patch
 
-import cv2
 import numpy as np
 
-from export.manifest import record
 from train.examples import LANE_TOLERANCE_PX, Example
-from train.fit_judge import FOLDS, fit, log_loss, renders_to_fit
+from train.fit_judge import FOLDS, fit, log_loss, render_to_fit
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.lanes import lines as lane_lines
@@ -38,7 +32,7 @@ from v2hdm.detection.lanes.span import draw
 from v2hdm.detection.markings.foreground import Foreground
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.sight import AnchorRow
-from v2hdm.detection.weights import FOLDER, LANE_SCORE_FILE, being_fitted
+from v2hdm.detection.weights import LANE_SCORE_FILE, being_fitted
 from v2hdm.files import replace_text
 from v2hdm.records import BoolArray, FloatArray, LaneDetection
 
@@ -184,28 +178,26 @@ class Gathered:
         return odds
 
 
-def main() -> None:
-    """Gather, fit, print, and write if asked to."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--images", type=int, default=450)
-    parser.add_argument("--model")
-    parser.add_argument("--write", action="store_true")
-    parsed = parser.parse_args()
-    cv2.setNumThreads(1)
-    options = DetectorOptions(model=parsed.model, max_range_m=24.0)
+@dataclass(frozen=True)
+class Part:
+    """Scenes ``numbers`` of ``images``, to be seen with the network ``model``."""
+
+    numbers: range
+    images: int
+    model: Path
+
+
+def see(part: Part) -> list[Seen]:
+    """What a part of the scenes says of its lanes."""
     with being_fitted():
-        detector = Detector.load(options=options)
-    images = [seen(shown, detector) for _, shown in renders_to_fit(parsed.images, SEED)]
-    weights = fit_to(images, options.lane_step_m)
-    if parsed.write:
-        write(weights, parsed.images)
+        detector = Detector.load(options=DetectorOptions(model=str(part.model), max_range_m=24.0))
+    return [seen(render_to_fit(number, part.images, SEED)[1], detector) for number in part.numbers]
 
 
-def write(weights: Weights, images: int, folder: Path = FOLDER) -> None:
-    """Put the weights where the detector looks for them, and in the manifest."""
+def write(weights: Weights, folder: Path) -> None:
+    """Write the weights to a folder."""
     named = {name: _named(*weights[name], keys) for name, keys in KEYS.items()}
     replace_text(folder / LANE_SCORE_FILE.name, json.dumps(named, indent=1) + "\n")
-    record([LANE_SCORE_FILE.name], f"python -m train.fit_lane_score --images {images} --write", folder)
 
 
 def fit_to(images: Sequence[Seen], paint_step_m: float) -> Weights:
@@ -232,7 +224,3 @@ def fit_to(images: Sequence[Seen], paint_step_m: float) -> Weights:
 def _named(weights: FloatArray, bias: float, keys: Sequence[str]) -> dict[str, object]:
     """Weights and bias as ``lane_score.json`` holds them."""
     return {"bias": round(bias, 4), "weights": dict(zip(keys, weights.round(4).tolist(), strict=True))}
-
-
-if __name__ == "__main__":
-    main()

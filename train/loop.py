@@ -9,6 +9,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -62,8 +63,7 @@ class Trainer:
         self._resumed_at = self.state.step, self.state.renders
         self.net = MarkingNet(config.net).to(self.device)
         self.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        average = get_ema_multi_avg_fn(1.0 - 1.0 / config.ema_updates)  # type: ignore[no-untyped-call]
-        self.averaged = AveragedModel(self.net, multi_avg_fn=average, use_buffers=True)
+        self.averaged = AveragedModel(self.net, multi_avg_fn=self._average, use_buffers=True)
         self.optimizer = torch.optim.AdamW(self.net.parameters(), weight_decay=config.weight_decay)
         if self.state.model:
             self._restore()
@@ -125,6 +125,14 @@ class Trainer:
         if share < warmup:
             return self.config.learning_rate * (0.05 + 0.95 * share / warmup)
         return self.config.learning_rate * 0.5 * (1 + math.cos(math.pi * (share - warmup) / (1 - warmup)))
+
+    def _average(self, averaged: Any, current: Any, count: Any) -> None:
+        """Move averaged weights towards the current ones, the farther the fewer updates there were.
+
+        Otherwise the first weights, which are random, would outlast a run of a few ``ema_updates``.
+        """
+        decay = min(1 - 1 / self.config.ema_updates, (1 + self.state.step) / (10 + self.state.step))
+        get_ema_multi_avg_fn(decay)(averaged, current, count)  # type: ignore[no-untyped-call]
 
     def _update(self, batch: Pair) -> float:
         """One step of the optimiser."""

@@ -99,7 +99,7 @@ def explain(error: Exception, schema: type[Any], overrides: list[str]) -> Config
 
 
 _NOISE = re.compile(
-    r"(\^$|full_key|To append to your config|reference_type|object_type"
+    r"(\^$|full_key|To append to your config|reference_type|object_type|Config search path|provider="
     r"|Set the environment variable|See https?:)"
 )
 

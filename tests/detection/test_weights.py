@@ -56,7 +56,7 @@ def test_a_judge_of_another_network_is_refused_until_it_is_fitted(folder):
     (folder / "manifest.json").write_text(json.dumps(manifest))
     message = refusal(folder)
     assert "fitted to another network" in message
-    assert "python -m train.fit_judge --write" in message
+    assert "python -m train.ship v2hdm/detection/weights/default.onnx" in message
     with weights.being_fitted():
         weights.check_weights(folder)
     refusal(folder)

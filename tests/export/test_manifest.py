@@ -29,14 +29,12 @@ def change(folder, name: str) -> None:
 def test_a_new_network_is_refused_until_judge_and_lane_score_were_fitted_to_it(folder):
     change(folder, "default.onnx")
     manifest.record(["default.onnx"], "python -m export", folder)
-    with pytest.raises(
-        DetectorError, match=r"judge\.onnx: was fitted to another network .* train\.fit_judge"
-    ):
+    with pytest.raises(DetectorError, match=r"judge\.onnx: was fitted to another network .* train\.ship"):
         check(folder)
     change(folder, "judge.onnx")
     change(folder, "confidence.json")
-    manifest.record(["judge.onnx", "confidence.json"], "python -m train.fit_judge --write", folder)
-    with pytest.raises(DetectorError, match=r"lane_score\.json: .* train\.fit_lane_score"):
+    manifest.record(["judge.onnx", "confidence.json"], "python -m train.ship runs/gpu", folder)
+    with pytest.raises(DetectorError, match=r"lane_score\.json: .* train\.ship"):
         check(folder)
     manifest.record(["lane_score.json"], "kept", folder)
     check(folder)
@@ -46,11 +44,11 @@ def test_a_new_network_is_refused_until_judge_and_lane_score_were_fitted_to_it(f
 
 
 def test_the_manifest_names_the_commit_the_day_and_the_command(folder):
-    manifest.record(["judge.onnx"], "python -m train.fit_judge --write", folder)
+    manifest.record(["judge.onnx"], "python -m train.ship runs/gpu", folder)
     written = weights.read_manifest(folder)
     entry = written["files"]["judge.onnx"]
     assert written["commit"] is None or len(written["commit"].removesuffix("-dirty")) == 40
-    assert entry["command"] == "python -m train.fit_judge --write"
+    assert entry["command"] == "python -m train.ship runs/gpu"
     assert entry["made"].count("-") == 2
 
 
@@ -59,6 +57,6 @@ def test_an_export_elsewhere_leaves_the_manifest_alone(tmp_path, monkeypatch):
     manifest.record_network(tmp_path / "mine.onnx", "python -m export")
 
 
-def test_the_door_refuses_what_is_no_fitted_file(capsys):
-    assert manifest.main(["scores.json"]) == 2
-    assert "give one of default.onnx" in capsys.readouterr().err
+def test_what_is_no_fitted_file_is_refused(folder):
+    with pytest.raises(DetectorError, match=r"scores\.json: no fitted file .* give one of default\.onnx"):
+        manifest.record(["scores.json"], "by hand", folder)

@@ -1,14 +1,13 @@
 """What teaches the detector its scores runs against the detector as it is."""
 
-import shutil
 from collections.abc import Sequence
+from dataclasses import fields
 from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
-from models.judge import Judge
 from train import fit_judge, fit_lane_score
 from train.examples import Example, TrueMarking, example, polygon_overlap
 from train.fit_judge import Gathered, is_true
@@ -16,11 +15,9 @@ from train.fit_lane_score import proposed, seen
 from train.sworn_flecks import Spots, lit, swearing
 from v2hdm.detection import weights
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.markings.evidence import FEATURES
-from v2hdm.detection.markings.judge import SHAPES, TOLD
-from v2hdm.detection.markings.rectified import CHANNELS
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import ARROW, DIAMOND, LANE_DASH, MarkingDetection
+from v2hdm.workers import share_out
 
 SEED = 4711
 
@@ -99,18 +96,31 @@ def test_lines_of_lanes_are_proposed_with_their_truth(shown, detector):
     assert found.true.any()
 
 
-def test_judge_and_lane_score_are_written_with_a_manifest_that_the_detector_accepts(tmp_path):
-    folder = tmp_path / "weights"
-    shutil.copytree(weights.FOLDER, folder, ignore=shutil.ignore_patterns("__pycache__", "*.py"))
-    judge = Judge(len(CHANNELS), len(FEATURES), len(SHAPES), width=4, dropout=0.0).eval()
-    fitted = {name: {"bias": 0.0, "weights": dict.fromkeys(TOLD, 0.5)} for name in SHAPES}
-    fit_judge.write_both(judge, fitted, 3, folder)
-    fit_lane_score.write({n: (np.ones(len(k)), 0.0) for n, k in fit_lane_score.KEYS.items()}, 4, folder)
-    weights.check_weights(folder)
-    files = weights.read_manifest(folder)["files"]
-    assert files["judge.onnx"]["command"] == "python -m train.fit_judge --images 3 --write"
-    assert files["lane_score.json"]["command"] == "python -m train.fit_lane_score --images 4 --write"
-    assert weights.digest(folder / "judge.onnx") != weights.digest(weights.JUDGE_FILE)
+def test_readings_that_were_gathered_in_parts_are_those_gathered_at_once(tmp_path):
+    cv2.setNumThreads(1)
+    ranges = range(0, 2), range(2, 3), range(0, 3)
+    parts = [
+        fit_judge.Part(numbers, 3, weights.NETWORK_FILE, tmp_path / f"{k}.npz")
+        for k, numbers in enumerate(ranges)
+    ]
+    first, second, whole = (Gathered.load([fit_judge.gather(part).path]) for part in parts)
+    together = Gathered.load([part.path for part in parts[:2]])
+    assert 0 < len(first.kind) < len(whole.kind) == len(first.kind) + len(second.kind)
+    for item in fields(Gathered):
+        one, other = getattr(together, item.name), getattr(whole, item.name)
+        assert type(one[0]) is type(other[0])
+        np.testing.assert_array_equal(np.array(one), np.array(other), err_msg=item.name)
+    assert {type(true) for true in whole.true} <= {bool, type(None)}
+
+
+def test_what_is_seen_of_lanes_comes_back_from_another_process():
+    seen_there: list[fit_lane_score.Seen] = []
+    part = fit_lane_score.Part(range(3), 100, weights.NETWORK_FILE)
+    share_out(fit_lane_score.see, [part], 1, cv2.setNumThreads, (1,), seen_there.extend)
+    step_m = DetectorOptions().lane_step_m
+    lines = [found.lines for image in seen_there if (found := proposed(image, step_m)) is not None]
+    assert len(seen_there) == 3
+    assert sum(map(len, lines)) > 0
 
 
 def test_the_head_of_an_arrow_is_no_diamond_and_a_hidden_dash_is_neither_true_nor_false():

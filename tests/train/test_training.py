@@ -15,6 +15,7 @@ from omegaconf import OmegaConf
 
 from models import NetConfig
 from train import __main__ as door
+from train import data
 from train.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from train.config import DataConfig, LossConfig, TrainConfig, ValidationConfig
 from train.loop import Trainer
@@ -126,12 +127,64 @@ def test_the_shipped_settings_compose_and_typos_do_not() -> None:
     with initialize_config_dir(CONF, version_base="1.3"):
         config = OmegaConf.to_object(compose("train"))
         assert isinstance(config, TrainConfig)
+        assert config == OmegaConf.to_object(compose("train", overrides=["recipe=cpu"]))
         assert config.minutes is not None
         with pytest.raises(ConfigCompositionException, match="learning_rat"):
             compose("train", overrides=["learning_rat=1"])
 
 
-@pytest.mark.parametrize("argument", ["learning_rat=1", "batch=many"])
+@pytest.mark.parametrize("name", ["cpu", "gpu"])
+def test_a_recipe_is_the_trainers_settings_by_one_name(name: str) -> None:
+    register("train", TrainConfig)
+    with initialize_config_dir(CONF, version_base="1.3"):
+        config = OmegaConf.to_object(compose("train", overrides=[f"recipe={name}"]))
+        shorter = OmegaConf.to_object(compose("train", overrides=[f"recipe={name}", "minutes=1"]))
+    assert config.output == f"runs/{name}"
+    assert config.minutes <= 150
+    assert config.start is None
+    assert shorter == replace(config, minutes=1.0)
+
+
+def test_a_recipe_trains_from_nothing_and_goes_on_after_a_kill(tmp_path: Path) -> None:
+    """The settings of the GPU's recipe, with a network and images that a CPU can bear."""
+    register("train", TrainConfig)
+    with initialize_config_dir(CONF, version_base="1.3"):
+        recipe = OmegaConf.to_object(compose("train", overrides=["recipe=gpu"]))
+    small = tiny(tmp_path)
+    sizes = {key: getattr(small.data, key) for key in ("width", "height", "render_width", "render_height")}
+    shown = replace(recipe.data, **sizes, workers=1)
+    config = replace(recipe, output=str(tmp_path), steps=1, data=shown, net=small.net)
+    config = replace(config, validation=small.validation)
+    assert train(config).step == 1
+    state = train(replace(config, steps=2))
+    assert state.step == 2
+    assert (tmp_path / "best.pt").is_file()
+
+
+def test_a_worker_for_each_core_is_one_or_more(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    made: list[int] = []
+    monkeypatch.setattr(data, "DataLoader", lambda *_, num_workers, **__: made.append(num_workers) or [])
+    for cores, part in ((8, (0, 1)), (8, (1, 2)), (1, (0, 1)), (None, (0, 1))):
+        monkeypatch.setattr(data.os, "cpu_count", lambda cores=cores: cores)
+        data.training_batches(DataConfig(workers=None), 1, 2, 0, part)
+    data.training_batches(DataConfig(workers=0), 1, 2, 0)
+    assert made == [7, 3, 1, 1, 0]
+
+
+def test_the_average_follows_a_short_run_and_forgets_its_random_start(tmp_path: Path) -> None:
+    trainer = Trainer(tiny(tmp_path, 40), lambda share, line: None)
+    trainer.run()
+    begin = Trainer(tiny(tmp_path / "begin", 40), lambda share, line: None).net
+    nets = (begin, trainer.averaged.module, trainer.net)
+    pairs = zip(*([p.detach() for p in net.parameters()] for net in nets), strict=True)
+    still_to_go, gone = 0.0, 0.0
+    for first, average, last in pairs:
+        still_to_go += float((last - average).norm())
+        gone += float((last - first).norm())
+    assert still_to_go < 0.5 * gone
+
+
+@pytest.mark.parametrize("argument", ["learning_rat=1", "batch=many", "recipe=gpuu"])
 def test_a_mistyped_argument_is_one_line_and_exit_code_2(
     argument: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

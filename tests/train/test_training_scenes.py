@@ -40,7 +40,7 @@ from v2hdm.records import (
     FloatArray,
 )
 from v2hdm.simulate.render.optics import Motion, Optics
-from v2hdm.simulate.render.scene import Light, box_footprint
+from v2hdm.simulate.render.scene import Ground, Light, box_footprint
 
 TINY = DataConfig(width=64, height=32, render_width=80, render_height=48, views_per_render=2, reservoir=3)
 
@@ -211,14 +211,14 @@ def test_tight_bends_turn_the_lines_and_keep_the_way_clear() -> None:
     [
         field.name
         for field in fields(Hardships)
-        if field.name not in ("things_beside", "tight_bends", "kerbs", "aside")
+        if field.name not in ("things_beside", "tight_bends", "kerbs", "junctions", "mountings", "aside")
     ],
 )
 def test_hardships_change_what_paint_looks_like_and_not_where_it_is(name: str) -> None:
-    hardships = Hardships(**{name: 1.0})
+    hardships = Hardships(**{name: 3.0})
     pairs = [
         (training_sample(5, index, 160, 96), training_sample(5, index, 160, 96, hardships=hardships))
-        for index in range(6)
+        for index in range(16)
     ]
     for plain, hard in pairs:
         np.testing.assert_array_equal(plain.labels, hard.labels)
@@ -332,7 +332,7 @@ def test_blue_shade_takes_red_from_the_sky_and_nothing_from_the_sun() -> None:
 
 def test_overexposed_optics_expose_longer_within_reason() -> None:
     optics = Optics(mean_level=0.2)
-    levels = [overexposed(np.random.default_rng(k), optics, 0.5).mean_level for k in range(60)]
+    levels = [overexposed(np.random.default_rng(k), optics, Ground(), 0.5).mean_level for k in range(60)]
     assert min(levels) == 0.2
     assert 0.6 < max(levels) <= 0.9
     assert 15 < sum(level > 0.2 for level in levels) < 45

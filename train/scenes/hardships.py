@@ -10,16 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from train.scenes.clutter import kerb_colours, plain_marks, thing_to_stand_beside
-from train.scenes.paint import Bend, rectangle
+from train.scenes.paint import Bend, Brush, RoadPaint, arrow, crosswalk, rectangle, stop_line
 from v2hdm.geometry.planar import inside_convex
-from v2hdm.records import CORNERED_CLASSES, FloatArray
+from v2hdm.records import ARROW, CORNERED_CLASSES, CROSSWALK_BAR, STOP_LINE, FloatArray
 from v2hdm.simulate.render.optics import Optics
-from v2hdm.simulate.render.scene import Bgr, Box, GroundMarks, Light, Paint, Shadow, box_footprint
+from v2hdm.simulate.render.scene import Bgr, Box, Ground, GroundMarks, Light, Paint, Shadow, box_footprint
 
 _CROSSED_M = 22.0
 _LONGEST_LEVEL = 0.9
 _CAMERA_CLEARANCE_M = 3.5
 _KERB_M = 45.0
+_SEAM_STEP_M = 0.25
+_BLEACHED_ALBEDO = (0.37, 0.52)
+"""Of sun-bleached concrete; fresh paint has 0.6 to 0.9."""
+
+_BLEACHED_OVEREXPOSED = 0.5
 _SHIFT = 4
 """Bits of fraction of the coordinates that OpenCV is given."""
 
@@ -35,7 +40,10 @@ class Hardships:
         faint: share of scenes half of whose markings are so dirty that the ground is nearly as bright.
         seams: share of lane lines that have a seam of the surface beside them, as paving leaves it there:
             dark or bright, and going on where a dash ends.
+        side_seams: mean number of markings with a crack or a tar seam along one of their sides and beyond it.
         pavements: share of scenes in which the surface changes its tone along a line, beside its paint.
+        bleached: share of scenes whose ground is nearly as light as its paint. Half of them are overexposed,
+            so that ground and paint are clipped together.
         overexposed: share of images that are exposed several times too long, as the sunlit half of a scene
             is by a camera set for its shade.
         blue_shade: share of scenes whose shade is lit by a deep blue sky.
@@ -43,6 +51,9 @@ class Hardships:
             roundabouts; what would stand on the paint is left out.
         kerbs: share of scenes with a bright kerb along a line of a lane, no wider than paint, that lies open
             in stretches as long as dashes.
+        junctions: share of scenes with the whole approach to a junction: arrows, stop line, crosswalk.
+        mountings: share of cameras that sit lower than in cars (0.5 to 1.1 m) or higher than on most trucks
+            (3.6 to 5 m).
         aside: share of cameras that look to the side of the vehicle. What they see is another scene's worth,
             and its dashes and stop lines have changed names: see
             :func:`~train.scenes.scenes.training_sample`.
@@ -52,11 +63,15 @@ class Hardships:
     things_beside: float = 0.0
     faint: float = 0.0
     seams: float = 0.0
+    side_seams: float = 0.0
     pavements: float = 0.0
+    bleached: float = 0.0
     overexposed: float = 0.0
     blue_shade: float = 0.0
     tight_bends: float = 0.0
     kerbs: float = 0.0
+    junctions: float = 0.0
+    mountings: float = 0.0
     aside: float = 0.0
 
 
@@ -183,6 +198,49 @@ def _along(
     return out
 
 
+def with_junction(
+    rng: np.random.Generator, road: RoadPaint, brush: Brush, bend: Bend, share: float
+) -> RoadPaint:
+    """This road, or in a ``share`` of cases with the approach to a junction instead of what was there."""
+    if rng.random() >= share:
+        return road
+    approach, ground = junction_approach(rng, brush, bend)
+    middles = np.array([paint.polygon_map.mean(axis=0) for paint in road.paints]).reshape(-1, 2)
+    there = inside_convex(ground, middles)
+    kept = [paint for paint, inside in zip(road.paints, there, strict=True) if not inside]
+    return RoadPaint([*kept, *approach], road.lanes)
+
+
+def junction_approach(rng: np.random.Generator, brush: Brush, bend: Bend) -> tuple[list[Paint], FloatArray]:
+    """The approach to a junction: arrows in one to three lanes, their stop line, the crosswalk behind it.
+
+    Returns:
+        The paint, and the outline (4, 2, map) of the ground from the stop line to the end of the crosswalk.
+    """
+    lanes, lane_m = int(rng.integers(1, 4)), rng.uniform(2.6, 3.8)
+    right, stop_m, thick_m = rng.uniform(-1.5, -0.2) * lane_m, rng.uniform(5, 26), rng.uniform(0.2, 0.6)
+    shapes = [
+        (STOP_LINE, shape + np.array([stop_m, right])) for shape in stop_line(rng, lanes * lane_m, thick_m)
+    ]
+    for lane in range(lanes):
+        tip_m, head = stop_m - rng.uniform(1, 5), 1 if rng.random() < 0.8 else -1
+        while rng.random() < 0.8 and tip_m > 5:
+            parts = list(arrow(rng, lane_m))
+            long_m = max(part[:, 0].max() for part in parts)
+            tail = (tip_m - long_m if head > 0 else tip_m, right + (lane + 0.5) * lane_m)
+            shapes += [(ARROW, head * part + tail) for part in parts]
+            tip_m -= long_m + rng.uniform(4, 15)
+    behind_m, beside_m = stop_m + thick_m / 2 + rng.uniform(0.4, 2), rng.uniform(0, 2 * lane_m, 2)
+    extent_m = lanes * lane_m + beside_m.sum()
+    bars = list(crosswalk(rng, extent_m)) if rng.random() < 0.8 else []
+    long_m = np.ptp(bars[0][:, 0]) if bars else 0.0
+    first = np.array([behind_m + long_m / 2, right - beside_m[0]])
+    shapes += [(CROSSWALK_BAR, bar + first) for bar in bars]
+    middle = np.array([(stop_m + behind_m + long_m) / 2, right - beside_m[0] + extent_m / 2])
+    ground = rectangle(middle, behind_m + long_m - stop_m + 1, extent_m + 1)
+    return [brush.paint(rng, kind, bend.to_map(shape)) for kind, shape in shapes], bend.to_map(ground)
+
+
 def _some_within_sight(rng: np.random.Generator, paints: Sequence[Paint], mean: float) -> list[FloatArray]:
     """The polygons (N, 2) of some markings with corners that are near, ``mean`` of them on average."""
     near = [p for p in paints if p.kind in CORNERED_CLASSES and 1 < p.polygon_map[:, 0].mean() < _CROSSED_M]
@@ -197,13 +255,38 @@ def with_seams(
     beside = [line for line in lines_map if rng.random() < share]
     if not beside:
         return marks
+    wavy = [rng.normal(0, 0.01) * np.cumsum(rng.normal(0, 1, len(line))) for line in beside]
+    seams = (_beside(line, rng.normal(0, 0.12) + off) for line, off in zip(beside, wavy, strict=True))
+    return _with_strips(rng, marks, seams)
+
+
+def with_side_seams(
+    rng: np.random.Generator, marks: GroundMarks | None, paints: Sequence[Paint], mean: float
+) -> GroundMarks | None:
+    """The marks of a ground and seams along a side of ``mean`` markings within sight, oftenest a long one."""
+    seams = []
+    for polygon in _some_within_sight(rng, paints, mean):
+        sides = np.roll(polygon, -1, axis=0) - polygon
+        lengths_m = np.linalg.norm(sides, axis=1)
+        k = int(rng.choice(len(polygon), p=lengths_m / lengths_m.sum()))
+        before_m, after_m = rng.exponential(1.0, 2)
+        along_m = np.arange(-before_m, lengths_m[k] + after_m, _SEAM_STEP_M)
+        line = polygon[k] + along_m[:, None] * sides[k] / lengths_m[k]
+        rough_m = rng.uniform(0, 0.012) * np.cumsum(rng.normal(0, 1, len(line)))
+        seams.append(_beside(line, rng.normal(0, 0.03) + rough_m - rough_m.mean()))
+    return _with_strips(rng, marks, seams) if seams else marks
+
+
+def _with_strips(
+    rng: np.random.Generator, marks: GroundMarks | None, strips_map: Iterable[FloatArray]
+) -> GroundMarks:
+    """The marks of a ground and narrow dark or bright strips along lines (N, 2, map)."""
     marks = plain_marks() if marks is None else marks
     factor = marks.factor.copy()
-    for line in beside:
-        offset_m = rng.normal(0, 0.12) + rng.normal(0, 0.01) * np.cumsum(rng.normal(0, 1, len(line)))
-        at = _sixteenths(_beside(line, offset_m), marks)
+    for strip in strips_map:
         tone = rng.uniform(35, 110) if rng.random() < 0.75 else rng.uniform(145, 200)
-        cv2.polylines(factor, [at], False, tone, int(rng.integers(1, 4)), cv2.LINE_AA, _SHIFT)
+        wide_px = int(rng.integers(1, 4))
+        cv2.polylines(factor, [_sixteenths(strip, marks)], False, tone, wide_px, cv2.LINE_AA, _SHIFT)
     return replace(marks, factor=factor)
 
 
@@ -248,8 +331,24 @@ def blue_shade(rng: np.random.Generator, light: Light, share: float) -> Light:
     return replace(light, sky_bgr=(blue * (1 + tint), green, red * (1 - tint)))
 
 
-def overexposed(rng: np.random.Generator, optics: Optics, share: float) -> Optics:
-    """These optics, or in a ``share`` of cases set to expose up to four times longer."""
+def bleached(rng: np.random.Generator, ground: Ground, share: float) -> Ground:
+    """This ground, or in a ``share`` of cases nearly as light as paint is, in its own tint."""
     if rng.random() >= share:
+        return ground
+    lighter = rng.uniform(*_BLEACHED_ALBEDO) / max(ground.albedo_bgr)
+    blue, green, red = (float(lighter * c) for c in ground.albedo_bgr)
+    return replace(ground, albedo_bgr=(blue, green, red))
+
+
+def overexposed(rng: np.random.Generator, optics: Optics, ground: Ground, share: float) -> Optics:
+    """These optics, or in a ``share`` of cases, half of those of a bleached ground, exposing too long.
+
+    Up to four times longer, that is.
+    """
+    if rng.random() >= (max(share, _BLEACHED_OVEREXPOSED) if _is_bleached(ground) else share):
         return optics
     return replace(optics, mean_level=float(min(optics.mean_level * rng.uniform(1.5, 4.0), _LONGEST_LEVEL)))
+
+
+def _is_bleached(ground: Ground) -> bool:
+    return max(ground.albedo_bgr) >= _BLEACHED_ALBEDO[0]

@@ -297,7 +297,7 @@ def _lane_symbols(
     rng: np.random.Generator, brush: Brush, bend: Bend, left: float, lane_m: float
 ) -> list[Paint]:
     """An arrow or a line of writing in a lane, perhaps repeated."""
-    draw, kind = (_arrow, ARROW) if rng.random() < 0.6 else (_writing, OTHER_PAINT)
+    draw, kind = (arrow, ARROW) if rng.random() < 0.6 else (_writing, OTHER_PAINT)
     out: list[Paint] = []
     for along in np.arange(rng.uniform(1, 12), 32, rng.uniform(9, 30)):
         for polygon in draw(rng, lane_m):
@@ -306,7 +306,7 @@ def _lane_symbols(
     return out
 
 
-def _arrow(rng: np.random.Generator, lane_m: float) -> Iterator[FloatArray]:
+def arrow(rng: np.random.Generator, lane_m: float) -> Iterator[FloatArray]:
     """Convex parts of a lane arrow: straight on, a turn, or both."""
     length, shaft = rng.uniform(2.0, 6.0), rng.uniform(0.12, 0.3)
     head_length, head = rng.uniform(0.25, 0.45) * length, rng.uniform(2.5, 4.5) * shaft
@@ -348,8 +348,8 @@ def _junction(rng: np.random.Generator, brush: Brush, bend: Bend, lane_m: float)
     along, left = rng.uniform(3, 25), rng.uniform(-5, 2)
     extent = lane_m * rng.integers(1, 4)
     draw, kind = [
-        (_stop_line, STOP_LINE),
-        (_crosswalk, CROSSWALK_BAR),
+        (stop_line, STOP_LINE),
+        (crosswalk, CROSSWALK_BAR),
         (_teeth, OTHER_PAINT),
         (_chevrons, CHEVRON),
     ][int(rng.choice(4, p=[0.27, 0.27, 0.13, 0.33]))]
@@ -358,12 +358,13 @@ def _junction(rng: np.random.Generator, brush: Brush, bend: Bend, lane_m: float)
     ]
 
 
-def _stop_line(rng: np.random.Generator, extent: float) -> Iterator[FloatArray]:
+def stop_line(rng: np.random.Generator, extent: float, thick_m: float | None = None) -> Iterator[FloatArray]:
     """One thick line across the way."""
-    yield rectangle(np.array([0.0, extent / 2]), rng.uniform(0.25, 0.6), extent)
+    thick = rng.uniform(0.25, 0.6) if thick_m is None else thick_m
+    yield rectangle(np.array([0.0, extent / 2]), thick, extent)
 
 
-def _crosswalk(rng: np.random.Generator, extent: float) -> Iterator[FloatArray]:
+def crosswalk(rng: np.random.Generator, extent: float) -> Iterator[FloatArray]:
     """Bars along the way, side by side across it."""
     bar, long = rng.uniform(0.35, 0.6), rng.uniform(2, 4.5)
     for left in np.arange(0, extent, 2 * bar):

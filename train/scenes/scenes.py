@@ -15,6 +15,7 @@ from train.scenes.clutter import ground_marks, port_boxes, street_boxes
 from train.scenes.hardships import (
     NONE,
     Hardships,
+    bleached,
     blue_shade,
     clear_of,
     faint,
@@ -23,11 +24,13 @@ from train.scenes.hardships import (
     shadows_on_paint,
     things_beside,
     tight_bend,
+    with_junction,
     with_pavements,
     with_seams,
+    with_side_seams,
 )
 from train.scenes.paint import Bend, RoadPaint, port_paint, random_brush, rectangle, street_paint
-from train.scenes.views import TrainingView, random_view, turned_aside
+from train.scenes.views import TrainingView, mounted_otherwise, random_view, turned_aside
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.records import CORNERED_CLASSES, PAINT_CLASSES, SEEN_ACROSS, FloatArray
@@ -86,16 +89,17 @@ def training_sample(
     """
     rng = np.random.default_rng([seed, index])
     scene, lanes = random_scene(rng, difficulty, hardships)
-    straight = random_view(rng, width, height)
+    usual = random_view(rng, width, height)
     places = [paint.polygon_map.mean(axis=0) for paint in scene.paints if paint.kind in CORNERED_CLASSES]
-    for_optics, for_view = rng.spawn(2)
-    view = turned_aside(for_view, straight, places, hardships.aside)
+    for_optics, for_view, for_mounting = rng.spawn(3)
+    ahead = mounted_otherwise(for_mounting, usual, hardships.mountings)
+    view = turned_aside(for_view, ahead, places, hardships.aside)
     scene = _without_hidden_boxes(scene, view)
-    optics = overexposed(for_optics, view.optics, hardships.overexposed)
+    optics = overexposed(for_optics, view.optics, scene.ground, hardships.overexposed)
     rendered = Renderer(scene).render(view.info, view.cam_from_map, rng, optics, view.motion)
     seen = (image_line(view, lane) for lane in lanes)
     lanes_px = tuple(lane for lane in seen if len(lane) > 1)
-    labels = rendered.labels if view is straight else _TO_ONE_ASIDE[rendered.labels]
+    labels = rendered.labels if view is ahead else _TO_ONE_ASIDE[rendered.labels]
     return TrainingSample(rendered.image, labels, rendered.hidden, lanes_px)
 
 
@@ -148,7 +152,9 @@ def random_scene(
     """
     place = rng.choice(["port", "street", "bare"], p=[0.4, 0.5, 0.1])
     bend = Bend(float(rng.normal(0, 0.006)) if rng.random() < 0.4 else 0.0)
-    for_shadows, for_ground, for_light, for_things, for_paint, for_bend, for_kerbs = rng.spawn(7)
+    for_shadows, for_ground, for_light, for_things, for_paint, for_bend, for_kerbs, for_junction = rng.spawn(
+        8
+    )
     tight = tight_bend(for_bend, hardships.tight_bends)
     bend = tight or bend
     brush = random_brush(rng, difficulty)
@@ -159,10 +165,14 @@ def random_scene(
         road, boxes = street_paint(rng, brush, bend), street_boxes(rng, road_half_m)
     else:
         road, boxes = RoadPaint(), street_boxes(rng, road_half_m) if rng.random() < 0.7 else port_boxes(rng)
-    boxes = clear_of(boxes, road.paints) if tight else boxes
+    junction = with_junction(for_junction, road, brush, bend, hardships.junctions)
+    boxes = clear_of(boxes, junction.paints) if tight or junction is not road else boxes
+    road = junction
     ground, shadows = _ground(rng, place == "port", difficulty), _shadows(rng, difficulty)
     marks = with_pavements(for_ground, ground.marks, road.lanes, hardships.pavements)
     marks = with_seams(for_ground, marks, road.lanes, hardships.seams)
+    marks = with_side_seams(for_ground, marks, road.paints, hardships.side_seams)
+    ground = bleached(for_ground, ground, hardships.bleached)
     scene = Scene(
         ground=replace(ground, marks=marks),
         paints=faint(for_paint, road.paints, hardships.faint),

@@ -13,12 +13,15 @@ import numpy as np
 
 from v2hdm.detection.camera.view import ASIDE_RAD
 from v2hdm.geometry.lens import distort_points, undistort_points
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import CameraInfo, FloatArray
 from v2hdm.simulate.render.optics import Motion, Optics
 
 _LENS_TOLERANCE_PX = 0.1
 _BORDER_POINTS = 17
 _FARTHEST_PASSED_M = 12.0
+_UNUSUAL_HEIGHTS_M = ((0.5, 1.1), (3.6, 5.0))
+"""Of cameras in bumpers and on small robots, and of those on masts, cranes and straddle carriers."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,17 @@ def random_view(rng: np.random.Generator, width: int, height: int) -> TrainingVi
         info = _crop_camera(rng, width, height, focal_px, pitch)
     cam_from_map = looking(np.array([0.0, rng.normal(0, 0.6), height_m]), yaw, float(pitch), roll)
     return TrainingView(info, cam_from_map, _random_optics(rng), _random_motion(rng))
+
+
+def mounted_otherwise(rng: np.random.Generator, view: TrainingView, share: float) -> TrainingView:
+    """The view or, in a ``share`` of cases, that from a height of 0.5 to 1.1 m or of 3.6 to 5 m."""
+    if rng.random() >= share:
+        return view
+    low, high = _UNUSUAL_HEIGHTS_M[int(rng.integers(len(_UNUSUAL_HEIGHTS_M)))]
+    x, y, _ = camera_centre(view.cam_from_map)
+    cam_from_map = view.cam_from_map.copy()
+    cam_from_map[:3, 3] = -cam_from_map[:3, :3] @ np.array([x, y, rng.uniform(low, high)])
+    return replace(view, cam_from_map=cam_from_map)
 
 
 def turned_aside(

@@ -2,7 +2,7 @@
 
 First each line is judged alone, then with its span and among the others of its image. A
 road's lines run beside each other, a lane apart: kerbs, joints and edges of shadows run closer. The weights,
-in ``lane_score.json``, belong to the network. ``python -m train.fit_lane_score --write`` fits them to renders
+in ``lane_score.json``, belong to the network. ``python -m train.ship`` fits them to renders
 which no benchmark shows.
 """
 

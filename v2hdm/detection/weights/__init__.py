@@ -25,13 +25,14 @@ CONFIDENCE_FILE = FOLDER / "confidence.json"
 LANE_SCORE_FILE = FOLDER / "lane_score.json"
 MANIFEST_FILE = FOLDER / "manifest.json"
 
+_FIT = f"python -m train.ship v2hdm/detection/weights/{NETWORK_FILE.name}"
 COMMANDS: Mapping[str, str] = {
-    NETWORK_FILE.name: f"python -m export checkpoint=... output=v2hdm/detection/weights/{NETWORK_FILE.name}",
-    JUDGE_FILE.name: "python -m train.fit_judge --write",
-    CONFIDENCE_FILE.name: "python -m train.fit_judge --write",
-    LANE_SCORE_FILE.name: "python -m train.fit_lane_score --write",
+    NETWORK_FILE.name: "python -m train.ship runs/gpu",
+    JUDGE_FILE.name: _FIT,
+    CONFIDENCE_FILE.name: _FIT,
+    LANE_SCORE_FILE.name: _FIT,
 }
-"""The command that makes each file."""
+"""The command that makes each file, from a training or for the network that is there."""
 
 _being_fitted = False
 

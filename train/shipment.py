@@ -1,0 +1,219 @@
+"""What makes a trained network the detector's own: export, judge, lane score, manifest, in this order.
+
+Each step leaves its files in a folder of ``runs/`` named by all that they depend on: the network, the numbers
+of renders and the code. A run that was stopped finds there what it has done; after a change it begins anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from export.config import ExportConfig, Precision
+from export.console import run as export
+from export.manifest import record
+from train import fit_judge, fit_lane_score
+from train.exported import read_exported
+from train.fit_judge import Gathered
+from v2hdm.detection import weights
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.errors import ConfigError
+from v2hdm.files import whole_file
+from v2hdm.workers import share_out
+
+_ROOT = Path(__file__).resolve().parents[1]
+_CODE = ("v2hdm", "models", "train", "export")
+_FLOAT_FILE = _ROOT / "models" / "marking_net.onnx"
+_KEPT_FILES = {
+    "judge": (weights.JUDGE_FILE.name, weights.CONFIDENCE_FILE.name),
+    "lane_score": (weights.LANE_SCORE_FILE.name,),
+}
+_LEAST_IMAGES = 100
+"""Fewer renders leave some fifth of them without a marking of some class."""
+
+_PART_IMAGES = 25
+"""Renders that one process looks at in one go: what a kill loses at most, per process."""
+
+_EXPORTED, _GATHERED, _JUDGED, _LANES_SEEN = 0.05, 0.6, 0.85, 0.99
+"""Shares of the time that have passed after each step, about."""
+
+Tell = Callable[[float, str], None]
+"""Is told what share of the work is done, and what is being done."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Order:
+    """What to ship, and how; the fields are the arguments of :mod:`train.ship`."""
+
+    source: Path
+    into: Path | None = None
+    precision: str = "int8"
+    keep: Sequence[str] = ()
+    judge_images: int = 1650
+    lane_images: int = 450
+    workers: int = 0
+
+    @property
+    def network(self) -> Path:
+        """The checkpoint or exported file that ``source`` stands for."""
+        return self.source / "best.pt" if self.source.is_dir() else self.source
+
+    @property
+    def folder(self) -> Path:
+        """Where the files go."""
+        return self.into or weights.FOLDER
+
+    @property
+    def command(self) -> str:
+        """The command that this is."""
+        kept = f" --keep {' '.join(self.keep)}" if self.keep else ""
+        images = f"--judge-images {self.judge_images} --lane-images {self.lane_images}"
+        return f"python -m train.ship {self.source} --precision {self.precision} {images}{kept}"
+
+
+def ship(order: Order, tell: Tell) -> Path:
+    """Export, fit, and put the files in place; returns the folder that they are in.
+
+    Raises:
+        ConfigError: The network cannot be read, a kept file is not there, or there are too few renders.
+        DetectorError: The exported file would not do what the network does.
+    """
+    _check(order)
+    folder = Path("runs") / f"ship-{_state(order)}"
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in (file for kept in order.keep for file in _KEPT_FILES[kept]):
+        _copy(order.folder / name, folder / name)
+    _export(order, folder, tell)
+    if not (folder / weights.JUDGE_FILE.name).is_file():
+        _fit_judge(order, folder, tell)
+    if not (folder / weights.LANE_SCORE_FILE.name).is_file():
+        _fit_lane_score(order, folder, tell)
+    tell(_LANES_SEEN, "putting the files in place")
+    record(list(weights.COMMANDS), order.command, folder)
+    weights.check_weights(folder)
+    float_file = _FLOAT_FILE if order.into is None else order.into / _FLOAT_FILE.name
+    if (folder / _FLOAT_FILE.name).is_file():
+        _copy(folder / _FLOAT_FILE.name, float_file)
+    for name in (*weights.COMMANDS, weights.MANIFEST_FILE.name):
+        _copy(folder / name, order.folder / name)
+    shutil.rmtree(folder)
+    return order.folder
+
+
+def ship_on_terminal(order: Order) -> None:
+    """:func:`ship` with a bar over all of its steps."""
+    console = Console(stderr=True)
+    columns = (
+        BarColumn(),
+        TextColumn("{task.percentage:.0f} %"),
+        TimeElapsedColumn(),
+        TextColumn("{task.description}"),
+    )
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("reading", total=1.0)
+        folder = ship(order, lambda share, doing: bar.update(task, completed=share, description=doing))
+        bar.update(task, completed=1.0, description="done")
+    print(f"{folder}: network, judge and lane score of {order.source}")
+
+
+def _check(order: Order) -> None:
+    if not order.network.is_file():
+        raise ConfigError(f"no network at {order.network}: train one with `python -m train`, or name another")
+    for option, images in (("judge", order.judge_images), ("lane", order.lane_images)):
+        if images < _LEAST_IMAGES:
+            raise ConfigError(f"--{option}-images {images}: give {_LEAST_IMAGES} or more")
+    for name in (file for kept in order.keep for file in _KEPT_FILES[kept]):
+        if not (order.folder / name).is_file():
+            raise ConfigError(f"{order.folder / name}: no such file to keep; leave out --keep to fit it")
+
+
+def _state(order: Order) -> str:
+    """A name for all that the files depend on."""
+    said = f"{order.precision} {order.judge_images} {order.lane_images} {sorted(order.keep)}"
+    digest = hashlib.sha256(said.encode() + order.network.read_bytes())
+    for name in (file for kept in order.keep for file in _KEPT_FILES[kept]):
+        digest.update((order.folder / name).read_bytes())
+    for package in _CODE:
+        for path in sorted((_ROOT / package).rglob("*.py")) + sorted((_ROOT / package).rglob("*.yaml")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def _export(order: Order, folder: Path, tell: Tell) -> None:
+    """Write the network that runs on the vehicle and, unless it was rounded before, that of float32."""
+    network, source = folder / weights.NETWORK_FILE.name, order.network
+    if network.is_file():
+        return
+    if source.suffix == ".onnx" and read_exported(source).label.get("precision", "float32") != "float32":
+        _copy(source, network)
+        return
+    tell(0.0, "exporting the network")
+    export(ExportConfig(checkpoint=str(source), output=str(folder / _FLOAT_FILE.name)))
+    config = ExportConfig(checkpoint=str(source), output=str(network), precision=Precision[order.precision])
+    print(export(config, lambda share, doing: tell(_EXPORTED * share, f"exporting the network: {doing}")))
+
+
+def _fit_judge(order: Order, folder: Path, tell: Tell) -> None:
+    parts = [
+        fit_judge.Part(numbers, order.judge_images, folder / weights.NETWORK_FILE.name, folder / f"{k}.npz")
+        for k, numbers in enumerate(_in_parts(order.judge_images))
+    ]
+    left = [part for part in parts if not part.path.is_file()]
+    done = len(parts) - len(left)
+
+    def take(_: object) -> None:
+        nonlocal done
+        done += 1
+        share = _EXPORTED + (_GATHERED - _EXPORTED) * done / len(parts)
+        tell(share, f"judge: {min(done * _PART_IMAGES, order.judge_images)} renders seen")
+
+    tell(_EXPORTED, "judge: looking at renders")
+    share_out(fit_judge.gather, left, _workers(order), cv2.setNumThreads, (1,), take)
+
+    def learnt(share: float) -> None:
+        tell(_GATHERED + (_JUDGED - _GATHERED) * share, "judge: learning")
+
+    learnt(0.0)
+    judge, confidence = fit_judge.fit_all(Gathered.load([part.path for part in parts]), learnt)
+    fit_judge.write_both(judge, confidence, order.judge_images, folder)
+
+
+def _fit_lane_score(order: Order, folder: Path, tell: Tell) -> None:
+    network = folder / weights.NETWORK_FILE.name
+    parts = [
+        fit_lane_score.Part(numbers, order.lane_images, network) for numbers in _in_parts(order.lane_images)
+    ]
+    images: list[fit_lane_score.Seen] = []
+
+    def take(seen: list[fit_lane_score.Seen]) -> None:
+        images.extend(seen)
+        share = _JUDGED + (_LANES_SEEN - _JUDGED) * len(images) / order.lane_images
+        tell(share, f"lane score: {len(images)} renders seen")
+
+    tell(_JUDGED, "lane score: looking at renders")
+    share_out(fit_lane_score.see, parts, _workers(order), cv2.setNumThreads, (1,), take)
+    fit_lane_score.write(fit_lane_score.fit_to(images, DetectorOptions().lane_step_m), folder)
+
+
+def _in_parts(images: int) -> list[range]:
+    return [range(k, min(k + _PART_IMAGES, images)) for k in range(0, images, _PART_IMAGES)]
+
+
+def _workers(order: Order) -> int:
+    return order.workers or os.cpu_count() or 1
+
+
+def _copy(source: Path, destination: Path) -> None:
+    try:
+        with whole_file(destination) as partial:
+            shutil.copyfile(source, partial)
+    except OSError as error:
+        raise ConfigError(f"{destination}: cannot be written ({error.strerror})") from None
