@@ -4,8 +4,8 @@
 
 Rendered images of ports and streets are looked at with the camera's true mounting and with guesses of it that
 are 2 degrees of pitch or 20 % of height off. Printed for each guess: the recall and the false markings as
-``detector_quality`` counts them, and the share of the true markings within 15 m, symbols among them, found with
-the true mounting that is found again, as the same class.
+``detector_quality`` counts them, and of the true markings within 15 m found with the true mounting, symbols
+among them, the share that is found again as the same class.
 """
 
 from __future__ import annotations
