@@ -1,7 +1,7 @@
-"""The door to a drift alarm: ``python -m v2hdm.calibration BEFORE AFTER``, has a camera moved, and by how much?
+"""The door to a drift alarm: ``python -m v2hdm.calibration BEFORE AFTER`` tells whether a camera has moved.
 
-Both are results of ``python -m v2hdm.map`` or ``v2hdm.extrinsic``: a folder, or one calibration file. One line a
-camera on stdout. docs/calibration.md describes it.
+Both are results of ``python -m v2hdm.map`` or ``v2hdm.extrinsic``: a folder, or one calibration file. One line
+a camera on stdout. docs/calibration.md describes it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _LEAST = 1e-12
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the door; 0 where no camera has moved, 3 where one has, 2 with one line for what cannot be compared."""
+    """Run the door; 0 where no camera has moved, 3 where one has, 2 with one line where none can tell."""
     parsed = _parser().parse_args(arguments)
     return open_door("v2hdm.calibration", "map", "interrupted", lambda: _compare(parsed))
 
@@ -49,8 +49,8 @@ def _compare(parsed: argparse.Namespace) -> int:
             print(_line(one))
         if turned_alike(movements):
             print(
-                "all cameras have turned alike: rather than each of them, the vehicle's heading, or the frame of "
-                "the poses, has changed"
+                "all cameras have turned alike: rather than each of them, the vehicle's heading, "
+                "or the frame of the poses, has changed"
             )
     for name in sorted(before.keys() ^ after.keys()):
         print(f"{name}: only in one of the two; not compared", file=sys.stderr)
@@ -66,7 +66,7 @@ def _calibrations(path: Path) -> dict[str, Calibration]:
     files = sorted(path.glob("calibration_*.yaml")) if path.is_dir() else [path]
     if not files:
         raise MapFileError(
-            f"{path}: no calibration_*.yaml in it; give a result of v2hdm.map or v2hdm.extrinsic"
+            f"{path}: no calibration_*.yaml in it; give what v2hdm.map or v2hdm.extrinsic wrote"
         )
     out = {}
     for file in files:

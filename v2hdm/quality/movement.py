@@ -14,21 +14,23 @@ from v2hdm.geometry.rigid import adjoint, camera_centre, inverse, log
 from v2hdm.records import Calibration, FloatArray
 
 FALSE_ALARM = 1e-3
-"""Probability that a camera which has not moved is said to have: one alarm in twenty years of weekly checks."""
+"""Probability that a camera which has not moved is said to have: an alarm in 20 years of weekly checks."""
 
 MISSED = 0.05
 """Probability with which a movement of the size told as detectable would be missed."""
 
-_SAME_FOCAL = 2e-3
-"""Relative difference of focal lengths, and difference of the principal point as a share of the image's width,
-up to which two calibrations are of the same lens: more turns into pitch, yaw and height."""
+_SAME_LENS = 2e-3
+"""Difference of the intrinsics, as a share of focal length or width, up to which they are of one lens.
+
+More of it turns into pitch, yaw and height.
+"""
 
 
 @dataclass(frozen=True)
 class Movement:
-    """How a camera sits after, beside before, along and about the vehicle's axes (forward, left, up).
+    """How a camera has moved along and about the vehicle's axes: forward, left, up.
 
-    ``shift_m`` (3,) and ``turn_rad`` (3,) are the movement, ``covariance`` (6, 6) is that of both in this order.
+    ``shift_m`` (3,) and ``turn_rad`` (3,) are the movement, ``covariance`` (6, 6) is that of both.
     ``probability`` is that of differences at least as large where nothing has moved.
     """
 
@@ -45,7 +47,7 @@ class Movement:
 
     @property
     def detectable(self) -> FloatArray:
-        """The least shift, m, and turn, rad, along and about each axis alone (6,) that would hardly be missed."""
+        """The least shifts, m, and turns, rad, each alone (6,), that would hardly be missed."""
         limit = chi2.isf(FALSE_ALARM, 6)
         needed = brentq(lambda offset: ncx2.sf(limit, 6, offset) - (1 - MISSED), 1.0, 1e3)
         return np.asarray(np.sqrt(needed / np.diag(np.linalg.inv(self.covariance))))
@@ -108,10 +110,10 @@ def _check_comparable(before: Calibration, after: Calibration) -> None:
             f"{who}: image sizes or lens models differ; calibrate with the same intrinsics both times"
         )
     off = np.abs(first.intrinsic - second.intrinsic)
-    if off.max() > _SAME_FOCAL * max(first.intrinsic[0, 0], first.width):
+    if off.max() > _SAME_LENS * max(first.intrinsic[0, 0], first.width):
         raise MapFileError(
-            f"{who}: the intrinsics differ by {off.max():.1f} px, which looks like a movement; calibrate with the "
-            "same intrinsics both times"
+            f"{who}: the intrinsics differ by {off.max():.1f} px, which looks like a movement; calibrate "
+            "with the same intrinsics both times"
         )
     for calibration, which in ((before, "first"), (after, "second")):
         covariance = calibration.covariance
