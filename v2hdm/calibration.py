@@ -74,8 +74,8 @@ def _calibrations(path: Path) -> dict[str, Calibration]:
         verdict = load_yaml(file, MapFileError).get("verdict")
         if isinstance(verdict, dict) and verdict.get("status") == "FAIL":
             raise MapFileError(
-                f"{file}: the verdict on its drive is FAIL, so that its sigmas cannot be relied on; mend that "
-                "drive first (docs/verdict.md)"
+                f"{file}: the verdict on its drive is FAIL, so that its sigmas cannot be relied on; mend "
+                "that drive first (docs/verdict.md)"
             )
         out[calibration.info.name] = calibration
     return out
