@@ -1,7 +1,7 @@
 """The door to a drift alarm: ``python -m v2hdm.calibration BEFORE AFTER`` tells whether a camera has moved.
 
-Both are results of ``python -m v2hdm.map`` or ``v2hdm.extrinsic``: a folder, or one calibration file. One line
-a camera on stdout. docs/calibration.md describes it.
+Both are results of ``python -m v2hdm.map`` or ``v2hdm.extrinsic``: a folder, or one calibration file. One
+line a camera on stdout. docs/calibration.md describes it.
 """
 
 from __future__ import annotations
