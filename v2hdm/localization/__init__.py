@@ -1,0 +1,1 @@
+"""Where the vehicle is, from a map's markings seen by its cameras alone."""
