@@ -33,28 +33,6 @@ CROSSWALK_BAR = "crosswalk_bar"
 CHEVRON = "chevron"
 OTHER_PAINT = "other_paint"
 
-PAINT_CLASSES: tuple[str, ...] = (
-    DIAMOND,
-    LANE_DASH,
-    LANE_LINE,
-    ARROW,
-    STOP_LINE,
-    CROSSWALK_BAR,
-    CHEVRON,
-    OTHER_PAINT,
-)
-"""What the detector tells apart, in the order of its class channels. Chevrons are the bars and angles
-that fill an area; other paint is writing, teeth and whatever else is no marking to map."""
-
-CORNERED_CLASSES: tuple[str, ...] = (DIAMOND, LANE_DASH, STOP_LINE, CROSSWALK_BAR)
-"""Classes mapped as quadrilaterals by their four corners."""
-
-OUTLINED_CLASSES: tuple[str, ...] = (ARROW, CHEVRON)
-"""Classes detected with their outline, but not mapped: they have no four corners."""
-
-LANE_CLASSES: tuple[str, ...] = (LANE_DASH, LANE_LINE)
-"""Classes whose centre lines make up the lanes."""
-
 SEEN_ACROSS: Mapping[str, str] = {LANE_DASH: STOP_LINE, STOP_LINE: LANE_DASH}
 """Stripes that a camera on the vehicle's side sees as one that looks ahead sees the other: a dash lies across
 its view."""
@@ -266,10 +244,9 @@ class MarkingDetection:
 class LaneDetection:
     """A centre line in one image: ``points_px`` (N, 2), near to far.
 
-    ``kind`` is one of :data:`LANE_CLASSES` for that of one piece of lane paint, or :data:`LANE_BOUNDARY` for
-    a whole line. The whole lines of an image have an ``identity``: 1, 2, ... from the vehicle to the left,
-    -1, -2, ... to the right. ``sigma_px`` (N,) is each point's standard deviation along its image row, None
-    where it is not known.
+    ``kind`` is the class of one piece of lane paint, or :data:`LANE_BOUNDARY` for a whole line. The whole
+    lines of an image have an ``identity``: 1, 2, ... from the vehicle to the left, -1, -2, ... to the right.
+    ``sigma_px`` (N,) is each point's standard deviation along its image row, None where it is not known.
     """
 
     kind: str

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from train.scenes.clutter import kerb_colours, plain_marks, thing_to_stand_beside
 from train.scenes.paint import Bend, rectangle
+from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.geometry.planar import inside_convex
-from v2hdm.records import CORNERED_CLASSES, FloatArray
+from v2hdm.records import FloatArray
 from v2hdm.simulate.render.optics import Optics
 from v2hdm.simulate.render.scene import Bgr, Box, GroundMarks, Light, Paint, Shadow, box_footprint
 

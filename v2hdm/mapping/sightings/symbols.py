@@ -15,7 +15,7 @@ import numpy as np
 from v2hdm.geometry.ipm import apply_in_front, ground_from_pinhole_px
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.mapping.sightings.rig import Rig
-from v2hdm.records import OUTLINED_CLASSES, Drive, FloatArray, ImageDetections, IntArray
+from v2hdm.records import Drive, FloatArray, ImageDetections, IntArray
 
 _MAX_RANGE_M = 16.0
 """Farther from the camera a symbol's place on the ground is too vague to speak against a neighbour."""
@@ -46,7 +46,7 @@ def collect_symbols(
         if name not in camera_index:
             continue
         for marking in found.markings:
-            if marking.kind in OUTLINED_CLASSES and len(marking.outline_px) >= 3:
+            if len(marking.outline_px) >= 3:
                 camera.append(camera_index[name])
                 frame.append(int(frame_of_image[found.image]))
                 outlines.append(undistort_points(drive.cameras[name].info, marking.outline_px))
