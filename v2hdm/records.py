@@ -228,8 +228,8 @@ class MarkingDetection:
     image hides it is large, as along a dash whose end lies beyond the image's border. ``corner_valid`` (4,)
     says which corners are points: known well in every direction.
 
-    Arrows and chevrons are no quadrilaterals: of their corners, all nan, none is valid, and ``outline_px``
-    (N, 2) is their polygon; it is empty for quadrilaterals.
+    Symbols, as arrows and chevrons, are no quadrilaterals: of their corners, all nan, none is valid, and
+    ``outline_px`` (N, 2) is their polygon; it is empty for quadrilaterals.
     """
 
     kind: str
@@ -284,6 +284,21 @@ class Marking:
 
 
 @dataclass(frozen=True)
+class Symbol:
+    """One mapped symbol: the outline ``outline_map`` (N, 2) m of its paint, counter-clockwise from above.
+
+    ``sigma_m`` is the standard deviation a coordinate of its place, as its sightings scatter. ``heights_m``
+    (N,) are the recorded heights of the ground there, None where it was recorded as z = 0.
+    """
+
+    kind: str
+    outline_map: FloatArray
+    sightings: int
+    sigma_m: float | None = None
+    heights_m: FloatArray | None = None
+
+
+@dataclass(frozen=True)
 class Lane:
     """One mapped lane line: a polyline ``points_map`` (N, 2) m along its centre.
 
@@ -298,11 +313,12 @@ class Lane:
 
 @dataclass(frozen=True)
 class HdMap:
-    """Markings and lanes of a site in its map frame."""
+    """Markings, lanes and symbols of a site in its map frame."""
 
     markings: tuple[Marking, ...]
     lanes: tuple[Lane, ...] = ()
     origin: GeodeticOrigin | None = None
+    symbols: tuple[Symbol, ...] = ()
 
 
 @dataclass(frozen=True)

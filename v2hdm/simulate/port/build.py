@@ -187,7 +187,8 @@ def _is_convex(shape: list[list[float]]) -> bool:
     turn = np.arctan2(
         side[:, 0] * following[:, 1] - side[:, 1] * following[:, 0], (side * following).sum(axis=1)
     )
-    return bool((np.abs(turn) > 0).all() and np.isclose(abs(turn.sum()), 2 * np.pi))
+    one_way = (turn > 0).all() or (turn < 0).all()
+    return bool(one_way and np.isclose(abs(turn.sum()), 2 * np.pi))
 
 
 def _triple(vector: FloatArray) -> tuple[float, float, float]:
