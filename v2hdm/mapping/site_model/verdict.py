@@ -19,7 +19,7 @@ from v2hdm.mapping.site_model.places import Counts, Places
 from v2hdm.mapping.site_model.posterior import CLUTTER, PART_OF_SYMBOL, Posterior, posterior
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
 
-OF_SYMBOL = "part of an arrow or a chevron"
+OF_SYMBOL = "part of a symbol, such as an arrow"
 TOO_UNCERTAIN = "its position is too uncertain"
 LACKS_A_CORNER = "a corner was never seen twice"
 COVERED = "lies on a better supported marking"
