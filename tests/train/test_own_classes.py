@@ -55,6 +55,17 @@ def shipped_run(tmp_path: Path) -> Path:
     return tmp_path / "shipped.pt"
 
 
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An exported file of an untaught network that knows two own classes."""
+    folder = tmp_path_factory.mktemp("exported")
+    config = run_of(folder)
+    state = fresh_checkpoint(config)
+    state.averaged = MarkingNet(config.net, len(CLASSES)).state_dict()
+    export_checkpoint(state, folder / "own.onnx", opset=18, tolerance=1e-3)
+    return folder / "own.onnx"
+
+
 def written(folder: Path, entries: dict[str, dict[str, object]] = ENTRIES) -> Path:
     path = folder / "classes.yaml"
     path.write_text(json.dumps({"classes": entries}))
@@ -203,12 +214,10 @@ def test_a_catalogue_that_is_missing_is_refused(tmp_path: Path) -> None:
     ],
 )
 def test_a_file_with_wrong_classes_is_refused(
-    tmp_path: Path, shipped_run: Path, own: object, words: str
+    tmp_path: Path, exported: Path, own: object, words: str
 ) -> None:
-    state = fresh_checkpoint(run_of(tmp_path, shipped_run))
     path = tmp_path / "own.onnx"
-    export_checkpoint(state, path, opset=18, tolerance=1e-3)
-    model = onnx.load_model(str(path))
+    model = onnx.load_model(str(exported))
     (entry,) = model.metadata_props
     entry.value = json.dumps(json.loads(entry.value) | {"own_classes": own})
     onnx.save_model(model, str(path))
