@@ -212,6 +212,9 @@ class Told:
     kind: np.ndarray
     known: Counts
 
+    def names(self) -> tuple[str, ...]:
+        return ("diamond",) * len(self.kind)
+
     def counts(self, corners_map: np.ndarray) -> Counts:
         return self.known
 

@@ -27,8 +27,7 @@ class Sightings:
     F distinct time stamps ``stamp_s`` (F,) whose recorded poses are ``map_from_vehicle`` (F, 4, 4), so that
     images taken together share a frame. ``kind`` indexes ``kinds``, the names of the classes.
     ``corners_pinhole_px`` (S, 4, 2) have covariances ``covariance_px`` (S, 4, 2, 2), px^2; ``valid`` (S, 4)
-    says which of them are points, small in every direction. ``symbols`` are the same images' arrows and
-    chevrons.
+    says which of them are points, small in every direction. ``symbols`` are those of the same images.
     """
 
     cameras: tuple[str, ...]

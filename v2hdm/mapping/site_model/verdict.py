@@ -53,6 +53,10 @@ class Seen:
     group: IntArray
     accepted: BoolArray
 
+    def names(self) -> tuple[str, ...]:
+        """The class of each place."""
+        return tuple(self.sightings.kinds[kind] for kind in self.kind)
+
     def counts(self, corners_map: FloatArray) -> Counts:
         """How often places of corners (G, 4, 2) were seen."""
         count = len(self.kind)
@@ -134,8 +138,7 @@ def judge(solved: Places, seen: Seen, options: AcceptanceOptions) -> Judged:
         verdict[group] = TOO_UNCERTAIN if seen_corners[group] == 4 else LACKS_A_CORNER
     for group in _covered(found, np.flatnonzero([reason is None for reason in verdict])):
         verdict[group] = COVERED
-    kinds = tuple(seen.sightings.kinds[kind] for kind in seen.kind)
-    return Judged(kinds, found.places, counts.images, verdict)
+    return Judged(seen.names(), found.places, counts.images, verdict)
 
 
 def _reason(found: Posterior, group: int) -> str:
