@@ -13,11 +13,12 @@ from train.config import DataConfig
 from train.scenes.hardships import Hardships
 from train.scenes.scenes import random_scene
 from train.scenes.views import TrainingView, random_view
+from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.network import Network, NetworkInfo, NetworkOutput
 from v2hdm.detection.sight import look
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
-from v2hdm.records import PAINT_CLASSES, Camera
+from v2hdm.records import Camera
 from v2hdm.simulate.render.renderer import Renderer
 
 FRAME_SIZES = ((1280, 720), (1248, 384), (1920, 1088))

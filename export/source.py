@@ -16,7 +16,6 @@ from train.checkpoint import Checkpoint, load_checkpoint
 from train.exported import read_exported
 from train.growth import recorded_net
 from v2hdm.errors import ConfigError
-from v2hdm.records import PAINT_CLASSES
 
 STRIDES = dict(zip(Prediction._fields, (PAINT_STRIDE, KIND_STRIDE, LANE_STRIDE), strict=True))
 
@@ -41,7 +40,8 @@ def read_source(path: Path) -> Source:
 def of_checkpoint(checkpoint: Checkpoint) -> Source:
     """The averaged weights of a checkpoint."""
     label = {
-        "classes": list(PAINT_CLASSES),
+        "classes": list(checkpoint.catalogue.names),
+        "own_classes": checkpoint.own_classes,
         "multiple": MULTIPLE,
         "strides": STRIDES,
         "input": "uint8 BGR, NHWC",
@@ -63,7 +63,7 @@ def _of_exported(path: Path) -> Source:
             f"{path} holds weights that were rounded to int8 already: give the checkpoint, or the float32 "
             "file, that it was made from"
         )
-    net = MarkingNet(recorded_net(exported.config["net"])).fold()
+    net = MarkingNet(recorded_net(exported.config["net"]), len(exported.catalogue.names)).fold()
     try:
         net.load_state_dict({name: exported.weights[name] for name in net.state_dict()})
     except (KeyError, RuntimeError) as error:
@@ -79,7 +79,8 @@ def weights_not_finite(net: torch.nn.Module) -> list[str]:
 def _without_paths(config: Mapping[str, Any]) -> dict[str, Any]:
     """The settings of a training less what says something of the machine that it ran on."""
     kept = {key: value for key, value in config.items() if key not in ("output", "device", "resume")}
-    kept["start"] = kept.get("start") and Path(kept["start"]).name
+    for key in ("start", "catalogue"):
+        kept[key] = kept.get(key) and Path(kept[key]).name
     labels = {key: bool(kept["data"].get(key)) for key in ("coco", "tusimple")}
     paths = ("coco", "coco_images", "tusimple", "tusimple_images")
     kept["data"] = {k: v for k, v in kept["data"].items() if k not in paths} | {"own_labels": labels}

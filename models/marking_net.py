@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from v2hdm.records import PAINT_CLASSES
+from v2hdm.catalogue import PAINT_CLASSES
 
 MULTIPLE = 16
 """Image height and width must be multiples of this many pixels."""
@@ -58,12 +58,12 @@ class Prediction(NamedTuple):
     """What the network says of images (B, H, W, 3); the names are those of the ONNX file's outputs.
 
     ``paint`` (B, 1, H/2, W/2): log odds of paint against everything else; element (i, j) is centred on the
-    image pixel (u, v) = (2j + 0.5, 2i + 0.5). ``kinds`` (B, len(PAINT_CLASSES), H/4, W/4): logits of the
-    class of whatever paint is there, centred on (4j + 1.5, 4i + 1.5). ``lanes`` (B, 2, H/8, W/8): for every
-    row anchor i, which is the image row 8i + 3.5, and every cell j of 8 px along it, the log odds that a
-    lane's line crosses it in that cell, and where: at the pixel u = 8 (j + offset) + 3.5. After the row
-    anchors of Qin et al., "Ultra Fast Structure-aware Deep Lane Detection", ECCV 2020, but with local cells,
-    so that any image size and any number of lanes will do.
+    image pixel (u, v) = (2j + 0.5, 2i + 0.5). ``kinds`` (B, classes, H/4, W/4): logits of the class
+    of whatever paint is there, centred on (4j + 1.5, 4i + 1.5). ``lanes`` (B, 2, H/8, W/8): for every row
+    anchor i, which is the image row 8i + 3.5, and every cell j of 8 px along it, the log odds that a lane's
+    line crosses it in that cell, and where: at the pixel u = 8 (j + offset) + 3.5. After the row anchors of
+    Qin et al., "Ultra Fast Structure-aware Deep Lane Detection", ECCV 2020, but with local cells, so that any
+    image size and any number of lanes will do.
     """
 
     paint: Tensor
@@ -100,9 +100,14 @@ class ConvNormRelu(nn.Sequential):
 
 
 class MarkingNet(nn.Module):
-    """Finds paint, its class, and the lines of lanes in images; see :class:`Prediction`."""
+    """Finds paint, its class, and the lines of lanes in images; see :class:`Prediction`.
 
-    def __init__(self, config: NetConfig | None = None) -> None:
+    Args:
+        config: channel counts.
+        classes: how many classes of paint it tells apart.
+    """
+
+    def __init__(self, config: NetConfig | None = None, classes: int = len(PAINT_CLASSES)) -> None:
         super().__init__()
         config = config or NetConfig()
         quarter, eighth, sixteenth, bottom = config.widths
@@ -118,8 +123,8 @@ class MarkingNet(nn.Module):
         self.decode4 = refine(quarter, quarter)
         self.expand = ConvNormRelu(quarter, config.head_width * PAINT_UPSCALE**2, kernel=1)
         self.paint = nn.Conv2d(config.head_width, 1, 3, padding=1)
-        self.kinds = nn.Conv2d(quarter, len(PAINT_CLASSES), 1)
-        self.wide_kinds = _head(refine, eighth, len(PAINT_CLASSES)) if config.wide_kinds else None
+        self.kinds = nn.Conv2d(quarter, classes, 1)
+        self.wide_kinds = _head(refine, eighth, classes) if config.wide_kinds else None
         self.lanes = _head(refine, eighth, 2) if config.lanes else None
 
     def forward(self, image: Tensor) -> Prediction:

@@ -49,7 +49,7 @@ def mean_checkpoint(
     states = [mean.averaged]
     for path in others:
         torch.manual_seed(mean.config["seed"])  # what a smaller network grows by is drawn as that run drew it
-        states.append(fresh_checkpoint(replace(asked, start=str(path))).averaged)
+        states.append(fresh_checkpoint(replace(asked, start=str(path)), mean.catalogue).averaged)
     mean.averaged = {
         name: sum(s * state[name].double() for s, state in zip(shares, states, strict=True))
         .div(sum(shares))
@@ -65,7 +65,7 @@ def mean_checkpoint(
 @torch.inference_mode()
 def scored(checkpoint: Checkpoint) -> dict[str, float]:
     """What a checkpoint's averaged weights score on the validation renders of its own settings."""
-    config, net, tally = checkpoint.config, checkpoint.network(), Tally()
+    config, net, tally = checkpoint.config, checkpoint.network(), Tally(checkpoint.catalogue.names)
     images = config["validation"]["images"]
     for image, targets in validation_pairs(DataConfig(**config["data"]), config["seed"], images):
         tally.add(net(image[None]), Targets(*(target[None] for target in targets)))

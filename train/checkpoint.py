@@ -14,7 +14,8 @@ from models import MarkingNet
 from train.config import TrainConfig
 from train.data import validation_pairs
 from train.exported import read_exported, unfold
-from train.growth import can_grow, grow, recorded_net
+from train.growth import can_grow, class_count, grow, recorded_net, with_classes
+from v2hdm.catalogue import SHIPPED, Catalogue, load_catalogue
 from v2hdm.errors import ConfigError
 from v2hdm.files import whole_file
 
@@ -37,8 +38,8 @@ _VIEWS_TO_UNFOLD = 24
 class Checkpoint:
     """State of a training. ``averaged`` are the weights to use, ``metrics`` what they scored last.
 
-    ``config`` is the :class:`TrainConfig` as a dict. Everything is plain data and tensors, so that a file is
-    read without running code from it.
+    ``config`` is the :class:`TrainConfig` as a dict, ``own_classes`` what users' catalogue says.
+    Everything is plain data and tensors, so that a file is read without running code from it.
     """
 
     config: dict[str, Any]
@@ -50,21 +51,32 @@ class Checkpoint:
     optimizer: dict[str, Any] = field(default_factory=dict)
     metrics: dict[str, float] = field(default_factory=dict)
     best_iou: float = 0.0
+    own_classes: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    @property
+    def catalogue(self) -> Catalogue:
+        """The classes that the network tells apart."""
+        return SHIPPED.with_own(self.own_classes, "the checkpoint")
 
     def network(self) -> MarkingNet:
         """The network with the averaged weights, in eval mode."""
-        net = MarkingNet(recorded_net(self.config["net"]))
+        net = MarkingNet(recorded_net(self.config["net"]), class_count(self.averaged))
         net.load_state_dict(self.averaged)
         return net.eval()
 
 
-def fresh_checkpoint(config: TrainConfig) -> Checkpoint:
+def fresh_checkpoint(config: TrainConfig, catalogue: Catalogue | None = None) -> Checkpoint:
     """The state before the first update: that of no network yet, or with the weights of ``config.start``.
 
+    Its classes are those of ``catalogue``, else of ``config.catalogue``, else of ``config.start``.
+
     Raises:
-        ConfigError: ``config.start`` is no checkpoint or exported file, or one of another network.
+        ConfigError: ``config.start`` is no checkpoint or exported file, or one of another network;
+            ``config.catalogue`` is none, or lacks a class that ``config.start`` knows.
     """
-    state = Checkpoint(config=asdict(config))
+    if catalogue is None and config.catalogue is not None:
+        catalogue = load_catalogue(Path(config.catalogue))
+    state = Checkpoint(config=asdict(config), own_classes=(catalogue or SHIPPED).own_entries())
     if config.start is None:
         return state
     path = Path(config.start)
@@ -75,10 +87,14 @@ def fresh_checkpoint(config: TrainConfig) -> Checkpoint:
             f"start={config.start} holds the network {asdict(then)}, not {asdict(config.net)}: "
             "give its `net` settings"
         )
+    catalogue = catalogue or earlier.catalogue
+    state.own_classes = catalogue.own_entries()
+    classes, where = earlier.catalogue.names, f"start={config.start}"
     if isinstance(earlier, Checkpoint) and then == config.net:
-        state.averaged = earlier.averaged
+        state.averaged = with_classes(earlier.averaged, classes, catalogue, where)
     else:
         folded = earlier.network().fold().state_dict() if isinstance(earlier, Checkpoint) else earlier.weights
+        folded = with_classes(folded, classes, catalogue, where)
         pairs = validation_pairs(config.data, config.seed, _VIEWS_TO_UNFOLD)
         views = (image[None] for image, _ in pairs)
         state.averaged = unfold(grow(folded, then, config.net), config.net, views)
@@ -122,7 +138,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
 
 
 def check_same_experiment(checkpoint: Checkpoint, config: TrainConfig, path: Path) -> None:
-    """Refuse to go on with a run under settings that would make it another one.
+    """Refuse to go on with a run under settings, or with classes, that would make it another one.
 
     Raises:
         ConfigError: Naming the settings that differ.
@@ -133,6 +149,13 @@ def check_same_experiment(checkpoint: Checkpoint, config: TrainConfig, path: Pat
         raise ConfigError(
             f"{path} was trained with another {', '.join(changed)}: set it back, or choose a new `output`"
         )
+    if config.catalogue is not None:
+        own = load_catalogue(Path(config.catalogue)).own_entries()
+        if list(own) != list(checkpoint.own_classes):
+            raise ConfigError(
+                f"{path} was trained with the classes {', '.join(checkpoint.own_classes)}, not "
+                f"{', '.join(own)}: set them back in {config.catalogue}, or choose a new `output`"
+            )
 
 
 def _completed(config: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:

@@ -43,9 +43,9 @@ def _train(config: TrainConfig, team: Team) -> None:
         except KeyboardInterrupt:
             _end_workers()
             raise
-    console.print(
-        f"trained {state.step} steps, mean IoU {state.best_iou:.3f}: {Path(config.output) / 'best.pt'}"
-    )
+    # The renders that choose best.pt show none of a user's own classes.
+    kept = Path(config.output) / ("last.pt" if state.own_classes else "best.pt")
+    console.print(f"trained {state.step} steps, mean IoU {state.best_iou:.3f}: {kept}")
 
 
 def _end_workers() -> None:

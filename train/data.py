@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import fields
 
 import cv2
@@ -18,6 +18,7 @@ from train.labels import LabelledImages, read_labels
 from train.scenes.hardships import Hardships
 from train.scenes.scenes import TrainingSample, training_sample
 from train.targets import Targets, targets
+from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.workers import undisturbed_starts
 
 _VALIDATION_SEED_OFFSET = 1_000_003
@@ -95,14 +96,21 @@ class RenderStream(IterableDataset[Pair]):
 
 
 def training_batches(
-    config: DataConfig, seed: int, batch: int, first_render: int, part: tuple[int, int] = (0, 1)
+    config: DataConfig,
+    seed: int,
+    batch: int,
+    first_render: int,
+    part: tuple[int, int] = (0, 1),
+    classes: Sequence[str] = PAINT_CLASSES,
 ) -> Iterator[Pair]:
     """Batches without end, from worker processes (or this one if ``workers`` is 0).
+
+    Users' own labels are of the ``classes`` of the network.
 
     Raises:
         LabelError: The users' own labels cannot be used.
     """
-    stream = RenderStream(config, seed, first_render, part, read_labels(config))
+    stream = RenderStream(config, seed, first_render, part, read_labels(config, classes))
     workers = config.workers
     if workers is None:
         workers = max(1, ((os.cpu_count() or 2) - 1) // part[1])

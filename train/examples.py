@@ -14,18 +14,12 @@ import numpy as np
 
 from train.scenes.scenes import image_line, image_points, random_scene
 from train.scenes.views import TrainingView, random_view
+from v2hdm.catalogue import CORNERED_CLASSES, LANE_CLASSES, OUTLINED_CLASSES, PAINT_CLASSES
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import clip_convex, clip_half, signed_area
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import (
-    CORNERED_CLASSES,
-    LANE_CLASSES,
-    OUTLINED_CLASSES,
-    PAINT_CLASSES,
-    Camera,
-    FloatArray,
-)
+from v2hdm.records import Camera, FloatArray
 from v2hdm.simulate.render.renderer import Rendered, Renderer
 from v2hdm.simulate.render.scene import Scene
 

@@ -16,7 +16,8 @@ from torch import Tensor, nn
 
 from models import MarkingNet, NetConfig
 from models.marking_net import ConvNormRelu
-from v2hdm.detection.network import METADATA_KEY
+from v2hdm.catalogue import Catalogue
+from v2hdm.detection.network import METADATA_KEY, read_catalogue
 from v2hdm.errors import ConfigError
 
 _GROWTH = 3.0
@@ -37,6 +38,11 @@ class Exported:
     renders: int
     weights: dict[str, Tensor]
     label: dict[str, Any]
+
+    @property
+    def catalogue(self) -> Catalogue:
+        """The classes of its channels."""
+        return read_catalogue(self.label)
 
 
 def read_exported(path: Path) -> Exported:
@@ -86,11 +92,12 @@ def unfold(folded: dict[str, Tensor], config: NetConfig, images: Iterable[Tensor
     Raises:
         ConfigError: A weight is missing or of another shape.
     """
-    wanted = MarkingNet(config).fold().state_dict()
+    classes = len(folded["kinds.bias"]) if "kinds.bias" in folded else 1
+    wanted = MarkingNet(config, classes).fold().state_dict()
     for name, value in wanted.items():
         if name not in folded or folded[name].shape != value.shape:
             raise ConfigError(f"the file to start from has no weight {name} of shape {tuple(value.shape)}")
-    net = MarkingNet(config).eval()
+    net = MarkingNet(config, classes).eval()
     norms = {name: module[1] for name, module in net.named_modules() if isinstance(module, ConvNormRelu)}
     shifts = {f"{name}.0.bias": f"{name}.1.bias" for name in norms}
     state = net.state_dict()

@@ -27,6 +27,7 @@ from models.judge import Judge
 from train.examples import Example, TrueMarking, example, polygon_overlap
 from train.judge import JudgeConfig, Quadrilaterals, judged, train_judge
 from train.sworn_flecks import Spots, lit, swearing
+from v2hdm.catalogue import OUTLINED_CLASSES
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.markings.evidence import CLAIMED, FEATURES
 from v2hdm.detection.markings.find import Readings
@@ -42,7 +43,7 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE, being_fitted
 from v2hdm.files import replace_text, whole_file
 from v2hdm.geometry.quadrilateral import following, side_frames
-from v2hdm.records import OUTLINED_CLASSES, BoolArray, FloatArray
+from v2hdm.records import BoolArray, FloatArray
 
 SEED = 917
 EASY = 0.2

@@ -5,7 +5,8 @@ After "Net2Net" (Chen, Goodfellow and Shlens, ICLR 2016): what is added computes
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,9 +14,61 @@ import torch
 from torch import Tensor
 
 from models import MarkingNet, NetConfig
+from v2hdm.catalogue import OTHER, QUADRILATERAL, STRIPE, SYMBOL, Catalogue
+from v2hdm.errors import ConfigError
+from v2hdm.records import CROSSWALK_BAR, OTHER_PAINT, STOP_LINE
 
 _OFF_BEFORE = {"wide_kinds": False}
 """Switches of networks that files may be older than, and what they were then."""
+
+_STARTS_AS = {QUADRILATERAL: CROSSWALK_BAR, STRIPE: STOP_LINE, SYMBOL: OTHER_PAINT, OTHER: OTHER_PAINT}
+"""By family, the class that a network takes a new one for before it has learnt it."""
+
+_STARTS_WITH = 0.05
+"""Share of that class's odds that the new one starts with."""
+
+_CLASS_HEADS = ("kinds", "wide_kinds.1")
+"""Layers with an output channel for each class, whose sum is the logits."""
+
+
+def class_count(weights: Mapping[str, Tensor]) -> int:
+    """How many classes a network of such weights tells apart."""
+    return len(weights["kinds.bias"])
+
+
+def with_classes(
+    weights: Mapping[str, Tensor], then: Sequence[str], catalogue: Catalogue, where: str
+) -> dict[str, Tensor]:
+    """The weights of a network that knows the classes ``then``, and now those of a catalogue.
+
+    The shares of known classes among themselves stay. A new one starts with a small share of that of the
+    shipped class that it looks most like.
+
+    Args:
+        weights: of a network, folded or not.
+        then: its classes, in the order of its channels.
+        catalogue: the classes wanted.
+        where: the weights come from, for errors.
+
+    Raises:
+        ConfigError: the catalogue lacks one of the classes.
+    """
+    missing = [name for name in then if name not in catalogue.classes]
+    if missing:
+        raise ConfigError(f"{where} knows {', '.join(missing)}: list every class of it in catalogue=, too")
+    told = dict(weights)
+    if tuple(then) == catalogue.names:
+        return told
+    known = [name in then for name in catalogue.names]
+    origin = [
+        then.index(name if name in then else _STARTS_AS[catalogue.classes[name].family])
+        for name in catalogue.names
+    ]
+    for head in (head for head in _CLASS_HEADS if f"{head}.bias" in told):
+        for part in ("weight", "bias"):
+            told[f"{head}.{part}"] = told[f"{head}.{part}"][origin]
+    told["kinds.bias"] = told["kinds.bias"] + torch.where(torch.tensor(known), 0.0, math.log(_STARTS_WITH))
+    return told
 
 
 def recorded_net(settings: Mapping[str, Any]) -> NetConfig:
@@ -56,7 +109,7 @@ def grow(folded: Mapping[str, Tensor], then: NetConfig, now: NetConfig) -> dict[
     grown = dict(folded)
     if then == now:
         return grown
-    fresh = MarkingNet(now).fold().state_dict()
+    fresh = MarkingNet(now, class_count(folded)).fold().state_dict()
     if then.separable and not now.separable:
         _join_separable(grown)
     for block in range(len(then.dilations), len(now.dilations)):

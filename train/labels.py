@@ -17,19 +17,19 @@ from train.labels_raster import coverage
 from train.labels_tusimple import read_tusimple
 from train.scenes.scenes import TrainingSample
 from train.targets import IGNORE, Targets, targets
+from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.detection.image_file import read_bgr
 from v2hdm.drive.image_header import image_size
 from v2hdm.errors import ConfigError, DriveError, LabelError
-from v2hdm.records import PAINT_CLASSES
 
 _NEAR_A_LABEL = 0.75
 """How often a view is taken around something that is labelled; the rest is taken anywhere."""
 
 
-def read_labels(config: DataConfig) -> LabelledImages | None:
+def read_labels(config: DataConfig, classes: Sequence[str] = PAINT_CLASSES) -> LabelledImages | None:
     """The labelled images that a configuration names, checked; None if it names none.
 
-    An image that is in both files has both kinds of labels.
+    An image that is in both files has both kinds of labels. Markings are of the ``classes`` of the network.
 
     Raises:
         LabelError: a label file or an image is missing, damaged or does not fit.
@@ -45,7 +45,8 @@ def read_labels(config: DataConfig) -> LabelledImages | None:
     images: dict[Path, LabelledImage] = {}
     found: list[LabelledImage] = []
     if config.coco is not None:
-        found += read_coco(Path(config.coco), _folder(config.coco, config.coco_images), config.coco_classes)
+        folder = _folder(config.coco, config.coco_images)
+        found += read_coco(Path(config.coco), folder, config.coco_classes, classes)
     if config.tusimple is not None:
         found += read_tusimple(Path(config.tusimple), _folder(config.tusimple, config.tusimple_images))
     for image in found:
@@ -53,7 +54,7 @@ def read_labels(config: DataConfig) -> LabelledImages | None:
         images[key] = images[key].merged(image) if key in images else image
     for image in images.values():
         _check(image, config)
-    return LabelledImages(list(images.values()), config)
+    return LabelledImages(list(images.values()), config, classes)
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,7 @@ class LabelledImages:
 
     images: Sequence[LabelledImage]
     config: DataConfig
+    classes: Sequence[str] = PAINT_CLASSES
 
     def view(self, rng: np.random.Generator) -> tuple[torch.Tensor, Targets]:
         """A crop (height, width, 3) uint8 of some image, and the answers; the unknown carries no loss.
@@ -92,19 +94,24 @@ class LabelledImages:
             corner = np.clip(centre - (width / 2, height / 2), 0, (columns - width, rows - height))
         left, top = (int(c) for c in corner)
         part = np.ascontiguousarray(pixels[top : top + height, left : left + width])
-        labels = paint_labels(image.shapes or (), left, top, width, height)
+        labels = paint_labels(image.shapes or (), left, top, width, height, self.classes)
         hidden = np.zeros((height, width), dtype=np.bool_)
         lanes_px = tuple(lane - (left, top) for lane in image.lanes_px or ())
         return TrainingSample(part, labels, hidden, lanes_px)
 
 
 def paint_labels(
-    shapes: Sequence[Shape], left: int, top: int, width: int, height: int
+    shapes: Sequence[Shape],
+    left: int,
+    top: int,
+    width: int,
+    height: int,
+    classes: Sequence[str] = PAINT_CLASSES,
 ) -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
     """Labels (height, width) of a window as the renderer makes them: 1 + class if half covered, or 0."""
     labels = np.zeros((height, width), dtype=np.uint8)
     for shape in shapes:
-        value = 1 + PAINT_CLASSES.index(shape.kind)
+        value = 1 + classes.index(shape.kind)
         for ring_px in shape.rings_px:
             labels[coverage(ring_px, left, top, width, height) > 0.5] = value
     return labels

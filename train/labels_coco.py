@@ -2,32 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from train.labels_image import LabelledImage, Shape
+from v2hdm.catalogue import NOT_PAINT, PAINT_CLASSES
 from v2hdm.errors import LabelError
 from v2hdm.files import load_json
-from v2hdm.records import PAINT_CLASSES, FloatArray
-
-NOT_PAINT = "none"
-"""What a category maps to if its annotations are no markings."""
+from v2hdm.records import FloatArray
 
 _HALF_PX = 0.5
 """COCO counts from the top-left pixel's corner, this project from its centre."""
 
 
-def read_coco(path: Path, images: Path, classes: Mapping[str, str]) -> list[LabelledImage]:
+def read_coco(
+    path: Path, images: Path, classes: Mapping[str, str], known: Sequence[str] = PAINT_CLASSES
+) -> list[LabelledImage]:
     """Every image of a COCO file; those without annotations are images without markings.
 
     Args:
         path: the JSON file.
         images: the folder that its ``file_name`` entries start from.
-        classes: what categories mean, by name: one of PAINT_CLASSES or "none"; those that are called like a
+        classes: what categories mean, by name: a class or "none"; those that are called like a
             class need not be in it.
+        known: the classes.
 
     Raises:
         LabelError: the file is missing or damaged, or uses a category that is not known.
@@ -42,7 +43,7 @@ def read_coco(path: Path, images: Path, classes: Mapping[str, str]) -> list[Labe
         if entry["id"] in shapes:
             raise LabelError(f"{path}: two images have the id {entry['id']}; give each its own")
         shapes[entry["id"]] = []
-    kinds = _kinds(names, classes, path)
+    kinds = _kinds(names, classes, known, path)
     for number, entry in enumerate(
         _entries(content, "annotations", ("image_id", "category_id", "segmentation"), path)
     ):
@@ -51,7 +52,7 @@ def read_coco(path: Path, images: Path, classes: Mapping[str, str]) -> list[Labe
             raise LabelError(f"{where}: its category {entry['category_id']!r} is not in the file; add it")
         if entry["image_id"] not in shapes:
             raise LabelError(f"{where}: its image {entry['image_id']!r} is not in the file; add it")
-        kind = _kind(names[entry["category_id"]], kinds, where)
+        kind = _kind(names[entry["category_id"]], kinds, known, where)
         if kind != NOT_PAINT:
             shapes[entry["image_id"]].append(Shape(kind, _rings(entry["segmentation"], where)))
     if not entries:
@@ -67,27 +68,29 @@ def read_coco(path: Path, images: Path, classes: Mapping[str, str]) -> list[Labe
     ]
 
 
-def _kinds(names: Mapping[Any, str], classes: Mapping[str, str], path: Path) -> dict[str, str]:
+def _kinds(
+    names: Mapping[Any, str], classes: Mapping[str, str], known: Sequence[str], path: Path
+) -> dict[str, str]:
     """The class map, complete with the names that are classes."""
     for name, kind in classes.items():
         if name not in names.values():
             raise LabelError(
                 f"data.coco_classes: {path} has no category {name!r} but {', '.join(names.values())}; mend it"
             )
-        if kind not in (*PAINT_CLASSES, NOT_PAINT):
+        if kind not in (*known, NOT_PAINT):
             raise LabelError(
-                f"data.coco_classes: {name!r} is to be {kind!r}; choose from: "
-                f"{', '.join(PAINT_CLASSES)}, {NOT_PAINT}"
+                f"data.coco_classes: {name!r} is to be {kind!r}; choose from: {', '.join(known)}, {NOT_PAINT}"
             )
     alike = {name: name.strip().lower().replace(" ", "_").replace("-", "_") for name in names.values()}
-    return {name: kind for name, kind in alike.items() if kind in PAINT_CLASSES} | dict(classes)
+    by_name = {kind.lower(): kind for kind in known}
+    return {name: by_name[kind] for name, kind in alike.items() if kind in by_name} | dict(classes)
 
 
-def _kind(name: str, kinds: Mapping[str, str], where: str) -> str:
+def _kind(name: str, kinds: Mapping[str, str], known: Sequence[str], where: str) -> str:
     if name not in kinds:
         raise LabelError(
             f"{where}: category {name!r} is no class of the detector; say which it is with "
-            f"'+data.coco_classes={{{name}: CLASS}}', CLASS one of: {', '.join(PAINT_CLASSES)}, {NOT_PAINT}"
+            f"'+data.coco_classes={{{name}: CLASS}}', CLASS one of: {', '.join(known)}, {NOT_PAINT}"
         )
     return kinds[name]
 

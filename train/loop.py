@@ -61,7 +61,7 @@ class Trainer:
         self.output = Path(config.output)
         self.state = self._team.from_leader(self._open)
         self._resumed_at = self.state.step, self.state.renders
-        self.net = MarkingNet(config.net).to(self.device)
+        self.net = MarkingNet(config.net, len(self.state.catalogue.names)).to(self.device)
         self.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.averaged = AveragedModel(self.net, multi_avg_fn=self._average, use_buffers=True)
         self.optimizer = torch.optim.AdamW(self.net.parameters(), weight_decay=config.weight_decay)
@@ -73,7 +73,8 @@ class Trainer:
         """Train to the end; returns the last state, which is also in last.pt."""
         config, state, team = self.config, self.state, self._team
         part = team.rank, team.size
-        batches = training_batches(config.data, config.seed, config.batch, state.renders, part)
+        classes = state.catalogue.names
+        batches = training_batches(config.data, config.seed, config.batch, state.renders, part, classes)
         images = config.validation.images if team.leads else 0
         validation = list(validation_pairs(config.data, config.seed, images))
         begun = time.monotonic() - state.elapsed_s
@@ -171,7 +172,7 @@ class Trainer:
         if not pairs or board is None:
             return
         self.averaged.eval()
-        tally = Tally()
+        tally = Tally(self.state.catalogue.names)
         for image, targets in pairs:
             batch = image[None], Targets(*(target[None] for target in targets))
             image, targets = self._to_device(batch)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ from torch.nn.functional import max_pool2d
 from models import Prediction
 from models.marking_net import KIND_STRIDE, PAINT_STRIDE
 from train.targets import IGNORE, Targets
-from v2hdm.records import PAINT_CLASSES
+from v2hdm.catalogue import PAINT_CLASSES
 
 
 @dataclass(frozen=True)
@@ -35,10 +36,11 @@ class Score:
 
 
 class Tally:
-    """Counts over images, added up one by one."""
+    """Counts over images, added up one by one, of the ``classes`` of a network."""
 
-    def __init__(self) -> None:
-        self._kinds: NDArray[np.int64] = np.zeros((1 + len(PAINT_CLASSES),) * 2, dtype=np.int64)
+    def __init__(self, classes: Sequence[str] = PAINT_CLASSES) -> None:
+        self._classes = classes
+        self._kinds: NDArray[np.int64] = np.zeros((1 + len(classes),) * 2, dtype=np.int64)
         self._paint: NDArray[np.int64] = np.zeros((2, 2), dtype=np.int64)
         self._lanes: NDArray[np.int64] = np.zeros(4, dtype=np.int64)
 
@@ -54,7 +56,7 @@ class Tally:
         hits = np.diag(self._kinds)
         union = self._kinds.sum(axis=0) + self._kinds.sum(axis=1) - hits
         shown = self._kinds.sum(axis=1) > 0
-        iou = {name: float(hits[c] / union[c]) for c, name in enumerate(PAINT_CLASSES, start=1) if shown[c]}
+        iou = {name: float(hits[c] / union[c]) for c, name in enumerate(self._classes, start=1) if shown[c]}
         paint = self._paint
         found, true, right, given = (int(count) for count in self._lanes)
         return Score(

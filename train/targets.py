@@ -14,7 +14,7 @@ from torch import Tensor
 
 from models.marking_net import KIND_STRIDE, LANE_STRIDE, PAINT_STRIDE
 from train.scenes.scenes import TrainingSample
-from v2hdm.records import PAINT_CLASSES, FloatArray
+from v2hdm.records import FloatArray
 
 IGNORE = 255
 """Marks elements that carry no loss."""
@@ -41,8 +41,8 @@ class Targets(NamedTuple):
     """The answers for images (B, H, W); the batch dimension is missing for a single one.
 
     ``paint`` (B, H/2, W/2) uint8: 1 for paint, and ``paint_weight`` (B, H/4, W/4) float32: what the 2 x 2
-    elements there are worth, see :func:`paint_weight`. ``kinds`` (B, H/4, W/4) uint8: index into
-    ``PAINT_CLASSES``, and ``kind_weight`` (B, H/4, W/4) float32: what each is worth, see :func:`kind_weight`.
+    elements there are worth, see :func:`paint_weight`. ``kinds`` (B, H/4, W/4) uint8: index of
+    the class, and ``kind_weight`` (B, H/4, W/4) float32: what each is worth, see :func:`kind_weight`.
     ``lane_there`` (B, H/8, W/8) uint8: 1 where a lane's line crosses the row anchor in that cell, and
     ``lane_offset`` (B, H/8, W/8) float32: where in it, in cells from its centre. :data:`IGNORE` carries no
     loss.
@@ -80,7 +80,8 @@ def paint_target(labels: Bytes) -> Bytes:
 def kind_target(labels: Bytes) -> Bytes:
     """The commonest paint class (H/4, W/4) of each block, ignored where there is little paint."""
     blocks = _blocks(labels, KIND_STRIDE)
-    counts = np.stack([(blocks == 1 + c).sum(axis=2) for c in range(len(PAINT_CLASSES))], axis=2)
+    classes = max(int(labels.max(initial=0)), 1)
+    counts = np.stack([(blocks == 1 + c).sum(axis=2) for c in range(classes)], axis=2)
     painted = counts.sum(axis=2) >= _LEAST_PAINT * KIND_STRIDE**2
     return np.where(painted, counts.argmax(axis=2), IGNORE).astype(np.uint8)
 

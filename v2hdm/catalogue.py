@@ -1,17 +1,22 @@
-"""The catalogue of painted markings: families of shapes and sizes by class."""
+"""The catalogue of painted markings: families of shapes and sizes by class.
+
+``catalogue.yaml`` lists the shipped classes. A user's file of the same form adds classes after them, so that
+the channels of networks keep their meaning. A network that knows such classes carries them in its file.
+"""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from v2hdm.errors import ConfigError
+from v2hdm.records import LANE_BOUNDARY
 
 CATALOGUE_FILE = Path(__file__).with_name("catalogue.yaml")
 
@@ -23,6 +28,17 @@ _SOFTNESS = 0.25
 
 _TINY_M = 1e-3
 """Least size that is told from nothing, m."""
+
+NOT_PAINT = "none"
+"""What a label means that is no marking: no class may be called so."""
+
+_NAME = re.compile(r"[A-Za-z0-9_]{1,64}")
+"""Names of classes stand in file formats, log lines and label files."""
+
+_MOST_CLASSES = 254
+"""Labels are bytes: 0 is no paint, 255 is unknown."""
+
+_KEYS = frozenset({"family", "length_m", "width_m", "softness", "group"})
 
 _STRIPE_ASPECT, _ASPECT_SOFTNESS = 3.0, 0.1
 """A stripe or a line is at least this many times as long as wide; the deviation of the logarithm of that."""
@@ -62,48 +78,160 @@ class MarkingClass:
 
 @dataclass(frozen=True)
 class Catalogue:
-    """All classes by name."""
+    """All classes by name, in the order of the network's channels."""
 
     classes: Mapping[str, MarkingClass]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All classes, in order."""
+        return tuple(self.classes)
+
+    @property
+    def cornered(self) -> tuple[str, ...]:
+        """Names of the classes that are mapped by four corners."""
+        return self.of_family(QUADRILATERAL, STRIPE)
+
+    @property
+    def lane_paint(self) -> tuple[str, ...]:
+        """Names of the classes whose centre lines make up lanes: those in a group with a line."""
+        groups = {self.classes[name].group for name in self.of_family(LINE)}
+        return tuple(name for name, one in self.classes.items() if one.group in groups)
 
     def of_family(self, *families: str) -> tuple[str, ...]:
         """Names of the classes of some families."""
         return tuple(name for name, one in self.classes.items() if one.family in families)
 
+    def own_entries(self) -> dict[str, dict[str, Any]]:
+        """The classes that are not shipped, as plain data that :meth:`with_own` takes."""
+        return {
+            name: {
+                key: list(v) if isinstance(v, tuple) else v for key, v in asdict(one).items() if key in _KEYS
+            }
+            for name, one in self.classes.items()
+            if name not in SHIPPED.classes
+        }
 
-@cache
-def load_catalogue(path: Path = CATALOGUE_FILE) -> Catalogue:
-    """Read a catalogue.
+    def with_own(self, entries: Mapping[Any, Any], where: str) -> Catalogue:
+        """This catalogue and a user's classes after it.
+
+        Args:
+            entries: by name, what ``catalogue.yaml`` says of a class.
+            where: they come from, for errors.
+
+        Raises:
+            ConfigError: an entry is wrong, or its name is taken.
+        """
+        taken = {name.lower(): name for name in (*self.classes, LANE_BOUNDARY, NOT_PAINT)}
+        for name in entries:
+            if not (isinstance(name, str) and _NAME.fullmatch(name)):
+                raise ConfigError(
+                    f"{where}: a class is called {name!r}; use letters, digits and underscores, 64 at most"
+                )
+            if name.lower() in taken:
+                other = taken[name.lower()]
+                raise ConfigError(f"{where}: {name!r} is the name of {other!r} already; choose another")
+            taken[name.lower()] = name
+        own = {name: _read_class(name, entry, where) for name, entry in entries.items()}
+        groups = {one.group for one in self.classes.values()}
+        lanes = {self.classes[name].group for name in self.of_family(LINE)}
+        for name, one in own.items():
+            if one.family == LINE or one.group in lanes:
+                raise ConfigError(
+                    f"{where}: {name!r} would be paint of lanes, which know their own classes only "
+                    f"({', '.join(self.lane_paint)}); choose another family and group"
+                )
+            if one.group not in groups | set(own):
+                known = ", ".join(sorted(groups - lanes))
+                raise ConfigError(
+                    f"{where}: group of {name!r} is {one.group!r}; name one of {known}, or a class of yours"
+                )
+        if len(self.classes) + len(own) > _MOST_CLASSES:
+            raise ConfigError(f"{where}: more than {_MOST_CLASSES} classes in all; drop some")
+        return Catalogue({**self.classes, **own})
+
+
+def load_catalogue(path: Path | None = None) -> Catalogue:
+    """The shipped classes and, after them, those of a user's file.
 
     Raises:
         ConfigError: the file is missing, is no YAML, or an entry is wrong.
     """
+    return SHIPPED if path is None else SHIPPED.with_own(_read_entries(path), str(path))
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuses a key that is there twice, of which YAML would take the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """The mapping of a node."""
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        twice = next((key for n, key in enumerate(keys) if key in keys[:n]), None)
+        if twice is not None:
+            raise yaml.constructor.ConstructorError(None, None, f"{twice!r} is there twice", node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
+def _read_entries(path: Path) -> dict[Any, Any]:
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path}: cannot be read as a catalogue of markings ({error}); mend it") from error
+        content = yaml.load(path.read_text(encoding="utf-8"), _Loader)
+    except (OSError, UnicodeError, yaml.YAMLError) as error:
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"{path}: cannot be read as a catalogue of markings ({reason}); mend it") from error
     entries = content.get("classes") if isinstance(content, dict) else None
     if not isinstance(entries, dict) or not entries:
         raise ConfigError(f"{path}: no `classes` in it; list them as v2hdm/catalogue.yaml does")
-    return Catalogue({name: _read_class(name, entry, path) for name, entry in entries.items()})
+    return entries
 
 
-def _read_class(name: str, entry: Any, path: Path) -> MarkingClass:
-    known = {"family", "length_m", "width_m", "softness", "group"}
-    if not isinstance(entry, dict) or not set(entry) <= known:
-        raise ConfigError(f"{path}: class {name!r} may have {', '.join(sorted(known))} and nothing else")
+def _read_class(name: str, entry: Any, where: str) -> MarkingClass:
+    if not isinstance(entry, dict) or not set(entry) <= _KEYS:
+        raise ConfigError(f"{where}: class {name!r} may have {', '.join(sorted(_KEYS))} and nothing else")
     family = entry.get("family")
     if family not in FAMILIES:
-        raise ConfigError(f"{path}: family of {name!r} is {family!r}; choose from {', '.join(FAMILIES)}")
+        raise ConfigError(f"{where}: family of {name!r} is {family!r}; choose from {', '.join(FAMILIES)}")
     ranges = {}
     for key in ("length_m", "width_m"):
         value = entry.get(key)
-        if not (isinstance(value, list) and len(value) == 2 and 0 <= value[0] <= value[1] and value[1] > 0):
-            raise ConfigError(f"{path}: {key} of {name!r} is {value!r}; give [from, to] in m")
+        if not (
+            isinstance(value, list)
+            and len(value) == 2
+            and all(map(_is_number, value))
+            and 0 <= value[0] <= value[1]
+            and value[1] > 0
+        ):
+            raise ConfigError(f"{where}: {key} of {name!r} is {value!r}; give [from, to] in m")
         ranges[key] = (float(value[0]), float(value[1]))
     softness = entry.get("softness", _SOFTNESS)
-    if not (isinstance(softness, (int, float)) and softness > 0):
-        raise ConfigError(f"{path}: softness of {name!r} is {softness!r}; give a positive number")
-    return MarkingClass(
-        name, family, ranges["length_m"], ranges["width_m"], entry.get("group", name), float(softness)
-    )
+    if not (_is_number(softness) and 0 < softness < math.inf):
+        raise ConfigError(f"{where}: softness of {name!r} is {softness!r}; give a positive number")
+    group = entry.get("group", name)
+    if not isinstance(group, str):
+        raise ConfigError(f"{where}: group of {name!r} is {group!r}; give the name of a group")
+    return MarkingClass(name, family, ranges["length_m"], ranges["width_m"], group, float(softness))
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+SHIPPED = Catalogue(
+    {
+        name: _read_class(name, entry, str(CATALOGUE_FILE))
+        for name, entry in _read_entries(CATALOGUE_FILE).items()
+    }
+)
+"""The shipped classes."""
+
+PAINT_CLASSES = SHIPPED.names
+"""What the shipped detector tells apart, in the order of its class channels. Chevrons are the bars and angles
+that fill an area; other paint is writing, teeth and whatever else is no marking to map."""
+
+CORNERED_CLASSES = SHIPPED.cornered
+"""Shipped classes that are mapped as quadrilaterals by their four corners."""
+
+OUTLINED_CLASSES = SHIPPED.of_family(SYMBOL)
+"""Shipped classes that are detected with their outline."""
+
+LANE_CLASSES = SHIPPED.lane_paint
+"""Classes whose centre lines make up the lanes."""

@@ -33,28 +33,6 @@ CROSSWALK_BAR = "crosswalk_bar"
 CHEVRON = "chevron"
 OTHER_PAINT = "other_paint"
 
-PAINT_CLASSES: tuple[str, ...] = (
-    DIAMOND,
-    LANE_DASH,
-    LANE_LINE,
-    ARROW,
-    STOP_LINE,
-    CROSSWALK_BAR,
-    CHEVRON,
-    OTHER_PAINT,
-)
-"""What the detector tells apart, in the order of its class channels. Chevrons are the bars and angles
-that fill an area; other paint is writing, teeth and whatever else is no marking to map."""
-
-CORNERED_CLASSES: tuple[str, ...] = (DIAMOND, LANE_DASH, STOP_LINE, CROSSWALK_BAR)
-"""Classes mapped as quadrilaterals by their four corners."""
-
-OUTLINED_CLASSES: tuple[str, ...] = (ARROW, CHEVRON)
-"""Classes detected with their outline, but not mapped: they have no four corners."""
-
-LANE_CLASSES: tuple[str, ...] = (LANE_DASH, LANE_LINE)
-"""Classes whose centre lines make up the lanes."""
-
 SEEN_ACROSS: Mapping[str, str] = {LANE_DASH: STOP_LINE, STOP_LINE: LANE_DASH}
 """Stripes that a camera on the vehicle's side sees as one that looks ahead sees the other: a dash lies across
 its view."""
@@ -250,8 +228,8 @@ class MarkingDetection:
     image hides it is large, as along a dash whose end lies beyond the image's border. ``corner_valid`` (4,)
     says which corners are points: known well in every direction.
 
-    Arrows and chevrons are no quadrilaterals: of their corners, all nan, none is valid, and ``outline_px``
-    (N, 2) is their polygon; it is empty for quadrilaterals.
+    Symbols, as arrows and chevrons, are no quadrilaterals: of their corners, all nan, none is valid, and
+    ``outline_px`` (N, 2) is their polygon; it is empty for quadrilaterals.
     """
 
     kind: str
@@ -266,10 +244,9 @@ class MarkingDetection:
 class LaneDetection:
     """A centre line in one image: ``points_px`` (N, 2), near to far.
 
-    ``kind`` is one of :data:`LANE_CLASSES` for that of one piece of lane paint, or :data:`LANE_BOUNDARY` for
-    a whole line. The whole lines of an image have an ``identity``: 1, 2, ... from the vehicle to the left,
-    -1, -2, ... to the right. ``sigma_px`` (N,) is each point's standard deviation along its image row, None
-    where it is not known.
+    ``kind`` is the class of one piece of lane paint, or :data:`LANE_BOUNDARY` for a whole line. The whole
+    lines of an image have an ``identity``: 1, 2, ... from the vehicle to the left, -1, -2, ... to the right.
+    ``sigma_px`` (N,) is each point's standard deviation along its image row, None where it is not known.
     """
 
     kind: str
@@ -307,6 +284,21 @@ class Marking:
 
 
 @dataclass(frozen=True)
+class Symbol:
+    """One mapped symbol: the outline ``outline_map`` (N, 2) m of its paint, counter-clockwise from above.
+
+    ``sigma_m`` is the standard deviation a coordinate of its place, as its sightings scatter. ``heights_m``
+    (N,) are the recorded heights of the ground there, None where it was recorded as z = 0.
+    """
+
+    kind: str
+    outline_map: FloatArray
+    sightings: int
+    sigma_m: float | None = None
+    heights_m: FloatArray | None = None
+
+
+@dataclass(frozen=True)
 class Lane:
     """One mapped lane line: a polyline ``points_map`` (N, 2) m along its centre.
 
@@ -321,11 +313,12 @@ class Lane:
 
 @dataclass(frozen=True)
 class HdMap:
-    """Markings and lanes of a site in its map frame."""
+    """Markings, lanes and symbols of a site in its map frame."""
 
     markings: tuple[Marking, ...]
     lanes: tuple[Lane, ...] = ()
     origin: GeodeticOrigin | None = None
+    symbols: tuple[Symbol, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,10 @@ import numpy as np
 
 from tests.benchmarks.tusimple import TuSimple, judge
 from train.examples import HEIGHT, LANE_TOLERANCE_PX, WIDTH, Example, TrueMarking, example, polygon_overlap
+from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.records import CORNERED_CLASSES, LANE_BOUNDARY, FloatArray, MarkingDetection
+from v2hdm.records import LANE_BOUNDARY, FloatArray, MarkingDetection
 
 CORNER_RANGE_M = 15.0
 ANY_CONFIDENCE = 0.05

@@ -14,8 +14,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.errors import MapFileError
-from v2hdm.records import LANE_DASH, PAINT_CLASSES, FloatArray, Marking
+from v2hdm.records import LANE_DASH, FloatArray, Marking
 
 MAX_FILLED_M = 30.0
 """Between dashes of the map farther apart than this, none are implied."""

@@ -16,6 +16,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from v2hdm.catalogue import PAINT_CLASSES, SHIPPED
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.markings.foreground import Foreground
 from v2hdm.detection.markings.frames import Quads
@@ -23,7 +24,7 @@ from v2hdm.detection.markings.rectified import rectified_views
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.quadrilateral import order_corners
-from v2hdm.records import DIAMOND, PAINT_CLASSES, Camera, CameraInfo
+from v2hdm.records import DIAMOND, Camera, CameraInfo
 
 HEIGHT, WIDTH = 360, 640
 OPTICAL_FROM_LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -80,7 +81,7 @@ def crisp_view(kind: str) -> np.ndarray:
     ground = view.ground(view.undistort(corners_px[0]))[None]
     image = picture(camera, [shape])
     return rectified_views(
-        image, view, replace(blank, kinds=kinds), Quads.seen(view, corners_px), ground, [kind]
+        image, view, replace(blank, kinds=kinds), Quads.seen(view, corners_px), ground, [kind], SHIPPED
     )[0][0]
 
 

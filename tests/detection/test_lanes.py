@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import bar, brightness_model, diamond, make_camera, picture
+from v2hdm.catalogue import LANE_CLASSES
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.records import LANE_CLASSES
 
 
 def lanes_of(tmp_path, shapes, kind="lane_line", lens="plumb_bob", **options):

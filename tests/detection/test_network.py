@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import STRIDES, brightness_model, make_camera, save_model
+from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.network import Network
 from v2hdm.errors import DetectorError
-from v2hdm.records import PAINT_CLASSES
 
 KINDS = np.zeros(len(PAINT_CLASSES))
 

@@ -85,5 +85,5 @@ def test_a_wrong_entry_of_the_catalogue_is_refused_by_name(tmp_path):
     ):
         file.write_text(f"classes:\n  mine: {entry}\n")
         with pytest.raises(ConfigError, match=word) as failure:
-            load_catalogue.__wrapped__(file)
+            load_catalogue(file)
         assert "mine" in str(failure.value)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import bar, diamond, foreground_of, make_camera, picture, to_image
+from v2hdm.catalogue import SHIPPED
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.markings.frames import Quads
 from v2hdm.detection.markings.rectified import CHANNELS, SIZE, rectified_views
@@ -21,7 +22,7 @@ def seen(image: np.ndarray, corners_px: np.ndarray, kind: str) -> np.ndarray:
     foreground = foreground_of(blank, blank.astype(np.int16), 0)
     ground = VIEW.ground(VIEW.undistort(corners_px))
     quads = Quads.seen(VIEW, corners_px[None])
-    return rectified_views(image, VIEW, foreground, quads, ground[None], [kind])[0][0]
+    return rectified_views(image, VIEW, foreground, quads, ground[None], [kind], SHIPPED)[0][0]
 
 
 def corners_of(shape: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.detection.markings.blobs import Blob, find_blobs, outline_polygon, zero_crossings
 from v2hdm.detection.markings.coverage import blurred_coverage
 from v2hdm.detection.markings.normal import normal_cdf, normal_pdf
@@ -13,7 +14,6 @@ from v2hdm.geometry.quadrilateral import (
     order_corners,
     side_frames,
 )
-from v2hdm.records import PAINT_CLASSES
 
 KITE = order_corners(np.array([[20.3, 10.2], [40.1, 14.9], [19.4, 19.3], [3.2, 15.5]]))
 

@@ -20,9 +20,9 @@ from train.checkpoint import Checkpoint
 from train.config import DataConfig, TrainConfig
 from train.scenes.scenes import training_sample
 from train.targets import IGNORE, paint_target
+from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.detection.network import METADATA_KEY
 from v2hdm.errors import DetectorError
-from v2hdm.records import PAINT_CLASSES
 
 ROOT = Path(__file__).resolve().parents[2]
 CONF = str(ROOT / "conf")

@@ -14,7 +14,7 @@ from tests.drive.example import ORIGIN, camera_info, looking_forward, make_map
 from v2hdm.errors import MapFileError
 from v2hdm.hdmap import read_calibration, read_geojson, with_heights, write_calibration, write_geojson
 from v2hdm.hdmap.geodetic import enu_from_geodetic, geodetic_from_enu
-from v2hdm.records import Calibration, GeodeticOrigin, HdMap, Lane, Marking, Road
+from v2hdm.records import Calibration, GeodeticOrigin, HdMap, Lane, Marking, Road, Symbol
 
 LATITUDES, LONGITUDES = st.floats(-89.9, 89.9), st.floats(-180, 180)
 
@@ -47,6 +47,27 @@ def assert_same(got: HdMap, expected: HdMap) -> None:
         assert (c.kind, c.sightings) == (d.kind, d.sightings)
         np.testing.assert_array_equal(c.points_map, d.points_map)
         np.testing.assert_array_equal(c.heights_m, d.heights_m)
+
+
+@pytest.mark.parametrize("origin", [None, ORIGIN])
+def test_symbols_survive_their_file_and_are_polygons(tmp_path: Path, origin: GeodeticOrigin | None) -> None:
+    outline = np.array([[0.1, 0.0], [1.0, 0.2], [0.3, 0.7]])
+    symbols = (
+        Symbol("parking_t", outline, 5, 0.013, np.array([0.1, 0.2, 0.3])),
+        Symbol("arrow", 2 * outline, 3),
+    )
+    path = tmp_path / "map.geojson"
+    write_geojson(HdMap(make_map().markings, (), origin, symbols), path)
+    for got, expected in zip(read_geojson(path).symbols, symbols, strict=True):
+        assert (got.kind, got.sightings, got.sigma_m) == (expected.kind, expected.sightings, expected.sigma_m)
+        np.testing.assert_array_equal(got.outline_map, expected.outline_map)
+        np.testing.assert_array_equal(got.heights_m, expected.heights_m)
+    feature = json.loads(path.read_text())["features"][-1]
+    assert (feature["id"], feature["geometry"]["type"]) == ("symbol/1", "Polygon")
+    assert feature["properties"]["class"] == "arrow"
+    (ring,) = feature["geometry"]["coordinates"]
+    assert ring[0] == ring[-1]
+    assert len(ring) == 4
 
 
 @pytest.mark.parametrize("origin", [None, ORIGIN])
@@ -133,7 +154,7 @@ def damaged_map(origin: object = None, **properties: object) -> str:
         ("{", "line 1 JSON syntax error"),
         ("[]", "expected a JSON object"),
         ('{"type": "FeatureCollection", "features": []}', "not a map written by v2hdm"),
-        ('{"v2hdm": {}, "features": [{"properties": {}}]}', "feature 0: has neither"),
+        ('{"v2hdm": {}, "features": [{"properties": {}}]}', "feature 0: has no 'corners_map'"),
         ('{"v2hdm": {}, "features": [{"properties": {"corners_map": [[0, 0]]}}]}', "feature 0, "),
         ('{"v2hdm": {"origin": {"lat": 1}}, "features": []}', "origin: unknown key 'lat'"),
         (

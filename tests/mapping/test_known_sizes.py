@@ -10,15 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.mapping.scene import SceneOptions, make_scene
+from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.errors import ConfigError
 from v2hdm.mapping.bundle import full_model, solve_bundle
 from v2hdm.mapping.known_sizes import known_lengths
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.optimise import Optimiser
-from v2hdm.mapping.options import MappingOptions, SizeOptions
+from v2hdm.mapping.options import MappingOptions, SizeOptions, check_options
 from v2hdm.mapping.sightings.table import collect_sightings
 from v2hdm.mapping.sightings.views import views_of
-from v2hdm.records import CORNERED_CLASSES, DIAMOND, LANE_DASH, FloatArray
+from v2hdm.records import DIAMOND, LANE_DASH, FloatArray
 
 SIZES = SizeOptions(by_class_m={DIAMOND: [1.2, 0.6], LANE_DASH: [3.0, 0.15]})
 RHOMBUS = np.array([[-0.6, 0.0], [0.0, -0.3], [0.6, 0.0], [0.0, 0.3]])
@@ -27,7 +28,7 @@ STRIP = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 0.15], [0.0, 0.15]])
 
 def lengths_of(kind: str, corners: FloatArray) -> dict[tuple[int, int], float]:
     index = np.arange(100, 104)[None]
-    found = known_lengths(SIZES, np.array([CORNERED_CLASSES.index(kind)]), corners[None], index)
+    found = known_lengths(SIZES, [kind], corners[None], index)
     if found is None:
         return {}
     ends = np.sort(np.stack([found.first, found.second]), axis=0).T - 100
@@ -90,10 +91,9 @@ def _diagonals(corners: FloatArray) -> FloatArray:
     ],
 )
 def test_sizes_that_no_marking_has_are_refused(change: dict[str, object], key: str) -> None:
-    scene = make_scene(SceneOptions(length_m=20.0))
     options = MappingOptions(known_sizes=SizeOptions(**change))  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match=key):
-        run_methods(scene.drive, scene.detections, ("front",), options)
+        check_options(options, CORNERED_CLASSES)
 
 
 def test_sizes_are_refused_where_they_would_be_ignored() -> None:

@@ -33,7 +33,7 @@ def scene(arrow_x_m: float) -> tuple[Symbols, Rig]:
         )
         cam = vehicle @ (rig.cam_from_vehicle[0] @ np.linalg.inv(pose)).T
         outlines.append((cam[:, :3] @ INTRINSIC.T)[:, :2] / cam[:, 2:3])
-    return Symbols(np.zeros(3, dtype=np.int64), np.arange(3), tuple(outlines)), rig
+    return Symbols(np.zeros(3, dtype=np.int64), np.arange(3), tuple(outlines), ("arrow",) * 3), rig
 
 
 def test_points_on_the_arrow_are_counted_in_every_image_that_shows_it() -> None:

@@ -7,7 +7,7 @@ from torch import nn
 
 from models import MarkingNet, NetConfig
 from models.marking_net import _channels_last_tiles, _depth_to_space, _space_to_depth
-from v2hdm.records import PAINT_CLASSES
+from v2hdm.catalogue import PAINT_CLASSES
 
 
 @pytest.fixture(scope="module")

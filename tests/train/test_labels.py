@@ -18,9 +18,10 @@ from train.labels import LabelledImages, paint_labels, read_labels
 from train.labels_image import Shape
 from train.labels_raster import coverage
 from train.targets import IGNORE
+from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.config import register
 from v2hdm.errors import ConfigError, LabelError
-from v2hdm.records import ARROW, CROSSWALK_BAR, DIAMOND, PAINT_CLASSES
+from v2hdm.records import ARROW, CROSSWALK_BAR, DIAMOND
 
 WIDTH, HEIGHT = 96, 64
 CONF = str(Path(__file__).resolve().parents[2] / "conf")

@@ -8,7 +8,7 @@ from train.config import LossConfig
 from train.losses import dice_loss, kind_loss, lane_loss, paint_loss, total_loss
 from train.metrics import Tally
 from train.targets import IGNORE, Targets
-from v2hdm.records import PAINT_CLASSES
+from v2hdm.catalogue import PAINT_CLASSES
 
 KINDS = len(PAINT_CLASSES)
 

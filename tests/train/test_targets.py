@@ -14,7 +14,7 @@ from train.targets import (
     piece_size,
     targets,
 )
-from v2hdm.records import PAINT_CLASSES
+from v2hdm.catalogue import PAINT_CLASSES
 
 
 def test_a_block_is_paint_by_most_of_its_pixels_and_a_tie_is_ignored() -> None:

@@ -29,16 +29,10 @@ from train.scenes.paint import (
 )
 from train.scenes.scenes import image_line, image_points, random_scene, training_sample
 from train.scenes.views import TrainingView, looking
+from v2hdm.catalogue import LANE_CLASSES, PAINT_CLASSES
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.planar import clip_convex, inside_convex
-from v2hdm.records import (
-    DIAMOND,
-    LANE_CLASSES,
-    LANE_DASH,
-    PAINT_CLASSES,
-    CameraInfo,
-    FloatArray,
-)
+from v2hdm.records import DIAMOND, LANE_DASH, CameraInfo, FloatArray
 from v2hdm.simulate.render.optics import Motion, Optics
 from v2hdm.simulate.render.scene import Ground, Light, box_footprint
 

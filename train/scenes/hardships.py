@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from train.scenes.clutter import kerb_colours, plain_marks, thing_to_stand_beside
 from train.scenes.paint import Bend, Brush, RoadPaint, arrow, crosswalk, rectangle, stop_line
+from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.geometry.planar import inside_convex
-from v2hdm.records import ARROW, CORNERED_CLASSES, CROSSWALK_BAR, STOP_LINE, FloatArray
+from v2hdm.records import ARROW, CROSSWALK_BAR, STOP_LINE, FloatArray
 from v2hdm.simulate.render.optics import Optics
 from v2hdm.simulate.render.scene import Bgr, Box, Ground, GroundMarks, Light, Paint, Shadow, box_footprint
 

@@ -31,9 +31,10 @@ from train.scenes.hardships import (
 )
 from train.scenes.paint import Bend, RoadPaint, port_paint, random_brush, rectangle, street_paint
 from train.scenes.views import TrainingView, mounted_otherwise, random_view, turned_aside
+from v2hdm.catalogue import CORNERED_CLASSES, PAINT_CLASSES
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points, undistort_points
-from v2hdm.records import CORNERED_CLASSES, PAINT_CLASSES, SEEN_ACROSS, FloatArray
+from v2hdm.records import SEEN_ACROSS, FloatArray
 from v2hdm.simulate.render.renderer import Renderer
 from v2hdm.simulate.render.scene import Backdrop, Bgr, Dapple, Ground, Light, Scene, Shadow
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from v2hdm.catalogue import LINE, SYMBOL, Catalogue, load_catalogue
+from v2hdm.catalogue import SYMBOL, Catalogue
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.lanes.centre_lines import LanePaint, trace_lanes
 from v2hdm.detection.lanes.lines import link_anchors
@@ -48,9 +48,8 @@ class Detector:
     def __init__(self, network: Network, options: DetectorOptions, catalogue: Catalogue | None = None):
         self.network = network
         self.options = options
-        self.catalogue = catalogue or load_catalogue()
-        groups = {self.catalogue.classes[name].group for name in self.catalogue.of_family(LINE)}
-        self._lane_classes = {name for name, one in self.catalogue.classes.items() if one.group in groups}
+        self.catalogue = catalogue or network.info.catalogue
+        self._lane_classes = set(self.catalogue.lane_paint)
         self._views: dict[str, CameraView] = {}
         self._reach_px: dict[str, int] = {}
 
@@ -101,7 +100,9 @@ class Detector:
         sight = self._without_own_vehicle(sight, view)
         with lap("propose"):
             reach_px = self._reach_px[camera.info.name]
-            blobs, owner = find_blobs(sight, info.classes, info.paint_stride, view.far_row, reach_px)
+            blobs, owner = find_blobs(
+                sight, info.classes, info.paint_stride, view.far_row, reach_px, self.catalogue
+            )
             proposals = propose(blobs, view, self.catalogue, self.options.max_range_m)
         foreground = Foreground(
             sight.paint, owner, info.paint_stride, view.far_row, sight.kinds, info.classes

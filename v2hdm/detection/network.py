@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,9 @@ import cv2
 import numpy as np
 import onnxruntime
 
+from v2hdm.catalogue import SHIPPED, Catalogue
 from v2hdm.detection.weights import NETWORK_FILE
-from v2hdm.errors import DetectorError
-from v2hdm.records import PAINT_CLASSES
+from v2hdm.errors import ConfigError, DetectorError
 
 DEFAULT_MODEL = NETWORK_FILE
 
@@ -28,7 +29,7 @@ class NetworkInfo:
     """What a model file says of itself.
 
     ``classes`` are those of the channels of ``kinds``; inputs are padded to ``multiple`` px; the strides are
-    the numbers of px per element of each output.
+    the numbers of px per element of each output. ``catalogue`` describes the classes.
     """
 
     classes: tuple[str, ...]
@@ -36,6 +37,7 @@ class NetworkInfo:
     paint_stride: int
     kind_stride: int
     lane_stride: int
+    catalogue: Catalogue = SHIPPED
 
 
 @dataclass(frozen=True)
@@ -143,23 +145,33 @@ def open_session(path: Path, threads: int) -> Any:
         ) from error
 
 
+def read_catalogue(metadata: Mapping[str, Any]) -> Catalogue:
+    """The classes that a model file describes: the shipped ones, and after them those of its user.
+
+    Raises:
+        ConfigError: one of them is wrong.
+    """
+    return SHIPPED.with_own(metadata.get("own_classes", {}), "its classes")
+
+
 def _read_info(session: Any, path: Path) -> NetworkInfo:
     try:
         metadata = json.loads(session.get_modelmeta().custom_metadata_map[METADATA_KEY])
-        info = NetworkInfo(
-            tuple(str(name) for name in metadata["classes"]),
-            int(metadata["multiple"]),
-            *(int(metadata["strides"][name]) for name in _OUTPUTS),
-        )
-    except (KeyError, TypeError, ValueError) as error:
+        paint, kinds, lanes = (int(metadata["strides"][name]) for name in _OUTPUTS)
+        classes = tuple(str(name) for name in metadata["classes"])
+        info = NetworkInfo(classes, int(metadata["multiple"]), paint, kinds, lanes, read_catalogue(metadata))
+    except ConfigError as error:
+        raise DetectorError(f"{path}: {error}") from error
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise DetectorError(
             f"{path}: no usable {METADATA_KEY!r} metadata ({_one_line(error)}); "
             "this is not a model written by `python -m export`"
         ) from error
-    unknown = [name for name in info.classes if name not in PAINT_CLASSES]
+    unknown = [name for name in info.classes if name not in info.catalogue.classes]
     if unknown or not info.classes:
         raise DetectorError(
-            f"{path}: unknown classes {unknown}, known are {', '.join(PAINT_CLASSES)}; use another model"
+            f"{path}: unknown classes {unknown}, known are {', '.join(info.catalogue.names)}; "
+            "use another model"
         )
     strides = (info.paint_stride, info.kind_stride, info.lane_stride)
     if min(strides) < 1 or any(info.multiple % stride for stride in strides):

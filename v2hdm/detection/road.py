@@ -46,7 +46,7 @@ class RoadMarking:
 
     @property
     def kind(self) -> str:
-        """The class, one of :data:`v2hdm.records.PAINT_CLASSES`."""
+        """The class, one of the detector's catalogue."""
         return self.image.kind
 
 

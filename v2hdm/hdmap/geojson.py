@@ -2,9 +2,9 @@
 
 With a geodetic origin the geometry is WGS84 longitude and latitude, as the RFC demands, and any GIS
 shows the map in its place. Without one it is local metres, which the foreign member ``v2hdm`` says
-under ``coordinates``. Either way the properties ``corners_map`` and ``points_map`` hold the local
-coordinates at full precision; reading back uses these. ``heights_m`` are the ground's heights in the map
-frame. Where there are any, or an origin, positions have a third coordinate, in m: above the ellipsoid, or
+under ``coordinates``. Either way the properties ``corners_map``, ``points_map`` and ``outline_map`` hold the
+local coordinates at full precision; reading back uses these. ``heights_m`` are the ground's heights in the
+map frame. Where there are any, or an origin, positions have a third coordinate, in m: above the ellipsoid, or
 above the local z = 0.
 """
 
@@ -23,7 +23,7 @@ from v2hdm.fields import take_covariance, take_origin, take_whole
 from v2hdm.files import load_json, replace_text, take_array, take_mapping, take_number, take_text
 from v2hdm.geometry.planar import signed_area
 from v2hdm.hdmap.geodetic import geodetic_from_enu
-from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, Lane, Marking
+from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, Lane, Marking, Symbol
 
 _WGS84 = "WGS84 longitude and latitude, degrees, and height above the ellipsoid, metres"
 _LOCAL = "local map frame, metres east and north, up where known; NOT longitude and latitude"
@@ -35,13 +35,14 @@ _HEIGHT_DECIMALS = 4
 def write_geojson(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None) -> None:
     """Write ``hd_map`` to ``path`` as a FeatureCollection, atomically.
 
-    Markings become Polygons (closed, counter-clockwise), lanes LineStrings. The ``verdict`` on the run that
-    made the map, as JSON, stands in the foreign member ``v2hdm``.
+    Markings and symbols become Polygons (closed, counter-clockwise), lanes LineStrings. The ``verdict`` on
+    the run that made the map, as JSON, stands in the foreign member ``v2hdm``.
     """
     features = [
         _marking_feature(number, marking, hd_map.origin) for number, marking in enumerate(hd_map.markings)
     ]
     features += [_lane_feature(number, lane, hd_map.origin) for number, lane in enumerate(hd_map.lanes)]
+    features += [_symbol_feature(number, one, hd_map.origin) for number, one in enumerate(hd_map.symbols)]
     write_features(path, features, hd_map.origin, {} if verdict is None else {"verdict": dict(verdict)})
 
 
@@ -70,7 +71,7 @@ def read_verdict(path: Path) -> Mapping[str, Any] | None:
 
 
 def read_geojson(path: Path) -> HdMap:
-    """Read what :func:`write_geojson` wrote; markings and lanes keep their order.
+    """Read what :func:`write_geojson` wrote; markings, lanes and symbols keep their order.
 
     Raises:
         MapFileError: when the file is missing, damaged or no map of this format.
@@ -83,6 +84,7 @@ def read_geojson(path: Path) -> HdMap:
         )
     markings: list[Marking] = []
     lanes: list[Lane] = []
+    symbols: list[Symbol] = []
     for number, feature in enumerate(features):
         where = f"{path}: feature {number}"
         properties = take_mapping(
@@ -92,14 +94,15 @@ def read_geojson(path: Path) -> HdMap:
             markings.append(_read_marking(properties, where))
         elif "points_map" in properties:
             lanes.append(_read_lane(properties, where))
+        elif "outline_map" in properties:
+            symbols.append(_read_symbol(properties, where))
         else:
-            raise MapFileError(
-                f"{where}: has neither 'corners_map' nor 'points_map'; add one or drop the feature"
-            )
+            raise MapFileError(f"{where}: has no 'corners_map', 'points_map' or 'outline_map'; add one")
     return HdMap(
         markings=tuple(markings),
         lanes=tuple(lanes),
         origin=take_origin(about.get("origin"), f"{path}: origin", MapFileError),
+        symbols=tuple(symbols),
     )
 
 
@@ -135,6 +138,21 @@ def _lane_feature(number: int, lane: Lane, origin: GeodeticOrigin | None) -> dic
         properties["heights_m"] = lane.heights_m.tolist()
     places = geojson_positions(lane.points_map, lane.heights_m, origin)
     return geojson_feature(f"lane/{number}", "LineString", places, properties)
+
+
+def _symbol_feature(number: int, symbol: Symbol, origin: GeodeticOrigin | None) -> dict[str, Any]:
+    properties: dict[str, Any] = {
+        "id": number,
+        "class": symbol.kind,
+        "sightings": symbol.sightings,
+        "outline_map": symbol.outline_map.tolist(),
+    }
+    if symbol.heights_m is not None:
+        properties["heights_m"] = symbol.heights_m.tolist()
+    if symbol.sigma_m is not None:
+        properties["sigma_m"] = symbol.sigma_m
+    ring = geojson_positions(symbol.outline_map, symbol.heights_m, origin)
+    return geojson_feature(f"symbol/{number}", "Polygon", [[*ring, ring[0]]], properties)
 
 
 def geojson_feature(
@@ -191,6 +209,20 @@ def _read_lane(properties: dict[str, Any], where: str) -> Lane:
             properties.get("sightings"), 0, _MOST_SIGHTINGS, f"{where}, sightings", MapFileError
         ),
         heights_m=_read_heights(properties, len(points_map), where),
+    )
+
+
+def _read_symbol(properties: dict[str, Any], where: str) -> Symbol:
+    outline_map = take_array(properties["outline_map"], (-1, 2), f"{where}, outline_map", MapFileError)
+    sigma_m = properties.get("sigma_m")
+    return Symbol(
+        kind=take_text(properties.get("class"), f"{where}, class", MapFileError),
+        outline_map=outline_map,
+        sightings=take_whole(
+            properties.get("sightings"), 0, _MOST_SIGHTINGS, f"{where}, sightings", MapFileError
+        ),
+        sigma_m=None if sigma_m is None else take_number(sigma_m, f"{where}, sigma_m", MapFileError),
+        heights_m=_read_heights(properties, len(outline_map), where),
     )
 
 

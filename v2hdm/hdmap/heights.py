@@ -21,7 +21,8 @@ def with_heights(hd_map: HdMap, road: Road | None) -> HdMap:
         return hd_map
     markings = tuple(replace(m, heights_m=ground_height_m(road, m.corners_map)) for m in hd_map.markings)
     lanes = tuple(replace(lane, heights_m=ground_height_m(road, lane.points_map)) for lane in hd_map.lanes)
-    return replace(hd_map, markings=markings, lanes=lanes)
+    symbols = tuple(replace(s, heights_m=ground_height_m(road, s.outline_map)) for s in hd_map.symbols)
+    return replace(hd_map, markings=markings, lanes=lanes, symbols=symbols)
 
 
 def ground_height_m(road: Road, points_map: FloatArray) -> FloatArray:

@@ -27,7 +27,7 @@ from v2hdm.localization.figure import save_errors
 from v2hdm.localization.match import Markings, Seen, locate
 from v2hdm.localization.motion import State, predict, start
 from v2hdm.mapping.sightings.table import Sightings, collect_sightings
-from v2hdm.records import CORNERED_CLASSES, Calibration, Drive, FloatArray, HdMap, ImageDetections, Trajectory
+from v2hdm.records import Calibration, Drive, FloatArray, HdMap, ImageDetections, Trajectory
 from v2hdm.report.outputs import result_folder, write_json
 
 START_SIGMA_M, START_SIGMA_RAD = 0.5, float(np.deg2rad(3.0))
@@ -151,7 +151,7 @@ def _seen(
     informs = sightings.informs
     return [
         Seen(
-            CORNERED_CLASSES[sightings.kind[row]],
+            sightings.kinds[sightings.kind[row]],
             drive.cameras[names[sightings.camera[row]]].info.intrinsic,
             calibrations[names[sightings.camera[row]]].cam_from_vehicle,
             sightings.corners_pinhole_px[row],

@@ -269,7 +269,7 @@ def _known(
     points_map = np.where(fused.valid[..., None], fused.corners_map, np.nan)
     kinds = group_kinds(association, sightings)
     return (
-        known_lengths(model.sizes, kinds, points_map, corner_index),
+        known_lengths(model.sizes, [sightings.kinds[k] for k in kinds], points_map, corner_index),
         control_points(model.survey, points_map, corner_index),
     )
 

@@ -22,7 +22,7 @@ from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.mapping.sightings.views import Views
 from v2hdm.mapping.site_model.places import Places
 from v2hdm.mapping.site_model.verdict import Seen, judge
-from v2hdm.records import CORNERED_CLASSES, BoolArray, Calibration, Camera, FloatArray, IntArray, Marking
+from v2hdm.records import BoolArray, Calibration, Camera, FloatArray, IntArray, Marking
 
 # Squared distance that one sound observation in ten thousand exceeds (2 degrees of freedom).
 _INLIER_SQUARED = 18.4
@@ -110,13 +110,18 @@ def solved_places(grown: IncrementalMap, places: Sequence[Place], scale: float =
     return Places.seen(corners, covariance)
 
 
-def growth_step(grown: IncrementalMap, places: Sequence[Place], names: Sequence[str]) -> GrowthStep:
-    """The map as it is now; markings of which a corner is not known are left out."""
+def growth_step(
+    grown: IncrementalMap, places: Sequence[Place], names: Sequence[str], kinds: Sequence[str]
+) -> GrowthStep:
+    """The map as it is now; markings of which a corner is not known are left out.
+
+    ``names`` are those of the cameras, ``kinds`` those of the classes that places are of.
+    """
     solved = solved_places(grown, places)
     whole = np.flatnonzero(solved.known.all(axis=1)).tolist()
     markings = tuple(
         Marking(
-            kind=CORNERED_CLASSES[places[m].kind],
+            kind=kinds[places[m].kind],
             corners_map=solved.corners_map[m],
             sightings=len(places[m].images),
             covariance_m2=solved.covariance_m2[m],

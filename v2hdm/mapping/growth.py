@@ -13,7 +13,7 @@ from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.results import GrowthStep
 from v2hdm.mapping.site_model.places import Counts, solved_places
 from v2hdm.mapping.site_model.posterior import posterior
-from v2hdm.records import CORNERED_CLASSES, IntArray, Marking
+from v2hdm.records import IntArray, Marking
 
 
 def grow_map(
@@ -74,9 +74,8 @@ def _markings(bundle: Bundle, optimised: Optimised, chosen: IntArray) -> tuple[M
     """The map so far; markings of too few corners, which the whole map's shapes would place, are left out."""
     solved = solved_places(bundle).subset(optimised.groups[chosen])
     whole = np.flatnonzero(solved.known.all(axis=1))
-    kind = np.array(
-        [CORNERED_CLASSES.index(optimised.markings[m].kind) for m in chosen[whole]], dtype=np.int64
-    )
+    names = [optimised.markings[m].kind for m in chosen[whole]]
+    kind = np.array([names.index(name) for name in names], dtype=np.int64)
     nothing_counted = Counts(*np.zeros((6, len(kind)), dtype=np.int64))
     shaped = posterior(solved.subset(whole), kind, nothing_counted).places
     return tuple(

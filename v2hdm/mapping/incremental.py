@@ -319,7 +319,7 @@ class IncrementalMapper:
         if count > self._known and count >= _GROWTH_STEP * len(
             self._growth[-1].markings if self._growth else ()
         ):
-            self._growth.append(growth_step(self.grown, self._places, self._names))
+            self._growth.append(growth_step(self.grown, self._places, self._names, self._sightings.kinds))
 
     def _reweigh(self) -> None:
         """Take the observations for as good as their residuals say, as the batch does."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from v2hdm.adjust import KnownLengths
 from v2hdm.mapping.options import SizeOptions
-from v2hdm.records import CORNERED_CLASSES, DIAMOND, FloatArray, IntArray
+from v2hdm.records import DIAMOND, FloatArray, IntArray
 
 _DIAGONALS = (((0, 2),), ((1, 3),))
 _SIDES = (((0, 1), (3, 2)), ((1, 2), (0, 3)))
@@ -14,7 +16,7 @@ _SIDES = (((0, 1), (3, 2)), ((1, 2), (0, 3)))
 
 
 def known_lengths(
-    sizes: SizeOptions, kind: IntArray, corners_map: FloatArray, corner_index: IntArray
+    sizes: SizeOptions, kind: Sequence[str], corners_map: FloatArray, corner_index: IntArray
 ) -> KnownLengths | None:
     """The distances between corners that sizes imply, None if there are none.
 
@@ -23,14 +25,14 @@ def known_lengths(
 
     Args:
         sizes: What the user says.
-        kind: (G,) class of every group, an index into :data:`v2hdm.records.CORNERED_CLASSES`.
+        kind: (G,) class of every group.
         corners_map: (G, 4, 2) about where the corners lie, nan where nobody knows.
         corner_index: (G, 4) the corners' numbers in the adjustment, -1 for none.
     """
     first, second, length_m = [], [], []
     for name, size in sizes.by_class_m.items():
         spans = _DIAGONALS if name == DIAMOND else _SIDES
-        for group in np.flatnonzero(kind == CORNERED_CLASSES.index(name)):
+        for group in np.flatnonzero(np.array(kind) == name):
             corners = corners_map[group]
             apart = [[np.linalg.norm(corners[a] - corners[b]) for a, b in span] for span in spans]
             seen = np.array([np.mean(distances) for distances in apart])

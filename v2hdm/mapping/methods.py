@@ -23,6 +23,7 @@ from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.naive import naive_markings
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
+from v2hdm.mapping.outlines import map_symbols
 from v2hdm.mapping.outputs import adjusted_poses, clock_offsets
 from v2hdm.mapping.remedy import Inputs, Outcome, judge_grown, optimise
 from v2hdm.mapping.results import MethodResult
@@ -155,10 +156,16 @@ def _optimised_result(
         )
     ground = ground_by_rig(drive, cameras, optimised.bundle.rig)
     lanes = _lanes(drive, outcome.inputs.detections, ground, options)
+    symbols = map_symbols(
+        outcome.inputs.sightings.symbols,
+        optimised.bundle.rig,
+        drive.pose_noise.roll_pitch_rad,
+        optimised.markings,
+    )
     return MethodResult(
         name="Opt",
         cameras=tuple(cameras),
-        hd_map=HdMap(optimised.markings, lanes, drive.origin),
+        hd_map=HdMap(optimised.markings, lanes, drive.origin, symbols),
         calibrations=optimised.calibrations,
         excluded=optimised.excluded,
         reprojection_rmse_px=optimised.reprojection_rmse_px,
@@ -183,10 +190,13 @@ def _incremental_result(
 ) -> MethodResult:
     drive, detections, options = outcome.inputs.drive, outcome.inputs.detections, outcome.inputs.options
     lanes = _lanes(drive, detections, ground_by_rig(drive, cameras, grown.rig), options)
+    symbols = map_symbols(
+        outcome.inputs.sightings.symbols, grown.rig, drive.pose_noise.roll_pitch_rad, grown.markings
+    )
     return MethodResult(
         name="Opt",
         cameras=tuple(cameras),
-        hd_map=HdMap(grown.markings, lanes, drive.origin),
+        hd_map=HdMap(grown.markings, lanes, drive.origin, symbols),
         calibrations=grown.calibrations,
         excluded=grown.excluded,
         reprojection_rmse_px=grown.reprojection_rmse_px,

@@ -18,7 +18,7 @@ from v2hdm.mapping.association.merge import group_kinds, merge_groups
 from v2hdm.mapping.options import LEAST_SIGHTINGS, MappingOptions
 from v2hdm.mapping.results import Exclusion
 from v2hdm.mapping.sightings.table import Sightings
-from v2hdm.records import CORNERED_CLASSES, BoolArray, Camera, FloatArray, Marking
+from v2hdm.records import BoolArray, Camera, FloatArray, Marking
 
 
 def naive_markings(
@@ -102,7 +102,7 @@ def _accept(
     convex = is_convex(average.corners_map)
     kinds = group_kinds(association, sightings)
     for group in range(association.count):
-        kind = CORNERED_CLASSES[kinds[group]]
+        kind = sightings.kinds[kinds[group]]
         corners = average.corners_map[group]
         count = int(average.seen[group, 0])
         if count < LEAST_SIGHTINGS:

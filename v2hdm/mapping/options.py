@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, is_dataclass
 
 from v2hdm.adjust.problem import LOSSES
 from v2hdm.errors import ConfigError
-from v2hdm.records import CORNERED_CLASSES
 
 BATCH = "batch"
 INCREMENTAL = "incremental"
@@ -135,8 +134,12 @@ class MappingOptions:
     survey: SurveyOptions = field(default_factory=SurveyOptions)
 
 
-def check_options(options: MappingOptions) -> None:
+def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -> None:
     """Refuse values that no mapping can work with.
+
+    Args:
+        options: the settings.
+        kinds: classes with four corners that the detector knows; None takes any.
 
     Raises:
         ConfigError: A value is out of range; the message names the key.
@@ -180,7 +183,7 @@ def check_options(options: MappingOptions) -> None:
     if options.acceptance.min_probability >= 1:
         value = options.acceptance.min_probability
         raise ConfigError(f"mapping.acceptance.min_probability is {value}; it must be less than one.")
-    _check_sizes(options)
+    _check_sizes(options, kinds)
     _check_survey(options)
 
 
@@ -201,11 +204,11 @@ def _check_survey(options: MappingOptions) -> None:
         raise ConfigError(f"mapping.survey is of no use in mapping.mode={INCREMENTAL}; leave it out.")
 
 
-def _check_sizes(options: MappingOptions) -> None:
+def _check_sizes(options: MappingOptions, kinds: Sequence[str] | None) -> None:
     for kind, size in options.known_sizes.by_class_m.items():
         key = f"mapping.known_sizes.by_class_m.{kind}"
-        if kind not in CORNERED_CLASSES:
-            raise ConfigError(f"{key}: there is no such class; choose from {', '.join(CORNERED_CLASSES)}.")
+        if kinds is not None and kind not in kinds:
+            raise ConfigError(f"{key}: there is no such class; choose from {', '.join(kinds)}.")
         if len(size) != 2 or not 0 < size[1] <= size[0] < math.inf:
             raise ConfigError(f"{key} is {list(size)}; give length and width in m, the longer one first.")
     if options.known_sizes.by_class_m and options.mode == INCREMENTAL:

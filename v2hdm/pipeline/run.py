@@ -247,9 +247,9 @@ def _check(config: RunConfig) -> str:
             f"name is {name!r}: give the name of a folder within {config.output!r}, without '/'"
         )
     _workers(config)
-    check_options(config.mapping)
+    detector = Detector.load(options=config.detector)
+    check_options(config.mapping, detector.catalogue.cornered)
     _check_device(config.mapping.device)
-    Detector.load(options=config.detector)
     return name
 
 

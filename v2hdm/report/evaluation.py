@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import CORNERED_CLASSES, DIAMOND, BoolArray, FloatArray, HdMap, Truth
+from v2hdm.records import DIAMOND, BoolArray, FloatArray, HdMap, Truth
 from v2hdm.report.dashes import dash_spacing
 from v2hdm.report.lane_metrics import lane_metrics
 from v2hdm.report.metrics import extrinsic_metrics, marking_metrics
@@ -28,7 +29,9 @@ def map_figures(hd_map: HdMap, truth: Truth | None, expected: BoolArray | None) 
     figures: dict[str, Any] = {"markings": len(hd_map.markings)}
     if truth is not None and expected is not None:
         figures |= asdict(marking_metrics(hd_map, truth, expected))
-        by_class = {kind: asdict(marking_metrics(hd_map, truth, expected, kind)) for kind in CORNERED_CLASSES}
+        shown = dict.fromkeys(m.kind for m in (*truth.map.markings, *hd_map.markings))
+        kinds = dict.fromkeys((*CORNERED_CLASSES, *shown))
+        by_class = {kind: asdict(marking_metrics(hd_map, truth, expected, kind)) for kind in kinds}
         if by_class[DIAMOND]["expected"]:
             figures |= {name: by_class[DIAMOND][name] for name in ("expected", "recall")}
         figures["by_class"] = by_class

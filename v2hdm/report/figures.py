@@ -121,6 +121,8 @@ def _draw_best(axes: Axes, hd_map: HdMap, truth: Truth | None) -> None:
             [lane.points_map for lane in hd_map.lanes], colors=style.METHOD["ONI"], lw=0.9, label="lanes"
         )
     )
+    outlines = [symbol.outline_map for symbol in hd_map.symbols]
+    axes.add_collection(PolyCollection(outlines, facecolors="none", edgecolors=solid, lw=0.9))
     polygons = [m.corners_map for m in hd_map.markings]
     if truth is None:
         axes.add_collection(PolyCollection(polygons, facecolors=solid, edgecolors=solid, label="markings"))
@@ -177,6 +179,7 @@ def _common_marking(maps: Mapping[str, HdMap], best: str) -> FloatArray:
 
 def _lines_of(hd_map: HdMap) -> list[tuple[FloatArray, bool]]:
     outlines = [(marking.corners_map, True) for marking in hd_map.markings]
+    outlines += [(symbol.outline_map, True) for symbol in hd_map.symbols]
     return outlines + [(lane.points_map, False) for lane in hd_map.lanes]
 
 

@@ -9,38 +9,15 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
+from v2hdm.catalogue import OTHER, SHIPPED, SYMBOL, Catalogue
 from v2hdm.detection.odds import as_probability
 from v2hdm.detection.sight import Sight
-from v2hdm.records import (
-    ARROW,
-    CHEVRON,
-    CROSSWALK_BAR,
-    DIAMOND,
-    LANE_DASH,
-    LANE_LINE,
-    OTHER_PAINT,
-    STOP_LINE,
-    BoolArray,
-    FloatArray,
-    IntArray,
-)
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _MIN_CELLS = 5
 """Blobs of fewer cells are noise: their outline is not worth four corners."""
 
-
-_GROUPS: tuple[tuple[str, ...], ...] = (
-    (DIAMOND,),
-    (LANE_DASH, LANE_LINE),
-    (STOP_LINE,),
-    (CROSSWALK_BAR,),
-    (ARROW, CHEVRON, OTHER_PAINT),
-)
-"""Classes that are never split from each other: a dash that looks like a line here and there is one blob."""
-
-_SYMBOLS = _GROUPS[-1]
-
-_LEAST_SHARE = np.array([0.25 if group == _SYMBOLS else 0.15 for group in _GROUPS])
+_LEAST_SHARE, _LEAST_SYMBOL_SHARE = 0.15, 0.25
 """Where two groups of classes hold this much of a blob, two markings touch. The head is more of an arrow."""
 
 _SURE, _DOUBTFUL = 2.0, -2.0
@@ -91,8 +68,35 @@ class Blob:
         return max(self.class_score, key=self.class_score.__getitem__)
 
 
+@dataclass(frozen=True)
+class _Groups:
+    """Groups of classes: ``of_class`` (K,) of each class, the ``least_share`` (G,) of a blob to be present.
+
+    ``symbols`` are the names of symbols and other paint.
+    """
+
+    of_class: IntArray
+    least_share: FloatArray
+    symbols: tuple[str, ...]
+
+    @classmethod
+    def of(cls, classes: Sequence[str], catalogue: Catalogue) -> _Groups:
+        """The groups of the ``classes``."""
+        names = list(dict.fromkeys(catalogue.classes[name].group for name in classes))
+        of_class = np.array([names.index(catalogue.classes[name].group) for name in classes], dtype=np.int64)
+        symbols = catalogue.of_family(SYMBOL, OTHER)
+        least = np.full(len(names), _LEAST_SHARE)
+        least[[of_class[k] for k, name in enumerate(classes) if name in symbols]] = _LEAST_SYMBOL_SHARE
+        return cls(of_class, least, symbols)
+
+
 def find_blobs(
-    sight: Sight, classes: Sequence[str], stride: int, top_px: int, reach_px: int = 0
+    sight: Sight,
+    classes: Sequence[str],
+    stride: int,
+    top_px: int,
+    reach_px: int = 0,
+    catalogue: Catalogue = SHIPPED,
 ) -> tuple[list[Blob], np.ndarray]:
     """Split the paint of one image into blobs.
 
@@ -102,6 +106,7 @@ def find_blobs(
         stride: recorded pixels per element of its ``paint``.
         top_px: image row at which the band starts.
         reach_px: image row; blobs that lie above it as a whole are too far away to be of use.
+        catalogue: tells the groups of the classes, within which nothing is split.
 
     Returns:
         The blobs, and a map (h, w) int16 with 1 + the index of the blob that covers each element of
@@ -114,6 +119,7 @@ def find_blobs(
     said = _hearsay(sight, classes, piece, level, len(contours))
     outlines = _outlines(level, piece, len(contours))
     owner = np.zeros_like(piece)
+    groups = _Groups.of(classes, catalogue)
     blobs: list[Blob] = []
     wholes, stats, whole_of = _doubtful(level, contours, said.cells)
     first_of_whole: dict[int, int] = {}
@@ -135,7 +141,7 @@ def find_blobs(
         inside = piece[box] == index + 1
         scores = dict(zip(classes, said.score[:, index].tolist(), strict=True))
         outline_px = corner_px + stride * outlines[index]
-        parts = _split(inside, level[box], sight, box, classes, origin_px, stride)
+        parts = _split(inside, level[box], sight, box, classes, origin_px, stride, groups)
         signed = _signed(inside, level[box])
         by_class = any(part.traced for part in parts)
         blobs.append(
@@ -242,13 +248,14 @@ def _split(
     classes: Sequence[str],
     origin_px: FloatArray,
     stride: int,
+    groups: _Groups,
 ) -> list[Blob]:
     """The parts that a piece (h, w) may be: those of different groups of classes, or else of sure paint."""
     rows, columns = np.nonzero(inside)
     probability = _class_probability(sight, rows + box[0].start - 1, columns + box[1].start - 1)
-    group_of = np.array([_group_index(name) for name in classes])
-    votes = np.bincount(group_of[probability.argmax(axis=0)], minlength=len(_GROUPS)) / len(rows)
-    present = np.flatnonzero(votes >= _LEAST_SHARE)
+    group_of = groups.of_class
+    votes = np.bincount(group_of[probability.argmax(axis=0)], minlength=len(groups.least_share)) / len(rows)
+    present = np.flatnonzero(votes >= groups.least_share)
     levels = [level - _SURE]
     if len(present) > 1:
         levels = [np.minimum(level, _lead(sight, group_of == group, box)) for group in present]
@@ -261,7 +268,7 @@ def _split(
                 parts.append(_blob(labels == label, own_level, sight, corner, classes, origin_px, stride))
     if len(parts) < 2:
         return []
-    touches = any(part.kind in _SYMBOLS for part in parts)
+    touches = any(part.kind in groups.symbols for part in parts)
     return [replace(part, touches_symbol=touches, traced=len(present) > 1) for part in parts]
 
 
@@ -310,10 +317,6 @@ def _lead(sight: Sight, mine: BoolArray, box: tuple[slice, slice]) -> np.ndarray
         for part, first in zip(box, near, strict=True)
     )
     return cv2.remap(lead, *np.meshgrid(u, v), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-
-def _group_index(name: str) -> int:
-    return next(index for index, group in enumerate(_GROUPS) if name in group)
 
 
 def _signed(mask: BoolArray, level: np.ndarray) -> np.ndarray:

@@ -93,7 +93,9 @@ def read_markings(
     evidence = gather(fit, foreground, quads, ground, chosen, rows, catalogue)
     at = np.array([m for m, _ in rows], dtype=np.intp)
     kinds = [kind for _, kind in rows]
-    views, first_side = rectified_views(image_bgr, view, foreground, quads.take(at), ground[at], kinds)
+    views, first_side = rectified_views(
+        image_bgr, view, foreground, quads.take(at), ground[at], kinds, catalogue
+    )
     place = {p.index: m for m, p in enumerate(chosen)}
     parts = {
         m: [place[k] for k in range(p.index + 1, p.index + 1 + p.blob.parts) if k in place]

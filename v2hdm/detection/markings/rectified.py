@@ -12,12 +12,13 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from v2hdm.catalogue import OTHER, SYMBOL, Catalogue
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.markings.foreground import Foreground
 from v2hdm.detection.markings.frames import Quads
 from v2hdm.detection.markings.grey import grey_of, linear_bgr, log_grey
 from v2hdm.geometry.quadrilateral import following, side_frames
-from v2hdm.records import DIAMOND, LANE_LINE, OTHER_PAINT, OUTLINED_CLASSES, FloatArray
+from v2hdm.records import DIAMOND, LANE_LINE, FloatArray
 
 CHANNELS = ("log_grey", "blueness", "paint_odds", "own_share", "line_share", "symbol_share", "outside")
 """Of :func:`rectified_views`: log of the grey value over its median; log of blue over red, over its median;
@@ -26,8 +27,6 @@ takes it for; whether it is outside the image."""
 
 CLAIMED_CHANNELS = CHANNELS[CHANNELS.index("paint_odds") : CHANNELS.index("outside")]
 """Those that are the network's."""
-
-_SYMBOLS = (*OUTLINED_CLASSES, OTHER_PAINT)
 
 SIZE = 20
 """Rows and columns of a picture."""
@@ -51,6 +50,7 @@ def rectified_views(
     quads: Quads,
     ground: FloatArray,
     kinds: Sequence[str],
+    catalogue: Catalogue,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pictures (M, C, 20, 20) float32, whose channels are :data:`CHANNELS`, and the side (M,) at their top.
 
@@ -61,6 +61,7 @@ def rectified_views(
         quads: the quadrilaterals.
         ground: their corners on the ground (M, 4, 2), m; NaN above the horizon.
         kinds: the classes; columns run along the longer sides of all but diamonds.
+        catalogue: all classes.
     """
     diamond = np.array(kinds) == DIAMOND
     length = np.nan_to_num(side_frames(ground)[2], nan=1.0)
@@ -75,7 +76,8 @@ def rectified_views(
     shares = foreground.shares_at(points)
     own = shares[np.arange(len(kinds)), [foreground.classes.index(kind) for kind in kinds]]
     lines = shares[:, foreground.classes.index(LANE_LINE)]
-    symbols = shares[:, [foreground.classes.index(name) for name in _SYMBOLS]].sum(axis=1)
+    names = catalogue.of_family(SYMBOL, OTHER)
+    symbols = shares[:, [k for k, name in enumerate(foreground.classes) if name in names]].sum(axis=1)
     planes = (_GREY_GAIN * grey, _COLOUR_GAIN * blueness, _ODDS_GAIN * odds, own, lines, symbols, outside)
     return np.stack(planes, axis=1).astype(np.float32), np.where(lengthwise, 0, 1)
 

@@ -19,16 +19,7 @@ from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import frames_of
-from v2hdm.records import (
-    LANE_BOUNDARY,
-    LANE_CLASSES,
-    LANE_DASH,
-    BoolArray,
-    Drive,
-    FloatArray,
-    ImageDetections,
-    IntArray,
-)
+from v2hdm.records import LANE_BOUNDARY, LANE_DASH, BoolArray, Drive, FloatArray, ImageDetections, IntArray
 
 _CENTRE_SIGMA_PX = 1.0
 """Noise of a detected centre point across its line: about a cell of the network's output."""
@@ -124,7 +115,7 @@ def collect_lane_points(
         for found in detections
         if covered[found.image]
         for lane in found.lanes
-        if lane.kind in LANE_CLASSES and len(lane.points_px) >= 2
+        if lane.kind != LANE_BOUNDARY and len(lane.points_px) >= 2
     ]
     if not pieces:
         empty = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, int), np.zeros(0, bool)

@@ -10,16 +10,7 @@ import numpy as np
 from v2hdm.errors import MappingError
 from v2hdm.geometry.lens import has_distortion, undistort_points
 from v2hdm.mapping.sightings.symbols import NO_SYMBOLS, Symbols, collect_symbols
-from v2hdm.records import (
-    CORNERED_CLASSES,
-    BoolArray,
-    Camera,
-    CameraInfo,
-    Drive,
-    FloatArray,
-    ImageDetections,
-    IntArray,
-)
+from v2hdm.records import BoolArray, Camera, CameraInfo, Drive, FloatArray, ImageDetections, IntArray
 
 SIDE_SIGMA_PX = 3.0
 """Largest sigma across, px, of a corner that is known to lie on a line; a vaguer one says next to nothing."""
@@ -34,10 +25,9 @@ class Sightings:
 
     ``image`` indexes ``Drive.images``, ``camera`` indexes ``cameras``, ``frame`` indexes the
     F distinct time stamps ``stamp_s`` (F,) whose recorded poses are ``map_from_vehicle`` (F, 4, 4), so that
-    images taken together share a frame. ``kind`` indexes :data:`v2hdm.records.CORNERED_CLASSES`.
+    images taken together share a frame. ``kind`` indexes ``kinds``, the names of the classes.
     ``corners_pinhole_px`` (S, 4, 2) have covariances ``covariance_px`` (S, 4, 2, 2), px^2; ``valid`` (S, 4)
-    says which of them are points, small in every direction. ``symbols`` are the same images' arrows and
-    chevrons.
+    says which of them are points, small in every direction. ``symbols`` are those of the same images.
     """
 
     cameras: tuple[str, ...]
@@ -50,6 +40,7 @@ class Sightings:
     corners_pinhole_px: FloatArray
     covariance_px: FloatArray
     valid: BoolArray
+    kinds: tuple[str, ...]
     symbols: Symbols = NO_SYMBOLS
 
     def __len__(self) -> int:
@@ -81,6 +72,7 @@ class Sightings:
             corners_pinhole_px=self.corners_pinhole_px[rows],
             covariance_px=self.covariance_px[rows],
             valid=self.valid[rows],
+            kinds=self.kinds,
             symbols=self.symbols,
         )
 
@@ -124,7 +116,7 @@ def collect_sightings(
         for found in sorted(detections, key=lambda one: one.image)
         if drive.images[found.image].camera in camera_index
         for marking in found.markings
-        if marking.kind in CORNERED_CLASSES
+        if not len(marking.outline_px)
     ]
     nothing = (
         f"no marking was found in the images of {', '.join(cameras)} of drive {drive.name}; check "
@@ -132,6 +124,7 @@ def collect_sightings(
     )
     if not rows:
         raise MappingError(nothing)
+    kinds = tuple(sorted({marking.kind for _, marking in rows}))
     image = np.array([i for i, _ in rows], dtype=np.int64)
     camera = np.array([camera_index[drive.images[i].camera] for i in image], dtype=np.int64)
     corners = np.stack([marking.corners_px for _, marking in rows]).astype(np.float64)
@@ -148,10 +141,11 @@ def collect_sightings(
         image=image,
         camera=camera,
         frame=frames.frame_of_image[image],
-        kind=np.array([CORNERED_CLASSES.index(m.kind) for _, m in rows], dtype=np.int64),
+        kind=np.array([kinds.index(m.kind) for _, m in rows], dtype=np.int64),
         corners_pinhole_px=corners,
         covariance_px=covariance,
         valid=valid,
+        kinds=kinds,
         symbols=collect_symbols(drive, detections, camera_index, frames.frame_of_image),
     )
     sightings = sightings.subset(sightings.informs.sum(axis=1) >= 2)

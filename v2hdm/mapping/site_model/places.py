@@ -67,7 +67,7 @@ class Counts:
 
     ``images`` with accepted observations of it; ``observations`` of its corners, of which so many are
     ``agreeing`` with the joint solution; ``easy_views``, images that had the whole place in easy view, and
-    ``found``, those among them that it was found in; ``as_symbol``, images in which an arrow or a chevron
+    ``found``, those among them that it was found in; ``as_symbol``, images in which a symbol
     lies on it.
     """
 

@@ -17,9 +17,9 @@ from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.mapping.sightings.views import Views, easy_views
 from v2hdm.mapping.site_model.places import Counts, Places
 from v2hdm.mapping.site_model.posterior import CLUTTER, PART_OF_SYMBOL, Posterior, posterior
-from v2hdm.records import CORNERED_CLASSES, BoolArray, Camera, FloatArray, IntArray, Marking
+from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
 
-OF_SYMBOL = "part of an arrow or a chevron"
+OF_SYMBOL = "part of a symbol, such as an arrow"
 TOO_UNCERTAIN = "its position is too uncertain"
 LACKS_A_CORNER = "a corner was never seen twice"
 COVERED = "lies on a better supported marking"
@@ -39,7 +39,7 @@ _MAX_OVERLAP = 0.2
 class Seen:
     """What was seen of G places, and under which rig.
 
-    ``kind`` (G,) is the class of each as an index into :data:`v2hdm.records.CORNERED_CLASSES`. Observation k
+    ``kind`` (G,) is the class of each as an index into ``sightings.kinds``. Observation k
     is one of row ``row`` (K,) of the sightings and of place ``group`` (K,), and has been ``accepted`` (K,) or
     not. ``cameras`` are in the rig's order.
     """
@@ -52,6 +52,10 @@ class Seen:
     row: IntArray
     group: IntArray
     accepted: BoolArray
+
+    def names(self) -> tuple[str, ...]:
+        """The class of each place."""
+        return tuple(self.sightings.kinds[kind] for kind in self.kind)
 
     def counts(self, corners_map: FloatArray) -> Counts:
         """How often places of corners (G, 4, 2) were seen."""
@@ -74,7 +78,7 @@ class Seen:
 class Judged:
     """G places, and of each the reason why it is no marking of the map, None if it is one."""
 
-    kind: IntArray
+    kind: tuple[str, ...]
     places: Places
     images: IntArray
     verdict: list[str | None]
@@ -94,7 +98,7 @@ class Judged:
             raise MappingError(_no_marking_message(self.exclusions()))
         return tuple(
             Marking(
-                kind=CORNERED_CLASSES[self.kind[group]],
+                kind=self.kind[group],
                 corners_map=self.places.corners_map[group],
                 sightings=int(self.images[group]),
                 covariance_m2=self.places.covariance_m2[group],
@@ -106,7 +110,7 @@ class Judged:
         """What was refused and why; places without a single solved corner were never candidates."""
         return tuple(
             Exclusion(
-                kind=CORNERED_CLASSES[self.kind[group]],
+                kind=self.kind[group],
                 position_map=self.places.corners_map[group].mean(axis=0),
                 sightings=int(self.images[group]),
                 reason=reason,
@@ -134,7 +138,7 @@ def judge(solved: Places, seen: Seen, options: AcceptanceOptions) -> Judged:
         verdict[group] = TOO_UNCERTAIN if seen_corners[group] == 4 else LACKS_A_CORNER
     for group in _covered(found, np.flatnonzero([reason is None for reason in verdict])):
         verdict[group] = COVERED
-    return Judged(seen.kind, found.places, counts.images, verdict)
+    return Judged(seen.names(), found.places, counts.images, verdict)
 
 
 def _reason(found: Posterior, group: int) -> str:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import Camera, FloatArray, GeodeticOrigin, HdMap
@@ -129,7 +130,9 @@ def build_port(config: PortConfig) -> Port:
     return Port(
         config=config,
         route=route,
-        renderer=Renderer(replace(scene, paints=tuple(layout.paints))),
+        renderer=Renderer(
+            replace(scene, paints=tuple(layout.paints)), (*PAINT_CLASSES, *config.paint.stencils)
+        ),
         trucks=moving_trucks(config.yard, route, stream(_TRUCKS)),
         hd_map=layout.hd_map(ORIGIN),
         cameras=cameras,
@@ -160,9 +163,32 @@ def _check(config: PortConfig) -> None:
         (len(config.calibration.points_ahead_m) >= 4, "calibration.points_ahead_m: give at least 4 points"),
         (50 <= config.exposure.jpeg_quality <= 100, "exposure.jpeg_quality: must be within 50 and 100"),
     ]
+    for name, stencil in config.paint.stencils.items():
+        key = f"paint.stencils.{name}"
+        rules += [
+            (name not in PAINT_CLASSES, f"{key}: there is a class of this name; give another"),
+            (stencil.spacing_m > 1, f"{key}.spacing_m: must be more than 1 m"),
+            (
+                stencil.shapes_m and all(map(_is_convex, stencil.shapes_m)),
+                f"{key}.shapes_m: each is a convex polygon of three or more points [ahead, left] in m",
+            ),
+        ]
     for holds, message in rules:
         if not holds:
             raise ConfigError(f"port '{config.name}', {message}")
+
+
+def _is_convex(shape: list[list[float]]) -> bool:
+    """Whether points make up a convex polygon that turns one way and once around."""
+    if len(shape) < 3 or any(len(point) != 2 for point in shape) or not np.isfinite(shape).all():
+        return False
+    side = np.roll(shape, -1, axis=0) - np.array(shape)
+    following = np.roll(side, -1, axis=0)
+    turn = np.arctan2(
+        side[:, 0] * following[:, 1] - side[:, 1] * following[:, 0], (side * following).sum(axis=1)
+    )
+    one_way = (turn > 0).all() or (turn < 0).all()
+    return bool(one_way and np.isclose(abs(turn.sum()), 2 * np.pi))
 
 
 def _triple(vector: FloatArray) -> tuple[float, float, float]:

@@ -89,11 +89,26 @@ class RouteConfig:
 
 
 @dataclass(kw_only=True)
+class StencilConfig:
+    """Paint of a user's own class, in rows along the route.
+
+    ``shapes_m`` are the convex polygons that make it up, as points [ahead, left] in m. One of four points is
+    a marking of the true map. A stencil is painted every ``spacing_m`` at each of ``offsets_m``, to the left
+    of the route, where there is room.
+    """
+
+    shapes_m: list[list[list[float]]]
+    spacing_m: float = 10.0
+    offsets_m: list[float] = field(default_factory=lambda: [-3.4, 3.4])
+
+
+@dataclass(kw_only=True)
 class PaintConfig:
     """The markings: diamonds in rows beside and on the route, lane lines, arrows, stop lines, lettering.
 
     Offsets are to the left of the route, in m; ``field_offsets_m`` are rows further out, on straights
-    only. ``wear`` and ``dirt`` are the means of what varies from marking to marking.
+    only. ``wear`` and ``dirt`` are the means of what varies from marking to marking. ``stencils`` are paint
+    of users' own classes, by their names.
     """
 
     diamond_length_m: float = 1.2
@@ -114,6 +129,7 @@ class PaintConfig:
     wear: float = 0.14
     dirt: float = 0.2
     yellow_diamonds: bool = False
+    stencils: dict[str, StencilConfig] = field(default_factory=dict)
 
 
 @dataclass(kw_only=True)

@@ -52,7 +52,10 @@ def rendered_drive(config: PortConfig, cache: Path, workers: int, progress: Prog
         DriveError: when the cache cannot be written.
         WorkerError: when a process died; what it had rendered is kept.
     """
-    text = json.dumps([RENDERER_VERSION, asdict(config)], sort_keys=True)
+    content = asdict(config)
+    if not config.paint.stencils:
+        del content["paint"]["stencils"]  # ports that were rendered before there were any stay the same
+    text = json.dumps([RENDERER_VERSION, content], sort_keys=True)
     folder = cache / f"{config.name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
     if not (folder / DRIVE_FILE).is_file():
         render_drive(config, folder, workers, progress)

@@ -7,9 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from v2hdm.catalogue import CORNERED_CLASSES, PAINT_CLASSES
+from v2hdm.geometry.planar import signed_area
 from v2hdm.records import (
     ARROW,
-    CORNERED_CLASSES,
     DIAMOND,
     LANE_DASH,
     LANE_LINE,
@@ -21,7 +22,7 @@ from v2hdm.records import (
     Lane,
     Marking,
 )
-from v2hdm.simulate.port.config import PaintConfig
+from v2hdm.simulate.port.config import PaintConfig, StencilConfig
 from v2hdm.simulate.port.route import Route
 from v2hdm.simulate.render.scene import WHITE_PAINT, YELLOW_PAINT, Bgr, Paint
 
@@ -31,6 +32,7 @@ _PIECE_LENGTH_M = 25.0
 _PIECE_OVERLAP_M = 0.1
 _LEAST_GAP_M = 1.7
 _LINE_GAP_M = 1.1
+_STENCIL_TRIES = 10
 _STOP_LINE_M = np.array([[-0.2, -1.5], [0.2, -1.5], [0.2, 1.5], [-0.2, 1.5]])
 # The bars (x0, x1, y0, y1) of a letter like an eight on a pocket calculator.
 _LETTER_BARS_M = (
@@ -68,6 +70,8 @@ def build_layout(config: PaintConfig, route: Route, rng: np.random.Generator) ->
         _diamond_row(config, route, offset, False, layout, rng)
     for offset in config.field_offsets_m:
         _diamond_row(config, route, offset, True, layout, rng)
+    for kind, stencil in config.stencils.items():
+        _stencil_rows(config, kind, stencil, route, layout, rng)
     return layout
 
 
@@ -169,6 +173,35 @@ def _diamond_row(
         )
 
 
+def _stencil_rows(
+    config: PaintConfig,
+    kind: str,
+    stencil: StencilConfig,
+    route: Route,
+    layout: Layout,
+    rng: np.random.Generator,
+) -> None:
+    shapes = [_counter_clockwise(np.array(shape)) for shape in stencil.shapes_m]
+    lines = np.vstack([lane.points_map for lane in layout.lanes] or [np.empty((0, 2))])
+    for offset_m in stencil.offsets_m:
+        for station in np.arange(
+            rng.uniform(0.0, stencil.spacing_m), route.length_m - 2.0, stencil.spacing_m
+        ):
+            worn, turned = _worn(config, rng), np.deg2rad(rng.normal(0.0, config.placing_sigma_deg))
+            colour = WHITE_PAINT if rng.random() < 0.7 else YELLOW_PAINT
+            for at in station + np.linspace(0.0, stencil.spacing_m, _STENCIL_TRIES, endpoint=False):
+                centre = route.points_at(np.array([at]), offset_m)[0]
+                inside = float(route.distance_to(centre[None])[0]) >= abs(offset_m) - 0.5
+                if at < route.length_m - 2.0 and inside and _is_free(centre, lines, layout):
+                    yaw = float(route.yaw_at(np.array([at]))[0]) + turned
+                    _place_shapes(kind, shapes, centre, yaw, worn, layout, colour)
+                    break
+
+
+def _counter_clockwise(shape: FloatArray) -> FloatArray:
+    return shape if signed_area(shape) > 0 else shape[::-1]
+
+
 def _is_free(centre: FloatArray, lines: FloatArray, layout: Layout) -> bool:
     """Whether a marking at ``centre`` (2,) keeps clear of ``lines`` (N, 2) and of all other paint."""
     for points, gap_m in ((lines, _LINE_GAP_M), (np.array(layout.occupied_map), _LEAST_GAP_M)):
@@ -213,7 +246,7 @@ def _place_shapes(
         layout.paints.append(
             Paint(kind=kind, polygon_map=polygon, albedo_bgr=colour, wear=worn[0], dirt=worn[1], seed=7)
         )
-        if kind in CORNERED_CLASSES:
+        if kind in CORNERED_CLASSES or (kind not in PAINT_CLASSES and len(shapes) == 1 and len(shape) == 4):
             layout.markings.append(Marking(kind, polygon, 0))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.records import PAINT_CLASSES
 from v2hdm.simulate.render.ground_layer import MEDIUM_TILE, GroundField, fine_tile
 from v2hdm.simulate.render.scene import Paint
 from v2hdm.simulate.render.textures import Float32, Tile, fade, noise_tile, sample
@@ -20,8 +19,9 @@ _FARTHEST_M = 60.0
 class PaintLayer:
     """All paint of a scene, with its vertices in one array so that what is out of view is cheaply skipped."""
 
-    def __init__(self, paints: tuple[Paint, ...]) -> None:
+    def __init__(self, paints: tuple[Paint, ...], classes: tuple[str, ...]) -> None:
         self._paints = paints
+        self._label = {kind: label for label, kind in enumerate(classes, start=1)}
         most = max((len(p.polygon_map) for p in paints), default=3)
         self._vertices = np.zeros((len(paints), most, 3))
         for row, paint in zip(self._vertices, paints, strict=True):
@@ -37,7 +37,7 @@ class PaintLayer:
             shape = outline(view, homogeneous[index, : len(paint.polygon_map)])
             if shape is None:
                 continue
-            label = PAINT_CLASSES.index(paint.kind) + 1
+            label = self._label[paint.kind]
             for window in windows(view, shape, field.first_row):
                 part = field.rows(window)
                 covered = coverage(view, shape, window)

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.records import CameraInfo, FloatArray
 from v2hdm.simulate.render.box_layer import draw_boxes
 from v2hdm.simulate.render.ground_layer import GroundField, intersect_ground, sun_visibility, tone, wetness
@@ -32,7 +33,7 @@ class Rendered:
     """One picture and what it shows.
 
     ``image`` (H, W, 3) uint8 BGR sRGB; ``labels`` (H, W) uint8, 0 for no paint and otherwise 1 + the index
-    into :data:`v2hdm.records.PAINT_CLASSES` (the painted shape, worn or not, where nothing stands in front
+    among the renderer's classes (the painted shape, worn or not, where nothing stands in front
     of it); ``hidden`` (H, W) bool where a box is in front of the ground.
     """
 
@@ -43,14 +44,15 @@ class Rendered:
 
 @dataclass
 class Renderer:
-    """Draws one scene from any number of places."""
+    """Draws one scene from any number of places; labels are those of ``classes``, in this order."""
 
     scene: Scene
+    classes: tuple[str, ...] = PAINT_CLASSES
     _paint: PaintLayer = field(init=False)
     _shadows: tuple[Shadow, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        self._paint = PaintLayer(self.scene.paints)
+        self._paint = PaintLayer(self.scene.paints, self.classes)
         cast = tuple(box_shadow(box, self.scene.light) for box in self.scene.boxes)
         self._shadows = self.scene.shadows + cast
 

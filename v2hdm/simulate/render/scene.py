@@ -58,7 +58,7 @@ class Ground:
 class Paint:
     """One convex painted polygon.
 
-    ``kind`` is one of :data:`v2hdm.records.PAINT_CLASSES`; ``polygon_map`` (N, 2). ``wear`` from 0 (fresh)
+    ``kind`` is one of the renderer's classes; ``polygon_map`` (N, 2). ``wear`` from 0 (fresh)
     to 1 (gone) is the fraction of paint worn off down to the ground, ``dirt`` the fraction of the
     remaining contrast lost under dirt. Pieces of one marking share a ``seed``.
     """
