@@ -13,9 +13,9 @@ from train.scenes.hardships import (
 from train.scenes.paint import Bend, random_brush, rectangle, street_paint
 from train.scenes.scenes import training_sample
 from train.scenes.views import mounted_otherwise, random_view
+from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.records import ARROW, CROSSWALK_BAR, LANE_DASH, STOP_LINE
 from v2hdm.simulate.render.scene import Ground
 

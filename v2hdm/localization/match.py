@@ -9,9 +9,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
-from v2hdm.geometry.ipm import project_ground
-from v2hdm.geometry.quadrilateral import SHIFTS
-from v2hdm.localization.motion import POSE, State, pose_of
+from v2hdm.geometry.ipm import homography_jacobian, pinhole_px_from_ground, project_ground
+from v2hdm.geometry.quadrilateral import SHIFTS, align
+from v2hdm.geometry.rigid import inverse
+from v2hdm.localization.motion import HEADING, POSE, State, pose_of
 from v2hdm.records import BoolArray, FloatArray, HdMap, IntArray, Marking
 
 _GATE = float(chi2.isf(1e-3, 8))
@@ -42,6 +43,9 @@ the ten frames that the filter remembers that is 1 + 9 x .2.
 _ITERATIONS = 3
 """Of an update; half a metre off at the first, a few millimetres at the third."""
 
+_SETTLED = 1e-3
+"""Change of a state, m or rad, after which the next iteration would change no pixel by a tenth."""
+
 _STEP = np.array([1e-4, 1e-4, 1e-5, 1e-5, 1e-5])
 """Steps of the differences by x, y, heading, roll, pitch: m and rad."""
 
@@ -63,13 +67,12 @@ class Seen:
 
 @dataclass(frozen=True)
 class Match:
-    """A detection and the marking of the map that it shows.
+    """A detection and a marking of the map that it may show.
 
     ``rows`` (2 K,) of the detection's stacked corners, those that say anything, are the rows ``kept`` of the
     marking's. ``noise`` (2 K, 2 K) is the covariance of both, px^2.
     """
 
-    marking: int
     seen: Seen
     rows: IntArray
     kept: BoolArray
@@ -78,8 +81,8 @@ class Match:
 
     def against(self, mean: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The residual (2 K,), px, at a state (7,), and the derivative (2 K, 7) of what is expected."""
-        expected, _ = _project(self.seen, mean[POSE], self.corners_map)
-        derivative = _by_state(self.seen, mean, self.corners_map[None])[0]
+        expected = _project(self.seen, mean[POSE], self.corners_map)
+        derivative = _by_state(self.seen, mean, self.corners_map)
         residual = self.seen.corners_px.reshape(8)[self.rows] - expected.reshape(8)[self.kept]
         return residual, derivative[self.kept]
 
@@ -102,75 +105,73 @@ class Markings:
         self._kind = np.array([marking.kind for marking in hd_map.markings])
         self._tree = cKDTree(self._corners.mean(axis=1))
 
-    def match(self, seen: Seen, state: State) -> Match | None:
-        """The one marking that fits a detection; None where none does, or more than one."""
-        candidates = self._near(seen, state)
+    def match(self, seen: Seen, state: State) -> tuple[int, State] | None:
+        """The one marking that fits a detection, and the state after it; None where not just one fits."""
+        ground = _on_ground(seen, state.mean[POSE])
+        known = seen.informs & np.isfinite(ground).all(axis=1)
+        candidates = self._near(seen.kind, ground[known], state)
         if not len(candidates):
             return None
         corners = self._corners[candidates]
-        expected, depth_m = _project(seen, state.mean[POSE], corners)
-        derivative = _by_state(seen, state.mean, corners)
-        informs = np.repeat(seen.informs, 2)
-        fits: list[tuple[float, Match]] = []
-        for row in np.flatnonzero(depth_m.min(axis=1) > 0).tolist():
-            by_place = _by_place(seen, state.mean[POSE], corners[row])
-            noise = by_place @ self._covariance[candidates[row]] @ by_place.T
-            each = [
-                self._fit(seen, state, SHIFT_ROWS[shift], informs, expected[row], derivative[row], noise)
-                for shift in range(4)
-            ]
-            squared, worth, rows, kept, total = min(each, key=lambda one: one[1])
+        shifts = align(corners, np.ones(corners.shape[:2], dtype=bool), ground, known).shift
+        fits: list[tuple[float, int, State]] = []
+        for marking, shift in zip(candidates.tolist(), shifts.tolist(), strict=True):
+            pair = self._pair(seen, state, marking, SHIFT_ROWS[shift])
+            if not np.isfinite(pair.noise).all():  # a corner is behind the camera
+                continue
+            after, squared, worth = fit(state, pair)
             if squared <= _GATE:
-                fits.append((worth, Match(int(candidates[row]), seen, rows, kept, total, corners[row])))
+                fits.append((worth, marking, after))
         fits.sort(key=lambda one: one[0])
         if not fits or (len(fits) > 1 and fits[1][0] < fits[0][0] + _CLEARER_BY):
             return None
-        return fits[0][1]
+        return fits[0][1:]
 
-    @staticmethod
-    def _fit(
-        seen: Seen,
-        state: State,
-        order: IntArray,
-        informs: BoolArray,
-        expected: FloatArray,
-        derivative: FloatArray,
-        map_noise: FloatArray,
-    ) -> tuple[float, float, IntArray, BoolArray, FloatArray]:
-        """Squared distance, in sigmas, and less the log likelihood; rows, kept, noise of :class:`Match`."""
-        kept = informs[order]
-        rows = order[kept]
-        noise = _REPEATS * _block(seen.covariance_px)[np.ix_(rows, rows)] + map_noise[np.ix_(kept, kept)]
-        residual = seen.corners_px.reshape(8)[rows] - expected.reshape(8)[kept]
-        slope = derivative[kept]
-        total = noise + slope @ state.covariance @ slope.T
-        squared = float(residual @ np.linalg.solve(total, residual))
-        return squared, squared + float(np.linalg.slogdet(total)[1]), rows, kept, noise
+    def _pair(self, seen: Seen, state: State, marking: int, order: IntArray) -> Match:
+        kept = np.repeat(seen.informs, 2)[order]
+        rows, corners = order[kept], self._corners[marking]
+        by_place = _by_place(seen, state.mean[POSE], corners)[kept]
+        noise = _REPEATS * _block(seen.covariance_px)[np.ix_(rows, rows)]
+        return Match(seen, rows, kept, noise + by_place @ self._covariance[marking] @ by_place.T, corners)
 
-    def _near(self, seen: Seen, state: State) -> IntArray:
-        """The markings of its class that lie about where a detection seems to."""
-        ground = _on_ground(seen, state.mean[POSE])
-        if ground is None:
+    def _near(self, kind: str, ground: FloatArray, state: State) -> IntArray:
+        """The markings of a class that lie about where corners (K, 2) seem to."""
+        if not len(ground):
             return np.zeros(0, dtype=np.int64)
-        reach_m = _LEAST_REACH_M + _REACH_SIGMAS * (
-            state.sigma_m
-            + float(np.sqrt(state.covariance[2, 2])) * float(np.linalg.norm(ground - state.mean[:2]))
-        )
-        near = np.array(sorted(self._tree.query_ball_point(ground, reach_m)), dtype=np.int64)
-        return near[self._kind[near] == seen.kind] if len(near) else near
+        middle = ground.mean(axis=0)
+        arm_m = float(np.linalg.norm(middle - state.mean[:2]))
+        turned_m = arm_m * float(np.sqrt(state.covariance[HEADING, HEADING]))
+        reach_m = _LEAST_REACH_M + _REACH_SIGMAS * (state.sigma_m + turned_m)
+        near = np.array(sorted(self._tree.query_ball_point(middle, reach_m)), dtype=np.int64)
+        return near[self._kind[near] == kind] if len(near) else near
 
 
-def update(state: State, match: Match) -> State:
-    """The state after a match: a Kalman update, iterated as no projection is linear, in Joseph's form."""
-    mean = state.mean
+def fit(state: State, match: Match) -> tuple[State, float, float]:
+    """The state after a match, its squared distance, in sigmas, and that less twice the log likelihood.
+
+    A Kalman update in Joseph's form, iterated as no projection is linear: the distance is what is left of
+    pixels and state where both are best.
+    """
+    mean, squared = state.mean, np.inf
     for _ in range(_ITERATIONS):
         residual, slope = match.against(mean)
         innovation = slope @ state.covariance @ slope.T + match.noise
-        gain = np.linalg.solve(innovation, slope @ state.covariance).T
-        mean = state.mean + gain @ (residual - slope @ (state.mean - mean))
+        off = residual - slope @ (state.mean - mean)
+        weighed = np.linalg.solve(innovation, off)
+        squared = float(off @ weighed)
+        before, mean = mean, state.mean + state.covariance @ slope.T @ weighed
+        if np.abs(mean - before)[POSE].max() < _SETTLED:
+            break
+    gain = np.linalg.solve(innovation, slope @ state.covariance).T
     left = np.eye(7) - gain @ slope
     covariance = left @ state.covariance @ left.T + gain @ match.noise @ gain.T
-    return State(mean, (covariance + covariance.T) / 2)
+    if not np.isfinite(squared):
+        squared = np.inf
+    return (
+        State(mean, (covariance + covariance.T) / 2),
+        squared,
+        squared + float(np.linalg.slogdet(innovation)[1]),
+    )
 
 
 def locate(state: State, seen: Sequence[Seen], markings: Markings) -> tuple[State, list[int]]:
@@ -184,12 +185,12 @@ def locate(state: State, seen: Sequence[Seen], markings: Markings) -> tuple[Stat
     while waiting:
         later = []
         for one in waiting:
-            match = markings.match(one, state)
-            if match is None or match.marking in matched:
+            found = markings.match(one, state)
+            if found is None or found[0] in matched:
                 later.append(one)
                 continue
-            state = update(state, match)
-            matched.append(match.marking)
+            matched.append(found[0])
+            state = found[1]
         if len(later) == len(waiting):
             break
         waiting = later
@@ -200,50 +201,40 @@ def _covariance(marking: Marking) -> FloatArray:
     return np.eye(8) * _UNKNOWN_SIGMA_M**2 if marking.covariance_m2 is None else marking.covariance_m2
 
 
-def _project(seen: Seen, pose: FloatArray, corners_map: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pixels (N, 4, 2) and depths (N, 4) of markings (N, 4, 2) from a pose (5,)."""
-    cam_from_map = seen.cam_from_vehicle @ np.linalg.inv(pose_of(pose))
-    pixels, depth_m = project_ground(seen.intrinsic, cam_from_map, corners_map.reshape(-1, 2))
-    return pixels.reshape(*corners_map.shape[:-2], 4, 2), depth_m.reshape(*corners_map.shape[:-2], 4)
+def _project(seen: Seen, pose: FloatArray, corners_map: FloatArray) -> FloatArray:
+    """Pixels (..., 4, 2) of a marking (4, 2) from poses (..., 5)."""
+    cam_from_map = seen.cam_from_vehicle @ inverse(pose_of(pose))
+    return project_ground(seen.intrinsic, cam_from_map, corners_map)[0]
 
 
 def _by_state(seen: Seen, mean: FloatArray, corners_map: FloatArray) -> FloatArray:
-    """Derivative (N, 8, 7) of the pixels of markings (N, 4, 2) by a state (7,)."""
-    out = np.zeros((len(corners_map), 8, 7))
-    for column, step in zip(POSE, np.diag(_STEP), strict=True):
-        up, _ = _project(seen, mean[POSE] + step, corners_map)
-        down, _ = _project(seen, mean[POSE] - step, corners_map)
-        out[:, :, column] = (up - down).reshape(-1, 8) / (2 * step.max())
+    """Derivative (8, 7) of the pixels of a marking (4, 2) by a state (7,), by central differences."""
+    steps = np.diag(_STEP)
+    pixels = _project(seen, mean[POSE] + np.concatenate([steps, -steps]), corners_map).reshape(10, 8)
+    out = np.zeros((8, 7))
+    out[:, POSE] = ((pixels[:5] - pixels[5:]) / (2 * _STEP[:, None])).T
     return out
 
 
 def _by_place(seen: Seen, pose: FloatArray, corners_map: FloatArray) -> FloatArray:
     """Derivative (8, 8) of a marking's pixels by its corners in the map."""
-    out = np.zeros((8, 8))
-    step_m = 1e-4
-    for axis in range(2):
-        shift = step_m * np.eye(2)[axis]
-        up, _ = _project(seen, pose, corners_map[None] + shift)
-        down, _ = _project(seen, pose, corners_map[None] - shift)
-        slope = (up - down)[0] / (2 * step_m)
-        for corner in range(4):
-            out[2 * corner : 2 * corner + 2, 2 * corner + axis] = slope[corner]
-    return out
+    pixels_from_map = pinhole_px_from_ground(seen.intrinsic, seen.cam_from_vehicle @ inverse(pose_of(pose)))
+    return _block(homography_jacobian(pixels_from_map, corners_map))
 
 
-def _block(covariance_px: FloatArray) -> FloatArray:
+def _block(each: FloatArray) -> FloatArray:
+    """The matrix (8, 8) of blocks (4, 2, 2)."""
     out = np.zeros((8, 8))
     for corner in range(4):
         part = slice(2 * corner, 2 * corner + 2)
-        out[part, part] = covariance_px[corner]
+        out[part, part] = each[corner]
     return out
 
 
-def _on_ground(seen: Seen, pose: FloatArray) -> FloatArray | None:
-    """Where on the ground (2,) the middle of the corners that say anything lies; None above the horizon."""
-    middle = np.append(seen.corners_px[seen.informs].mean(axis=0), 1.0)
-    map_from_cam = np.linalg.inv(seen.cam_from_vehicle @ np.linalg.inv(pose_of(pose)))
-    ray = map_from_cam[:3, :3] @ np.linalg.solve(seen.intrinsic, middle)
-    if ray[2] >= 0:
-        return None
-    return np.asarray((map_from_cam[:3, 3] - ray * map_from_cam[2, 3] / ray[2])[:2])
+def _on_ground(seen: Seen, pose: FloatArray) -> FloatArray:
+    """Where on the ground a detection's corners (4, 2) lie; nan above the horizon."""
+    map_from_cam = pose_of(pose) @ inverse(seen.cam_from_vehicle)
+    pixels = np.column_stack([seen.corners_px, np.ones(4)])
+    rays = np.linalg.solve(seen.intrinsic, pixels.T).T @ map_from_cam[:3, :3].T
+    down = np.where(rays[:, 2:] < 0, rays[:, 2:], np.nan)
+    return np.asarray((map_from_cam[:3, 3] - rays * map_from_cam[2, 3] / down)[:, :2])

@@ -15,6 +15,9 @@ ACCELERATION_M_S2 = 1.5
 TURN_ACCELERATION_RAD_S2 = 0.3
 """The same of the yaw rate: full lock within about two seconds at walking pace."""
 
+SLIP_M_S = 0.05
+"""Standard deviation of the sideways speed: tyres slip, and the poses' origin may lie off the rear axle."""
+
 _START_SPEED_M_S, _START_TURN_RAD_S = 5.0, 0.3
 """Sigmas of speed and yaw rate before the first frame: anything that a vehicle does in a yard."""
 
@@ -86,5 +89,6 @@ def predict(state: State, step_s: float, attitude_rad: float) -> State:
     pushed[HEADING, 1], pushed[TURN, 1] = step_s**2 / 2, step_s
     noise = np.square([ACCELERATION_M_S2, TURN_ACCELERATION_RAD_S2])
     covariance = change @ state.covariance @ change.T + (pushed * noise) @ pushed.T
+    covariance[:2, :2] += (SLIP_M_S * step_s) ** 2 * np.outer(left, left)
     covariance[[ROLL, PITCH], [ROLL, PITCH]] += attitude_rad**2
     return State(mean, covariance)
