@@ -201,3 +201,11 @@ def test_the_stated_drift_is_that_of_the_recorded_positions() -> None:
     assert same == pytest.approx(stated.position_m**2, rel=0.2)
     assert across == pytest.approx(stated.position_drift_m**2 * fade, rel=0.3)
     assert stated.heading_drift_over_m == config.speed_mps * disturbance.heading_correlation_s
+
+
+def test_another_visit_finds_the_same_paint_under_other_noise() -> None:
+    first, second = build_port(tiny_port()), build_port(tiny_port(visit=1))
+    for one, other in zip(first.hd_map.markings, second.hd_map.markings, strict=True):
+        np.testing.assert_array_equal(one.corners_map, other.corners_map)
+    assert not np.allclose(first.driven.map_from_vehicle, second.driven.map_from_vehicle, atol=1e-6)
+    assert (first.picture(FRONT, 0).image != second.picture(FRONT, 0).image).any()

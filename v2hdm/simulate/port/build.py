@@ -54,7 +54,7 @@ class Port:
     def picture(self, camera: str, frame: int) -> Rendered:
         """Render an image and its labels: a function of the configuration, the camera and the frame alone."""
         number = sorted(self.cameras).index(camera)
-        rng = np.random.default_rng([self.config.seed, _IMAGES, number, frame])
+        rng = np.random.default_rng([*_visit_seed(self.config, _IMAGES), number, frame])
         exposure, lens = self.config.exposure, self.config.cameras[camera]
         optics = Optics(
             psf_sigma_px=lens.psf_sigma_px,
@@ -103,6 +103,11 @@ _SHORTEST_ROUTE_M = 25.0
 """What stands in the way does so at least 12 m from either end."""
 
 
+def _visit_seed(config: PortConfig, part: int) -> list[int]:
+    """The seed of a stream that is drawn anew at every visit."""
+    return [config.seed, part, *([-1 % 2**32, config.visit] if config.visit else [])]
+
+
 def build_port(config: PortConfig) -> Port:
     """Build a port; equal configurations give equal ports.
 
@@ -113,6 +118,9 @@ def build_port(config: PortConfig) -> Port:
 
     def stream(part: int) -> np.random.Generator:
         return np.random.default_rng([config.seed, part])
+
+    def anew(part: int) -> np.random.Generator:
+        return np.random.default_rng(_visit_seed(config, part))
 
     route = build_route(config.route)
     if route.length_m < _SHORTEST_ROUTE_M:
@@ -133,11 +141,11 @@ def build_port(config: PortConfig) -> Port:
         renderer=Renderer(
             replace(scene, paints=tuple(layout.paints)), (*PAINT_CLASSES, *config.paint.stencils)
         ),
-        trucks=moving_trucks(config.yard, route, stream(_TRUCKS)),
+        trucks=moving_trucks(config.yard, route, anew(_TRUCKS)),
         hd_map=layout.hd_map(ORIGIN),
         cameras=cameras,
         cam_from_vehicle={name: cam_from_vehicle(config.cameras[name].mount) for name in cameras},
-        driven=drive_along(route, config.route, config.disturbance, stream(_POSES)),
+        driven=drive_along(route, config.route, config.disturbance, anew(_POSES)),
     )
 
 
@@ -149,6 +157,7 @@ def _check(config: PortConfig) -> None:
             config.initial_ipm in ("calibrated", "estimated"),
             "initial_ipm: choose 'calibrated' or 'estimated'",
         ),
+        (config.visit >= 0, "visit: must be 0 or more"),
         (config.route.pieces, "route.pieces: empty; give [length_m, turn_deg] pieces"),
         (
             all(len(p) == 2 and p[0] > 0 for p in config.route.pieces),

@@ -205,11 +205,13 @@ class PortConfig:
     """A port, a vehicle with its cameras, and one drive through it.
 
     ``initial_ipm`` is ``calibrated`` when the drive starts from this vehicle's own manual calibration,
-    ``estimated`` when it starts from the other vehicle's. Equal values give equal files, byte for byte.
+    ``estimated`` when it starts from the other vehicle's. ``visit`` numbers drives through one port: the same
+    paint, other noise of poses and images, other traffic. Equal values give equal files, byte for byte.
     """
 
     name: str = "port1"
     seed: int = 1
+    visit: int = 0
     initial_ipm: str = "calibrated"
     cameras: dict[str, CameraConfig] = field(default_factory=lambda: {"front": _front(), "rear": _rear()})
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)

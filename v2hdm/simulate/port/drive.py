@@ -53,8 +53,11 @@ def rendered_drive(config: PortConfig, cache: Path, workers: int, progress: Prog
         WorkerError: when a process died; what it had rendered is kept.
     """
     content = asdict(config)
+    # Ports that were rendered before there were visits and stencils stay the same.
+    if not config.visit:
+        del content["visit"]
     if not config.paint.stencils:
-        del content["paint"]["stencils"]  # ports that were rendered before there were any stay the same
+        del content["paint"]["stencils"]
     text = json.dumps([RENDERER_VERSION, content], sort_keys=True)
     folder = cache / f"{config.name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
     if not (folder / DRIVE_FILE).is_file():
