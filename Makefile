@@ -37,7 +37,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(MAP_INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
-	$(INSTALL) -e '.[map]'
+	$(INSTALL) -e '.[map,fast]'
 	@touch $@
 
 # The development packages include those for mapping.

@@ -32,7 +32,7 @@ def test_where_the_objective_is_no_number_the_point_before_it_stands(wrong: str,
         return cost, gradient
 
     start_cost, start_gradient = bowl(torch.zeros(3, dtype=torch.float64))
-    found = minimise(objective, start_cost, start_gradient, 1e-12, 30, patient=True)
+    found = minimise(objective, start_cost, start_gradient, 1e-12, 30)
     cost, gradient = bowl(found.whitened)
     assert float(found.cost) <= float(start_cost)
     torch.testing.assert_close(found.cost, cost)

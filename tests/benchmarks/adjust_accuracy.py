@@ -24,6 +24,7 @@ import torch
 from tests.adjust.scene import Scene, make_scene
 from v2hdm.adjust import ControlPoints, Drift, Observations, PoseSigma, SolveOptions, solve
 from v2hdm.adjust.covariance import Covariance
+from v2hdm.adjust.descent import Descent
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.problem import POSE_STATES
 from v2hdm.adjust.reduced import make_plan
@@ -103,8 +104,20 @@ def squared_bound_m2(scene: Scene, pose_states: tuple[str, ...] = POSE_STATES) -
         arrays.no_clock(),
     )
     whitening = factorise(arrays, make_plan(arrays), truth, Loss("none", 1.0))
+    at_truth = Descent(
+        arrays=arrays,
+        plan=whitening.plan,
+        estimate=truth,
+        robust=whitening.robust,
+        terms=whitening.terms,
+        gap=0.0,
+        evaluations=0,
+        progressing=False,
+        is_singular=whitening.is_singular,
+        made=whitening,
+    )
     groups = np.arange(scene.problem.corner_count)[:, None]
-    return float(np.trace(Covariance(whitening).corners(groups), axis1=1, axis2=2).mean())
+    return float(np.trace(Covariance(at_truth).corners(groups), axis1=1, axis2=2).mean())
 
 
 def squared_error_m2(scene: Scene, options: SolveOptions) -> float:

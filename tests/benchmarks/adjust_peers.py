@@ -1,19 +1,22 @@
-"""Our adjustment beside native Ceres on the same problem, from the same start.
+"""Our adjustment beside its peers on the same problem, from the same start.
 
-``python -m tests.benchmarks.adjust_peers [observations ...] [--threads N]`` prints time (set-up and solve
-apart; wall, and CPU for a machine that is busy otherwise), final cost and memory of each. Ceres runs
-natively, through pyceres with pycolmap's compiled cost functions and the Schur complement that suits few
-cameras; where these are not installed (the extra ``bench``), it is left out and said so. SciPy's trust region
-knows the Jacobian's sparsity, and is left out beyond the size that it can manage.
+``python -m tests.benchmarks.adjust_peers [observations ...] [--threads N] [--rounds N] [--states]`` prints
+time (wall, and CPU for a machine that is busy otherwise: the least of several rounds, in which the solvers
+take turns), final cost and the ratio to *native Ceres*: a program of our own with analytic derivatives,
+written for this very problem (``native_ceres/``), of whose linear solvers the fastest counts, and of whose
+time that of ``ceres::Solve`` alone. Ours is all of ``solve()``, with checks, layout and report.
 
-The model is the paper's, extrinsics and corners. Our six states a frame are a row of their own, and beside
-it Ceres with a pose a frame under the same prior.
+The other peers are slower and solve once: Ceres through pyceres with pycolmap's compiled cost functions (the
+extra ``bench``), and SciPy's trust region, which knows the Jacobian's sparsity and is left out beyond the
+size that it can manage. Our own rival is Levenberg-Marquardt on the same kernels (``ours, lm``).
+
+The model is the paper's, extrinsics and corners. ``--states`` gives every frame six states, and Ceres a pose
+a frame under the same prior.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
 import resource
 import time
 from collections.abc import Iterator
@@ -27,8 +30,16 @@ from scipy.spatial.transform import Rotation
 
 from tests.adjust.scene import make_scene
 from tests.benchmarks.adjust_ceres import ABSENT, CeresOptions, solve_ceres
+from tests.benchmarks.adjust_native import (
+    PAPER_SOLVERS,
+    POSE_SOLVERS,
+    NativeOptions,
+    build,
+    solve_native,
+)
 from tests.benchmarks.adjust_scaling import driven_on
 from v2hdm.adjust import PoseSigma, Problem, SolveOptions, solve
+from v2hdm.adjust.kernels import available
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.start import back_project
 
@@ -36,14 +47,20 @@ SCIPY_LIMIT = 120_000
 """Observations above which SciPy takes minutes: its steps solve the whole system iteratively."""
 
 CERES_POSES_LIMIT = 400_000
-"""Of a million observations' frame poses CHOLMOD finds the matrix not positive, over and over for minutes."""
+"""Of a million observations' frame poses CHOLMOD finds pycolmap's matrix not positive, over and over."""
 
-PAPER = SolveOptions(pose_states=(), loss="none", coarse=False)
+SAME_COST = 1e-8
+"""Share of the cost by which a linear solver may miss the optimum and still count as a peer."""
+
+STREET = 25_000
+"""Observations, about, of the street that larger problems repeat; smaller ones are its beginning."""
+
+PAPER = SolveOptions(pose_states=(), loss="none")
 
 
 @dataclass(frozen=True)
 class Row:
-    """One solver's figures; times in s, ``cpu_s`` that of the solve."""
+    """One solver's figures; times in s, ``solve_s`` and ``cpu_s`` those of the solve."""
 
     name: str
     setup_s: float
@@ -51,33 +68,45 @@ class Row:
     cpu_s: float
     cost: float
     note: str
-    same_model: bool = True
 
 
 def street(observations: int) -> Problem:
-    """At least so many observations by two cameras, started one degree off; corners from back-projection."""
-    one = make_scene(0, frames=400, every_m=1.0, jitter=None, max_range_m=12.0, start_error_deg=1.0).problem
-    problem = driven_on(one, -(-observations // len(one.observations.corner)))
+    """About so many observations by two cameras, started one degree off; corners from back-projection."""
+    frames = 400 if observations > STREET else max(observations // 43, 20)
+    every_m, range_m = (1.0, 12.0) if observations > STREET else (2.0, 15.0)
+    one = make_scene(
+        0, frames=frames, every_m=every_m, jitter=None, max_range_m=range_m, start_error_deg=1.0
+    ).problem
+    problem = driven_on(one, -(-observations // len(one.observations.corner))) if frames == 400 else one
     arrays = make_arrays(problem, (), "cpu")
     corners, _ = back_project(arrays, torch.as_tensor(problem.cam_from_vehicle))
     start = np.empty((problem.corner_count, 2))
     start[arrays.corner_order.numpy()] = corners.numpy()
-    return replace(problem, corners_start=start)
+    return replace(problem, corners_start=start, pose_sigma=PoseSigma())
 
 
 def ours(problem: Problem, options: SolveOptions, name: str) -> Row:
-    """Our solver; what it lays out is part of the solve."""
+    """Our solver; all that it checks, lays out and reports is part of the solve, the corners' start too."""
+    problem = replace(problem, corners_start=None)
     began, cpu = time.perf_counter(), time.process_time()
     solution = solve(problem, options)
     took, cpu = time.perf_counter() - began, time.process_time() - cpu
-    note = f"{solution.evaluations} evaluations, gap {solution.gap:.0e}"
+    note = f"{solution.evaluations} evaluations, gap {solution.gap:.0e}, {solution.status.value}"
     return Row(name, 0.0, took, cpu, solution.cost, note)
 
 
-def ceres(problem: Problem, options: CeresOptions, name: str) -> Row:
-    """Native Ceres: Levenberg-Marquardt on the Schur complement."""
+def native(problem: Problem, options: NativeOptions) -> Row:
+    """Native Ceres with analytic derivatives."""
+    found = solve_native(problem, options)
+    name = f"native Ceres, {options.linear_solver}"
+    note = f"{found.steps} steps, {found.ended.lower()}"
+    return Row(name, found.setup_s, found.solve_s, found.cpu_s, found.cost, note)
+
+
+def ceres(problem: Problem, options: CeresOptions) -> Row:
+    """Ceres through pyceres: Levenberg-Marquardt on the Schur complement."""
     found = solve_ceres(problem, options)
-    return Row(name, found.setup_s, found.solve_s, found.cpu_s, found.cost, f"{found.steps} steps")
+    return Row("pyceres", found.setup_s, found.solve_s, found.cpu_s, found.cost, f"{found.steps} steps")
 
 
 def scipy_trf(problem: Problem) -> Row:
@@ -126,57 +155,69 @@ def _sparsity(problem: Problem) -> coo_matrix:
     return coo_matrix((np.ones(len(rows), dtype=np.int8), (rows, columns)))
 
 
+def in_turn(problem: Problem, states: bool, threads: int, rounds: int) -> list[Row]:
+    """Ours and native Ceres in turn; of each the round that took the least CPU time."""
+    options = SolveOptions(loss="none") if states else PAPER
+    rows: list[Row] = []
+    for _ in range(rounds):
+        rows += [ours(problem, options, "ours"), ours(problem, replace(options, solver="lm"), "ours, lm")]
+        if build()[0] is not None:
+            for name in POSE_SOLVERS if states else PAPER_SOLVERS:
+                asked = NativeOptions(frame_poses=states, threads=threads, linear_solver=name)
+                rows.append(native(problem, asked))
+    names = dict.fromkeys(row.name for row in rows)
+    return [min((row for row in rows if row.name == name), key=lambda row: row.cpu_s) for name in names]
+
+
+def others(problem: Problem, states: bool, threads: int) -> Iterator[Row]:
+    """The peers that solve once."""
+    count = len(problem.observations.corner)
+    if not ABSENT and not (states and count > CERES_POSES_LIMIT):
+        yield ceres(problem, CeresOptions(frame_poses=states, threads=threads))
+    if not states and count <= SCIPY_LIMIT:
+        yield scipy_trf(problem)
+
+
+def show(rows: list[Row]) -> None:
+    """Print rows, and how they compare."""
+    least = min(row.cost for row in rows)
+    reached = [row for row in rows if row.name.startswith("native") and row.cost <= least * (1 + SAME_COST)]
+    peer = min(reached, key=lambda row: row.cpu_s, default=None)
+    for row in rows:
+        ratio = "" if peer is None else f"{row.cpu_s / peer.cpu_s:6.3f} x native Ceres' CPU time "
+        ratio += "" if peer is None else f"({row.solve_s / peer.solve_s:6.3f} x its wall time)  "
+        print(
+            f"  {row.name:31s} {ratio}solve {row.solve_s:8.4f} s, {row.cpu_s:8.4f} s CPU  "
+            f"cost above the least {row.cost / least - 1:7.1e}  {row.note}",
+            flush=True,
+        )
+
+
 def main() -> None:
     """Print a table per size."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("observations", nargs="*", type=int, default=[100_000, 1_000_000])
-    parser.add_argument("--threads", type=int, default=min(2, os.cpu_count() or 1))
+    parser.add_argument("observations", nargs="*", type=int, default=[4_000, 100_000, 1_000_000])
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--states", action="store_true", help="six states a frame")
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
-    solve(make_scene(0, frames=30).problem)
-    if ABSENT:
-        print(ABSENT)
+    solve(make_scene(0, frames=30).problem, SolveOptions(loss="none") if arguments.states else PAPER)
+    for reason in (
+        ABSENT,
+        build()[1],
+        "" if available() else "numba is left out: the extra 'fast' is missing",
+    ):
+        if reason:
+            print(reason)
     for size in arguments.observations:
         problem = street(size)
-        print(f"{len(problem.observations.corner)} observations, {arguments.threads} threads", flush=True)
-        rows = [shown(row) for row in solved(problem, arguments.threads)]
-        least = min(row.cost for row in rows if row.same_model)
-        peer = next((row for row in rows if row.name == "ceres"), None)
-        for row in rows:
-            above = f"cost above the least {row.cost / least - 1:8.1e}" if row.same_model else "another model"
-            ratio = "" if peer is None else f"{row.solve_s / peer.solve_s:6.2f} x Ceres' time, "
-            ratio += "" if peer is None else f"{row.cpu_s / peer.cpu_s:6.2f} x its CPU time; "
-            print(f"  {row.name:22s} {ratio}{above}")
+        count, threads = len(problem.observations.corner), arguments.threads
+        print(f"{count} observations, {threads} thread{'s' if threads > 1 else ''}", flush=True)
+        rows = in_turn(problem, arguments.states, threads, arguments.rounds)
+        show(rows + list(others(problem, arguments.states, threads)))
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-        print(f"  peak memory of all of it {peak:.2f} GB")
-
-
-def solved(problem: Problem, threads: int) -> Iterator[Row]:
-    """All solvers, one after another."""
-    yield ours(problem, PAPER, "ours")
-    states = replace(problem, pose_sigma=PoseSigma())
-    row = ours(states, SolveOptions(loss="none", coarse=False), "ours, 6 states a frame")
-    yield replace(row, same_model=False)
-    if not ABSENT:
-        yield ceres(problem, CeresOptions(threads=threads), "ceres")
-    if not ABSENT and len(problem.observations.corner) <= CERES_POSES_LIMIT:
-        row = ceres(states, CeresOptions(frame_poses=True, threads=threads), "ceres, a pose a frame")
-        yield replace(row, same_model=False)
-    yield ours(problem, replace(PAPER, solver="lm"), "ours, lm")
-    if len(problem.observations.corner) <= SCIPY_LIMIT:
-        yield scipy_trf(problem)
-    else:
-        print(f"  scipy is left out: beyond {SCIPY_LIMIT} observations it takes minutes to hours")
-
-
-def shown(row: Row) -> Row:
-    """Print a row as soon as it is there."""
-    print(
-        f"  {row.name:22s} set-up {row.setup_s:6.2f} s  solve {row.solve_s:6.2f} s ({row.cpu_s:6.2f} s CPU)  "
-        f"cost {row.cost:.9e}  {row.note}",
-        flush=True,
-    )
-    return row
+        print(f"  peak memory of this process {peak:.2f} GB")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """Bundle adjustment of marking corners, camera extrinsics and vehicle poses on the ground plane.
 
 ``solve(problem, options) -> solution``: numpy in, numpy out; torch's LBFGS on whitened variables
-inside. :mod:`v2hdm.adjust.problem` states the model.
+inside. :mod:`v2hdm.adjust.problem` states the model. What is done to every observation torch does, or
+:mod:`v2hdm.adjust.kernels` where numba is installed.
 """
 
 from v2hdm.adjust.gating import Excluded, Verdict

@@ -6,9 +6,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+
+from v2hdm.adjust.kernels import passes_over
+
+if TYPE_CHECKING:
+    from v2hdm.adjust.kernels.passes import Passes
 
 # Observations that are computed at once: their intermediate results stay in the processor's cache, and
 # beside the whole take no memory.
@@ -133,6 +139,11 @@ class Arrays:
         return self.centre.new_zeros(self.camera_count, self.clock_twist.shape[-1])
 
     @cached_property
+    def passes(self) -> Passes | None:
+        """The compiled kernels over all observations, None where torch has to do their work."""
+        return passes_over(self)
+
+    @cached_property
     def unit_bounds(self) -> tuple[Tensor, Tensor]:
         """Corners that may begin a run, the end appended, and where their observations begin."""
         end = self.joined.new_full((1,), self.corner_count, dtype=torch.int64)
@@ -140,7 +151,7 @@ class Arrays:
         return corners, torch.searchsorted(self.corner, corners.to(self.corner.dtype))
 
     @cached_property
-    def _run_bounds(self) -> list[tuple[int, int]]:
+    def run_bounds(self) -> list[tuple[int, int]]:
         """(observation, corner) at which each run begins, and the end."""
         corners, begins = self.unit_bounds
         size = _RUN if self.measured.device.type == "cpu" else _RUN_ON_DEVICE
@@ -150,7 +161,7 @@ class Arrays:
 
     def runs(self) -> Iterator[Run]:
         """The whole problem, run by run; corners that are joined are never parted."""
-        for (begin, first), (end, last) in pairwise(self._run_bounds):
+        for (begin, first), (end, last) in pairwise(self.run_bounds):
             yield self.run(slice(begin, end), slice(first, last))
 
     def run(self, observations: slice, corners: slice) -> Run:
@@ -184,10 +195,10 @@ class Arrays:
         return self.run(slice(0, len(self.corner)), slice(0, self.corner_count))
 
     def take(self, keep: Tensor) -> tuple[Arrays, Tensor]:
-        """The problem restricted to the observations ``keep`` (K,) and to the corners they touch.
+        """The problem restricted to some observations and to the corners they touch.
 
-        Of the known lengths, those are left whose corners both are. Returns it with the indices here of
-        the corners that are left.
+        ``keep`` is a mask (K,) or ascending indices. Of the known lengths, those are left whose corners both
+        are. Returns it with the indices here of the corners that are left.
         """
         corners, corner = torch.unique(self.corner[keep], return_inverse=True)
         corners = corners.long()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from v2hdm.adjust.kernels import available
 from v2hdm.adjust.problem import LOSSES, POSE_STATES, SOLVERS, Problem, SolveOptions
 from v2hdm.errors import AdjustError
 from v2hdm.records import FloatArray, IntArray
@@ -22,13 +23,26 @@ def check_problem(problem: Problem) -> None:
     Except observations that are there twice: :func:`v2hdm.adjust.layout.make_arrays` finds them as it sorts.
     """
     _check_shapes(problem)
-    _check_finite(problem)
+    sound = _observations_are_sound(problem)
+    if not sound:
+        _check_indices(problem)
+    _check_finite(problem, observations_too=not sound)
     _check_rigid("cam_from_vehicle", problem.cam_from_vehicle)
     _check_rigid("map_from_vehicle", problem.map_from_vehicle)
-    _check_observations(problem)
+    if not sound:
+        _check_observations(problem)
     _check_priors(problem)
     _check_control(problem)
     _check_lengths(problem)
+
+
+def _observations_are_sound(problem: Problem) -> bool:
+    """Whether one compiled pass finds no fault in any observation; False where there is none to be had."""
+    if not available():
+        return False
+    from v2hdm.adjust.kernels.prepare import are_sound
+
+    return are_sound(problem, _SYMMETRIC_TO, _MAX_SLOPE)
 
 
 def _check_control(problem: Problem) -> None:
@@ -126,13 +140,19 @@ def _check_shapes(problem: Problem) -> None:
             raise AdjustError(f"{name} has shape {np.shape(values)}, expected {shape}")
     if count == 0:
         raise AdjustError("there is no observation to adjust: detect and associate markings first")
+    for name in ("camera", "frame", "corner"):
+        kind = getattr(seen, name).dtype
+        if not np.issubdtype(kind, np.integer):
+            raise AdjustError(f"observations.{name} holds {kind}: give whole numbers")
+
+
+def _check_indices(problem: Problem) -> None:
+    seen = problem.observations
     for name, index, size in (
-        ("camera", seen.camera, cameras),
-        ("frame", seen.frame, frames),
+        ("camera", seen.camera, len(problem.intrinsic)),
+        ("frame", seen.frame, len(problem.map_from_vehicle)),
         ("corner", seen.corner, problem.corner_count),
     ):
-        if not np.issubdtype(index.dtype, np.integer):
-            raise AdjustError(f"observations.{name} holds {index.dtype}: give whole numbers")
         wrong = np.flatnonzero((index < 0) | (index >= size))
         if len(wrong):
             raise AdjustError(
@@ -140,14 +160,14 @@ def _check_shapes(problem: Problem) -> None:
             )
 
 
-def _check_finite(problem: Problem) -> None:
+def _check_finite(problem: Problem, observations_too: bool) -> None:
     seen = problem.observations
     named = {
         "intrinsic of camera": problem.intrinsic,
         "cam_from_vehicle of camera": problem.cam_from_vehicle,
         "map_from_vehicle of frame": problem.map_from_vehicle,
-        "pinhole_px of observation": seen.pinhole_px,
-        "covariance_px of observation": seen.covariance_px,
+        "pinhole_px of observation": seen.pinhole_px if observations_too else None,
+        "covariance_px of observation": seen.covariance_px if observations_too else None,
         "centre_vehicle of camera": problem.centre_vehicle,
         "corners_start of corner": problem.corners_start,
         "twist_vehicle of frame": problem.twist_vehicle,

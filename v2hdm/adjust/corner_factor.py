@@ -10,8 +10,14 @@ from torch import Tensor
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.errors import AdjustError
 
-# Information, 1 / m^2, that keeps a corner factorable which runs off to the horizon.
-_CORNER_FLOOR = 1e-10
+CORNER_FLOOR = 1e-10
+"""Information, 1 / m^2, that keeps a corner factorable which runs off to the horizon."""
+
+PIVOT_FLOOR = 1e-12
+"""Least pivot of a corner's second coordinate, as a share of its own information."""
+
+INSEPARABLE = "corners joined by known lengths cannot be solved for together: state their sigma_m larger"
+"""What a block is reported as that has no factor."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +114,7 @@ def factorise_corners(
     surveyed = arrays.control_information[corners]
     xx, yx, yy = blocks[0] + surveyed, blocks[1], blocks[2] + surveyed
     grow = 1 + damping
-    lower = cholesky_2x2(xx * grow + _CORNER_FLOOR, yx, yy * grow + _CORNER_FLOOR)
+    lower = cholesky_2x2(xx * grow + CORNER_FLOOR, yx, yy * grow + CORNER_FLOOR)
     joined = arrays.joined[corners]
     if not bool(joined.any()):
         return CornerFactor(lower, ())
@@ -119,12 +125,10 @@ def factorise_corners(
         group = Joint(begin[size == corners_each], corners_each, lower)
         matrix = _group_blocks(group, torch.stack([xx, yx, yy]))
         _add_lengths(arrays, corners.start, group, by_length, matrix)
-        matrix.diagonal(dim1=1, dim2=2).mul_(grow).add_(_CORNER_FLOOR)
+        matrix.diagonal(dim1=1, dim2=2).mul_(grow).add_(CORNER_FLOOR)
         factor, failed = torch.linalg.cholesky_ex(matrix)
         if bool(failed.any()):
-            raise AdjustError(
-                "corners joined by known lengths cannot be solved for together: state their sigma_m larger"
-            )
+            raise AdjustError(INSEPARABLE)
         groups.append(Joint(group.begin, corners_each, factor))
     return CornerFactor(lower, tuple(groups))
 
@@ -161,5 +165,5 @@ def cholesky_2x2(xx: Tensor, yx: Tensor, yy: Tensor) -> Tensor:
     """Lower factors (3, n) of symmetric 2 x 2 blocks, by hand: one call per block would be slow."""
     first = xx.sqrt()
     below = yx / first
-    last = (yy - below.square()).clamp(min=1e-12 * yy).sqrt()
+    last = (yy - below.square()).clamp(min=PIVOT_FLOOR * yy).sqrt()
     return torch.stack([first, below, last])

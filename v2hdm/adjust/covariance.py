@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
+from v2hdm.adjust.descent import Descent
 from v2hdm.adjust.linear import coupling, jacobians
 from v2hdm.adjust.reduced import coupling_by_camera, to_tiles
 from v2hdm.adjust.residuals import observe
@@ -32,7 +33,12 @@ class Covariance:
     V^-1 + V^-1 W' S^-1 W V^-1.
     """
 
-    whitening: Whitening
+    descent: Descent
+
+    @property
+    def whitening(self) -> Whitening:
+        """The factors, made when they are first asked for."""
+        return self.descent.whitening
 
     def extrinsic(self) -> FloatArray:
         """Of each camera's left tangent (C, 6, 6): translation m, rotation rad."""

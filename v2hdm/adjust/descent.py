@@ -2,35 +2,41 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from v2hdm.adjust.arrays import Arrays, Run
-from v2hdm.adjust.corner_factor import CornerFactor
+from v2hdm.adjust.arrays import Arrays
+from v2hdm.adjust.kernels.pool import one_thread_in_torch
 from v2hdm.adjust.lbfgs import minimise, predicted_gap
-from v2hdm.adjust.linear import Linear
-from v2hdm.adjust.reduced import make_plan
+from v2hdm.adjust.reduced import Plan, make_plan
 from v2hdm.adjust.residuals import (
     Estimate,
     Gradient,
     Loss,
     Tally,
     by_corner_priors,
+    moved_columns,
     observe,
     pair_table,
     squared_residuals,
     with_priors,
 )
 from v2hdm.adjust.robust import annealed_scale
-from v2hdm.adjust.whitening import Whitener, Whitening, factorise
+from v2hdm.adjust.whitening import Evaluated, Whitener, Whitening, factorise, whitened_gradient
 from v2hdm.geometry.tensors import exp, left_jacobian
 
 # While a robust loss is still being narrowed, there is no point in more digits than this.
 _ANNEALING_TOLERANCE = 1e-3
 _ANNEALING_STEP = 3.0
 _ITERATIONS_PER_WHITENING = 12
+# Evaluations that a whitening takes as long as.
+_RENEWAL = 2.0
+_RENEWAL_WITH_STATES = 10.0
 _MAX_LM_DAMPING = 1e8
 _MIN_LM_DAMPING = 1e-5
 
@@ -39,14 +45,42 @@ _MIN_LM_DAMPING = 1e-5
 class Descent:
     """Where a descent ended.
 
-    ``whitening`` is that at the estimate, and knows it; ``gap`` is the predicted remaining decrease as a
-    fraction of the cost. ``progressing``: it was still going down when it was stopped.
+    Attributes:
+        arrays, plan: the problem.
+        estimate, robust, terms: where it ended, under which loss, and the cost there by name.
+        gap: the predicted remaining decrease as a fraction of the cost.
+        evaluations: of cost and gradient.
+        progressing: it was still going down when it was stopped.
+        is_singular: observations and priors leave a direction of the reduced unknowns free.
+        made: the whitening at the estimate, where the descent had to make it.
     """
 
-    whitening: Whitening
+    arrays: Arrays
+    plan: Plan
+    estimate: Estimate
+    robust: Loss
+    terms: dict[str, Tensor]
     gap: float
     evaluations: int
     progressing: bool
+    is_singular: bool
+    made: Whitening | None
+
+    @cached_property
+    def whitening(self) -> Whitening:
+        """That at the estimate, made when it is asked for."""
+        if self.made is not None:
+            return self.made
+        with one_thread_in_torch(len(self.arrays.pair), self.arrays.passes is not None):
+            return factorise(self.arrays, self.plan, self.estimate, self.robust)
+
+
+class Point(NamedTuple):
+    """Whitened variables, what they stand for, and the cost there by name."""
+
+    whitened: Tensor
+    estimate: Estimate
+    terms: dict[str, Tensor]
 
 
 class Objective:
@@ -55,61 +89,77 @@ class Objective:
     def __init__(self, whitening: Whitening) -> None:
         self.whitening = whitening
         self.evaluations = 0
+        self._last: Point | None = None
 
     def at_base(self) -> tuple[Tensor, Tensor]:
         """Cost and gradient at 0, which the whitening knows."""
         self.evaluations += 1
         return total(self.whitening.terms), self.whitening.gradient
 
-    def moved(self, whitened: Tensor) -> Estimate:
-        """The estimate at whitened variables."""
-        step, motion = self.whitening.reduced_step(whitened)
-        estimate = _moved(self.whitening.estimate, step)
-        for run in self.whitening.arrays.runs():
-            self._move_corners(run, whitened, motion, estimate)
-        return estimate
+    def point(self, whitened: Tensor) -> Point:
+        """What whitened variables stand for; known where they were evaluated last."""
+        if not bool(whitened.any()):
+            return Point(whitened, self.whitening.estimate, self.whitening.terms)
+        if self._last is None or not torch.equal(self._last.whitened, whitened):
+            self(whitened)
+        assert self._last is not None
+        return self._last
 
     def __call__(self, whitened: Tensor) -> tuple[Tensor, Tensor]:
-        """Cost and gradient at whitened variables.
-
-        One pass: a run's corners are moved and seen, and their gradient is carried back, while all of it
-        is in the processor's cache.
-        """
+        """Cost and gradient at whitened variables."""
         self.evaluations += 1
         whitening, arrays = self.whitening, self.whitening.arrays
-        step, motion = whitening.reduced_step(whitened)
-        estimate = _moved(whitening.estimate, step)
-        table, tally, back = pair_table(arrays, estimate), Tally(arrays), Whitener(arrays, whitening.table)
-        for run in arrays.runs():
-            linear, factor = self._move_corners(run, whitened, motion, estimate)
-            tally.add(run, observe(run, table, estimate.corners_map), whitening.robust)
-            by_corner = tally.by_corner[run.corners] + by_corner_priors(arrays, estimate, run.corners)
-            back.add(linear, factor, by_corner)
-        terms, gradient = with_priors(arrays, estimate, table, tally)
-        by_tangent = (left_jacobian(step.extrinsic).mT @ gradient.extrinsic[..., None])[..., 0]
-        gradient = replace(gradient, extrinsic=by_tangent)
-        by_whitened = back.whitened(whitening.plan, whitening.spread, whitening.reduced_factor, gradient)
+        step, tangents = whitening.reduced_step(whitened)
+        estimate, jacobian = _moved(arrays, whitening.estimate, step)
+        own = whitening.corner_part(whitened)
+        if arrays.passes is not None and whitening.base is not None:
+            done = arrays.passes.evaluate(whitening, estimate, step, tangents, own)
+        else:
+            done = evaluate(whitening, estimate, tangents, own)
+        estimate = replace(estimate, corners_map=done.corners_map)
+        terms, gradient = with_priors(arrays, estimate, done.sums)
+        by_tangent = (jacobian.mT @ gradient.extrinsic[..., None])[..., 0]
+        by_whitened = whitened_gradient(
+            whitening.plan,
+            whitening.reduced_factor,
+            replace(gradient, extrinsic=by_tangent),
+            done.coupled,
+            done.whitened,
+        )
+        self._last = Point(whitened.clone(), estimate, terms)
         return total(terms), by_whitened
 
-    def _move_corners(
-        self, run: Run, whitened: Tensor, motion: Tensor, estimate: Estimate
-    ) -> tuple[Linear, CornerFactor]:
-        """Move a run's corners in ``estimate``, x_c = L^-T (y_c - B x_r); returns their coupling and L."""
-        linear, factor = self.whitening.linear(run), self.whitening.corner_factor.part(run.corners)
+
+def evaluate(whitening: Whitening, estimate: Estimate, tangents: Tensor, own: Tensor) -> Evaluated:
+    """Evaluate where the reduced unknowns are those of ``estimate``, and its corners move with them.
+
+    Run by run: a run's corners are moved, x_c = L^-T (y_c - B x_r), and seen, and their gradient is carried
+    back, while all of it is in the processor's cache.
+    """
+    arrays, robust = whitening.arrays, whitening.robust
+    table, tally, back = pair_table(arrays, estimate), Tally(arrays), Whitener(arrays, whitening.table)
+    motion = moved_columns(whitening.table, tangents.reshape(-1, 6).T)
+    estimate = replace(estimate, corners_map=estimate.corners_map.clone())
+    for run in arrays.runs():
+        linear, factor = whitening.linear(run), whitening.corner_factor.part(run.corners)
         coupled = factor.solve(linear.corners_from_pairs(motion))
-        own = self.whitening.corner_part(whitened)[run.corners]
-        estimate.corners_map[run.corners] += factor.solve_transposed(own - coupled)
-        return linear, factor
+        estimate.corners_map[run.corners] += factor.solve_transposed(own[run.corners] - coupled)
+        tally.add(run, observe(run, table, estimate.corners_map), robust)
+        by_corner = tally.by_corner[run.corners] + by_corner_priors(arrays, estimate, run.corners)
+        back.add(linear, factor, by_corner)
+    sums = tally.sums(arrays, estimate, table)
+    return Evaluated(sums, back.coupled(whitening.spread), back.corners, estimate.corners_map)
 
 
-def _moved(base: Estimate, step: Gradient) -> Estimate:
-    """``base`` moved by a step x, in tensors of its own."""
-    return Estimate(
-        exp(step.extrinsic) @ base.cam_from_vehicle,
-        base.frame_state + step.frame_state,
-        base.corners_map + step.corners_map,
-        base.clock_s + step.clock_s,
-    )
+def _moved(arrays: Arrays, base: Estimate, step: Gradient) -> tuple[Estimate, Tensor]:
+    """``base`` moved by a step x but for its corners, and the left Jacobians (C, 6, 6) of the extrinsics'."""
+    if arrays.passes is not None:
+        cam_from_vehicle, jacobian = arrays.passes.move(step.extrinsic, base.cam_from_vehicle)
+    else:
+        cam_from_vehicle = exp(step.extrinsic) @ base.cam_from_vehicle
+        jacobian = left_jacobian(step.extrinsic)
+    state, clock = base.frame_state + step.frame_state, base.clock_s + step.clock_s
+    return Estimate(cam_from_vehicle, state, base.corners_map, clock), jacobian
 
 
 def total(terms: dict[str, Tensor]) -> Tensor:
@@ -125,42 +175,66 @@ def descend(
     tolerance: float,
     max_refreshes: int,
     max_evaluations: int,
+    opening: Whitening | None = None,
 ) -> Descent:
-    """Minimise the cost from ``estimate``, narrowing the robust loss on the way."""
+    """Minimise the cost from ``estimate``, narrowing the robust loss on the way.
+
+    ``opening`` is what :func:`open_descent` makes of ``estimate``, if that was needed before.
+    """
     evaluations, refreshes, damping, progressing, slow = 0, 0, 0.0, True, False
-    scale = robust.scale if robust.name == "none" else float("inf")
-    plan = make_plan(arrays)
+    whitening = opening or open_descent(arrays, estimate, robust)
+    plan, renewal = whitening.plan, _RENEWAL_WITH_STATES if arrays.states else _RENEWAL
     while True:
-        if scale > robust.scale:
-            narrowed = annealed_scale(squared_residuals(arrays, estimate), robust.scale)
-            scale = max(robust.scale, min(narrowed, scale / _ANNEALING_STEP))
+        scale = whitening.robust.scale
         final = scale <= robust.scale
-        whitening = factorise(arrays, plan, estimate, Loss(robust.name, scale), damping)
         objective = Objective(whitening)
         cost, gradient = objective.at_base()
         gap = predicted_gap(cost, gradient)
         refreshes += 1
-        done = (
+        ended = (
             (final and gap <= tolerance and damping == 0)
             # Each step of Levenberg-Marquardt has a whitening of its own.
             or (refreshes > max_refreshes and solver != "lm")
             or evaluations >= max_evaluations
+            or not progressing
         )
-        if done or not progressing:
-            return Descent(whitening, gap, evaluations + 1, progressing)
-        if solver == "lm":
+        whitened, reached, made = torch.zeros_like(gradient), cost, None
+        if ended:
+            made = whitening if damping == 0 else None
+        elif solver == "lm":
             whitened, reached, damping = _newton_step(objective, cost, gradient, damping)
         else:
             inner = tolerance if final else _ANNEALING_TOLERANCE
             # One that follows a slow one was made near enough: what slows it is the loss, not the distance.
             whitened, reached, gradient, slow = minimise(
-                objective, cost, gradient, inner, _ITERATIONS_PER_WHITENING, patient=slow
+                objective, cost, gradient, inner, _ITERATIONS_PER_WHITENING, math.inf if slow else renewal
             )
+            gap = predicted_gap(reached, gradient)
+            # A whitening under which the gap shrank this fast tells it well enough.
+            ended = final and not slow and gap <= tolerance
+        point, used = objective.point(whitened), whitening.robust
         evaluations += objective.evaluations
-        estimate = objective.moved(whitened)
+        singular = whitening.is_singular
+        if ended:
+            return Descent(
+                arrays, plan, point.estimate, used, point.terms, gap, evaluations, progressing, singular, made
+            )
+        estimate = point.estimate
         progressing = float(reached) < float(cost) or not final or 0 < damping < _MAX_LM_DAMPING
         # The old factor and what led away from it go before the new one comes.
-        del whitening, objective, whitened, gradient
+        del whitening, objective, whitened, gradient, point
+        if not final:
+            narrowed = annealed_scale(squared_residuals(arrays, estimate), robust.scale)
+            scale = max(robust.scale, min(narrowed, scale / _ANNEALING_STEP))
+        whitening = factorise(arrays, plan, estimate, Loss(robust.name, scale), damping)
+
+
+def open_descent(arrays: Arrays, estimate: Estimate, robust: Loss) -> Whitening:
+    """The first whitening of a descent, under a loss as wide as the residuals ask for."""
+    scale = robust.scale
+    if robust.name != "none":
+        scale = annealed_scale(squared_residuals(arrays, estimate), scale)
+    return factorise(arrays, make_plan(arrays), estimate, Loss(robust.name, scale))
 
 
 def _newton_step(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from v2hdm.adjust.kernels import available
 from v2hdm.adjust.problem import Observations
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
@@ -64,9 +65,16 @@ class Excluded:
 
 def noise_scale(mahalanobis2: FloatArray) -> float:
     """How many times as large as stated the noise's variance is, by the median; at least 1."""
-    # Seven digits are plenty, and half the memory.
-    median = np.median(mahalanobis2.astype(np.float32), overwrite_input=True)
-    return max(1.0, float(median) / _MEDIAN_SQUARED)
+    return max(1.0, _median(mahalanobis2) / _MEDIAN_SQUARED)
+
+
+def _median(values: FloatArray) -> float:
+    """The median of values from 0 up, to seven digits."""
+    if available():
+        from v2hdm.adjust.kernels.prepare import median
+
+        return median(values)
+    return float(np.median(values.astype(np.float32), overwrite_input=True))
 
 
 def as_of_point(squared_of_line: FloatArray) -> FloatArray:
@@ -100,17 +108,23 @@ def judge(
     verdict[mahalanobis2 > gate] = Verdict.CONTRADICTS
     verdict[behind] = Verdict.BEHIND_CAMERA
     count = int(observations.corner.max()) + 1
-    left, seen = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
-    parts = [slice(begin, begin + _ROWS) for begin in range(0, len(verdict), _ROWS)]
-    for part in parts:
-        np.add.at(seen, observations.corner[part], 1)
-        np.add.at(left, observations.corner[part], verdict[part] == Verdict.ACCEPTED)
+    seen, left = _count_accepted(observations.corner, verdict == Verdict.ACCEPTED, count)
     alone = (left == 1) & (seen > 1)
-    for part in parts:
+    for begin in range(0, len(verdict) if alone.any() else 0, _ROWS):
+        part = slice(begin, begin + _ROWS)
         verdict[part][alone[observations.corner[part]] & (verdict[part] == Verdict.ACCEPTED)] = (
             Verdict.UNCONFIRMED
         )
     return verdict
+
+
+def _count_accepted(corner: IntArray, accepted: BoolArray, corners: int) -> tuple[IntArray, IntArray]:
+    """How often each corner was seen, and how many of its observations are accepted."""
+    if available():
+        from v2hdm.adjust.kernels.prepare import count_accepted
+
+        return count_accepted(corner, accepted, corners)
+    return np.bincount(corner, minlength=corners), np.bincount(corner[accepted], minlength=corners)
 
 
 def excluded(

@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays, Lengths
+from v2hdm.adjust.kernels import available
 from v2hdm.adjust.pose_prior import state_components, state_prior
 from v2hdm.adjust.problem import Problem
 from v2hdm.errors import AdjustError
@@ -77,8 +78,7 @@ def _corners_in_route_order(problem: Problem) -> tuple[IntArray, BoolArray]:
     Corners that known lengths join come side by side, where the first of them belongs.
     """
     count, lengths = problem.corner_count, problem.lengths
-    first_frame = np.full(count, len(problem.map_from_vehicle))
-    np.minimum.at(first_frame, problem.observations.corner, problem.observations.frame)
+    first_frame = _first_frames(problem)
     if lengths is None or not len(lengths.first):
         return np.argsort(first_frame, kind="stable"), np.zeros(count, dtype=bool)
     edges = coo_matrix((np.ones(len(lengths.first)), (lengths.first, lengths.second)), shape=(count, count))
@@ -95,10 +95,28 @@ def _corners_in_route_order(problem: Problem) -> tuple[IntArray, BoolArray]:
     return order, np.concatenate([[False], np.diff(unit[order]) == 0])
 
 
+def _first_frames(problem: Problem) -> IntArray:
+    """The first frame (N,) that saw each corner."""
+    if available():
+        from v2hdm.adjust.kernels.prepare import first_frames
+
+        return first_frames(problem)
+    out = np.full(problem.corner_count, len(problem.map_from_vehicle))
+    np.minimum.at(out, problem.observations.corner, problem.observations.frame)
+    return out
+
+
 def _sorted_observations(
     problem: Problem, rank: IntArray
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
     """Observations (K,) by corner, then camera, then frame; the corner and the pair of each."""
+    if available():
+        from v2hdm.adjust.kernels.prepare import sorted_observations
+
+        order, corner, pair, again = sorted_observations(problem, rank)
+        if again >= 0:
+            _refuse_twice(problem, *sorted(order[again - 1 : again + 1].tolist()))
+        return order, corner, pair
     seen = problem.observations
     pairs = len(problem.intrinsic) * len(problem.map_from_vehicle)
     key = rank[seen.corner]
@@ -130,6 +148,10 @@ def _refuse_twice(problem: Problem, first: int, second: int) -> None:
 
 def _whitened(problem: Problem, order: NDArray[np.int32]) -> tuple[FloatArray, FloatArray]:
     """``measured`` (2, K) and ``root_information`` (3, K) of :class:`Arrays`."""
+    if available():
+        from v2hdm.adjust.kernels.prepare import whitened
+
+        return whitened(problem, order)
     seen = problem.observations
     measured, root = np.empty((2, len(order))), np.empty((3, len(order)))
     for begin in range(0, len(order), _ROWS):

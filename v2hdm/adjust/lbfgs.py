@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
+import sys
 from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -13,9 +17,8 @@ Objective = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 _HISTORY = 20
 _LINE_SEARCH_EVALUATIONS = 25
-# A whitening after which a step, the first aside, leaves more than this of the gap was made too far away: a
-# new one, though it costs several evaluations, pays.
-_SLOW = 0.25
+# Steps that a whitening near the optimum takes to the end.
+_STEPS_FROM_NEARBY = 2
 # A relative decrease below this is rounding.
 _NO_PROGRESS = 1e-15
 
@@ -43,7 +46,7 @@ def minimise(
     gradient: Tensor,
     tolerance: float,
     max_iterations: int,
-    patient: bool = False,
+    renewal: float = math.inf,
 ) -> Minimum:
     """Minimise from y = 0, whose cost and gradient are given.
 
@@ -57,7 +60,8 @@ def minimise(
         gradient: at 0, (n,).
         tolerance: stop when :func:`predicted_gap` is below this.
         max_iterations: after these the whitening is better renewed.
-        patient: whether to go on where the whitening is slow.
+        renewal: evaluations that a new whitening costs. Where the steps that are left, at the rate of the
+            last, cost more than that and the few steps from nearby, this one was made too far away.
     """
     scale = gradient.abs().sum()
     u = torch.zeros_like(gradient, requires_grad=True)
@@ -92,8 +96,15 @@ def minimise(
         if progress <= _NO_PROGRESS * float(best):
             break
         before, gap = gap, predicted_gap(best, best_gradient)
-        slow = not patient and iteration > 0 and gap > _SLOW * before
+        slow = iteration > 0 and _steps_left(before, gap, tolerance) > renewal + _STEPS_FROM_NEARBY
     return Minimum(u.detach() * scale, best, best_gradient, slow)
+
+
+def _steps_left(before: float, gap: float, tolerance: float) -> float:
+    """Steps to the tolerance, if each takes as much of the gap as the last."""
+    if gap <= tolerance:
+        return 0.0
+    return math.log(tolerance / gap) / math.log(gap / before) if gap < before else math.inf
 
 
 class _NoNumberError(Exception):
@@ -131,8 +142,25 @@ class _Evaluations:
         return cost, gradient
 
 
+@cache
+def _leave_compiler_out() -> None:
+    """Keep torch from importing its compiler, for 1 to 2.5 s, when the first optimiser is made.
+
+    It does so to keep the compiler away from an optimiser's methods, all of which this marks as kept from it
+    already. The mark is torch's own affair: where it has another, the compiler is imported as ever.
+    """
+    if "torch._dynamo" in sys.modules:
+        return
+    for name in dir(torch.optim.Optimizer):
+        method = getattr(getattr(torch.optim.Optimizer, name), "__wrapped__", None)
+        if method is not None:
+            with suppress(AttributeError, TypeError):
+                method.__dynamo_disable = method
+
+
 def _one_step_optimizer(u: Tensor) -> torch.optim.LBFGS:
     """LBFGS that makes one iteration a step and leaves stopping to its caller."""
+    _leave_compiler_out()
     return torch.optim.LBFGS(
         [u],
         lr=1.0,

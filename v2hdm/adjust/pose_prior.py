@@ -43,6 +43,8 @@ def state_prior(
     innovation variance sigma^2 (1 - m^2) (Gelb, Applied Optimal Estimation, section 3.8).
     """
     poses = map_from_vehicle
+    if not components:
+        return np.zeros((len(poses), 0, 0)), np.zeros((len(poses), 0))
     step_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     turn = np.tile(np.eye(6), (max(len(poses) - 1, 0), 1, 1))
     turn[:, :2, :2] = poses[1:, :2, :2].transpose(0, 2, 1) @ poses[:-1, :2, :2]

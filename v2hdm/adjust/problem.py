@@ -25,6 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from v2hdm.adjust.kernels import available
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 POSE_STATES: tuple[str, ...] = ("x", "y", "height", "roll", "pitch", "heading")
@@ -59,6 +60,10 @@ class Observations:
 
 def on_line(covariance_px: FloatArray) -> BoolArray:
     """Whether covariances (K, 2, 2) are as good as those of a line of the image."""
+    if available():
+        from v2hdm.adjust.kernels.prepare import on_line as compiled
+
+        return compiled(covariance_px, _LINE_RATIO + 2 + 1 / _LINE_RATIO)
     xx, yx, yy = covariance_px[:, 0, 0], covariance_px[:, 1, 0], covariance_px[:, 1, 1]
     # With the variances a > b: a b = det, a + b = trace, so a / b > q where trace^2 > det (q + 2 + 1 / q).
     return np.asarray((xx + yy) ** 2 > (xx * yy - yx**2) * (_LINE_RATIO + 2 + 1 / _LINE_RATIO))
@@ -168,7 +173,8 @@ class SolveOptions:
         loss_scale: residual, in standard deviations, from which the loss departs from least squares.
         gate_probability: share of sound observations that the verdict on outliers may cost.
         solver: ``lbfgs``, or ``lm`` (Schur-complement Levenberg-Marquardt) to cross-check.
-        coarse: first solve a subset of steep rays, which converges from ten degrees away.
+        coarse: where the start is far off, or the problem large, first solve a subset of steep rays, which
+            converges from ten degrees away.
         gap_tolerance: stop when the predicted remaining decrease is this fraction of the cost.
         max_refreshes: how often the problem is whitened anew at most; ``lm`` does so at each step, and is
             limited by its evaluations alone.

@@ -36,6 +36,6 @@ class PosePulls:
 
 def pose_pulls(solution: Solution) -> PosePulls:
     """The pulls on the poses of a solution; none where it estimates no state of a frame."""
-    whitening = solution.covariance.whitening
-    pulls = state_residual(whitening.arrays, whitening.estimate.frame_state)
-    return PosePulls(np.array(whitening.arrays.states, dtype=np.int64), pulls.cpu().numpy())
+    descent = solution.covariance.descent
+    pulls = state_residual(descent.arrays, descent.estimate.frame_state)
+    return PosePulls(np.array(descent.arrays.states, dtype=np.int64), pulls.cpu().numpy())

@@ -37,12 +37,14 @@ class Block:
 class Plan:
     """How a problem's reduced system is cut into tiles; depends on who saw what, not on numbers.
 
-    ``blocks`` are those of each run; where frames have no states there are none.
+    ``blocks`` are those of each run; where frames have no states, or kernels need none, there are none.
+    ``most_tiles`` is how many a unit of the kernels touches at most.
     """
 
     frames_per_tile: int
     pattern: Pattern
     blocks: tuple[tuple[Block, ...], ...]
+    most_tiles: int = 0
 
     @property
     def tile_count(self) -> int:
@@ -55,12 +57,16 @@ def make_plan(arrays: Arrays) -> Plan:
     if not arrays.states:
         return Plan(arrays.frame_count, find_pattern(0, []), tuple(() for _ in arrays.runs()))
     per_tile = max(_TILE_ROWS // len(arrays.states), 1)
-    count = -(-arrays.frame_count // per_tile)
-    blocks = tuple(tuple(_blocks(arrays, run, per_tile)) for run in arrays.runs())
-    cliques = [list(block.tiles) for of_run in blocks for block in of_run]
+    count, most_tiles = -(-arrays.frame_count // per_tile), 0
+    blocks: tuple[tuple[Block, ...], ...] = tuple(() for _ in arrays.runs())
+    if arrays.passes is not None:
+        cliques, most_tiles = arrays.passes.coupled_tiles(per_tile, count)
+    else:
+        blocks = tuple(tuple(_blocks(arrays, run, per_tile)) for run in arrays.runs())
+        cliques = [list(block.tiles) for of_run in blocks for block in of_run]
     if bool(arrays.state_transition.any()):
         cliques += [[tile, tile + 1] for tile in range(count - 1)]
-    return Plan(per_tile, find_pattern(count, cliques), blocks)
+    return Plan(per_tile, find_pattern(count, cliques), blocks, most_tiles)
 
 
 def _blocks(arrays: Arrays, run: Run, per_tile: int) -> list[Block]:
@@ -119,6 +125,24 @@ class Spread:
         identity = torch.eye(6, dtype=self.clock.dtype, device=self.clock.device)
         return torch.cat([identity.expand(*self.clock.shape[:2], 6, 6), self.clock], dim=-1)
 
+    def gather(self, by_pair: Tensor) -> Coupled:
+        """What a gradient (C, J, 6) by the pairs' tangents is by the unknowns that they move with."""
+        by_state, by_camera = by_pair.new_zeros(by_pair.shape[1], 0), by_pair.sum(1)
+        if self.state.shape[-1]:
+            by_state = (self.state.mT @ by_pair[..., None])[..., 0].sum(0)
+        if self.clock.shape[-1]:
+            by_clock = (self.clock.mT @ by_pair[..., None])[..., 0].sum(1)
+            by_camera = torch.cat([by_camera, by_clock], dim=1)
+        return Coupled(by_state, by_camera)
+
+
+@dataclass(frozen=True)
+class Coupled:
+    """A gradient by the reduced unknowns: by frame state (J, S) and by the cameras' unknowns (C, 6 + Q)."""
+
+    frame_state: Tensor
+    camera: Tensor
+
 
 class ReducedSystem:
     """S while it is put together: U is summed up and the corners' part comes off, run by run."""
@@ -127,21 +151,26 @@ class ReducedSystem:
         self.arrays, self.plan, self.spread = arrays, plan, spread
         self._state_table = spread.state.reshape(arrays.pair_count, -1).T.contiguous()
         # U by pair; where no pair moves but with its camera, by camera.
-        self._by_pair = bool(arrays.states) or arrays.camera_unknowns > 6
-        self._own = arrays.centre.new_zeros(21, arrays.pair_count if self._by_pair else arrays.camera_count)
+        self.by_pair = bool(arrays.states) or arrays.camera_unknowns > 6
+        self._own = arrays.centre.new_zeros(21, arrays.pair_count if self.by_pair else arrays.camera_count)
         tip = arrays.camera_count * arrays.camera_unknowns
         size = plan.frames_per_tile * len(arrays.states)
-        self._matrix = TiledMatrix.zeros(plan.pattern, size, tip, arrays.centre)
-        self._tiles = self._matrix.tiles
+        self.matrix = TiledMatrix.zeros(plan.pattern, size, tip, arrays.centre)
+        self._tiles = self.matrix.tiles
 
     def add(self, run: Run, blocks: Tensor) -> None:
         """Add U of a run, ``blocks`` (21, k) by observation."""
-        if self._by_pair:
+        if self.by_pair:
             self._own.index_add_(1, run.pair, blocks)
         else:
             cameras = torch.arange(self.arrays.camera_count, device=run.pair.device)
             belongs = run.pair[:, None] // self.arrays.frame_count == cameras
             self._own.addmm_(blocks, belongs.to(blocks.dtype))
+
+    def add_all(self, own: Tensor, tip: Tensor) -> None:
+        """Add U of all runs, by pair or camera (21, n), and take off the cameras' B' B, a lower triangle."""
+        self._own += own
+        self._tiles[TIP, TIP] -= tip + tip.tril(-1).mT
 
     def subtract(self, number: int, run: Run, coupling: Tensor, factor: CornerFactor) -> None:
         """Take B' B of run ``number`` off; ``coupling`` (2, 6, k) is W' by observation."""
@@ -195,7 +224,7 @@ class ReducedSystem:
         keys = [*((k, k) for k in range(self.plan.tile_count)), (TIP, TIP)]
         for key, values in zip(keys, diagonal, strict=True):
             self._tiles[key].diagonal().add_(values, alpha=damping)
-        factor = factorise_tiles(self._matrix)
+        factor = factorise_tiles(self.matrix)
         if factor is None:
             return None
         return factor, float((factor.pivots() / (1 + damping) / torch.cat(diagonal)).min())

@@ -103,13 +103,27 @@ def frame_tangent(arrays: Arrays, frame_state: Tensor) -> Tensor:
     return tangent.index_add(1, columns, frame_state)
 
 
-def pair_table(arrays: Arrays, estimate: Estimate) -> Tensor:
-    """The columns of A of every pair, one below the other, (9, P)."""
+def cam_from_map(arrays: Arrays, estimate: Estimate) -> Tensor:
+    """Of every pair, (C, J, 4, 4)."""
     vehicle_from_map = arrays.vehicle_from_map
     if arrays.states:
         vehicle_from_map = exp(-frame_tangent(arrays, estimate.frame_state)) @ vehicle_from_map
-    cam_from_map = _cam_from_vehicle_then(arrays, estimate) @ vehicle_from_map
-    return cam_from_map[..., :3, [0, 1, 3]].permute(3, 2, 0, 1).reshape(9, arrays.pair_count)
+    cameras = _cam_from_vehicle_then(arrays, estimate)
+    if cameras.shape[1] > 1:
+        return cameras @ vehicle_from_map
+    # One product of two matrices, instead of many of four rows each.
+    product = cameras.reshape(-1, 4) @ vehicle_from_map.transpose(0, 1).reshape(4, -1)
+    return product.view(len(cameras), 4, -1, 4).transpose(1, 2).contiguous()
+
+
+def pair_table(arrays: Arrays, estimate: Estimate) -> Tensor:
+    """The columns of A of every pair, one below the other, (9, P)."""
+    return columns_of(cam_from_map(arrays, estimate))
+
+
+def columns_of(transforms: Tensor) -> Tensor:
+    """The first, second and fourth column of transforms (C, J, 4, 4), one below the other, (9, P)."""
+    return transforms[..., :3, [0, 1, 3]].permute(3, 2, 0, 1).reshape(9, -1)
 
 
 def wrenches(table: Tensor, by_table: Tensor) -> Tensor:
@@ -117,6 +131,11 @@ def wrenches(table: Tensor, by_table: Tensor) -> Tensor:
     shift = by_table[6:]
     columns, forces = table.view(3, 3, -1), by_table.view(3, 3, -1)
     return torch.cat([shift, torch.linalg.cross(columns, forces, dim=1).sum(0)])
+
+
+def by_camera_and_frame(arrays: Arrays, by_pair: Tensor) -> Tensor:
+    """Values (n, P) of the pairs as (C, J, n)."""
+    return by_pair.T.reshape(arrays.camera_count, arrays.frame_count, -1)
 
 
 def moved_columns(table: Tensor, tangents: Tensor) -> Tensor:
@@ -151,6 +170,8 @@ def observe(run: Run, table: Tensor, corners_map: Tensor) -> View:
 
 def squared_residuals(arrays: Arrays, estimate: Estimate) -> Tensor:
     """Squared Mahalanobis distance (K,) of each observation."""
+    if arrays.passes is not None:
+        return arrays.passes.squared_residuals(estimate)
     table = pair_table(arrays, estimate)
     return torch.cat([observe(run, table, estimate.corners_map).squared for run in arrays.runs()])
 
@@ -174,6 +195,8 @@ def pair_from_state(arrays: Arrays, estimate: Estimate) -> Tensor:
 
 def pair_from_clock(arrays: Arrays, estimate: Estimate) -> Tensor:
     """Derivative (C, J, 6, Q) of each pair's left tangent by the clock offset of its camera."""
+    if not arrays.clock_twist.shape[-1]:
+        return arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6, 0)
     return -adjoint(estimate.cam_from_vehicle)[:, None] @ arrays.clock_twist
 
 
@@ -186,6 +209,8 @@ def centre_residual(arrays: Arrays, estimate: Estimate) -> Tensor:
 
 def state_residual(arrays: Arrays, frame_state: Tensor) -> Tensor:
     """Whitened innovations (J, S) of the frame states."""
+    if not arrays.states:
+        return frame_state
     before = torch.cat([torch.zeros_like(frame_state[:1]), frame_state[:-1]])
     expected = (arrays.state_transition @ before[..., None])[..., 0]
     return (frame_state - expected) * arrays.state_information_root
@@ -204,6 +229,13 @@ def length_residual(arrays: Arrays, corners_map: Tensor) -> tuple[Tensor, Tensor
     return (distance - known.length_m) * known.information_root, direction * known.information_root[:, None]
 
 
+def corner_priors(arrays: Arrays, corners_map: Tensor) -> tuple[Tensor, Tensor]:
+    """What the survey and what the known lengths cost."""
+    off = corners_map - arrays.control
+    length, _ = length_residual(arrays, corners_map)
+    return (off.square().sum(1) * arrays.control_information).sum() / 2, length.square().sum() / 2
+
+
 def by_corner_priors(arrays: Arrays, estimate: Estimate, corners: slice) -> Tensor:
     """The gradient (n, 2), by some corners, of what the survey and the known lengths cost.
 
@@ -219,6 +251,23 @@ def by_corner_priors(arrays: Arrays, estimate: Estimate, corners: slice) -> Tens
         gradient.index_add_(0, known.first[inside] - corners.start, pull)
         gradient.index_add_(0, known.second[inside] - corners.start, pull, alpha=-1)
     return gradient
+
+
+@dataclass(frozen=True)
+class Sums:
+    """What is added up over observations and corners: costs, and gradients by pair and by corner.
+
+    Attributes:
+        observations, control, lengths: the costs of the observations, the survey and the known lengths.
+        wrench: (C, J, 6) the observations' gradient by the pairs' left tangents.
+        by_corner: (N, 2) the gradient by the corners, priors included; (0, 2) where it is whitened already.
+    """
+
+    observations: Tensor
+    control: Tensor
+    lengths: Tensor
+    wrench: Tensor
+    by_corner: Tensor
 
 
 class Tally:
@@ -244,36 +293,37 @@ class Tally:
         self.by_table.index_add_(1, run.pair, view.by_table(force))
         self.by_corner[run.corners] = run.sum_by_corner(view.along_axes(force))
 
+    def sums(self, arrays: Arrays, estimate: Estimate, table: Tensor) -> Sums:
+        """All of it, once all runs are in; ``table`` is the :func:`pair_table`."""
+        control, lengths = corner_priors(arrays, estimate.corners_map)
+        by_corner = self.by_corner + by_corner_priors(arrays, estimate, slice(0, arrays.corner_count))
+        wrench = by_camera_and_frame(arrays, wrenches(table, self.by_table))
+        return Sums(self.cost, control, lengths, wrench, by_corner)
+
 
 def cost_and_gradient(arrays: Arrays, estimate: Estimate, robust: Loss) -> tuple[dict[str, Tensor], Gradient]:
     """The named terms of the cost, and the gradient of their sum."""
     tally, table = Tally(arrays), pair_table(arrays, estimate)
     for run in arrays.runs():
         tally.add(run, observe(run, table, estimate.corners_map), robust)
-    return with_priors(arrays, estimate, table, tally)
+    return with_priors(arrays, estimate, tally.sums(arrays, estimate, table))
 
 
-def with_priors(
-    arrays: Arrays, estimate: Estimate, table: Tensor, tally: Tally
-) -> tuple[dict[str, Tensor], Gradient]:
-    """The named terms of the cost, and the gradient of their sum, from the observations' part."""
+def with_priors(arrays: Arrays, estimate: Estimate, sums: Sums) -> tuple[dict[str, Tensor], Gradient]:
+    """The named terms of the cost, and the gradient of their sum, from what is added up."""
     centre = centre_residual(arrays, estimate)
     state = state_residual(arrays, estimate.frame_state)
     clock = estimate.clock_s * arrays.clock_information_root
-    off_control = estimate.corners_map - arrays.control
-    length, _ = length_residual(arrays, estimate.corners_map)
     terms = {
-        "observations": tally.cost,
+        "observations": sums.observations,
         "camera_centre": centre.square().sum() / 2,
         "frame_states": state.square().sum() / 2,
         "clock_offsets": clock.square().sum() / 2,
-        "control_points": (off_control.square().sum(1) * arrays.control_information).sum() / 2,
-        "known_lengths": length.square().sum() / 2,
+        "control_points": sums.control,
+        "known_lengths": sums.lengths,
     }
-    by_corner = tally.by_corner + by_corner_priors(arrays, estimate, slice(0, arrays.corner_count))
-    return terms, by_unknowns(
-        arrays, estimate, table, tally.by_table, by_corner, Priors(centre, state, clock)
-    )
+    priors = Priors(centre, state, clock)
+    return terms, by_unknowns(arrays, estimate, sums.wrench, sums.by_corner, priors)
 
 
 @dataclass(frozen=True)
@@ -286,18 +336,18 @@ class Priors:
 
 
 def by_unknowns(
-    arrays: Arrays, estimate: Estimate, table: Tensor, by_table: Tensor, by_corner: Tensor, priors: Priors
+    arrays: Arrays, estimate: Estimate, wrench: Tensor, by_corner: Tensor, priors: Priors
 ) -> Gradient:
-    """The gradient by all that is estimated, from that by the pairs' columns (9, P) and by corner (N, 2)."""
-    wrench = wrenches(table, by_table).T.reshape(arrays.camera_count, arrays.frame_count, 6)
+    """The gradient by all that is estimated, from that by the pairs (C, J, 6) and by corner (N, 2)."""
     by_extrinsic = wrench.sum(1)
     # A left perturbation moves the centre by minus its translation part, turned into the vehicle.
     rotation = estimate.cam_from_vehicle[:, :3, :3]
     by_extrinsic[:, :3] -= (rotation @ (priors.centre * arrays.centre_information_root)[..., None])[..., 0]
-    by_state = (pair_from_state(arrays, estimate).mT @ wrench[..., None])[..., 0].sum(0)
-    innovation = priors.state * arrays.state_information_root
-    by_state += innovation
-    by_state[:-1] -= (arrays.state_transition.mT @ innovation[..., None])[1:, :, 0]
-    by_clock = (pair_from_clock(arrays, estimate).mT @ wrench[..., None])[..., 0].sum(1)
-    by_clock += priors.clock * arrays.clock_information_root
+    by_state, by_clock = priors.state, priors.clock * arrays.clock_information_root
+    if arrays.states:
+        innovation = priors.state * arrays.state_information_root
+        by_state = (pair_from_state(arrays, estimate).mT @ wrench[..., None])[..., 0].sum(0) + innovation
+        by_state[:-1] -= (arrays.state_transition.mT @ innovation[..., None])[1:, :, 0]
+    if arrays.clock_twist.shape[-1]:
+        by_clock = (pair_from_clock(arrays, estimate).mT @ wrench[..., None])[..., 0].sum(1) + by_clock
     return Gradient(by_extrinsic, by_state, by_corner, by_clock)

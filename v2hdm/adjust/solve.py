@@ -11,14 +11,16 @@ from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.checks import check_model, check_options, check_problem
-from v2hdm.adjust.coarse import coarse_extrinsics
+from v2hdm.adjust.coarse import coarse_extrinsics, is_near, is_worth_a_look
 from v2hdm.adjust.covariance import Covariance
-from v2hdm.adjust.descent import Descent, descend
+from v2hdm.adjust.descent import Descent, descend, open_descent
 from v2hdm.adjust.gating import as_of_point, judge, noise_scale
+from v2hdm.adjust.kernels import available
+from v2hdm.adjust.kernels.pool import one_thread_in_torch
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.origin import nearby_origin, shifted
 from v2hdm.adjust.problem import Problem, SolveOptions
-from v2hdm.adjust.residuals import Estimate, Loss, cost_and_gradient, frame_tangent, observe
+from v2hdm.adjust.residuals import Estimate, Loss, cost_and_gradient, frame_tangent, observe, pair_table
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.start import back_project
 from v2hdm.adjust.variance import VarianceFactors, variance_factors
@@ -43,12 +45,19 @@ def solve(problem: Problem, options: SolveOptions | None = None) -> Solution:
     check_options(options)
     check_problem(problem)
     check_model(problem, options)
+    compiled = available() and torch.device(options.device).type == "cpu"
+    with one_thread_in_torch(len(problem.observations.corner), compiled):
+        return _solve(problem, options, began)
+
+
+def _solve(problem: Problem, options: SolveOptions, began: float) -> Solution:
+    """Solve what has been checked."""
     origin_map = nearby_origin(problem)
     near = shifted(problem, -origin_map)
     arrays = make_arrays(near, tuple(options.pose_states), options.device, options.clock_offset)
-    start, spent = _start(near, arrays, options)
-    del near
     robust = Loss(options.loss, options.loss_scale)
+    start, opening, spent = _start(near, arrays, robust, options)
+    del near
     descent = descend(
         arrays,
         start,
@@ -57,28 +66,47 @@ def solve(problem: Problem, options: SolveOptions | None = None) -> Solution:
         options.gap_tolerance,
         options.max_refreshes,
         options.max_evaluations,
+        opening,
     )
+    del opening
     return _report(problem, origin_map, options, descent, spent, began)
 
 
-def _start(problem: Problem, arrays: Arrays, options: SolveOptions) -> tuple[Estimate, int]:
-    """Where the descent starts, and the evaluations spent on finding it."""
+def _start(
+    problem: Problem, arrays: Arrays, robust: Loss, options: SolveOptions
+) -> tuple[Estimate, Whitening | None, int]:
+    """Where the descent starts, its first whitening if that is known, and the evaluations spent.
+
+    A coarse stage comes before it where the start is far from the optimum, or the problem is large.
+    """
     cam_from_vehicle = torch.as_tensor(problem.cam_from_vehicle, dtype=torch.float64, device=options.device)
+    if options.coarse and not is_worth_a_look(arrays):
+        estimate, corner = _estimate(problem, arrays, cam_from_vehicle)
+        opening = open_descent(arrays, estimate, robust) if corner is None else None
+        if opening is not None and is_near(opening):
+            return estimate, opening, 0
+        del opening
     spent = 0
     if options.coarse:
         cam_from_vehicle, spent = coarse_extrinsics(arrays, cam_from_vehicle)
-    state = torch.zeros_like(arrays.state_information_root)
-    if problem.corners_start is not None:
-        given = torch.as_tensor(problem.corners_start, dtype=torch.float64, device=options.device)
-        return Estimate(cam_from_vehicle, state, given[arrays.corner_order], arrays.no_clock()), spent
-    corners, fixed = back_project(arrays, cam_from_vehicle)
-    if not bool(fixed.all()):
-        corner = int(arrays.corner_order[~fixed].min())
+    estimate, corner = _estimate(problem, arrays, cam_from_vehicle)
+    if corner is not None:
         raise AdjustError(
             f"no ray of corner {corner} meets the ground under the starting extrinsics: its observations "
             "lie above the horizon; leave it out or give corners_start"
         )
-    return Estimate(cam_from_vehicle, state, corners, arrays.no_clock()), spent
+    return estimate, None, spent
+
+
+def _estimate(problem: Problem, arrays: Arrays, cam_from_vehicle: Tensor) -> tuple[Estimate, int | None]:
+    """The start under some extrinsics, and a corner that none of its rays fixes, if there is any."""
+    state = torch.zeros_like(arrays.state_information_root)
+    if problem.corners_start is not None:
+        given = torch.as_tensor(problem.corners_start, dtype=torch.float64, device=cam_from_vehicle.device)
+        return Estimate(cam_from_vehicle, state, given[arrays.corner_order], arrays.no_clock()), None
+    corners, fixed = back_project(arrays, cam_from_vehicle)
+    loose = None if bool(fixed.all()) else int(arrays.corner_order[~fixed].min())
+    return Estimate(cam_from_vehicle, state, corners, arrays.no_clock()), loose
 
 
 def _report(
@@ -90,13 +118,13 @@ def _report(
     began: float,
 ) -> Solution:
     """What came of it, on the map of ``problem``, whose point ``origin_map`` is the origin of the arrays."""
-    whitening, robust = descent.whitening, Loss(options.loss, options.loss_scale)
-    arrays, estimate, terms = whitening.arrays, whitening.estimate, whitening.terms
-    if whitening.robust != robust:
+    robust = Loss(options.loss, options.loss_scale)
+    arrays, estimate, terms = descent.arrays, descent.estimate, descent.terms
+    if descent.robust != robust:
         terms, _ = cost_and_gradient(arrays, estimate, robust)
-    seen = _seen(problem, whitening)
+    seen = _seen(problem, arrays, estimate)
     scale = noise_scale(seen.mahalanobis2)
-    variance = _variance_factors(arrays, terms, seen.mahalanobis2)
+    variance = _variance_factors(arrays, terms, seen.mahalanobis2, scale)
     corners_map = _unsorted(estimate.corners_map, arrays.corner_order)
     corners_map += origin_map
     return Solution(
@@ -116,7 +144,7 @@ def _report(
         chi2_per_dof=variance.all,
         observation_factor=variance.observations,
         time_s=time.perf_counter() - began,
-        covariance=Covariance(whitening),
+        covariance=Covariance(descent),
     )
 
 
@@ -129,18 +157,27 @@ class _Seen:
     behind: BoolArray
 
 
-def _seen(problem: Problem, whitening: Whitening) -> _Seen:
-    arrays, count = whitening.arrays, len(whitening.arrays.pair)
+def _seen(problem: Problem, arrays: Arrays, estimate: Estimate) -> _Seen:
+    if arrays.passes is not None:
+        out = _Seen(*arrays.passes.report(estimate, problem.intrinsic[:, :2]))
+    else:
+        out = _seen_by_torch(problem, arrays, estimate)
+    on_line = problem.observations.on_line
+    if on_line.any():
+        out.mahalanobis2[on_line] = as_of_point(out.mahalanobis2[on_line])
+    return out
+
+
+def _seen_by_torch(problem: Problem, arrays: Arrays, estimate: Estimate) -> _Seen:
+    count, table = len(arrays.pair), pair_table(arrays, estimate)
     out = _Seen(np.empty((count, 2)), np.empty(count), np.empty(count, dtype=bool))
     for run in arrays.runs():
-        view = observe(run, whitening.table, whitening.estimate.corners_map)
+        view = observe(run, table, estimate.corners_map)
         rows = arrays.order[run.observations].cpu().numpy()
         focal = problem.intrinsic[problem.observations.camera[rows], :2]
         out.residual_px[rows] = view.off.T.cpu().numpy() * focal
         out.mahalanobis2[rows] = view.squared.cpu().numpy()
         out.behind[rows] = (view.point[2] <= NEAR_M).cpu().numpy()
-    on_line = problem.observations.on_line
-    out.mahalanobis2[on_line] = as_of_point(out.mahalanobis2[on_line])
     return out
 
 
@@ -169,17 +206,20 @@ def _unsorted(values: Tensor, order: Tensor) -> FloatArray:
 def _status(descent: Descent, options: SolveOptions, behind: bool) -> Status:
     if behind:
         return Status.BEHIND_CAMERA
-    if descent.whitening.is_singular:
+    if descent.is_singular:
         return Status.UNDETERMINED
     if descent.gap <= options.gap_tolerance:
         return Status.CONVERGED
     return Status.EVALUATIONS_EXHAUSTED if descent.progressing else Status.STALLED
 
 
-def _variance_factors(arrays: Arrays, terms: dict[str, Tensor], squared: FloatArray) -> VarianceFactors:
-    """Those of a solve whose cost consists of ``terms``."""
+def _variance_factors(
+    arrays: Arrays, terms: dict[str, Tensor], squared: FloatArray, scale: float
+) -> VarianceFactors:
+    """Those of a solve whose cost consists of ``terms``, and whose noise has the ``scale``."""
     of_priors = 2 * sum(float(value) for name, value in terms.items() if name != "observations")
     centres = int((arrays.centre_information_root > 0).sum())
     surveyed = int((arrays.control_information > 0).sum())
     known = 2 * surveyed + centres + len(arrays.lengths.first)
-    return variance_factors(squared, of_priors, 2 * arrays.corner_count + 6 * arrays.camera_count - known)
+    free = 2 * arrays.corner_count + 6 * arrays.camera_count - known
+    return variance_factors(squared, of_priors, free, scale)

@@ -11,8 +11,8 @@ from v2hdm.adjust.linear import corner_blocks, jacobians
 from v2hdm.adjust.residuals import Estimate, of_each, pair_table, project
 from v2hdm.geometry.tensors import inverse
 
-# Below this sine of the depression a ray meets the ground too far away to say where.
-_MIN_DEPRESSION_SINE = 0.01
+MIN_DEPRESSION_SINE = 0.01
+"""Below this sine of the depression a ray meets the ground too far away to say where."""
 
 
 def ray_table(arrays: Arrays, cam_from_vehicle: Tensor) -> Tensor:
@@ -28,11 +28,11 @@ def ground_hits(run: Run, table: Tensor) -> tuple[Tensor, Tensor]:
     Returns the points (2, k) of the map, and the sine (k,) of the ray's depression below the horizon;
     where that is not positive, the ray misses the ground and the point means nothing.
     """
-    map_from_cam = of_each(table, run.pair).view(3, 4, -1)
-    ray = map_from_cam[:, 0] * run.measured[0] + map_from_cam[:, 1] * run.measured[1] + map_from_cam[:, 2]
-    centre = map_from_cam[:, 3]
+    columns = of_each(table, run.pair).view(3, 4, -1)
+    ray = columns[:, 0] * run.measured[0] + columns[:, 1] * run.measured[1] + columns[:, 2]
+    centre = columns[:, 3]
     sine = -ray[2] / ray.norm(dim=0)
-    usable = torch.where(sine > _MIN_DEPRESSION_SINE, ray[2], -1.0)
+    usable = torch.where(sine > MIN_DEPRESSION_SINE, ray[2], -1.0)
     return torch.addcmul(centre[:2], ray[:2], -centre[2] / usable), sine
 
 
@@ -46,12 +46,15 @@ def back_project(arrays: Arrays, cam_from_vehicle: Tensor) -> tuple[Tensor, Tens
     """
     corners = arrays.centre.new_empty(arrays.corner_count, 2)
     state = torch.zeros_like(arrays.state_information_root)
-    table = pair_table(arrays, Estimate(cam_from_vehicle, state, corners, arrays.no_clock()))
+    estimate = Estimate(cam_from_vehicle, state, corners, arrays.no_clock())
+    if arrays.passes is not None:
+        return arrays.passes.back_project(estimate)
+    table = pair_table(arrays, estimate)
     rays = ray_table(arrays, cam_from_vehicle)
     fixed = torch.empty_like(arrays.joined)
     for run in arrays.runs():
         ground, sine = ground_hits(run, rays)
-        usable = sine > _MIN_DEPRESSION_SINE
+        usable = sine > MIN_DEPRESSION_SINE
         ground = torch.where(usable, ground, 0.0)
         _, by_corner = jacobians(run, project(run, table, ground))
         xx, yx, yy = torch.where(usable, corner_blocks(by_corner), 0.0)

@@ -27,10 +27,12 @@ from v2hdm.adjust.problem import Problem
 from v2hdm.adjust.residuals import (
     Priors,
     Tally,
+    by_camera_and_frame,
     by_unknowns,
     centre_residual,
     length_residual,
     observe,
+    wrenches,
 )
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.whitening import Whitening
@@ -191,7 +193,8 @@ class _Bench:
             torch.zeros_like(arrays.state_information_root),
             arrays.no_clock(),
         )
-        return self.whitening.whiten(by_unknowns(arrays, estimate, table, tally.by_table, by_corner, priors))
+        wrench = by_camera_and_frame(arrays, wrenches(table, tally.by_table))
+        return self.whitening.whiten(by_unknowns(arrays, estimate, wrench, by_corner, priors))
 
 
 def suspects(problem: Problem, solution: Solution) -> tuple[Suspect, ...]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import accumulate, combinations
 
 import numpy as np
 import torch
@@ -62,13 +62,18 @@ class TiledMatrix:
 
     Attributes:
         pattern: which there are.
+        values: all numbers. What follows are views of them.
+        diagonal_at, panel_at: where each tile on the diagonal begins, and where what stands below it.
         diagonal: tiles on the diagonal, in elimination order, without the tip.
         panels: what stands below each, stacked, the tip's rows last.
         tip: the last tile on the diagonal.
-        tiles: views of all of them by (row, column) in elimination order, or :data:`TIP`.
+        tiles: all of them by (row, column) in elimination order, or :data:`TIP`.
     """
 
     pattern: Pattern
+    values: Tensor
+    diagonal_at: tuple[int, ...]
+    panel_at: tuple[int, ...]
     diagonal: tuple[Tensor, ...]
     panels: tuple[Tensor, ...]
     tip: Tensor
@@ -77,16 +82,23 @@ class TiledMatrix:
     @classmethod
     def zeros(cls, pattern: Pattern, size: int, tip: int, like: Tensor) -> TiledMatrix:
         """Tiles of ``size`` rows and columns and a tip of ``tip``; numbers are of the kind of ``like``."""
-        diagonal = tuple(like.new_zeros(size, size) for _ in pattern.below)
-        panels = tuple(like.new_zeros(len(below) * size + tip, size) for below in pattern.below)
-        last = like.new_zeros(tip, tip)
+        heights = [len(below) * size + tip for below in pattern.below]
+        begins = [0, *accumulate(size * (size + height) for height in heights)]
+        values = like.new_zeros(begins[-1] + tip * tip)
+        panel_at = [begin + size * size for begin in begins[:-1]]
+        diagonal = tuple(values[at : at + size * size].view(size, size) for at in begins[:-1])
+        panels = tuple(
+            values[at : at + height * size].view(height, size)
+            for at, height in zip(panel_at, heights, strict=True)
+        )
+        last = values[begins[-1] :].view(tip, tip)
         tiles = {(TIP, TIP): last}
         for column, below in enumerate(pattern.below):
-            heights = [size] * len(below) + [tip]
-            for row, tile in zip((*below, TIP), torch.split(panels[column], heights), strict=True):
+            rows = [size] * len(below) + [tip]
+            for row, tile in zip((*below, TIP), torch.split(panels[column], rows), strict=True):
                 tiles[row, column] = tile
             tiles[column, column] = diagonal[column]
-        return cls(pattern, diagonal, panels, last, tiles)
+        return cls(pattern, values, tuple(begins[:-1]), tuple(panel_at), diagonal, panels, last, tiles)
 
 
 @dataclass(frozen=True)

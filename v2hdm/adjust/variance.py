@@ -22,7 +22,9 @@ class VarianceFactors:
     observations: float
 
 
-def variance_factors(squared: FloatArray, of_priors: float, free: int) -> VarianceFactors:
+def variance_factors(
+    squared: FloatArray, of_priors: float, free: int, scale: float | None = None
+) -> VarianceFactors:
     """Chi-square per degree of freedom, of good observations and priors together and of the former.
 
     What the priors have left of their own degrees of freedom is what the observations have taken of them:
@@ -33,8 +35,9 @@ def variance_factors(squared: FloatArray, of_priors: float, free: int) -> Varian
         squared: (K,) squared residuals of the observations, in standard deviations.
         of_priors: chi-square of the priors.
         free: unknowns less those that priors other than the poses' hold.
+        scale: :func:`~v2hdm.adjust.gating.noise_scale` of ``squared``, where it is known already.
     """
-    good = squared <= _OUTLIER_SQUARED * noise_scale(squared)
+    good = squared <= _OUTLIER_SQUARED * (noise_scale(squared) if scale is None else scale)
     of_observations = float(squared.sum(where=good)) / _TRIMMED_MEAN
     redundancy = 2 * int(good.sum()) - free
     return VarianceFactors(

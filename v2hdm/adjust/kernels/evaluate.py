@@ -1,0 +1,221 @@
+"""Corners moved, cost and gradient, and the gradient carried back, in one pass."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from v2hdm.adjust.kernels.build import inlined, kernel
+from v2hdm.adjust.kernels.layout import Layout
+from v2hdm.adjust.kernels.parts import (
+    add_corner_priors,
+    add_force,
+    add_loss,
+    along_axes,
+    number_touched,
+    see,
+    solve_unit,
+    solve_unit_transposed,
+    weigh,
+    whiten,
+)
+from v2hdm.adjust.whitening import WEIGHT_FLOOR
+from v2hdm.records import FloatArray, IntArray
+
+
+class Base(NamedTuple):
+    """Where a whitening was made: its pairs' table (P, 16), corners (N, 2), and the factors of V.
+
+    ``rows`` is L^-1 W' (2 N, D) where frames have no states; else it is computed anew, by observation.
+    """
+
+    table: FloatArray
+    corners: FloatArray
+    lower: FloatArray
+    joint: FloatArray
+    rows: FloatArray
+
+
+class Scratch(NamedTuple):
+    """What :func:`evaluate` works in: numbers of pairs (P,), a unit's linearised observations and steps."""
+
+    slot: IntArray
+    known: FloatArray
+    step: FloatArray
+    gradient: FloatArray
+
+    @classmethod
+    def of(cls, layout: Layout, pairs: int) -> Scratch:
+        """Room for any chunk."""
+        return cls(
+            np.empty(pairs, dtype=np.int32),
+            np.empty((layout.most_seen, 8)),
+            np.empty(2 * layout.most_joined),
+            np.empty(2 * layout.most_joined),
+        )
+
+
+class Evaluation(NamedTuple):
+    """What :func:`evaluate` computes, as in :class:`~v2hdm.adjust.kernels.linearise.Linearisation`.
+
+    ``corners`` (N, 2) are those moved; ``whitened`` (N, 2) is the gradient by their whitened variables.
+    """
+
+    costs: FloatArray
+    wrench: FloatArray
+    coupled: FloatArray
+    carried: FloatArray
+    corners: FloatArray
+    whitened: FloatArray
+
+
+@inlined
+def _oppose(known: FloatArray, i: int, mx: float, my: float, mz: float) -> tuple[float, float, float]:
+    """The force with which the observation in row i of ``known`` opposes a motion of its point."""
+    along = known[i, 4] * mz
+    x, y = mx * known[i, 3] + known[i, 0] * along, my * known[i, 3] + known[i, 1] * along
+    fu, fv = known[i, 5] * x + known[i, 6] * y, known[i, 6] * x + known[i, 7] * y
+    return fu * known[i, 3], fv * known[i, 3], (fu * known[i, 0] + fv * known[i, 1]) * known[i, 4]
+
+
+@inlined
+def _recall(
+    layout: Layout,
+    table: FloatArray,
+    k: int,
+    x: float,
+    y: float,
+    code: int,
+    scale: float,
+    known: FloatArray,
+    i: int,
+) -> None:
+    """Write a linearised observation (8,): point, inverse depth, slope, weighted information at depth 1."""
+    px, py, pz, inverse, slope, u, v = see(layout, table, k, x, y)
+    a, b, c = layout.root[0, k], layout.root[1, k], layout.root[2, k]
+    weight = 1.0
+    if code:
+        r0, r1 = whiten(layout, k, u, v)
+        weight = weigh(code, scale, r0 * r0 + r1 * r1)
+        weight = WEIGHT_FLOOR if weight < WEIGHT_FLOOR else weight
+    known[i, 0], known[i, 1], known[i, 2], known[i, 3], known[i, 4] = px, py, pz, inverse, slope
+    known[i, 5], known[i, 6], known[i, 7] = (a * a + b * b) * weight, b * c * weight, c * c * weight
+
+
+@kernel
+def evaluate(
+    begin: int,
+    end: int,
+    layout: Layout,
+    base: Base,
+    table: FloatArray,
+    motion: FloatArray,
+    cameras: FloatArray,
+    own: FloatArray,
+    code: int,
+    scale: float,
+    scratch: Scratch,
+    out: Evaluation,
+) -> None:
+    """Evaluate chunks ``begin`` to ``end`` at a step from where the whitening was made.
+
+    Args:
+        begin: the first chunk.
+        end: the chunk after the last.
+        layout: the problem.
+        base: the whitening.
+        table: of the pairs (P, 16) after the step.
+        motion: the step as left tangents (P, 6) of the pairs, where frames have states.
+        cameras: that of the cameras' unknowns (D,).
+        own: the whitened variables (N, 2) of the corners.
+        code: the loss.
+        scale: of the loss.
+        scratch: room to work in.
+        out: where the results go.
+    """
+    slot, known, step, gradient = scratch
+    states = len(base.rows) == 0
+    for q in range(begin, end):
+        number_touched(layout, q, slot)
+        total, product = 0.0, 1.0
+        for u in range(layout.chunk[q], layout.chunk[q + 1]):
+            first, last = layout.unit[u], layout.unit[u + 1]
+            size, seen = last - first, layout.begin[first]
+            joint_at = layout.joint_at[u]
+            for c in range(first, last):
+                x, y = base.corners[c, 0], base.corners[c, 1]
+                sx = sy = 0.0
+                if not states:
+                    for p in range(len(cameras)):
+                        sx += base.rows[2 * c, p] * cameras[p]
+                        sy += base.rows[2 * c + 1, p] * cameras[p]
+                for k in range(layout.begin[c], layout.begin[c + 1] if states else layout.begin[c]):
+                    j, t = k - seen, layout.pair[k]
+                    _recall(layout, base.table, k, x, y, code, scale, known, j)
+                    fx, fy, fz = _oppose(
+                        known,
+                        j,
+                        motion[t, 0] + motion[t, 4] * known[j, 2] - motion[t, 5] * known[j, 1],
+                        motion[t, 1] + motion[t, 5] * known[j, 0] - motion[t, 3] * known[j, 2],
+                        motion[t, 2] + motion[t, 3] * known[j, 1] - motion[t, 4] * known[j, 0],
+                    )
+                    ax, ay = along_axes(base.table, t, fx, fy, fz)
+                    sx += ax
+                    sy += ay
+                i = 2 * (c - first)
+                step[i], step[i + 1] = sx, sy
+            if states:
+                solve_unit(size, base.lower, first, base.joint, joint_at, step)
+            for c in range(first, last):
+                i = 2 * (c - first)
+                step[i], step[i + 1] = own[c, 0] - step[i], own[c, 1] - step[i + 1]
+            solve_unit_transposed(size, base.lower, first, base.joint, joint_at, step)
+            for c in range(first, last):
+                i = 2 * (c - first)
+                x, y = base.corners[c, 0] + step[i], base.corners[c, 1] + step[i + 1]
+                out.corners[c, 0], out.corners[c, 1] = x, y
+                gx = gy = 0.0
+                for k in range(layout.begin[c], layout.begin[c + 1]):
+                    px, py, pz, inverse, slope, du, dv = see(layout, table, k, x, y)
+                    r0, r1 = whiten(layout, k, du, dv)
+                    squared = r0 * r0 + r1 * r1
+                    total, product = add_loss(code, scale, squared, total, product)
+                    weight = weigh(code, scale, squared)
+                    w0, w1 = weight * r0, weight * r1
+                    fu = layout.root[0, k] * w0 + layout.root[1, k] * w1
+                    fv = layout.root[2, k] * w1
+                    fx, fy, fz = fu * inverse, fv * inverse, (fu * px + fv * py) * slope
+                    ax, ay = along_axes(table, layout.pair[k], fx, fy, fz)
+                    gx += ax
+                    gy += ay
+                    add_force(out.wrench, slot[layout.pair[k]], px, py, pz, fx, fy, fz)
+                gradient[i], gradient[i + 1] = gx, gy
+            add_corner_priors(layout, u, out.corners, gradient, out.costs[q])
+            solve_unit(size, base.lower, first, base.joint, joint_at, gradient)
+            for c in range(first, last):
+                i = 2 * (c - first)
+                out.whitened[c, 0], out.whitened[c, 1] = gradient[i], gradient[i + 1]
+                if not states:
+                    for p in range(len(cameras)):
+                        out.carried[q, p] += base.rows[2 * c, p] * gradient[i]
+                        out.carried[q, p] += base.rows[2 * c + 1, p] * gradient[i + 1]
+            if not states:
+                continue
+            solve_unit_transposed(size, base.lower, first, base.joint, joint_at, gradient)
+            for c in range(first, last):
+                x, y = gradient[2 * (c - first)], gradient[2 * (c - first) + 1]
+                for k in range(layout.begin[c], layout.begin[c + 1]):
+                    j, t = k - seen, layout.pair[k]
+                    fx, fy, fz = _oppose(
+                        known,
+                        j,
+                        base.table[t, 0] * x + base.table[t, 1] * y,
+                        base.table[t, 4] * x + base.table[t, 5] * y,
+                        base.table[t, 8] * x + base.table[t, 9] * y,
+                    )
+                    add_force(out.coupled, slot[t], known[j, 0], known[j, 1], known[j, 2], fx, fy, fz)
+        if code == 2:
+            total += scale * scale * math.log(product)
+        out.costs[q, 0] = total / 2

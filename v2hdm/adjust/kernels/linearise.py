@@ -1,0 +1,252 @@
+"""Cost, gradient and Gauss-Newton blocks in one pass, the corners eliminated unit by unit."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from v2hdm.adjust.kernels.build import inlined, kernel
+from v2hdm.adjust.kernels.layout import Layout
+from v2hdm.adjust.kernels.parts import (
+    add_corner_priors,
+    add_force,
+    add_loss,
+    factorise_unit,
+    length_residual,
+    number_touched,
+    see,
+    solve_unit,
+    solve_unit_rows,
+    solve_unit_transposed,
+    weigh,
+    whiten,
+)
+from v2hdm.adjust.whitening import WEIGHT_FLOOR
+from v2hdm.records import FloatArray, IntArray
+
+
+class Linearisation(NamedTuple):
+    """What :func:`linearise` computes; R pairs are touched in all chunks together, Q chunks.
+
+    Attributes:
+        costs: (Q, 3) of observations, survey and known lengths.
+        wrench: (R, 6) the gradient by the pairs.
+        coupled: (R, 6) W V^-1 times the gradient by the corners, by pair, where frames have states.
+        carried: (Q, D) the same by the cameras' unknowns, where they have none.
+        rows: (2 N, D) then L^-1 W', one corner after the other; else (0, D).
+        whitened: (N, 2) the gradient by the corners, L^-1 g.
+        lower, joint: the factors of V, :func:`v2hdm.adjust.kernels.parts.factorise_unit`.
+        own: J'J by pair (R, 21) or, where pairs move with their camera alone, by camera (Q C, 21).
+        tip: (Q, D, D) B'B of the cameras' unknowns, its lower triangle.
+        failed: (Q,) units whose block has no factor.
+    """
+
+    costs: FloatArray
+    wrench: FloatArray
+    coupled: FloatArray
+    carried: FloatArray
+    rows: FloatArray
+    whitened: FloatArray
+    lower: FloatArray
+    joint: FloatArray
+    own: FloatArray
+    tip: FloatArray
+    failed: FloatArray
+
+
+class Scratch(NamedTuple):
+    """What :func:`linearise` works in: the number of each pair (P,), and derivatives and blocks of a unit."""
+
+    slot: IntArray
+    jacobian: FloatArray
+    coupling: FloatArray
+    block: FloatArray
+    gradient: FloatArray
+    rows: FloatArray
+
+    @classmethod
+    def of(cls, layout: Layout, pairs: int, width: int) -> Scratch:
+        """Room for any chunk; ``width`` is the number of the cameras' unknowns."""
+        n = 2 * layout.most_joined
+        return cls(
+            np.empty(pairs, dtype=np.int32),
+            np.empty(16),
+            np.empty((layout.most_seen, 12)),
+            np.empty((n, n)),
+            np.empty(n),
+            np.empty((n, width)),
+        )
+
+
+@inlined
+def differentiate(
+    layout: Layout, table: FloatArray, k: int, x: float, y: float, jacobian: FloatArray
+) -> tuple[float, float, float, float, float]:
+    """Write the derivatives (16,) of observation k's residual: by pair (2, 6), then by corner (2, 2).
+
+    Returns its residual and its point.
+    """
+    px, py, pz, inverse, slope, u, v = see(layout, table, k, x, y)
+    a, b, c = layout.root[0, k], layout.root[1, k], layout.root[2, k]
+    ad, bd, cd = a * inverse, b * inverse, c * inverse
+    g, h = a * px * slope, (b * px + c * py) * slope
+    t = layout.pair[k]
+    jacobian[0], jacobian[1], jacobian[2] = ad, 0.0, g
+    jacobian[3], jacobian[4], jacobian[5] = py * g, pz * ad - px * g, -py * ad
+    jacobian[6], jacobian[7], jacobian[8] = bd, cd, h
+    jacobian[9], jacobian[10], jacobian[11] = py * h - pz * cd, pz * bd - px * h, px * cd - py * bd
+    jacobian[12] = ad * table[t, 0] + g * table[t, 8]
+    jacobian[13] = ad * table[t, 1] + g * table[t, 9]
+    jacobian[14] = bd * table[t, 0] + cd * table[t, 4] + h * table[t, 8]
+    jacobian[15] = bd * table[t, 1] + cd * table[t, 5] + h * table[t, 9]
+    first, second = whiten(layout, k, u, v)
+    return first, second, px, py, pz
+
+
+@inlined
+def couple(jacobian: FloatArray, weight: float, out: FloatArray, i: int) -> None:
+    """Write W' of an observation, (12,), from its :func:`differentiate`, in row i of ``out``."""
+    for p in range(6):
+        top, low = weight * jacobian[p], weight * jacobian[6 + p]
+        out[i, p] = jacobian[12] * top + jacobian[14] * low
+        out[i, 6 + p] = jacobian[13] * top + jacobian[15] * low
+
+
+@kernel
+def linearise(
+    begin: int,
+    end: int,
+    layout: Layout,
+    table: FloatArray,
+    clock: FloatArray,
+    corners: FloatArray,
+    code: int,
+    scale: float,
+    growth: float,
+    by_pair: bool,
+    states: bool,
+    scratch: Scratch,
+    out: Linearisation,
+) -> None:
+    """Linearise chunks ``begin`` to ``end``.
+
+    Args:
+        begin: the first chunk.
+        end: the chunk after the last.
+        layout: the problem.
+        table: of the pairs (P, 16).
+        clock: (P, 6 Q) the pairs' left tangents by the clock offset of their camera.
+        corners: (N, 2) where.
+        code: the loss.
+        scale: of the loss.
+        growth: what the diagonal of V is multiplied by.
+        by_pair: whether J'J is asked for by pair.
+        states: whether frames have states.
+        scratch: room to work in.
+        out: where the results go.
+    """
+    cameras = len(table) // layout.frames
+    each = out.tip.shape[1] // cameras
+    slot, jacobian, coupling, block, gradient, rows = scratch
+    for q in range(begin, end):
+        number_touched(layout, q, slot)
+        total, product, cut = 0.0, 1.0, scale * scale
+        for u in range(layout.chunk[q], layout.chunk[q + 1]):
+            first, last = layout.unit[u], layout.unit[u + 1]
+            size, seen = last - first, layout.begin[first]
+            block[: 2 * size, : 2 * size] = 0.0
+            gradient[: 2 * size] = 0.0
+            rows[: 2 * size] = 0.0
+            for c in range(first, last):
+                i = 2 * (c - first)
+                x, y = corners[c, 0], corners[c, 1]
+                gx = gy = xx = yx = yy = 0.0
+                for k in range(layout.begin[c], layout.begin[c + 1]):
+                    r0, r1, px, py, pz = differentiate(layout, table, k, x, y, jacobian)
+                    squared = r0 * r0 + r1 * r1
+                    total, product = add_loss(code, scale, squared, total, product)
+                    weight = weigh(code, scale, squared)
+                    w0, w1 = weight * r0, weight * r1
+                    gx += jacobian[12] * w0 + jacobian[14] * w1
+                    gy += jacobian[13] * w0 + jacobian[15] * w1
+                    at = slot[layout.pair[k]]
+                    fx, fy = jacobian[0] * w0 + jacobian[6] * w1, jacobian[7] * w1
+                    fz = jacobian[2] * w0 + jacobian[8] * w1
+                    add_force(out.wrench, at, px, py, pz, fx, fy, fz)
+                    weight = WEIGHT_FLOOR if weight < WEIGHT_FLOOR else weight
+                    xx += weight * (jacobian[12] * jacobian[12] + jacobian[14] * jacobian[14])
+                    yx += weight * (jacobian[13] * jacobian[12] + jacobian[15] * jacobian[14])
+                    yy += weight * (jacobian[13] * jacobian[13] + jacobian[15] * jacobian[15])
+                    camera = layout.pair[k] // layout.frames
+                    owner, m = at if by_pair else q * cameras + camera, 0
+                    for p in range(6):
+                        top, low = weight * jacobian[p], weight * jacobian[6 + p]
+                        for s in range(p, 6):
+                            out.own[owner, m] += top * jacobian[s] + low * jacobian[6 + s]
+                            m += 1
+                    j, column = k - seen if states else 0, camera * each
+                    couple(jacobian, weight, coupling, j)
+                    for p in range(6):
+                        rows[i, column + p] += coupling[j, p]
+                        rows[i + 1, column + p] += coupling[j, 6 + p]
+                    if each > 6:
+                        for p in range(6):
+                            rows[i, column + 6] += coupling[j, p] * clock[layout.pair[k], p]
+                            rows[i + 1, column + 6] += coupling[j, 6 + p] * clock[layout.pair[k], p]
+                surveyed = layout.control_information[c]
+                block[i, i], block[i + 1, i], block[i + 1, i + 1] = xx + surveyed, yx, yy + surveyed
+                gradient[i], gradient[i + 1] = gx, gy
+            add_corner_priors(layout, u, corners, gradient, out.costs[q])
+            _add_lengths(layout, u, corners, block)
+            joint_at = layout.joint_at[u]
+            if not factorise_unit(size, block, growth, out.lower, first, out.joint, joint_at):
+                out.failed[q] += 1.0
+                continue
+            solve_unit(size, out.lower, first, out.joint, joint_at, gradient)
+            width = cameras * each
+            solve_unit_rows(size, out.lower, first, out.joint, joint_at, rows, 0, width)
+            for c in range(first, last):
+                i = 2 * (c - first)
+                out.whitened[c, 0], out.whitened[c, 1] = gradient[i], gradient[i + 1]
+                if not states:
+                    for p in range(width):
+                        out.rows[2 * c, p], out.rows[2 * c + 1, p] = rows[i, p], rows[i + 1, p]
+                        out.carried[q, p] += rows[i, p] * gradient[i] + rows[i + 1, p] * gradient[i + 1]
+            if states:
+                solve_unit_transposed(size, out.lower, first, out.joint, joint_at, gradient)
+                for c in range(first, last):
+                    i = 2 * (c - first)
+                    x, y = gradient[i], gradient[i + 1]
+                    for k in range(layout.begin[c], layout.begin[c + 1]):
+                        at, j = slot[layout.pair[k]], k - seen
+                        for p in range(6):
+                            out.coupled[at, p] += coupling[j, p] * x + coupling[j, 6 + p] * y
+            tip = out.tip[q]
+            for i in range(0, 2 * size, 2):
+                for p in range(width):
+                    top, low = rows[i, p], rows[i + 1, p]
+                    for s in range(p + 1):
+                        tip[p, s] += top * rows[i, s] + low * rows[i + 1, s]
+        if code == 2:
+            total += cut * math.log(product)
+        out.costs[q, 0] = total / 2
+
+
+@inlined
+def _add_lengths(layout: Layout, u: int, corners: FloatArray, block: FloatArray) -> None:
+    """Add J'J of a unit's known lengths to the lower triangle of its block."""
+    first = layout.unit[u]
+    for m in range(layout.length_at[u], layout.length_at[u + 1]):
+        _, jx, jy = length_residual(layout, m, corners)
+        a, b = 2 * (layout.length_first[m] - first), 2 * (layout.length_second[m] - first)
+        for at in (a, b):
+            block[at, at] += jx * jx
+            block[at + 1, at] += jx * jy
+            block[at + 1, at + 1] += jy * jy
+        low, high = min(a, b), max(a, b)
+        block[high, low] -= jx * jx
+        block[high, low + 1] -= jx * jy
+        block[high + 1, low] -= jx * jy
+        block[high + 1, low + 1] -= jy * jy

@@ -1,0 +1,107 @@
+"""Where corners start, and what the report says of each observation."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from v2hdm.adjust.kernels.build import kernel
+from v2hdm.adjust.kernels.layout import Layout
+from v2hdm.adjust.kernels.parts import see, whiten
+from v2hdm.adjust.start import MIN_DEPRESSION_SINE
+from v2hdm.geometry.tensors import NEAR_M
+from v2hdm.records import BoolArray, FloatArray, IntArray
+
+
+@kernel
+def back_project(
+    begin: int,
+    end: int,
+    layout: Layout,
+    table: FloatArray,
+    corners: FloatArray,
+    fixed: BoolArray,
+) -> None:
+    """Start the corners (N, 2) of chunks ``begin`` to ``end``, and say which (N,) a ray fixes."""
+    for c in range(layout.unit[layout.chunk[begin]], layout.unit[layout.chunk[end]]):
+        xx = yx = yy = x = y = 0.0
+        for k in range(layout.begin[c], layout.begin[c + 1]):
+            t = layout.pair[k]
+            u, v = layout.measured[0, k], layout.measured[1, k]
+            # The ray and the camera's centre in the map, by the transposed rotation.
+            dx = table[t, 0] * u + table[t, 4] * v + table[t, 8]
+            dy = table[t, 1] * u + table[t, 5] * v + table[t, 9]
+            dz = table[t, 2] * u + table[t, 6] * v + table[t, 10]
+            least = MIN_DEPRESSION_SINE * MIN_DEPRESSION_SINE * (dx * dx + dy * dy + dz * dz)
+            if not (dz < 0 and dz * dz > least):
+                continue
+            sx, sy, sz = table[t, 3], table[t, 7], table[t, 11]
+            reach = (table[t, 2] * sx + table[t, 6] * sy + table[t, 10] * sz) / dz
+            gx = reach * dx - (table[t, 0] * sx + table[t, 4] * sy + table[t, 8] * sz)
+            gy = reach * dy - (table[t, 1] * sx + table[t, 5] * sy + table[t, 9] * sz)
+            px, py, _, inverse, slope, _, _ = see(layout, table, k, gx, gy)
+            xu = inverse * table[t, 0] + slope * px * table[t, 8]
+            yu = inverse * table[t, 1] + slope * px * table[t, 9]
+            xv = inverse * table[t, 4] + slope * py * table[t, 8]
+            yv = inverse * table[t, 5] + slope * py * table[t, 9]
+            j0, j2 = whiten(layout, k, xu, xv)
+            j1, j3 = whiten(layout, k, yu, yv)
+            a, b, d = j0 * j0 + j2 * j2, j0 * j1 + j2 * j3, j1 * j1 + j3 * j3
+            xx, yx, yy = xx + a, yx + b, yy + d
+            x, y = x + a * gx + b * gy, y + b * gx + d * gy
+        fixed[c] = xx > 0
+        if not xx > 0:
+            corners[c, 0] = corners[c, 1] = 0.0
+            continue
+        first = math.sqrt(xx)
+        below = yx / first
+        rest, least = yy - below * below, 1e-12 * yy
+        last = math.sqrt(least if rest < least else rest)
+        top = x / first
+        low = (y - below * top) / last / last
+        corners[c, 0], corners[c, 1] = (top - below * low) / first, low
+
+
+class Report(NamedTuple):
+    """What is said of the problem's observations (K,), in its order: see :class:`v2hdm.adjust.Solution`."""
+
+    residual_px: FloatArray
+    mahalanobis2: FloatArray
+    behind: BoolArray
+
+
+@kernel
+def report(
+    begin: int,
+    end: int,
+    layout: Layout,
+    table: FloatArray,
+    corners: FloatArray,
+    order: IntArray,
+    focal: FloatArray,
+    out: Report,
+) -> None:
+    """Report on chunks ``begin`` to ``end``; ``order`` (K,) is the problem's, ``focal`` (C, 2) in px."""
+    for c in range(layout.unit[layout.chunk[begin]], layout.unit[layout.chunk[end]]):
+        x, y = corners[c, 0], corners[c, 1]
+        for k in range(layout.begin[c], layout.begin[c + 1]):
+            _, _, pz, _, _, u, v = see(layout, table, k, x, y)
+            r0, r1 = whiten(layout, k, u, v)
+            row, camera = order[k], layout.pair[k] // layout.frames
+            out.residual_px[row, 0] = u * focal[camera, 0]
+            out.residual_px[row, 1] = v * focal[camera, 1]
+            out.mahalanobis2[row] = r0 * r0 + r1 * r1
+            out.behind[row] = pz <= NEAR_M
+
+
+@kernel
+def squared_residuals(
+    begin: int, end: int, layout: Layout, table: FloatArray, corners: FloatArray, out: FloatArray
+) -> None:
+    """Squared Mahalanobis distances (K,) of the observations of chunks ``begin`` to ``end``."""
+    for c in range(layout.unit[layout.chunk[begin]], layout.unit[layout.chunk[end]]):
+        x, y = corners[c, 0], corners[c, 1]
+        for k in range(layout.begin[c], layout.begin[c + 1]):
+            _, _, _, _, _, u, v = see(layout, table, k, x, y)
+            r0, r1 = whiten(layout, k, u, v)
+            out[k] = r0 * r0 + r1 * r1

@@ -1,0 +1,231 @@
+"""What the kernels have in common: an observation, a loss, the factor of a unit's corners.
+
+The formulas are those of :mod:`~v2hdm.adjust.residuals`, :mod:`~v2hdm.adjust.linear`,
+:mod:`~v2hdm.adjust.robust` and :mod:`~v2hdm.adjust.corner_factor`, where they are explained, and which tests
+hold these to. A pair's table is its ``cam_from_map``, row by row (16,).
+"""
+
+from __future__ import annotations
+
+import math
+
+from v2hdm.adjust.corner_factor import CORNER_FLOOR, PIVOT_FLOOR
+from v2hdm.adjust.kernels.build import inlined
+from v2hdm.adjust.kernels.layout import Layout
+from v2hdm.geometry.tensors import NEAR_M
+from v2hdm.records import FloatArray, IntArray
+
+_Seen = tuple[float, float, float, float, float, float, float]
+
+# A product of the Cauchy loss's terms is taken the logarithm of before it can overflow.
+_LARGE = 1e150
+
+
+@inlined
+def see(layout: Layout, table: FloatArray, k: int, x: float, y: float) -> _Seen:
+    """Observation k of the ground point x, y: p, the inverse depth and its slope, and how far it is off."""
+    t = layout.pair[k]
+    px = table[t, 0] * x + table[t, 1] * y + table[t, 3]
+    py = table[t, 4] * x + table[t, 5] * y + table[t, 7]
+    pz = table[t, 8] * x + table[t, 9] * y + table[t, 11]
+    near = pz if not pz < NEAR_M else NEAR_M
+    reciprocal = 1.0 / near
+    slope = -reciprocal * reciprocal
+    inverse = reciprocal + slope * (pz - near)
+    return (
+        px,
+        py,
+        pz,
+        inverse,
+        slope,
+        px * inverse - layout.measured[0, k],
+        py * inverse - layout.measured[1, k],
+    )
+
+
+@inlined
+def whiten(layout: Layout, k: int, u: float, v: float) -> tuple[float, float]:
+    """The whitened residual of observation k."""
+    return layout.root[0, k] * u, layout.root[1, k] * u + layout.root[2, k] * v
+
+
+@inlined
+def weigh(code: int, scale: float, squared: float) -> float:
+    """The derivative of the loss."""
+    if code == 0:
+        return 1.0
+    cut = scale * scale
+    if code == 1:
+        return 1.0 if squared <= cut else scale / math.sqrt(squared)
+    weight = cut / (cut + squared)
+    return weight if code == 2 else weight * weight
+
+
+@inlined
+def add_loss(code: int, scale: float, squared: float, total: float, product: float) -> tuple[float, float]:
+    """Add the loss to a total, the Cauchy loss as a factor of a product: one logarithm for many."""
+    if code == 0:
+        return total + squared, product
+    cut = scale * scale
+    if code == 1:
+        return total + (squared if squared <= cut else 2 * scale * math.sqrt(squared) - cut), product
+    ratio = squared / cut
+    if code == 3:
+        return total + squared / (1 + ratio), product
+    if not ratio < _LARGE:
+        return total + cut * math.log1p(ratio), product
+    product *= 1 + ratio
+    if product > _LARGE:
+        return total + cut * math.log(product), 1.0
+    return total, product
+
+
+@inlined
+def add_force(
+    out: FloatArray, at: int, px: float, py: float, pz: float, fx: float, fy: float, fz: float
+) -> None:
+    """Add a force at a point to row ``at`` of wrenches (n, 6)."""
+    out[at, 0] += fx
+    out[at, 1] += fy
+    out[at, 2] += fz
+    out[at, 3] += py * fz - pz * fy
+    out[at, 4] += pz * fx - px * fz
+    out[at, 5] += px * fy - py * fx
+
+
+@inlined
+def add_corner_priors(
+    layout: Layout, u: int, corners: FloatArray, gradient: FloatArray, costs: FloatArray
+) -> None:
+    """Add a unit's survey and known lengths to its gradient (2g,) and to ``costs[1]`` and ``costs[2]``."""
+    first = layout.unit[u]
+    for c in range(first, layout.unit[u + 1]):
+        information = layout.control_information[c]
+        if information > 0:
+            dx, dy = corners[c, 0] - layout.control[c, 0], corners[c, 1] - layout.control[c, 1]
+            gradient[2 * (c - first)] += dx * information
+            gradient[2 * (c - first) + 1] += dy * information
+            costs[1] += (dx * dx + dy * dy) * information / 2
+    for m in range(layout.length_at[u], layout.length_at[u + 1]):
+        residual, jx, jy = length_residual(layout, m, corners)
+        a, b = 2 * (layout.length_first[m] - first), 2 * (layout.length_second[m] - first)
+        gradient[a] += jx * residual
+        gradient[a + 1] += jy * residual
+        gradient[b] -= jx * residual
+        gradient[b + 1] -= jy * residual
+        costs[2] += residual * residual / 2
+
+
+@inlined
+def length_residual(layout: Layout, m: int, corners: FloatArray) -> tuple[float, float, float]:
+    """The whitened residual of a known length and its derivative by its first corner."""
+    a, b = layout.length_first[m], layout.length_second[m]
+    dx, dy = corners[a, 0] - corners[b, 0], corners[a, 1] - corners[b, 1]
+    distance = math.sqrt(dx * dx + dy * dy)
+    root = layout.length_root[m]
+    over = root / distance if distance > 0 else 0.0
+    return (distance - layout.length_m[m]) * root, dx * over, dy * over
+
+
+@inlined
+def factorise_unit(
+    size: int, block: FloatArray, growth: float, lower: FloatArray, c: int, joint: FloatArray, at: int
+) -> bool:
+    """Factorise a unit's block (2g, 2g): into column c of ``lower`` (3, N), or ``joint`` from ``at`` on."""
+    n = 2 * size
+    for i in range(n):
+        block[i, i] = block[i, i] * growth + CORNER_FLOOR
+    if size == 1:
+        first = math.sqrt(block[0, 0])
+        below = block[1, 0] / first
+        rest = block[1, 1] - below * below
+        least = PIVOT_FLOOR * block[1, 1]
+        lower[0, c], lower[1, c], lower[2, c] = first, below, math.sqrt(least if rest < least else rest)
+        return True
+    for i in range(size):
+        lower[0, c + i], lower[1, c + i], lower[2, c + i] = 1.0, 0.0, 1.0
+    for i in range(n):
+        for j in range(i + 1):
+            rest = block[i, j]
+            for m in range(j):
+                rest -= joint[at + i * n + m] * joint[at + j * n + m]
+            if j < i:
+                joint[at + i * n + j] = rest / joint[at + j * n + j]
+            elif rest > 0:
+                joint[at + i * n + i] = math.sqrt(rest)
+            else:
+                return False
+        for j in range(i + 1, n):
+            joint[at + i * n + j] = 0.0
+    return True
+
+
+@inlined
+def solve_unit(size: int, lower: FloatArray, c: int, joint: FloatArray, at: int, right: FloatArray) -> None:
+    """L^-1 b in the place of b (2g,)."""
+    if size == 1:
+        right[0] /= lower[0, c]
+        right[1] = (right[1] - lower[1, c] * right[0]) / lower[2, c]
+        return
+    n = 2 * size
+    for i in range(n):
+        rest = right[i]
+        for m in range(i):
+            rest -= joint[at + i * n + m] * right[m]
+        right[i] = rest / joint[at + i * n + i]
+
+
+@inlined
+def solve_unit_transposed(
+    size: int, lower: FloatArray, c: int, joint: FloatArray, at: int, right: FloatArray
+) -> None:
+    """L^-T b in the place of b (2g,)."""
+    if size == 1:
+        right[1] /= lower[2, c]
+        right[0] = (right[0] - lower[1, c] * right[1]) / lower[0, c]
+        return
+    n = 2 * size
+    for i in range(n - 1, -1, -1):
+        rest = right[i]
+        for m in range(i + 1, n):
+            rest -= joint[at + m * n + i] * right[m]
+        right[i] = rest / joint[at + i * n + i]
+
+
+@inlined
+def solve_unit_rows(
+    size: int, lower: FloatArray, c: int, joint: FloatArray, at: int, rows: FloatArray, begin: int, end: int
+) -> None:
+    """L^-1 b in the place of b (2g, end - begin), the columns of ``rows`` from ``begin`` to ``end``."""
+    if size == 1:
+        first, below, last = lower[0, c], lower[1, c], lower[2, c]
+        for p in range(begin, end):
+            rows[0, p] /= first
+            rows[1, p] = (rows[1, p] - below * rows[0, p]) / last
+        return
+    n = 2 * size
+    for i in range(n):
+        for m in range(i):
+            factor = joint[at + i * n + m]
+            for p in range(begin, end):
+                rows[i, p] -= factor * rows[m, p]
+        pivot = joint[at + i * n + i]
+        for p in range(begin, end):
+            rows[i, p] /= pivot
+
+
+@inlined
+def along_axes(table: FloatArray, t: int, fx: float, fy: float, fz: float) -> tuple[float, float]:
+    """The gradient by a corner of what has the gradient f by its point in pair t."""
+    return (
+        table[t, 0] * fx + table[t, 4] * fy + table[t, 8] * fz,
+        table[t, 1] * fx + table[t, 5] * fy + table[t, 9] * fz,
+    )
+
+
+@inlined
+def number_touched(layout: Layout, q: int, slot: IntArray) -> None:
+    """Number in ``slot`` (P,) the pairs that chunk q touches."""
+    begin = layout.touched_at[q]
+    for i in range(begin, layout.touched_at[q + 1]):
+        slot[layout.touched[i]] = i
