@@ -81,7 +81,7 @@ def hanging(folder: Path) -> subprocess.Popen[str]:
 def test_ctrl_c_ends_all_processes_and_leaves_nothing_half_written(tmp_path: Path) -> None:
     started = hanging(tmp_path)
     os.killpg(started.pid, signal.SIGINT)
-    _, errors = started.communicate(timeout=30)  # returns when the last process has closed its end
+    _, errors = started.communicate(timeout=120)  # returns when the last process has closed its end
     assert errors.count("Traceback") == 1, "only the process that was started may speak"
     assert "KeyboardInterrupt" in errors
     assert not list(tmp_path.iterdir())
@@ -100,5 +100,5 @@ def test_workers_whose_parent_was_killed_end_after_their_job() -> None:
     assert started.stdout is not None
     started.stdout.readline()
     started.kill()
-    _, errors = started.communicate(timeout=30)  # as above
+    _, errors = started.communicate(timeout=120)  # as above
     assert "Traceback" not in errors

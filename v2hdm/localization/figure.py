@@ -17,9 +17,10 @@ _KNOWN, _LOST, _BAND = "#0072b2", "#d55e00", "#bbbbbb"
 def save_errors(
     path: Path, stamp_s: FloatArray, error: FloatArray, sigma: FloatArray, known: np.ndarray
 ) -> None:
-    """Draw errors (F, 3) beside the recorded poses, with bands of two standard deviations (F, 3), as PNG.
+    """Draw errors (F, 3) beside the recorded poses as PNG.
 
-    ``known`` (F,) says in which frames the vehicle knows where it is; the others are drawn as crosses.
+    Bands are two standard deviations (F, 3) of estimate and recorded pose together. ``known`` (F,) says in which
+    frames the vehicle knows where it is; the others are drawn as crosses.
     """
     figure = Figure(figsize=(9, 6), layout="constrained")
     FigureCanvasAgg(figure)
@@ -27,7 +28,7 @@ def save_errors(
     axes = figure.subplots(3, 1, sharex=True)
     for k, (axis, (name, factor, unit)) in enumerate(zip(axes, _PANELS, strict=True)):
         band = 2 * factor * sigma[:, k]
-        axis.fill_between(time_s, -band, band, color=_BAND, alpha=0.6, lw=0, label="two sigmas as stated")
+        axis.fill_between(time_s, -band, band, color=_BAND, alpha=0.6, lw=0, label="two sigmas, of both")
         axis.plot(time_s[known], factor * error[known, k], ".", ms=3, color=_KNOWN, label="localised")
         if not known.all():
             axis.plot(time_s[~known], factor * error[~known, k], "x", ms=4, color=_LOST, label="lost")

@@ -210,7 +210,10 @@ def localise_drive(parsed: argparse.Namespace) -> None:
         write_json(unfinished / "localization.json", figures)
         poses = np.stack([state.map_from_vehicle for state in found.states])
         write_tum(Trajectory(found.stamp_s, poses), unfinished / "localized.tum")
-        save_errors(unfinished / "errors.png", found.stamp_s, found.error, found.sigma, found.known)
+        noise = drive.pose_noise
+        recorded = [noise.position_m, noise.position_m, noise.heading_rad]
+        sigma = np.hypot(found.sigma, recorded)
+        save_errors(unfinished / "errors.png", found.stamp_s, found.error, sigma, found.known)
     print(
         f"{figures['localised_share']:.1%} of {figures['frames_with_a_marking_in_view']} frames with a "
         f"marking in view localised; position {100 * figures['position_rmse_m']:.1f} cm, heading "
