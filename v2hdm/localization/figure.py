@@ -19,8 +19,8 @@ def save_errors(
 ) -> None:
     """Draw errors (F, 3) beside the recorded poses as PNG.
 
-    Bands are two standard deviations (F, 3) of estimate and recorded pose together. ``known`` (F,) says in which
-    frames the vehicle knows where it is; the others are drawn as crosses.
+    Bands are two standard deviations (F, 3) of estimate and recorded pose together. ``known`` (F,) says in
+    which frames the vehicle knows where it is; the others are drawn as crosses.
     """
     figure = Figure(figsize=(9, 6), layout="constrained")
     FigureCanvasAgg(figure)
