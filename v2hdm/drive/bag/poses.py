@@ -21,11 +21,11 @@ TF = "tf2_msgs/msg/TFMessage"
 NMEA = "nmea_msgs/msg/Sentence"
 _WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 _POSE = "geometry_msgs/msg/PoseStamped"
-_IMU = "sensor_msgs/msg/Imu"
-_QUATERNION = "geometry_msgs/msg/QuaternionStamped"
+IMU = "sensor_msgs/msg/Imu"
+QUATERNION = "geometry_msgs/msg/QuaternionStamped"
 
 POSE_KINDS = (ODOMETRY, _WITH_COVARIANCE, _POSE, FIX, NMEA, TF)
-HEADING_KINDS = (_IMU, _QUATERNION, ODOMETRY, _WITH_COVARIANCE, _POSE)
+HEADING_KINDS = (IMU, QUATERNION, ODOMETRY, _WITH_COVARIANCE, _POSE)
 
 _NO_FIX = -1
 _NORM_TOLERANCE = 1e-2
@@ -42,11 +42,11 @@ def position_row(kind: str, fields: Any) -> Row:
 
 def heading_row(kind: str, fields: Any) -> Row:
     """Quaternion (4) and the standard deviation of its heading (1), nan if not stated."""
-    if kind == _IMU:
+    if kind == IMU:
         if fields.orientation_covariance[0] < 0:  # sensor_msgs: this Imu measures no orientation
             return (np.nan,) * 5
         return (*_quaternion(fields.orientation), _sigma(fields.orientation_covariance[8]))
-    if kind == _QUATERNION:
+    if kind == QUATERNION:
         return (*_quaternion(fields.quaternion), np.nan)
     return position_row(kind, fields)[4:]
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from v2hdm.errors import DriveError
 from v2hdm.extras import need
+from v2hdm.files import load_yaml, take_mapping
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
@@ -67,37 +70,81 @@ def _parts(path: Path) -> list[Path]:
 
 
 class Bag:
-    """An open bag."""
+    """An open bag: a reader for each of its files, in the order of time.
 
-    def __init__(self, path: Path, reader: Any) -> None:
+    Types are taken from the bag as they are needed: a definition that is not understood, such as a service's,
+    does not concern the other topics.
+    """
+
+    def __init__(self, path: Path, readers: Sequence[Any]) -> None:
         self.path = path
-        self._reader = reader
-        found = reader.topics
+        self._readers = readers
+        self._is_ros1 = path.suffix == ".bag" or any(reader.path.suffix == ".bag" for reader in readers)
+        self._stores: dict[str, Any] = {}
+        kinds: dict[str, set[str]] = defaultdict(set)
+        counts: dict[str, int] = defaultdict(int)
+        for reader in readers:
+            for connection in reader.connections:
+                kinds[connection.topic].add(connection.msgtype)
+                counts[connection.topic] += connection.msgcount
         self.topics: Mapping[str, Topic] = {
-            name: Topic(name, info.msgtype or "several types", info.msgcount)
-            for name, info in sorted(found.items())
+            name: Topic(name, " and ".join(sorted(kinds[name])), counts[name]) for name in sorted(kinds)
         }
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
-        """The messages of some topics in the order in which they were received.
+        """The messages of some topics, those of each in the order in which they were received.
 
         Raises:
-            DriveError: the bag is damaged, or its types are not known.
+            DriveError: the bag is damaged, holds fewer messages than it says, or its types are not known.
         """
-        connections = [c for c in self._reader.connections if c.topic in topics]
-        if not connections:
-            return
-        with _one_line(self.path):
-            stream = iter(self._reader.messages(connections=connections))
+        missing = sum(self.topics[name].messages for name in topics if name in self.topics)
+        streams = (
+            reader.messages(connections=wanted)
+            for reader in self._readers
+            if (wanted := [connection for connection in reader.connections if connection.topic in topics])
+        )
+        stream = chain.from_iterable(streams)
         while True:
             with _one_line(self.path):
                 item = next(stream, None)
             if item is None:
-                return
+                break
+            missing -= 1
             connection, received_ns, data = item
             with _one_line(self.path, f"topic {connection.topic}, type {connection.msgtype}: "):
-                fields = self._reader.deserialize(data, connection.msgtype)
+                fields = self._fields(connection, data)
             yield Message(connection.topic, connection.msgtype, received_ns / 1e9, fields)
+        if missing > 0:
+            raise DriveError(
+                f"{self.path}: {missing} messages of {', '.join(sorted(topics))} that it lists are not there; copy it "
+                "again, or mend it with 'ros2 bag reindex'"
+            )
+
+    def _fields(self, connection: Any, data: bytes) -> Any:
+        kind = connection.msgtype
+        if kind not in self._stores:
+            self._stores[kind] = self._store_of(connection)
+        read = self._stores[kind].deserialize_ros1 if self._is_ros1 else self._stores[kind].deserialize_cdr
+        return read(data, kind)
+
+    def _store_of(self, connection: Any) -> Any:
+        """The types of one connection: as the bag defines them, else the common ones."""
+        from rosbags.interfaces import MessageDefinitionFormat
+        from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+        definition = connection.msgdef
+        if definition.format == MessageDefinitionFormat.NONE:
+            return get_typestore(Stores.ROS1_NOETIC if self._is_ros1 else Stores.LATEST)
+        store = get_typestore(Stores.EMPTY)
+        if definition.format == MessageDefinitionFormat.MSG:
+            store.register(get_types_from_msg(definition.data, connection.msgtype))
+            return store
+        types: dict[str, Any] = {}
+        for part in definition.data.split("=" * 80 + "\n"):
+            head, _, rest = part.partition("\n")
+            types.update(get_types_from_idl(rest if head.startswith("IDL: ") else part) if part.strip() else {})
+        store.register(types)
+        return store
 
     def need(self, name: str, kinds: Collection[str], where: str) -> Topic:
         """The topic ``name``, which is of one of the types ``kinds``.
@@ -127,20 +174,30 @@ def open_bag(path: Path) -> Iterator[Bag]:
         DriveError: it is none, damaged or cut off, or rosbags is not installed.
     """
     need("rosbags", "ros", f"{path}: a bag", DriveError)
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags import rosbag1, rosbag2
 
     files = bag_files(path)
-    paths = files if files[0].name != _METADATA else [path]
-    with _one_line(path):
-        reader = AnyReader(paths, default_typestore=get_typestore(Stores.LATEST))
-        reader.open()
-    try:
+    with ExitStack() as opened:
         with _one_line(path):
-            bag = Bag(path, reader)
+            readers: list[Any] = []
+            if files[0].name == _METADATA and _is_compressed(path):
+                readers.append(opened.enter_context(rosbag2.Reader(path)))
+            else:
+                # rosbags skips, without a word, topics of which the folder's description and the file state
+                # other qualities of service, as bags that were rewritten do. The files alone have them all.
+                for one in files[files[0].name == _METADATA :]:
+                    kind = rosbag1.Reader if one.suffix == ".bag" else rosbag2.Reader
+                    readers.append(opened.enter_context(kind(one)))
+                readers.sort(key=lambda reader: reader.start_time)
+            bag = Bag(path, readers)
         yield bag
-    finally:
-        reader.close()
+
+
+def _is_compressed(path: Path) -> bool:
+    """Whether the files of a folder, or each of its messages, are compressed."""
+    about = load_yaml(path / _METADATA, DriveError).get("rosbag2_bagfile_information")
+    mode = take_mapping(about, f"{path / _METADATA}", DriveError).get("compression_mode")
+    return str(mode or "none").lower() not in ("none", "storage")
 
 
 @contextmanager
@@ -152,11 +209,13 @@ def _one_line(path: Path, what: str = "") -> Iterator[None]:
         raise
     # Bytes that are not what they should be fail anywhere within rosbags, with any error.
     except Exception as failure:
-        reason = " ".join(str(failure).split()) or type(failure).__name__
         if isinstance(failure, KeyError):
-            reason = f"the type {reason} is not defined in the bag"
-        mend = _MEND.get(path.suffix, "ros2 bag reindex")
+            raise DriveError(
+                f"{path}: {what}the bag does not define the type {failure}; convert it to MCAP, which holds its "
+                "types, where it was recorded: 'ros2 bag convert'"
+            ) from None
+        reason = " ".join(str(failure).split()) or type(failure).__name__
         raise DriveError(
             f"{path}: {what}not readable as a bag ({reason[:200].rstrip('.')}); copy it again, or mend it with "
-            f"'{mend}' if the recording was cut off"
+            f"'{_MEND.get(path.suffix, 'ros2 bag reindex')}' if the recording was cut off"
         ) from None
