@@ -12,13 +12,14 @@ import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from v2hdm.drive import read_drive
 from v2hdm.geometry.rigid import inverse, quaternion_from_rotation
 from v2hdm.records import Drive, FloatArray
 
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.LATEST)
+ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
 
 Row = tuple[float, str, Any]
 """Time of reception, topic, message."""
@@ -188,9 +189,10 @@ def mountings() -> dict[str, FloatArray]:
 
 def write_ros1(path: Path, made: Messages, compressed: bool = False) -> Path:
     path = path.with_suffix(".bag")
-    with Writer1(path) as writer:
-        if compressed:
-            writer.set_compression(Writer1.CompressionFormat.LZ4)
+    writer = Writer1(path)
+    if compressed:
+        writer.set_compression(Writer1.CompressionFormat.LZ4)
+    with writer:
         _write(writer, made, ROS1.serialize_ros1, ROS1)
     return path
 

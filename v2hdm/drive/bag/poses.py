@@ -17,7 +17,7 @@ from v2hdm.records import FloatArray
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 FIX = "sensor_msgs/msg/NavSatFix"
-TF = "tf2_msgs/msg/TFMessage"
+TF, OLD_TF = "tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"
 NMEA = "nmea_msgs/msg/Sentence"
 _WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 _POSE = "geometry_msgs/msg/PoseStamped"

@@ -177,6 +177,9 @@ def open_bag(path: Path) -> Iterator[Bag]:
     from rosbags import rosbag1, rosbag2
 
     files = bag_files(path)
+    for one in files:
+        if one.suffix == ".db3":
+            _check_database(one)
     with ExitStack() as opened:
         with _one_line(path):
             readers: list[Any] = []
@@ -191,6 +194,29 @@ def open_bag(path: Path) -> Iterator[Bag]:
                 readers.sort(key=lambda reader: reader.start_time)
             bag = Bag(path, readers)
         yield bag
+
+
+def _check_database(path: Path) -> None:
+    """Refuse an SQLite file whose end is missing or still in a journal: SQLite reads on without it.
+
+    The places in the header are those of https://www.sqlite.org/fileformat.html, 1.3.
+    """
+    with path.open("rb") as file:
+        header = file.read(100)
+    journal = path.with_name(f"{path.name}-wal")
+    if journal.is_file() and journal.stat().st_size:
+        raise DriveError(f"{path}: was not closed, {journal.name} holds its end; mend it with 'ros2 bag reindex'")
+    if len(header) < 100:
+        return
+    # One stands for 65536, which two bytes cannot.
+    page_bytes = int.from_bytes(header[16:18], "big")
+    page_bytes = 65536 if page_bytes == 1 else page_bytes
+    pages = int.from_bytes(header[28:32], "big")
+    counts = header[24:28] == header[92:96]
+    if counts and path.stat().st_size < pages * page_bytes:
+        raise DriveError(
+            f"{path}: is cut off: {path.stat().st_size} of {pages * page_bytes} bytes are there; copy it again"
+        )
 
 
 def _is_compressed(path: Path) -> bool:

@@ -185,7 +185,7 @@ class TfStream(Stream):
     def topics(self, bag: Bag) -> Sequence[str]:
         if not any(name in bag.topics for name in self._wanted):
             raise DriveError(f"{self.where}: {bag.path} has no topic {' or '.join(self._wanted)}")
-        return [bag.need(name, [poses.TF], self.where).name for name in self._wanted if name in bag.topics]
+        return [bag.need(name, [poses.TF, poses.OLD_TF], self.where).name for name in self._wanted if name in bag.topics]
 
     def begin(self, folder: Path) -> None:
         self._file = (folder / _TRANSFORMS).open("w", encoding="utf-8")
