@@ -24,6 +24,9 @@ _SAME_ELLIPSOID_M = 1e-3
 _STEP_M = 50.0
 """Half of the stretch along which the grid's north is measured, m."""
 
+_CONFORMAL_RAD = 1e-5
+"""Angle by which a grid's axes may be off a right angle; a conformal projection's are by rounding, rad."""
+
 
 def geodetic_from_enu(origin: GeodeticOrigin, points_map: FloatArray) -> FloatArray:
     """Map points (N, 3) in m to (N, 3): latitude and longitude in degrees, ellipsoidal height in m."""
@@ -47,14 +50,11 @@ def enu_axes(geodetic: FloatArray) -> FloatArray:
     return np.stack([east, north, up], axis=2)
 
 
-def geodetic_from_grid(
-    crs: str, points: FloatArray, where: str, error: type[V2hdmError]
-) -> tuple[FloatArray, FloatArray]:
+def geodetic_from_grid(crs: str, points: FloatArray, where: str, error: type[V2hdmError]) -> FloatArray:
     """Points (N, 3) of a projected system: easting, northing in its unit, height in m above the ellipsoid.
 
     Returns:
-        Geodetic (N, 3) in the system's own datum, and the grid's convergence (N,) rad: the angle, clockwise,
-        from true north to grid north.
+        Geodetic (N, 3) in the system's own datum.
 
     Raises:
         V2hdmError: of type ``error``, when the system is unknown, geographic, or of no satellite datum, or the
@@ -63,23 +63,36 @@ def geodetic_from_grid(
     system = _system(crs, where, error)
     if not system.is_projected:
         raise error(f"{where}: {crs} is not projected; give latitude and longitude as such, or a projected one")
-    horizontal = system.sub_crs_list[0] if system.is_compound else system
-    transformer = need("pyproj", "map", "a projected system", error).Transformer.from_crs(
-        horizontal, horizontal.geodetic_crs, always_xy=True
-    )
-
-    def geodetic(easting: FloatArray, northing: FloatArray) -> FloatArray:
-        lon, lat = transformer.transform(easting, northing)
-        return np.column_stack([lat, lon, points[:, 2]])
-
-    here = geodetic(points[:, 0], points[:, 1])
-    if not np.isfinite(here).all():
+    lon, lat = _inverse_of(crs).transform(points[:, 0], points[:, 1])
+    geodetic = np.column_stack([lat, lon, points[:, 2]])
+    if not np.isfinite(geodetic).all():
         raise error(f"{where}: some points lie outside of {crs}; check it and the order easting, northing")
-    step = _STEP_M / system.axis_info[0].unit_conversion_factor
-    ends = [geodetic(points[:, 0], points[:, 1] + side * step) for side in (1, -1)]
-    toward_ecef = _ecef_from_geodetic(ends[0]) - _ecef_from_geodetic(ends[1])
-    toward = np.einsum("nij,ni->nj", enu_axes(here), toward_ecef)
-    return here, np.arctan2(toward[:, 0], toward[:, 1])
+    return geodetic
+
+
+def convergence_rad(crs: str, points: FloatArray, where: str, error: type[V2hdmError]) -> FloatArray:
+    """The angles (N,), clockwise, from true north to the north of a projected system's grid at its points.
+
+    Measured along 100 m of the grid's lines.
+
+    Raises:
+        V2hdmError: of type ``error``, as :func:`geodetic_from_grid`, and when the projection is not conformal:
+            then a grid has no north that all directions turn with.
+    """
+    here = geodetic_from_grid(crs, points, where, error)
+    axes = enu_axes(here)
+    step = _STEP_M / _system(crs, where, error).axis_info[0].unit_conversion_factor
+
+    def azimuth_rad(offset: FloatArray) -> FloatArray:
+        ends = [geodetic_from_grid(crs, points + side * offset, where, error) for side in (1, -1)]
+        toward_ecef = _ecef_from_geodetic(ends[0]) - _ecef_from_geodetic(ends[1])
+        east, north, _ = np.einsum("nij,ni->jn", axes, toward_ecef)
+        return np.arctan2(east, north)
+
+    north, east = azimuth_rad(np.array([0.0, step, 0.0])), azimuth_rad(np.array([step, 0.0, 0.0]))
+    if np.abs(np.sin(east - north - np.pi / 2)).max() > _CONFORMAL_RAD:
+        raise error(f"{where}: {crs} does not keep angles; give headings from true north (heading: true)")
+    return north
 
 
 def datum_of(crs: str, where: str, error: type[V2hdmError]) -> str:
@@ -120,6 +133,15 @@ def _system(crs: str, where: str, error: type[V2hdmError]) -> Any:
             "your survey office's transformation (in Europe ETRS89, such as EPSG:25832)"
         )
     return system
+
+
+@lru_cache(maxsize=8)
+def _inverse_of(crs: str) -> Any:
+    """The transformer from a projected system to its own longitude and latitude."""
+    pyproj = need("pyproj", "map", "a projected system", MapFileError)
+    system = pyproj.CRS.from_user_input(crs)
+    horizontal = system.sub_crs_list[0] if system.is_compound else system
+    return pyproj.Transformer.from_crs(horizontal, horizontal.geodetic_crs, always_xy=True)
 
 
 def _position(origin: GeodeticOrigin) -> FloatArray:

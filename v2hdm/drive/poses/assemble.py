@@ -19,6 +19,7 @@ from v2hdm.drive.trajectory import interpolate
 from v2hdm.errors import DriveError
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.hdmap.geodetic import (
+    convergence_rad,
     datum_of,
     enu_axes,
     enu_from_geodetic,
@@ -82,13 +83,13 @@ def assemble(
     rotation = rotation @ settings.vehicle_from_sensor.T
     stamp_s = readings.stamp_s[known] + settings.offset_s
     if readings.geodetic or settings.crs is not None:
-        geodetic, convergence_rad = _on_earth(points, readings.geodetic, settings, where)
+        geodetic, north_rad = _on_earth(points, readings.geodetic, settings, where)
         datum = "WGS84" if settings.crs is None else datum_of(settings.crs, where, DriveError)
         origin = _origin(origin, geodetic[0], datum, settings, where)
         zeros = np.zeros(len(points))
         here = np.array([[origin.latitude_deg, origin.longitude_deg, origin.altitude_m]])
         # A grid whose north lies clockwise of true north turns all that is measured from it clockwise.
-        rotation = rotation_from_euler(zeros, zeros, -convergence_rad) @ rotation
+        rotation = rotation_from_euler(zeros, zeros, -north_rad) @ rotation
         rotation = enu_axes(here)[0].T @ enu_axes(geodetic) @ rotation
         points = enu_from_geodetic(origin, geodetic)
     elif settings.heading is not None or settings.geoid_m is not None:
@@ -164,8 +165,10 @@ def _on_earth(
             f"{where}: true and grid north differ in {crs}: add heading: true (gyrocompass, dual antenna) or "
             "heading: grid (yaw of the projected coordinates)"
         )
-    here, convergence_rad = geodetic_from_grid(crs, raised, where, DriveError)
-    return here, convergence_rad if settings.heading == "grid" else np.zeros(len(points))
+    north_rad = np.zeros(len(points))
+    if settings.heading == "grid":
+        north_rad = convergence_rad(crs, raised, where, DriveError)
+    return geodetic_from_grid(crs, raised, where, DriveError), north_rad
 
 
 def _origin(
