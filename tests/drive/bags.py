@@ -41,9 +41,7 @@ class Messages:
 
     def header(self, stamp_s: float, frame: str) -> Any:
         nanoseconds = round(stamp_s * 1e9)
-        time = self.make(
-            "builtin_interfaces/msg/Time", sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9
-        )
+        time = self.make("builtin_interfaces/msg/Time", sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
         sequence = {"seq": 0} if self.ros1 else {}
         return self.make("std_msgs/msg/Header", stamp=time, frame_id=frame, **sequence)
 
@@ -140,7 +138,8 @@ class Messages:
             place = pose.position
             made.append(
                 self.make(
-                    "geometry_msgs/msg/TransformStamped", header=self.header(stamp_s, parent),
+                    "geometry_msgs/msg/TransformStamped",
+                    header=self.header(stamp_s, parent),
                     child_frame_id=child,
                     transform=self.make(
                         "geometry_msgs/msg/Transform",
@@ -166,17 +165,20 @@ def messages_of(folder: Path, ros1: bool = False, fixed_frames: bool = True) -> 
             made.add(image.stamp_s, topic, made.raw_image(image.stamp_s, rgb, "rgb8", frame, pad=5))
         else:
             data = image.path.read_bytes()
-            made.add(image.stamp_s, f"{topic}/compressed", made.compressed(image.stamp_s, data, "jpeg", frame))
+            made.add(
+                image.stamp_s, f"{topic}/compressed", made.compressed(image.stamp_s, data, "jpeg", frame)
+            )
         info = made.info(image.stamp_s, drive.cameras[image.camera].info, frame)
         made.add(image.stamp_s, f"/sensing/{image.camera}/camera_info", info)
     for stamp_s, pose in zip(drive.trajectory.stamp_s, drive.trajectory.map_from_vehicle, strict=True):
         made.add(stamp_s, "/odom", made.odometry(stamp_s, pose, np.zeros(36), "base_link"))
     if fixed_frames:
         edges = {
-            ("base_link", f"{name}_optical"): inverse(np.array(guess))
-            for name, guess in mountings().items()
+            ("base_link", f"{name}_optical"): inverse(np.array(guess)) for name, guess in mountings().items()
         }
-        made.add(drive.trajectory.stamp_s[0], "/tf_static", made.transforms(drive.trajectory.stamp_s[0], edges))
+        made.add(
+            drive.trajectory.stamp_s[0], "/tf_static", made.transforms(drive.trajectory.stamp_s[0], edges)
+        )
     made.rows.sort(key=lambda row: row[0])
     return made
 
@@ -230,7 +232,10 @@ def assert_same_drive(got: Drive, expected: Drive) -> None:
     for name, camera in expected.cameras.items():
         info = got.cameras[name].info
         assert (info.name, info.width, info.height) == (name, camera.info.width, camera.info.height)
-        assert (info.distortion_model, info.distortion) == (camera.info.distortion_model, camera.info.distortion)
+        assert (info.distortion_model, info.distortion) == (
+            camera.info.distortion_model,
+            camera.info.distortion,
+        )
         np.testing.assert_array_equal(info.intrinsic, camera.info.intrinsic)
         np.testing.assert_allclose(
             got.cameras[name].ipm[camera.initial_ipm], camera.ipm[camera.initial_ipm], rtol=1e-12

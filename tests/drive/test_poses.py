@@ -93,7 +93,9 @@ def nmea_angle(degrees: float, digits: int, sides: str) -> str:
     return f"{whole:0{digits}d}{minutes:012.9f},{sides[0 if degrees >= 0 else 1]}"
 
 
-def nmea_log(qualities: Sequence[int] | None = None, heading: str = "HDT", start_day_s: float = 30630.0) -> str:
+def nmea_log(
+    qualities: Sequence[int] | None = None, heading: str = "HDT", start_day_s: float = 30630.0
+) -> str:
     stamp_s, points, yaw = curve()
     places = place(antenna(points, yaw))
     headings = true_azimuth_deg(points, yaw)
@@ -103,7 +105,9 @@ def nmea_log(qualities: Sequence[int] | None = None, heading: str = "HDT", start
         clock = f"{int(of_day // 3600):02d}{int(of_day % 3600 // 60):02d}{of_day % 60:05.2f}"
         quality = 4 if qualities is None else qualities[k]
         where = f"{nmea_angle(lat, 2, 'NS')},{nmea_angle(lon, 3, 'EW')}"
-        lines.append(checksum(f"GNGGA,{clock},{where},{quality},12,0.8,{height - 40.5:.7f},M,40.5,M,1.0,0000"))
+        lines.append(
+            checksum(f"GNGGA,{clock},{where},{quality},12,0.8,{height - 40.5:.7f},M,40.5,M,1.0,0000")
+        )
         if heading == "HDT":
             lines.append(checksum(f"GNHDT,{headings[k]:.8f},T"))
         elif heading == "THS":
@@ -203,7 +207,9 @@ def test_projected_coordinates_and_either_north_give_the_same_poses(
 
 
 def test_what_a_projected_system_leaves_open_is_asked_for(tmp_path: Path) -> None:
-    (tmp_path / "route.csv").write_text("stamp_s,x_m,y_m,z_m,heading_deg\n1,560000,5930000,3,5\n2,560001,5930000,3,5\n")
+    (tmp_path / "route.csv").write_text(
+        "stamp_s,x_m,y_m,z_m,heading_deg\n1,560000,5930000,3,5\n2,560001,5930000,3,5\n"
+    )
     content: dict[str, Any] = {"csv": "route.csv", "crs": "EPSG:25832", "heading": "grid"}
     for changes, message in (
         ({"heading": None}, "true and grid north differ in EPSG:25832: add heading"),
@@ -225,7 +231,9 @@ def test_what_a_projected_system_leaves_open_is_asked_for(tmp_path: Path) -> Non
 
 
 def test_heights_above_the_sea_are_raised_by_the_geoid(tmp_path: Path) -> None:
-    (tmp_path / "route.csv").write_text("stamp_s,x_m,y_m,z_m,heading_deg\n1,560000,5930000,3,5\n2,560001,5930000,3,5\n")
+    (tmp_path / "route.csv").write_text(
+        "stamp_s,x_m,y_m,z_m,heading_deg\n1,560000,5930000,3,5\n2,560001,5930000,3,5\n"
+    )
     content = {"csv": "route.csv", "crs": 5555, "heading": "grid", "geoid_m": 41.25, "epoch": 2024.5}
     got = read(content, tmp_path, None)
     assert got.origin is not None
@@ -237,7 +245,10 @@ def test_a_table_in_the_map_frame_with_angles(tmp_path: Path) -> None:
     stamp_s, points, yaw = curve()
     roll, pitch = 0.03, -0.02
     rows = zip(stamp_s, points.tolist(), yaw.tolist(), strict=True)
-    lines = [f"{t * 1e9:.0f}\t{p[0]!r}\t{p[1]!r}\t{p[2]!r}\t{y!r}\t{roll}\t{np.degrees(-pitch)}\t" for t, p, y in rows]
+    lines = [
+        f"{t * 1e9:.0f}\t{p[0]!r}\t{p[1]!r}\t{p[2]!r}\t{y!r}\t{roll}\t{np.degrees(-pitch)}\t"
+        for t, p, y in rows
+    ]
     names = "stamp_ns\tx_m\ty_m\tz_m\tyaw_rad\troll_rad\tpitch_up_deg\tsigma_m"
     (tmp_path / "route.csv").write_text("\n".join([names, *lines]))
     got = read({"csv": "route.csv"}, tmp_path)

@@ -220,9 +220,7 @@ def _read_pose_noise(content: object, of_source: Mapping[str, float], where: str
             raise DriveError(
                 f"{where}, {key}: an error that fades over no distance is no drift; leave it out"
             )
-    stated = {
-        key: value for key, value in of_source.items() if not {key, DRIFTS[key]} & set(values)
-    }
+    stated = {key: value for key, value in of_source.items() if not {key, DRIFTS[key]} & set(values)}
     noise = PoseNoise.as_far_as_stated(**stated, **values)
     for total, drift in DRIFTS.items():
         if getattr(noise, drift) > getattr(noise, total):

@@ -13,7 +13,16 @@ from typing import Any
 import numpy as np
 
 from v2hdm.drive.bag.importing import import_streams
-from v2hdm.drive.bag.streams import IMAGE_LIST, INFO_FILE, STAMPS, ImageStream, InfoStream, PoseStream, Stream, TfStream
+from v2hdm.drive.bag.streams import (
+    IMAGE_LIST,
+    INFO_FILE,
+    STAMPS,
+    ImageStream,
+    InfoStream,
+    PoseStream,
+    Stream,
+    TfStream,
+)
 from v2hdm.drive.bag.tf import TF_TOPIC
 from v2hdm.drive.camera_info import read_camera_info
 from v2hdm.drive.images import ImageFiles
@@ -97,7 +106,9 @@ def plan_info(content: object, camera: str, sources: Sources, where: str) -> Cal
     return lambda: replace(read_camera_info(folder() / INFO_FILE), name=camera)
 
 
-def plan_topic_poses(content: object, sources: Sources, where: str) -> Callable[[dict[str, Any], str], Readings]:
+def plan_topic_poses(
+    content: object, sources: Sources, where: str
+) -> Callable[[dict[str, Any], str], Readings]:
     """How to read the poses of ``poses`` if they are a topic's: of messages of poses, or of transforms."""
     if not isinstance(content, dict) or "topic" not in content:
         return _not_planned
@@ -105,8 +116,12 @@ def plan_topic_poses(content: object, sources: Sources, where: str) -> Callable[
     if topic == TF_TOPIC:
         for key in ("frame", "vehicle"):
             if key not in content:
-                raise DriveError(f"{where}: add {key} for {TF_TOPIC}: frame of the map, vehicle of the vehicle")
-        frame, vehicle = (take_text(content[key], f"{where}, {key}", DriveError) for key in ("frame", "vehicle"))
+                raise DriveError(
+                    f"{where}: add {key} for {TF_TOPIC}: frame of the map, vehicle of the vehicle"
+                )
+        frame, vehicle = (
+            take_text(content[key], f"{where}, {key}", DriveError) for key in ("frame", "vehicle")
+        )
         transforms = TfStream(True, where)
         tf_folder = sources.want(transforms)
 

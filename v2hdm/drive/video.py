@@ -45,14 +45,20 @@ def import_video(path: Path, cache: Path, where: str) -> Path:
                 for frame in container.decode(video=0):
                     number = len(stamps)
                     if frame.pts is None:
-                        raise DriveError(f"{path}: frame {number + 1} has no time; give stamps, a time a line")
+                        raise DriveError(
+                            f"{path}: frame {number + 1} has no time; give stamps, a time a line"
+                        )
                     if number and float(frame.pts * frame.time_base) <= stamps[-1]:
-                        raise DriveError(f"{path}: frame {number + 1}: its time does not rise; convert the video")
+                        raise DriveError(
+                            f"{path}: frame {number + 1}: its time does not rise; convert the video"
+                        )
                     stamps.append(float(frame.pts * frame.time_base))
                     (partial / f"{number:06d}.png").write_bytes(png(frame.to_ndarray(format="bgr24")))
         except (av.error.FFmpegError, IndexError) as failure:
             reason = " ".join(str(failure).split())
-            raise DriveError(f"{path}: not readable as a video ({reason}); convert or copy it again") from None
+            raise DriveError(
+                f"{path}: not readable as a video ({reason}); convert or copy it again"
+            ) from None
         if not stamps:
             raise DriveError(f"{path}: holds no frame; convert or copy it again")
         names = [f"{number:06d}.png" for number in range(len(stamps))]

@@ -99,7 +99,9 @@ def list_topics(path: Path, cache: Path) -> str:
 
 def dump_flow(content: Mapping[str, Any]) -> str:
     """``content`` as YAML on one line."""
-    return str(yaml.safe_dump(dict(content), sort_keys=False, default_flow_style=True, width=1_000_000)).strip()
+    return str(
+        yaml.safe_dump(dict(content), sort_keys=False, default_flow_style=True, width=1_000_000)
+    ).strip()
 
 
 def _describe(path: Path, cache: Path) -> tuple[dict[str, Any], list[str]]:
@@ -170,7 +172,9 @@ def _info_topic(bag: Bag, image: Topic) -> Topic | None:
 
 
 def _only(bag: Bag, kinds: Sequence[str]) -> Topic | None:
-    found = [topic for topic in bag.topics.values() if topic.kind in kinds and topic.messages >= _LEAST_MESSAGES]
+    found = [
+        topic for topic in bag.topics.values() if topic.kind in kinds and topic.messages >= _LEAST_MESSAGES
+    ]
     return found[0] if len(found) == 1 else None
 
 

@@ -52,7 +52,10 @@ def heading_row(kind: str, fields: Any) -> Row:
 
 
 def readings_of(
-    kind: str, positions: tuple[FloatArray, FloatArray], headings: tuple[FloatArray, FloatArray] | None, where: str
+    kind: str,
+    positions: tuple[FloatArray, FloatArray],
+    headings: tuple[FloatArray, FloatArray] | None,
+    where: str,
 ) -> Readings:
     """Readings of the rows (P, 9) of a topic at its stamps (P,), and of rows (A, 5) of a topic of headings.
 

@@ -142,7 +142,9 @@ class Bag:
         types: dict[str, Any] = {}
         for part in definition.data.split("=" * 80 + "\n"):
             head, _, rest = part.partition("\n")
-            types.update(get_types_from_idl(rest if head.startswith("IDL: ") else part) if part.strip() else {})
+            types.update(
+                get_types_from_idl(rest if head.startswith("IDL: ") else part) if part.strip() else {}
+            )
         store.register(types)
         return store
 
@@ -205,7 +207,9 @@ def _check_database(path: Path) -> None:
         header = file.read(100)
     journal = path.with_name(f"{path.name}-wal")
     if journal.is_file() and journal.stat().st_size:
-        raise DriveError(f"{path}: was not closed, {journal.name} holds its end; mend it with 'ros2 bag reindex'")
+        raise DriveError(
+            f"{path}: was not closed, {journal.name} holds its end; mend it with 'ros2 bag reindex'"
+        )
     if len(header) < 100:
         return
     # One stands for 65536, which two bytes cannot.

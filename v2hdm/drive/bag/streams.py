@@ -117,7 +117,8 @@ class InfoStream(Stream):
     def take(self, message: Message) -> None:
         if not self._done:
             write_camera_info(
-                info_of(message.fields, self.label, f"{self.where}: topic {self.label}"), self._folder / INFO_FILE
+                info_of(message.fields, self.label, f"{self.where}: topic {self.label}"),
+                self._folder / INFO_FILE,
             )
             self._done = True
 
@@ -167,7 +168,9 @@ class PoseStream(Stream):
         kind = (folder / _KIND).read_text(encoding="utf-8")
         where = f"{self.where}, topic {self.label}"
         if kind == poses.NMEA:
-            lines = [line.split(" ", 1) for line in (folder / _POSES).read_text(encoding="utf-8").splitlines()]
+            lines = [
+                line.split(" ", 1) for line in (folder / _POSES).read_text(encoding="utf-8").splitlines()
+            ]
             stamp_s = np.array([float(stamp) for stamp, _ in lines])
             return poses.readings_of_sentences(stamp_s, [text for _, text in lines], where)
         headings = None if self._heading is None else _read_rows(folder / _HEADINGS, 6)
@@ -185,7 +188,11 @@ class TfStream(Stream):
     def topics(self, bag: Bag) -> Sequence[str]:
         if not any(name in bag.topics for name in self._wanted):
             raise DriveError(f"{self.where}: {bag.path} has no topic {' or '.join(self._wanted)}")
-        return [bag.need(name, [poses.TF, poses.OLD_TF], self.where).name for name in self._wanted if name in bag.topics]
+        return [
+            bag.need(name, [poses.TF, poses.OLD_TF], self.where).name
+            for name in self._wanted
+            if name in bag.topics
+        ]
 
     def begin(self, folder: Path) -> None:
         self._file = (folder / _TRANSFORMS).open("w", encoding="utf-8")
@@ -241,7 +248,9 @@ def info_of(fields: Any, name: str, where: str) -> CameraInfo:
     if not intrinsic.any():
         raise DriveError(f"{where}: the camera is not calibrated (K is zero); give camera_info as a file")
     if max(fields.binning_x, fields.binning_y) > 1 or fields.roi.width or fields.roi.height:
-        raise DriveError(f"{where}: its images are binned or cut to a region; give their camera_info as a file")
+        raise DriveError(
+            f"{where}: its images are binned or cut to a region; give their camera_info as a file"
+        )
     if model not in DISTORTION_COEFFICIENTS:
         raise DriveError(
             f"{where}: unknown distortion_model '{model}'; give camera_info as a file with one of: "
@@ -249,7 +258,9 @@ def info_of(fields: Any, name: str, where: str) -> CameraInfo:
         )
     count = DISTORTION_COEFFICIENTS[model]
     if len(distortion) > count and distortion[count:].any():
-        raise DriveError(f"{where}: {model} has {count} coefficients, got {len(distortion)}; give it as a file")
+        raise DriveError(
+            f"{where}: {model} has {count} coefficients, got {len(distortion)}; give it as a file"
+        )
     # k3 and those after it are zero where they are not given.
     padded = np.zeros(count)
     padded[: min(count, len(distortion))] = distortion[:count]

@@ -71,11 +71,15 @@ class Frames:
         """
         path = self._path(dst, src)
         if path is None:
-            raise DriveError(f"{where}: no transforms lead from {src} to {dst}; there are: {', '.join(self.names)}")
+            raise DriveError(
+                f"{where}: no transforms lead from {src} to {dst}; there are: {', '.join(self.names)}"
+            )
         tracks = [(self._edges[edge], forward) for edge, forward in path]
         busiest = max((track for track, _ in tracks), key=lambda track: len(track.stamp_s), default=None)
         if busiest is None or len(busiest.stamp_s) < 2:
-            raise DriveError(f"{where}: {src} does not move in {dst}; name the frame of the map and the vehicle's")
+            raise DriveError(
+                f"{where}: {src} does not move in {dst}; name the frame of the map and the vehicle's"
+            )
         stamp_s = busiest.stamp_s
         inside = np.ones(len(stamp_s), dtype=bool)
         out = np.tile(np.eye(4), (len(stamp_s), 1, 1))

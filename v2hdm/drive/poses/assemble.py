@@ -94,7 +94,9 @@ def assemble(
         points = enu_from_geodetic(origin, geodetic)
     elif settings.heading is not None or settings.geoid_m is not None:
         key = "heading" if settings.heading is not None else "geoid_m"
-        raise DriveError(f"{where}, {key}: only for coordinates with a place on the earth; add crs or drop it")
+        raise DriveError(
+            f"{where}, {key}: only for coordinates with a place on the earth; add crs or drop it"
+        )
     poses = np.tile(np.eye(4), (len(points), 1, 1))
     poses[:, :3, :3] = rotation
     poses[:, :3, 3] = points
@@ -138,7 +140,10 @@ def _rotation_at(readings: Readings, max_gap_s: float, where: str) -> tuple[Floa
         )
     if not known.all():
         _log.warning(
-            "%s: left out %d of %d positions: no heading at their time", where, int((~known).sum()), len(known)
+            "%s: left out %d of %d positions: no heading at their time",
+            where,
+            int((~known).sum()),
+            len(known),
         )
     return found[known, :3, :3], known
 
@@ -157,7 +162,9 @@ def _on_earth(
         if crs is not None and not is_geographic(crs, where, DriveError):
             raise DriveError(f"{where}: holds latitudes and longitudes, but crs {crs} is projected; mend crs")
         if settings.heading == "grid":
-            raise DriveError(f"{where}: heading 'grid' of latitudes and longitudes, which have no grid; mend it")
+            raise DriveError(
+                f"{where}: heading 'grid' of latitudes and longitudes, which have no grid; mend it"
+            )
         return raised, np.zeros(len(points))
     assert crs is not None
     if settings.heading is None:
@@ -194,5 +201,3 @@ def _noise(sigma_m: FloatArray, readings: Readings) -> dict[str, float]:
         for key, values in noise.items()
         if len(stated := values[np.isfinite(values) & (values > 0)])
     }
-
-

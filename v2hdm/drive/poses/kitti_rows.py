@@ -50,7 +50,9 @@ def read_kitti_rows(path: Path, entry: dict[str, Any], root: Path, where: str) -
         turn = _VEHICLE_FROM_CAMERA_AXES
         rotation, points = turn @ rotation @ turn.T, points @ turn.T
     elif np.median(rotation[:, 2, 2]) < _UPRIGHT:
-        raise DriveError(f"{path}: the poses' z axis does not point up; say axes: camera if they are KITTI's own")
+        raise DriveError(
+            f"{path}: the poses' z axis does not point up; say axes: camera if they are KITTI's own"
+        )
     rows = in_order(stamp_s, str(path))
     unknown = np.full(len(rows), np.nan)
     stamps = stamp_s[rows]
@@ -76,7 +78,9 @@ def _numbers(path: Path, columns: int) -> FloatArray:
         except ValueError:
             row = []
         if len(row) != columns or not np.isfinite(row).all():
-            raise DriveError(f"{path}: line {number}: expected {columns} finite numbers, got '{line[:60]}'; mend it")
+            raise DriveError(
+                f"{path}: line {number}: expected {columns} finite numbers, got '{line[:60]}'; mend it"
+            )
         rows.append(row)
     if not rows:
         raise DriveError(f"{path}: holds no numbers; expected {columns} a line")

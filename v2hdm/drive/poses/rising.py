@@ -20,7 +20,9 @@ def in_order(stamp_s: FloatArray, where: str, what: str = "line") -> IntArray:
     if not len(stamp_s):
         raise DriveError(f"{where}: holds no pose; record some, or check what it is")
     if not np.isfinite(stamp_s).all():
-        raise DriveError(f"{where}: {what} {int(np.argmin(np.isfinite(stamp_s))) + 1}: its time is not finite")
+        raise DriveError(
+            f"{where}: {what} {int(np.argmin(np.isfinite(stamp_s))) + 1}: its time is not finite"
+        )
     late_s = np.maximum.accumulate(stamp_s) - stamp_s
     if late_s.max() >= _LATE_S:
         k = int(np.argmax(late_s >= _LATE_S))

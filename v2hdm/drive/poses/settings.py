@@ -53,6 +53,7 @@ def take_pose_settings(entry: Mapping[str, Any], where: str) -> PoseSettings:
     Raises:
         DriveError: a value is of the wrong type or out of range.
     """
+
     def number(key: str) -> float | None:
         return None if key not in entry else take_number(entry[key], f"{where}, {key}", DriveError)
 

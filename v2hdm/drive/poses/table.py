@@ -84,7 +84,9 @@ def _columns(path: Path, names: Mapping[str, str]) -> dict[str, FloatArray]:
     header = [name.strip() for name in _split(title, separator)]
     for ours, theirs in names.items():
         if header.count(theirs) != 1:
-            raise DriveError(f"{path}: has no column '{theirs}' for {ours}, or two; it has: {', '.join(header)}")
+            raise DriveError(
+                f"{path}: has no column '{theirs}' for {ours}, or two; it has: {', '.join(header)}"
+            )
     found = {ours: header.index(theirs) for ours, theirs in names.items()}
     for place, name in enumerate(header):
         if name in NAMES and place not in found.values() and name not in found:
