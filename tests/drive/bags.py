@@ -146,7 +146,7 @@ class Messages:
                         translation=self.make("geometry_msgs/msg/Vector3", x=place.x, y=place.y, z=place.z),
                         rotation=pose.orientation,
                     ),
-                )  # fmt: skip
+                )
             )
         return self.make("tf2_msgs/msg/TFMessage", transforms=made)
 

@@ -225,7 +225,7 @@ def test_a_type_that_the_bag_does_not_define_is_named_only_if_it_is_wanted(
     database.close()
     assert_same_drive(read(tmp_path / "drive", described(folder, bag)), read_drive(folder))
     poses = {"topic": "/tf", "frame": "map", "vehicle": "base_link"}
-    with pytest.raises(DriveError, match="topic /tf_static .*own_msgs/msg/Odd, wanted is TFMessage"):
+    with pytest.raises(DriveError, match=r"topic /tf_static .*own_msgs/msg/Odd, wanted is TFMessage"):
         read(tmp_path / "drive", described(folder, bag, poses=poses))
 
 
@@ -251,7 +251,7 @@ def test_poses_on_another_clock_than_images_are_named(folder: Path, tmp_path: Pa
         if name == "/odom":
             message.header.stamp.sec += 18 + 315964800
     bag = write_ros2(tmp_path / "site", made)
-    with pytest.raises(DriveError, match="the poses begin 315964818 s later than the images.*one clock"):
+    with pytest.raises(DriveError, match=r"the poses begin 315964818 s later than the images.*one clock"):
         read(tmp_path / "drive", described(folder, bag))
 
 

@@ -25,7 +25,7 @@ START_S = 1715934630.0
 
 LEVER_M = (1.2, -0.3, 1.8)
 LEVEL_M = 3e-4
-"""A vehicle level where it is has its antenna 0.2 mm elsewhere than one level with the map's origin, 820 m off."""
+"""Level where it is, 820 m off, a vehicle has its antenna 0.2 mm elsewhere than level with the map, m."""
 
 
 def curve(count: int = 41) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -33,7 +33,7 @@ def curve(count: int = 41) -> tuple[FloatArray, FloatArray, FloatArray]:
     stamp_s = START_S + 0.25 * np.arange(count)
     yaw = 0.4 + 5.0 * (stamp_s - START_S) / 30.0
     points = np.column_stack([30 * np.sin(yaw), -30 * np.cos(yaw), 0.01 * np.arange(count)])
-    return stamp_s, points + [700.0, -400.0, 2.0], yaw
+    return stamp_s, points + np.array([700.0, -400.0, 2.0]), yaw
 
 
 def antenna(points: FloatArray, yaw: FloatArray) -> FloatArray:
@@ -139,7 +139,7 @@ def test_positions_without_an_rtk_fix_are_left_out_and_counted(
     check(wide, slice(0, 35), metres=LEVEL_M, radians=1e-6)
     assert wide.noise["position_m"] == pytest.approx(np.sqrt((20 * 0.02**2 + 15 * 0.5**2) / 35))
     (tmp_path / "log.nmea").write_text(nmea_log([5] * 41))
-    with pytest.raises(DriveError, match=r"no position is sure to 0.1 m \(the best is 0.5 m\)"):
+    with pytest.raises(DriveError, match=r"no position is sure to 0\.1 m \(the best is 0\.5 m\)"):
         read(content, tmp_path)
 
 
@@ -164,7 +164,7 @@ def test_an_nmea_log_is_refused_for_what_it_lacks(tmp_path: Path) -> None:
     with pytest.raises(DriveError, match="holds an antenna's positions: add lever_arm_m"):
         read({"nmea": "log.nmea"}, tmp_path)
     log.write_text("\n".join(line.replace(",4,12", ",4,13") for line in whole))
-    with pytest.raises(DriveError, match="41 of 83 NMEA sentences are damaged|no GGA"):
+    with pytest.raises(DriveError, match=r"41 of 83 NMEA sentences are damaged|no GGA"):
         read(content, tmp_path)
 
 
@@ -324,8 +324,11 @@ def test_fixes_and_an_imu_at_other_times_with_antenna_and_turned_sensor(tmp_path
         turn = 0.4 + 5.0 * (t - START_S) / 30.0 + np.pi / 2
         made.add(t, "/imu", made.imu(t, Rotation.from_euler("z", turn).as_matrix(), "imu"))
     poses = {
-        "topic": "/fix", "heading_topic": "/imu", "lever_arm_m": list(LEVER_M), "mounting_rpy_deg": [0, 0, 90],
-    }  # fmt: skip
+        "topic": "/fix",
+        "heading_topic": "/imu",
+        "lever_arm_m": list(LEVER_M),
+        "mounting_rpy_deg": [0, 0, 90],
+    }
     drive = with_topic(tmp_path, made, poses)
     keep = np.delete(np.arange(41), (3, 4))
     np.testing.assert_allclose(drive.recorded.stamp_s, stamp_s[keep], atol=1e-6)

@@ -1,7 +1,8 @@
 """Streams of bags and videos kept as plain files: imported once, whole or not at all.
 
-An entry is a folder that is named by a hash of its source (names, sizes and times of change of the files) and of
-how it was read. Its list of contents, with the size of every file, tells a damaged one, which is made anew.
+An entry is a folder that is named by a hash of its source (names, sizes and times of change of the files) and
+of how it was read. Its list of contents, with the size of every file, tells a damaged one, which is made
+anew.
 """
 
 from __future__ import annotations

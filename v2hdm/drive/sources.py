@@ -174,8 +174,8 @@ def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str)
                 stamp_s = np.array([float(path.stem) for path in paths])
             except ValueError:
                 raise DriveError(
-                    f"{where}: the images of {folder} are not named by their times; add stamps, a file with one "
-                    "time a line"
+                    f"{where}: the images of {folder} are not named by their times; add stamps, a file with "
+                    "one time a line"
                 ) from None
             order = np.argsort(stamp_s, kind="stable")
             stamp_s, paths = stamp_s[order], [paths[n] for n in order.tolist()]
@@ -190,8 +190,8 @@ def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) 
     path = sources.root / take_text(entry["video"], f"{where}, video", DriveError)
     if ("start_s" in entry) == ("stamps" in entry):
         raise DriveError(
-            f"{where}: add start_s, the time of the first frame on the poses' clock, or stamps, a file with the "
-            "time of every frame; one of the two"
+            f"{where}: add start_s, the time of the first frame on the poses' clock, or stamps, a file with "
+            "the time of every frame; one of the two"
         )
 
     def images() -> ImageFiles:
@@ -202,7 +202,8 @@ def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) 
         stamp_s = read_stamps(sources.root / take_text(entry["stamps"], f"{where}, stamps", DriveError))
         if len(stamp_s) != len(listed.paths) or (np.diff(stamp_s) <= 0).any():
             raise DriveError(
-                f"{where}: {len(listed.paths)} frames in {path} and {len(stamp_s)} stamps; give one a frame, rising"
+                f"{where}: {len(listed.paths)} frames in {path} and {len(stamp_s)} stamps; give one a frame, "
+                "rising"
             )
         return replace(listed, stamp_s=stamp_s)
 

@@ -1,7 +1,7 @@
 """A video's frames as PNG files with their times, by PyAV.
 
-PyAV's wheel holds FFmpeg with parts under the GPL (x264, x265): it is an extra of its own, and never installed
-by another one.
+PyAV's wheel holds FFmpeg with parts under the GPL (x264, x265): it is an extra of its own, and never
+installed by another one.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.drive.bag.pixels import png
 from v2hdm.drive.imported import begin_entry, cannot_write, drop_entry, entry_folder, finish_entry, is_whole
+from v2hdm.drive.lossless import png
 from v2hdm.drive.tum import write_image_list
 from v2hdm.errors import DriveError
 from v2hdm.extras import need

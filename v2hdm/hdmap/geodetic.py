@@ -1,8 +1,9 @@
 """Between a local east-north-up frame, geodetic coordinates and projected ones, by PROJ (pyproj).
 
 Datums are kept, never shifted: ETRS89 coordinates stay ETRS89. Datums whose ellipsoid is WGS84's to within a
-millimetre on the ground count as satellite datums (WGS84, ETRS89, NAD83, GDA2020, JGD2011); others are refused,
-since without grid files of their country nobody takes them to satellite positions better than by metres.
+millimetre on the ground count as satellite datums (WGS84, ETRS89, NAD83, GDA2020, JGD2011); others are
+refused, since without grid files of their country nobody takes them to satellite positions better than by
+metres.
 """
 
 from __future__ import annotations
@@ -57,8 +58,8 @@ def geodetic_from_grid(crs: str, points: FloatArray, where: str, error: type[V2h
         Geodetic (N, 3) in the system's own datum.
 
     Raises:
-        V2hdmError: of type ``error``, when the system is unknown, geographic, or of no satellite datum, or the
-            points lie outside of what it can represent.
+        V2hdmError: of type ``error``, when the system is unknown, geographic, or of no satellite datum, or
+            the points lie outside of what it can represent.
     """
     system = _system(crs, where, error)
     if not system.is_projected:
@@ -78,8 +79,8 @@ def convergence_rad(crs: str, points: FloatArray, where: str, error: type[V2hdmE
     Measured along 100 m of the grid's lines.
 
     Raises:
-        V2hdmError: of type ``error``, as :func:`geodetic_from_grid`, and when the projection is not conformal:
-            then a grid has no north that all directions turn with.
+        V2hdmError: of type ``error``, as :func:`geodetic_from_grid`, and when the projection is not
+            conformal: then a grid has no north that all directions turn with.
     """
     here = geodetic_from_grid(crs, points, where, error)
     axes = enu_axes(here)
@@ -89,7 +90,7 @@ def convergence_rad(crs: str, points: FloatArray, where: str, error: type[V2hdmE
         ends = [geodetic_from_grid(crs, points + side * offset, where, error) for side in (1, -1)]
         toward_ecef = _ecef_from_geodetic(ends[0]) - _ecef_from_geodetic(ends[1])
         east, north, _ = np.einsum("nij,ni->jn", axes, toward_ecef)
-        return np.arctan2(east, north)
+        return np.asarray(np.arctan2(east, north))
 
     north, east = azimuth_rad(np.array([0.0, step, 0.0])), azimuth_rad(np.array([step, 0.0, 0.0]))
     if np.abs(np.sin(east - north - np.pi / 2)).max() > _CONFORMAL_RAD:

@@ -1,7 +1,7 @@
 """A bag without a ``drive.yaml``: the description that its topics and frames tell, if they tell enough.
 
-The mounting of the cameras comes from ``/tf_static``; where it is not there, the error holds the description as
-far as it is known, to be completed and put beside the bag.
+The mounting of the cameras comes from ``/tf_static``; where it is not there, the error holds the description
+as far as it is known, to be completed and put beside the bag.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ def describe_bag(path: Path, cache: Path) -> dict[str, Any]:
         if missing:
             flow = dump_flow(content)
             raise DriveError(
-                f"{path}: says no {', no '.join(missing)}; complete this and save it as drive.yaml in a folder beside "
-                f"the bag: {flow}"
+                f"{path}: says no {', no '.join(missing)}; complete this and save it as drive.yaml in a "
+                f"folder beside the bag: {flow}"
             )
         partial = begin_entry(folder)
         try:
@@ -148,7 +148,7 @@ def _first_messages(bag: Bag, names: set[str]) -> _Found:
 
 
 def _cameras(bag: Bag) -> dict[str, Topic]:
-    """Topics of images by the camera's name; of a camera that is there raw and compressed, the compressed one."""
+    """Topics of images by the camera's name; a camera's compressed ones rather than its raw ones."""
     topics = [topic for topic in bag.topics.values() if topic.kind in IMAGE_KINDS and topic.messages]
     by_base: dict[str, Topic] = {}
     for topic in sorted(topics, key=lambda topic: topic.kind != IMAGE_KINDS[1]):
@@ -269,4 +269,4 @@ def _rpy_deg(rotation: FloatArray) -> list[float]:
     """Roll, pitch and yaw in degrees, about fixed axes (REP-103)."""
     pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[2, 1], rotation[2, 2]))
     roll, yaw = np.arctan2(rotation[2, 1], rotation[2, 2]), np.arctan2(rotation[1, 0], rotation[0, 0])
-    return np.degrees([roll, pitch, yaw]).tolist()
+    return [float(np.degrees(angle)) for angle in (roll, pitch, yaw)]

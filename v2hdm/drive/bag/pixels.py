@@ -9,13 +9,13 @@ from typing import Any
 import cv2
 import numpy as np
 
+from v2hdm.drive.lossless import png
 from v2hdm.errors import DriveError
 
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 IMAGE_KINDS = (RAW, COMPRESSED)
 
 _PNG_SIGNATURE, _JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
-_QUICK_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)
 
 
 @dataclass(frozen=True)
@@ -53,13 +53,6 @@ def file_of(kind: str, fields: Any, where: str) -> tuple[str, bytes]:
     return _WRITERS[kind](fields, where)
 
 
-def png(pixels: np.ndarray) -> bytes:
-    """The PNG file of an image, (H, W) or (H, W, 3) BGR uint8, quick rather than small."""
-    done, data = cv2.imencode(".png", pixels, _QUICK_PNG)
-    assert done
-    return data.tobytes()
-
-
 def _compressed(fields: Any, where: str) -> tuple[str, bytes]:
     data = fields.data.tobytes()
     if data.startswith(_JPEG_START):
@@ -89,7 +82,7 @@ def _raw(fields: Any, where: str) -> tuple[str, bytes]:
     shape = (height, width) if encoding.channels == 1 else (height, width, encoding.channels)
     pixels = data.reshape(height, step)[:, :row].reshape(shape)
     if encoding.to_bgr is not None:
-        pixels = cv2.cvtColor(np.ascontiguousarray(pixels), encoding.to_bgr)
+        pixels = np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), encoding.to_bgr), dtype=np.uint8)
     return ".png", png(pixels)
 
 

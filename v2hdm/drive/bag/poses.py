@@ -80,8 +80,8 @@ def readings_of(
         norm = np.linalg.norm(turned[known, :4], axis=1, keepdims=True)
         if (np.abs(norm - 1) > _NORM_TOLERANCE).any():
             raise DriveError(
-                f"{where}: holds a quaternion of norm {norm[np.argmax(np.abs(norm - 1)), 0]:.3g}: no orientation "
-                "was measured there; choose another topic for the heading"
+                f"{where}: holds a quaternion of norm {norm[np.argmax(np.abs(norm - 1)), 0]:.3g}: no "
+                "orientation was measured there; choose another topic for the heading"
             )
         rotation = rotation_from_quaternion(turned[known, :4] / norm)
         attitudes = Attitudes(heading_s[known], rotation, turned[known, 4])

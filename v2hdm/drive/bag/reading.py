@@ -116,8 +116,8 @@ class Bag:
             yield Message(connection.topic, connection.msgtype, received_ns / 1e9, fields)
         if missing > 0:
             raise DriveError(
-                f"{self.path}: {missing} messages of {', '.join(sorted(topics))} that it lists are not there; copy it "
-                "again, or mend it with 'ros2 bag reindex'"
+                f"{self.path}: {missing} messages of {', '.join(sorted(topics))} that it lists are not "
+                "there; copy it again, or mend it with 'ros2 bag reindex'"
             )
 
     def _fields(self, connection: Any, data: bytes) -> Any:
@@ -161,7 +161,8 @@ class Bag:
             raise DriveError(f"{where}: {self.path} has no topic {name}; of type {wanted} it has: {fitting}")
         if topic.kind not in kinds:
             raise DriveError(
-                f"{where}: topic {name} of {self.path} is of type {topic.kind}, wanted is {wanted}; it has: {fitting}"
+                f"{where}: topic {name} of {self.path} is of type {topic.kind}, wanted is {wanted}; it has: "
+                f"{fitting}"
             )
         if not topic.messages:
             raise DriveError(f"{where}: topic {name} of {self.path} holds no message; record it")
@@ -219,7 +220,8 @@ def _check_database(path: Path) -> None:
     counts = header[24:28] == header[92:96]
     if counts and path.stat().st_size < pages * page_bytes:
         raise DriveError(
-            f"{path}: is cut off: {path.stat().st_size} of {pages * page_bytes} bytes are there; copy it again"
+            f"{path}: is cut off: {path.stat().st_size} of {pages * page_bytes} bytes are there; copy it "
+            "again"
         )
 
 
@@ -241,11 +243,11 @@ def _one_line(path: Path, what: str = "") -> Iterator[None]:
     except Exception as failure:
         if isinstance(failure, KeyError):
             raise DriveError(
-                f"{path}: {what}the bag does not define the type {failure}; convert it to MCAP, which holds its "
-                "types, where it was recorded: 'ros2 bag convert'"
+                f"{path}: {what}the bag does not define the type {failure}; convert it to MCAP, which holds "
+                "its types, where it was recorded: 'ros2 bag convert'"
             ) from None
         reason = " ".join(str(failure).split()) or type(failure).__name__
         raise DriveError(
-            f"{path}: {what}not readable as a bag ({reason[:200].rstrip('.')}); copy it again, or mend it with "
-            f"'{_MEND.get(path.suffix, 'ros2 bag reindex')}' if the recording was cut off"
+            f"{path}: {what}not readable as a bag ({reason[:200].rstrip('.')}); copy it again, or mend it "
+            f"with '{_MEND.get(path.suffix, 'ros2 bag reindex')}' if the recording was cut off"
         ) from None

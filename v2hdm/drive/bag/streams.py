@@ -75,14 +75,17 @@ class ImageStream(Stream):
         self._stamps = stamps
 
     def topics(self, bag: Bag) -> Sequence[str]:
+        """The topics of this stream, found and of a type that it understands."""
         return [bag.need(self.label, IMAGE_KINDS, self.where).name]
 
     def begin(self, folder: Path) -> None:
+        """Make ready to write into ``folder``."""
         self._folder = folder
         self._taken_s = array("d")
         self._suffixes: list[str] = []
 
     def take(self, message: Message) -> None:
+        """Write one message."""
         number = len(self._taken_s)
         where = f"{self.where}: topic {self.label}, image {number + 1}"
         stamp_s = stamp_of(message, self._stamps, where)
@@ -97,6 +100,7 @@ class ImageStream(Stream):
         (self._folder / f"{number:06d}{suffix}").write_bytes(data)
 
     def finish(self) -> None:
+        """Write what comes last."""
         names = [f"{number:06d}{suffix}" for number, suffix in enumerate(self._suffixes)]
         write_image_list(np.array(self._taken_s), names, self._folder / IMAGE_LIST)
 
@@ -108,13 +112,16 @@ class InfoStream(Stream):
         super().__init__(topic, ["camera_info"], where)
 
     def topics(self, bag: Bag) -> Sequence[str]:
+        """The topics of this stream, found and of a type that it understands."""
         return [bag.need(self.label, [INFO_KIND], self.where).name]
 
     def begin(self, folder: Path) -> None:
+        """Make ready to write into ``folder``."""
         self._folder = folder
         self._done = False
 
     def take(self, message: Message) -> None:
+        """Write one message."""
         if not self._done:
             write_camera_info(
                 info_of(message.fields, self.label, f"{self.where}: topic {self.label}"),
@@ -135,17 +142,20 @@ class PoseStream(Stream):
         self._files: list[TextIO] = []
 
     def topics(self, bag: Bag) -> Sequence[str]:
+        """The topics of this stream, found and of a type that it understands."""
         names = [bag.need(self.label, poses.POSE_KINDS, self.where).name]
         if self._heading is not None:
             names.append(bag.need(self._heading, poses.HEADING_KINDS, f"{self.where}, heading_topic").name)
         return names
 
     def begin(self, folder: Path) -> None:
+        """Make ready to write into ``folder``."""
         self._folder = folder
         self._files = [(folder / name).open("w", encoding="utf-8") for name in (_POSES, _HEADINGS)]
         self._kind = ""
 
     def take(self, message: Message) -> None:
+        """Write one message."""
         stamp_s = stamp_of(message, self._stamps, f"{self.where}: topic {message.topic}")
         if message.topic == self.label:
             self._kind = message.kind
@@ -157,9 +167,11 @@ class PoseStream(Stream):
             _write_row(self._files[1], stamp_s, poses.heading_row(message.kind, message.fields))
 
     def finish(self) -> None:
+        """Write what comes last."""
         (self._folder / _KIND).write_text(self._kind, encoding="utf-8")
 
     def close(self) -> None:
+        """Close the files."""
         for file in self._files:
             file.close()
 
@@ -186,6 +198,7 @@ class TfStream(Stream):
         self._file: TextIO | None = None
 
     def topics(self, bag: Bag) -> Sequence[str]:
+        """The topics of this stream, found and of a type that it understands."""
         if not any(name in bag.topics for name in self._wanted):
             raise DriveError(f"{self.where}: {bag.path} has no topic {' or '.join(self._wanted)}")
         return [
@@ -195,9 +208,11 @@ class TfStream(Stream):
         ]
 
     def begin(self, folder: Path) -> None:
+        """Make ready to write into ``folder``."""
         self._file = (folder / _TRANSFORMS).open("w", encoding="utf-8")
 
     def take(self, message: Message) -> None:
+        """Write one message."""
         assert self._file is not None
         for edge, row in transform_rows(message.fields):
             self._file.write("\t".join([*edge, *map(repr, map(float, row))]) + "\n")
@@ -206,6 +221,7 @@ class TfStream(Stream):
         """All is written."""
 
     def close(self) -> None:
+        """Close the files."""
         if self._file is not None:
             self._file.close()
 
@@ -230,8 +246,8 @@ def stamp_of(message: Message, stamps: str, where: str) -> float:
     stamp = message.fields.header.stamp
     if not stamp.sec and not stamp.nanosec:
         raise DriveError(
-            f"{where}: its header has no time; set stamps: received to take the recorder's, which come later by "
-            "as much as the computer needed"
+            f"{where}: its header has no time; set stamps: received to take the recorder's, which come later "
+            "by as much as the computer needed"
         )
     return float(stamp.sec + stamp.nanosec / 1e9)
 

@@ -91,7 +91,8 @@ class Frames:
             out = out @ (poses if forward else inverse(poses))
         if not inside.any():
             raise DriveError(
-                f"{where}: the transforms between {src} and {dst} are never known at one time; record them anew"
+                f"{where}: the transforms between {src} and {dst} are never known at one time; record them "
+                "anew"
             )
         return Trajectory(stamp_s[inside], out[inside])
 
@@ -114,7 +115,7 @@ class Frames:
 
 def transform_rows(fields: Any) -> list[tuple[Edge, tuple[float, ...]]]:
     """Edges of a ``TFMessage`` with their rows of stamp, translation and quaternion."""
-    rows = []
+    rows: list[tuple[Edge, tuple[float, ...]]] = []
     for one in fields.transforms:
         move, turn = one.transform.translation, one.transform.rotation
         stamp = one.header.stamp

@@ -76,8 +76,8 @@ def read_poses(
     named = [key for key in (*POSE_FORMATS, "topic") if key in entry]
     if len(named) != 1:
         raise DriveError(
-            f"{where}: name one source, a file of poses by its format ({', '.join(POSE_FORMATS)}) or a topic of "
-            f"the bag; got {', '.join(named) or 'none'}"
+            f"{where}: name one source, a file of poses by its format ({', '.join(POSE_FORMATS)}) or a topic "
+            f"of the bag; got {', '.join(named) or 'none'}"
         )
     (kind,) = named
     keys = TOPIC_KEYS if kind == "topic" else POSE_FORMATS[kind].keys

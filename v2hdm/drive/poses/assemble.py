@@ -1,8 +1,8 @@
 """Readings of positions and attitudes to poses of the vehicle in the map.
 
-Antenna and vehicle: ``vehicle = position - rotation @ lever_arm``. True and grid north: the attitude at a place
-is relative to that place's east and north; the map's axes are those at its origin, and both differences are
-taken exactly, over the earth's centre.
+Antenna and vehicle: ``vehicle = position - rotation @ lever_arm``. True and grid north: the attitude at a
+place is relative to that place's east and north; the map's axes are those at its origin, and both differences
+are taken exactly, over the earth's centre.
 """
 
 from __future__ import annotations
@@ -66,13 +66,15 @@ def assemble(
     """
     if readings.antenna and settings.lever_arm_m is None:
         raise DriveError(
-            f"{where}: holds an antenna's positions: add lever_arm_m: [x, y, z], where the antenna sits in the "
-            "vehicle frame (m forward, left, up); [0, 0, 0] only if it is above the rear axle, on the ground"
+            f"{where}: holds an antenna's positions: add lever_arm_m: [x, y, z], where the antenna sits in "
+            "the vehicle frame (m forward, left, up); [0, 0, 0] only if it is above the rear axle, on the "
+            "ground"
         )
     if readings.attitudes is None:
         raise DriveError(
             f"{where}: holds positions without a heading, and the course over ground is none where a vehicle "
-            "turns, stands or reverses; add a heading (HDT, THS, PASHR, an Imu or dual-antenna topic, a column)"
+            "turns, stands or reverses; add a heading (HDT, THS, PASHR, an Imu or dual-antenna topic, a "
+            "column)"
         )
     kept = _sure_enough(readings, settings.max_sigma_m, where)
     readings = replace(
@@ -155,9 +157,10 @@ def _on_earth(
     crs = settings.crs
     if crs is not None and has_height_datum(crs, where, DriveError) and settings.geoid_m is None:
         raise DriveError(
-            f"{where}: heights of {crs} count from the sea: add geoid_m, the geoid's height above the ellipsoid"
+            f"{where}: heights of {crs} count from the sea: add geoid_m, the geoid's height above the "
+            "ellipsoid"
         )
-    raised = points + [0.0, 0.0, settings.geoid_m or 0.0]
+    raised = points + np.array([0.0, 0.0, settings.geoid_m or 0.0])
     if geodetic:
         if crs is not None and not is_geographic(crs, where, DriveError):
             raise DriveError(f"{where}: holds latitudes and longitudes, but crs {crs} is projected; mend crs")
@@ -186,8 +189,8 @@ def _origin(
     # Without crs the source does not say its datum: that of a correction service is the origin's.
     if settings.crs is not None and given.datum.replace(" ", "") != datum.replace(" ", ""):
         raise DriveError(
-            f"{where}: the poses are in {datum}, the origin in {given.datum}, which differ by decimetres; give "
-            f"the origin in {datum} (datum: {datum})"
+            f"{where}: the poses are in {datum}, the origin in {given.datum}, which differ by decimetres; "
+            f"give the origin in {datum} (datum: {datum})"
         )
     return given if given.epoch is not None else replace(given, epoch=settings.epoch)
 

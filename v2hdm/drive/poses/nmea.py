@@ -1,7 +1,7 @@
 """Poses in a receiver's NMEA 0183 log: GGA, RMC, GST, HDT, THS and PASHR.
 
-GGA gives positions and their quality, GST their standard deviations, RMC or ZDA the date; HDT and THS, which have
-no time, belong to the sentence with a time before them. A course over ground (RMC, VTG) is no heading.
+GGA gives positions and their quality, GST their standard deviations, RMC or ZDA the date; HDT and THS, which
+have no time, belong to the sentence with a time before them. A course over ground (RMC, VTG) is no heading.
 """
 
 from __future__ import annotations
@@ -50,7 +50,10 @@ def read_nmea(path: Path, entry: dict[str, Any], root: Path, where: str) -> Read
 
 
 def nmea_readings(lines: Iterable[str], where: str, first_day: date | None = None) -> Readings:
-    """Readings of sentences in the order of the log; ``first_day`` where neither RMC nor ZDA tells the date."""
+    """Readings of sentences in the order of the log.
+
+    ``first_day`` counts where neither RMC nor ZDA tells the date.
+    """
     log = _Log(where)
     total = bad = 0
     for line in lines:
@@ -123,12 +126,13 @@ class _Log:
         day = self._first_date or first_day
         if day is None:
             raise DriveError(
-                f"{self._where}: no RMC or ZDA sentence tells the date: add date, the day of the first sentence"
+                f"{self._where}: no RMC or ZDA sentence tells the date: add date, the day of the first "
+                "sentence"
             )
         if self._above_sea:
             _log.warning(
-                "%s: its heights count from the sea, and GGA does not say where that is; add geoid_m if the map "
-                "is to have heights above the ellipsoid", self._where,
+                "%s: its heights count from the sea, and GGA does not say where that is; add geoid_m if the "
+                "map is to have heights above the ellipsoid", self._where,
             )  # fmt: skip
         begin_s = datetime(day.year, day.month, day.day, tzinfo=UTC).timestamp()
         stamp_s, fixes = _table(self._fixes, begin_s, self._where)

@@ -27,7 +27,7 @@ def in_order(stamp_s: FloatArray, where: str, what: str = "line") -> IntArray:
     if late_s.max() >= _LATE_S:
         k = int(np.argmax(late_s >= _LATE_S))
         raise DriveError(
-            f"{where}: {what} {k + 1}: its time {stamp_s[k]:.3f} s is {late_s[k]:.3f} s before that of an earlier "
-            "one: two clocks or two recordings in one; keep one of them"
+            f"{where}: {what} {k + 1}: its time {stamp_s[k]:.3f} s is {late_s[k]:.3f} s before that of an "
+            "earlier one: two clocks or two recordings in one; keep one of them"
         )
     return np.unique(stamp_s, return_index=True)[1]

@@ -19,7 +19,8 @@ COMMON_KEYS = (
 )  # fmt: skip
 
 _MAX_SIGMA_M = 0.1
-"""Positions that are stated to be less sure than this, m, are left out: RTK fixed is 0.02, float about 0.5."""
+"""Positions that are stated to be less sure than this, m, are left out: RTK fixed is 0.02, float about "
+"0.5."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Poses in a CSV file with named columns.
 
-A column's name says what it holds and in which unit; ``columns`` in ``drive.yaml`` says what the file calls it.
+A column's name says what it holds and in which unit; ``columns`` in ``drive.yaml`` says what the file calls
+it.
 """
 
 from __future__ import annotations
@@ -31,14 +32,17 @@ _ANGLES = (
 )  # fmt: skip
 _SURENESS = ("quality", "sigma_m", "heading_sigma_deg")
 NAMES = (*_STAMPS, "utc", *_MAP, *_GEODETIC, *_QUATERNION, *_ANGLES, *_SURENESS)
-"""Columns that are understood. ``heading_deg`` counts clockwise from north, ``yaw_...`` counter-clockwise from
-x or east; roll is positive with the left side up, ``pitch_...`` with the nose down, ``pitch_up_deg`` up."""
+"""Columns that are understood. ``heading_deg`` counts clockwise from north, ``yaw_...`` counter-clockwise
+from x or east; roll is positive with the left side up, ``pitch_...`` with the nose down, ``pitch_up_deg``
+up."""
 
 _NORM_TOLERANCE = 1e-3
 
 
 def read_table(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
-    """Read the CSV file at ``path``: comma, semicolon, tab or blanks between columns, names in the first line.
+    """Read the CSV file at ``path``: names in its first line, then a pose a line.
+
+    Columns are parted by commas, semicolons, tabs or blanks.
 
     Raises:
         DriveError: columns are missing or say a thing twice, or a cell does not parse; with the line.
@@ -126,9 +130,9 @@ def _parse(name: str, cell: str, where: str) -> float:
 def _stamps(columns: Mapping[str, FloatArray], path: Path) -> FloatArray:
     named = [name for name in (*_STAMPS, "utc") if name in columns]
     if len(named) != 1:
+        has = ", ".join(named) or "none"
         raise DriveError(
-            f"{path}: needs one column of times, {', '.join(_STAMPS)} or utc, has {', '.join(named) or 'none'}; "
-            "say which under columns"
+            f"{path}: needs one column of times, {', '.join(_STAMPS)} or utc, has {has}; name it under columns"
         )
     return columns[named[0]] / _STAMPS.get(named[0], 1.0)
 
