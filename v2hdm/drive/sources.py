@@ -85,13 +85,13 @@ def plan_images(content: object, camera: str, sources: Sources, where: str) -> C
             return lambda: _of_folder({"folder": content}, camera, sources, where)()
         return lambda: _of_list(camera, path, 0.0)
     entry = take_mapping(content, where, DriveError)
-    named = [key for key in _IMAGE_SOURCES if key in entry]
+    named = [key for key in IMAGE_SOURCES if key in entry]
     if len(named) != 1:
         raise DriveError(
-            f"{where}: name one source, a list file or one of {', '.join(_IMAGE_SOURCES)}; "
+            f"{where}: name one source, a list file or one of {', '.join(IMAGE_SOURCES)}; "
             f"got {', '.join(named) or 'none'}"
         )
-    source = _IMAGE_SOURCES[named[0]]
+    source = IMAGE_SOURCES[named[0]]
     check_keys(entry, (named[0],), source.keys, where, DriveError)
     return source.plan(entry, camera, sources, where)
 
@@ -229,8 +229,9 @@ class _ImageSource:
     keys: tuple[str, ...]
 
 
-_IMAGE_SOURCES: Mapping[str, _ImageSource] = {
+IMAGE_SOURCES: Mapping[str, _ImageSource] = {
     "folder": _ImageSource(_of_folder, ("stamps", "unit")),
     "video": _ImageSource(_of_video, ("start_s", "stamps")),
     "topic": _ImageSource(_of_topic, ("stamps",)),
 }
+"""Sources of images that are no list file, by the key that names them."""

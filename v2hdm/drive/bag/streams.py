@@ -88,7 +88,7 @@ class ImageStream(Stream):
         """Write one message."""
         number = len(self._taken_s)
         where = f"{self.where}: topic {self.label}, image {number + 1}"
-        stamp_s = stamp_of(message, self._stamps, where)
+        stamp_s = stamp_of(message, self._stamps, not number, where)
         if number and stamp_s <= self._taken_s[-1]:
             raise DriveError(
                 f"{where}: its time {stamp_s:.6f} s is not after that of the one before "
@@ -153,10 +153,13 @@ class PoseStream(Stream):
         self._folder = folder
         self._files = [(folder / name).open("w", encoding="utf-8") for name in (_POSES, _HEADINGS)]
         self._kind = ""
+        self._begun: set[str] = set()
 
     def take(self, message: Message) -> None:
         """Write one message."""
-        stamp_s = stamp_of(message, self._stamps, f"{self.where}: topic {message.topic}")
+        first = message.topic not in self._begun
+        self._begun.add(message.topic)
+        stamp_s = stamp_of(message, self._stamps, first, f"{self.where}: topic {message.topic}")
         if message.topic == self.label:
             self._kind = message.kind
             if message.kind == poses.NMEA:
@@ -235,8 +238,8 @@ class TfStream(Stream):
         return Frames.of({edge: np.array(flat).reshape(-1, 8) for edge, flat in rows.items()}, self.where)
 
 
-def stamp_of(message: Message, stamps: str, where: str) -> float:
-    """The time of a message, s.
+def stamp_of(message: Message, stamps: str, first: bool, where: str) -> float:
+    """The time of a message, s; that of the ``first`` of a simulation may be zero.
 
     Raises:
         DriveError: its header has none.
@@ -244,7 +247,7 @@ def stamp_of(message: Message, stamps: str, where: str) -> float:
     if stamps == "received":
         return message.received_s
     stamp = message.fields.header.stamp
-    if not stamp.sec and not stamp.nanosec:
+    if not stamp.sec and not stamp.nanosec and not first:
         raise DriveError(
             f"{where}: its header has no time; set stamps: received to take the recorder's, which come later "
             "by as much as the computer needed"

@@ -132,7 +132,7 @@ def _stamps(columns: Mapping[str, FloatArray], path: Path) -> FloatArray:
     if len(named) != 1:
         has = ", ".join(named) or "none"
         raise DriveError(
-            f"{path}: needs one column of times, {', '.join(_STAMPS)} or utc, has {has}; name it under columns"
+            f"{path}: needs one column of times, {', '.join(_STAMPS)} or utc, has {has}; see columns"
         )
     return columns[named[0]] / _STAMPS.get(named[0], 1.0)
 
