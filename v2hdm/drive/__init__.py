@@ -43,8 +43,8 @@ class Reader:
 
 
 def _read_bag(path: Path, options: ReadOptions) -> Drive:
-    content = describe_bag(path, Path(options.cache))
-    return read_description(content, path.resolve().parent, str(path), options)
+    path = path.resolve()
+    return read_description(describe_bag(path, Path(options.cache)), path.parent, str(path), options)
 
 
 READERS: Mapping[str, Reader] = {
