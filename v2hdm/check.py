@@ -23,6 +23,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _check(parsed: argparse.Namespace) -> int:
+    if parsed.list_topics:
+        from v2hdm.drive import ReadOptions
+        from v2hdm.drive.bag.bare import list_topics
+
+        print(list_topics(parsed.drive, Path(ReadOptions().cache)))
+        return 0
     from v2hdm.checkup import check_up
 
     return EXIT_FAILED_VERDICT if check_up(parsed) else 0
@@ -30,7 +36,7 @@ def _check(parsed: argparse.Namespace) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m v2hdm.check", description=__doc__.split("\n\n")[0])
-    parser.add_argument("drive", type=Path, help="a drive folder, in any format that is mapped")
+    parser.add_argument("drive", type=Path, help="a drive folder or a bag, in any format that is mapped")
     parser.add_argument(
         "--camera", action="append", default=[], metavar="NAME", help="check this camera; may be repeated"
     )
@@ -39,6 +45,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--no-ground", dest="ground", action="store_false", help="do not match bare ground: faster, says less"
+    )
+    parser.add_argument(
+        "--list-topics", action="store_true", help="only list a bag's topics, and the drive.yaml for it"
     )
     parser.add_argument("--all", action="store_true", help="also print the checks that passed")
     parser.add_argument("--workers", type=int, default=0, help="processes (default: one per core)")

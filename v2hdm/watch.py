@@ -117,6 +117,8 @@ def _job(parsed: argparse.Namespace, detector: Detector) -> _Job:
         if any(reader.accepts(path) for reader in READERS.values()):
             return _Job(_drive_frames(path, detector, road))
         raise DriveError(f"{path}: no images ({', '.join(IMAGE_SUFFIXES)}) and no drive in this folder")
+    if READERS["bag"].accepts(path):
+        return _Job(_drive_frames(path, detector, road))
     frames = image_frames([path]) if path.suffix.lower() in IMAGE_SUFFIXES else video_frames(path)
     return _Job((frame, road) for frame in frames)
 

@@ -6,8 +6,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from v2hdm.drive.bag.bare import describe_bag
+from v2hdm.drive.bag.reading import is_bag
 from v2hdm.drive.clock import with_clock_offsets
-from v2hdm.drive.folder import folder_drive_name, is_folder_drive, read_folder_drive, write_drive
+from v2hdm.drive.folder import (
+    folder_drive_name,
+    is_folder_drive,
+    read_description,
+    read_folder_drive,
+    write_drive,
+)
 from v2hdm.drive.kitti import is_kitti_drive, read_kitti_drive
 from v2hdm.drive.options import KittiOptions, ReadOptions
 from v2hdm.errors import DriveError
@@ -28,15 +36,21 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Reader:
-    """One format: ``accepts`` a path by a look at the folder, ``read`` makes a drive of it."""
+    """One format: ``accepts`` a path by a look at it, ``read`` makes a drive of it."""
 
     accepts: Callable[[Path], bool]
     read: Callable[[Path, ReadOptions], Drive]
 
 
+def _read_bag(path: Path, options: ReadOptions) -> Drive:
+    path = path.resolve()
+    return read_description(describe_bag(path, Path(options.cache)), path.parent, str(path), options)
+
+
 READERS: Mapping[str, Reader] = {
     "folder": Reader(accepts=is_folder_drive, read=read_folder_drive),
     "kitti": Reader(accepts=is_kitti_drive, read=read_kitti_drive),
+    "bag": Reader(accepts=is_bag, read=_read_bag),
 }
 
 
@@ -51,8 +65,8 @@ def read_drive(path: Path, options: ReadOptions | None = None) -> Drive:
         DriveError: naming what is wrong, where, and what to do about it.
     """
     options = options or ReadOptions()
-    if not path.is_dir():
-        raise DriveError(f"{path}: no such drive folder; check drive.path")
+    if not path.exists():
+        raise DriveError(f"{path}: no such drive folder or bag; check drive.path")
     if options.max_gap_s <= 0:
         raise DriveError(f"max_gap_s is {options.max_gap_s:g}; give a positive number of seconds")
     if options.format != "auto":
@@ -75,4 +89,6 @@ def drive_name(path: Path) -> str:
     Raises:
         DriveError: when ``drive.yaml`` cannot be read or names it otherwise than by text.
     """
-    return folder_drive_name(path) if is_folder_drive(path) else path.resolve().name
+    if is_folder_drive(path):
+        return folder_drive_name(path)
+    return path.resolve().stem if is_bag(path) else path.resolve().name

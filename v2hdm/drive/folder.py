@@ -5,6 +5,7 @@ docs/drive-format.md describes it for those who want to make one.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from v2hdm.drive.camera_info import read_camera_info, write_camera_info
+from v2hdm.drive.camera_info import write_camera_info
 from v2hdm.drive.images import ImageFiles, check_image_files, count_unposed, pose_images, select_cameras
 from v2hdm.drive.mounting import (
     IPM_NAMES,
@@ -25,8 +26,10 @@ from v2hdm.drive.mounting import (
     take_roi,
 )
 from v2hdm.drive.options import ReadOptions
+from v2hdm.drive.poses import read_poses
 from v2hdm.drive.road import lay_flat, tell
-from v2hdm.drive.tum import read_image_list, read_tum, write_image_list, write_tum
+from v2hdm.drive.sources import Sources, plan_images, plan_info, plan_topic_poses
+from v2hdm.drive.tum import write_image_list, write_tum
 from v2hdm.errors import DriveError
 from v2hdm.fields import take_origin
 from v2hdm.files import check_keys, dump_yaml, load_yaml, replace_text, take_mapping, take_number, take_text
@@ -36,7 +39,7 @@ DRIVE_FILE = "drive.yaml"
 POSES_FILE = "poses.tum"
 TRUTH_FOLDER = "truth"
 
-_DRIVE_KEYS = (("cameras",), ("name", "poses", "pose_noise", "origin", "truth"))
+_DRIVE_KEYS = (("cameras",), ("name", "bag", "poses", "pose_noise", "origin", "truth"))
 _CAMERA_KEYS = (
     ("camera_info", "images", "roi_vehicle"),
     ("linear_response", "initial_ipm", "ipm", "cam_from_vehicle", "centre_prior", "mask"),
@@ -51,22 +54,51 @@ def is_folder_drive(path: Path) -> bool:
 def read_folder_drive(path: Path, options: ReadOptions) -> Drive:
     """Read the drive at ``path``; see :func:`v2hdm.drive.read_drive`."""
     where = path / DRIVE_FILE
-    content = load_yaml(where, DriveError)
-    check_keys(content, *_DRIVE_KEYS, str(where), DriveError)
+    return read_description(load_yaml(where, DriveError), path, str(where), options)
+
+
+def read_description(content: dict[str, Any], path: Path, where: str, options: ReadOptions) -> Drive:
+    """Read the drive that the ``content`` of a ``drive.yaml`` describes.
+
+    Args:
+        content: as in docs/drive-format.md.
+        path: folder that file names are relative to.
+        where: the description, for errors.
+        options: how to read it.
+
+    Raises:
+        DriveError: as :func:`v2hdm.drive.read_drive`.
+    """
+    check_keys(content, *_DRIVE_KEYS, where, DriveError)
     entries = take_mapping(content["cameras"], f"{where}: cameras", DriveError)
     if not entries:
         raise DriveError(f"{where}: names no camera; add one under 'cameras'")
-    cameras: dict[str, Camera] = {}
-    files: list[ImageFiles] = []
-    for name in select_cameras([str(name) for name in entries], options.cameras, where):
+    bag = None
+    if "bag" in content:
+        bag = path / take_text(content["bag"], f"{where}: bag", DriveError)
+    sources = Sources(path, Path(options.cache), bag, options.max_gap_s)
+    planned = {}
+    for name in select_cameras([str(name) for name in entries], options.cameras, Path(where)):
         place = f"{where}: camera '{name}'"
         entry = take_mapping(entries[name], place, DriveError)
         check_keys(entry, *_CAMERA_KEYS, place, DriveError)
-        cameras[name] = _read_camera(entry, path, place)
-        files.append(_list_images(name, path / take_text(entry["images"], f"{place}, images", DriveError)))
-    recorded = read_tum(path / take_text(content.get("poses", POSES_FILE), f"{where}: poses", DriveError))
-    pose_noise = _read_pose_noise(content.get("pose_noise"), f"{where}: pose_noise")
-    laid = lay_flat(recorded, pose_noise.position_m)
+        info = plan_info(entry["camera_info"], name, sources, f"{place}, camera_info")
+        planned[name] = (entry, info, plan_images(entry["images"], name, sources, f"{place}, images"))
+    poses_at = f"{where}: poses"
+    poses = content.get("poses", POSES_FILE)
+    if not isinstance(poses, dict):
+        poses = take_text(poses, poses_at, DriveError)
+    read_topic = plan_topic_poses(poses, sources, poses_at)
+    origin = take_origin(content.get("origin"), f"{where}: origin", DriveError)
+
+    cameras: dict[str, Camera] = {}
+    files: list[ImageFiles] = []
+    for name, (entry, read_info, list_images) in planned.items():
+        cameras[name] = _read_camera(entry, read_info(), path, f"{where}: camera '{name}'")
+        files.append(list_images())
+    recorded = read_poses(poses, path, origin, options.max_gap_s, poses_at, read_topic)
+    pose_noise = _read_pose_noise(content.get("pose_noise"), recorded.noise, f"{where}: pose_noise")
+    laid = lay_flat(recorded.trajectory, pose_noise.position_m)
     tell(laid, path)
     images = pose_images(files, laid.trajectory, options.max_gap_s, path)
     check_image_files(images, cameras)
@@ -76,11 +108,11 @@ def read_folder_drive(path: Path, options: ReadOptions) -> Drive:
         cameras=cameras,
         images=images,
         pose_noise=pose_noise,
-        origin=take_origin(content.get("origin"), f"{where}: origin", DriveError),
+        origin=recorded.origin,
         truth_dir=_find_truth(content.get("truth"), path, f"{where}: truth"),
         unposed=count_unposed(files, images),
         trajectory=laid.trajectory,
-        recorded=recorded,
+        recorded=recorded.trajectory,
         road=laid.road,
     )
 
@@ -127,8 +159,7 @@ def _name(content: dict[str, Any], path: Path) -> str:
     return take_text(content.get("name", path.resolve().name), f"{path / DRIVE_FILE}: name", DriveError)
 
 
-def _read_camera(entry: dict[str, Any], root: Path, where: str) -> Camera:
-    info = read_camera_info(root / take_text(entry["camera_info"], f"{where}, camera_info", DriveError))
+def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str) -> Camera:
     if ("ipm" in entry) == ("cam_from_vehicle" in entry):
         raise DriveError(f"{where}: give either 'ipm' or 'cam_from_vehicle', one of the two")
     if "ipm" in entry:
@@ -177,15 +208,9 @@ def _read_mask(entry: dict[str, Any], root: Path, info: CameraInfo, where: str) 
     return np.asarray(mask > 0)
 
 
-def _list_images(camera: str, path: Path) -> ImageFiles:
-    stamp_s, names = read_image_list(path)
-    return ImageFiles(camera=camera, stamp_s=stamp_s, paths=[path.parent / name for name in names])
-
-
-def _read_pose_noise(content: object, where: str) -> PoseNoise:
-    if content is None:
-        return PoseNoise.as_far_as_stated()
-    entry = take_mapping(content, where, DriveError)
+def _read_pose_noise(content: object, of_source: Mapping[str, float], where: str) -> PoseNoise:
+    """What the drive states; of what it does not, what the source of its poses states."""
+    entry = {} if content is None else take_mapping(content, where, DriveError)
     check_keys(entry, (), [field.name for field in fields(PoseNoise)], where, DriveError)
     values = {key: take_number(value, f"{where}, {key}", DriveError) for key, value in entry.items()}
     for key, value in values.items():
@@ -195,7 +220,8 @@ def _read_pose_noise(content: object, where: str) -> PoseNoise:
             raise DriveError(
                 f"{where}, {key}: an error that fades over no distance is no drift; leave it out"
             )
-    noise = PoseNoise.as_far_as_stated(**values)
+    stated = {key: value for key, value in of_source.items() if not {key, DRIFTS[key]} & set(values)}
+    noise = PoseNoise.as_far_as_stated(**stated, **values)
     for total, drift in DRIFTS.items():
         if getattr(noise, drift) > getattr(noise, total):
             raise DriveError(f"{where}, {drift}: is part of {total} and cannot be above it; mend one of them")

@@ -33,10 +33,12 @@ class ReadOptions:
         cameras: names of the cameras to read; empty for all.
         max_gap_s: poses further apart than this are not interpolated across; images that fall into
             such a gap are dropped.
+        cache: folder that keeps what is imported from bags and videos.
         kitti: only used by the ``kitti`` reader.
     """
 
     format: str = "auto"
     cameras: list[str] = field(default_factory=list)
     max_gap_s: float = 0.5
+    cache: str = "cache"
     kitti: KittiOptions = field(default_factory=KittiOptions)

@@ -10,6 +10,9 @@ from v2hdm.records import FloatArray
 
 _UNITS: Mapping[str, float] = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 
+UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+"""Units of times as files name them, and how many of each make a second."""
+
 _LONGEST_S = 5.0
 """Poses and images of a drive are never recorded more seldom than this."""
 

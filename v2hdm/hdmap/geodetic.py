@@ -1,62 +1,163 @@
-"""Between a local east-north-up frame and WGS84 latitude, longitude and height, in plain numpy."""
+"""Between a local east-north-up frame, geodetic coordinates and projected ones, by PROJ (pyproj).
+
+Datums are kept, never shifted: ETRS89 coordinates stay ETRS89. Datums whose ellipsoid is WGS84's to within a
+millimetre on the ground count as satellite datums (WGS84, ETRS89, NAD83, GDA2020, JGD2011); others are
+refused, since without grid files of their country nobody takes them to satellite positions better than by
+metres.
+"""
 
 from __future__ import annotations
 
+from functools import lru_cache
+from typing import Any
+
 import numpy as np
 
+from v2hdm.errors import MapFileError, V2hdmError
+from v2hdm.extras import need
 from v2hdm.records import FloatArray, GeodeticOrigin
 
-_SEMI_MAJOR_M = 6378137.0
-_FLATTENING = 1.0 / 298.257223563
-_SEMI_MINOR_M = _SEMI_MAJOR_M * (1.0 - _FLATTENING)
-_ECCENTRICITY2 = _FLATTENING * (2.0 - _FLATTENING)
-_SECOND_ECCENTRICITY2 = _ECCENTRICITY2 / (1.0 - _ECCENTRICITY2)
+_CARTESIAN = "+proj=cart +ellps=WGS84"
+_SEMI_MAJOR_M, _FLATTENING = 6378137.0, 1 / 298.257223563
+_SAME_ELLIPSOID_M = 1e-3
+"""GRS80's semi-minor axis is 0.1 mm longer than WGS84's, m."""
+
+_STEP_M = 50.0
+"""Half of the stretch along which the grid's north is measured, m."""
+
+_CONFORMAL_RAD = 1e-5
+"""Angle by which a grid's axes may be off a right angle; a conformal projection's are by rounding, rad."""
 
 
 def geodetic_from_enu(origin: GeodeticOrigin, points_map: FloatArray) -> FloatArray:
     """Map points (N, 3) in m to (N, 3): latitude and longitude in degrees, ellipsoidal height in m."""
-    origin_ecef, ecef_from_enu = _tangent_frame(origin)
-    return _geodetic_from_ecef(points_map @ ecef_from_enu.T + origin_ecef)
+    points_ecef = points_map @ enu_axes(_position(origin))[0].T + _ecef_from_geodetic(_position(origin))[0]
+    lon, lat, height_m = _cartesian().transform(*points_ecef.T, direction="INVERSE")
+    return np.column_stack([lat, lon, height_m])
 
 
 def enu_from_geodetic(origin: GeodeticOrigin, geodetic: FloatArray) -> FloatArray:
     """The inverse of :func:`geodetic_from_enu`: (N, 3) degrees, degrees, m to map points (N, 3) in m."""
-    origin_ecef, ecef_from_enu = _tangent_frame(origin)
-    return np.asarray((_ecef_from_geodetic(geodetic) - origin_ecef) @ ecef_from_enu)
+    here = _position(origin)
+    return np.asarray((_ecef_from_geodetic(geodetic) - _ecef_from_geodetic(here)[0]) @ enu_axes(here)[0])
 
 
-def _tangent_frame(origin: GeodeticOrigin) -> tuple[FloatArray, FloatArray]:
-    """Earth-centred position (3,) of the origin and the rotation (3, 3) with the columns E, N, U."""
-    position = np.array([[origin.latitude_deg, origin.longitude_deg, origin.altitude_m]])
-    lat, lon = np.radians(position[0, :2])
-    east = [-np.sin(lon), np.cos(lon), 0.0]
-    north = [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)]
-    up = [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]
-    return _ecef_from_geodetic(position)[0], np.column_stack([east, north, up])
+def enu_axes(geodetic: FloatArray) -> FloatArray:
+    """Rotations (N, 3, 3), earth-centred from local, with the columns east, north, up at (N, 3) places."""
+    lat, lon = np.radians(geodetic[:, 0]), np.radians(geodetic[:, 1])
+    east = np.column_stack([-np.sin(lon), np.cos(lon), np.zeros(len(lat))])
+    north = np.column_stack([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)])
+    up = np.column_stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+    return np.stack([east, north, up], axis=2)
+
+
+def geodetic_from_grid(crs: str, points: FloatArray, where: str, error: type[V2hdmError]) -> FloatArray:
+    """Points (N, 3) of a projected system: easting, northing in its unit, height in m above the ellipsoid.
+
+    Returns:
+        Geodetic (N, 3) in the system's own datum.
+
+    Raises:
+        V2hdmError: of type ``error``, when the system is unknown, geographic, or of no satellite datum, or
+            the points lie outside of what it can represent.
+    """
+    system = _system(crs, where, error)
+    if not system.is_projected:
+        raise error(
+            f"{where}: {crs} is not projected; give latitude and longitude as such, or a projected one"
+        )
+    lon, lat = _inverse_of(crs).transform(points[:, 0], points[:, 1])
+    geodetic = np.column_stack([lat, lon, points[:, 2]])
+    if not np.isfinite(geodetic).all():
+        raise error(f"{where}: some points lie outside of {crs}; check it and the order easting, northing")
+    return geodetic
+
+
+def convergence_rad(crs: str, points: FloatArray, where: str, error: type[V2hdmError]) -> FloatArray:
+    """The angles (N,), clockwise, from true north to the north of a projected system's grid at its points.
+
+    Measured along 100 m of the grid's lines.
+
+    Raises:
+        V2hdmError: of type ``error``, as :func:`geodetic_from_grid`, and when the projection is not
+            conformal: then a grid has no north that all directions turn with.
+    """
+    here = geodetic_from_grid(crs, points, where, error)
+    axes = enu_axes(here)
+    step = _STEP_M / _system(crs, where, error).axis_info[0].unit_conversion_factor
+
+    def azimuth_rad(offset: FloatArray) -> FloatArray:
+        ends = [geodetic_from_grid(crs, points + side * offset, where, error) for side in (1, -1)]
+        toward_ecef = _ecef_from_geodetic(ends[0]) - _ecef_from_geodetic(ends[1])
+        east, north, _ = np.einsum("nij,ni->jn", axes, toward_ecef)
+        return np.asarray(np.arctan2(east, north))
+
+    north, east = azimuth_rad(np.array([0.0, step, 0.0])), azimuth_rad(np.array([step, 0.0, 0.0]))
+    if np.abs(np.sin(east - north - np.pi / 2)).max() > _CONFORMAL_RAD:
+        raise error(f"{where}: {crs} does not keep angles; give headings from true north (heading: true)")
+    return north
+
+
+def datum_of(crs: str, where: str, error: type[V2hdmError]) -> str:
+    """Name of the satellite datum that coordinates of ``crs`` refer to, ``WGS84`` written like that.
+
+    Raises:
+        V2hdmError: of type ``error``, when the system is unknown or its datum is of another ellipsoid.
+    """
+    name = str(_system(crs, where, error).geodetic_crs.name)
+    return "WGS84" if name.replace(" ", "") == "WGS84" else name
+
+
+def has_height_datum(crs: str, where: str, error: type[V2hdmError]) -> bool:
+    """Whether heights of ``crs`` count from the sea (a compound system) and not from the ellipsoid."""
+    return bool(_system(crs, where, error).is_compound)
+
+
+def is_geographic(crs: str, where: str, error: type[V2hdmError]) -> bool:
+    """Whether coordinates of ``crs`` are latitude and longitude."""
+    return bool(_system(crs, where, error).is_geographic)
+
+
+def _system(crs: str, where: str, error: type[V2hdmError]) -> Any:
+    pyproj = need("pyproj", "map", f"{where}: crs", error)
+    try:
+        system = pyproj.CRS.from_user_input(crs)
+    except pyproj.exceptions.CRSError:
+        raise error(f"{where}: unknown crs '{crs}'; give an EPSG code such as EPSG:25832") from None
+    ellipsoid = system.ellipsoid
+    minor_m = _SEMI_MAJOR_M * (1 - _FLATTENING)
+    if (
+        ellipsoid is None
+        or abs(ellipsoid.semi_major_metre - _SEMI_MAJOR_M) > _SAME_ELLIPSOID_M
+        or abs(ellipsoid.semi_minor_metre - minor_m) > _SAME_ELLIPSOID_M
+    ):
+        raise error(
+            f"{where}: {crs} ({system.name}) is of no satellite datum; convert the coordinates to one with "
+            "your survey office's transformation (in Europe ETRS89, such as EPSG:25832)"
+        )
+    return system
+
+
+@lru_cache(maxsize=8)
+def _inverse_of(crs: str) -> Any:
+    """The transformer from a projected system to its own longitude and latitude."""
+    pyproj = need("pyproj", "map", "a projected system", MapFileError)
+    system = pyproj.CRS.from_user_input(crs)
+    horizontal = system.sub_crs_list[0] if system.is_compound else system
+    return pyproj.Transformer.from_crs(horizontal, horizontal.geodetic_crs, always_xy=True)
+
+
+def _position(origin: GeodeticOrigin) -> FloatArray:
+    return np.array([[origin.latitude_deg, origin.longitude_deg, origin.altitude_m]])
 
 
 def _ecef_from_geodetic(geodetic: FloatArray) -> FloatArray:
-    lat, lon = np.radians(geodetic[:, 0]), np.radians(geodetic[:, 1])
-    height_m = geodetic[:, 2]
-    normal_m = _SEMI_MAJOR_M / np.sqrt(1.0 - _ECCENTRICITY2 * np.sin(lat) ** 2)
-    across_m = (normal_m + height_m) * np.cos(lat)
-    along_m = (normal_m * (1.0 - _ECCENTRICITY2) + height_m) * np.sin(lat)
-    return np.column_stack([across_m * np.cos(lon), across_m * np.sin(lon), along_m])
+    return np.column_stack(_cartesian().transform(geodetic[:, 1], geodetic[:, 0], geodetic[:, 2]))
 
 
-def _geodetic_from_ecef(points_ecef: FloatArray) -> FloatArray:
-    """Bowring's formula (Survey Review 23, 1976), repeated once: below 1e-9 m near the ground."""
-    x, y, z = points_ecef.T
-    axis_m = np.hypot(x, y)
-    reduced = np.arctan2(z * _SEMI_MAJOR_M, axis_m * _SEMI_MINOR_M)
-    lat = reduced
-    for _ in range(2):
-        lat = np.arctan2(
-            z + _SECOND_ECCENTRICITY2 * _SEMI_MINOR_M * np.sin(reduced) ** 3,
-            axis_m - _ECCENTRICITY2 * _SEMI_MAJOR_M * np.cos(reduced) ** 3,
-        )
-        reduced = np.arctan2((1.0 - _FLATTENING) * np.sin(lat), np.cos(lat))
-    # This form of the height, unlike p / cos(lat) - N, holds at the poles too.
-    normal_m = _SEMI_MAJOR_M / np.sqrt(1.0 - _ECCENTRICITY2 * np.sin(lat) ** 2)
-    height_m = axis_m * np.cos(lat) + z * np.sin(lat) - _SEMI_MAJOR_M**2 / normal_m
-    return np.column_stack([np.degrees(lat), np.degrees(np.arctan2(y, x)), height_m])
+@lru_cache(maxsize=1)
+def _cartesian() -> Any:
+    pyproj = need("pyproj", "map", "a place on the earth", MapFileError)
+    # PROJ takes angles of a bare pipeline in radians: the first step makes them of degrees.
+    pipeline = f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step {_CARTESIAN}"
+    return pyproj.Transformer.from_pipeline(pipeline)

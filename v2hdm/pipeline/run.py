@@ -59,7 +59,7 @@ def silent(task: str, done: int, total: int) -> None:
 
 @dataclass(kw_only=True)
 class DriveConfig(ReadOptions):
-    """Where the drive is, and how to read it: ``path`` is its folder, None where it is rendered."""
+    """Where the drive is, and how to read it: ``path`` is its folder or bag, None where it is rendered."""
 
     path: str | None = None
 
@@ -75,7 +75,7 @@ class RunConfig:
         detector: settings of the detector.
         mapping: settings of association, optimisation and lanes.
         output: folder that takes the results.
-        cache: folder that keeps rendered drives.
+        cache: folder that keeps rendered drives and what is imported from bags and videos.
         workers: processes for rendering and detection; 0 takes one per core.
         device: what ``conf/map.yaml`` hands on as ``mapping.device``, ``cpu`` or ``cuda``.
         all_maps: whether the map of every method and camera set is written, into ``maps/``.

@@ -1,0 +1,242 @@
+"""Bags of a drive folder, written with rosbags' own writers, for the tests of reading them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from v2hdm.drive import read_drive
+from v2hdm.geometry.rigid import inverse, quaternion_from_rotation
+from v2hdm.records import Drive, FloatArray
+
+ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.LATEST)
+ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+
+Row = tuple[float, str, Any]
+"""Time of reception, topic, message."""
+
+
+@dataclass
+class Messages:
+    """Makes messages of either ROS."""
+
+    ros1: bool = False
+    rows: list[Row] = field(default_factory=list)
+
+    @property
+    def store(self) -> Any:
+        return ROS1 if self.ros1 else ROS2
+
+    def make(self, kind: str, **fields: Any) -> Any:
+        return self.store.types[kind](**fields)
+
+    def header(self, stamp_s: float, frame: str) -> Any:
+        nanoseconds = round(stamp_s * 1e9)
+        time = self.make("builtin_interfaces/msg/Time", sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
+        sequence = {"seq": 0} if self.ros1 else {}
+        return self.make("std_msgs/msg/Header", stamp=time, frame_id=frame, **sequence)
+
+    def add(self, stamp_s: float, topic: str, message: Any) -> None:
+        self.rows.append((stamp_s, topic, message))
+
+    def raw_image(self, stamp_s: float, pixels: np.ndarray, encoding: str, frame: str, pad: int = 0) -> Any:
+        height, width = pixels.shape[:2]
+        rows = pixels.reshape(height, -1)
+        data = np.pad(rows, ((0, 0), (0, pad)), constant_values=77)
+        return self.make(
+            "sensor_msgs/msg/Image", header=self.header(stamp_s, frame), height=height, width=width,
+            encoding=encoding, is_bigendian=0, step=data.shape[1], data=data.ravel(),
+        )  # fmt: skip
+
+    def compressed(self, stamp_s: float, data: bytes, form: str, frame: str) -> Any:
+        return self.make(
+            "sensor_msgs/msg/CompressedImage", header=self.header(stamp_s, frame), format=form,
+            data=np.frombuffer(data, np.uint8),
+        )  # fmt: skip
+
+    def info(self, stamp_s: float, camera: Any, frame: str) -> Any:
+        names = ("K", "D", "R", "P") if self.ros1 else ("k", "d", "r", "p")
+        values = (
+            camera.intrinsic.ravel(), np.array(camera.distortion), np.eye(3).ravel(),
+            np.column_stack([camera.intrinsic, np.zeros(3)]).ravel(),
+        )  # fmt: skip
+        roi = self.make(
+            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+        )
+        return self.make(
+            "sensor_msgs/msg/CameraInfo", header=self.header(stamp_s, frame), height=camera.height,
+            width=camera.width, distortion_model=camera.distortion_model, binning_x=0, binning_y=0, roi=roi,
+            **dict(zip(names, values, strict=True)),
+        )  # fmt: skip
+
+    def pose(self, matrix: FloatArray) -> Any:
+        x, y, z, w = quaternion_from_rotation(matrix[None, :3, :3])[0].tolist()
+        px, py, pz = matrix[:3, 3].tolist()
+        return self.make(
+            "geometry_msgs/msg/Pose",
+            position=self.make("geometry_msgs/msg/Point", x=px, y=py, z=pz),
+            orientation=self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+        )
+
+    def pose_stamped(self, stamp_s: float, matrix: FloatArray) -> Any:
+        return self.make(
+            "geometry_msgs/msg/PoseStamped", header=self.header(stamp_s, "map"), pose=self.pose(matrix)
+        )
+
+    def with_covariance(self, stamp_s: float, matrix: FloatArray, covariance: FloatArray) -> Any:
+        pose = self.make(
+            "geometry_msgs/msg/PoseWithCovariance", pose=self.pose(matrix), covariance=covariance.ravel()
+        )
+        return self.make(
+            "geometry_msgs/msg/PoseWithCovarianceStamped", header=self.header(stamp_s, "map"), pose=pose
+        )
+
+    def odometry(self, stamp_s: float, matrix: FloatArray, covariance: FloatArray, child: str) -> Any:
+        zero = self.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+        twist = self.make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
+        return self.make(
+            "nav_msgs/msg/Odometry", header=self.header(stamp_s, "map"), child_frame_id=child,
+            pose=self.make(
+                "geometry_msgs/msg/PoseWithCovariance", pose=self.pose(matrix), covariance=covariance.ravel()
+            ),
+            twist=self.make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
+        )  # fmt: skip
+
+    def fix(self, stamp_s: float, place: Sequence[float], status: int, sigma_m: float, frame: str) -> Any:
+        covariance = np.diag([sigma_m**2, sigma_m**2, (2 * sigma_m) ** 2]).ravel()
+        return self.make(
+            "sensor_msgs/msg/NavSatFix", header=self.header(stamp_s, frame),
+            status=self.make("sensor_msgs/msg/NavSatStatus", status=status, service=1),
+            latitude=float(place[0]), longitude=float(place[1]), altitude=float(place[2]),
+            position_covariance=covariance, position_covariance_type=2 if sigma_m else 0,
+        )  # fmt: skip
+
+    def imu(self, stamp_s: float, rotation: FloatArray, frame: str) -> Any:
+        x, y, z, w = quaternion_from_rotation(rotation[None])[0].tolist()
+        zero = self.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+        return self.make(
+            "sensor_msgs/msg/Imu", header=self.header(stamp_s, frame),
+            orientation=self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+            orientation_covariance=np.diag([1e-4, 1e-4, 4e-6]).ravel(), angular_velocity=zero,
+            angular_velocity_covariance=np.zeros(9), linear_acceleration=zero,
+            linear_acceleration_covariance=np.zeros(9),
+        )  # fmt: skip
+
+    def transforms(self, stamp_s: float, edges: Mapping[tuple[str, str], FloatArray]) -> Any:
+        made = []
+        for (parent, child), matrix in edges.items():
+            pose = self.pose(matrix)
+            place = pose.position
+            made.append(
+                self.make(
+                    "geometry_msgs/msg/TransformStamped",
+                    header=self.header(stamp_s, parent),
+                    child_frame_id=child,
+                    transform=self.make(
+                        "geometry_msgs/msg/Transform",
+                        translation=self.make("geometry_msgs/msg/Vector3", x=place.x, y=place.y, z=place.z),
+                        rotation=pose.orientation,
+                    ),
+                )
+            )
+        return self.make("tf2_msgs/msg/TFMessage", transforms=made)
+
+
+def messages_of(folder: Path, ros1: bool = False, fixed_frames: bool = True) -> Messages:
+    """The drive in ``folder``: raw images of ``front``, those of ``rear`` as they are, odometry, frames."""
+    drive = read_drive(folder)
+    made = Messages(ros1)
+    assert drive.trajectory is not None
+    for image in drive.images:
+        frame = f"{image.camera}_optical"
+        topic = f"/sensing/{image.camera}/image_raw"
+        if image.camera == "front":
+            pixels = cv2.imread(str(image.path), cv2.IMREAD_COLOR)
+            rgb = np.ascontiguousarray(pixels[..., ::-1])
+            made.add(image.stamp_s, topic, made.raw_image(image.stamp_s, rgb, "rgb8", frame, pad=5))
+        else:
+            data = image.path.read_bytes()
+            made.add(
+                image.stamp_s, f"{topic}/compressed", made.compressed(image.stamp_s, data, "jpeg", frame)
+            )
+        info = made.info(image.stamp_s, drive.cameras[image.camera].info, frame)
+        made.add(image.stamp_s, f"/sensing/{image.camera}/camera_info", info)
+    for stamp_s, pose in zip(drive.trajectory.stamp_s, drive.trajectory.map_from_vehicle, strict=True):
+        made.add(stamp_s, "/odom", made.odometry(stamp_s, pose, np.zeros(36), "base_link"))
+    if fixed_frames:
+        edges = {
+            ("base_link", f"{name}_optical"): inverse(np.array(guess)) for name, guess in mountings().items()
+        }
+        made.add(
+            drive.trajectory.stamp_s[0], "/tf_static", made.transforms(drive.trajectory.stamp_s[0], edges)
+        )
+    made.rows.sort(key=lambda row: row[0])
+    return made
+
+
+def mountings() -> dict[str, FloatArray]:
+    from tests.drive.example import looking_forward
+
+    return {"front": looking_forward(2.0), "rear": looking_forward(3.0)}
+
+
+def write_ros1(path: Path, made: Messages, compressed: bool = False) -> Path:
+    path = path.with_suffix(".bag")
+    writer = Writer1(path)
+    if compressed:
+        writer.set_compression(Writer1.CompressionFormat.LZ4)
+    with writer:
+        _write(writer, made, ROS1.serialize_ros1, ROS1)
+    return path
+
+
+def write_ros2(
+    path: Path,
+    made: Messages,
+    storage: StoragePlugin = StoragePlugin.MCAP,
+    compression: CompressionMode = CompressionMode.NONE,
+) -> Path:
+    writer = Writer2(path, version=9, storage_plugin=storage)
+    writer.set_compression(compression, CompressionFormat.ZSTD)
+    with writer:
+        _write(writer, made, ROS2.serialize_cdr, ROS2)
+    return path
+
+
+def _write(writer: Any, made: Messages, serialize: Callable[..., Any], store: Any) -> None:
+    connections: dict[str, Any] = {}
+    for stamp_s, topic, message in made.rows:
+        if topic not in connections:
+            connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=store)
+        data = serialize(message, message.__msgtype__)
+        writer.write(connections[topic], round(stamp_s * 1e9) + 1_000_000, data)
+
+
+def assert_same_drive(got: Drive, expected: Drive) -> None:
+    """Poses to a micrometre, pixels and times to the last bit."""
+    assert [(image.camera, image.stamp_s) for image in got.images] == [
+        (image.camera, image.stamp_s) for image in expected.images
+    ]
+    for one, other in zip(got.images, expected.images, strict=True):
+        np.testing.assert_allclose(one.map_from_vehicle, other.map_from_vehicle, rtol=0, atol=1e-6)
+        np.testing.assert_array_equal(cv2.imread(str(one.path)), cv2.imread(str(other.path)))
+    for name, camera in expected.cameras.items():
+        info = got.cameras[name].info
+        assert (info.name, info.width, info.height) == (name, camera.info.width, camera.info.height)
+        assert (info.distortion_model, info.distortion) == (
+            camera.info.distortion_model,
+            camera.info.distortion,
+        )
+        np.testing.assert_array_equal(info.intrinsic, camera.info.intrinsic)
+        np.testing.assert_allclose(
+            got.cameras[name].ipm[camera.initial_ipm], camera.ipm[camera.initial_ipm], rtol=1e-12
+        )

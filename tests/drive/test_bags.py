@@ -1,0 +1,290 @@
+"""One drive in every container is the same drive; damaged containers end in one line."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
+
+from tests.drive.bags import Messages, assert_same_drive, messages_of, mountings, write_ros1, write_ros2
+from tests.drive.example import make_drive
+from v2hdm.drive import ReadOptions, drive_name, read_drive
+from v2hdm.drive.bag.bare import list_topics
+from v2hdm.drive.bag.pixels import file_of
+from v2hdm.errors import DriveError
+from v2hdm.records import Drive
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A drive with a picture in its images, so that a wrong channel or row would be seen."""
+    root = tmp_path_factory.mktemp("folder")
+    drive = make_drive(root)
+    rng = np.random.default_rng(5)
+    for image in drive.images:
+        cv2.imwrite(str(image.path), rng.integers(0, 255, (48, 64, 3), np.uint8))
+    return root
+
+
+def _ros2(storage: StoragePlugin, compression: CompressionMode) -> Callable[[Path, Path], Path]:
+    return lambda path, folder: write_ros2(path, messages_of(folder), storage, compression)
+
+
+SQLITE3, MCAP = StoragePlugin.SQLITE3, StoragePlugin.MCAP
+CONTAINERS: dict[str, Callable[[Path, Path], Path]] = {
+    "ros1": lambda path, folder: write_ros1(path, messages_of(folder, ros1=True)),
+    "ros1 lz4": lambda path, folder: write_ros1(path, messages_of(folder, ros1=True), compressed=True),
+    "sqlite3": _ros2(SQLITE3, CompressionMode.NONE),
+    "sqlite3 zstd file": _ros2(SQLITE3, CompressionMode.FILE),
+    "sqlite3 zstd message": _ros2(SQLITE3, CompressionMode.MESSAGE),
+    "mcap": _ros2(MCAP, CompressionMode.NONE),
+    "mcap zstd chunks": _ros2(MCAP, CompressionMode.STORAGE),
+    "mcap zstd messages": _ros2(MCAP, CompressionMode.MESSAGE),
+}
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory, folder: Path) -> dict[str, Path]:
+    target = tmp_path_factory.mktemp("bags")
+    return {kind: write(target / kind.replace(" ", "_"), folder) for kind, write in CONTAINERS.items()}
+
+
+def described(folder: Path, bag: Path, **changes: Any) -> dict[str, Any]:
+    """The folder's ``drive.yaml`` with the topics of ``bag`` in the place of files."""
+    content = yaml.safe_load((folder / "drive.yaml").read_text())
+    content.pop("truth")
+    content |= {"bag": str(bag), "poses": {"topic": "/odom"}}
+    for name, suffix in (("front", ""), ("rear", "/compressed")):
+        content["cameras"][name] |= {
+            "camera_info": {"topic": f"/sensing/{name}/camera_info"},
+            "images": {"topic": f"/sensing/{name}/image_raw{suffix}"},
+        }
+    return content | changes
+
+
+def read(root: Path, content: dict[str, Any]) -> Drive:
+    root.mkdir(exist_ok=True)
+    (root / "drive.yaml").write_text(yaml.safe_dump(content))
+    return read_drive(root, ReadOptions(cache=str(root / "cache")))
+
+
+@pytest.mark.parametrize("kind", CONTAINERS)
+def test_a_bag_is_the_same_drive_as_its_folder(
+    kind: str, folder: Path, bags: dict[str, Path], tmp_path: Path
+) -> None:
+    got = read(tmp_path / "drive", described(folder, bags[kind]))
+    assert_same_drive(got, read_drive(folder))
+    # The rear camera's JPEG files are those that were recorded, byte by byte.
+    rear = [image.path for image in got.images if image.camera == "rear"]
+    recorded = sorted((folder / "rear" / "images").iterdir())
+    assert [path.read_bytes() for path in rear] == [path.read_bytes() for path in recorded]
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
+def test_a_bag_without_description_is_a_drive_where_its_frames_tell_the_mounting(
+    kind: str, folder: Path, bags: dict[str, Path], tmp_path: Path
+) -> None:
+    assert drive_name(bags[kind]) == bags[kind].stem
+    got = read_drive(bags[kind], ReadOptions(cache=str(tmp_path)))
+    expected = read_drive(folder)
+    assert [(image.camera, image.stamp_s) for image in got.images] == [
+        (image.camera, image.stamp_s) for image in expected.images
+    ]
+    for one, other in zip(got.images, expected.images, strict=True):
+        np.testing.assert_allclose(one.map_from_vehicle, other.map_from_vehicle, rtol=0, atol=1e-6)
+    for name, cam_from_vehicle in mountings().items():
+        # Of the extrinsic the IPM keeps the two columns of the ground's axes and the translation.
+        ground = got.cameras[name].info.intrinsic @ cam_from_vehicle[:3, [0, 1, 3]]
+        product = got.cameras[name].ipm["estimated"] @ ground
+        np.testing.assert_allclose(product / product[2, 2], np.eye(3), atol=1e-9)
+
+
+def test_a_bag_without_mounting_says_which_description_to_write(folder: Path, tmp_path: Path) -> None:
+    bag = write_ros2(tmp_path / "site", messages_of(folder, fixed_frames=False))
+    with pytest.raises(DriveError, match="mounting of camera 'front'") as caught:
+        read_drive(bag, ReadOptions(cache=str(tmp_path / "cache")))
+    assert "\n" not in str(caught.value)
+    content = yaml.safe_load(str(caught.value).split("the bag: ")[1])
+    assert content["poses"]["topic"] == "/odom"
+    # Completed as it asks for, it is a drive.
+    whole = described(folder, bag)
+    content |= {"bag": str(bag), "origin": whole["origin"], "pose_noise": whole["pose_noise"]}
+    content["poses"].pop("lever_arm_m")
+    for name, camera in content["cameras"].items():
+        camera |= {key: whole["cameras"][name][key] for key in ("ipm", "initial_ipm", "roi_vehicle")}
+        camera.pop("cam_from_vehicle")
+    assert_same_drive(read(tmp_path / "drive", content), read_drive(folder))
+
+
+def test_topics_are_listed_with_the_description(bags: dict[str, Path], tmp_path: Path) -> None:
+    text = list_topics(bags["mcap"], tmp_path)
+    assert "/sensing/rear/image_raw/compressed         3  sensor_msgs/msg/CompressedImage" in text
+    content = yaml.safe_load(text.split("# drive.yaml\n")[1])
+    assert set(content["cameras"]) == {"front", "rear"}
+
+
+def test_a_second_reading_decodes_nothing_and_mends_what_was_damaged(
+    folder: Path, bags: dict[str, Path], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    content = described(folder, bags["mcap"])
+    with caplog.at_level(logging.INFO, "v2hdm"):
+        first = read(tmp_path / "drive", content)
+        assert caplog.text.count(", once") == 1
+        changed = {image.path: image.path.stat().st_mtime_ns for image in first.images}
+        second = read(tmp_path / "drive", content)
+        assert caplog.text.count(", once") == 1
+        assert {image.path: image.path.stat().st_mtime_ns for image in second.images} == changed
+        content["poses"]["lever_arm_m"] = [1.0, 0.0, 0.5]  # how poses are understood needs no new import
+        read(tmp_path / "drive", content)
+        assert caplog.text.count(", once") == 1
+        first.images[0].path.write_bytes(b"cut")
+        content["poses"].pop("lever_arm_m")
+        mended = read(tmp_path / "drive", content)
+        assert caplog.text.count(", once") == 2
+    assert_same_drive(mended, read_drive(folder))
+    assert not list((tmp_path / "drive" / "cache").glob(".*"))
+
+
+def test_another_recording_under_the_same_name_is_imported_anew(folder: Path, tmp_path: Path) -> None:
+    bag = write_ros1(tmp_path / "site", messages_of(folder, ros1=True))
+    count = len(read(tmp_path / "drive", described(folder, bag)).images)
+    bag.unlink()
+    made = messages_of(folder, ros1=True)
+    last_s = max(row[0] for row in made.rows if "image" in row[1])
+    made.rows = [row for row in made.rows if row[0] < last_s or "image" not in row[1]]
+    write_ros1(tmp_path / "site", made)
+    assert len(read(tmp_path / "drive", described(folder, bag)).images) == count - 2
+
+
+def test_a_bag_in_parts_is_read_through(folder: Path, tmp_path: Path) -> None:
+    made = messages_of(folder)
+    parts = tmp_path / "parts"
+    parts.mkdir()
+    for number in range(2):
+        half = Messages(rows=[row for row in made.rows if (row[0] > 101.0) == bool(number)])
+        (file,) = write_ros2(tmp_path / f"part_{number}", half).glob("*.mcap")
+        file.rename(parts / f"wbag_{number}.mcap")
+    assert_same_drive(read(tmp_path / "drive", described(folder, parts)), read_drive(folder))
+
+
+def cut(path: Path, share: float) -> Path:
+    file = path if path.is_file() else next(path.glob("*[!l]"))
+    file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+    return path
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.4, 0.9, 0.999])
+@pytest.mark.parametrize("kind", CONTAINERS)
+def test_a_bag_that_is_cut_off_is_one_line(kind: str, share: float, folder: Path, tmp_path: Path) -> None:
+    bag = cut(CONTAINERS[kind](tmp_path / "site", folder), share)
+    with pytest.raises(DriveError, match=r"copy it again") as caught:
+        read(tmp_path / "drive", described(folder, bag))
+    assert "\n" not in str(caught.value)
+    assert not list((tmp_path / "drive").glob("cache/*"))
+
+
+def topic(name: str) -> dict[str, Any]:
+    return {"poses": {"topic": name}}
+
+
+def test_a_topic_that_is_not_there_or_of_another_type_is_named(
+    folder: Path, bags: dict[str, Path], tmp_path: Path
+) -> None:
+    for name, message in (
+        ("/nowhere", r"no topic /nowhere; of type .*it has: /odom"),
+        ("/sensing/front/camera_info", r"is of type sensor_msgs/msg/CameraInfo, wanted is .*Odometry"),
+    ):
+        with pytest.raises(DriveError, match=message):
+            read(tmp_path / "drive", described(folder, bags["mcap"], **topic(name)))
+    content = described(folder, bags["mcap"])
+    content["cameras"]["front"]["images"] = {"topic": "/odom"}
+    with pytest.raises(DriveError, match=r"camera 'front', images: topic /odom .*it has: /sensing/front"):
+        read(tmp_path / "drive", content)
+    content.pop("bag")
+    with pytest.raises(DriveError, match="the drive has no bag"):
+        read(tmp_path / "drive", content)
+
+
+def test_a_type_that_the_bag_does_not_define_is_named_only_if_it_is_wanted(
+    folder: Path, tmp_path: Path
+) -> None:
+    bag = write_ros2(tmp_path / "own", messages_of(folder), StoragePlugin.SQLITE3)
+    import sqlite3
+
+    (file,) = bag.glob("*.db3")
+    with sqlite3.connect(file) as database:
+        database.execute("UPDATE topics SET type = 'own_msgs/msg/Odd' WHERE name = '/tf_static'")
+        database.execute("DELETE FROM message_definitions")
+    database.close()
+    assert_same_drive(read(tmp_path / "drive", described(folder, bag)), read_drive(folder))
+    poses = {"topic": "/tf", "frame": "map", "vehicle": "base_link"}
+    with pytest.raises(DriveError, match=r"topic /tf_static .*own_msgs/msg/Odd, wanted is TFMessage"):
+        read(tmp_path / "drive", described(folder, bag, poses=poses))
+
+
+def test_images_on_two_clocks_and_without_a_time_are_named(folder: Path, tmp_path: Path) -> None:
+    for number, (change_s, message) in enumerate(
+        ((-1e6, "image 3: its time .* two clocks"), (None, "image 3: its header has no time"))
+    ):
+        made = messages_of(folder)
+        images = [row[2] for row in made.rows if row[1] == "/sensing/front/image_raw"]
+        images[-1].header.stamp.sec = images[-1].header.stamp.sec + int(change_s) if change_s else 0
+        if change_s is None:
+            images[-1].header.stamp.nanosec = 0
+        else:
+            images[-1].header.stamp.sec = 7
+        bag = write_ros2(tmp_path / f"clocks_{number}", made)
+        with pytest.raises(DriveError, match=message):
+            read(tmp_path / "drive", described(folder, bag))
+
+
+def test_poses_on_another_clock_than_images_are_named(folder: Path, tmp_path: Path) -> None:
+    made = messages_of(folder)
+    for _, name, message in made.rows:
+        if name == "/odom":
+            message.header.stamp.sec += 18 + 315964800
+    bag = write_ros2(tmp_path / "site", made)
+    with pytest.raises(DriveError, match=r"the poses begin 315964818 s later than the images.*one clock"):
+        read(tmp_path / "drive", described(folder, bag))
+
+
+@pytest.mark.parametrize(
+    ("encoding", "channels"),
+    [("mono8", 1), ("bgr8", 3), ("rgb8", 3), ("bgra8", 4), ("rgba8", 4)],
+)
+def test_raw_images_keep_every_bit(encoding: str, channels: int) -> None:
+    made = Messages()
+    pixels = np.random.default_rng(1).integers(0, 255, (6, 7, channels), np.uint8)
+    suffix, data = file_of(
+        "sensor_msgs/msg/Image", made.raw_image(1.0, pixels, encoding, "cam", pad=3), "here"
+    )
+    got = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    colour = pixels[..., :3] if channels > 1 else np.repeat(pixels, 3, axis=2)
+    assert suffix == ".png"
+    np.testing.assert_array_equal(got, colour[..., ::-1] if encoding.startswith("rgb") else colour)
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+def test_a_bayer_pattern_is_read_as_ros_names_it(pattern: str) -> None:
+    """A plane of one colour: behind every filter its own channel's value."""
+    value = {"r": 200, "g": 120, "b": 30}
+    tile = np.array([value[letter] for letter in pattern], np.uint8).reshape(2, 2)
+    made = Messages().raw_image(1.0, np.tile(tile, (4, 4))[..., None], f"bayer_{pattern}8", "cam")
+    got = cv2.imdecode(np.frombuffer(file_of("sensor_msgs/msg/Image", made, "here")[1], np.uint8), 1)
+    np.testing.assert_array_equal(got, np.broadcast_to([30, 120, 200], got.shape))
+
+
+def test_images_of_an_unknown_encoding_are_named(folder: Path, tmp_path: Path) -> None:
+    made = messages_of(folder)
+    for _, name, message in made.rows:
+        if name == "/sensing/front/image_raw":
+            message.encoding = "16UC1"
+    with pytest.raises(DriveError, match="image 1: encoding '16UC1' is not known; record one of mono8"):
+        read(tmp_path / "drive", described(folder, write_ros2(tmp_path / "site", made)))

@@ -1,0 +1,407 @@
+"""Poses as people have them, against formulas and libraries that the readers do not use."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from tests.drive.bags import Messages, write_ros2
+from tests.drive.example import ORIGIN, make_drive
+from v2hdm.drive import ReadOptions, read_drive
+from v2hdm.drive.poses import Recorded, read_poses
+from v2hdm.errors import DriveError
+from v2hdm.quality import check_drive
+from v2hdm.records import FloatArray, GeodeticOrigin
+
+START_S = 1715934630.0
+"""2024-05-17 08:30:30 UTC."""
+
+LEVER_M = (1.2, -0.3, 1.8)
+LEVEL_M = 3e-4
+"""Level where it is, 820 m off, a vehicle has its antenna 0.2 mm elsewhere than level with the map, m."""
+
+
+def curve(count: int = 41) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Times, positions in the map and headings (to the left of east) of a vehicle on a bend of 30 m."""
+    stamp_s = START_S + 0.25 * np.arange(count)
+    yaw = 0.4 + 5.0 * (stamp_s - START_S) / 30.0
+    points = np.column_stack([30 * np.sin(yaw), -30 * np.cos(yaw), 0.01 * np.arange(count)])
+    return stamp_s, points + np.array([700.0, -400.0, 2.0]), yaw
+
+
+def antenna(points: FloatArray, yaw: FloatArray) -> FloatArray:
+    """Where the antenna of a level vehicle is, written out."""
+    x, y, z = LEVER_M
+    offset = np.column_stack([
+        np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x + np.cos(yaw) * y, np.full(len(yaw), z),
+    ])  # fmt: skip
+    return points + offset
+
+
+def place(points_map: FloatArray, origin: GeodeticOrigin = ORIGIN) -> FloatArray:
+    """Latitude, longitude, height of map points, by PROJ's own topocentric frame."""
+    pipeline = (
+        f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lat_0={origin.latitude_deg!r} "
+        f"+lon_0={origin.longitude_deg!r} +h_0={origin.altitude_m!r} +step +inv +proj=cart +ellps=WGS84 "
+        "+step +proj=unitconvert +xy_in=rad +xy_out=deg"
+    )
+    lon, lat, height = pyproj.Transformer.from_pipeline(pipeline).transform(*points_map.T)
+    return np.column_stack([lat, lon, height])
+
+
+def true_azimuth_deg(points_map: FloatArray, yaw: FloatArray) -> FloatArray:
+    """Compass headings at the places themselves, from two points a metre apart on the ellipsoid."""
+    ahead = points_map + np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))])
+    here, there = place(points_map), place(ahead)
+    azimuth, _, _ = pyproj.Geod(ellps="WGS84").inv(here[:, 1], here[:, 0], there[:, 1], there[:, 0])
+    return np.asarray(azimuth) % 360
+
+
+def read(content: object, root: Path, origin: GeodeticOrigin | None = ORIGIN) -> Recorded:
+    def no_topic(*_: object) -> Any:
+        raise AssertionError
+
+    return read_poses(content, root, origin, 0.5, "drive.yaml: poses", no_topic)
+
+
+def check(got: Recorded, rows: slice = slice(None), metres: float = 1e-6, radians: float = 1e-7) -> None:
+    stamp_s, points, yaw = (values[rows] for values in curve())
+    np.testing.assert_allclose(got.trajectory.stamp_s, stamp_s, rtol=0, atol=1e-6)
+    poses = got.trajectory.map_from_vehicle
+    np.testing.assert_allclose(poses[:, :3, 3], points, rtol=0, atol=metres)
+    off = np.arctan2(poses[:, 1, 0], poses[:, 0, 0]) - yaw
+    np.testing.assert_allclose((off + np.pi) % (2 * np.pi) - np.pi, 0, atol=radians)
+
+
+def checksum(body: str) -> str:
+    value = 0
+    for letter in body:
+        value ^= ord(letter)
+    return f"${body}*{value:02X}"
+
+
+def nmea_angle(degrees: float, digits: int, sides: str) -> str:
+    whole = int(abs(degrees))
+    minutes = 60 * (abs(degrees) - whole)
+    return f"{whole:0{digits}d}{minutes:012.9f},{sides[0 if degrees >= 0 else 1]}"
+
+
+def nmea_log(
+    qualities: Sequence[int] | None = None, heading: str = "HDT", start_day_s: float = 30630.0
+) -> str:
+    stamp_s, points, yaw = curve()
+    places = place(antenna(points, yaw))
+    headings = true_azimuth_deg(points, yaw)
+    lines = [checksum("GPRMC,083030.00,A,,,,,,,170524,,")]
+    for k, (lat, lon, height) in enumerate(places):
+        of_day = (start_day_s + stamp_s[k] - START_S) % 86400
+        clock = f"{int(of_day // 3600):02d}{int(of_day % 3600 // 60):02d}{of_day % 60:05.2f}"
+        quality = 4 if qualities is None else qualities[k]
+        where = f"{nmea_angle(lat, 2, 'NS')},{nmea_angle(lon, 3, 'EW')}"
+        lines.append(
+            checksum(f"GNGGA,{clock},{where},{quality},12,0.8,{height - 40.5:.7f},M,40.5,M,1.0,0000")
+        )
+        if heading == "HDT":
+            lines.append(checksum(f"GNHDT,{headings[k]:.8f},T"))
+        elif heading == "THS":
+            lines.append(checksum(f"GNTHS,{headings[k]:.8f},A"))
+        elif heading == "PASHR":
+            lines.append(checksum(f"PASHR,{clock},{headings[k]:.8f},T,0.0,0.0,0.0,0.1,0.1,0.05,2,1"))
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize("heading", ["HDT", "THS", "PASHR"])
+def test_an_nmea_log_gives_the_vehicle_and_not_the_antenna(heading: str, tmp_path: Path) -> None:
+    (tmp_path / "log.nmea").write_text(nmea_log(heading=heading))
+    got = read({"nmea": "log.nmea", "lever_arm_m": list(LEVER_M)}, tmp_path)
+    check(got, metres=LEVEL_M, radians=1e-6)
+    assert got.noise["position_m"] == pytest.approx(0.02)
+    assert got.origin == ORIGIN
+
+
+def test_positions_without_an_rtk_fix_are_left_out_and_counted(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    qualities = [4] * 20 + [5] * 15 + [1] * 4 + [0] * 2
+    (tmp_path / "log.nmea").write_text(nmea_log(qualities))
+    content: dict[str, Any] = {"nmea": "log.nmea", "lever_arm_m": list(LEVER_M)}
+    with caplog.at_level(logging.WARNING):
+        check(read(content, tmp_path), slice(0, 20), metres=LEVEL_M, radians=1e-6)
+    assert "left out 19 of 39 positions" in caplog.text
+    wide = read(content | {"max_sigma_m": 1.0}, tmp_path)
+    check(wide, slice(0, 35), metres=LEVEL_M, radians=1e-6)
+    assert wide.noise["position_m"] == pytest.approx(np.sqrt((20 * 0.02**2 + 15 * 0.5**2) / 35))
+    (tmp_path / "log.nmea").write_text(nmea_log([5] * 41))
+    with pytest.raises(DriveError, match=r"no position is sure to 0\.1 m \(the best is 0\.5 m\)"):
+        read(content, tmp_path)
+
+
+def test_a_log_past_midnight_goes_on(tmp_path: Path) -> None:
+    (tmp_path / "log.nmea").write_text(nmea_log(start_day_s=86395.0))
+    stamps = read({"nmea": "log.nmea", "lever_arm_m": list(LEVER_M)}, tmp_path).trajectory.stamp_s
+    np.testing.assert_allclose(np.diff(stamps), 0.25, atol=1e-6)
+
+
+def test_an_nmea_log_is_refused_for_what_it_lacks(tmp_path: Path) -> None:
+    log = tmp_path / "log.nmea"
+    content: dict[str, Any] = {"nmea": "log.nmea", "lever_arm_m": list(LEVER_M)}
+    whole = nmea_log().splitlines()
+    log.write_text("\n".join(whole[1:]))
+    with pytest.raises(DriveError, match="tells the date: add date"):
+        read(content, tmp_path)
+    check(read(content | {"date": "2024-05-17"}, tmp_path), metres=LEVEL_M, radians=1e-6)
+    log.write_text("\n".join(line for line in whole if "HDT" not in line))
+    with pytest.raises(DriveError, match="positions without a heading, and the course over ground is none"):
+        read(content, tmp_path)
+    log.write_text("\n".join(whole))
+    with pytest.raises(DriveError, match="holds an antenna's positions: add lever_arm_m"):
+        read({"nmea": "log.nmea"}, tmp_path)
+    log.write_text("\n".join(line.replace(",4,12", ",4,13") for line in whole))
+    with pytest.raises(DriveError, match=r"41 of 83 NMEA sentences are damaged|no GGA"):
+        read(content, tmp_path)
+
+
+def grid(points: FloatArray, crs: str) -> FloatArray:
+    places = place(points)
+    easting, northing = pyproj.Transformer.from_crs("EPSG:4258", crs, always_xy=True).transform(
+        places[:, 1], places[:, 0]
+    )
+    return np.column_stack([easting, northing, places[:, 2]])
+
+
+ETRS = GeodeticOrigin(53.5, 9.9, 45.0, "ETRS89")
+
+
+@pytest.mark.parametrize("crs", ["EPSG:25832", "EPSG:25833", "EPSG:4647"])
+@pytest.mark.parametrize("heading", ["true", "grid"])
+def test_projected_coordinates_and_either_north_give_the_same_poses(
+    crs: str, heading: str, tmp_path: Path
+) -> None:
+    stamp_s, points, yaw = curve()
+    table = grid(points, crs)
+    azimuth_deg = true_azimuth_deg(points, yaw)
+    if heading == "grid":
+        ahead = points + 0.5 * np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))])
+        east, north, _ = (grid(ahead, crs) - grid(2 * points - ahead, crs)).T
+        between_deg = (azimuth_deg - np.degrees(np.arctan2(east, north)) + 180) % 360 - 180
+        # Four degrees west of zone 33's meridian the two norths are four degrees apart.
+        assert np.abs(between_deg).min() > (4 if crs == "EPSG:25833" else 0.7)
+        azimuth_deg = azimuth_deg - between_deg
+    rows = np.column_stack([stamp_s, table, azimuth_deg])
+    lines = [";".join(map(repr, row)) for row in rows.tolist()]
+    (tmp_path / "route.csv").write_text("\n".join(["t;E;N;h;hdg", *lines]))
+    columns = {"stamp_s": "t", "x_m": "E", "y_m": "N", "z_m": "h", "heading_deg": "hdg"}
+    content = {"csv": "route.csv", "columns": columns, "crs": crs, "heading": heading}
+    got = read(content, tmp_path, None)
+    assert got.origin is not None
+    assert got.origin.datum.startswith("ETRS89")
+    origin = GeodeticOrigin(53.5, 9.9, 45.0, got.origin.datum)
+    check(read(content, tmp_path, origin), metres=1e-5, radians=1e-6)
+
+
+def test_what_a_projected_system_leaves_open_is_asked_for(tmp_path: Path) -> None:
+    (tmp_path / "route.csv").write_text(
+        "stamp_s,x_m,y_m,z_m,heading_deg\n1,560000,5930000,3,5\n2,560001,5930000,3,5\n"
+    )
+    content: dict[str, Any] = {"csv": "route.csv", "crs": "EPSG:25832", "heading": "grid"}
+    for changes, message in (
+        ({"heading": None}, "true and grid north differ in EPSG:25832: add heading"),
+        ({"crs": "EPSG:99999"}, "unknown crs 'EPSG:99999'"),
+        ({"crs": "EPSG:27700"}, "EPSG:27700 .* is of no satellite datum"),
+        ({"crs": "EPSG:5555"}, "count from the sea: add geoid_m"),
+        ({"crs": None}, "heading: only for coordinates with a place on the earth"),
+        ({"crs": "EPSG:4258"}, "EPSG:4258 is not projected"),
+        ({"crs": "EPSG:3035"}, "EPSG:3035 does not keep angles"),
+        ({"heading": "north"}, "heading: expected one of true, grid"),
+        ({"lever_arm": [0, 0, 0]}, "unknown key 'lever_arm'; did you mean 'lever_arm_m'"),
+        ({"tum": "a"}, "name one source"),
+    ):
+        wrong = {key: value for key, value in (content | changes).items() if value is not None}
+        with pytest.raises(DriveError, match=message):
+            read(wrong, tmp_path, None)
+    with pytest.raises(DriveError, match="the poses are in ETRS89, the origin in WGS84"):
+        read(content, tmp_path, ORIGIN)
+
+
+def test_heights_above_the_sea_are_raised_by_the_geoid(tmp_path: Path) -> None:
+    (tmp_path / "route.csv").write_text(
+        "stamp_s,x_m,y_m,z_m,heading_deg\n1,560000,5930000,3,5\n2,560001,5930000,3,5\n"
+    )
+    content = {"csv": "route.csv", "crs": 5555, "heading": "grid", "geoid_m": 41.25, "epoch": 2024.5}
+    got = read(content, tmp_path, None)
+    assert got.origin is not None
+    assert got.origin.altitude_m == pytest.approx(44.25)
+    assert got.origin.epoch == 2024.5
+
+
+def test_a_table_in_the_map_frame_with_angles(tmp_path: Path) -> None:
+    stamp_s, points, yaw = curve()
+    roll, pitch = 0.03, -0.02
+    rows = zip(stamp_s, points.tolist(), yaw.tolist(), strict=True)
+    lines = [
+        f"{t * 1e9:.0f}\t{p[0]!r}\t{p[1]!r}\t{p[2]!r}\t{y!r}\t{roll}\t{np.degrees(-pitch)}\t"
+        for t, p, y in rows
+    ]
+    names = "stamp_ns\tx_m\ty_m\tz_m\tyaw_rad\troll_rad\tpitch_up_deg\tsigma_m"
+    (tmp_path / "route.csv").write_text("\n".join([names, *lines]))
+    got = read({"csv": "route.csv"}, tmp_path)
+    expected = Rotation.from_euler("xyz", np.column_stack([np.full(41, roll), np.full(41, pitch), yaw]))
+    np.testing.assert_allclose(got.trajectory.map_from_vehicle[:, :3, :3], expected.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(got.trajectory.map_from_vehicle[:, :3, 3], points, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "holds no pose"),
+        ("stamp_s,x_m,y_m\n1,2\n", "line 2: 2 cells under 3 columns"),
+        ("stamp_s,x_m,y_m,yaw_deg\n1,2,x,0\n", "line 2: y_m: 'x' is not a number"),
+        ("stamp_s,x_m,y_m,yaw_deg\n1,2,nan,0\n", "line 2: y_m: 'nan' is not a finite"),
+        ("x_m,y_m,yaw_deg\n1,2,0\n", "needs one column of times"),
+        ("stamp_s,stamp_ns,x_m,y_m,yaw_deg\n1,1,2,0,0\n", "has stamp_s, stamp_ns"),
+        ("stamp_s,x_m,yaw_deg\n1,2,0\n", "has no column 'y_m'"),
+        ("stamp_s,yaw_deg\n1,2\n", "needs positions"),
+        ("stamp_s,x_m,y_m,yaw_deg,heading_deg\n1,2,0,0,0\n", "says heading_deg and yaw_deg"),
+        ("stamp_s,x_m,y_m\n1,2,0\n", "positions without a heading"),
+        ("stamp_s,x_m,y_m,yaw_deg\n9,2,0,0\n3,2,0,0\n", "pose 2: its time 3.000 s is 6.000 s before"),
+        ("stamp_s,x_m,y_m,qx,qy,qz,qw\n9,2,0,0,0,0,2\n", "pose 1: quaternion of norm 2"),
+        ("utc,x_m,y_m,yaw_deg\nnow,2,0,0\n", "'now' is not a time such as"),
+    ],
+)
+def test_a_damaged_table_is_refused_in_one_line(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "route.csv").write_text(text)
+    with pytest.raises(DriveError, match=message) as caught:
+        read({"csv": "route.csv"}, tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("axes", ["vehicle", "camera"])
+def test_rows_of_kitti_have_their_times_beside_them(axes: str, tmp_path: Path) -> None:
+    stamp_s, points, yaw = curve()
+    matrices = np.zeros((41, 3, 4))
+    matrices[:, :, :3] = Rotation.from_euler("z", yaw[:, None]).as_matrix()
+    matrices[:, :, 3] = points
+    if axes == "camera":
+        # A camera that looks ahead: its x is the vehicle's -y, its y -z, its z x.
+        swap = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
+        matrices = np.concatenate([swap @ matrices[:, :, :3] @ swap.T, swap @ matrices[:, :, 3:]], axis=2)
+    np.savetxt(tmp_path / "poses.txt", matrices.reshape(41, 12), fmt="%.15g")
+    np.savetxt(tmp_path / "times.txt", stamp_s, fmt="%.9f")
+    check(read({"kitti": "poses.txt", "stamps": "times.txt", "axes": axes}, tmp_path))
+    if axes == "camera":
+        with pytest.raises(DriveError, match="z axis does not point up; say axes: camera"):
+            read({"kitti": "poses.txt", "stamps": "times.txt"}, tmp_path)
+    with pytest.raises(DriveError, match="have no times: add stamps"):
+        read({"kitti": "poses.txt"}, tmp_path)
+
+
+def with_topic(root: Path, made: Messages, poses: dict[str, Any], **changes: Any) -> Any:
+    """A drive of a folder's images at times within the curve, with the poses of a bag."""
+    make_drive(root, stamps=(START_S + 1.0, START_S + 2.0, START_S + 9.0))
+    content = yaml.safe_load((root / "drive.yaml").read_text())
+    content.pop("pose_noise")
+    content |= {"bag": "site", "poses": poses} | changes
+    write_ros2(root / "site", made)
+    (root / "drive.yaml").write_text(yaml.safe_dump(content))
+    return read_drive(root, ReadOptions(cache=str(root / "cache")))
+
+
+def test_fixes_and_an_imu_at_other_times_with_antenna_and_turned_sensor(tmp_path: Path) -> None:
+    stamp_s, points, yaw = curve()
+    made = Messages()
+    for k, where in enumerate(place(antenna(points, yaw))):
+        status = -1 if k in (3, 4) else 2
+        made.add(stamp_s[k], "/fix", made.fix(stamp_s[k], where, status, 0.015, "gnss"))
+    # The Imu's x axis points left, and its clock ticks between the fixes.
+    for t in np.arange(START_S - 0.01, START_S + 10.1, 0.02):
+        turn = 0.4 + 5.0 * (t - START_S) / 30.0 + np.pi / 2
+        made.add(t, "/imu", made.imu(t, Rotation.from_euler("z", turn).as_matrix(), "imu"))
+    poses = {
+        "topic": "/fix",
+        "heading_topic": "/imu",
+        "lever_arm_m": list(LEVER_M),
+        "mounting_rpy_deg": [0, 0, 90],
+    }
+    drive = with_topic(tmp_path, made, poses)
+    keep = np.delete(np.arange(41), (3, 4))
+    np.testing.assert_allclose(drive.recorded.stamp_s, stamp_s[keep], atol=1e-6)
+    got = drive.recorded.map_from_vehicle
+    # At 800 m from the origin east is turned by 2e-4 rad, and the Imu counts from the east of the place.
+    np.testing.assert_allclose(got[:, :3, 3], points[keep], atol=5e-4)
+    turned = np.arctan2(got[:, 1, 0], got[:, 0, 0]) - yaw[keep]
+    expected = np.radians(true_azimuth_deg(points, yaw)[keep]) - (np.pi / 2 - yaw[keep])
+    np.testing.assert_allclose(np.angle(np.exp(1j * (turned - expected))), 0, atol=1e-6)
+    assert drive.pose_noise.position_m == pytest.approx(0.015)
+    assert drive.pose_noise.heading_rad == pytest.approx(0.002)
+
+
+def test_covariances_become_the_noise_unless_the_drive_says_otherwise(tmp_path: Path) -> None:
+    stamp_s, points, yaw = curve()
+    covariance = np.diag([0.03**2, 0.03**2, 1.0, 0.1, 0.1, 0.004**2])
+    made = Messages()
+    for t, point, angle in zip(stamp_s, points, yaw, strict=True):
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = Rotation.from_euler("z", angle).as_matrix(), point
+        made.add(t, "/pose", made.with_covariance(t, matrix, covariance))
+    drive = with_topic(tmp_path, made, {"topic": "/pose"})
+    assert drive.pose_noise.position_m == pytest.approx(0.03)
+    assert drive.pose_noise.position_drift_m == pytest.approx(0.03 / np.sqrt(2))
+    assert drive.pose_noise.heading_rad == pytest.approx(0.004)
+    content = yaml.safe_load((tmp_path / "drive.yaml").read_text()) | {"pose_noise": {"position_m": 0.05}}
+    (tmp_path / "drive.yaml").write_text(yaml.safe_dump(content))
+    noise = read_drive(tmp_path, ReadOptions(cache=str(tmp_path / "cache"))).pose_noise
+    assert (noise.position_m, noise.heading_rad) == (0.05, pytest.approx(0.004))
+
+
+def test_poses_of_transforms_over_a_moving_and_a_fixed_edge(tmp_path: Path) -> None:
+    stamp_s, points, yaw = curve()
+    map_from_odom, base_from_gnss = np.eye(4), np.eye(4)
+    map_from_odom[:3, :3] = Rotation.from_euler("z", 0.7).as_matrix()
+    map_from_odom[:3, 3] = [5.0, -2.0, 0.0]
+    base_from_gnss[:3, 3] = LEVER_M
+    made = Messages()
+    for t, point, angle in zip(stamp_s, points, yaw, strict=True):
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = Rotation.from_euler("z", angle).as_matrix(), point
+        made.add(t, "/tf", made.transforms(t, {("odom", "gnss"): np.linalg.inv(map_from_odom) @ matrix}))
+    edges = {("map", "odom"): map_from_odom, ("base_link", "gnss"): base_from_gnss}
+    made.rows.insert(0, (START_S, "/tf_static", made.transforms(START_S, edges)))
+    drive = with_topic(tmp_path, made, {"topic": "/tf", "frame": "map", "vehicle": "base_link"})
+    expected = 2 * points - antenna(points, yaw)
+    np.testing.assert_allclose(drive.recorded.map_from_vehicle[:, :3, 3], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(("stated_m", "status"), [((1.2, 0.0, 1.8), "PASS"), ((0.0, 0.0, 0.0), "WARN")])
+def test_a_lever_arm_of_zero_that_should_not_be_is_named_by_the_check(
+    stated_m: tuple[float, ...], status: str, tmp_path: Path
+) -> None:
+    """A straight of 40 m, a bend of 15 m radius and a straight, driven with the axle on the line."""
+    station_m = np.arange(0.0, 110.0, 0.25)
+    yaw = np.clip((station_m - 40.0) / 15.0, 0.0, 3.5)
+    halfway = np.clip((station_m - 0.125 - 40.0) / 15.0, 0.0, 3.5)
+    points = 0.25 * np.cumsum([[np.cos(angle), np.sin(angle), 0.0] for angle in halfway], axis=0)
+    moved = points + np.column_stack([1.2 * np.cos(yaw), 1.2 * np.sin(yaw), np.full(len(yaw), 1.8)])
+    stamp_s = START_S + station_m / 5.0
+    rows = np.column_stack([stamp_s, place(moved), true_azimuth_deg(points, yaw), np.full(len(yaw), 4)])
+    root = tmp_path / "drive"
+    root.mkdir()
+    make_drive(root, stamps=(START_S + 1.0, START_S + 2.0, START_S + 9.0))
+    names = "stamp_s,latitude_deg,longitude_deg,altitude_m,heading_deg,quality"
+    lines = [",".join(map(repr, row)) for row in rows.tolist()]
+    (root / "route.csv").write_text("\n".join([names, *lines]))
+    content = yaml.safe_load((root / "drive.yaml").read_text())
+    content["poses"] = {"csv": "route.csv", "lever_arm_m": list(stated_m)}
+    (root / "drive.yaml").write_text(yaml.safe_dump(content))
+    (finding,) = [one for one in check_drive(read_drive(root), {}) if one.check == "origin"]
+    assert finding.status.name == status
+    if status == "WARN":
+        assert finding.value == pytest.approx(1.2, abs=0.03)
+        assert "m ahead of the rear axle" in finding.line

@@ -1,0 +1,145 @@
+"""Image folders and videos are the same drive as a list of images."""
+
+from __future__ import annotations
+
+import shutil
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from tests.drive.bags import assert_same_drive
+from tests.drive.example import make_drive
+from v2hdm.drive import ReadOptions, read_drive
+from v2hdm.errors import DriveError
+from v2hdm.records import Drive, Image
+
+STAMPS = tuple(100.05 + 0.1 * n for n in range(6))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A drive with pictures without loss at 10 Hz."""
+    root = tmp_path / "folder"
+    root.mkdir()
+    drive = make_drive(root, STAMPS)
+    rng = np.random.default_rng(5)
+    for image in drive.images:
+        cv2.imwrite(str(image.path.with_suffix(".png")), rng.integers(0, 255, (48, 64, 3), np.uint8))
+        image.path.unlink()
+    for name in drive.cameras:
+        listed = root / name / "images.txt"
+        listed.write_text(listed.read_text().replace(".jpg", ".png"))
+    return root
+
+
+def write_video(folder: Path, path: Path, codec: str = "ffv1", keep: int | None = None) -> Path:
+    """The images of the front camera as a video without loss, its first frame not at zero."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "bgr0" if codec == "ffv1" else "rgb24"
+        stream.codec_context.time_base = Fraction(1, 1000)
+        for number, image in enumerate(sorted((folder / "front" / "images").iterdir())[:keep]):
+            frame = av.VideoFrame.from_ndarray(cv2.imread(str(image)), format="bgr24")
+            frame.pts, frame.time_base = 700 + 100 * number, Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+def read(root: Path, images: Any) -> Drive:
+    content = yaml.safe_load((root / "drive.yaml").read_text())
+    content["cameras"]["front"]["images"] = images
+    (root / "drive.yaml").write_text(yaml.safe_dump(content))
+    return read_drive(root, ReadOptions(cache=str(root / "cache")))
+
+
+def by_camera(drive: Drive) -> list[Image]:
+    return sorted(drive.images, key=lambda image: (image.camera, image.stamp_s))
+
+
+def test_a_video_with_poses_is_the_same_drive(folder: Path) -> None:
+    expected = read_drive(folder)
+    write_video(folder, folder / "front.mkv")
+    got = read(folder, {"video": "front.mkv", "start_s": 100.05})
+    for one, other in zip(by_camera(got), by_camera(expected), strict=True):
+        assert one.camera == other.camera
+        assert one.stamp_s == pytest.approx(other.stamp_s, abs=1e-7)
+        np.testing.assert_allclose(one.map_from_vehicle, other.map_from_vehicle, rtol=0, atol=1e-6)
+        np.testing.assert_array_equal(cv2.imread(str(one.path)), cv2.imread(str(other.path)))
+    decoded = [(image.path, image.path.stat().st_mtime_ns) for image in by_camera(got)]
+    # Another start needs no decoding; neither does a second reading.
+    later = read(folder, {"video": "front.mkv", "start_s": 100.06})
+    assert by_camera(later)[0].stamp_s == pytest.approx(100.06)
+    assert [(image.path, image.path.stat().st_mtime_ns) for image in by_camera(later)] == decoded
+    np.savetxt(folder / "times.txt", STAMPS, fmt="%.9f")
+    assert_same_drive(read(folder, {"video": "front.mkv", "stamps": "times.txt"}), expected)
+
+
+def test_an_image_folder_with_a_file_of_times_or_named_by_them(folder: Path) -> None:
+    expected = read_drive(folder)
+    np.savetxt(folder / "times.txt", STAMPS, fmt="%.9f")
+    assert_same_drive(read(folder, {"folder": "front/images", "stamps": "times.txt"}), expected)
+    named = folder / "front" / "named"
+    named.mkdir()
+    for stamp_s, image in zip(STAMPS, sorted((folder / "front" / "images").iterdir()), strict=True):
+        shutil.copy(image, named / f"{stamp_s * 1e3:.0f}.png")
+    assert_same_drive(read(folder, {"folder": "front/named", "unit": "ms"}), expected)
+
+
+def test_a_source_that_does_not_fit_is_named(folder: Path) -> None:
+    write_video(folder, folder / "front.mkv")
+    (folder / "times.txt").write_text("1.0\n2.0\n")
+    (folder / "text.mp4").write_text("no video")
+    (folder / "front" / "images" / "first.png").write_bytes(b"")
+    for images, message in (
+        ({"video": "front.mkv"}, "add start_s, the time of the first frame"),
+        ({"video": "front.mkv", "start_s": "now"}, "start_s: expected a finite number"),
+        ({"video": "front.mkv", "stamps": "times.txt"}, "6 frames in .* and 2 stamps"),
+        ({"video": "rear.mkv", "start_s": 1}, "rear.mkv: no such video"),
+        ({"video": "text.mp4", "start_s": 1}, "text.mp4: not readable as a video"),
+        ({"video": "front.mkv", "start": 1}, "unknown key 'start'; did you mean 'start_s'"),
+        ({"folder": "front/images"}, "not named by their times; add stamps"),
+        ({"folder": "front/images", "stamps": "times.txt"}, "7 images in .* but 2 stamps"),
+        ({"folder": "front/images", "unit": "h"}, "unit: expected one of s, ms, us, ns"),
+        ({"folder": "nowhere"}, "no such folder"),
+        ({"folder": "front"}, "no image .* in this folder"),
+        ({"list": "a"}, "name one source"),
+        ({"topic": "/image"}, "the drive has no bag; add bag at the top"),
+        (7, "images: expected a text, got 7|expected 'key: value' entries"),
+    ):
+        with pytest.raises(DriveError, match=message) as caught:
+            read(folder, images)
+        assert "\n" not in str(caught.value)
+    assert not list((folder / "cache").glob(".*"))
+
+
+@pytest.mark.parametrize("module", ["rosbags", "av", "pyproj"])
+def test_a_library_that_is_not_installed_is_named_with_its_extra(
+    module: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from v2hdm.hdmap import geodetic
+
+    content = yaml.safe_load((folder / "drive.yaml").read_text())
+    extra, images = {"rosbags": "ros", "av": "video", "pyproj": "map"}[module], "front/images.txt"
+    if module == "rosbags":
+        (folder / "site.bag").write_bytes(b"#ROSBAG")
+        content |= {"bag": "site.bag"}
+        images = {"topic": "/image"}
+    elif module == "av":
+        images = {"video": str(write_video(folder, folder / "front.mkv")), "start_s": 100.05}
+    else:
+        (folder / "route.csv").write_text("stamp_s,x_m,y_m,yaw_deg\n100,1,2,3\n103,1,2,3\n")
+        content["poses"] = {"csv": "route.csv", "crs": "EPSG:25832", "heading": "true"}
+    (folder / "drive.yaml").write_text(yaml.safe_dump(content))
+    monkeypatch.setitem(__import__("sys").modules, module, None)
+    geodetic._cartesian.cache_clear()
+    with pytest.raises(
+        DriveError, match=rf"needs {module}: install the {extra} extra, pip install 'v2hdm\[{extra}\]'"
+    ):
+        read(folder, images)
