@@ -5,7 +5,7 @@ docs/drive-format.md describes it for those who want to make one.
 
 from __future__ import annotations
 
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +62,9 @@ def read_folder_drive(path: Path, options: ReadOptions) -> Drive:
         place = f"{where}: camera '{name}'"
         entry = take_mapping(entries[name], place, DriveError)
         check_keys(entry, *_CAMERA_KEYS, place, DriveError)
-        cameras[name] = _read_camera(entry, path, place)
+        camera = _read_camera(entry, path, place)
+        # Many tools call every camera they calibrate alike: the drive's own name for it holds.
+        cameras[name] = replace(camera, info=replace(camera.info, name=name))
         files.append(_list_images(name, path / take_text(entry["images"], f"{place}, images", DriveError)))
     recorded = read_tum(path / take_text(content.get("poses", POSES_FILE), f"{where}: poses", DriveError))
     pose_noise = _read_pose_noise(content.get("pose_noise"), f"{where}: pose_noise")

@@ -23,12 +23,13 @@ from v2hdm.files import take_array, whole_file
 from v2hdm.hdmap.features import CORNERS, POINTS, Feature, FeatureReader, Geometry, features_of, properties_of
 from v2hdm.hdmap.needs import need
 from v2hdm.hdmap.qgis_style import qgis_style
-from v2hdm.records import FloatArray, GeodeticOrigin, HdMap
+from v2hdm.records import GeodeticOrigin, HdMap
 
 _WGS84 = "EPSG:4979"
 _LOCAL = (
-    'ENGCRS["v2hdm map frame: metres east and north of the drive\'s own origin",EDATUM["origin of the drive"],'
-    'CS[Cartesian,2],AXIS["easting (E)",east,ORDER[1]],AXIS["northing (N)",north,ORDER[2]],LENGTHUNIT["metre",1]]'
+    'ENGCRS["v2hdm map frame: metres east and north of the drive\'s own origin",'
+    'EDATUM["origin of the drive"],CS[Cartesian,2],AXIS["easting (E)",east,ORDER[1]],'
+    'AXIS["northing (N)",north,ORDER[2]],LENGTHUNIT["metre",1]]'
 )
 _LAYERS = {True: ("markings", "Polygon Z"), False: ("lanes", "LineString Z")}
 """Name and type of the layer of closed features and of open ones."""
@@ -36,6 +37,9 @@ _LAYERS = {True: ("markings", "Polygon Z"), False: ("lanes", "LineString Z")}
 AnyArray = NDArray[Any]
 
 _ABOUT = "v2hdm"
+_EXACT = ("heights_m", "covariance_m2")
+"""Columns that hold JSON, as does the one of the exact coordinates."""
+
 _ROUNDING = np.array([1e-11, 1e-11, 1e-6])
 """Degrees and m that a float64 position may lose on its way through other tools."""
 
@@ -74,31 +78,59 @@ def write_geopackage(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | Non
 
 
 def read_geopackage(path: Path) -> HdMap:
-    """Read what :func:`write_geopackage` wrote and others may have edited; as :func:`read_geojson` does.
+    """Read what :func:`write_geopackage` wrote and others may have edited; as ``read_geojson`` does.
 
     Raises:
         MapFileError: when the file is missing, damaged or no map of this format.
         ConfigError: ``pyogrio`` is not installed.
     """
-    raw, errors = need("pyogrio.raw", "gpkg"), need("pyogrio.errors", "gpkg")
-    if not path.is_file():
-        raise MapFileError(f"{path}: no such file; check the path or restore it")
-    try:
-        about = _read_table(raw, path, _ABOUT)
-        layers = {closed: _read_layer(raw, path, layer) for closed, (layer, _) in _LAYERS.items()}
-    except (errors.DataSourceError, errors.DataLayerError, errors.FeatureError) as failure:
-        raise MapFileError(f"{path}: not a map written by v2hdm ({failure}); give one that is") from None
-    origin = take_origin(_json(about[0].get("origin"), f"{path}: origin"), f"{path}: origin", MapFileError)
-    rounding = np.full(3, _LOCAL_ROUNDING_M) if origin is None else _ROUNDING
-    reader = FeatureReader(path, origin, rounding)
-    for closed, rows in layers.items():
-        for number, (wkb, properties) in enumerate(rows):
-            where = f"{path}: {_LAYERS[closed][0]}, row {number + 1}"
-            for key in (CORNERS, POINTS, "heights_m", "covariance_m2"):
-                properties[key] = _json(properties.get(key), f"{where}, {key}")
-            del properties[POINTS if closed else CORNERS]
-            reader.add(properties, _geometry(wkb, where), where)
+    content = _Content(path)
+    origin = take_origin(content.about("origin"), f"{path}: origin", MapFileError)
+    reader = FeatureReader(path, origin, np.full(3, _LOCAL_ROUNDING_M) if origin is None else _ROUNDING)
+    for closed, (layer, _) in _LAYERS.items():
+        for number, (wkb, properties) in enumerate(content.layer(layer)):
+            where = f"{path}: {layer}, row {number + 1}"
+            key = CORNERS if closed else POINTS
+            exact = {name: _json(properties.get(name), f"{where}, {name}") for name in (key, *_EXACT)}
+            reader.add(properties | exact, _geometry(wkb, where), where)
     return reader.map()
+
+
+def read_geopackage_verdict(path: Path) -> Mapping[str, Any] | None:
+    """The verdict that :func:`write_geopackage` wrote beside a map, None where there is none."""
+    verdict = _Content(path).about("verdict")
+    return verdict if isinstance(verdict, dict) else None
+
+
+class _Content:
+    """The tables of a GeoPackage."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._raw, self._errors = need("pyogrio.raw", "gpkg"), need("pyogrio.errors", "gpkg")
+        if not path.is_file():
+            raise MapFileError(f"{path}: no such file; check the path or restore it")
+
+    def about(self, key: str) -> object:
+        """What is to be known of the map by ``key``."""
+        rows = self.layer(_ABOUT)
+        return _json(rows[0][1].get(key), f"{self._path}: {key}") if rows else None
+
+    def layer(self, layer: str) -> list[tuple[bytes | None, dict[str, Any]]]:
+        """Geometry and properties of each row; numbers that are missing are None."""
+        errors = self._errors
+        try:
+            meta, _, geometry, columns = self._raw.read(str(self._path), layer=layer)
+        except (errors.DataSourceError, errors.DataLayerError, errors.FeatureError) as failure:
+            problem = str(failure).splitlines()[0]
+            raise MapFileError(
+                f"{self._path}: not a map written by v2hdm ({problem}); give one that is"
+            ) from None
+        rows = [
+            {name: None if value != value else value for name, value in zip(meta["fields"], row, strict=True)}
+            for row in zip(*(column.tolist() for column in columns), strict=True)
+        ]
+        return list(zip([None] * len(rows) if geometry is None else geometry, rows, strict=True))
 
 
 def _write_layer(
@@ -118,7 +150,7 @@ def _write_layer(
         "sigma_m": np.array([one.get("sigma_m", np.nan) for one in told], dtype=np.float64),
         "relative_sigma_m": np.array([one.get("relative_sigma_m", np.nan) for one in told], dtype=np.float64),
     }
-    for key in (shape, "heights_m", "covariance_m2"):
+    for key in (shape, *_EXACT):
         texts = [json.dumps(one[key]) if key in one else None for one in told]
         columns[key] = _texts(texts)
     raw.write(
@@ -139,7 +171,10 @@ def _wkb(feature: Feature, origin: GeodeticOrigin | None) -> bytes:
     if positions.shape[1] == 2:
         positions = np.column_stack([positions, np.zeros(len(positions))])
     if not feature.closed:
-        return struct.pack("<BII", _LITTLE_ENDIAN, _WKB_LINE_Z, len(positions)) + positions.astype("<f8").tobytes()
+        return (
+            struct.pack("<BII", _LITTLE_ENDIAN, _WKB_LINE_Z, len(positions))
+            + positions.astype("<f8").tobytes()
+        )
     ring = np.concatenate([positions, positions[:1]])
     return struct.pack("<BIII", _LITTLE_ENDIAN, _WKB_POLYGON_Z, 1, len(ring)) + ring.astype("<f8").tobytes()
 
@@ -179,7 +214,7 @@ def _write_table(raw: Any, path: Path, layer: str, columns: Mapping[str, AnyArra
     raw.write(str(path), None, list(columns.values()), list(columns), layer=layer, driver="GPKG", **options)
 
 
-def _texts(values: Sequence[str | None]) -> AnyArray:
+def _texts(values: Sequence[str | bytes | None]) -> AnyArray:
     return np.array(values, dtype=object)
 
 
@@ -202,20 +237,6 @@ def _styles(features: Sequence[Feature]) -> dict[str, AnyArray]:
         "ui": empty,
         "update_time": np.full(len(names), np.datetime64("now", "ms")),
     }
-
-
-def _read_table(raw: Any, path: Path, layer: str) -> list[dict[str, Any]]:
-    return [row for _, row in _read_layer(raw, path, layer)]
-
-
-def _read_layer(raw: Any, path: Path, layer: str) -> list[tuple[bytes | None, dict[str, Any]]]:
-    """Geometry and properties of each row; numbers that are missing are None."""
-    meta, _, geometry, columns = raw.read(str(path), layer=layer)
-    rows = [
-        {name: None if value != value else value for name, value in zip(meta["fields"], row, strict=True)}
-        for row in zip(*(column.tolist() for column in columns), strict=True)
-    ]
-    return list(zip([None] * len(rows) if geometry is None else geometry, rows, strict=True))
 
 
 def _json(text: object, where: str) -> object:
