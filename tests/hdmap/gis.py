@@ -100,6 +100,8 @@ def street(origin: GeodeticOrigin | None = ORIGIN, with_heights: bool = True) ->
         half = rng.normal(scale=0.004, size=(8, 8))
         heights = 1.0 + 0.03 * corners[:, 0] if with_heights else None
         markings.append(
-            Marking(kind, corners, int(rng.integers(3, 20)), half @ half.T, 0.002 + rng.random() / 1e3, heights)
+            Marking(
+                kind, corners, int(rng.integers(3, 20)), half @ half.T, 0.002 + rng.random() / 1e3, heights
+            )
         )
     return HdMap(tuple(markings), tuple(lanes), origin)

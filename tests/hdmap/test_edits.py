@@ -71,7 +71,7 @@ def test_what_was_moved_in_a_gis_comes_back_moved_and_all_else_as_it_was(
         assert (new.id, new.kind, new.sightings) == (old.id, old.kind, old.sightings)
         moved_m = points(new) - points(old)
         np.testing.assert_allclose(moved_m, np.tile([0.5, -0.25], (len(moved_m), 1)), atol=3e-3)
-        assert np.ptp(moved_m, axis=0).max() < 2 * TENTH_OF_A_MM
+        assert np.ptp(moved_m, axis=0).max() < TENTH_OF_A_MM
         np.testing.assert_array_equal(new.heights_m, old.heights_m)
         if isinstance(old, Marking) and isinstance(new, Marking):
             np.testing.assert_array_equal(new.covariance_m2, old.covariance_m2)
@@ -170,12 +170,15 @@ def test_ids_are_unique_and_stay_when_features_go_or_are_copied(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"coordinates": lambda rings: [[*rings[0][:2], [122.05, 29.95, 12.0], *rings[0][2:]]]}, "has four corners"),
+        (
+            {"coordinates": lambda rings: [[*rings[0][:2], [122.05, 29.95, 12.0], *rings[0][2:]]]},
+            "has four corners",
+        ),
         ({"coordinates": lambda rings: [rings[0], rings[0]]}, "holes or several parts"),
         ({"coordinates": lambda rings: [[[x, y + 500, z] for x, y, z in rings[0]]]}, "not in degrees"),
         ({"coordinates": lambda rings: "here"}, "holes or several parts"),
         ({"geometry": {"type": "Point", "coordinates": [0, 0]}}, "is a Point"),
-        ({"geometry": None, "corners_map": None}, "corners"),
+        ({"geometry": None, "corners_map": None}, "four corners, this has 0"),
         ({"id": "three"}, "id: expected a finite number"),
         ({"id": 2**40}, "id: expected a whole number"),
         ({"class": None}, "class: expected a text"),
@@ -190,7 +193,7 @@ def test_an_edit_that_makes_no_map_is_refused_by_name(
         read_geojson(path)
 
 
-@pytest.mark.parametrize("content", [b"", b"SQLite format 3\0" + bytes(100), b"{}"])
+@pytest.mark.parametrize("content", [b"", b"{}"])
 def test_a_geopackage_that_is_none_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "map.gpkg"
     path.write_bytes(content)
@@ -202,7 +205,9 @@ def test_a_geopackage_that_is_none_is_refused_in_one_line(tmp_path: Path, conten
 def test_a_geopackage_of_another_tool_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "map.gpkg"
     nothing: np.ndarray = np.array([], dtype=object)
-    pyogrio.raw.write(path, nothing, [nothing], ["name"], layer="roads", geometry_type="Point", crs="EPSG:4326")
+    pyogrio.raw.write(
+        path, nothing, [nothing], ["name"], layer="roads", geometry_type="Point", crs="EPSG:4326"
+    )
     with pytest.raises(MapFileError, match="not a map written by v2hdm"):
         read_geopackage(path)
 

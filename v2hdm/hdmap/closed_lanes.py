@@ -70,7 +70,7 @@ def _across(lines_map: Sequence[FloatArray], number: int, side: int) -> tuple[In
         for k, (place, away) in enumerate(zip(line, normal, strict=True)):
             offset = points - place
             ahead, beside = offset @ away, offset[:, 0] * away[1] - offset[:, 1] * away[0]
-            crosses = np.flatnonzero((beside[:-1] < 0) != (beside[1:] < 0))
+            crosses = np.flatnonzero((beside[:-1] * beside[1:] <= 0) & (beside[:-1] != beside[1:]))
             if not len(crosses):
                 continue
             part = beside[crosses] / (beside[crosses] - beside[crosses + 1])

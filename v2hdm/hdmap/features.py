@@ -174,7 +174,7 @@ class FeatureReader:
     Attributes:
         path: names the file in errors.
         origin: the map's place on the earth.
-        rounding: how far (3,) the file's positions may be off for having been rounded, in their own units.
+        rounding: how far (3,) positions may be off for having been rounded, in the file's own units.
     """
 
     def __init__(self, path: object, origin: GeodeticOrigin | None, rounding: FloatArray) -> None:
@@ -213,20 +213,24 @@ class FeatureReader:
             named = ", ".join(str(ids[index]) for index in self._edited[:9])
             more = ", ..." if len(self._edited) > 9 else ""
             _log.info(
-                "%s: %d features were edited and are taken as drawn: %s", self.path, len(self._edited), named + more
+                "%s: %d features were edited and are taken as drawn: %s",
+                self.path,
+                len(self._edited),
+                named + more,
             )
         new = sum(a != b for a, b in zip(before, ids, strict=True))
         if new:
             _log.info("%s: %d features had no id of their own and were given one", self.path, new)
         return map_of(
-            [_with_id(feature, number) for feature, number in zip(self._features, ids, strict=True)], self.origin
+            [_with_id(feature, number) for feature, number in zip(self._features, ids, strict=True)],
+            self.origin,
         )
 
 
 def believed(
     stored: Feature, geometry: Geometry, origin: GeodeticOrigin | None, rounding: FloatArray
 ) -> Feature:
-    """``stored`` itself where the geometry says the same, else what the geometry says.
+    """``stored`` itself where the geometry says the same, else what the geometry says, point by point.
 
     A ring may start at another corner and run the other way round. Points whose number has not changed keep
     their order and covariance, and their heights unless these were edited, too.
@@ -248,19 +252,18 @@ def believed(
     expected = np.zeros((len(positions), 3))
     expected[stored.ring, : drawn.shape[1]] = drawn
     positions = positions[_aligned(expected[:, :2], positions, geometry.closed)]
-    off = np.abs(positions - expected[:, :size]).max(axis=0, initial=0.0)
-    same = np.less_equal(off, rounding[:size])
-    if same.all():
+    agree = np.abs(positions - expected[:, :size]) <= rounding[:size]
+    if agree.all():
         return stored
     xyz = _in_map(positions, stored.heights_m, origin)
-    return replace(
-        stored, points_map=xyz[:, :2], heights_m=stored.heights_m if same[2:].all() else xyz[:, 2]
-    )
+    points_map = np.where(agree[:, :2].all(axis=1, keepdims=True), stored.points_map, xyz[:, :2])
+    heights_m = stored.heights_m
+    if not agree[:, 2:].all():
+        heights_m = np.where(agree[:, 2], stored.xyz_map[:, 2], xyz[:, 2])
+    return replace(stored, points_map=points_map, heights_m=heights_m)
 
 
-def _in_map(
-    positions: FloatArray, heights_m: FloatArray | None, origin: GeodeticOrigin | None
-) -> FloatArray:
+def _in_map(positions: FloatArray, heights_m: FloatArray | None, origin: GeodeticOrigin | None) -> FloatArray:
     """A file's positions (N, 2 or 3) in the map: (N, 3), m; heights that they lack are ``heights_m`` or 0."""
     known = np.zeros(len(positions)) if heights_m is None else heights_m
     if origin is None:
@@ -286,8 +289,11 @@ def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
     if properties.get(key) is not None:
         shape = (4, 2) if closed else (-1, 2)
         points = take_array(properties[key], shape, f"{where}, {key}", MapFileError)
-    covariance, relative = properties.get("covariance_m2"), properties.get("relative_sigma_m")
-    heights, number, sightings = properties.get("heights_m"), properties.get("id"), properties.get("sightings")
+    # What is known of each point is nothing without the points that it is known of.
+    of_points = properties if len(points) else {}
+    heights, covariance = of_points.get("heights_m"), of_points.get("covariance_m2")
+    relative = properties.get("relative_sigma_m")
+    number, sightings = properties.get("id"), properties.get("sightings")
     least = -LARGEST_ID
     return Feature(
         id=0 if number is None else take_whole(number, least, LARGEST_ID, f"{where}, id", MapFileError),

@@ -28,8 +28,11 @@ from v2hdm.records import FloatArray, GeodeticOrigin, HdMap
 
 _WGS84 = "WGS84 longitude and latitude, degrees, and height above the ellipsoid, metres"
 _LOCAL = "local map frame, metres east and north, up where known; NOT longitude and latitude"
-_DEGREE_DECIMALS = 9  # 0.1 mm on the ground
-_HEIGHT_DECIMALS = 4
+_DEGREE_DECIMALS = 11  # 0.001 mm on the ground
+_HEIGHT_DECIMALS = 5
+_ROUNDING = np.array([1e-9, 1e-9, 1e-4])
+"""Degrees and m, 0.1 mm on the ground, by which positions may be off without an edit: GDAL takes a last digit
+after several zeros for noise and drops it, and files of version 0.1 have nine and four decimals."""
 _LOCAL_ROUNDING_M = 1e-6
 """Metres are written at full precision; a GIS that rewrites the file keeps 15 digits of them."""
 
@@ -54,8 +57,11 @@ def write_features(
     told: dict[str, Any] = {"frame": "map", "coordinates": _LOCAL if origin is None else _WGS84}
     if origin is not None:
         told["origin"] = asdict(origin)
-    resolution = {} if origin is None else dict(zip(_RESOLUTION, _rounding(origin)[1:].tolist(), strict=True))
-    head = json.dumps({"type": "FeatureCollection", **resolution, "v2hdm": told | dict(about)}, allow_nan=False)
+    decimals = (_DEGREE_DECIMALS, _HEIGHT_DECIMALS)
+    resolution = {} if origin is None else {k: 10.0**-n for k, n in zip(_RESOLUTION, decimals, strict=True)}
+    head = json.dumps(
+        {"type": "FeatureCollection", **resolution, "v2hdm": told | dict(about)}, allow_nan=False
+    )
     lines = ",\n".join(json.dumps(feature, allow_nan=False) for feature in features)
     replace_text(path, f'{head[:-1]}, "features": [\n{lines}\n]}}\n')
 
@@ -87,10 +93,12 @@ def read_geojson(path: Path) -> HdMap:
             "keeps that member when it saves edits in place, and drops it from a copy"
         )
     origin = take_origin(about.get("origin"), f"{path}: origin", MapFileError)
-    rounding = _rounding(origin)
+    rounding = np.full(3, _LOCAL_ROUNDING_M) if origin is None else _ROUNDING.copy()
     for axes, key in zip((slice(0, 2), slice(2, 3)), _RESOLUTION, strict=True):
         if key in content:
-            rounding[axes] = np.maximum(rounding[axes], take_number(content[key], f"{path}: {key}", MapFileError))
+            rounding[axes] = np.maximum(
+                rounding[axes], take_number(content[key], f"{path}: {key}", MapFileError)
+            )
     reader = FeatureReader(path, origin, rounding)
     for number, feature in enumerate(features):
         where = f"{path}: feature {number}"
@@ -98,13 +106,6 @@ def read_geojson(path: Path) -> HdMap:
         properties = take_mapping(entry.get("properties"), where, MapFileError)
         reader.add(properties, _read_geometry(entry.get("geometry"), where), where)
     return reader.map()
-
-
-def _rounding(origin: GeodeticOrigin | None) -> FloatArray:
-    """How far (3,) positions may be off for having been rounded."""
-    if origin is None:
-        return np.full(3, _LOCAL_ROUNDING_M)
-    return np.array([10.0**-_DEGREE_DECIMALS, 10.0**-_DEGREE_DECIMALS, 10.0**-_HEIGHT_DECIMALS])
 
 
 def _feature(feature: Feature, origin: GeodeticOrigin | None) -> dict[str, Any]:
@@ -123,7 +124,9 @@ def _read_geometry(content: object, where: str) -> Geometry | None:
     kind, parts = entry.get("type"), entry.get("coordinates")
     closed = kind in ("Polygon", "MultiPolygon")
     if not closed and kind not in ("LineString", "MultiLineString"):
-        raise MapFileError(f"{where}: its geometry is a {kind}; draw markings as Polygons, lanes as LineStrings")
+        raise MapFileError(
+            f"{where}: its geometry is a {kind}; draw markings as Polygons, lanes as LineStrings"
+        )
     for _ in range({"Polygon": 1, "MultiPolygon": 2, "MultiLineString": 1}.get(str(kind), 0)):
         if not isinstance(parts, list) or len(parts) != 1:
             raise MapFileError(f"{where}: its {kind} has holes or several parts; split it")

@@ -1,7 +1,7 @@
 """An HD map as GeoPackage (OGC 12-128) through ``pyogrio``, and back; it opens styled in QGIS.
 
 Layer ``markings`` holds polygons, ``lanes`` lines, both with heights; the table ``v2hdm`` what is to be known
-of the map. With a geodetic origin the coordinates are longitude, latitude and ellipsoidal height (EPSG:4979).
+of the map. With a geodetic origin the coordinates are longitude, latitude and ellipsoidal height (EPSG:4326).
 Without one they are local metres in an engineering CRS, which no GIS takes for degrees.
 """
 
@@ -25,7 +25,7 @@ from v2hdm.hdmap.needs import need
 from v2hdm.hdmap.qgis_style import qgis_style
 from v2hdm.records import GeodeticOrigin, HdMap
 
-_WGS84 = "EPSG:4979"
+_WGS84 = "EPSG:4326"
 _LOCAL = (
     'ENGCRS["v2hdm map frame: metres east and north of the drive\'s own origin",'
     'EDATUM["origin of the drive"],CS[Cartesian,2],AXIS["easting (E)",east,ORDER[1]],'

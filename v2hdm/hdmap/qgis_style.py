@@ -33,19 +33,36 @@ def qgis_style(kinds: Sequence[str], closed: bool) -> str:
     symbols = ET.SubElement(renderer, "symbols")
     for number, kind in enumerate([*kinds, ""]):
         ET.SubElement(
-            categories, "category", symbol=str(number), value=kind, label=kind or "other", render="true", type="string"
+            categories,
+            "category",
+            symbol=str(number),
+            value=kind,
+            label=kind or "other",
+            render="true",
+            type="string",
         )
         colour = _COLOURS.get(kind, _OTHER_COLOUR)
-        symbol = ET.SubElement(symbols, "symbol", name=str(number), type="fill" if closed else "line", alpha="1")
-        layer = ET.SubElement(symbol, "layer", {"class": "SimpleFill" if closed else "SimpleLine", "enabled": "1"})
+        symbol = ET.SubElement(
+            symbols, "symbol", name=str(number), type="fill" if closed else "line", alpha="1"
+        )
+        layer = ET.SubElement(
+            symbol, "layer", {"class": "SimpleFill" if closed else "SimpleLine", "enabled": "1"}
+        )
         options = ET.SubElement(layer, "Option", type="Map")
         for name, value in _fill(colour) if closed else _line(colour):
             ET.SubElement(options, "Option", type="QString", name=name, value=value)
-    return "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n" + ET.tostring(root, encoding="unicode")
+    return "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n" + ET.tostring(
+        root, encoding="unicode"
+    )
 
 
 def _fill(colour: str) -> list[tuple[str, str]]:
-    return [("color", colour), ("outline_color", "35,35,35,255"), ("outline_width", "0.1"), ("style", "solid")]
+    return [
+        ("color", colour),
+        ("outline_color", "35,35,35,255"),
+        ("outline_width", "0.1"),
+        ("style", "solid"),
+    ]
 
 
 def _line(colour: str) -> list[tuple[str, str]]:
