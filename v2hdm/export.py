@@ -26,18 +26,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _export(parsed: argparse.Namespace) -> None:
     from v2hdm.errors import MapFileError
 
-    log = logging.getLogger("v2hdm")
-    log.addHandler(logging.StreamHandler())
+    log, handler = logging.getLogger("v2hdm"), logging.StreamHandler()
+    log.addHandler(handler)
     log.setLevel(logging.INFO)
     folder = parsed.output or parsed.source.parent
     try:
         export = _export_calibration if parsed.source.suffix.lower() in (".yaml", ".yml") else _export_map
         for path in export(parsed, folder):
             print(path)
+    except BrokenPipeError:  # the reader of our output has had enough
+        raise
     except OSError as error:
         raise MapFileError(
             f"{error.filename}: cannot be written ({error.strerror}); set another --output"
         ) from None
+    finally:
+        log.removeHandler(handler)
 
 
 def _export_map(parsed: argparse.Namespace, folder: Path) -> list[Path]:

@@ -74,7 +74,7 @@ def _ogr() -> ctypes.CDLL:
 
 
 def street(origin: GeodeticOrigin | None = ORIGIN, with_heights: bool = True) -> HdMap:
-    """A street bending left: three lane lines 3.5 m apart, a stop line across the right lane, diamonds, a dash.
+    """A street bending left: three lane lines 3.5 m apart, a stop line across the right lane, and more.
 
     Corners of one diamond run clockwise, and everything is known with correlated covariances.
     """

@@ -170,10 +170,7 @@ def test_ids_are_unique_and_stay_when_features_go_or_are_copied(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (
-            {"coordinates": lambda rings: [[*rings[0][:2], [122.05, 29.95, 12.0], *rings[0][2:]]]},
-            "has four corners",
-        ),
+        ({"coordinates": lambda rings: [[[122.05, 29.95, 12.0], *rings[0]]]}, "four corners, this has 5"),
         ({"coordinates": lambda rings: [rings[0], rings[0]]}, "holes or several parts"),
         ({"coordinates": lambda rings: [[[x, y + 500, z] for x, y, z in rings[0]]]}, "not in degrees"),
         ({"coordinates": lambda rings: "here"}, "holes or several parts"),

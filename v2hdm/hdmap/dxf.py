@@ -1,7 +1,7 @@
 """An HD map as DXF for CAD: local metres, a layer a class, through ``ezdxf``.
 
-What CAD has no word for is extended data (XDATA) of the application ``V2HDM`` at each polyline: strings name what
-follows them, as ``id``, ``sightings``, ``relative_sigma_m`` and the rows of ``covariance_m2``.
+Extended data (XDATA) of the application ``V2HDM`` at each polyline hold what CAD has no word for: strings
+name the values after them, ``id``, ``sightings``, ``relative_sigma_m`` and the rows of ``covariance_m2``.
 """
 
 from __future__ import annotations

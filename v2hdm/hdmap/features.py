@@ -1,7 +1,7 @@
 """A map as a list of features, which is what every file format writes, and back again.
 
-Where a file holds a feature's geometry and its exact local coordinates, :func:`believed` decides between them:
-the geometry is the truth, for people edit it, and the stored coordinates stand only where they agree with it.
+Where a file holds a feature's geometry and its exact local coordinates, :func:`believed` decides between
+them: the geometry is the truth, for people edit it; the stored coordinates stand where they agree with it.
 """
 
 from __future__ import annotations
@@ -27,9 +27,14 @@ LARGEST_ID = 1_000_000_000
 
 _MOST_SIGHTINGS = 1_000_000_000
 
+_NAMED = 9
+"""Edited features that the log names."""
+
 CORNERS = "corners_map"
+"""Property that holds the exact local coordinates of a closed feature."""
+
 POINTS = "points_map"
-"""Property that holds the exact local coordinates, of a closed feature and of an open one."""
+"""Property that holds the exact local coordinates of an open feature."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +81,8 @@ class Feature:
     def positions(self, origin: GeodeticOrigin | None) -> FloatArray:
         """The points in order of :attr:`ring`.
 
-        (N, 3) longitude and latitude in degrees and ellipsoidal height in m; without an ``origin`` local metres,
-        (N, 2) where no height is known.
+        (N, 3) longitude and latitude in degrees and ellipsoidal height in m; without an ``origin`` local
+        metres, (N, 2) where no height is known.
         """
         if origin is None:
             return (self.points_map if self.heights_m is None else self.xyz_map)[self.ring]
@@ -210,8 +215,8 @@ class FeatureReader:
         before = [feature.id for feature in self._features]
         ids = unique_ids(before)
         if self._edited:
-            named = ", ".join(str(ids[index]) for index in self._edited[:9])
-            more = ", ..." if len(self._edited) > 9 else ""
+            named = ", ".join(str(ids[index]) for index in self._edited[:_NAMED])
+            more = ", ..." if len(self._edited) > _NAMED else ""
             _log.info(
                 "%s: %d features were edited and are taken as drawn: %s",
                 self.path,

@@ -3,10 +3,10 @@
 With a geodetic origin the geometry is WGS84 longitude and latitude, as the RFC demands, and any GIS
 shows the map in its place. Without one it is local metres, which the foreign member ``v2hdm`` says
 under ``coordinates``. The geometry is the truth when a map is read, so that edits survive. The properties
-``corners_map`` and ``points_map`` hold the local coordinates at full precision, and stand where they agree with
-the geometry to its rounding, which ``xy_coordinate_resolution`` and ``z_coordinate_resolution`` state as GDAL
-does. ``heights_m`` are the ground's heights in the map frame. Where there are any, or an origin, positions have
-a third coordinate, in m: above the ellipsoid, or above the local z = 0.
+``corners_map`` and ``points_map`` hold the local coordinates at full precision, and stand where they agree
+with the geometry to 0.1 mm, or to a coarser ``xy_coordinate_resolution`` and ``z_coordinate_resolution``.
+``heights_m`` are the ground's heights in the map frame. Where there are any, or an origin, positions have a
+third coordinate, in m: above the ellipsoid, or above the local z = 0.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _LOCAL_ROUNDING_M = 1e-6
 """Metres are written at full precision; a GIS that rewrites the file keeps 15 digits of them."""
 
 _RESOLUTION = ("xy_coordinate_resolution", "z_coordinate_resolution")
-"""Members of a FeatureCollection by which GDAL 3.9 and later tells, and is told, how coordinates are rounded."""
+"""Members of a FeatureCollection by which GDAL since 3.9 tells how coordinates are rounded, m or degrees."""
 
 
 def write_geojson(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None) -> None:
@@ -89,8 +89,8 @@ def read_geojson(path: Path) -> HdMap:
     about, features = content.get("v2hdm"), content.get("features")
     if not isinstance(about, dict) or not isinstance(features, list):
         raise MapFileError(
-            f"{path}: not a map written by v2hdm (no 'v2hdm' member or no 'features'); give one that is. A GIS "
-            "keeps that member when it saves edits in place, and drops it from a copy"
+            f"{path}: not a map written by v2hdm (no 'v2hdm' member or no 'features'); give one that is. A "
+            "GIS keeps that member when it saves edits in place, and drops it from a copy"
         )
     origin = take_origin(about.get("origin"), f"{path}: origin", MapFileError)
     rounding = np.full(3, _LOCAL_ROUNDING_M) if origin is None else _ROUNDING.copy()

@@ -24,5 +24,6 @@ def need(package: str, file_format: str) -> Any:
         if error.name != missing:
             raise
         raise ConfigError(
-            f"the format {file_format} needs {missing}: install the {EXTRA} extra, pip install 'v2hdm[{EXTRA}]'"
+            f"the format {file_format} needs {missing}: install the {EXTRA} extra, "
+            f"pip install 'v2hdm[{EXTRA}]'"
         ) from None

@@ -22,8 +22,8 @@ COLUMNS: tuple[str, ...] = (
     *("sigma_x_m", "sigma_y_m", "sightings", "relative_sigma_m"),
     *(f"cov_{own}_{other}{k}_m2" for own in "xy" for k in range(1, _CORNERS + 1) for other in "xy"),
 )
-"""``point`` counts from 1 along the feature. ``cov_x_y3_m2`` is the covariance of this point's x with the y of
-point 3 of the same feature. Empty where it is not known."""
+"""``point`` counts from 1 along the feature. ``cov_x_y3_m2`` is the covariance of this point's x with the y
+of point 3 of the same feature. Empty where it is not known."""
 
 
 def write_csv(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None) -> None:
