@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyogrio.errors
 import pyogrio.raw
 import pytest
 
@@ -207,6 +208,16 @@ def test_a_geopackage_of_another_tool_is_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(MapFileError, match="not a map written by v2hdm"):
         read_geopackage(path)
+
+
+def test_where_gdal_cannot_write_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise pyogrio.errors.DataSourceError("disk full\nat line 7")
+
+    monkeypatch.setattr(pyogrio.raw, "write", full)
+    with pytest.raises(MapFileError, match=r"map\.gpkg: cannot be written \(disk full\)"):
+        write_geopackage(street(), tmp_path / "map.gpkg")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_geopackage_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> None:

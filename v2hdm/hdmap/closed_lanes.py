@@ -14,6 +14,9 @@ LANE_WIDTH_M = (2.55, 5.1)
 """Lines that are closer have no room for a truck, 2.55 m wide (Directive 96/53/EC, annex I, 1.1), and those
 farther apart have room for two."""
 
+_AT_ONCE = 64
+"""Neighbouring vertices that are held against the segments around them together."""
+
 
 @dataclass(frozen=True)
 class ClosedLane:
@@ -32,11 +35,12 @@ def closed_lanes(lines_map: Sequence[FloatArray]) -> list[ClosedLane]:
     A lane lies between a line and the nearest one that is met across it, at a lane's width.
     """
     found = []
+    segments = _Segments.of(lines_map)
     for number, line in enumerate(lines_map):
         if len(line) < 2:
             continue
         for side in (1, -1):
-            other, nearest, gap_m = _across(lines_map, number, side)
+            other, nearest, gap_m = segments.across(number, line, side)
             for begin, end in _stretches(other, gap_m):
                 if other[begin] < number:  # found from there
                     continue
@@ -52,35 +56,67 @@ def closed_lanes(lines_map: Sequence[FloatArray]) -> list[ClosedLane]:
     return found
 
 
-def _across(lines_map: Sequence[FloatArray], number: int, side: int) -> tuple[IntArray, IntArray, FloatArray]:
-    """Of each vertex of a line (N,): the line met first on its left (1) or right (-1), -1 where none is.
+@dataclass(frozen=True)
+class _Segments:
+    """All lines' segments: both ends (S, 2) m, the line that each is of, and its place along it."""
 
-    And the vertex of that line nearest to where it is met, and how far away that is, m.
-    """
-    line = lines_map[number]
-    tangent = np.gradient(line, axis=0)
-    normal = side * np.column_stack([-tangent[:, 1], tangent[:, 0]])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    other = np.full(len(line), -1)
-    nearest = np.zeros(len(line), dtype=np.int64)
-    gap_m = np.full(len(line), LANE_WIDTH_M[1])
-    for candidate, points in enumerate(lines_map):
-        if candidate == number or len(points) < 2:
-            continue
-        for k, (place, away) in enumerate(zip(line, normal, strict=True)):
-            offset = points - place
-            ahead, beside = offset @ away, offset[:, 0] * away[1] - offset[:, 1] * away[0]
-            crosses = np.flatnonzero((beside[:-1] * beside[1:] <= 0) & (beside[:-1] != beside[1:]))
-            if not len(crosses):
-                continue
-            part = beside[crosses] / (beside[crosses] - beside[crosses + 1])
-            met_m = ahead[crosses] + part * (ahead[crosses + 1] - ahead[crosses])
-            met_m[met_m <= 0] = np.inf
-            best = int(np.argmin(met_m))
-            if met_m[best] < gap_m[k]:
-                other[k], gap_m[k] = candidate, met_m[best]
-                nearest[k] = crosses[best] + round(float(part[best]))
-    return other, nearest, gap_m
+    start: FloatArray
+    end: FloatArray
+    line: IntArray
+    index: IntArray
+
+    @classmethod
+    def of(cls, lines_map: Sequence[FloatArray]) -> _Segments:
+        none = np.empty((0, 2))
+        return cls(
+            start=np.concatenate([none, *(line[:-1] for line in lines_map)]),
+            end=np.concatenate([none, *(line[1:] for line in lines_map)]),
+            line=np.repeat(np.arange(len(lines_map)), [max(len(line) - 1, 0) for line in lines_map]),
+            index=np.concatenate(
+                [np.arange(0), *(np.arange(len(line) - 1) for line in lines_map if len(line))]
+            ),
+        )
+
+    def across(self, number: int, line: FloatArray, side: int) -> tuple[IntArray, IntArray, FloatArray]:
+        """Of each vertex of a line (N,): the line met first on its left (1) or right (-1), -1 where none is.
+
+        And the vertex of that line nearest to where it is met, and how far away that is, m.
+        """
+        tangent = np.gradient(line, axis=0)
+        normal = side * np.column_stack([-tangent[:, 1], tangent[:, 0]])
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+        pieces = [
+            self._met(number, line[at : at + _AT_ONCE], normal[at : at + _AT_ONCE])
+            for at in range(0, len(line), _AT_ONCE)
+        ]
+        other, nearest, gap_m = zip(*pieces, strict=True)
+        return np.concatenate(other), np.concatenate(nearest), np.concatenate(gap_m)
+
+    def _met(
+        self, number: int, places: FloatArray, away: FloatArray
+    ) -> tuple[IntArray, IntArray, FloatArray]:
+        """What :meth:`across` tells, of neighbouring places (N, 2) and the directions ``away`` (N, 2)."""
+        low, high = places.min(axis=0) - LANE_WIDTH_M[1], places.max(axis=0) + LANE_WIDTH_M[1]
+        near = (np.maximum(self.start, self.end) >= low) & (np.minimum(self.start, self.end) <= high)
+        candidates = np.flatnonzero(near.all(axis=1) & (self.line != number))
+        if not len(candidates):
+            nothing = np.zeros(len(places), dtype=np.int64)
+            return nothing - 1, nothing, np.full(len(places), LANE_WIDTH_M[1])
+        ahead, beside = [], []
+        for ends in (self.start, self.end):
+            offset = ends[candidates] - places[:, None]
+            ahead.append(np.einsum("nsi,ni->ns", offset, away))
+            beside.append(offset[..., 0] * away[:, None, 1] - offset[..., 1] * away[:, None, 0])
+        crosses = (beside[0] * beside[1] <= 0) & (beside[0] != beside[1])
+        part = beside[0] / np.where(crosses, beside[0] - beside[1], 1.0)
+        met_m = ahead[0] + part * (ahead[1] - ahead[0])
+        met_m[~crosses | (met_m <= 0)] = np.inf
+        rows, best = np.arange(len(places)), np.argmin(met_m, axis=1)
+        met_at = candidates[best]
+        gap_m = met_m[rows, best]
+        reached = gap_m < LANE_WIDTH_M[1]
+        nearest = self.index[met_at] + np.rint(np.where(reached, part[rows, best], 0.0)).astype(np.int64)
+        return np.where(reached, self.line[met_at], -1), nearest, np.where(reached, gap_m, LANE_WIDTH_M[1])
 
 
 def _stretches(other: IntArray, gap_m: FloatArray) -> list[tuple[int, int]]:

@@ -54,8 +54,9 @@ def write_geopackage(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | Non
 
     Raises:
         ConfigError: ``pyogrio`` is not installed.
+        MapFileError: GDAL cannot write there.
     """
-    raw = need("pyogrio.raw", "gpkg")
+    raw, errors = need("pyogrio.raw", "gpkg"), need("pyogrio.errors", "gpkg")
     features = features_of(hd_map)
     told: dict[str, Any] = {"frame": "map"}
     if hd_map.origin is not None:
@@ -73,6 +74,9 @@ def write_geopackage(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | Non
             _write_table(raw, unfinished, _ABOUT, about)
             _write_table(raw, unfinished, "layer_styles", _styles(features), FID="id")
             unfinished.replace(partial)
+        except (errors.DataSourceError, errors.DataLayerError, errors.FeatureError) as failure:
+            problem = str(failure).splitlines()[0]
+            raise MapFileError(f"{path}: cannot be written ({problem}); set another folder") from None
         finally:
             unfinished.unlink(missing_ok=True)
 
