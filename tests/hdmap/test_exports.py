@@ -454,3 +454,26 @@ def test_classes_of_ones_own_with_signs_in_their_names_are_written(tmp_path: Pat
     for file_format, name in names.items():
         path = exported(tmp_path, file_format, HdMap((marking,), (), ORIGIN))
         assert name(path).startswith("pad ")
+
+
+def test_a_lane_beside_which_another_begins_is_cut_there_so_that_one_can_change(tmp_path: Path) -> None:
+    def line(kind: str, y: float, begin: float) -> Lane:
+        x = np.arange(begin, 60.0, 0.37)
+        return Lane(kind, np.column_stack([x, np.full(len(x), y)]), 3)
+
+    lines = (line("lane_line", 0.0, 0.0), line("lane_dash", 3.5, 0.2), line("lane_line", 7.0, 21.3))
+    loaded = load(exported(tmp_path, "lanelet2", HdMap((), lines, ORIGIN)), ORIGIN)
+    before, beside, begun = sorted(
+        loaded.laneletLayer, key=lambda one: points_of(one.centerline)[:, :2].mean(axis=0) @ [1.0, 10.0]
+    )
+    rules = lanelet2.traffic_rules.create(
+        lanelet2.traffic_rules.Locations.Germany, lanelet2.traffic_rules.Participants.Vehicle
+    )
+    graph = lanelet2.routing.RoutingGraph(loaded, rules)
+    assert [one.id for one in graph.following(before)] == [beside.id]
+    assert graph.left(beside).id == begun.id
+    assert graph.right(begun).id == beside.id
+    route = graph.getRoute(before, begun)
+    assert route is not None
+    assert [one.id for one in route.shortestPath()] == [before.id, beside.id, begun.id]
+    assert before.leftBound[-1].id == beside.leftBound[0].id

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import groupby, pairwise
 
 import numpy as np
 
@@ -30,12 +30,87 @@ class ClosedLane:
 
 
 def closed_lanes(lines_map: Sequence[FloatArray]) -> list[ClosedLane]:
-    """The lanes between polylines (N, 2) m: stretches longer than wide, in the order of their first line.
+    """The lanes between polylines (N, 2) m, in the order of their first line.
 
-    A lane lies between a line and the nearest one that is met across it, at a lane's width.
+    A lane lies between a line and the nearest one that is met across it, at a lane's width, for longer than it
+    is wide. Where one ends, those beside it are cut, too: neighbours then share a bound from end to end, as a
+    change between them needs.
     """
-    found = []
+    runs = _runs(lines_map)
+    cuts = [_Cuts(line) for line in lines_map]
+    for run in runs:
+        for end in (0, -1):
+            cuts[run.line].at(run.own[end])
+            cuts[run.other].at(run.met[end])
+    while sum(run.cut_alike(cuts) for run in runs):
+        pass
+    return [lane for run in runs for lane in run.lanes(cuts)]
+
+
+class _Cuts:
+    """Vertices at which a line is cut, at least the width of a narrow lane apart along it."""
+
+    def __init__(self, line: FloatArray) -> None:
+        steps_m = np.linalg.norm(np.diff(line, axis=0), axis=1)
+        self._along_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+        self.vertices: list[int] = []
+
+    def at(self, vertex: int) -> int:
+        """The cut at a vertex: one that is near it, else it is made there."""
+        for cut in self.vertices:
+            if abs(self._along_m[cut] - self._along_m[vertex]) < LANE_WIDTH_M[0]:
+                return cut
+        self.vertices = sorted([*self.vertices, int(vertex)])
+        return int(vertex)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """Consecutive vertices ``own`` (N,) of a ``line`` that meet an ``other`` on one ``side``.
+
+    ``met`` (N,) are the vertices of the other that are nearest to where it is met.
+    """
+
+    line: int
+    own: IntArray
+    other: int
+    met: IntArray
+    side: int
+
+    def cut_alike(self, cuts: Sequence[_Cuts]) -> bool:
+        """Cut each line where the other is; whether there was anything to do."""
+        before = len(cuts[self.line].vertices) + len(cuts[self.other].vertices)
+        for vertex in cuts[self.line].vertices:
+            if self.own[0] < vertex < self.own[-1]:
+                cuts[self.other].at(self.met[vertex - self.own[0]])
+        for vertex in cuts[self.other].vertices:
+            if self.met.min() < vertex < self.met.max():
+                cuts[self.line].at(self.own[np.argmin(np.abs(self.met - vertex))])
+        return len(cuts[self.line].vertices) + len(cuts[self.other].vertices) > before
+
+    def lanes(self, cuts: Sequence[_Cuts]) -> list[ClosedLane]:
+        """The lanes between one cut and the next."""
+        first, last = (cuts[self.line].at(self.own[end]) for end in (0, -1))
+        own = [vertex for vertex in cuts[self.line].vertices if first <= vertex <= last]
+        places = np.clip(np.array(own) - self.own[0], 0, len(self.met) - 1)
+        met = [cuts[self.other].at(vertex) for vertex in self.met[places]]
+        lanes = []
+        for (begin, end), (start, stop) in zip(pairwise(own), pairwise(met), strict=True):
+            if start == stop:
+                continue
+            turn = 1 if start < stop else -1
+            bounds = (
+                (self.line, np.arange(begin, end + 1)),
+                (self.other, np.arange(start, stop + turn, turn)),
+            )
+            lanes.append(ClosedLane(*(bounds if self.side < 0 else bounds[::-1])))
+        return lanes
+
+
+def _runs(lines_map: Sequence[FloatArray]) -> list[_Run]:
+    """Where two lines run beside each other for longer than they are apart, each pair once."""
     segments = _Segments.of(lines_map)
+    runs = []
     for number, line in enumerate(lines_map):
         if len(line) < 2:
             continue
@@ -44,16 +119,12 @@ def closed_lanes(lines_map: Sequence[FloatArray]) -> list[ClosedLane]:
             for begin, end in _stretches(other, gap_m):
                 if other[begin] < number:  # found from there
                     continue
-                across = lines_map[other[begin]]
-                own = np.arange(begin, end + 1)
-                first, last = nearest[begin], nearest[end]
-                its = np.arange(first, last + 1) if first <= last else np.arange(first, last - 1, -1)
-                shortest_m = min(_length(line[own]), _length(across[its]))
-                if shortest_m > gap_m[begin : end + 1].max():
-                    bounds = ((number, own), (int(other[begin]), its))
-                    left, right = bounds if side < 0 else bounds[::-1]
-                    found.append(ClosedLane(left, right))
-    return found
+                run = slice(begin, end + 1)
+                met = lines_map[other[begin]][nearest[run]]
+                if min(_length(line[run]), _length(met)) > gap_m[run].max():
+                    own = np.arange(begin, end + 1)
+                    runs.append(_Run(number, own, int(other[begin]), nearest[run], side))
+    return runs
 
 
 @dataclass(frozen=True)
