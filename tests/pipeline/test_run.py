@@ -133,6 +133,17 @@ def test_the_files_of_a_result_can_be_read_back(result: Path) -> None:
     assert "detected" in (result / "run.log").read_text()
 
 
+def test_lane_lines_run_as_the_drive_passed_them(result: Path, drive_folder: Path) -> None:
+    poses = np.array([image.map_from_vehicle for image in read_drive(drive_folder).images])
+    lanes = read_geojson(result / "map.geojson").lanes
+    assert lanes
+    for lane in lanes:
+        steps = np.diff(lane.points_map, axis=0)
+        offset = lane.points_map[:-1, None] - poses[:, :2, 3]
+        headings = poses[np.argmin((offset**2).sum(axis=2), axis=1), :2, 0]
+        assert (steps * headings).sum() > 0
+
+
 def test_the_map_is_the_same_to_the_byte_without_the_truth(
     result: Path, drive_folder: Path, tmp_path: Path
 ) -> None:
