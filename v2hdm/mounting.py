@@ -15,7 +15,7 @@ from v2hdm.errors import ConfigError
 from v2hdm.ground import GroundEstimate, estimate_cameras
 from v2hdm.ground.picture import draw_matched_ground
 from v2hdm.ground.say import lines
-from v2hdm.hdmap.calibration import write_calibration
+from v2hdm.hdmap.calibration import Provenance, write_calibration
 from v2hdm.quality import Status, Verdict, check_drive
 from v2hdm.records import Drive
 from v2hdm.report.outputs import result_folder, write_json
@@ -65,5 +65,6 @@ def _write(drive: Drive, estimate: GroundEstimate, folder: Path, verdict: Verdic
     if estimate.calibration is None or picture is None:
         return
     path = folder / f"calibration_{estimate.camera}.yaml"
-    write_calibration(estimate.calibration, path, verdict=verdict.as_json())
+    told = verdict.as_json()
+    write_calibration(estimate.calibration, path, verdict=told, about=Provenance.today(drive.name, told))
     cv2.imwrite(str(folder / f"ground_{estimate.camera}.png"), picture)

@@ -273,6 +273,7 @@ class Marking:
     ``relative_sigma_m`` is what the marking contributes to the error of a distance to one about 10 m away,
     one standard deviation a coordinate: without the drift and the survey that both share. None if unknown.
     ``heights_m`` (4,) are the recorded heights of the ground there, None where it was recorded as z = 0.
+    ``id`` is positive and no other feature's of its map; None until the map is written.
     """
 
     kind: str
@@ -281,6 +282,7 @@ class Marking:
     covariance_m2: FloatArray | None = None
     relative_sigma_m: float | None = None
     heights_m: FloatArray | None = None
+    id: int | None = None
 
 
 @dataclass(frozen=True)
@@ -303,12 +305,14 @@ class Lane:
     """One mapped lane line: a polyline ``points_map`` (N, 2) m along its centre.
 
     ``heights_m`` (N,) are the recorded heights of the ground there, None where it was recorded as z = 0.
+    ``id`` is positive and no other feature's of its map; None until the map is written.
     """
 
     kind: str
     points_map: FloatArray
     sightings: int
     heights_m: FloatArray | None = None
+    id: int | None = None
 
 
 @dataclass(frozen=True)

@@ -99,3 +99,15 @@ def test_a_mask_of_the_vehicle_is_read_and_one_of_another_size_refused(tmp_path:
     cv2.imwrite(str(tmp_path / "front" / "bonnet.png"), mask[:10])
     with pytest.raises(DriveError, match=r"mask: .*bonnet\.png is no image of 64 x 48 px"):
         read_drive(tmp_path)
+
+
+def test_a_camera_is_called_as_the_drive_calls_it_whatever_its_calibration_says(tmp_path: Path) -> None:
+    make_drive(tmp_path)
+    for name in ("front", "rear"):
+        path = tmp_path / name / "camera_info.yaml"
+        path.write_text(path.read_text().replace(f"camera_name: {name}", "camera_name: narrow_stereo"))
+        assert "narrow_stereo" in path.read_text()
+    assert {name: camera.info.name for name, camera in read_drive(tmp_path).cameras.items()} == {
+        "front": "front",
+        "rear": "rear",
+    }

@@ -18,6 +18,8 @@ from v2hdm.drive.tum import read_tum, write_tum
 from v2hdm.errors import ConfigError, DetectorError, DriveError, V2hdmError
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.hdmap.calibration import read_calibration
+from v2hdm.hdmap.calibration_formats import CALIBRATION_FORMATS
+from v2hdm.hdmap.formats import FORMATS
 from v2hdm.hdmap.geojson import read_geojson
 from v2hdm.mapping.options import AcceptanceOptions, LaneOptions, MappingOptions
 from v2hdm.pipeline import DriveConfig, RunConfig, run
@@ -55,7 +57,7 @@ def run_config(drive: Path, output: Path, **changes: object) -> RunConfig:
 @pytest.fixture(scope="module")
 def result(drive_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("outputs")
-    return run(run_config(drive_folder, output)).folder
+    return run(run_config(drive_folder, output, export=list(FORMATS))).folder
 
 
 def test_every_method_is_judged_on_every_camera_set(result: Path) -> None:
@@ -118,12 +120,28 @@ def test_the_files_of_a_result_can_be_read_back(result: Path) -> None:
         calibration = read_calibration(result / f"calibration_{camera}.yaml")
         assert calibration.covariance is not None
         assert np.linalg.det(calibration.cam_from_vehicle[:3, :3]) == pytest.approx(1.0)
+        for form in CALIBRATION_FORMATS.values():
+            text = (result / f"calibration_{camera}" / f"{camera}_{form.ending}").read_text()
+            assert "# drive: short\n# date: " in text
+    for one in FORMATS.values():
+        assert (result / one.file.format(name="map")).stat().st_size > 1000
     for picture in ("birdseye.png", "growth.png", "overlay_front.png", "overlay_rear.png"):
         image = cv2.imread(str(result / picture))
         assert image is not None, picture
         assert image.std() > 5.0
     assert (result / "config.yaml").stat().st_size > 0
     assert "detected" in (result / "run.log").read_text()
+
+
+def test_lane_lines_run_as_the_drive_passed_them(result: Path, drive_folder: Path) -> None:
+    poses = np.array([image.map_from_vehicle for image in read_drive(drive_folder).images])
+    lanes = read_geojson(result / "map.geojson").lanes
+    assert lanes
+    for lane in lanes:
+        steps = np.diff(lane.points_map, axis=0)
+        offset = lane.points_map[:-1, None] - poses[:, :2, 3]
+        headings = poses[np.argmin((offset**2).sum(axis=2), axis=1), :2, 0]
+        assert (steps * headings).sum() > 0
 
 
 def test_the_map_is_the_same_to_the_byte_without_the_truth(
@@ -227,6 +245,7 @@ def test_a_drive_past_nothing_fails_and_says_that_no_marking_was_found(
             "mapping.acceptance.min_probability is 50",
         ),
         ({"detector": DetectorOptions(model="no such.onnx")}, "no such.onnx"),
+        ({"export": ["geojson", "shp"]}, "export: unknown format 'shp'"),
     ],
 )
 def test_what_cannot_work_is_refused_before_anything_is_read(

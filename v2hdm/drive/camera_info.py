@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.fields import check_camera, take_size_px
@@ -18,6 +15,7 @@ from v2hdm.files import (
     take_mapping,
     take_text,
 )
+from v2hdm.hdmap.calibration_formats import camera_info_content
 from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo, FloatArray
 
 _REQUIRED = (
@@ -68,22 +66,7 @@ def read_camera_info(path: Path) -> CameraInfo:
 
 def write_camera_info(info: CameraInfo, path: Path) -> None:
     """Write ``info`` to ``path``, atomically, with the identity as rectification for ROS' sake."""
-    projection = np.column_stack([info.intrinsic, np.zeros(3)])
-    content = {
-        "image_width": info.width,
-        "image_height": info.height,
-        "camera_name": info.name,
-        "camera_matrix": _matrix(info.intrinsic),
-        "distortion_model": info.distortion_model,
-        "distortion_coefficients": _matrix(np.array([info.distortion])),
-        "rectification_matrix": _matrix(np.eye(3)),
-        "projection_matrix": _matrix(projection),
-    }
-    replace_text(path, dump_yaml(content))
-
-
-def _matrix(values: FloatArray) -> dict[str, Any]:
-    return {"rows": values.shape[0], "cols": values.shape[1], "data": values.ravel().tolist()}
+    replace_text(path, dump_yaml(camera_info_content(info)))
 
 
 def _take_matrix(content: object, where: str) -> FloatArray:

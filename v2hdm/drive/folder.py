@@ -6,7 +6,7 @@ docs/drive-format.md describes it for those who want to make one.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +94,9 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
     cameras: dict[str, Camera] = {}
     files: list[ImageFiles] = []
     for name, (entry, read_info, list_images) in planned.items():
-        cameras[name] = _read_camera(entry, read_info(), path, f"{where}: camera '{name}'")
+        # Many tools call every camera they calibrate alike: the drive's own name for it holds.
+        info = replace(read_info(), name=name)
+        cameras[name] = _read_camera(entry, info, path, f"{where}: camera '{name}'")
         files.append(list_images())
     recorded = read_poses(poses, path, origin, options.max_gap_s, poses_at, read_topic)
     pose_noise = _read_pose_noise(content.get("pose_noise"), recorded.noise, f"{where}: pose_noise")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +32,27 @@ _OPTIONAL = (
     "covariance",
     "clock_offset_s",
     "clock_sigma_s",
+    "drive",
+    "date",
     "verdict",
 )
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a calibration comes from: name of the drive, ISO date, and the status of the verdict on the run.
+
+    Of each None where it is not known.
+    """
+
+    drive: str | None = None
+    date: str | None = None
+    verdict: str | None = None
+
+    @classmethod
+    def today(cls, drive: str, verdict: Mapping[str, Any]) -> Provenance:
+        """That of a run of today (UTC) over ``drive``, with its verdict as JSON."""
+        return cls(drive, datetime.now(UTC).date().isoformat(), str(verdict["status"]))
 
 
 def write_calibration(
@@ -40,6 +61,7 @@ def write_calibration(
     *,
     clock_s: tuple[float, float] | None = None,
     verdict: Mapping[str, Any] | None = None,
+    about: Provenance | None = None,
 ) -> None:
     """Write ``calibration`` to ``path``, atomically.
 
@@ -52,6 +74,7 @@ def write_calibration(
         clock_s: how much later than stamped the camera's images were taken, and the sigma of that (infinite
             where it is not known; it is then left out).
         verdict: that on the run which found it, as JSON.
+        about: its drive and date.
     """
     info = calibration.info
     content: dict[str, Any] = {
@@ -75,6 +98,9 @@ def write_calibration(
         content["clock_offset_s"] = float(clock_s[0])
         if np.isfinite(clock_s[1]):
             content["clock_sigma_s"] = float(clock_s[1])
+    for key in ("drive", "date"):
+        if about is not None and getattr(about, key) is not None:
+            content[key] = getattr(about, key)
     if verdict is not None:
         content["verdict"] = dict(verdict)
     replace_text(path, dump_yaml(content))
@@ -106,3 +132,20 @@ def read_calibration(path: Path) -> Calibration:
     if "covariance" in content:
         covariance = take_covariance(content["covariance"], 6, f"{path}: covariance", MapFileError)
     return Calibration(info=info, cam_from_vehicle=array("cam_from_vehicle", 4, 4), covariance=covariance)
+
+
+def read_provenance(path: Path) -> Provenance:
+    """Where the calibration that :func:`write_calibration` wrote comes from.
+
+    Raises:
+        MapFileError: when the file is missing, damaged or not of this format.
+    """
+    content = load_yaml(path, MapFileError)
+    verdict = content.get("verdict")
+    status = verdict.get("status") if isinstance(verdict, dict) else None
+    texts = {}
+    for key, value in (("drive", content.get("drive")), ("date", content.get("date")), ("verdict", status)):
+        # YAML takes a plain date for one.
+        plain = value.isoformat() if isinstance(value, date) else value
+        texts[key] = None if plain is None else take_text(plain, f"{path}: {key}", MapFileError)
+    return Provenance(**texts)

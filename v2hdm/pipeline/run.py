@@ -24,6 +24,7 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import unknown_network
 from v2hdm.drive import ReadOptions, drive_name, read_drive
 from v2hdm.errors import AdjustError, ConfigError, MappingError, V2hdmError
+from v2hdm.hdmap.formats import check_formats
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.pipeline.evaluate import CameraSets, evaluate
@@ -80,6 +81,7 @@ class RunConfig:
         device: what ``conf/map.yaml`` hands on as ``mapping.device``, ``cpu`` or ``cuda``.
         all_maps: whether the map of every method and camera set is written, into ``maps/``.
         mode: what it hands on as ``mapping.mode``, ``batch`` or ``incremental``.
+        export: formats of the map: ``geojson``, ``csv``, ``gpkg``, ``lanelet2``, ``dxf`` (docs/exports.md).
     """
 
     name: str | None = None
@@ -93,6 +95,7 @@ class RunConfig:
     device: str = "cpu"
     mode: str = "batch"
     all_maps: bool = False
+    export: list[str] = field(default_factory=lambda: ["geojson"])
 
 
 @dataclass(frozen=True)
@@ -165,7 +168,9 @@ def _map_and_judge(
         described = inspection.drive_as_described
         judgement = evaluate(described, detections, methods, config.mapping, partial(progress, "evaluate"))
     metrics = {**about, "verdict": verdict.as_json(), **judgement.metrics, "seconds": seconds}
-    write_results(folder, described, detections, methods, judgement, metrics, verdict, config.all_maps)
+    write_results(
+        folder, described, detections, methods, judgement, metrics, verdict, config.all_maps, config.export
+    )
     return RunResult(Path(config.output) / about["name"], metrics, judgement.headlines, verdict)
 
 
@@ -249,6 +254,7 @@ def _check(config: RunConfig) -> str:
     _workers(config)
     detector = Detector.load(options=config.detector)
     check_options(config.mapping, detector.catalogue.cornered)
+    check_formats(config.export, "export")
     _check_device(config.mapping.device)
     return name
 

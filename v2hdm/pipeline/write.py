@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from v2hdm.detection.batch import read_image
+from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import facing_ipm, flat_motion, pinhole_px_from_ground
 from v2hdm.geometry.rigid import inverse
-from v2hdm.hdmap.calibration import write_calibration
+from v2hdm.hdmap.calibration import Provenance, write_calibration
+from v2hdm.hdmap.calibration_formats import CALIBRATION_FORMATS, write_calibration_as
 from v2hdm.hdmap.exclusions import ExcludedMarking, write_exclusions
+from v2hdm.hdmap.formats import write_map
 from v2hdm.hdmap.geojson import write_geojson
 from v2hdm.hdmap.heights import with_heights
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.evaluate import CameraSets, Judgement
 from v2hdm.pipeline.trajectory import write_trajectory
 from v2hdm.quality import Verdict
-from v2hdm.records import Drive, Image, ImageDetections
+from v2hdm.records import Calibration, Drive, HdMap, Image, ImageDetections
 from v2hdm.report.figures import save_birdseye, save_growth, save_overlay
 from v2hdm.report.outputs import write_json
+
+_log = logging.getLogger(__name__)
 
 BEST = "Opt"
 """The method whose map and calibration are the run's result."""
@@ -36,6 +43,7 @@ def write_results(
     metrics: Mapping[str, Any],
     verdict: Verdict,
     all_maps: bool = False,
+    formats: Sequence[str] = ("geojson",),
 ) -> None:
     """Write map, calibrations, trajectory, metrics and pictures of a run into ``folder``.
 
@@ -48,15 +56,18 @@ def write_results(
         metrics: what goes into ``metrics.json``.
         verdict: on the run.
         all_maps: whether to write the map of every method and camera set as well.
+        formats: those of the map, of :data:`v2hdm.hdmap.formats.FORMATS`.
     """
     methods = list(sets.values())[-1]
     best, told = methods[BEST], verdict.as_json()
-    write_geojson(with_heights(best.hd_map, drive.road), folder / "map.geojson", told)
+    write_map(_along_route(with_heights(best.hd_map, drive.road), drive), folder, "map", formats, told)
+    about = Provenance.today(drive.name, told)
     for name, calibration in best.calibrations.items():
         clock = best.clocks.get(name)
         clock_s = None if clock is None else (clock.value_s, clock.sigma_s)
         path = folder / f"calibration_{name}.yaml"
-        write_calibration(calibration, path, clock_s=clock_s, verdict=told)
+        write_calibration(calibration, path, clock_s=clock_s, verdict=told, about=about)
+        _write_calibration_forms(calibration, about, path)
     if best.poses is not None:
         write_trajectory(best.poses, drive, folder)
     _write_exclusions(folder / "excluded.geojson", drive, sets)
@@ -71,6 +82,30 @@ def write_results(
     for name in best.calibrations:
         image = _fullest_image(drive, name, detections)
         _save_overlay(folder / f"overlay_{name}.png", drive, image, best)
+
+
+def _along_route(hd_map: HdMap, drive: Drive) -> HdMap:
+    """The map with every lane line in the direction in which the drive passed it: that of its lanelets."""
+    route_map = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
+    ahead = np.array([image.map_from_vehicle[:2, 0] for image in drive.images])
+    lanes = []
+    for lane in hd_map.lanes:
+        offset = lane.points_map[:, None] - route_map
+        passed = ahead[np.argmin((offset**2).sum(axis=2), axis=1)]
+        if (passed * np.gradient(lane.points_map, axis=0)).sum() < 0:
+            heights = None if lane.heights_m is None else lane.heights_m[::-1]
+            lane = replace(lane, points_map=lane.points_map[::-1], heights_m=heights)
+        lanes.append(lane)
+    return replace(hd_map, lanes=tuple(lanes))
+
+
+def _write_calibration_forms(calibration: Calibration, about: Provenance, path: Path) -> None:
+    """The calibration in the forms of other tools, into a folder named like ``path``."""
+    for name in CALIBRATION_FORMATS:
+        try:
+            write_calibration_as(name, calibration, about, path.with_suffix(""), calibration.info.name)
+        except MapFileError as error:
+            _log.info("no %s calibration is written: %s", name, error)
 
 
 def _write_exclusions(path: Path, drive: Drive, sets: CameraSets) -> None:

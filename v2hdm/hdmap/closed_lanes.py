@@ -1,0 +1,201 @@
+"""Where two lane lines run beside each other and bound a lane."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby, pairwise
+
+import numpy as np
+
+from v2hdm.records import FloatArray, IntArray
+
+LANE_WIDTH_M = (2.55, 5.1)
+"""Lines that are closer have no room for a truck, 2.55 m wide (Directive 96/53/EC, annex I, 1.1), and those
+farther apart have room for two."""
+
+_AT_ONCE = 64
+"""Neighbouring vertices that are held against the segments around them together."""
+
+
+@dataclass(frozen=True)
+class ClosedLane:
+    """A stretch of a lane between two lines, in the direction of the first line that bounds it.
+
+    ``left`` and ``right`` are a line's number, and its vertices in the order of that direction.
+    """
+
+    left: tuple[int, IntArray]
+    right: tuple[int, IntArray]
+
+
+def closed_lanes(lines_map: Sequence[FloatArray]) -> list[ClosedLane]:
+    """The lanes between polylines (N, 2) m, in the order of their first line.
+
+    A lane lies between a line and the nearest one that is met across it, at a lane's width, for longer than
+    it is wide. Where one ends, those beside it are cut, too: neighbours then share a bound from end to end,
+    as a change between them needs.
+    """
+    runs = _runs(lines_map)
+    cuts = [_Cuts(line) for line in lines_map]
+    for run in runs:
+        for end in (0, -1):
+            cuts[run.line].at(run.own[end])
+            cuts[run.other].at(run.met[end])
+    while sum(run.cut_alike(cuts) for run in runs):
+        pass
+    return [lane for run in runs for lane in run.lanes(cuts)]
+
+
+class _Cuts:
+    """Vertices at which a line is cut, at least the width of a narrow lane apart along it."""
+
+    def __init__(self, line: FloatArray) -> None:
+        steps_m = np.linalg.norm(np.diff(line, axis=0), axis=1)
+        self._along_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+        self.vertices: list[int] = []
+
+    def at(self, vertex: int) -> int:
+        """The cut at a vertex: one that is near it, else it is made there."""
+        for cut in self.vertices:
+            if abs(self._along_m[cut] - self._along_m[vertex]) < LANE_WIDTH_M[0]:
+                return cut
+        self.vertices = sorted([*self.vertices, int(vertex)])
+        return int(vertex)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """Consecutive vertices ``own`` (N,) of a ``line`` that meet an ``other`` on one ``side``.
+
+    ``met`` (N,) are the vertices of the other that are nearest to where it is met.
+    """
+
+    line: int
+    own: IntArray
+    other: int
+    met: IntArray
+    side: int
+
+    def cut_alike(self, cuts: Sequence[_Cuts]) -> bool:
+        """Cut each line where the other is; whether there was anything to do."""
+        before = len(cuts[self.line].vertices) + len(cuts[self.other].vertices)
+        for vertex in cuts[self.line].vertices:
+            if self.own[0] < vertex < self.own[-1]:
+                cuts[self.other].at(self.met[vertex - self.own[0]])
+        for vertex in cuts[self.other].vertices:
+            if self.met.min() < vertex < self.met.max():
+                cuts[self.line].at(self.own[np.argmin(np.abs(self.met - vertex))])
+        return len(cuts[self.line].vertices) + len(cuts[self.other].vertices) > before
+
+    def lanes(self, cuts: Sequence[_Cuts]) -> list[ClosedLane]:
+        """The lanes between one cut and the next."""
+        first, last = (cuts[self.line].at(self.own[end]) for end in (0, -1))
+        own = [vertex for vertex in cuts[self.line].vertices if first <= vertex <= last]
+        places = np.clip(np.array(own) - self.own[0], 0, len(self.met) - 1)
+        met = [cuts[self.other].at(vertex) for vertex in self.met[places]]
+        lanes = []
+        for (begin, end), (start, stop) in zip(pairwise(own), pairwise(met), strict=True):
+            if start == stop:
+                continue
+            turn = 1 if start < stop else -1
+            bounds = (
+                (self.line, np.arange(begin, end + 1)),
+                (self.other, np.arange(start, stop + turn, turn)),
+            )
+            lanes.append(ClosedLane(*(bounds if self.side < 0 else bounds[::-1])))
+        return lanes
+
+
+def _runs(lines_map: Sequence[FloatArray]) -> list[_Run]:
+    """Where two lines run beside each other for longer than they are apart, each pair once."""
+    segments = _Segments.of(lines_map)
+    runs = []
+    for number, line in enumerate(lines_map):
+        if len(line) < 2:
+            continue
+        for side in (1, -1):
+            other, nearest, gap_m = segments.across(number, line, side)
+            for begin, end in _stretches(other, gap_m):
+                if other[begin] < number:  # found from there
+                    continue
+                run = slice(begin, end + 1)
+                met = lines_map[other[begin]][nearest[run]]
+                if min(_length(line[run]), _length(met)) > gap_m[run].max():
+                    own = np.arange(begin, end + 1)
+                    runs.append(_Run(number, own, int(other[begin]), nearest[run], side))
+    return runs
+
+
+@dataclass(frozen=True)
+class _Segments:
+    """All lines' segments: both ends (S, 2) m, the line that each is of, and its place along it."""
+
+    start: FloatArray
+    end: FloatArray
+    line: IntArray
+    index: IntArray
+
+    @classmethod
+    def of(cls, lines_map: Sequence[FloatArray]) -> _Segments:
+        none = np.empty((0, 2))
+        return cls(
+            start=np.concatenate([none, *(line[:-1] for line in lines_map)]),
+            end=np.concatenate([none, *(line[1:] for line in lines_map)]),
+            line=np.repeat(np.arange(len(lines_map)), [max(len(line) - 1, 0) for line in lines_map]),
+            index=np.concatenate(
+                [np.arange(0), *(np.arange(len(line) - 1) for line in lines_map if len(line))]
+            ),
+        )
+
+    def across(self, number: int, line: FloatArray, side: int) -> tuple[IntArray, IntArray, FloatArray]:
+        """Of each vertex of a line (N,): the line met first on its left (1) or right (-1), -1 where none is.
+
+        And the vertex of that line nearest to where it is met, and how far away that is, m.
+        """
+        tangent = np.gradient(line, axis=0)
+        normal = side * np.column_stack([-tangent[:, 1], tangent[:, 0]])
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+        pieces = [
+            self._met(number, line[at : at + _AT_ONCE], normal[at : at + _AT_ONCE])
+            for at in range(0, len(line), _AT_ONCE)
+        ]
+        other, nearest, gap_m = zip(*pieces, strict=True)
+        return np.concatenate(other), np.concatenate(nearest), np.concatenate(gap_m)
+
+    def _met(
+        self, number: int, places: FloatArray, away: FloatArray
+    ) -> tuple[IntArray, IntArray, FloatArray]:
+        """What :meth:`across` tells, of neighbouring places (N, 2) and the directions ``away`` (N, 2)."""
+        low, high = places.min(axis=0) - LANE_WIDTH_M[1], places.max(axis=0) + LANE_WIDTH_M[1]
+        near = (np.maximum(self.start, self.end) >= low) & (np.minimum(self.start, self.end) <= high)
+        candidates = np.flatnonzero(near.all(axis=1) & (self.line != number))
+        if not len(candidates):
+            nothing = np.zeros(len(places), dtype=np.int64)
+            return nothing - 1, nothing, np.full(len(places), LANE_WIDTH_M[1])
+        ahead, beside = [], []
+        for ends in (self.start, self.end):
+            offset = ends[candidates] - places[:, None]
+            ahead.append(np.einsum("nsi,ni->ns", offset, away))
+            beside.append(offset[..., 0] * away[:, None, 1] - offset[..., 1] * away[:, None, 0])
+        crosses = (beside[0] * beside[1] <= 0) & (beside[0] != beside[1])
+        part = beside[0] / np.where(crosses, beside[0] - beside[1], 1.0)
+        met_m = ahead[0] + part * (ahead[1] - ahead[0])
+        met_m[~crosses | (met_m <= 0)] = np.inf
+        rows, best = np.arange(len(places)), np.argmin(met_m, axis=1)
+        met_at = candidates[best]
+        gap_m = met_m[rows, best]
+        reached = gap_m < LANE_WIDTH_M[1]
+        nearest = self.index[met_at] + np.rint(np.where(reached, part[rows, best], 0.0)).astype(np.int64)
+        return np.where(reached, self.line[met_at], -1), nearest, np.where(reached, gap_m, LANE_WIDTH_M[1])
+
+
+def _stretches(other: IntArray, gap_m: FloatArray) -> list[tuple[int, int]]:
+    """First and last vertex of each run that meets the same line at a lane's width."""
+    meets = np.where(gap_m > LANE_WIDTH_M[0], other, -1)
+    runs = [(key, list(group)) for key, group in groupby(range(len(meets)), key=lambda k: int(meets[k]))]
+    return [(run[0], run[-1]) for key, run in runs if key >= 0 and len(run) > 1]
+
+
+def _length(points: FloatArray) -> float:
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
