@@ -290,7 +290,8 @@ class Symbol:
     """One mapped symbol: the outline ``outline_map`` (N, 2) m of its paint, counter-clockwise from above.
 
     ``sigma_m`` is the standard deviation a coordinate of its place, as its sightings scatter. ``heights_m``
-    (N,) are the recorded heights of the ground there, None where it was recorded as z = 0.
+    (N,) are the recorded heights of the ground there, None where it was recorded as z = 0. ``id`` is positive
+    and no other feature's of its map; None until the map is written.
     """
 
     kind: str
@@ -298,6 +299,7 @@ class Symbol:
     sightings: int
     sigma_m: float | None = None
     heights_m: FloatArray | None = None
+    id: int | None = None
 
 
 @dataclass(frozen=True)

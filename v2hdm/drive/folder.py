@@ -95,8 +95,8 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
     files: list[ImageFiles] = []
     for name, (entry, read_info, list_images) in planned.items():
         # Many tools call every camera they calibrate alike: the drive's own name for it holds.
-        info = replace(read_info(), name=name)
-        cameras[name] = _read_camera(entry, info, path, f"{where}: camera '{name}'")
+        named = replace(read_info(), name=name)
+        cameras[name] = _read_camera(entry, named, path, f"{where}: camera '{name}'")
         files.append(list_images())
     recorded = read_poses(poses, path, origin, options.max_gap_s, poses_at, read_topic)
     pose_noise = _read_pose_noise(content.get("pose_noise"), recorded.noise, f"{where}: pose_noise")

@@ -18,7 +18,7 @@ from v2hdm.fields import take_covariance, take_whole
 from v2hdm.files import take_array, take_number, take_text
 from v2hdm.geometry.planar import signed_area
 from v2hdm.hdmap.geodetic import enu_from_geodetic, geodetic_from_enu
-from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, IntArray, Lane, Marking
+from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, IntArray, Lane, Marking, Symbol
 
 _log = logging.getLogger(__name__)
 
@@ -36,13 +36,17 @@ CORNERS = "corners_map"
 POINTS = "points_map"
 """Property that holds the exact local coordinates of an open feature."""
 
+OUTLINE = "outline_map"
+"""Property that holds the exact local coordinates of a symbol's outline, a closed feature of any shape."""
+
 
 @dataclass(frozen=True)
 class Feature:
-    """A marking or a lane as file formats see it.
+    """A marking, a symbol or a lane as file formats see it.
 
-    ``points_map`` (N, 2) m are the corners of a ``closed`` feature or the vertices of an open one,
-    ``heights_m`` (N,) those of the ground there in the map frame, None where it is the plane z = 0.
+    ``points_map`` (N, 2) m are the corners of a ``closed`` feature or the vertices of an open one; a closed one
+    is a marking of four corners unless it is a ``symbol``, of which ``place_sigma_m`` may be known.
+    ``heights_m`` (N,) are those of the ground there in the map frame, None where it is the plane z = 0.
     ``covariance_m2`` (2N, 2N) is that of the stacked points, None where it is not known.
     """
 
@@ -54,6 +58,13 @@ class Feature:
     heights_m: FloatArray | None = None
     covariance_m2: FloatArray | None = None
     relative_sigma_m: float | None = None
+    symbol: bool = False
+    place_sigma_m: float | None = None
+
+    @property
+    def key(self) -> str:
+        """Property that holds its local coordinates."""
+        return OUTLINE if self.symbol else CORNERS if self.closed else POINTS
 
     @property
     def ring(self) -> IntArray:
@@ -70,7 +81,11 @@ class Feature:
     def sigma_m(self) -> float | None:
         """One standard deviation a coordinate, over all points."""
         covariance = self.covariance_m2
-        return None if covariance is None else float(np.sqrt(np.trace(covariance) / len(covariance)))
+        return (
+            self.place_sigma_m
+            if covariance is None
+            else float(np.sqrt(np.trace(covariance) / len(covariance)))
+        )
 
     @property
     def xyz_map(self) -> FloatArray:
@@ -90,7 +105,7 @@ class Feature:
 
 
 def features_of(hd_map: HdMap) -> list[Feature]:
-    """Markings, then lanes, each with an id of its own: that which it has, else the next free one."""
+    """Markings, lanes, then symbols, each with its own id: that which it has, else the next free one."""
     features = [
         Feature(
             id=marking.id or 0,
@@ -108,6 +123,19 @@ def features_of(hd_map: HdMap) -> list[Feature]:
         Feature(lane.id or 0, lane.kind, lane.points_map, lane.sightings, False, lane.heights_m)
         for lane in hd_map.lanes
     ]
+    features += [
+        Feature(
+            one.id or 0,
+            one.kind,
+            one.outline_map,
+            one.sightings,
+            True,
+            one.heights_m,
+            symbol=True,
+            place_sigma_m=one.sigma_m,
+        )
+        for one in hd_map.symbols
+    ]
     ids = unique_ids([feature.id for feature in features])
     return [_with_id(feature, number) for feature, number in zip(features, ids, strict=True)]
 
@@ -116,8 +144,13 @@ def map_of(features: Iterable[Feature], origin: GeodeticOrigin | None) -> HdMap:
     """The map whose features these are, in their order."""
     markings: list[Marking] = []
     lanes: list[Lane] = []
+    symbols: list[Symbol] = []
     for one in features:
-        if one.closed:
+        if one.symbol:
+            symbols.append(
+                Symbol(one.kind, one.points_map, one.sightings, one.place_sigma_m, one.heights_m, one.id)
+            )
+        elif one.closed:
             markings.append(
                 Marking(
                     kind=one.kind,
@@ -131,7 +164,7 @@ def map_of(features: Iterable[Feature], origin: GeodeticOrigin | None) -> HdMap:
             )
         else:
             lanes.append(Lane(one.kind, one.points_map, one.sightings, one.heights_m, one.id))
-    return HdMap(markings=tuple(markings), lanes=tuple(lanes), origin=origin)
+    return HdMap(tuple(markings), tuple(lanes), origin, tuple(symbols))
 
 
 def unique_ids(ids: Sequence[int]) -> list[int]:
@@ -153,12 +186,13 @@ def properties_of(feature: Feature) -> dict[str, Any]:
         "id": feature.id,
         "class": feature.kind,
         "sightings": feature.sightings,
-        CORNERS if feature.closed else POINTS: feature.points_map.tolist(),
+        feature.key: feature.points_map.tolist(),
     }
     if feature.heights_m is not None:
         properties["heights_m"] = feature.heights_m.tolist()
-    if feature.covariance_m2 is not None:
+    if feature.sigma_m is not None:
         properties["sigma_m"] = feature.sigma_m
+    if feature.covariance_m2 is not None:
         properties["covariance_m2"] = feature.covariance_m2.tolist()
     if feature.relative_sigma_m is not None:
         properties["relative_sigma_m"] = feature.relative_sigma_m
@@ -195,14 +229,16 @@ class FeatureReader:
         Raises:
             MapFileError: It has neither a geometry nor local coordinates, or something in it is damaged.
         """
-        if geometry is None and CORNERS not in properties and POINTS not in properties:
-            raise MapFileError(f"{where}: has neither a geometry nor '{CORNERS}' or '{POINTS}'; drop it")
+        if geometry is None and not properties.keys() & {CORNERS, POINTS, OUTLINE}:
+            raise MapFileError(
+                f"{where}: has neither a geometry nor '{CORNERS}', '{POINTS}' or '{OUTLINE}'; drop it"
+            )
         if geometry is not None and self.origin is not None and (np.abs(geometry.positions[:, 1]) > 90).any():
             raise MapFileError(f"{where}: its geometry is not in degrees of longitude and latitude; mend it")
-        closed = CORNERS in properties if geometry is None else geometry.closed
+        closed = POINTS not in properties if geometry is None else geometry.closed
         stored = _stored(properties, closed, where)
         feature = stored if geometry is None else believed(stored, geometry, self.origin, self.rounding)
-        if closed and len(feature.points_map) != 4:
+        if closed and not feature.symbol and len(feature.points_map) != 4:
             raise MapFileError(
                 f"{where}: a marking has four corners, this has {len(feature.points_map)}; mend its outline"
             )
@@ -289,15 +325,16 @@ def _aligned(expected: FloatArray, positions: FloatArray, closed: bool) -> IntAr
 
 def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
     """The feature by its properties alone; without points where they are not among them."""
-    key = CORNERS if closed else POINTS
+    symbol = closed and properties.get(CORNERS) is None and properties.get(OUTLINE) is not None
+    key = OUTLINE if symbol else CORNERS if closed else POINTS
     points = np.empty((0, 2))
     if properties.get(key) is not None:
-        shape = (4, 2) if closed else (-1, 2)
+        shape = (4, 2) if key == CORNERS else (-1, 2)
         points = take_array(properties[key], shape, f"{where}, {key}", MapFileError)
     # What is known of each point is nothing without the points that it is known of.
     of_points = properties if len(points) else {}
     heights, covariance = of_points.get("heights_m"), of_points.get("covariance_m2")
-    relative = properties.get("relative_sigma_m")
+    relative, sigma = properties.get("relative_sigma_m"), properties.get("sigma_m")
     number, sightings = properties.get("id"), properties.get("sightings")
     least = -LARGEST_ID
     return Feature(
@@ -317,6 +354,10 @@ def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
         relative_sigma_m=None
         if relative is None
         else take_number(relative, f"{where}, relative_sigma_m", MapFileError),
+        symbol=symbol,
+        place_sigma_m=take_number(sigma, f"{where}, sigma_m", MapFileError)
+        if symbol and sigma is not None
+        else None,
     )
 
 

@@ -1,8 +1,8 @@
 """An HD map as GeoPackage (OGC 12-128) through ``pyogrio``, and back; it opens styled in QGIS.
 
-Layer ``markings`` holds polygons, ``lanes`` lines, both with heights; the table ``v2hdm`` what is to be known
-of the map. With a geodetic origin the coordinates are longitude, latitude and ellipsoidal height (EPSG:4326).
-Without one they are local metres in an engineering CRS, which no GIS takes for degrees.
+Layers ``markings`` and ``symbols`` hold polygons, ``lanes`` lines, all with heights; the table ``v2hdm`` what is
+to be known of the map. With a geodetic origin the coordinates are longitude, latitude and ellipsoidal height
+(EPSG:4326). Without one they are local metres in an engineering CRS, which no GIS takes for degrees.
 """
 
 from __future__ import annotations
@@ -20,7 +20,16 @@ from numpy.typing import NDArray
 from v2hdm.errors import MapFileError
 from v2hdm.fields import take_origin
 from v2hdm.files import take_array, whole_file
-from v2hdm.hdmap.features import CORNERS, POINTS, Feature, FeatureReader, Geometry, features_of, properties_of
+from v2hdm.hdmap.features import (
+    CORNERS,
+    OUTLINE,
+    POINTS,
+    Feature,
+    FeatureReader,
+    Geometry,
+    features_of,
+    properties_of,
+)
 from v2hdm.hdmap.needs import need
 from v2hdm.hdmap.qgis_style import qgis_style
 from v2hdm.records import GeodeticOrigin, HdMap
@@ -31,8 +40,12 @@ _LOCAL = (
     'EDATUM["origin of the drive"],CS[Cartesian,2],AXIS["easting (E)",east,ORDER[1]],'
     'AXIS["northing (N)",north,ORDER[2]],LENGTHUNIT["metre",1]]'
 )
-_LAYERS = {True: ("markings", "Polygon Z"), False: ("lanes", "LineString Z")}
-"""Name and type of the layer of closed features and of open ones."""
+_LAYERS = {
+    CORNERS: ("markings", "Polygon Z"),
+    POINTS: ("lanes", "LineString Z"),
+    OUTLINE: ("symbols", "Polygon Z"),
+}
+"""Name and type of the layer of the features whose coordinates a property holds."""
 
 AnyArray = NDArray[Any]
 
@@ -67,9 +80,9 @@ def write_geopackage(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | Non
         # GDAL tells the format of a file by its ending.
         unfinished = partial.with_name(f"{partial.name}.gpkg")
         try:
-            for closed, (layer, geometry_type) in _LAYERS.items():
-                mine = [feature for feature in features if feature.closed is closed]
-                _write_layer(raw, unfinished, layer, geometry_type, mine, hd_map.origin)
+            for key in _LAYERS:
+                mine = [feature for feature in features if feature.key == key]
+                _write_layer(raw, unfinished, key, mine, hd_map.origin)
             about = {key: _texts([json.dumps(value)]) for key, value in told.items()}
             _write_table(raw, unfinished, _ABOUT, about)
             _write_table(raw, unfinished, "layer_styles", _styles(features), FID="id")
@@ -91,10 +104,9 @@ def read_geopackage(path: Path) -> HdMap:
     content = _Content(path)
     origin = take_origin(content.about("origin"), f"{path}: origin", MapFileError)
     reader = FeatureReader(path, origin, np.full(3, _LOCAL_ROUNDING_M) if origin is None else _ROUNDING)
-    for closed, (layer, _) in _LAYERS.items():
+    for key, (layer, _) in _LAYERS.items():
         for number, (wkb, properties) in enumerate(content.layer(layer)):
             where = f"{path}: {layer}, row {number + 1}"
-            key = CORNERS if closed else POINTS
             exact = {name: _json(properties.get(name), f"{where}, {name}") for name in (key, *_EXACT)}
             reader.add(properties | exact, _geometry(wkb, where), where)
     return reader.map()
@@ -140,13 +152,12 @@ class _Content:
 def _write_layer(
     raw: Any,
     path: Path,
-    layer: str,
-    geometry_type: str,
+    shape: str,
     features: Sequence[Feature],
     origin: GeodeticOrigin | None,
 ) -> None:
     told = [properties_of(feature) for feature in features]
-    shape = CORNERS if layer == _LAYERS[True][0] else POINTS
+    layer, geometry_type = _LAYERS[shape]
     columns: dict[str, AnyArray] = {
         "id": np.array([one["id"] for one in told], dtype=np.int64),
         "class": _texts([one["class"] for one in told]),
@@ -225,7 +236,9 @@ def _texts(values: Sequence[str | bytes | None]) -> AnyArray:
 def _styles(features: Sequence[Feature]) -> dict[str, AnyArray]:
     """The table in which QGIS looks for the style of a GeoPackage's layers."""
     names = [layer for layer, _ in _LAYERS.values()]
-    styles = [qgis_style(sorted({f.kind for f in features if f.closed is c}), c) for c in _LAYERS]
+    styles = [
+        qgis_style(sorted({f.kind for f in features if f.key == key}), key != POINTS) for key in _LAYERS
+    ]
     empty = _texts([""] * len(names))
     return {
         "f_table_catalog": empty,

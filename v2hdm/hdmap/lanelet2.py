@@ -84,7 +84,11 @@ def write_lanelet2(
     vertices = {line.id: document.nodes(line, line.xyz_map) for line in lines}
     lanes = _Lanes(document, lines, closed_lanes([line.points_map for line in lines]), vertices)
     for feature in features:
-        if feature.closed:
+        if feature.symbol:
+            outline = document.nodes(feature, feature.xyz_map[feature.ring])
+            tags = {"type": "road_symbol", "subtype": feature.kind, "area": "yes"}
+            document.way(feature.id, outline, tags | _told(feature))
+        elif feature.closed:
             _write_marking(document, feature, lanes)
         else:
             document.way(feature.id, vertices[feature.id], _line_tags(feature) | _told(feature))
