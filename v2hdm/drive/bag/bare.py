@@ -15,8 +15,9 @@ import numpy as np
 import yaml
 
 from v2hdm.drive.bag import poses
+from v2hdm.drive.bag.encoded_video import VIDEO
 from v2hdm.drive.bag.importing import import_streams
-from v2hdm.drive.bag.pixels import IMAGE_KINDS
+from v2hdm.drive.bag.pixels import IMAGE_KINDS as PICTURES
 from v2hdm.drive.bag.reading import Bag, Topic, bag_files, open_bag
 from v2hdm.drive.bag.streams import INFO_KIND, TfStream, frame_of
 from v2hdm.drive.bag.tf import TF_STATIC, TF_TOPIC, Frames, frame_name
@@ -45,6 +46,7 @@ _TURNED = 1e-6
 """Elements of a rotation that are less than this from the identity's are so by rounding."""
 
 _DESCRIPTION = "drive.yaml"
+IMAGE_KINDS = (*PICTURES, VIDEO)
 
 
 @dataclass(frozen=True)
