@@ -18,7 +18,7 @@ from v2hdm.drive.poses.rising import in_order
 from v2hdm.drive.road import lay_flat, tell
 from v2hdm.errors import DriveError
 from v2hdm.fields import check_camera, take_size_px
-from v2hdm.files import read_text, take_array, take_number
+from v2hdm.files import read_text, take_array, take_number, take_text
 from v2hdm.geometry.rigid import inverse, rotation_from_quaternion
 from v2hdm.records import Camera, CameraInfo, Drive, FloatArray, PoseNoise, Trajectory
 
