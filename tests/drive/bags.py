@@ -18,7 +18,13 @@ from v2hdm.drive import read_drive
 from v2hdm.geometry.rigid import inverse, quaternion_from_rotation
 from v2hdm.records import Drive, FloatArray
 
+VIDEO = "foxglove_msgs/msg/CompressedVideo"
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.LATEST)
+ROS2.register(
+    get_types_from_msg(
+        "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format", VIDEO
+    )
+)
 ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
 
 Row = tuple[float, str, Any]

@@ -3,21 +3,34 @@
 from __future__ import annotations
 
 import logging
+import tracemalloc
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 import pytest
 import yaml
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
-from tests.drive.bags import Messages, assert_same_drive, messages_of, mountings, write_ros1, write_ros2
+from tests.drive.bags import (
+    VIDEO,
+    Messages,
+    assert_same_drive,
+    messages_of,
+    mountings,
+    write_ros1,
+    write_ros2,
+)
 from tests.drive.example import make_drive
 from v2hdm.drive import ReadOptions, drive_name, read_drive
 from v2hdm.drive.bag.bare import list_topics
+from v2hdm.drive.bag.importing import import_streams
 from v2hdm.drive.bag.pixels import file_of
+from v2hdm.drive.bag.streams import ImageStream
 from v2hdm.errors import DriveError
 from v2hdm.records import Drive
 
@@ -288,3 +301,64 @@ def test_images_of_an_unknown_encoding_are_named(folder: Path, tmp_path: Path) -
             message.encoding = "16UC1"
     with pytest.raises(DriveError, match="image 1: encoding '16UC1' is not known; record one of mono8"):
         read(tmp_path / "drive", described(folder, write_ros2(tmp_path / "site", made)))
+
+
+@pytest.mark.parametrize("codec", ["libx264rgb", "libx265"])
+def test_video_in_a_bag_is_decoded_from_its_first_key_frame_on(
+    codec: str, folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A packet a message without loss; the recording began two packets too late."""
+    expected = read_drive(folder)
+    pictures = [cv2.imread(str(image.path)) for image in expected.images if image.camera == "front"]
+    pictures = [pictures[0], pictures[1], *pictures]
+    encoder = av.CodecContext.create(codec, "w")
+    encoder.width, encoder.height, encoder.time_base = 64, 48, Fraction(1, 10)
+    lossless = {"x265-params": "lossless=1:bframes=0:keyint=2:min-keyint=2:repeat-headers=1:log-level=0"}
+    if codec == "libx264rgb":
+        lossless = {"crf": "0", "bf": "0", "preset": "ultrafast", "g": "2"}
+    encoder.options, encoder.pix_fmt = lossless, "rgb24" if codec == "libx264rgb" else "gbrp"
+    packets: list[bytes] = []
+    for number, pixels in enumerate([*pictures, None]):
+        frame = None if pixels is None else av.VideoFrame.from_ndarray(pixels, format="bgr24")
+        if frame is not None:
+            frame = frame.reformat(format=encoder.pix_fmt)
+            frame.pts = number
+        packets += [bytes(packet) for packet in encoder.encode(frame)]
+    made = messages_of(folder)
+    rows = [row for row in made.rows if row[1] == "/sensing/front/image_raw"]
+    made.rows = [row for row in made.rows if row[1] != "/sensing/front/image_raw"]
+    # The first packet of all is a key frame: leave it out, and the one after it has none.
+    begin_s = rows[0][0] - 0.04
+    for stamp_s, packet in zip([begin_s, *(row[0] for row in rows)], packets[1:], strict=True):
+        header = made.header(stamp_s, "front_optical")
+        form = "h264" if codec == "libx264rgb" else "h265"
+        data = np.frombuffer(packet, np.uint8)
+        message = made.make(VIDEO, timestamp=header.stamp, frame_id="front_optical", data=data, format=form)
+        made.add(stamp_s, "/sensing/front/image_raw", message)
+    made.rows.sort(key=lambda row: row[0])
+    bag = write_ros2(tmp_path / "site", made)
+    with caplog.at_level(logging.WARNING):
+        assert_same_drive(read(tmp_path / "drive", described(folder, bag)), expected)
+    assert "left out 1 of 4 packets of video: no key frame before them" in caplog.text
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
+def test_memory_does_not_grow_with_the_bag(kind: str, folder: Path, tmp_path: Path) -> None:
+    pixels = np.random.default_rng(1).integers(0, 255, (48, 64, 3), np.uint8)
+    large = cv2.resize(pixels, (640, 480))
+    peaks = []
+    for count in (10, 60):
+        made = Messages(ros1=kind == "ros1")
+        for k in range(count):
+            made.add(1.0 + k, "/image", made.raw_image(1.0 + k, large, "bgr8", "cam"))
+        path = tmp_path / f"site_{count}"
+        if kind == "ros1":
+            path = write_ros1(path, made)
+        else:
+            write_ros2(path, made, MCAP if kind == "mcap" else SQLITE3)
+        del made
+        tracemalloc.start()
+        import_streams(path, [ImageStream("/image", "header", "here")], tmp_path / "cache")
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.1 * peaks[0] + 100_000

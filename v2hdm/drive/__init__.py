@@ -17,6 +17,7 @@ from v2hdm.drive.folder import (
     write_drive,
 )
 from v2hdm.drive.kitti import is_kitti_drive, read_kitti_drive
+from v2hdm.drive.nuscenes import is_nuscenes_drive, read_nuscenes_drive
 from v2hdm.drive.options import KittiOptions, ReadOptions
 from v2hdm.errors import DriveError
 from v2hdm.records import Drive, Trajectory
@@ -50,6 +51,7 @@ def _read_bag(path: Path, options: ReadOptions) -> Drive:
 READERS: Mapping[str, Reader] = {
     "folder": Reader(accepts=is_folder_drive, read=read_folder_drive),
     "kitti": Reader(accepts=is_kitti_drive, read=read_kitti_drive),
+    "nuscenes": Reader(accepts=is_nuscenes_drive, read=read_nuscenes_drive),
     "bag": Reader(accepts=is_bag, read=_read_bag),
 }
 

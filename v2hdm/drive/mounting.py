@@ -20,6 +20,12 @@ _ROTATION_TOLERANCE = 1e-4
 _ROI_SAMPLES = 8
 """Points along each edge of a region of interest that are looked for in the image."""
 
+_ROI_M = (2.0, 20.0)
+"""Ground in front of a camera that a map is made of where nobody says: from, and to, m."""
+
+_ROI_HALF_WIDTH_M = 5.0
+_STEEPEST_RAY = 0.999
+
 
 def take_ipm(content: object, where: str) -> FloatArray:
     """An invertible 3 x 3 homography ``vehicle_from_pinhole_px``, scaled to unit norm.
@@ -120,6 +126,18 @@ def _in_image(info: CameraInfo, rays_cam: FloatArray) -> BoolArray:
     pixels = np.column_stack([rays_cam[:, :2] * scale[:, None], np.ones(len(rays_cam))]) @ info.intrinsic.T
     inside = (pixels[:, :2] > -0.5) & (pixels[:, :2] < np.array([info.width, info.height]) - 0.5)
     return np.asarray(inside.all(axis=1) & (rays_cam[:, 2] > 0))
+
+
+def roi_ahead(vehicle_from_cam: FloatArray) -> FloatArray:
+    """A rectangle (4, 2) on the ground in the direction in which a camera looks."""
+    forward, down = vehicle_from_cam[:2, 2], vehicle_from_cam[:2, 1]
+    # A camera that looks straight down has its image's top ahead.
+    along = forward if np.linalg.norm(forward) > np.sqrt(1 - _STEEPEST_RAY**2) else -down
+    along = along / np.linalg.norm(along)
+    left = np.array([-along[1], along[0]])
+    (near, far), half = _ROI_M, _ROI_HALF_WIDTH_M
+    corners = [(near, -half), (far, -half), (far, half), (near, half)]
+    return np.array([vehicle_from_cam[:2, 3] + ahead * along + side * left for ahead, side in corners])
 
 
 def take_centre_prior(content: object, where: str) -> CentrePrior:

@@ -15,12 +15,14 @@ import numpy as np
 import yaml
 
 from v2hdm.drive.bag import poses
+from v2hdm.drive.bag.encoded_video import VIDEO
 from v2hdm.drive.bag.importing import import_streams
-from v2hdm.drive.bag.pixels import IMAGE_KINDS
+from v2hdm.drive.bag.pixels import IMAGE_KINDS as PICTURES
 from v2hdm.drive.bag.reading import Bag, Topic, bag_files, open_bag
 from v2hdm.drive.bag.streams import INFO_KIND, TfStream, frame_of
 from v2hdm.drive.bag.tf import TF_STATIC, TF_TOPIC, Frames, frame_name
 from v2hdm.drive.imported import begin_entry, cannot_write, drop_entry, entry_folder, finish_entry, is_whole
+from v2hdm.drive.mounting import roi_ahead
 from v2hdm.errors import DriveError
 from v2hdm.files import dump_yaml, load_yaml
 from v2hdm.geometry.rigid import inverse
@@ -36,15 +38,11 @@ _IMAGE_WORDS = frozenset(
      "camera", "cameras", "sensing", "sensors", "raw", "image_raw_compressed"}
 )  # fmt: skip
 
-_ROI_M = (2.0, 20.0)
-"""Ground in front of a camera that a map is made of where nobody says: from, and to, m."""
-
-_ROI_HALF_WIDTH_M = 5.0
-_STEEPEST_RAY = 0.999
 _TURNED = 1e-6
 """Elements of a rotation that are less than this from the identity's are so by rounding."""
 
 _DESCRIPTION = "drive.yaml"
+IMAGE_KINDS = (*PICTURES, VIDEO)
 
 
 @dataclass(frozen=True)
@@ -242,7 +240,7 @@ def _camera(
         entry["cam_from_vehicle"], entry["roi_vehicle"] = "?", "?"
         return entry
     entry["cam_from_vehicle"] = inverse(vehicle_from_cam).tolist()
-    entry["roi_vehicle"] = _ahead(vehicle_from_cam).tolist()
+    entry["roi_vehicle"] = roi_ahead(vehicle_from_cam).tolist()
     return entry
 
 
@@ -251,18 +249,6 @@ def _fixed(frames: Frames, vehicle: str | None, sensor: str) -> FloatArray | Non
     if vehicle is not None and sensor == vehicle:
         return np.eye(4)
     return None if vehicle is None or not sensor else frames.fixed(vehicle, sensor)
-
-
-def _ahead(vehicle_from_cam: FloatArray) -> FloatArray:
-    """A rectangle (4, 2) on the ground in the direction in which a camera looks."""
-    forward, down = vehicle_from_cam[:2, 2], vehicle_from_cam[:2, 1]
-    # A camera that looks straight down has its image's top ahead.
-    along = forward if np.linalg.norm(forward) > np.sqrt(1 - _STEEPEST_RAY**2) else -down
-    along = along / np.linalg.norm(along)
-    left = np.array([-along[1], along[0]])
-    (near, far), half = _ROI_M, _ROI_HALF_WIDTH_M
-    corners = [(near, -half), (far, -half), (far, half), (near, half)]
-    return np.array([vehicle_from_cam[:2, 3] + ahead * along + side * left for ahead, side in corners])
 
 
 def _rpy_deg(rotation: FloatArray) -> list[float]:

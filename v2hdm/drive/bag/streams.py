@@ -1,10 +1,11 @@
 """What of a bag is kept as files: images, intrinsics, poses, frames; one class a kind of stream.
 
-A stream writes as messages come, so that its memory does not grow with the bag but by eight bytes an image.
+A stream writes as messages come, so that its memory grows with the bag by its list of images only.
 """
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from array import array
 from collections import defaultdict
@@ -15,15 +16,19 @@ from typing import Any, TextIO
 import numpy as np
 
 from v2hdm.drive.bag import poses
+from v2hdm.drive.bag.encoded_video import VIDEO, VideoDecoder
 from v2hdm.drive.bag.pixels import IMAGE_KINDS, file_of
 from v2hdm.drive.bag.reading import Bag, Message
 from v2hdm.drive.bag.tf import TF_STATIC, TF_TOPIC, Edge, Frames, frame_name, transform_rows
 from v2hdm.drive.camera_info import write_camera_info
+from v2hdm.drive.lossless import png
 from v2hdm.drive.poses.readings import Readings
 from v2hdm.drive.tum import write_image_list
 from v2hdm.errors import DriveError
 from v2hdm.fields import check_camera
 from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo, FloatArray
+
+_log = logging.getLogger(__name__)
 
 STAMPS = ("header", "received")
 """Times that count: those of the messages' headers, or those at which the recorder received them."""
@@ -76,13 +81,14 @@ class ImageStream(Stream):
 
     def topics(self, bag: Bag) -> Sequence[str]:
         """The topics of this stream, found and of a type that it understands."""
-        return [bag.need(self.label, IMAGE_KINDS, self.where).name]
+        return [bag.need(self.label, (*IMAGE_KINDS, VIDEO), self.where).name]
 
     def begin(self, folder: Path) -> None:
         """Make ready to write into ``folder``."""
         self._folder = folder
         self._taken_s = array("d")
-        self._suffixes: list[str] = []
+        self._names: dict[int, str] = {}
+        self._decoder: VideoDecoder | None = None
 
     def take(self, message: Message) -> None:
         """Write one message."""
@@ -94,15 +100,36 @@ class ImageStream(Stream):
                 f"{where}: its time {stamp_s:.6f} s is not after that of the one before "
                 f"({self._taken_s[-1]:.6f} s): two clocks or two recordings in one topic; keep one of them"
             )
-        suffix, data = file_of(message.kind, message.fields, where)
         self._taken_s.append(stamp_s)
-        self._suffixes.append(suffix)
-        (self._folder / f"{number:06d}{suffix}").write_bytes(data)
+        if message.kind == VIDEO:
+            if self._decoder is None:
+                self._decoder = VideoDecoder(message.fields.format, f"{self.where}: topic {self.label}")
+            self._decode(self._decoder, message.fields.data.tobytes())
+        else:
+            self._write(number, *file_of(message.kind, message.fields, where))
+
+    def _decode(self, decoder: VideoDecoder, data: bytes | None) -> None:
+        for number, pixels in decoder.frames(data, len(self._taken_s) - 1):
+            self._write(number, ".png", png(pixels))
+
+    def _write(self, number: int, suffix: str, data: bytes) -> None:
+        self._names[number] = f"{number:06d}{suffix}"
+        (self._folder / self._names[number]).write_bytes(data)
 
     def finish(self) -> None:
         """Write what comes last."""
-        names = [f"{number:06d}{suffix}" for number, suffix in enumerate(self._suffixes)]
-        write_image_list(np.array(self._taken_s), names, self._folder / IMAGE_LIST)
+        if self._decoder is not None:
+            self._decode(self._decoder, None)
+        if len(self._names) < len(self._taken_s):
+            _log.warning(
+                "%s: topic %s: left out %d of %d packets of video: no key frame before them",
+                self.where, self.label, len(self._taken_s) - len(self._names), len(self._taken_s),
+            )  # fmt: skip
+        if not self._names:
+            raise DriveError(f"{self.where}: topic {self.label}: its video has no key frame; record images")
+        numbers = sorted(self._names)
+        names = [self._names[number] for number in numbers]
+        write_image_list(np.array(self._taken_s)[numbers], names, self._folder / IMAGE_LIST)
 
 
 class InfoStream(Stream):
@@ -246,7 +273,8 @@ def stamp_of(message: Message, stamps: str, first: bool, where: str) -> float:
     """
     if stamps == "received":
         return message.received_s
-    stamp = message.fields.header.stamp
+    fields = message.fields
+    stamp = fields.timestamp if message.kind == VIDEO else fields.header.stamp
     if not stamp.sec and not stamp.nanosec and not first:
         raise DriveError(
             f"{where}: its header has no time; set stamps: received to take the recorder's, which come later "
