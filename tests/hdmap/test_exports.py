@@ -170,10 +170,10 @@ def test_a_geopackage_brings_a_style_of_every_class_as_qgis_looks_for_it(tmp_pat
     ).fetchall()
     classes = {
         layer: {row[0] for row in data.execute(f"SELECT DISTINCT class FROM {layer}")}
-        for layer in ("markings", "lanes")
+        for layer in ("markings", "lanes", "symbols")
     }
     data.close()
-    assert [row[0] for row in rows] == ["markings", "lanes"]
+    assert [row[0] for row in rows] == ["markings", "lanes", "symbols"]
     for layer, column, style, default in rows:
         assert (column, default) == ("geom", 1)
         root = ET.fromstring(style)

@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 from tests.drive.example import ORIGIN, camera_info, looking_forward, make_map
 from v2hdm.errors import MapFileError
 from v2hdm.hdmap import read_calibration, read_geojson, with_heights, write_calibration, write_geojson
+from v2hdm.hdmap.formats import FORMATS
 from v2hdm.hdmap.geodetic import enu_from_geodetic, geodetic_from_enu
+from v2hdm.hdmap.geopackage import read_geopackage
 from v2hdm.records import Calibration, GeodeticOrigin, HdMap, Lane, Marking, Road, Symbol
 
 LATITUDES, LONGITUDES = st.floats(-89.9, 89.9), st.floats(-180, 180)
@@ -63,11 +65,27 @@ def test_symbols_survive_their_file_and_are_polygons(tmp_path: Path, origin: Geo
         np.testing.assert_array_equal(got.outline_map, expected.outline_map)
         np.testing.assert_array_equal(got.heights_m, expected.heights_m)
     feature = json.loads(path.read_text())["features"][-1]
-    assert (feature["id"], feature["geometry"]["type"]) == ("symbol/1", "Polygon")
+    assert (feature["id"], feature["geometry"]["type"]) == (4, "Polygon")
     assert feature["properties"]["class"] == "arrow"
     (ring,) = feature["geometry"]["coordinates"]
     assert ring[0] == ring[-1]
     assert len(ring) == 4
+
+
+@pytest.mark.parametrize("ending", ["csv", "gpkg", "dxf", "osm"])
+def test_every_format_holds_a_symbol_of_three_corners(tmp_path: Path, ending: str) -> None:
+    symbol = Symbol("parking_t", np.array([[0.1, 0.0], [1.0, 0.2], [0.3, 0.7]]), 5, 0.013)
+    hd_map = HdMap((), (), ORIGIN, (symbol,))
+    file_format = {"osm": "lanelet2"}.get(ending, ending)
+    path = tmp_path / f"map.{ending}"
+    FORMATS[file_format].write(hd_map, path, None)
+    assert path.stat().st_size > 0
+    if ending == "gpkg":
+        (got,) = read_geopackage(path).symbols
+        assert (got.kind, got.sightings, got.sigma_m, got.id) == ("parking_t", 5, 0.013, 1)
+        np.testing.assert_allclose(got.outline_map, symbol.outline_map, atol=1e-12)
+    elif ending in ("csv", "osm"):
+        assert "parking_t" in path.read_text()
 
 
 @pytest.mark.parametrize("origin", [None, ORIGIN])
@@ -154,7 +172,7 @@ def damaged_map(origin: object = None, **properties: object) -> str:
         ("{", "line 1 JSON syntax error"),
         ("[]", "expected a JSON object"),
         ('{"type": "FeatureCollection", "features": []}', "not a map written by v2hdm"),
-        ('{"v2hdm": {}, "features": [{"properties": {}}]}', "feature 0: has no 'corners_map'"),
+        ('{"v2hdm": {}, "features": [{"properties": {}}]}', "feature 0: has neither a geometry nor 'corn"),
         ('{"v2hdm": {}, "features": [{"properties": {"corners_map": [[0, 0]]}}]}', "feature 0, "),
         ('{"v2hdm": {"origin": {"lat": 1}}, "features": []}', "origin: unknown key 'lat'"),
         (

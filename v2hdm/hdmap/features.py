@@ -44,8 +44,8 @@ OUTLINE = "outline_map"
 class Feature:
     """A marking, a symbol or a lane as file formats see it.
 
-    ``points_map`` (N, 2) m are the corners of a ``closed`` feature or the vertices of an open one; a closed one
-    is a marking of four corners unless it is a ``symbol``, of which ``place_sigma_m`` may be known.
+    ``points_map`` (N, 2) m are the corners of a ``closed`` feature or the vertices of an open one. A closed
+    one is a marking of four corners unless it is a ``symbol``, of which ``place_sigma_m`` may be known.
     ``heights_m`` (N,) are those of the ground there in the map frame, None where it is the plane z = 0.
     ``covariance_m2`` (2N, 2N) is that of the stacked points, None where it is not known.
     """

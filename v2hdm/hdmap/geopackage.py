@@ -1,7 +1,7 @@
 """An HD map as GeoPackage (OGC 12-128) through ``pyogrio``, and back; it opens styled in QGIS.
 
-Layers ``markings`` and ``symbols`` hold polygons, ``lanes`` lines, all with heights; the table ``v2hdm`` what is
-to be known of the map. With a geodetic origin the coordinates are longitude, latitude and ellipsoidal height
+Layers ``markings`` and ``symbols`` hold polygons, ``lanes`` lines, all with heights; the table ``v2hdm`` what
+is to be known of the map. With a geodetic origin coordinates are longitude, latitude and ellipsoidal height
 (EPSG:4326). Without one they are local metres in an engineering CRS, which no GIS takes for degrees.
 """
 
