@@ -62,6 +62,8 @@ def hanging(folder: Path) -> subprocess.Popen[str]:
     """A session of processes, each of which has half written a file of ``folder``."""
     code = (
         "from pathlib import Path; from tests.test_workers import *; "
+        # A shell's background job, as this test may be part of, ignores Ctrl-C and so would its processes.
+        "signal.signal(signal.SIGINT, signal.default_int_handler); "
         f"share_out(hang_while_writing, [Path({str(folder)!r}, n) for n in 'ab'], 2, nothing, (), print)"
     )
     started = subprocess.Popen(
