@@ -14,7 +14,6 @@ from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.errors import ConfigError
 from v2hdm.mapping.bundle import full_model, solve_bundle
 from v2hdm.mapping.known_sizes import known_lengths
-from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions, SizeOptions, check_options
 from v2hdm.mapping.sightings.table import collect_sightings
@@ -75,6 +74,21 @@ def test_a_joint_solve_keeps_to_the_sizes() -> None:
     assert spread[1] < 0.5 * spread[0]
 
 
+def test_a_map_that_grows_marking_by_marking_keeps_to_the_sizes() -> None:
+    scene = make_scene(SceneOptions(seed=31, length_m=40.0, pixel_sigma=0.6, hidden_corner_rate=0.0))
+    (true,) = {tuple(np.round(_diagonals(m.corners_map), 6)) for m in scene.markings if m.kind == DIAMOND}
+    sightings = collect_sightings(scene.drive, scene.detections, ("front", "rear"))
+    views, noise = views_of(scene.drive, ("front", "rear")), scene.drive.pose_noise
+    sizes = SizeOptions(by_class_m={DIAMOND: list(true)}, sigma_m=0.002)
+    options = MappingOptions(mode="incremental", pose_model="heave", known_sizes=sizes)
+    solved = Optimiser(sightings, views, scene.drive.cameras, noise, options).grow()
+    assert solved.problem.lengths is not None
+    long_m = np.array([_diagonals(c)[0] for c in solved.corners_map if np.isfinite(c).all()])
+    near = long_m[np.abs(long_m - true[0]) < 0.15 * true[0]]
+    assert len(near) > 5
+    assert np.std(near) < 0.004
+
+
 def _diagonals(corners: FloatArray) -> FloatArray:
     return np.sort(np.linalg.norm(corners[2:] - corners[:2], axis=1))[::-1]
 
@@ -94,10 +108,3 @@ def test_sizes_that_no_marking_has_are_refused(change: dict[str, object], key: s
     options = MappingOptions(known_sizes=SizeOptions(**change))  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match=key):
         check_options(options, CORNERED_CLASSES)
-
-
-def test_sizes_are_refused_where_they_would_be_ignored() -> None:
-    scene = make_scene(SceneOptions(length_m=20.0))
-    options = MappingOptions(mode="incremental", known_sizes=SIZES)
-    with pytest.raises(ConfigError, match="incremental"):
-        run_methods(scene.drive, scene.detections, ("front",), options)

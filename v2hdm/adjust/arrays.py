@@ -33,6 +33,15 @@ class Lengths:
 
 
 @dataclass(frozen=True)
+class CameraQuadratic:
+    """Base (C, 4, 4), mean (C, 6 + Q) and information of :class:`v2hdm.adjust.problem.CameraPrior`."""
+
+    base: Tensor
+    mean: Tensor
+    information: Tensor
+
+
+@dataclass(frozen=True)
 class Run:
     """Neighbouring corners and all that was seen of them: k observations of n corners.
 
@@ -88,6 +97,7 @@ class Arrays:
         control, control_information: surveyed positions (N, 2) of the corners and 1 / sigma^2 (N,), 0 where
             there is no survey.
         lengths: known distances between corners.
+        camera_prior: what earlier markings say of the cameras, None if nothing.
     """
 
     order: Tensor
@@ -108,6 +118,7 @@ class Arrays:
     control: Tensor
     control_information: Tensor
     lengths: Lengths
+    camera_prior: CameraQuadratic | None = None
 
     @property
     def frame_count(self) -> int:

@@ -93,6 +93,16 @@ def _check_lengths(problem: Problem) -> None:
 
 def check_model(problem: Problem, options: SolveOptions) -> None:
     """Raise :class:`AdjustError` where ``options`` ask for more than ``problem`` says."""
+    prior, each = problem.camera_prior, 6 + int(options.clock_offset)
+    if prior is not None:
+        size = len(problem.intrinsic) * each
+        for name, values, shape in (
+            ("base", prior.base, problem.cam_from_vehicle.shape),
+            ("mean", prior.mean, (len(problem.intrinsic), each)),
+            ("information", prior.information, (size, size)),
+        ):
+            if np.shape(values) != shape or not np.isfinite(values).all():
+                raise AdjustError(f"camera_prior.{name} must hold finite numbers in the shape {shape}")
     if options.clock_offset and problem.twist_vehicle is None:
         raise AdjustError("a clock offset needs twist_vehicle: say how the vehicle moves at each frame")
 

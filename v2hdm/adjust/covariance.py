@@ -72,6 +72,35 @@ class Covariance:
             out[own.cpu().numpy()] = root.square().sum(0).view(len(own), 6).cpu().numpy()
         return out
 
+    def camera_information(self) -> FloatArray:
+        """Marginal information (C (6 + Q), C (6 + Q)) of the cameras' left tangents and clock offsets."""
+        tip = self.whitening.reduced_factor.tip
+        return np.asarray((tip @ tip.mT).cpu().numpy())
+
+    def gain(self) -> FloatArray:
+        """How corners follow the cameras (N, 2, C (6 + Q)): they move by minus this times their change.
+
+        Frames follow as well. Column by column, x = L_S^-T (0, L_tip' e) is what a change e of the cameras
+        does to the reduced unknowns, so that W' x = (L_S^-1 W)' (0, L_tip' e).
+        """
+        whitening, arrays = self.whitening, self.whitening.arrays
+        tip = whitening.reduced_factor.tip
+        at_once = max(_NUMBERS_AT_ONCE // (2 * whitening.reduced_factor.size), 1)
+        at_once = min(at_once, _CORNERS_AT_ONCE)
+        out = np.empty((arrays.corner_count, 2, len(tip)))
+        starts = arrays.unit_bounds[0].tolist()
+        begin = 0
+        for end in starts[1:]:
+            if end - begin < at_once and end < arrays.corner_count:
+                continue
+            corners = torch.arange(begin, end, device=tip.device)
+            follow = (tip @ _reduced_root(whitening, corners)[-len(tip) :]).mT
+            factor = whitening.corner_factor.part(slice(begin, end))
+            gain = factor.solve_transposed(factor.solve(follow.reshape(end - begin, 2, -1)))
+            out[arrays.corner_order[begin:end].cpu().numpy()] = gain.cpu().numpy()
+            begin = end
+        return out
+
     def corners(self, groups: NDArray[np.int64]) -> FloatArray:
         """Joint covariance (M, 2 n, 2 n), m^2, within each of M groups (M, n) of corners of the problem."""
         at_once = min(max(_NUMBERS_AT_ONCE // (2 * self.whitening.reduced_factor.size), 1), _CORNERS_AT_ONCE)

@@ -1,372 +1,382 @@
 r"""The map while the vehicle drives: one marking at a time, at a cost that does not grow with the map.
 
-Given the extrinsics the markings are independent, so all that the settled ones say about the extrinsics is
-the sum of their Schur complements, one quadratic in the 6C tangents :math:`\xi` of
-``cam_from_vehicle = exp(xi) @ start``. A further marking is solved for together with that quadratic, and
-its own Schur complement is added. Every corner stays an affine function of :math:`\xi`, read on demand. To
-take a marking back out, subtract what was added; to see it again, do that and solve it with all sightings.
-When the number of markings has doubled, all are linearised anew: a constant share of the cost of each.
+Given the cameras (extrinsics and clock offsets) the markings are independent, so all that those in the map
+say about the cameras is one quadratic in their tangents :math:`\xi`, ``cam_from_vehicle = exp(xi) @ base``. A
+further marking is solved for by :func:`v2hdm.adjust.solve`, with that quadratic as the prior on the cameras;
+what the solve's Hessian leaves of the cameras once frames and corners are eliminated, less the prior, is
+added to the quadratic. Every corner stays an affine function of :math:`\xi`, read on demand.
 
-The poses' errors are marginalised out marking by marking, so that for the estimate two markings in one image
-do not share them: what that gives away against the batch adjustment is the price of its independence. For the
-covariance they do: with H the information, J_m the influence of the poses' errors e_m on marking m's part of
-the gradient, it is that of a composite likelihood (Varin, Reid and Firth, Statistica Sinica 21, 2011),
-:math:`H^{-1} (H + \sum_{m \ne n} J_m \, \mathrm{cov}(e_m, e_n) \, J_n^T) H^{-1}`.
+Whenever the number of markings has doubled, all are solved anew together: a constant share of the cost of
+each, and the batch's own optimum. Until then the errors of a frame's pose are marginalised out marking by
+marking, so that markings that came since do not share them with the others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import block_diag, cho_factor, cho_solve
+import torch
 
-from v2hdm.adjust.marking_fit import (
-    MarkingObservations,
-    Normal,
-    back_projected,
-    normal_equations,
-    squared_residuals,
-)
-from v2hdm.adjust.pose_errors import Noise
-from v2hdm.adjust.variance import VarianceFactors, variance_factors
+from v2hdm.adjust.layout import make_arrays
+from v2hdm.adjust.problem import CameraPrior, ControlPoints, KnownLengths, Observations, Problem, SolveOptions
+from v2hdm.adjust.solution import Solution, Status
+from v2hdm.adjust.solve import solve
+from v2hdm.adjust.start import back_project
 from v2hdm.errors import AdjustError
-from v2hdm.geometry.rigid import exp, left_jacobian
-from v2hdm.records import FloatArray
+from v2hdm.geometry.rigid import exp, inverse, left_jacobian, log
+from v2hdm.records import FloatArray, IntArray
 
-_MAX_STEPS = 30
-# Mean squared step of an unknown, in standard deviations, below which nothing moves any more.
-_STEP_TOLERANCE = 1e-4
-_PREVIEW_TOLERANCE = 1e-2
-_PASSES = 2
-# Beyond so many times its length a drift's correlation is below one per cent.
-_REACHES = 5.0
+# Of a marking's solve: from a cost of a few hundred it then ends within a hundredth of a sigma.
+_GAP_TOLERANCE = 1e-7
+# Share of an unknown's information, as correlated as it is, below which a difference is what rounding left.
+_LEAST_LEFT = 1e-12
 
 
-@dataclass(frozen=True)
-class RigPrior:
-    """What is known before the first marking.
-
-    ``intrinsic`` (C, 4) is fx, fy, cx, cy; ``cam_from_vehicle`` (C, 4, 4) the start;
-    ``centre_vehicle`` and ``centre_sigma_m`` (C, 3) the survey of the camera centres;
-    ``rotation_sigma_rad`` how far off the start's rotation may be.
-    """
-
-    intrinsic: FloatArray
-    cam_from_vehicle: FloatArray
-    centre_vehicle: FloatArray
-    centre_sigma_m: FloatArray
-    rotation_sigma_rad: float = 0.1
+class UndeterminedError(AdjustError):
+    """The markings so far leave a direction of the extrinsics free."""
 
 
 @dataclass(frozen=True)
-class Settled:
-    """One marking of the map, linearised at the tangents ``at`` (6C,).
+class Sighted:
+    """All that is known of one marking; its corners are numbered from 0.
 
-    Its corners are ``corners_map`` (n, 2) there and move by ``-gain`` (2n, 6C) times the change of the
-    tangents; given the extrinsics their covariance is ``covariance_m2`` (2n, 2n). ``information`` (6C, 6C)
-    and ``vector`` (6C,) are the marking's part of the extrinsics' normal equations. ``frame_state`` (F, 6)
-    are the states of the marking's own frames, which cost ``state_squared`` standard deviations squared;
-    ``influence`` (6C, 6F) is what errors of these states add to the vector.
+    ``lengths`` and ``control`` are what a standard and a survey say of them, None if nothing.
     """
 
-    observations: MarkingObservations
+    observations: Observations
+    lengths: KnownLengths | None = None
+    control: ControlPoints | None = None
+
+    @property
+    def corner_count(self) -> int:
+        """Corners up to the last that was seen."""
+        return int(self.observations.corner.max()) + 1
+
+    def joined(self, later: Sighted) -> Sighted:
+        """With what was seen of the same corners later; what is known of them is as said last."""
+        return Sighted(
+            _stacked([self.observations, later.observations]),
+            later.lengths or self.lengths,
+            later.control or self.control,
+        )
+
+
+@dataclass(frozen=True)
+class _Settled:
+    """Corners (n, 2) at the unknowns ``at`` (D,) of all cameras; ``gain`` (n, 2, D) how they follow these.
+
+    ``own`` is what the marking says of the cameras, None where it was solved for together with others.
+    """
+
     at: FloatArray
     corners_map: FloatArray
     gain: FloatArray
-    covariance_m2: FloatArray
+    own: _Own | None
+
+
+@dataclass(frozen=True)
+class _Own:
+    """One marking's share of a :class:`_Quadratic`, in the unknowns ``rows`` of its cameras."""
+
+    rows: IntArray
     information: FloatArray
     vector: FloatArray
-    frame_state: FloatArray
-    state_squared: float
-    influence: FloatArray
-
-    def corners_at(self, tangents: FloatArray) -> FloatArray:
-        """The corners (n, 2) under other extrinsics."""
-        return self.corners_map - (self.gain @ (tangents - self.at)).reshape(-1, 2)
 
 
-@dataclass
-class State:
-    """All that changes as the map grows.
+@dataclass(frozen=True)
+class _Quadratic:
+    """Half xi' ``information`` xi less ``vector`` xi, in the unknowns (D,) of ``cameras`` around ``base``.
 
-    ``settled`` holds the markings by their number, of which ``linearised_count`` were there when all were
-    last linearised anew; ``tangents`` (6C,) solves ``information`` (6C, 6C) times it = ``vector`` (6C,).
+    Its least value is at ``mean`` (D,).
     """
 
-    settled: dict[int, Settled]
-    linearised_count: int
-    tangents: FloatArray
+    cameras: IntArray
+    base: FloatArray
     information: FloatArray
     vector: FloatArray
 
-    @classmethod
-    def empty(cls, prior: RigPrior, tangents: FloatArray) -> State:
-        """No markings, and extrinsics to begin with at ``tangents`` (6C,)."""
-        return cls({}, 0, tangents, *_prior_at(prior, tangents))
+    @property
+    def mean(self) -> FloatArray:
+        return np.asarray(np.linalg.solve(self.information, self.vector))
+
+    def has(self, sighted: Sighted) -> bool:
+        """Whether all cameras that saw a marking are among these."""
+        return bool(np.isin(sighted.observations.camera, self.cameras).all())
+
+    def rows(self, cameras: IntArray) -> IntArray:
+        """Where the unknowns of some of the cameras stand."""
+        each = len(self.vector) // len(self.cameras)
+        place = np.searchsorted(self.cameras, cameras)
+        return np.asarray((place[:, None] * each + np.arange(each)).ravel())
+
+    def plus(self, own: _Own, sign: float) -> _Quadratic:
+        """With a marking's share added, or with ``sign`` -1 subtracted."""
+        added, moved = self.information.copy(), self.vector.copy()
+        added[np.ix_(own.rows, own.rows)] += sign * own.information
+        moved[own.rows] += sign * own.vector
+        return replace(self, information=added, vector=moved)
 
 
 class IncrementalMap:
     """Extrinsics and corners, up to date after every marking."""
 
-    def __init__(self, prior: RigPrior, noise: Noise, state: State | None = None) -> None:
-        """Begin with an empty map, or go on from ``state``.
+    def __init__(self, drive: Problem, options: SolveOptions | None = None) -> None:
+        """Begin with an empty map.
 
         Args:
-            prior: what is known of the cameras.
-            noise: how observations and poses err.
-            state: where another map of the same rig stopped.
+            drive: its cameras, frames and priors; its observations and what it knows of corners are not
+                looked at.
+            options: how to solve; the model is theirs and ``drive``'s.
         """
-        self.prior = prior
-        self.noise = noise
-        if state is None:
-            state = State.empty(prior, np.zeros(6 * len(prior.cam_from_vehicle)))
-        self.state = state
+        self._drive = drive
+        self._options = options or SolveOptions()
+        self._sighted: dict[int, Sighted] = {}
+        self._settled: dict[int, _Settled] = {}
+        self._earlier: _Quadratic | None = None
+        self._adjusted_count = 0
+        self._poses = drive.map_from_vehicle.copy()
 
     @property
-    def markings(self) -> Mapping[int, Settled]:
-        """The settled markings by their number, in the order in which they came."""
-        return self.state.settled
+    def map_from_vehicle(self) -> FloatArray:
+        """The poses (J, 4, 4) as all markings were last solved with; recorded ones where none was seen."""
+        return self._poses
+
+    @property
+    def markings(self) -> Mapping[int, Sighted]:
+        """The markings by their number, in the order in which they came."""
+        return self._sighted
 
     @property
     def cam_from_vehicle(self) -> FloatArray:
-        """The extrinsics (C, 4, 4) that all markings together say."""
-        return self._extrinsics(self.state.tangents)
-
-    @property
-    def extrinsic_covariance(self) -> FloatArray:
-        """Covariance (C, 6, 6) of each extrinsic's left tangent: translation m, rotation rad."""
-        covariance = self._left_covariance()
-        starts = range(0, len(covariance), 6)
-        return np.stack([covariance[k : k + 6, k : k + 6] for k in starts])
-
-    def corners_map(self, marking: int) -> FloatArray:
-        """Corners (n, 2) of a marking under the present extrinsics."""
-        return self._known(marking).corners_at(self.state.tangents)
-
-    def corner_covariance(self, marking: int) -> FloatArray:
-        """Joint covariance (2n, 2n), m^2, of a marking's corners."""
-        return _corner_covariance(self._known(marking), self._tangent_covariance())
-
-    def corner_covariances(self) -> dict[int, FloatArray]:
-        """The same of all markings, by their number."""
-        extrinsic = self._tangent_covariance()
-        return {marking: _corner_covariance(one, extrinsic) for marking, one in self.markings.items()}
-
-    def variance(self) -> VarianceFactors:
-        """How many times as large as stated the variances are."""
-        squared, of_priors, corners = [np.zeros(0)], self._prior_squared(), 0
-        for marking, settled in self.state.settled.items():
-            fit = squared_residuals(
-                settled.observations,
-                self.prior.intrinsic,
-                self.cam_from_vehicle,
-                self.corners_map(marking),
-                settled.frame_state,
-            )
-            squared.append(fit)
-            of_priors += settled.state_squared
-            corners += len(settled.corners_map)
-        free = 2 * corners + self.state.tangents.size - int(np.isfinite(self.prior.centre_sigma_m).sum())
-        return variance_factors(np.concatenate(squared), of_priors, free)
-
-    def _prior_squared(self) -> float:
-        """How far the cameras' centres are from their prior, standard deviations squared."""
-        extrinsics = self.cam_from_vehicle
-        centre = -np.einsum("cba,cb->ca", extrinsics[:, :3, :3], extrinsics[:, :3, 3])
-        return float(np.sum(((centre - self.prior.centre_vehicle) / self.prior.centre_sigma_m) ** 2))
-
-    def preview(self, observations: MarkingObservations) -> FloatArray:
-        """Where a marking's corners (n, 2) would come to lie, without taking it into the map.
-
-        Raises:
-            AdjustError: a corner has no observation, or the marking cannot be solved for.
-        """
-        settled, tangents = self._solve("preview", observations, None, _PREVIEW_TOLERANCE)
-        return settled.corners_at(tangents)
-
-    def observe(self, marking: int, observations: MarkingObservations) -> None:
-        """Take a marking into the map; one that is in it already is re-estimated from all its observations.
-
-        Raises:
-            AdjustError: a corner has no observation, or the marking cannot be solved for.
-        """
-        before = self.state.settled.get(marking)
-        if before is not None:
-            observations = before.observations.joined(observations)
-            self.forget(marking)
-        try:
-            settled, _ = self._solve(marking, observations, before)
-        except AdjustError:
-            if before is not None:
-                self._add(marking, before)
-            raise
-        self._add(marking, settled)
-        if len(self.state.settled) >= 2 * self.state.linearised_count:
-            self.linearise()
-
-    def forget(self, marking: int) -> None:
-        """Take a marking back out of the map and out of what the extrinsics rest on."""
-        settled = self._known(marking)
-        del self.state.settled[marking]
-        self.state.information = self.state.information - settled.information
-        self.state.vector = self.state.vector - settled.vector
-        self.state.tangents = _solved(self.state.information, self.state.vector)
-
-    def linearise(self) -> None:
-        """Linearise everything anew where it is now; happens by itself whenever the map has doubled."""
-        for _ in range(_PASSES):
-            at = self.state.tangents
-            self.state.information, self.state.vector = _prior_at(self.prior, at)
-            for marking, settled in self.state.settled.items():
-                renewed = self._settle(settled.observations, at, settled.corners_at(at), settled.frame_state)
-                self.state.settled[marking] = renewed
-                self.state.information = self.state.information + renewed.information
-                self.state.vector = self.state.vector + renewed.vector
-            self.state.tangents = _solved(self.state.information, self.state.vector)
-        self.state.linearised_count = len(self.state.settled)
-
-    def _add(self, marking: int, settled: Settled) -> None:
-        """Add a marking's part to the normal equations and solve them."""
-        self.state.settled[marking] = settled
-        self.state.information = self.state.information + settled.information
-        self.state.vector = self.state.vector + settled.vector
-        self.state.tangents = _solved(self.state.information, self.state.vector)
-
-    def _known(self, marking: int) -> Settled:
-        if marking not in self.state.settled:
-            raise AdjustError(f"marking {marking} is not in the map")
-        return self.state.settled[marking]
-
-    def _extrinsics(self, tangents: FloatArray) -> FloatArray:
-        return np.asarray(exp(tangents.reshape(-1, 6)) @ self.prior.cam_from_vehicle)
-
-    def _left_covariance(self) -> FloatArray:
-        """Covariance (6C, 6C) of the left tangents at the present extrinsics."""
-        turn = block_diag(*left_jacobian(self.state.tangents.reshape(-1, 6)))
-        return np.asarray(turn @ self._tangent_covariance() @ turn.T)
-
-    def _tangent_covariance(self) -> FloatArray:
-        """Covariance (6C, 6C) of the tangents, errors that markings share included."""
-        alone = np.linalg.inv(self.state.information)
-        return np.asarray(alone + alone @ self._shared() @ alone)
-
-    def _shared(self) -> FloatArray:
-        """What the poses' errors that markings share add to the variance (6C, 6C) of the vector."""
-        settled = list(self.state.settled.values())
-        frames = [one.observations.frames for one in settled]
-        begin, end = (np.array([pick(f.travelled_m) for f in frames]) for pick in (np.min, np.max))
-        reach_m = _REACHES * self.noise.reach_m
-        out = np.zeros_like(self.state.information)
-        for m, one in enumerate(settled):
-            near = (begin <= end[m] + reach_m) & (end >= begin[m] - reach_m)
-            for n in np.flatnonzero(near[:m]).tolist():
-                part = one.influence @ self.noise.covariance(frames[m], frames[n]) @ settled[n].influence.T
-                out += part + part.T
+        """The extrinsics (C, 4, 4) that all markings together say; where to start from, of unseen cameras."""
+        out = self._drive.cam_from_vehicle.copy()
+        if self._earlier is not None:
+            tangents = self._earlier.mean.reshape(len(self._earlier.cameras), -1)[:, :6]
+            out[self._earlier.cameras] = exp(tangents) @ self._earlier.base
         return out
 
-    def _solve(
-        self,
-        marking: int | str,
-        observations: MarkingObservations,
-        before: Settled | None = None,
-        tolerance: float = _STEP_TOLERANCE,
-    ) -> tuple[Settled, FloatArray]:
-        """Gauss-Newton over the marking's corners and the extrinsics, the settled markings as a quadratic.
+    def is_solved(self, marking: int) -> bool:
+        """Whether a marking is part of the map, and not but noted (:meth:`add`) or waiting."""
+        return marking in self._settled and self._earlier is not None
 
-        Corners and frames that were there ``before`` start where they were.
+    def preview(self, sighted: Sighted) -> FloatArray:
+        """Where the corners (n, 2) lie by back-projection under the present extrinsics, nan if nowhere.
+
+        Raises:
+            AdjustError: it has two sightings of a corner in one image.
         """
-        unseen = np.flatnonzero(np.bincount(observations.corner) == 0)
-        if len(unseen):
-            raise AdjustError(
-                f"corner {unseen[0]} of marking {marking} has no observation: number them from 0"
-            )
-        for name in ("vehicle_from_map", "pinhole_px", "covariance_px"):
-            if not np.isfinite(getattr(observations, name)).all():
-                raise AdjustError(f"{name} of marking {marking} is not finite: leave that observation out")
-        tangents = self.state.tangents
-        corners = back_projected(observations, self.prior.intrinsic, self._extrinsics(tangents))
-        frames = np.unique(observations.frame)
-        state = np.zeros((len(frames), 6))
-        if before is not None:
-            corners[: len(before.corners_map)] = before.corners_at(tangents)
-            state[np.searchsorted(frames, np.unique(before.observations.frame))] = before.frame_state
-        for _ in range(_MAX_STEPS):
-            settled = self._settle(observations, tangents, corners, state)
-            information = self.state.information + settled.information
-            reached = _solved(information, self.state.vector + settled.vector)
-            step = reached - tangents
-            moved = settled.corners_at(reached)
-            shift = (moved - corners).reshape(-1)
-            length = step @ information @ step + shift @ np.linalg.solve(settled.covariance_m2, shift)
-            tangents, corners, state = reached, moved, settled.frame_state
-            if not np.isfinite(length):
-                break
-            if length < tolerance * (len(step) + len(shift)):
-                return settled, reached
-        raise AdjustError(
-            f"marking {marking} does not settle: its observations contradict one another or lie above the "
-            "horizon; leave it out"
+        cameras = np.unique(sighted.observations.camera)
+        problem = self._problem([sighted], cameras)
+        arrays = make_arrays(problem, (), "cpu")
+        corners, fixed = back_project(arrays, torch.from_numpy(problem.cam_from_vehicle))
+        out = np.full(corners.shape, np.nan)
+        known = fixed.numpy()
+        out[arrays.corner_order.numpy()[known]] = corners.numpy()[known]
+        return out
+
+    def corners_map(self, marking: int) -> FloatArray:
+        """Corners (n, 2) of a marking under the present extrinsics.
+
+        Raises:
+            AdjustError: it is not in the map, or waits for others or for :meth:`adjust`.
+        """
+        if not self.is_solved(marking) or self._earlier is None:
+            raise AdjustError(f"marking {marking} is not in the map")
+        settled = self._settled[marking]
+        return np.asarray(settled.corners_map - settled.gain @ (self._earlier.mean - settled.at))
+
+    def add(self, marking: int, sighted: Sighted) -> None:
+        """Take note of a marking, or more of it, without solving; :meth:`adjust` does."""
+        before = self._sighted.get(marking)
+        self._sighted[marking] = sighted if before is None else before.joined(sighted)
+
+    def observe(self, marking: int, sighted: Sighted) -> None:
+        """Take a marking into the map; one that is in it already is re-estimated from all its sightings.
+
+        The first ones of a camera wait until there are enough to fix its extrinsic.
+
+        Raises:
+            AdjustError: it cannot be solved for; the map is as it was.
+        """
+        before = self._sighted.get(marking)
+        earlier = self._earlier if before is None else self._without(marking, before)
+        joined = sighted if before is None else before.joined(sighted)
+        self._sighted[marking] = joined
+        try:
+            if earlier is None or len(self._sighted) >= 2 * self._adjusted_count or not earlier.has(joined):
+                self.adjust()
+            else:
+                own, settled = self._linearised(earlier, marking, joined)
+                self._earlier = earlier.plus(own, 1.0)
+                self._settled[marking] = settled
+        except UndeterminedError:
+            # The first few of a camera leave its extrinsic free; they wait for those that come.
+            self._adjusted_count = 0
+        except AdjustError:
+            del self._sighted[marking]
+            if before is not None:
+                self._sighted[marking] = before
+            raise
+
+    def forget(self, marking: int) -> None:
+        """Take a marking back out of the map and out of what the extrinsics rest on.
+
+        Raises:
+            AdjustError: it is not in the map.
+        """
+        if marking not in self._sighted:
+            raise AdjustError(f"marking {marking} is not in the map")
+        earlier = self._without(marking, self._sighted.pop(marking))
+        self._settled.pop(marking, None)
+        if earlier is None and self._sighted:
+            self.adjust()
+        else:
+            self._earlier = earlier
+
+    def _without(self, marking: int, sighted: Sighted) -> _Quadratic | None:
+        """What the other markings say; None where that takes a solve of all of them.
+
+        So it does where little is left, for what a marking shared with others is then much of it.
+        """
+        if self._earlier is None or marking not in self._settled:
+            return self._earlier
+        own = self._settled[marking].own or self._linearised(self._earlier, marking, sighted)[0]
+        less = self._earlier.plus(own, -1.0)
+        least = np.linalg.eigvalsh(less.information / _scale(self._earlier.information)).min()
+        return less if least > _LEAST_LEFT else None
+
+    def adjust(self) -> Solution:
+        """Solve for all markings together; happens by itself whenever the map has doubled.
+
+        The solution's corners are those of :attr:`markings`, one after the other.
+
+        Raises:
+            AdjustError: there is no marking, or they cannot be solved for.
+        """
+        if not self._sighted:
+            raise AdjustError("there is no marking to adjust")
+        every = list(self._sighted.values())
+        cameras = np.unique(np.concatenate([one.observations.camera for one in every]))
+        problem = self._problem(every, cameras)
+        options = replace(self._options, coarse=self._options.coarse and self._earlier is None)
+        solution = _sound(solve(problem, options), "the map")
+        information = solution.covariance.camera_information()
+        at = np.zeros((len(cameras), len(information) // len(cameras)))
+        at[:, 6:] = solution.clock_offset_s[:, None]
+        self._earlier = _Quadratic(cameras, solution.cam_from_vehicle, information, information @ at.ravel())
+        self._adjusted_count = len(every)
+        frames = np.unique(np.concatenate([one.observations.frame for one in every]))
+        self._poses = self._drive.map_from_vehicle.copy()
+        self._poses[frames] = solution.map_from_vehicle
+        gain, end = solution.covariance.gain(), 0
+        for marking, sighted in self._sighted.items():
+            own = slice(end, end := end + sighted.corner_count)
+            self._settled[marking] = _Settled(at.ravel(), solution.corners_map[own], gain[own], None)
+        return solution
+
+    def _linearised(self, earlier: _Quadratic, marking: int, sighted: Sighted) -> tuple[_Own, _Settled]:
+        """A marking, and what it says of the cameras, where ``earlier`` and it agree."""
+        cameras = np.unique(sighted.observations.camera)
+        rows, mean = earlier.rows(cameras), earlier.mean
+        marginal = np.linalg.inv(np.linalg.inv(earlier.information)[np.ix_(rows, rows)])
+        marginal = (marginal + marginal.T) / 2
+        base = earlier.base[np.searchsorted(earlier.cameras, cameras)]
+        problem = replace(
+            self._problem([sighted], cameras),
+            centre_vehicle=None,
+            centre_sigma_m=None,
+            clock_sigma_s=np.inf,
+            camera_prior=CameraPrior(base, mean[rows].reshape(len(cameras), -1), marginal),
+        )
+        options = replace(
+            self._options, coarse=False, gap_tolerance=max(_GAP_TOLERANCE, self._options.gap_tolerance)
+        )
+        solution = _sound(solve(problem, options), f"marking {marking}")
+        tangents = log(solution.cam_from_vehicle @ inverse(base))
+        at = mean[rows].reshape(len(cameras), -1)
+        chart = np.zeros((len(rows), len(rows)))
+        for c, turn in enumerate(left_jacobian(tangents)):
+            part = slice(c * at.shape[1], (c + 1) * at.shape[1])
+            chart[part, part] = np.eye(at.shape[1])
+            chart[part, part][:6, :6] = turn
+        reached = np.column_stack([tangents, solution.clock_offset_s])[:, : at.shape[1]].ravel()
+        information = chart.T @ solution.covariance.camera_information() @ chart - marginal
+        vector = information @ reached + marginal @ (reached - mean[rows])
+        everywhere = mean.copy()
+        everywhere[rows] = reached
+        gain = np.zeros((len(solution.corners_map), 2, len(mean)))
+        gain[:, :, rows] = solution.covariance.gain() @ chart
+        own = _Own(rows, information, vector)
+        return own, _Settled(everywhere, solution.corners_map, gain, own)
+
+    def _problem(self, sighted: Sequence[Sighted], cameras: IntArray) -> Problem:
+        """Some markings as a problem of the cameras and frames that saw them."""
+        drive, starts = self._drive, np.cumsum([0, *(one.corner_count for one in sighted)])
+        seen = _stacked(
+            [
+                replace(one.observations, corner=one.observations.corner + start)
+                for one, start in zip(sighted, starts[:-1], strict=True)
+            ]
+        )
+        frames, frame = np.unique(seen.frame, return_inverse=True)
+        twist, centre, sigma = drive.twist_vehicle, drive.centre_vehicle, drive.centre_sigma_m
+        return Problem(
+            intrinsic=drive.intrinsic[cameras],
+            cam_from_vehicle=self.cam_from_vehicle[cameras],
+            map_from_vehicle=drive.map_from_vehicle[frames],
+            observations=replace(seen, camera=np.searchsorted(cameras, seen.camera), frame=frame),
+            corner_count=int(starts[-1]),
+            centre_vehicle=None if centre is None else centre[cameras],
+            centre_sigma_m=None if sigma is None else sigma[cameras],
+            pose_sigma=drive.pose_sigma,
+            twist_vehicle=None if twist is None else twist[frames],
+            clock_sigma_s=drive.clock_sigma_s,
+            control=_control(sighted, starts),
+            lengths=_lengths(sighted, starts),
         )
 
-    def _settle(
-        self, observations: MarkingObservations, tangents: FloatArray, corners: FloatArray, state: FloatArray
-    ) -> Settled:
-        """Linearise a marking and eliminate its corners."""
-        normal = normal_equations(
-            observations, self.prior.intrinsic, self._extrinsics(tangents), corners, state, self.noise
-        )
-        return _eliminated(observations, normal, tangents, corners)
+
+def _scale(information: FloatArray) -> FloatArray:
+    """Products (D, D) of the roots of an information's diagonal: entries by it have no unit."""
+    root = np.sqrt(np.diagonal(information))
+    return np.asarray(root[:, None] * root)
 
 
-def _prior_at(prior: RigPrior, tangents: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The prior's part of the normal equations, linearised at ``tangents``: (6C, 6C) and (6C,)."""
-    extrinsics = exp(tangents.reshape(-1, 6)) @ prior.cam_from_vehicle
-    rotation, translation = extrinsics[:, :3, :3], extrinsics[:, :3, 3]
-    off = -np.einsum("cba,cb->ca", rotation, translation) - prior.centre_vehicle
-    root = 1 / prior.centre_sigma_m
-    information = np.zeros((len(tangents),) * 2)
-    vector = np.zeros(len(tangents))
-    for c, chart in enumerate(left_jacobian(tangents.reshape(-1, 6))):
-        part = slice(6 * c, 6 * c + 6)
-        # A left perturbation moves the centre by minus its translation, turned into the vehicle.
-        jacobian = np.zeros((3, 6))
-        jacobian[:, :3] = -rotation[c].T * root[c][:, None]
-        jacobian = jacobian @ chart
-        information[part, part] = jacobian.T @ jacobian
-        vector[part] = -jacobian.T @ (off[c] * root[c])
-    vector += information @ tangents
-    turns = np.tile([0, 0, 0, 1, 1, 1], len(extrinsics)) / prior.rotation_sigma_rad**2
-    return information + np.diag(turns), vector
+def _sound(solution: Solution, what: str) -> Solution:
+    """A solution that determines ``what``."""
+    said = f"{what} cannot be solved for ({solution.status.value}): {solution.status.advice}"
+    if solution.status is Status.UNDETERMINED:
+        raise UndeterminedError(said)
+    if solution.status is Status.BEHIND_CAMERA or not np.isfinite(solution.corners_map).all():
+        raise AdjustError(said)
+    return solution
 
 
-def _corner_covariance(settled: Settled, extrinsic: FloatArray) -> FloatArray:
-    return np.asarray(settled.covariance_m2 + settled.gain @ extrinsic @ settled.gain.T)
+def _stacked(parts: Sequence[Observations]) -> Observations:
+    names = ("camera", "frame", "corner", "pinhole_px", "covariance_px")
+    return Observations(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-def _solved(information: FloatArray, vector: FloatArray) -> FloatArray:
-    return np.asarray(cho_solve(cho_factor(information, lower=True), vector))
+def _control(sighted: Sequence[Sighted], starts: IntArray) -> ControlPoints | None:
+    parts = [(one.control, start) for one, start in zip(sighted, starts, strict=False) if one.control]
+    if not parts:
+        return None
+    return ControlPoints(
+        np.concatenate([one.corner + start for one, start in parts]),
+        np.concatenate([one.points_map for one, _ in parts]),
+        np.concatenate([one.sigma_m for one, _ in parts]),
+    )
 
 
-def _eliminated(
-    observations: MarkingObservations, normal: Normal, tangents: FloatArray, corners: FloatArray
-) -> Settled:
-    chart = block_diag(*left_jacobian(tangents.reshape(-1, 6)))
-    factor = cho_factor(normal.V, lower=True)
-    gain = cho_solve(factor, normal.W.T)
-    best = corners - cho_solve(factor, normal.by_corner).reshape(-1, 2)
-    information = chart.T @ (normal.U - normal.W @ gain) @ chart
-    gradient = chart.T @ (normal.by_extrinsic - gain.T @ normal.by_corner)
-    return Settled(
-        observations=observations,
-        at=tangents,
-        corners_map=best,
-        gain=gain @ chart,
-        covariance_m2=cho_solve(factor, np.eye(len(normal.V))),
-        information=(information + information.T) / 2,
-        vector=information @ tangents - gradient,
-        frame_state=normal.frame_state,
-        state_squared=normal.state_squared,
-        influence=chart.T @ (normal.influence[: len(chart)] - gain.T @ normal.influence[len(chart) :]),
+def _lengths(sighted: Sequence[Sighted], starts: IntArray) -> KnownLengths | None:
+    parts = [(one.lengths, start) for one, start in zip(sighted, starts, strict=False) if one.lengths]
+    if not parts:
+        return None
+    return KnownLengths(
+        np.concatenate([one.first + start for one, start in parts]),
+        np.concatenate([one.second + start for one, start in parts]),
+        np.concatenate([one.length_m for one, _ in parts]),
+        np.concatenate([one.sigma_m for one, _ in parts]),
     )

@@ -11,7 +11,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from v2hdm.adjust.arrays import Arrays, Lengths
+from v2hdm.adjust.arrays import Arrays, CameraQuadratic, Lengths
 from v2hdm.adjust.kernels import available
 from v2hdm.adjust.pose_prior import state_components, state_prior
 from v2hdm.adjust.problem import Problem
@@ -69,6 +69,9 @@ def make_arrays(
         control=real(control[corner_order]),
         control_information=real(control_information[corner_order]),
         lengths=_lengths(problem, rank, device),
+        camera_prior=None
+        if problem.camera_prior is None
+        else CameraQuadratic(*(real(values) for values in vars(problem.camera_prior).values())),
     )
 
 

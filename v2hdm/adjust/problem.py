@@ -106,6 +106,20 @@ class KnownLengths:
 
 
 @dataclass(frozen=True)
+class CameraPrior:
+    """What earlier markings say of the cameras: a quadratic in their tangents and clock offsets.
+
+    With ``cam_from_vehicle = exp(tangent) @ base`` (C, 4, 4), each camera's tangent and, where it is
+    estimated, clock offset in s are ``mean`` (C, 6 + Q), with the joint ``information``
+    (C (6 + Q), C (6 + Q)). What the priors on centres and clocks say is part of it; do not state them again.
+    """
+
+    base: FloatArray
+    mean: FloatArray
+    information: FloatArray
+
+
+@dataclass(frozen=True)
 class PoseSigma:
     """How far the recorded poses are off, one standard deviation of each state of a frame.
 
@@ -144,7 +158,8 @@ class Problem:
     moves at each frame, per second and in its own frame (m/s, then rad/s); a clock offset needs it, and
     is held near zero by ``clock_sigma_s``. ``control``, if given, ties corners to a survey: the only thing
     that can tell a shift of the whole map from the drift of the receiver. ``lengths``, if given, are known
-    distances between corners.
+    distances between corners. ``camera_prior``, if given, is what markings outside this problem say of the
+    cameras.
     """
 
     intrinsic: FloatArray
@@ -160,6 +175,7 @@ class Problem:
     clock_sigma_s: float = 0.02
     control: ControlPoints | None = None
     lengths: KnownLengths | None = None
+    camera_prior: CameraPrior | None = None
 
 
 @dataclass(kw_only=True)

@@ -15,7 +15,7 @@ from torch import Tensor
 from v2hdm.adjust.arrays import Arrays, Run
 from v2hdm.adjust.corner_factor import CornerFactor
 from v2hdm.adjust.linear import PAIR_BLOCK
-from v2hdm.adjust.residuals import Estimate, of_each
+from v2hdm.adjust.residuals import Estimate, earlier_markings, of_each
 from v2hdm.adjust.tiles import TIP, Pattern, TiledCholesky, TiledMatrix, factorise_tiles, find_pattern
 
 # Rows of a tile, about: large enough for fast products, small against a corner's span of frames.
@@ -240,6 +240,8 @@ class ReducedSystem:
         by_camera[:, :3, :3] += rotation * root.square()[:, None] @ rotation.mT
         by_camera.diagonal(dim1=1, dim2=2)[:, 6:] += arrays.clock_information_root**2
         tip = torch.block_diag(*by_camera)  # type: ignore[no-untyped-call]
+        if arrays.camera_prior is not None:
+            tip = tip + earlier_markings(arrays, estimate, arrays.camera_prior).hessian
         self._tiles[TIP, TIP] += tip
         return torch.diagonal(tip)
 

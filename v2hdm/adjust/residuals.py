@@ -21,12 +21,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from v2hdm.adjust.arrays import Arrays, Run
+from v2hdm.adjust.arrays import Arrays, CameraQuadratic, Run
 from v2hdm.adjust.robust import loss
-from v2hdm.geometry.tensors import adjoint, exp, inverse_depth, left_jacobian
+from v2hdm.geometry.rigid import left_jacobian as rigid_left_jacobian
+from v2hdm.geometry.rigid import log
+from v2hdm.geometry.tensors import adjoint, exp, inverse, inverse_depth, left_jacobian
 
 
 @dataclass(frozen=True)
@@ -323,7 +326,40 @@ def with_priors(arrays: Arrays, estimate: Estimate, sums: Sums) -> tuple[dict[st
         "known_lengths": sums.lengths,
     }
     priors = Priors(centre, state, clock)
-    return terms, by_unknowns(arrays, estimate, sums.wrench, sums.by_corner, priors)
+    gradient = by_unknowns(arrays, estimate, sums.wrench, sums.by_corner, priors)
+    if arrays.camera_prior is not None:
+        earlier = earlier_markings(arrays, estimate, arrays.camera_prior)
+        terms["earlier_markings"] = earlier.cost
+        gradient.extrinsic.add_(earlier.gradient[:, :6])
+        gradient.clock_s.add_(earlier.gradient[:, 6:])
+    return terms, gradient
+
+
+@dataclass(frozen=True)
+class Earlier:
+    """Cost of the prior by earlier markings, its gradient (C, 6 + Q) and Gauss-Newton Hessian."""
+
+    cost: Tensor
+    gradient: Tensor
+    hessian: Tensor
+
+
+def earlier_markings(arrays: Arrays, estimate: Estimate, prior: CameraQuadratic) -> Earlier:
+    """What earlier markings say of the cameras at ``estimate``, by left tangents and clock offsets."""
+    each, like = arrays.camera_unknowns, prior.mean
+    tangent = log((estimate.cam_from_vehicle @ inverse(prior.base)).cpu().numpy())
+    turned = np.eye(like.numel())
+    for camera, jacobian in enumerate(np.linalg.inv(rigid_left_jacobian(tangent))):
+        part = slice(each * camera, each * camera + 6)
+        turned[part, part] = jacobian
+    chart, moved = (torch.as_tensor(v, dtype=like.dtype, device=like.device) for v in (turned, tangent))
+    off = (torch.cat([moved, estimate.clock_s], dim=1) - like).flatten()
+    pulled = prior.information @ off
+    return Earlier(
+        off @ pulled / 2,
+        (chart.mT @ pulled).view(-1, each),
+        chart.mT @ prior.information @ chart,
+    )
 
 
 @dataclass(frozen=True)

@@ -240,13 +240,21 @@ def _problem(
         cam_from_vehicle=rig.cam_from_vehicle[used.cameras],
         map_from_vehicle=sightings.map_from_vehicle[used.frames],
         observations=observations,
-        corner_count=int(observations.corner.max()) + 1,
+        corner_count=int(observations.corner.max(initial=-1)) + 1,
         centre_vehicle=centre,
         centre_sigma_m=sigma,
         pose_sigma=model.pose_sigma,
         twist_vehicle=vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s)[used.frames],
         clock_sigma_s=model.clock_sigma_s,
     )
+
+
+def drive_problem(sightings: Sightings, rig: Rig, cameras: Mapping[str, Camera], model: Model) -> Problem:
+    """All cameras and frames of a drive and their priors, without any observation."""
+    none = np.zeros(0, dtype=np.int64)
+    used = _Used(np.arange(len(sightings.cameras)), none, np.arange(len(sightings.map_from_vehicle)), none)
+    nothing = Observations(none, none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    return _problem(sightings, rig, used, [cameras[name] for name in sightings.cameras], nothing, model)
 
 
 def _known(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -51,15 +51,6 @@ def growth_counts(total: int, steps: int) -> list[int]:
     if total < 2:
         return [total] if total else []
     return sorted({round(float(count)) for count in np.geomspace(2, total, steps)})
-
-
-def chosen_steps(steps: Sequence[GrowthStep], most: int) -> tuple[GrowthStep, ...]:
-    """At most so many of ``steps``, the last one among them, their sizes geometrically spaced."""
-    sizes = np.array([len(step.markings) for step in steps])
-    if not most or not len(sizes):
-        return ()
-    wanted = growth_counts(int(sizes[-1]), most)
-    return tuple(steps[k] for k in sorted({int(np.argmin(np.abs(sizes - count))) for count in wanted}))
 
 
 def _order_of_sight(optimised: Optimised) -> IntArray:

@@ -1,12 +1,12 @@
 """The drive mapped as it would be on the vehicle: marking by marking, with nothing known of what comes.
 
 A track that the vehicle has left behind becomes a marking as soon as it ends: one of the map, where it lies
-on it, or else a further one. Map and extrinsics are up to date after each (:mod:`v2hdm.adjust.incremental`).
-Markings that follow one another share most of their images and so the errors of these images' poses: a few
-dozen are solved together, as one unit, from which a marking is taken back out whenever another one joins.
+on it, or else a further one. Map and extrinsics are up to date after each (:mod:`v2hdm.adjust.incremental`),
+under a model that takes the poses at their word, and their errors for noise in the image.
 
-The first tracks are linked under a coarse IPM. Whenever the map has doubled, and when the drive ends, what
-has been seen so far is linked again under the extrinsics that it has led to: a constant share of the cost.
+The first tracks are linked under a coarse IPM. Whenever the map has grown fourfold, and when the drive ends,
+all is solved together with the errors of the poses, as the batch does, and what has been seen so far is
+linked again under the extrinsics and poses that this leads to: a constant share of the cost.
 """
 
 from __future__ import annotations
@@ -16,37 +16,62 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from v2hdm.adjust.incremental import IncrementalMap, RigPrior, State
-from v2hdm.adjust.marking_fit import MarkingObservations
-from v2hdm.adjust.pose_errors import Noise
+from v2hdm.adjust import Observations
+from v2hdm.adjust.incremental import IncrementalMap, Sighted
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.quadrilateral import align, diameters
-from v2hdm.geometry.rigid import exp
 from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.association.merge import group_kinds
-from v2hdm.mapping.bundle import LEAST_OBSERVATIONS, VARIANCE_FACTORS, centre_priors, pose_sigma_of
-from v2hdm.mapping.grown import Grown, Place, Taken, conclude_grown, corners_of, growth_step
+from v2hdm.mapping.bundle import Model, drive_problem
+from v2hdm.mapping.known_sizes import known_lengths
 from v2hdm.mapping.options import LEAST_SIGHTINGS, MappingOptions
-from v2hdm.mapping.results import GrowthStep
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import Sightings
-from v2hdm.mapping.sightings.views import Views
-from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, PoseNoise
+from v2hdm.mapping.survey import control_points
+from v2hdm.records import BoolArray, Camera, FloatArray, IntArray
 
 Link = Callable[[Rig, bool], tuple[Association, BoolArray]]
 """Tracks under a rig, coarse or not, and which corners (S, 4) may be used."""
 
-_UNIT_MARKINGS = 30
-"""Markings that are solved together; a road or yard shows fewer at a time."""
+Solve = Callable[[Association, BoolArray, Rig], Rig]
+"""The rig that groups of sightings lead to, of usable corners (S, 4), from another."""
 
 _FIRST_LINK_MARKINGS = 12
 """From so many the extrinsics are better than the IPM that they began with."""
 
+_LINK_GROWTH = 4
+"""How many times as large the map is whenever all is linked and solved anew: over a drive that takes a third
+more than the last time alone."""
+
 _LEAST_CORNERS = 3
 """Corners that fix a marking: all are parallelograms."""
 
-_GROWTH_STEP = 1.5
-"""How many times as large the map is whenever it is kept to show how it grew."""
+
+@dataclass(frozen=True)
+class Grown:
+    """What the drive has left behind: the map's markings as groups of sightings, of usable corners (S, 4).
+
+    ``rig`` holds the extrinsics, and the poses as they were last solved for.
+    """
+
+    association: Association
+    usable: BoolArray
+    rig: Rig
+
+
+@dataclass
+class _Place:
+    """A marking of the map: the number of each of its corners (4,) there, -1 if it has none.
+
+    ``images`` are those that showed it, ``point`` (4,) the corners that they showed as points; ``preview``
+    (4, 2) is where these lay before the marking was solved.
+    """
+
+    corner: IntArray
+    kind: int
+    images: set[int]
+    point: BoolArray
+    preview: FloatArray
 
 
 @dataclass(frozen=True)
@@ -58,7 +83,7 @@ class _Track:
 
     rows: IntArray
     kind: int
-    seen: MarkingObservations
+    seen: Observations
     corners_map: FloatArray
 
 
@@ -70,93 +95,71 @@ class IncrementalMapper:
         sightings: Sightings,
         rig: Rig,
         cameras: Mapping[str, Camera],
-        pose_noise: PoseNoise,
+        position_sigma_m: float,
         options: MappingOptions,
         link: Link,
+        solve: Solve,
+        model: Model,
     ) -> None:
         """Begin with an empty map.
 
         Args:
             sightings: The table of sightings.
             rig: Extrinsics to start from, and the recorded poses.
-            cameras: The rig's cameras, in its order.
-            pose_noise: How far the recorded poses are off.
+            cameras: The rig's cameras by name.
+            position_sigma_m: How far the recorded positions are off.
             options: Settings of the mapping.
             link: Finds the tracks.
+            solve: Solves for all markings together.
+            model: What each marking is solved for under; of the poses it estimates nothing.
         """
-        self._sightings, self._link, self._rig = sightings, link, rig
-        self._cameras, self._options = cameras, options
-        centre, sigma = centre_priors(list(cameras.values()), rig.cam_from_vehicle)
-        focal = rig.intrinsic
-        intrinsic = np.column_stack([focal[:, 0, 0], focal[:, 1, 1], focal[:, :2, 2]])
-        self._prior = RigPrior(intrinsic, rig.cam_from_vehicle, centre, sigma)
-        self._noise = _noise(pose_noise, options)
-        self._jitter_rad = float(np.hypot(pose_noise.roll_pitch_rad, pose_noise.heading_rad))
-        self._floor_m = float(pose_noise.position_m)
-        self._vehicle_from_map: FloatArray = np.asarray(np.linalg.inv(rig.map_from_vehicle), np.float64)
-        step_m = np.linalg.norm(np.diff(rig.map_from_vehicle[:, :3, 3], axis=0), axis=1)
-        self._travelled_m = np.concatenate([[0.0], np.cumsum(step_m)])
-        self._names, self._variance_factor = sightings.cameras, 1.0
-        self._growth: list[GrowthStep] = []
-        self._begin(None, 0)
+        self._sightings, self._link, self._solve, self._options = sightings, link, solve, options
+        self._floor_m, self._model, self._first_rig = position_sigma_m, model, rig
+        self._drive = drive_problem(sightings, rig, cameras, model)
+        self._begin(rig, 0)
 
-    def run(self, views: Views, progress: Callable[[str], None]) -> Grown:
-        """Take up all tracks in the order in which they end, then judge the markings.
+    def run(self, progress: Callable[[str], None]) -> Grown:
+        """Take up all tracks in the order in which they end.
 
         Args:
-            views: What the images show.
             progress: Told in words how large the map is whenever the drive is linked anew.
 
         Raises:
-            MappingError: No marking is accepted.
+            MappingError: Nothing can be solved for.
         """
         tracks, usable = self._link(self._rig, True)
         due, ended = _FIRST_LINK_MARKINGS, False
         while not ended:
-            ended = self._take_up_safely(tracks, usable, due)[1]
+            association, ended = self._take_up_safely(tracks, usable, due)
             progress(f"linking anew with {len(self._places)} markings mapped")
-            self._reweigh()
-            tracks, usable = self._link(self._present_rig(), False)
-            self._begin(self.grown, len(self._places))
-            due *= 2
+            rig = self._solve(association, usable, self._present_rig())
+            tracks, usable = self._link(rig, False)
+            self._begin(rig, len(self._places))
+            due *= _LINK_GROWTH
         association, _ = self._take_up_safely(tracks, usable, len(self._sightings))
-        if self.grown.markings:
-            self.grown.linearise()
-        taken = Taken(
-            sightings=self._sightings,
-            association=association,
-            usable=usable,
-            views=views,
-            cameras=self._cameras,
-            initial_rig=self._rig,
-            jitter_rad=self._jitter_rad,
-            floor_px=self._options.model_floor_px,
-            variance_factor=self._variance_factor,
-        )
-        return conclude_grown(
-            self.grown, self._places, self._present_rig(), taken, self._growth, self._options.acceptance
-        )
+        return Grown(association, usable, self._present_rig())
 
-    def _begin(self, before: IncrementalMap | None, known: int) -> None:
-        """An empty map with the extrinsics that the one ``before`` found, which had ``known`` markings.
+    def _begin(self, rig: Rig, known: int) -> None:
+        """An empty map with a rig to start from, of a drive that showed ``known`` markings.
 
-        So many need not be up to date one by one again: they are solved a unit at a time.
+        So many need not be up to date one by one again: they are solved together.
         """
-        self.grown = IncrementalMap(self._prior, self._noise)
-        if before is not None:
-            self.grown.state = State.empty(self._prior, before.state.tangents)
-        self._start, self._known = before, known
-        self._places: list[Place] = []
+        self._rig, self._known = rig, known
+        # Only the IPM that the first map starts from may be far off, and all that is located by it.
+        self._coarse = rig is self._first_rig
+        drive = replace(
+            self._drive, cam_from_vehicle=rig.cam_from_vehicle, map_from_vehicle=rig.map_from_vehicle
+        )
+        self.grown = IncrementalMap(drive, replace(self._model.solver, coarse=self._coarse))
+        self._places: list[_Place] = []
         self._centres = np.zeros((0, 2))
-        self._corner_counts: list[int] = []
-        self._waiting: list[MarkingObservations] = []
 
     def _take_up_safely(self, tracks: Association, usable: BoolArray, most: int) -> tuple[Association, bool]:
-        """:meth:`_take_up`; where a unit cannot be solved at once, without the tracks that spoil it."""
+        """:meth:`_take_up`; where those known cannot be solved at once, without the tracks that spoil it."""
         try:
             return self._take_up(tracks, usable, most)
         except AdjustError:
-            self._begin(self._start, 0)
+            self._begin(self._rig, 0)
             return self._take_up(tracks, usable, most)
 
     def _take_up(self, tracks: Association, usable: BoolArray, most: int) -> tuple[Association, bool]:
@@ -182,7 +185,6 @@ class IncrementalMapper:
             if self._take(track, marking, turn):
                 number[own] = len(self._places) - 1 if marking is None else marking
                 shift[own] = (shift[own] + turn) % 4
-        self._settle()
         return Association(number, shift, len(self._places)), ended
 
     def _take(self, track: _Track, marking: int | None, turn: int) -> bool:
@@ -191,53 +193,49 @@ class IncrementalMapper:
         place = self._further_place(track) if marking is None else self._places[marking]
         numbers = place.corner.copy()
         further = np.setdiff1d(corner, np.flatnonzero(numbers >= 0))
-        numbers[further] = self._corner_counts[place.unit] + np.arange(len(further))
-        observed = MarkingObservations(**dict(vars(track.seen), corner=numbers[corner]))
-        newest = place.unit == len(self._corner_counts) - 1
-        if newest and len(self._places) < self._known:
-            self._waiting.append(observed)
+        numbers[further] = np.count_nonzero(numbers >= 0) + np.arange(len(further))
+        turned_map = track.corners_map[(np.arange(4) + turn) % 4]
+        sighted = Sighted(replace(track.seen, corner=numbers[corner]))
+        if not self._coarse:
+            kind = self._sightings.kinds[place.kind]
+            sighted = replace(
+                sighted,
+                lengths=known_lengths(self._options.known_sizes, [kind], turned_map[None], numbers[None]),
+                control=control_points(self._options.survey, turned_map[None], numbers[None]),
+            )
+        count = len(self._places)
+        number = count if marking is None else marking
+        if count < self._known:
+            self.grown.add(number, sighted)
         else:
-            self._settle()
             try:
-                self.grown.observe(place.unit, observed)
+                self.grown.observe(number, sighted)
             except AdjustError:
                 return False
-        self._corner_counts[place.unit] += len(further)
         place.corner = numbers
-        place.point |= np.isfinite(track.corners_map).all(axis=1)
+        place.point |= np.isfinite(turned_map).all(axis=1)
         place.images |= set(self._sightings.image[track.rows].tolist())
         if marking is None:
             self._places.append(place)
             self._centres = np.vstack([self._centres, np.nanmean(track.corners_map, axis=0)])
-            self._keep_step()
+            if len(self._places) == self._known:
+                self.grown.adjust()
         return True
 
-    def _further_place(self, track: _Track) -> Place:
-        """A place for a marking that the map does not have, in the newest unit or, if it is full, another."""
-        newest = len(self._corner_counts) - 1
-        last = self._places[-_UNIT_MARKINGS:]
-        if newest < 0 or sum(place.unit == newest for place in last) == _UNIT_MARKINGS:
-            self._settle()
-            self._corner_counts.append(0)
-            newest += 1
+    def _further_place(self, track: _Track) -> _Place:
+        """A place for a marking that the map does not have."""
         known = np.asarray(np.isfinite(track.corners_map).all(axis=1))
-        return Place(newest, np.full(4, -1, dtype=np.int64), track.kind, set(), known, track.corners_map)
-
-    def _settle(self) -> None:
-        """Solve for what waits for its unit to be full."""
-        waiting, self._waiting = self._waiting, []
-        if waiting:
-            joined = waiting[0]
-            for more in waiting[1:]:
-                joined = joined.joined(more)
-            self.grown.observe(len(self._corner_counts) - 1, joined)
+        return _Place(np.full(4, -1, dtype=np.int64), track.kind, set(), known, track.corners_map)
 
     def _corners(self, marking: int) -> FloatArray:
         """Corners (4, 2) of a marking under the present extrinsics, nan where none was seen as a point."""
         place = self._places[marking]
-        if self._waiting and place.unit == len(self._corner_counts) - 1:
+        if not self.grown.is_solved(marking):
             return place.preview
-        return np.where(place.point[:, None], corners_of(self.grown, place), np.nan)
+        out = np.full((4, 2), np.nan)
+        known = (place.corner >= 0) & place.point
+        out[known] = self.grown.corners_map(marking)[place.corner[known]]
+        return out
 
     def _track(self, rows: IntArray, kind: int, tracks: Association, usable: BoolArray) -> _Track | None:
         """What ``rows`` saw of corners that they saw twice; None where that fixes no marking."""
@@ -248,25 +246,25 @@ class IncrementalMapper:
             return None
         which, corner = which[twice[corner]], corner[twice[corner]]
         row, own = rows[which], order[which, corner]
-        sightings, floor_px = self._sightings, self._options.model_floor_px
+        points = np.bincount(corner[self._sightings.valid[row, own]], minlength=4) > 0
+        if np.count_nonzero(points) < 2:
+            return None
+        sightings, model = self._sightings, self._model
         known, dense = np.unique(corner, return_inverse=True)
-        seen = MarkingObservations(
+        seen = Observations(
             camera=sightings.camera[row],
-            corner=dense.astype(np.int64),
             frame=sightings.frame[row],
-            travelled_m=self._travelled_m[sightings.frame[row]],
-            vehicle_from_map=self._vehicle_from_map[sightings.frame[row]],
+            corner=dense.astype(np.int64),
             pinhole_px=sightings.corners_pinhole_px[row, own],
-            covariance_px=self._variance_factor
-            * (sightings.covariance_px[row, own] + floor_px**2 * np.eye(2)),
+            covariance_px=model.variance_factor
+            * (sightings.covariance_px[row, own] + model.floor_px**2 * np.eye(2)),
         )
         corners = np.full((4, 2), np.nan)
         try:
-            corners[known] = self.grown.preview(seen)
+            corners[known] = self.grown.preview(Sighted(seen))
         except AdjustError:
             return None
-        points = np.bincount(corner[sightings.valid[row, own]], minlength=4) > 0
-        if np.count_nonzero(points) < 2:
+        if not np.isfinite(corners[known]).all():
             return None
         corners[~points] = np.nan
         return _Track(rows, kind, replace(seen, corner=corner), corners)
@@ -303,40 +301,5 @@ class IncrementalMapper:
         return float(min(options.gate_sigmas * np.sqrt(2) * floor_m, options.max_gate_m))
 
     def _present_rig(self) -> Rig:
-        """The extrinsics, and the poses of the frames as the units that saw most in them say."""
-        poses, most = self._rig.map_from_vehicle.copy(), np.zeros(len(self._rig.map_from_vehicle))
-        for unit in self.grown.markings.values():
-            frames, count = np.unique(unit.observations.frame, return_counts=True)
-            better = count > most[frames]
-            chosen = frames[better]
-            poses[chosen] = self._rig.map_from_vehicle[chosen] @ exp(unit.frame_state[better])
-            most[chosen] = count[better]
-        return Rig(self._rig.intrinsic, self.grown.cam_from_vehicle, poses)
-
-    def _keep_step(self) -> None:
-        """Keep the map as it is, if it has grown enough since the last time that it was kept."""
-        count = len(self._places)
-        if count > self._known and count >= _GROWTH_STEP * len(
-            self._growth[-1].markings if self._growth else ()
-        ):
-            self._growth.append(growth_step(self.grown, self._places, self._names, self._sightings.kinds))
-
-    def _reweigh(self) -> None:
-        """Take the observations for as good as their residuals say, as the batch does."""
-        observations = sum(len(one.observations.camera) for one in self.grown.markings.values())
-        if observations >= LEAST_OBSERVATIONS:
-            self.grown.linearise()
-            factor = self._variance_factor * self.grown.variance().observations
-            self._variance_factor = float(np.clip(factor, *VARIANCE_FACTORS))
-
-
-def _noise(pose_noise: PoseNoise, options: MappingOptions) -> Noise:
-    """The noise of the batch, in the arrays of the incremental map."""
-    sigma = pose_sigma_of(pose_noise)
-    drifts = sigma.drift_by_state()
-    return Noise(
-        sigma.by_state(),
-        options.loss_scale,
-        np.array([drift.sigma for drift in drifts]),
-        np.array([drift.over_m for drift in drifts]),
-    )
+        """The extrinsics, and the poses as they were last solved for."""
+        return Rig(self._rig.intrinsic, self.grown.cam_from_vehicle, self._rig.map_from_vehicle)

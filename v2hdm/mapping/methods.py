@@ -15,17 +15,16 @@ from v2hdm.adjust import Status, observability
 from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.mapping.grown import Grown
-from v2hdm.mapping.growth import chosen_steps, grow_map
+from v2hdm.mapping.growth import grow_map
 from v2hdm.mapping.lanes.fuse import map_lanes
 from v2hdm.mapping.lanes.points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
 from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.naive import naive_markings
 from v2hdm.mapping.optimise import Optimiser
-from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
+from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.outlines import map_symbols
 from v2hdm.mapping.outputs import adjusted_poses, clock_offsets
-from v2hdm.mapping.remedy import Inputs, Outcome, judge_grown, optimise
+from v2hdm.mapping.remedy import Outcome, optimise
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.sightings.table import Sightings, camera_of, collect_sightings
 from v2hdm.mapping.sightings.views import views_of
@@ -56,8 +55,7 @@ def run_methods(
         cameras: Which cameras to map with, together.
         options: Settings of the mapping.
         progress: Called with the name of each step as it begins.
-        growth_steps: At how many sizes of the growing map ``Opt`` is solved again (in incremental mode,
-            shown as it was); 0 for none.
+        growth_steps: At how many sizes of the growing map ``Opt`` is solved again; 0 for none.
 
     Returns:
         Results by method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``.
@@ -78,21 +76,15 @@ def run_methods(
         tell(name)
         results[name] = run_naive(name, drive, detections, sightings, tracks, ipm, options)
     begin_s = time.perf_counter()
-    if options.mode == INCREMENTAL:
-        grown = optimiser.run_incrementally(tell)
-        tell("tests of the inputs")
-        outcome = judge_grown(Inputs(drive, detections, options, sightings), optimiser, grown)
-        optimal = _incremental_result(cameras, grown, outcome, begin_s, growth_steps)
-    else:
-        outcome, optimised = optimise(drive, detections, cameras, options, tell)
-        optimal = _optimised_result(cameras, outcome, optimised, begin_s)
-        optimiser, inputs = outcome.optimiser, outcome.inputs
-        drive, detections, options = inputs.drive, inputs.detections, inputs.options
-        if inputs.sightings is not sightings:
-            sightings, tracks = inputs.sightings, optimiser.initial_tracks()
-        if growth_steps:
-            tell("growth of the map")
-            optimal = replace(optimal, growth=grow_map(optimiser, optimised, growth_steps))
+    outcome, optimised = optimise(drive, detections, cameras, options, tell)
+    optimal = _optimised_result(cameras, outcome, optimised, begin_s)
+    optimiser, inputs = outcome.optimiser, outcome.inputs
+    drive, detections, options = inputs.drive, inputs.detections, inputs.options
+    if inputs.sightings is not sightings:
+        sightings, tracks = inputs.sightings, optimiser.initial_tracks()
+    if growth_steps:
+        tell("growth of the map")
+        optimal = replace(optimal, growth=grow_map(optimiser, optimised, growth_steps))
     results["Opt"] = optimal
     tell("ONI")
     found = optimal.calibrations
@@ -179,36 +171,6 @@ def _optimised_result(
             "time_s": time.perf_counter() - begin_s,
         },
         certainty=_certainty(optimised.bundle),
-        evidence=outcome.evidence,
-        poses=adjusted_poses(outcome),
-        clocks=clock_offsets(outcome),
-    )
-
-
-def _incremental_result(
-    cameras: Sequence[str], grown: Grown, outcome: Outcome, begin_s: float, growth_steps: int
-) -> MethodResult:
-    drive, detections, options = outcome.inputs.drive, outcome.inputs.detections, outcome.inputs.options
-    lanes = _lanes(drive, detections, ground_by_rig(drive, cameras, grown.rig), options)
-    symbols = map_symbols(
-        outcome.inputs.sightings.symbols, grown.rig, drive.pose_noise.roll_pitch_rad, grown.markings
-    )
-    return MethodResult(
-        name="Opt",
-        cameras=tuple(cameras),
-        hd_map=HdMap(grown.markings, lanes, drive.origin, symbols),
-        calibrations=grown.calibrations,
-        excluded=grown.excluded,
-        reprojection_rmse_px=grown.reprojection_rmse_px,
-        initial_reprojection_rmse_px=grown.initial_reprojection_rmse_px,
-        growth=chosen_steps(grown.growth, growth_steps),
-        diagnostics={
-            "observations": float(grown.observations),
-            "candidates": float(grown.association.count),
-            "chi2_per_dof": grown.chi2_per_dof,
-            "time_s": time.perf_counter() - begin_s,
-        },
-        certainty=grown.certainty,
         evidence=outcome.evidence,
         poses=adjusted_poses(outcome),
         clocks=clock_offsets(outcome),

@@ -29,7 +29,6 @@ from v2hdm.mapping.bundle import (
     full_model,
     solve_bundle,
 )
-from v2hdm.mapping.grown import Grown
 from v2hdm.mapping.incremental import IncrementalMapper
 from v2hdm.mapping.markings.conclude import Evidence, Optimised, conclude
 from v2hdm.mapping.options import AUTO, MappingOptions
@@ -127,8 +126,11 @@ class Optimiser:
         ).solution
         return {name: float(solved.clock_offset_s[c]) for name, c in bundle.camera_index.items()}
 
-    def run_incrementally(self, progress: Callable[[str], None] | None = None) -> Grown:
-        """Map one track after the other, as the vehicle would; ``progress`` is told how large the map is."""
+    def grow(self, progress: Callable[[str], None] | None = None) -> Bundle:
+        """Map one track after the other, as the vehicle would, and solve for all that the map rests on.
+
+        ``progress`` is told how large the map is. In place of :meth:`settle`.
+        """
 
         def link(rig: Rig, coarse: bool) -> tuple[Association, BoolArray]:
             located, options = self._locate(rig), self._options.association
@@ -136,16 +138,24 @@ class Optimiser:
             tracks = self._track(rig, located, direction_rad)
             return tracks, self._usable(tracks, rig)
 
-        mapper = IncrementalMapper(
-            self._sightings, self.initial_rig, self._cameras, self._pose_noise, self._options, link
-        )
-        return mapper.run(self._views, progress or _silent)
+        def solve(association: Association, usable: BoolArray, rig: Rig) -> Rig:
+            bundle = self._solve(association, usable, rig)
+            self._reweigh(bundle)
+            return bundle.rig
 
-    def joint_solve(self, grown: Grown) -> Bundle:
-        """All that an incremental map was grown from, solved together; and how well that predicts."""
-        self._variance_factor = grown.variance_factor
+        mapper = IncrementalMapper(
+            self._sightings,
+            self.initial_rig,
+            self._cameras,
+            self._pose_noise.position_m,
+            self._options,
+            link,
+            solve,
+            coarse_model(self.initial_rig, self._pose_noise, self._options),
+        )
+        grown = mapper.run(progress or _silent)
         bundle = self._solve(grown.association, grown.usable, grown.rig)
-        self._choose_pose_model(bundle)
+        self._reweigh(bundle)
         return bundle
 
     def solve_groups(self, optimised: Optimised, groups: IntArray) -> Bundle:

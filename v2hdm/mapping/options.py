@@ -113,8 +113,8 @@ class MappingOptions:
     ``roll_pitch``; ``full``, heading and position too; ``heave``, the height too; ``clock``, each camera's
     clock offset too; ``auto``, the one of them that predicts held-out observations best. ``loss`` and
     ``loss_scale`` are the robust loss of the solver.
-    ``mode`` is ``batch``, or ``incremental``: the drive as the vehicle would map it, marking by marking, each
-    frame's whole pose estimated with every few dozen.
+    ``mode`` is ``batch``, or ``incremental``: the drive as the vehicle would map it, marking by marking,
+    and in the end solved as ``batch`` does.
     ``rounds`` counts association under the optimised extrinsic followed by a joint solve.
     ``device`` is the torch device that the joint solves run on, ``cpu`` or ``cuda``.
     """
@@ -167,11 +167,6 @@ def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -
         raise ConfigError(
             f"mapping.pose_model is {options.pose_model!r}; choose from {', '.join(POSE_MODELS)}."
         )
-    if options.mode == INCREMENTAL and options.pose_model != AUTO:
-        raise ConfigError(
-            f"mapping.pose_model is {options.pose_model!r}, of no use in mapping.mode={INCREMENTAL}, which "
-            "estimates each frame's whole pose; leave it out."
-        )
     if options.loss not in LOSSES:
         raise ConfigError(f"mapping.loss is {options.loss!r}; choose from {', '.join(LOSSES)}.")
     for key, value in positive.items():
@@ -200,8 +195,6 @@ def _check_survey(options: MappingOptions) -> None:
     for number, point in enumerate(options.survey.points_map):
         if len(point) != 2 or not all(math.isfinite(value) for value in point):
             raise ConfigError(f"mapping.survey.points_map[{number}] is {list(point)}; give x and y in m.")
-    if options.survey.points_map and options.mode == INCREMENTAL:
-        raise ConfigError(f"mapping.survey is of no use in mapping.mode={INCREMENTAL}; leave it out.")
 
 
 def _check_sizes(options: MappingOptions, kinds: Sequence[str] | None) -> None:
@@ -211,5 +204,3 @@ def _check_sizes(options: MappingOptions, kinds: Sequence[str] | None) -> None:
             raise ConfigError(f"{key}: there is no such class; choose from {', '.join(kinds)}.")
         if len(size) != 2 or not 0 < size[1] <= size[0] < math.inf:
             raise ConfigError(f"{key} is {list(size)}; give length and width in m, the longer one first.")
-    if options.known_sizes.by_class_m and options.mode == INCREMENTAL:
-        raise ConfigError(f"mapping.known_sizes is of no use in mapping.mode={INCREMENTAL}; leave it out.")

@@ -25,10 +25,9 @@ from v2hdm.mapping.fit import (
     overall_factor,
     point_of,
 )
-from v2hdm.mapping.grown import Grown
 from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.optimise import Optimiser
-from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.options import INCREMENTAL, MappingOptions
 from v2hdm.mapping.sightings.table import Sightings, collect_sightings
 from v2hdm.mapping.sightings.views import views_of
 from v2hdm.records import Drive, ImageDetections
@@ -124,7 +123,10 @@ def optimise(
     while True:
         sightings = collect_sightings(drive, detections, cameras)
         optimiser = Optimiser(sightings, views_of(drive, cameras), drive.cameras, drive.pose_noise, options)
-        settled = optimiser.settle(optimiser.initial_tracks(), tell)
+        if options.mode == INCREMENTAL:
+            settled = optimiser.grow(tell)
+        else:
+            settled = optimiser.settle(optimiser.initial_tracks(), tell)
         tell("tests of the inputs")
         found = _suspects(settled, drive)
         worst = next((one for one in found if is_contradicted(one)), None)
@@ -148,17 +150,6 @@ def optimise(
         settled, contradictions(settled, found), corrected, optimiser, optimised.bundle, sightings
     )
     return Outcome(inputs, optimiser, optimised.bundle, evidence), optimised
-
-
-def judge_grown(inputs: Inputs, optimiser: Optimiser, grown: Grown) -> Outcome:
-    """The same evidence of a map that was grown marking by marking: all that it rests on, solved together.
-
-    Nothing is dropped: a vehicle has used its inputs long before.
-    """
-    bundle = optimiser.joint_solve(grown)
-    found = contradictions(bundle, _suspects(bundle, inputs.drive))
-    evidence = _evidence(bundle, found, (), optimiser, bundle, inputs.sightings)
-    return Outcome(inputs, optimiser, bundle, evidence)
 
 
 def _suspects(bundle: Bundle, drive: Drive) -> tuple[Suspect, ...]:
