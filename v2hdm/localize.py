@@ -11,21 +11,21 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.door import answer_signals, open_door
+from v2hdm.door import EXIT_FAILED_VERDICT, answer_signals, open_door
 
 _INTERRUPTED = "interrupted; nothing was written"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the door; 2 with one line on stderr for what cannot be read or does not belong together."""
+    """Run the door; 3 where the map does not explain the drive, 2 with one line for what cannot be read."""
     parsed = _parser().parse_args(arguments)
     return open_door("v2hdm.localize", "map", _INTERRUPTED, lambda: _localise(parsed))
 
 
-def _localise(parsed: argparse.Namespace) -> None:
+def _localise(parsed: argparse.Namespace) -> int:
     from v2hdm.localization.run import localise_drive
 
-    localise_drive(parsed)
+    return 0 if localise_drive(parsed) else EXIT_FAILED_VERDICT
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -36,6 +36,9 @@ START_SIGMA_M, START_SIGMA_RAD = 0.5, float(np.deg2rad(3.0))
 LOST_M = 0.3
 """With a larger standard deviation of the place the vehicle does not know where it is: half a dash's gap."""
 
+LEAST_MATCHED = 0.5
+"""Share of the detections that a map of the site explains at least: one explained .86, another site's .04."""
+
 IN_VIEW_M = 15.0
 """A marking is in view whose corners are all in an image and no farther from the camera."""
 
@@ -44,7 +47,8 @@ IN_VIEW_M = 15.0
 class Localised:
     """F frames: ``states`` after each, the markings ``matched`` (F,), and which have one ``in_view`` (F,).
 
-    ``shared`` (3,) are the variances of ahead, left and heading that map and calibration have in all frames.
+    ``detections`` counts those of all frames. ``shared`` (3,) are the variances of ahead, left and heading that
+    map and calibration have in common for all frames.
     """
 
     stamp_s: FloatArray
@@ -53,6 +57,7 @@ class Localised:
     matched: np.ndarray
     in_view: np.ndarray
     shared: FloatArray
+    detections: int
 
     @property
     def known(self) -> np.ndarray:
@@ -97,7 +102,8 @@ class Localised:
             else np.nan,
             "worst_position_m": float(np.hypot(*error[:, :2].T).max()) if len(error) else np.nan,
             "median_sigma_m": float(np.median(np.hypot(*self.sigma[:, :2].T))),
-            "matches": int(self.matched.sum()),
+            "detections": self.detections,
+            "matched_share": float(self.matched.sum() / max(self.detections, 1)),
         }
 
 
@@ -131,6 +137,7 @@ def localise(
         np.array(matched),
         _in_view(drive, sightings, hd_map, calibrations),
         np.array([markings.shared_m2, markings.shared_m2, _yaw_variance(calibrations)]),
+        len(sightings),
     )
 
 
@@ -181,11 +188,14 @@ def _in_view(
     return out
 
 
-def localise_drive(parsed: argparse.Namespace) -> None:
+def localise_drive(parsed: argparse.Namespace) -> bool:
     """Localise a drive in a map, print the figures and write them with poses and picture.
 
     Args:
         parsed: the arguments of :mod:`v2hdm.localize`.
+
+    Returns:
+        Whether the map explains the drive.
 
     Raises:
         V2hdmError: map, calibrations or drive cannot be read or do not belong together.
@@ -219,7 +229,15 @@ def localise_drive(parsed: argparse.Namespace) -> None:
         f"marking in view localised; position {100 * figures['position_rmse_m']:.1f} cm, heading "
         f"{figures['heading_rmse_deg']:.2f} deg from the recorded poses (RMSE)"
     )
+    explained = float(figures["matched_share"]) >= LEAST_MATCHED
+    if not explained:
+        print(
+            f"FAIL: the map explains {figures['matched_share']:.0%} of the detections, so that the figures "
+            "above cannot be relied on: is it of this site, as it is painted today, and does the drive begin "
+            "where its first pose says?"
+        )
     print(f"results in {folder}")
+    return explained
 
 
 def _calibrations(folder: Path) -> dict[str, Calibration]:
