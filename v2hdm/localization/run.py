@@ -47,8 +47,8 @@ IN_VIEW_M = 15.0
 class Localised:
     """F frames: ``states`` after each, the markings ``matched`` (F,), and which have one ``in_view`` (F,).
 
-    ``detections`` counts those of all frames. ``shared`` (3,) are the variances of ahead, left and heading that
-    map and calibration have in common for all frames.
+    ``detections`` counts those of all frames. ``shared`` (3,) are the variances of ahead, left and heading
+    that map and calibration have in common for all frames.
     """
 
     stamp_s: FloatArray
