@@ -17,7 +17,6 @@ from v2hdm.door import EXIT_FAILED_VERDICT, answer_signals, open_door
 
 if TYPE_CHECKING:
     from v2hdm.quality.movement import Movement
-    from v2hdm.records import Calibration
 
 
 _LEAST = 1e-12
@@ -32,9 +31,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _compare(parsed: argparse.Namespace) -> int:
     from v2hdm.errors import MapFileError
+    from v2hdm.hdmap.calibration import trusted_calibrations
     from v2hdm.quality.movement import movement, turned_alike
 
-    before, after = _calibrations(parsed.before), _calibrations(parsed.after)
+    before, after = (trusted_calibrations(path) for path in (parsed.before, parsed.after))
     common = [name for name in before if name in after]
     if not common:
         raise MapFileError(
@@ -55,30 +55,6 @@ def _compare(parsed: argparse.Namespace) -> int:
     for name in sorted(before.keys() ^ after.keys()):
         print(f"{name}: only in one of the two; not compared", file=sys.stderr)
     return EXIT_FAILED_VERDICT if any(one.moved for one in movements) else 0
-
-
-def _calibrations(path: Path) -> dict[str, Calibration]:
-    """The calibrations in a folder, or the one of a file, by camera."""
-    from v2hdm.errors import MapFileError
-    from v2hdm.files import load_yaml
-    from v2hdm.hdmap.calibration import read_calibration
-
-    files = sorted(path.glob("calibration_*.yaml")) if path.is_dir() else [path]
-    if not files:
-        raise MapFileError(
-            f"{path}: no calibration_*.yaml in it; give what v2hdm.map or v2hdm.extrinsic wrote"
-        )
-    out = {}
-    for file in files:
-        calibration = read_calibration(file)
-        verdict = load_yaml(file, MapFileError).get("verdict")
-        if isinstance(verdict, dict) and verdict.get("status") == "FAIL":
-            raise MapFileError(
-                f"{file}: the verdict on its drive is FAIL, so that its sigmas cannot be relied on; mend "
-                "that drive first (docs/verdict.md)"
-            )
-        out[calibration.info.name] = calibration
-    return out
 
 
 def _line(one: Movement) -> str:

@@ -96,17 +96,6 @@ def long_axis(corners: FloatArray) -> FloatArray:
     return np.asarray(axis if (axis[0], axis[1]) > (0.0, 0.0) else -axis)
 
 
-def characteristic_lengths(corners: FloatArray) -> FloatArray:
-    """Mean lengths of the two pairs of opposite sides, and the diagonals (G, 4), each pair sorted.
-
-    The lengths (m or px) do not depend on which corner comes first.
-    """
-    _, _, side = side_frames(corners)
-    pairs = np.sort(0.5 * (side[:, :2] + side[:, 2:]), axis=1)
-    diagonals = np.sort(np.linalg.norm(corners[:, 2:] - corners[:, :2], axis=2), axis=1)
-    return np.asarray(np.concatenate([pairs, diagonals], axis=1))
-
-
 def is_convex(corners_map: FloatArray) -> BoolArray:
     """Whether quadrilaterals (..., 4, 2) of the map are convex and counter-clockwise."""
     return np.asarray((_turns(corners_map) > 0).all(axis=-1))

@@ -134,6 +134,29 @@ def read_calibration(path: Path) -> Calibration:
     return Calibration(info=info, cam_from_vehicle=array("cam_from_vehicle", 4, 4), covariance=covariance)
 
 
+def trusted_calibrations(path: Path) -> dict[str, Calibration]:
+    """The calibrations in a result folder, or the one of a file, by camera.
+
+    Raises:
+        MapFileError: when there is none, one is damaged, or the verdict on its drive is FAIL.
+    """
+    files = sorted(path.glob("calibration_*.yaml")) if path.is_dir() else [path]
+    if not files:
+        raise MapFileError(
+            f"{path}: no calibration_*.yaml in it; give what v2hdm.map or v2hdm.extrinsic wrote"
+        )
+    out = {}
+    for file in files:
+        calibration = read_calibration(file)
+        if read_provenance(file).verdict == "FAIL":
+            raise MapFileError(
+                f"{file}: the verdict on its drive is FAIL, so that it cannot be relied on; mend that drive "
+                "first (docs/verdict.md)"
+            )
+        out[calibration.info.name] = calibration
+    return out
+
+
 def read_provenance(path: Path) -> Provenance:
     """Where the calibration that :func:`write_calibration` wrote comes from.
 

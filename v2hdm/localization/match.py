@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from v2hdm.geometry.ipm import homography_jacobian, pinhole_px_from_ground, project_ground
-from v2hdm.geometry.quadrilateral import SHIFTS, align
+from v2hdm.geometry.quadrilateral import SHIFTS, align, block_diagonal
 from v2hdm.geometry.rigid import inverse
 from v2hdm.localization.motion import HEADING, POSE, State, pose_of
 from v2hdm.records import BoolArray, FloatArray, HdMap, IntArray, Marking
@@ -131,7 +131,7 @@ class Markings:
         kept = np.repeat(seen.informs, 2)[order]
         rows, corners = order[kept], self._corners[marking]
         by_place = _by_place(seen, state.mean[POSE], corners)[kept]
-        noise = _REPEATS * _block(seen.covariance_px)[np.ix_(rows, rows)]
+        noise = _REPEATS * block_diagonal(seen.covariance_px[None])[0][np.ix_(rows, rows)]
         return Match(seen, rows, kept, noise + by_place @ self._covariance[marking] @ by_place.T, corners)
 
     def _near(self, kind: str, ground: FloatArray, state: State) -> IntArray:
@@ -219,16 +219,7 @@ def _by_state(seen: Seen, mean: FloatArray, corners_map: FloatArray) -> FloatArr
 def _by_place(seen: Seen, pose: FloatArray, corners_map: FloatArray) -> FloatArray:
     """Derivative (8, 8) of a marking's pixels by its corners in the map."""
     pixels_from_map = pinhole_px_from_ground(seen.intrinsic, seen.cam_from_vehicle @ inverse(pose_of(pose)))
-    return _block(homography_jacobian(pixels_from_map, corners_map))
-
-
-def _block(each: FloatArray) -> FloatArray:
-    """The matrix (8, 8) of blocks (4, 2, 2)."""
-    out = np.zeros((8, 8))
-    for corner in range(4):
-        part = slice(2 * corner, 2 * corner + 2)
-        out[part, part] = each[corner]
-    return out
+    return np.asarray(block_diagonal(homography_jacobian(pixels_from_map, corners_map)[None])[0])
 
 
 def _on_ground(seen: Seen, pose: FloatArray) -> FloatArray:

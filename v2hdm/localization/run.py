@@ -21,7 +21,7 @@ from v2hdm.drive.tum import write_tum
 from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.rigid import heading_rad
-from v2hdm.hdmap.calibration import read_calibration
+from v2hdm.hdmap.calibration import trusted_calibrations
 from v2hdm.hdmap.geojson import read_geojson
 from v2hdm.localization.figure import save_errors
 from v2hdm.localization.match import Markings, Seen, locate
@@ -205,7 +205,7 @@ def localise_drive(parsed: argparse.Namespace) -> bool:
     logging.basicConfig(format="%(message)s")
     cv2.setNumThreads(1)
     hd_map = read_geojson(parsed.map / "map.geojson" if parsed.map.is_dir() else parsed.map)
-    calibrations = _calibrations(parsed.map if parsed.map.is_dir() else parsed.map.parent)
+    calibrations = trusted_calibrations(parsed.map if parsed.map.is_dir() else parsed.map.parent)
     drive = read_drive(parsed.drive, ReadOptions(format=parsed.format, cameras=parsed.camera))
     _check_together(hd_map, calibrations, drive)
     folder = parsed.output or Path("outputs") / f"{drive.name}-localized"
@@ -238,15 +238,6 @@ def localise_drive(parsed: argparse.Namespace) -> bool:
         )
     print(f"results in {folder}")
     return explained
-
-
-def _calibrations(folder: Path) -> dict[str, Calibration]:
-    files = sorted(folder.glob("calibration_*.yaml"))
-    if not files:
-        raise MapFileError(
-            f"{folder}: no calibration_*.yaml beside the map; give a result folder of v2hdm.map"
-        )
-    return {one.info.name: one for one in map(read_calibration, files)}
 
 
 def _check_together(hd_map: HdMap, calibrations: Mapping[str, Calibration], drive: Drive) -> None:
