@@ -17,6 +17,7 @@ from v2hdm.adjust import Fault
 from v2hdm.mapping.evidence import Contradiction, SolveEvidence
 from v2hdm.mapping.remedy import CLOCK_TOLD_S, CONTRADICTED_SIGMAS, TOLD_SIGMA, is_contradicted
 from v2hdm.mapping.results import MethodResult
+from v2hdm.mapping.site_model.verdict import TOO_UNCERTAIN
 from v2hdm.quality.judgement import judge, passed
 from v2hdm.quality.results.agreement import check_agreement
 from v2hdm.quality.results.doubles import check_doubles
@@ -31,8 +32,8 @@ HELD_OUT_LIMIT = 4.0
 """Mean robust loss of held-out observations: clean drives reach 1.9 to 2.3, wrong inputs begin at 6.5."""
 
 EXCLUDED_LIMIT = 0.2
-"""Share of candidate markings that were left out, two standard errors taken off it: clean drives reach .11 of
-hundreds and .3 of 23, a survey of the wrong sign .23 of 140."""
+"""Share of candidate markings that were left out, but for those that are merely uncertain, two standard
+errors taken off it: clean drives reach .05 of hundreds and .13 of 26, swapped axes .75 of 200."""
 
 REJECTED_LIMIT = 0.06
 """Share of corner observations that the rest contradicts: clean drives reach .02, no distortion .14."""
@@ -282,19 +283,19 @@ def _poses(evidence: SolveEvidence) -> list[Finding]:
 
 
 def _excluded(best: MethodResult) -> Finding:
-    left_out, mapped = len(best.excluded), len(best.hd_map.markings)
-    count = max(left_out + mapped, 1)
-    share = left_out / count
-    surely = share - 2 * float(np.sqrt(share * (1 - share) / count))
+    # A place that is merely uncertain was seen too far off, or too briefly: it contradicts nothing.
+    left_out = sum(one.reason != TOO_UNCERTAIN for one in best.excluded)
+    count = left_out + len(best.hd_map.markings)
+    share = left_out / max(count, 1)
+    surely = share - 2 * float(np.sqrt(share * (1 - share) / max(count, 1)))
     return judge(
         "excluded",
         "map",
         surely,
         EXCLUDED_LIMIT,
         "",
-        fine=f"{left_out} of {left_out + mapped} candidates were left out",
-        wrong=f"{left_out} of {left_out + mapped} candidates were left out: markings are seen, but not "
-        f"where others "
-        "put them; see excluded.geojson",
+        fine=f"{left_out} of {count} candidates were left out, those aside that are merely uncertain",
+        wrong=f"{left_out} of {count} candidates were left out: markings are seen, but not where others put "
+        "them; see excluded.geojson",
         status=Status.WARN,
     )
