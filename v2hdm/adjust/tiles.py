@@ -129,7 +129,12 @@ class TiledCholesky:
     def solve(self, right: Tensor) -> Tensor:
         """L^-1 b for b (size, n)."""
         out, begin = right.clone(), 0
+        # Above the first row that is not zero there is nothing to solve for.
+        first = int(right.any(dim=1).to(torch.uint8).argmax())
         for tile, panel, rows in zip(self.diagonal, self.panels, self.rows, strict=True):
+            if begin + len(tile) <= first:
+                begin += len(tile)
+                continue
             part = out[begin : begin + len(tile)]
             part.copy_(torch.linalg.solve_triangular(tile, part, upper=False))
             out.index_add_(0, rows, panel @ part, alpha=-1)

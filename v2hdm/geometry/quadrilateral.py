@@ -137,6 +137,12 @@ def diameters(corners: FloatArray, valid: BoolArray) -> FloatArray:
     )
 
 
+def mean_corners(corners: FloatArray, valid: BoolArray) -> FloatArray:
+    """Mean (..., 2) of the valid corners of quadrilaterals (..., 4, 2), 0 where none is."""
+    weight = valid / np.maximum(valid.sum(axis=-1, keepdims=True), 1)
+    return np.asarray(np.sum(np.where(valid[..., None], corners, 0.0) * weight[..., None], axis=-2))
+
+
 def _turns(corners: FloatArray) -> FloatArray:
     """Cross product (..., 4) of each side with the next: positive where they turn from x towards y."""
     side = following(corners) - corners

@@ -13,21 +13,18 @@ from dataclasses import replace
 
 from v2hdm.adjust import Status, observability
 from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
-from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.growth import grow_map
 from v2hdm.mapping.lanes.fuse import map_lanes
 from v2hdm.mapping.lanes.points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
 from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.naive import naive_markings
-from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.outlines import map_symbols
 from v2hdm.mapping.outputs import adjusted_poses, clock_offsets
-from v2hdm.mapping.remedy import Outcome, optimise
+from v2hdm.mapping.remedy import Inputs, Outcome, optimise
 from v2hdm.mapping.results import MethodResult
-from v2hdm.mapping.sightings.table import Sightings, camera_of, collect_sightings
-from v2hdm.mapping.sightings.views import views_of
+from v2hdm.mapping.sightings.table import camera_of
 from v2hdm.mapping.survey import without_corner
 from v2hdm.records import Drive, FloatArray, HdMap, ImageDetections, Lane
 
@@ -68,29 +65,23 @@ def run_methods(
     check_options(options)
     tell = progress or _silent
     tell("linking sightings")
-    sightings = collect_sightings(drive, detections, cameras)
-    optimiser = Optimiser(sightings, views_of(drive, cameras), drive.cameras, drive.pose_noise, options)
-    tracks = optimiser.initial_tracks()
+    given = Inputs(drive, detections, cameras, options)
     results: dict[str, MethodResult] = {}
     for name, ipm in _given_ipms(drive, cameras).items():
         tell(name)
-        results[name] = run_naive(name, drive, detections, sightings, tracks, ipm, options)
+        results[name] = run_naive(name, given, ipm)
     begin_s = time.perf_counter()
-    outcome, optimised = optimise(drive, detections, cameras, options, tell)
-    optimal = _optimised_result(cameras, outcome, optimised, begin_s)
-    optimiser, inputs = outcome.optimiser, outcome.inputs
-    drive, detections, options = inputs.drive, inputs.detections, inputs.options
-    if inputs.sightings is not sightings:
-        sightings, tracks = inputs.sightings, optimiser.initial_tracks()
+    outcome, optimised = optimise(given, tell)
+    optimal = _optimised_result(outcome, optimised, begin_s)
     if growth_steps:
         tell("growth of the map")
-        optimal = replace(optimal, growth=grow_map(optimiser, optimised, growth_steps))
+        growth = grow_map(outcome.inputs.optimiser, optimised, growth_steps)
+        optimal = replace(optimal, growth=growth)
     results["Opt"] = optimal
     tell("ONI")
     found = optimal.calibrations
     ipm_found = {c: ipm_from_extrinsic(found[c].info, found[c].cam_from_vehicle) for c in cameras}
-    oni = run_naive("ONI", drive, detections, sightings, tracks, ipm_found, options)
-    results["ONI"] = replace(oni, calibrations=found)
+    results["ONI"] = replace(run_naive("ONI", outcome.inputs, ipm_found), calibrations=found)
     return results
 
 
@@ -98,27 +89,21 @@ def _given_ipms(drive: Drive, cameras: Sequence[str]) -> dict[str, dict[str, Flo
     """By naive method the IPMs of the cameras, for methods whose IPM every camera has."""
     given: dict[str, dict[str, FloatArray]] = {}
     for name, ipm_name in NAIVE_IPMS.items():
-        known = {c: drive.cameras[c].ipm[ipm_name] for c in cameras if ipm_name in drive.cameras[c].ipm}
+        ipms = {c: camera_of(drive, c).ipm for c in cameras}
+        known = {c: ipm[ipm_name] for c, ipm in ipms.items() if ipm_name in ipm}
         if len(known) == len(cameras):
             given[name] = known
     return given
 
 
-def run_naive(
-    name: str,
-    drive: Drive,
-    detections: Sequence[ImageDetections],
-    sightings: Sightings,
-    tracks: Association,
-    ipm: Mapping[str, FloatArray],
-    options: MappingOptions,
-) -> MethodResult:
+def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> MethodResult:
     """The naive strategy under one IPM per camera, for instance that of a known extrinsic."""
     begin_s = time.perf_counter()
+    drive, sightings, options = inputs.drive, inputs.sightings, inputs.options
     cameras = {c: camera_of(drive, c) for c in sightings.cameras}
-    markings, excluded = naive_markings(sightings, tracks, cameras, ipm, options)
+    markings, excluded = naive_markings(sightings, inputs.tracks, cameras, ipm, options)
     extrinsic = {c: extrinsic_from_ipm(cameras[c].info, matrix) for c, matrix in ipm.items()}
-    lanes = _lanes(drive, detections, ground_by_ipm(drive, ipm, extrinsic), options)
+    lanes = _lanes(inputs, ground_by_ipm(drive, ipm, extrinsic))
     return MethodResult(
         name=name,
         cameras=sightings.cameras,
@@ -128,10 +113,9 @@ def run_naive(
     )
 
 
-def _optimised_result(
-    cameras: Sequence[str], outcome: Outcome, optimised: Optimised, begin_s: float
-) -> MethodResult:
-    options, drive = outcome.inputs.options, outcome.inputs.drive
+def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) -> MethodResult:
+    inputs = outcome.inputs
+    options, drive, cameras = inputs.options, inputs.drive, inputs.cameras
     solution = optimised.bundle.solution
     if solution.status is not Status.CONVERGED:
         _log.warning(
@@ -147,9 +131,9 @@ def _optimised_result(
             ", ".join(f"({x:.2f}, {y:.2f})" for x, y in lost),
         )
     ground = ground_by_rig(drive, cameras, optimised.bundle.rig)
-    lanes = _lanes(drive, outcome.inputs.detections, ground, options)
+    lanes = _lanes(inputs, ground)
     symbols = map_symbols(
-        outcome.inputs.sightings.symbols,
+        inputs.sightings.symbols,
         optimised.bundle.rig,
         drive.pose_noise.roll_pitch_rad,
         optimised.markings,
@@ -182,17 +166,16 @@ def _certainty(bundle: Bundle) -> dict[str, str]:
     return {name: known[index].sentence(name) for name, index in bundle.camera_index.items()}
 
 
-def _lanes(
-    drive: Drive, detections: Sequence[ImageDetections], ground: ImageGround, options: MappingOptions
-) -> tuple[Lane, ...]:
+def _lanes(inputs: Inputs, ground: ImageGround) -> tuple[Lane, ...]:
+    options = inputs.options.lanes
     cloud = collect_lane_points(
-        drive,
-        detections,
+        inputs.drive,
+        inputs.detections,
         ground,
-        max_range_m=options.lanes.max_range_m,
-        jitter_rad=drive.pose_noise.roll_pitch_rad,
+        max_range_m=options.max_range_m,
+        jitter_rad=inputs.drive.pose_noise.roll_pitch_rad,
     )
-    return map_lanes(cloud, options.lanes)
+    return map_lanes(cloud, options)
 
 
 def _silent(step: str) -> None:

@@ -10,12 +10,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from v2hdm.adjust import Fault, Suspect, pose_pulls, suspects
 from v2hdm.drive.clock import with_clock_offsets
 from v2hdm.geometry.rigid import camera_centre
+from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.evidence import Contradiction, SolveEvidence
 from v2hdm.mapping.fit import (
@@ -86,12 +88,29 @@ MOST_CORRECTIONS = 4
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a camera set is mapped from, after corrections."""
+    """What a camera set is mapped from: as given, or after corrections."""
 
     drive: Drive
     detections: Sequence[ImageDetections]
+    cameras: Sequence[str]
     options: MappingOptions
-    sightings: Sightings
+
+    @cached_property
+    def sightings(self) -> Sightings:
+        """The detections of these cameras as one table."""
+        return collect_sightings(self.drive, self.detections, self.cameras)
+
+    @cached_property
+    def optimiser(self) -> Optimiser:
+        """Of these inputs, not yet run."""
+        drive, options = self.drive, self.options
+        views = views_of(drive, self.cameras)
+        return Optimiser(self.sightings, views, drive.cameras, drive.pose_noise, options)
+
+    @cached_property
+    def tracks(self) -> Association:
+        """Sightings linked from image to image under the initial IPMs."""
+        return self.optimiser.initial_tracks()
 
 
 @dataclass(frozen=True)
@@ -102,18 +121,11 @@ class Outcome:
     """
 
     inputs: Inputs
-    optimiser: Optimiser
     bundle: Bundle
     evidence: SolveEvidence
 
 
-def optimise(
-    drive: Drive,
-    detections: Sequence[ImageDetections],
-    cameras: Sequence[str],
-    options: MappingOptions,
-    tell: Callable[[str], None],
-) -> tuple[Outcome, Optimised]:
+def optimise(inputs: Inputs, tell: Callable[[str], None]) -> tuple[Outcome, Optimised]:
     """Optimise a drive, as often as inputs have to be dropped.
 
     Raises:
@@ -121,35 +133,34 @@ def optimise(
     """
     corrected: list[Contradiction] = []
     while True:
-        sightings = collect_sightings(drive, detections, cameras)
-        optimiser = Optimiser(sightings, views_of(drive, cameras), drive.cameras, drive.pose_noise, options)
-        if options.mode == INCREMENTAL:
+        optimiser, drive = inputs.optimiser, inputs.drive
+        if inputs.options.mode == INCREMENTAL:
             settled = optimiser.grow(tell)
         else:
-            settled = optimiser.settle(optimiser.initial_tracks(), tell)
+            settled = optimiser.settle(inputs.tracks, tell)
         tell("tests of the inputs")
         found = _suspects(settled, drive)
         worst = next((one for one in found if is_contradicted(one)), None)
-        inputs = Inputs(drive, detections, options, sightings)
         remedied = None
         if worst is not None and len(corrected) < MOST_CORRECTIONS and not _is_ambiguous(worst, found):
-            remedied = _remedied(inputs, worst, settled, optimiser)
+            remedied = _remedied(inputs, worst, settled)
         if worst is None or remedied is None:
             break
         told = contradictions(settled, (worst,))[0]
         whose, about = " and ".join(told.cameras), f" {told.about}" if told.about else ""
         _log.warning(
             "%s: mapped again, for the drive contradicts the %s%s of %s by %.0f sigmas (%+.3g %s)",
-            ", ".join(cameras), told.fault.value, about, whose, told.sigmas, told.value, told.fault.unit,
+            ", ".join(inputs.cameras), told.fault.value, about, whose, told.sigmas, told.value,
+            told.fault.unit,
         )  # fmt: skip
         corrected.append(told)
-        drive, detections, options = remedied.drive, remedied.detections, remedied.options
+        inputs = remedied
     optimised = optimiser.finish(settled, tell)
     corrected = [_as_solved(one, settled) for one in corrected]
     evidence = _evidence(
-        settled, contradictions(settled, found), corrected, optimiser, optimised.bundle, sightings
+        settled, contradictions(settled, found), corrected, optimiser, optimised.bundle, inputs.sightings
     )
-    return Outcome(inputs, optimiser, optimised.bundle, evidence), optimised
+    return Outcome(inputs, optimised.bundle, evidence), optimised
 
 
 def _suspects(bundle: Bundle, drive: Drive) -> tuple[Suspect, ...]:
@@ -233,12 +244,12 @@ def _clocks(bundle: Bundle) -> dict[str, tuple[float, float]]:
     }
 
 
-def _remedied(inputs: Inputs, worst: Suspect, settled: Bundle, optimiser: Optimiser) -> Inputs | None:
+def _remedied(inputs: Inputs, worst: Suspect, settled: Bundle) -> Inputs | None:
     """The inputs without what ``worst`` says is wrong; None where the drive cannot do without."""
     if worst.fault is Fault.CLOCK:
         if worst.sigma > CLOCK_TOLD_S:
             return None
-        return _with_clocks(inputs, optimiser.clock_offsets_s(settled))
+        return _with_clocks(inputs, inputs.optimiser.clock_offsets_s(settled))
     if worst.fault in (Fault.SURVEY, Fault.LEVER):
         if worst.sigma > CENTRE_TOLD_M:
             return None

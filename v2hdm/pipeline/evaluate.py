@@ -12,11 +12,9 @@ import numpy as np
 from v2hdm.drive.truth import read_truth
 from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.mapping.methods import run_naive
-from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions
+from v2hdm.mapping.remedy import Inputs
 from v2hdm.mapping.results import MethodResult
-from v2hdm.mapping.sightings.table import collect_sightings
-from v2hdm.mapping.sightings.views import views_of
 from v2hdm.records import Drive, HdMap, ImageDetections, Truth
 from v2hdm.report.evaluation import extrinsic_figures, growth_figures, headline, map_figures
 from v2hdm.report.metrics import driven_past
@@ -106,11 +104,7 @@ def _naive_under_true_extrinsic(
     ipms = {
         name: ipm_from_extrinsic(drive.cameras[name].info, truth.cam_from_vehicle[name]) for name in cameras
     }
-    sightings = collect_sightings(drive, detections, cameras)
-    optimiser = Optimiser(sightings, views_of(drive, cameras), drive.cameras, drive.pose_noise, options)
-    return run_naive(
-        "true extrinsic", drive, detections, sightings, optimiser.initial_tracks(), ipms, options
-    )
+    return run_naive("true extrinsic", Inputs(drive, detections, cameras, options), ipms)
 
 
 def _growth(methods: Mapping[str, MethodResult], truth: Truth) -> dict[str, list[tuple[int, float]]]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from v2hdm.geometry.quadrilateral import SHIFTS, align, diameters
+from v2hdm.geometry.quadrilateral import SHIFTS, align, diameters, mean_corners
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.options import AssociationOptions
@@ -22,6 +22,9 @@ from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _REFUSED = 1e9
+
+_LEAST_TOLERANCE_M = 0.05
+"""How far corners of one shape may deviate, m, however small the marking is."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,8 @@ class _Linker:
         self._heading_rad = np.unwrap(heading_rad(pose))
         self._noise_m2 = _noise_covariances(located, uncertainty)
         self._ray_map, self._range_m = _mean_rays(located)
+        self._centre_map = mean_corners(located.corners_map, located.valid)
+        self._size_m = diameters(located.corners_map, located.valid)
 
     def is_alive(self, track: _Track, row: int) -> bool:
         """Whether ``track`` may still be continued by the sighting at ``row``."""
@@ -122,54 +127,64 @@ class _Linker:
         last = np.array([track.row for track in tracks])
         corners = np.stack([track.corners_map for track in tracks])
         valid = np.stack([track.valid for track in tracks])
-        found = align(
-            corners[:, None], valid[:, None], self._located.corners_map[rows], self._located.valid[rows]
+        size_m = diameters(corners, valid)
+        t, d = self._near(last, mean_corners(corners, valid), size_m, rows)
+        own = rows[d]
+        found = align(corners[t], valid[t], self._located.corners_map[own], self._located.valid[own])
+        cost = self._mahalanobis2(found.offset, last[t], own)
+        tolerance_m = np.maximum(self._options.shape_tolerance * size_m[t], _LEAST_TOLERANCE_M)
+        shape = found.deformation_m / tolerance_m
+        accepted = (
+            (cost <= self._options.gate_sigmas**2)
+            & (np.linalg.norm(found.offset, axis=-1) <= self._options.max_gate_m)
+            & (shape <= 1.0)
         )
-        cost = self._mahalanobis2(found.offset, last, rows)
-        shape = found.deformation_m / self._shape_tolerance_m(corners, valid)
-        gate = self._options.gate_sigmas**2
-        refused = (
-            (self._sightings.kind[last][:, None] != self._sightings.kind[rows])
-            | (cost > gate)
-            | (np.linalg.norm(found.offset, axis=-1) > self._options.max_gate_m)
-            | (shape > 1.0)
-        )
-        cost = np.where(refused, _REFUSED, cost + shape**2)
-        picked = zip(*linear_sum_assignment(cost), strict=True)
-        return {int(rows[d]): (tracks[t], int(found.shift[t, d])) for t, d in picked if cost[t, d] < _REFUSED}
+        t, d = t[accepted], d[accepted]
+        costs = np.full((len(tracks), len(rows)), _REFUSED)
+        costs[t, d] = (cost + shape**2)[accepted]
+        shift = np.zeros(costs.shape, dtype=np.int64)
+        shift[t, d] = found.shift[accepted]
+        picked = zip(*linear_sum_assignment(costs), strict=True)
+        return {int(rows[d]): (tracks[t], int(shift[t, d])) for t, d in picked if costs[t, d] < _REFUSED}
 
-    def _shape_tolerance_m(self, corners: FloatArray, valid: BoolArray) -> FloatArray:
-        size_m = diameters(corners, valid)[:, None]
-        return np.asarray(np.maximum(self._options.shape_tolerance * size_m, 0.05))
+    def _near(
+        self, last: IntArray, centre_map: FloatArray, size_m: FloatArray, rows: IntArray
+    ) -> tuple[IntArray, IntArray]:
+        """Pairs of tracks and ``rows``, by index, of one class and close enough to be of one marking.
+
+        Means over different corners of one marking differ by no more than its diameter.
+        """
+        apart_m = np.linalg.norm(centre_map[:, None] - self._centre_map[rows], axis=-1)
+        reach_m = self._options.max_gate_m + size_m[:, None] + self._size_m[rows]
+        alike = self._sightings.kind[last][:, None] == self._sightings.kind[rows]
+        pair = np.argwhere(alike & (apart_m <= reach_m))
+        return pair[:, 0], pair[:, 1]
 
     def _mahalanobis2(self, offset: FloatArray, last: IntArray, rows: IntArray) -> FloatArray:
-        """Squared normalised displacements (T, D) between tracks' last sightings and ``rows``."""
-        noise = self._noise_m2[last][:, None] + self._noise_m2[rows][None]
-        covariance = noise + self._drift_covariance(last, rows)
+        """Squared normalised displacements (P,) between tracks' ``last`` sightings and ``rows``."""
+        covariance = self._noise_m2[last] + self._noise_m2[rows] + self._drift_covariance(last, rows)
         solved = np.linalg.solve(covariance, offset[..., None])[..., 0]
         return np.asarray(np.sum(offset * solved, axis=-1))
 
     def _drift_covariance(self, last: IntArray, rows: IntArray) -> FloatArray:
-        """What a wrong extrinsic adds between two images (T, D, 2, 2).
+        """What a wrong extrinsic adds between the images of two sightings (P, 2, 2).
 
         The error along the ray is r^2 / h * d and one across it r * d; between the images both
         change by their derivative times the motion, and the turn of the vehicle swings the first.
         """
         frame = self._sightings.frame
-        moved_m = np.abs(self._odometer_m[frame[rows]][None] - self._odometer_m[frame[last]][:, None])
-        turned = np.abs(self._heading_rad[frame[rows]][None] - self._heading_rad[frame[last]][:, None])
-        height_m = self._located.height_m[rows][None]
-        range_m = self._range_m[rows][None]
+        moved_m = np.abs(self._odometer_m[frame[rows]] - self._odometer_m[frame[last]])
+        turned = np.abs(self._heading_rad[frame[rows]] - self._heading_rad[frame[last]])
+        height_m, range_m = self._located.height_m[rows], self._range_m[rows]
         direction = self._uncertainty.direction_rad
         along_m = direction * (1.0 + 2.0 * range_m / height_m) * (moved_m + range_m * turned)
         across_m = direction * (moved_m + range_m * turned + range_m**2 / height_m * turned)
-        return _ray_covariance(self._ray_map[rows][None], along_m, across_m)
+        return _ray_covariance(self._ray_map[rows], along_m, across_m)
 
 
 def _mean_rays(located: Located) -> tuple[FloatArray, FloatArray]:
     """Mean ray (S, 2) and its length (S,) over each sighting's valid corners."""
-    weight = located.valid / np.maximum(located.valid.sum(axis=1, keepdims=True), 1)
-    ray = np.sum(np.where(located.valid[..., None], located.ray_map, 0.0) * weight[..., None], axis=1)
+    ray = mean_corners(located.ray_map, located.valid)
     return ray, np.linalg.norm(ray, axis=1)
 
 
