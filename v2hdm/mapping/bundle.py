@@ -269,7 +269,7 @@ def _known(
 
     ``rig`` is good enough to tell length from width, and one corner from the next.
     """
-    if not model.sizes.by_class_m and not model.survey.points_map:
+    if not model.sizes.by_class_m and not model.survey.control:
         return None, None
     located = locate(sightings, rig)
     located = replace(located, valid=located.valid & usable, informs=located.informs & usable)

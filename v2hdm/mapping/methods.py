@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from v2hdm.adjust import Status, observability
+from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.bundle import Bundle
@@ -66,6 +67,8 @@ def run_methods(
     """
     options = options or MappingOptions()
     check_options(options)
+    if options.survey.file is not None:
+        raise ConfigError(f"mapping.survey.file is {options.survey.file!r}: read it first, give its points")
     tell = progress or _silent
     tell("linking sightings")
     sightings = collect_sightings(drive, detections, cameras)
@@ -142,9 +145,9 @@ def _optimised_result(
         _log.warning(
             "%d of %d surveyed points are of no use, no corner of the map is nearest to them within %g m: %s",
             len(lost),
-            len(options.survey.points_map),
+            len(options.survey.control),
             options.survey.reach_m,
-            ", ".join(f"({x:.2f}, {y:.2f})" for x, y in lost),
+            ", ".join(lost),
         )
     ground = ground_by_rig(drive, cameras, optimised.bundle.rig)
     lanes = _lanes(drive, outcome.inputs.detections, ground, options)

@@ -252,11 +252,9 @@ def _remedied(inputs: Inputs, worst: Suspect, settled: Bundle, optimiser: Optimi
             inputs, options=replace(options, known_sizes=replace(options.known_sizes, by_class_m={}))
         )
     if worst.fault in (Fault.CONTROL, Fault.DATUM):
-        point = point_of(settled, worst.item) if worst.fault is Fault.CONTROL else None
-        points = [
-            one for one in options.survey.points_map if point is not None and tuple(one) != tuple(point)
-        ]
-        return replace(inputs, options=replace(options, survey=replace(options.survey, points_map=points)))
+        survey = options.survey
+        left = survey.without(point_of(settled, worst.item)) if worst.fault is Fault.CONTROL else survey.only([])
+        return replace(inputs, options=replace(options, survey=left))
     return None
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial import KDTree
 
 from v2hdm.adjust import ControlPoints
-from v2hdm.mapping.options import SurveyOptions
+from v2hdm.mapping.options import ControlOptions, SurveyOptions
 from v2hdm.records import FloatArray, IntArray
 
 
@@ -23,7 +25,7 @@ def control_points(
         corners_map: (G, 4, 2) about where the corners lie, nan where nobody knows.
         corner_index: (G, 4) the corners' numbers in the adjustment, -1 for none.
     """
-    points = np.array(survey.points_map, dtype=np.float64).reshape(-1, 2)
+    points, sigma_m = _arrays(survey.control)
     known = (corner_index >= 0) & np.isfinite(corners_map).all(axis=-1)
     if not len(points) or not known.any():
         return None
@@ -33,11 +35,22 @@ def control_points(
     corner, first = np.unique(corner_index[known][nearest[order]], return_index=True)
     if not len(corner):
         return None
-    return ControlPoints(corner, points[order[first]], np.full(len(corner), survey.sigma_m))
+    used = order[first]
+    return ControlPoints(corner, points[used], sigma_m[used])
 
 
-def without_corner(survey: SurveyOptions, control: ControlPoints | None) -> FloatArray:
-    """The surveyed points (N, 2) that ``control`` makes no use of."""
-    points = np.array(survey.points_map, dtype=np.float64).reshape(-1, 2)
-    used = np.zeros((0, 2)) if control is None else control.points_map
-    return np.asarray(points[~(points[:, None] == used).all(axis=-1).any(axis=-1)])
+def name_of(survey: SurveyOptions, point_map: FloatArray) -> str:
+    """The name of the control point at ``point_map`` (2,), which is one of those of the survey."""
+    return next(one.id for one in survey.control if np.array_equal(one.position_map, point_map))
+
+
+def without_corner(survey: SurveyOptions, control: ControlPoints | None) -> list[str]:
+    """The names of the control points that ``control`` makes no use of."""
+    used = set() if control is None else {name_of(survey, point) for point in control.points_map}
+    return [one.id for one in survey.control if one.id not in used]
+
+
+def _arrays(points: Sequence[ControlOptions]) -> tuple[FloatArray, FloatArray]:
+    """Positions and sigmas (N, 2) of control points, m."""
+    positions = np.array([one.position_map for one in points], dtype=np.float64).reshape(-1, 2)
+    return positions, np.array([one.sigma_m for one in points], dtype=np.float64).reshape(-1, 2)
