@@ -24,7 +24,7 @@ from v2hdm.mapping.naive import naive_markings
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.outlines import map_symbols
-from v2hdm.mapping.outputs import adjusted_poses, clock_offsets
+from v2hdm.mapping.outputs import JointCorners, adjusted_poses, clock_offsets
 from v2hdm.mapping.remedy import Outcome, optimise
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.sightings.table import Sightings, camera_of, collect_sightings
@@ -177,6 +177,7 @@ def _optimised_result(
         evidence=outcome.evidence,
         poses=adjusted_poses(outcome),
         clocks=clock_offsets(outcome),
+        corners=JointCorners(optimised),
     )
 
 
