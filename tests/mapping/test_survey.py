@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.mapping.scene import Scene, SceneOptions, make_scene
+from v2hdm.adjust import PoseSigma
 from v2hdm.errors import ConfigError
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.optimise import Optimiser
@@ -22,7 +23,7 @@ INDEX = np.array([[7, 8, -1, 9]])
 
 
 def found(points: list[list[float]]) -> dict[int, tuple[float, float]]:
-    control = control_points(SurveyOptions(points_map=points, reach_m=0.25), SQUARE[None], INDEX)
+    control = control_points(SurveyOptions(points_map=points, reach_m=0.25), SQUARE[None], INDEX, PoseSigma())
     if control is None:
         return {}
     return {int(c): (x, y) for c, (x, y) in zip(control.corner, control.points_map.tolist(), strict=True)}
@@ -38,7 +39,7 @@ def test_a_surveyed_point_is_of_the_nearest_corner_within_reach() -> None:
 
 def test_surveyed_points_that_no_corner_is_nearest_to_are_told() -> None:
     survey = SurveyOptions(points_map=[[0.1, 0.1], [5.0, 5.0], [0.0, 0.05], [1.0, 1.0]], reach_m=0.25)
-    control = control_points(survey, SQUARE[None], INDEX)
+    control = control_points(survey, SQUARE[None], INDEX, PoseSigma())
     assert without_corner(survey, control) == ["(0.10, 0.10)", "(5.00, 5.00)", "(1.00, 1.00)"]
     assert len(without_corner(survey, None)) == 4
     assert without_corner(SurveyOptions(), None) == []

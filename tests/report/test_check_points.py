@@ -48,7 +48,7 @@ def test_a_check_point_is_of_the_nearest_corner_within_reach_and_the_others_say_
     assert (one.point.id, one.marking, one.marking_id, one.corner) == ("A", 1, 2, 1)
     np.testing.assert_allclose(one.off_m, [0.02, -0.06], atol=1e-12)
     reasons = {which.id: why for which, why in table.unmatched}
-    assert reasons["B"] == "A is nearer to the only corner within reach, of diamond 2"
+    assert reasons["B"] == "A fits the only corner within reach better, of diamond 2"
     assert reasons["C"].startswith("no corner within 0.25 m: the nearest, of diamond 5, is 6.02 m away, the route")
     assert table.figures()["unmatched"] == reasons
 

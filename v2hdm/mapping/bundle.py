@@ -278,7 +278,7 @@ def _known(
     kinds = group_kinds(association, sightings)
     return (
         known_lengths(model.sizes, [sightings.kinds[k] for k in kinds], points_map, corner_index),
-        control_points(model.survey, points_map, corner_index),
+        control_points(model.survey, points_map, corner_index, model.pose_sigma),
     )
 
 

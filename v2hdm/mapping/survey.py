@@ -7,36 +7,44 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import KDTree
 
-from v2hdm.adjust import ControlPoints
+from v2hdm.adjust import ControlPoints, PoseSigma
+from v2hdm.hdmap.surveyed import match
 from v2hdm.mapping.options import ControlOptions, SurveyOptions
 from v2hdm.records import FloatArray, IntArray
 
 
 def control_points(
-    survey: SurveyOptions, corners_map: FloatArray, corner_index: IntArray
+    survey: SurveyOptions, corners_map: FloatArray, corner_index: IntArray, poses: PoseSigma
 ) -> ControlPoints | None:
     """The corners that surveyed points are of, None if there are none.
 
-    A point is of the corner nearest to it, if that lies within reach; a corner of the point nearest to it.
-    Points without a corner are left out: not every camera sees every one.
+    Points without a corner within reach are left out: not every camera sees every one.
 
     Args:
         survey: What the user says.
         corners_map: (G, 4, 2) about where the corners lie, nan where nobody knows.
         corner_index: (G, 4) the corners' numbers in the adjustment, -1 for none.
+        poses: How far the recorded poses are off; neighbouring corners share their drift.
     """
     points, sigma_m = _arrays(survey.control)
     known = (corner_index >= 0) & np.isfinite(corners_map).all(axis=-1)
     if not len(points) or not known.any():
         return None
-    off_m, nearest = KDTree(corners_map[known]).query(points, distance_upper_bound=survey.reach_m)
-    # The nearest first, so that of two points of one corner the nearer one is kept.
-    order = np.argsort(off_m)[: np.count_nonzero(np.isfinite(off_m))]
-    corner, first = np.unique(corner_index[known][nearest[order]], return_index=True)
-    if not len(corner):
+    off_m, _ = KDTree(corners_map[known]).query(points)
+    near = np.flatnonzero(off_m <= survey.reach_m)
+    covariance = _covariance(points[near], sigma_m[near], poses)
+    found = match(points[near], corners_map[known], survey.reach_m, covariance)
+    used = near[found >= 0]
+    if not len(used):
         return None
-    used = order[first]
-    return ControlPoints(corner, points[used], sigma_m[used])
+    return ControlPoints(corner_index[known][found[found >= 0]], points[used], sigma_m[used])
+
+
+def _covariance(points: FloatArray, sigma_m: FloatArray, poses: PoseSigma) -> FloatArray:
+    """Joint covariance (2N, 2N), m^2, of corners minus points (N, 2), before the survey has moved the map."""
+    drift, apart_m = poses.position_drift, np.linalg.norm(points[:, None] - points, axis=-1)
+    shared = drift.sigma**2 * np.exp(-apart_m / drift.over_m)
+    return np.kron(shared + poses.position_m**2 * np.eye(len(points)), np.eye(2)) + np.diag(sigma_m.ravel() ** 2)
 
 
 def name_of(survey: SurveyOptions, point_map: FloatArray) -> str:

@@ -25,6 +25,7 @@ from scipy.stats import chi2
 from v2hdm.drive.survey import SurveyedPoint
 from v2hdm.files import replace_text
 from v2hdm.hdmap.features import features_of
+from v2hdm.hdmap.surveyed import match
 from v2hdm.records import FloatArray, HdMap, IntArray
 
 JointCovariance = Callable[[IntArray, IntArray], FloatArray]
@@ -183,7 +184,8 @@ def compare(
 ) -> CheckTable:
     """Hold check points against the corners of a map.
 
-    A point is of the corner nearest to it, if that lies within reach; a corner of the point nearest to it.
+    Which corner a point is of, :func:`v2hdm.hdmap.surveyed.match` decides; what is reported is how far the two
+    are apart, of every point that has a corner within reach.
 
     Args:
         hd_map: the map, with heights where the drive has them.
@@ -197,21 +199,22 @@ def compare(
     off_m, nearest = KDTree(corners).query(positions)
     route_m = KDTree(route_map).query(positions)[0]
     ids = [feature.id for feature in features_of(hd_map)]
-    owner: dict[int, int] = {}
-    for k in np.argsort(off_m, kind="stable").tolist():
-        owner.setdefault(int(nearest[k]), k)
+    of_map = joint(*np.divmod(nearest, 4))
+    own = np.diag(np.concatenate([point.sigma_m**2 for point in points]))
+    matched = match(positions, corners, reach_m, of_map + own)
     compared, unmatched = [], []
     for k, point in enumerate(points):
-        marking, corner = divmod(int(nearest[k]), 4)
+        if matched[k] < 0:
+            there = f"{hd_map.markings[nearest[k] // 4].kind} {ids[nearest[k] // 4]}"
+            if off_m[k] > reach_m:
+                why = _far(off_m[k], there, reach_m, route_m[k])
+            else:
+                better = points[int(np.argmax(matched == nearest[k]))].id
+                why = f"{better} fits the only corner within reach better, of {there}"
+            unmatched.append((point, why))
+            continue
+        marking, corner = divmod(int(matched[k]), 4)
         found = hd_map.markings[marking]
-        there = f"{found.kind} {ids[marking]}"
-        if off_m[k] > reach_m:
-            unmatched.append((point, _far(off_m[k], there, reach_m, route_m[k])))
-            continue
-        if owner[int(nearest[k])] != k:
-            nearer = points[owner[int(nearest[k])]].id
-            unmatched.append((point, f"{nearer} is nearer to the only corner within reach, of {there}"))
-            continue
         has_height = found.heights_m is not None and point.height_m is not None
         compared.append(
             CheckedPoint(
