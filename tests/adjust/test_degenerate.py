@@ -119,7 +119,8 @@ def bad_problems():
             problem, control=ControlPoints(np.array([0, -1]), np.zeros((2, 2)), np.ones((2, 2)))
         ),
         "control point 0 is not finite": replace(
-            problem, control=ControlPoints(np.array([0, 1]), np.zeros((2, 2)), np.array([[1.0, 0.0], [1.0, 1.0]]))
+            problem,
+            control=ControlPoints(np.array([0, 1]), np.zeros((2, 2)), np.array([[1.0, 0.0], [1.0, 1.0]])),
         ),
         "there is no observation": with_observations(
             problem,

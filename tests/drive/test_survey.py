@@ -20,7 +20,9 @@ ORIGIN = GeodeticOrigin(53.54, 9.02, 45.0)
 PLACES = np.array([[0.0, 0.0, 0.0], [812.4, -350.2, 3.1], [-15.75, 620.04, -1.4]])
 
 
-def points(tmp_path: Path, text: str, origin: GeodeticOrigin | None = None, **how: object) -> tuple[SurveyedPoint, ...]:
+def points(
+    tmp_path: Path, text: str, origin: GeodeticOrigin | None = None, **how: object
+) -> tuple[SurveyedPoint, ...]:
     path = tmp_path / "points.csv"
     path.write_text(text, encoding="utf-8")
     settings = {"crs": None, "geoid_m": None, "sigma_m": 0.01, **how}

@@ -69,7 +69,9 @@ def test_no_point_within_reach_is_told_with_the_distance() -> None:
         ({"": 3}, Status.PASS),
     ],
 )
-def test_a_survey_that_fits_better_when_read_otherwise_is_told_how(counts: dict[str, int], status: Status) -> None:
+def test_a_survey_that_fits_better_when_read_otherwise_is_told_how(
+    counts: dict[str, int], status: Status
+) -> None:
     (finding,) = check_frame(counts)
     assert finding.status is status
     assert ("7 would with x_m and y_m swapped" in finding.says) is (status is Status.WARN)

@@ -49,7 +49,9 @@ def test_a_check_point_is_of_the_nearest_corner_within_reach_and_the_others_say_
     np.testing.assert_allclose(one.off_m, [0.02, -0.06], atol=1e-12)
     reasons = {which.id: why for which, why in table.unmatched}
     assert reasons["B"] == "A fits the only corner within reach better, of diamond 2"
-    assert reasons["C"].startswith("no corner within 0.25 m: the nearest, of diamond 5, is 6.02 m away, the route")
+    assert reasons["C"].startswith(
+        "no corner within 0.25 m: the nearest, of diamond 5, is 6.02 m away, the route"
+    )
     assert table.figures()["unmatched"] == reasons
 
 
@@ -86,7 +88,11 @@ def test_heights_are_compared_where_both_have_them_and_said_not_to_be_otherwise(
     lifted = replace(flat, markings=tuple(replace(m, heights_m=np.full(4, 2.0)) for m in flat.markings))
     table = checked(lifted, point(0.0, 0.0, "A", height_m=1.9), point(5.0, 0.0, "B"))
     assert [one.off_height_m for one in table.compared] == [pytest.approx(0.1), None]
-    assert table.figures()["height"] == {"compared": 1, "mean_z_m": pytest.approx(0.1), "rmse_z_m": pytest.approx(0.1)}
+    assert table.figures()["height"] == {
+        "compared": 1,
+        "mean_z_m": pytest.approx(0.1),
+        "rmse_z_m": pytest.approx(0.1),
+    }
     assert checked(flat, point(0.0, 0.0, "A", height_m=1.9)).figures()["height"]["compared"] == 0
 
 
@@ -98,7 +104,10 @@ def test_the_table_of_a_customer_holds_every_point_once_and_reads_back(tmp_path:
     assert set(first) == set(COLUMNS)
     assert (first["id"], first["marking"], first["class"], first["corner"]) == ("A", "2", "diamond", "2")
     assert float(first["distance_m"]) == pytest.approx(np.hypot(0.02, 0.06), abs=1e-4)
-    assert (float(first["map_sigma_x_m"]), first["inside_95_percent"]) == (pytest.approx(0.0316, abs=1e-4), "yes")
+    assert (float(first["map_sigma_x_m"]), first["inside_95_percent"]) == (
+        pytest.approx(0.0316, abs=1e-4),
+        "yes",
+    )
     assert (second["id"], second["dx_m"]) == ("C", "")
     assert second["not_compared_because"].startswith("no corner within 0.25 m")
 

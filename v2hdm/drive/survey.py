@@ -61,9 +61,7 @@ _CALLED: Mapping[str, tuple[str, ...]] = {
 }
 """Columns that are understood, and what else they may be called."""
 
-NAMES: Mapping[str, str] = {
-    name: ours for ours, others in _CALLED.items() for name in (ours, *others)
-}
+NAMES: Mapping[str, str] = {name: ours for ours, others in _CALLED.items() for name in (ours, *others)}
 _CONTROL, _CHECK = "control", "check"
 _NEARLY = 0.8
 """Likeness (:mod:`difflib`) from which an unknown column is taken for a misspelt one."""
@@ -240,7 +238,9 @@ def _on_earth(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[FloatA
             )
         if has_height_datum(crs, where, DriveError) and table.geoid_m is None:
             _log.warning(
-                "%s: heights of %s count from the sea and are not used: set mapping.survey.geoid_m", where, crs
+                "%s: heights of %s count from the sea and are not used: set mapping.survey.geoid_m",
+                where,
+                crs,
             )
             height_m = np.full_like(height_m, np.nan)
     known = np.isfinite(height_m)

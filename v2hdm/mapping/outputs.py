@@ -65,7 +65,9 @@ class JointCorners:
         optimised, bundle = self.optimised, self.optimised.bundle
         index = bundle.corner_index[optimised.groups[marking]]
         number = np.where(
-            index[np.arange(len(corner)), corner] >= 0, index[np.arange(len(corner)), corner], index.max(axis=1)
+            index[np.arange(len(corner)), corner] >= 0,
+            index[np.arange(len(corner)), corner],
+            index.max(axis=1),
         )
         out = max(1.0, bundle.solution.chi2_per_dof) * bundle.solution.corner_covariance(number)
         rows = 2 * corner[:, None] + np.arange(2)
@@ -75,4 +77,6 @@ class JointCorners:
             for other in np.flatnonzero(marking == marking[k]):
                 block = stated[np.ix_(rows[k], rows[other])]
                 out[2 * k : 2 * k + 2, 2 * other : 2 * other + 2] = block
-        return np.asarray(out)
+        # Put together from two sources, it may be negative along some direction, by a millimetre squared.
+        values, vectors = np.linalg.eigh(out)
+        return out if values[0] >= 0 else np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

@@ -269,7 +269,9 @@ def _remedied(inputs: Inputs, worst: Suspect, settled: Bundle, optimiser: Optimi
         )
     if worst.fault in (Fault.CONTROL, Fault.DATUM):
         survey = options.survey
-        left = survey.without(point_of(settled, worst.item)) if worst.fault is Fault.CONTROL else survey.only([])
+        left = (
+            survey.without(point_of(settled, worst.item)) if worst.fault is Fault.CONTROL else survey.only([])
+        )
         return replace(inputs, options=replace(options, survey=left))
     return None
 

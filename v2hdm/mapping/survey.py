@@ -44,7 +44,8 @@ def _covariance(points: FloatArray, sigma_m: FloatArray, poses: PoseSigma) -> Fl
     """Joint covariance (2N, 2N), m^2, of corners minus points (N, 2), before the survey has moved the map."""
     drift, apart_m = poses.position_drift, np.linalg.norm(points[:, None] - points, axis=-1)
     shared = drift.sigma**2 * np.exp(-apart_m / drift.over_m)
-    return np.kron(shared + poses.position_m**2 * np.eye(len(points)), np.eye(2)) + np.diag(sigma_m.ravel() ** 2)
+    own = (poses.position_m**2 - drift.sigma**2) * np.eye(len(points))
+    return np.kron(shared + own, np.eye(2)) + np.diag(sigma_m.ravel() ** 2)
 
 
 def name_of(survey: SurveyOptions, point_map: FloatArray) -> str:

@@ -85,9 +85,7 @@ def take_survey(drive: Drive, options: MappingOptions) -> Survey:
     return Survey(replace(options, survey=survey), check, points, elsewhere)
 
 
-def check_survey(
-    survey: Survey, drive: Drive, best: MethodResult
-) -> tuple[CheckTable | None, list[Finding]]:
+def check_survey(survey: Survey, drive: Drive, best: MethodResult) -> tuple[CheckTable | None, list[Finding]]:
     """The check points against the map of ``best``, None where there are none; and what follows."""
     findings = check_frame(survey.found(best)) if survey.points else []
     if not survey.check:

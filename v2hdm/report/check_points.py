@@ -232,9 +232,7 @@ def compare(
 
 
 def _far(off_m: float, there: str, reach_m: float, route_m: float) -> str:
-    return (
-        f"no corner within {reach_m:g} m: the nearest, of {there}, is {off_m:.2f} m away, the route {route_m:.0f} m"
-    )
+    return f"no corner within {reach_m:g} m: the nearest, of {there}, is {off_m:.2f} m away, the route {route_m:.0f} m"
 
 
 def _joint(compared: Sequence[CheckedPoint], joint: JointCovariance) -> FloatArray:
@@ -242,10 +240,7 @@ def _joint(compared: Sequence[CheckedPoint], joint: JointCovariance) -> FloatArr
     if not compared:
         return np.zeros((0, 0))
     of_map = joint(np.array([one.marking for one in compared]), np.array([one.corner for one in compared]))
-    variance = np.concatenate([one.point.sigma_m**2 for one in compared])
-    values, vectors = np.linalg.eigh(of_map + np.diag(variance))
-    # The map's part cannot be negative, but it is put together from two sources and rounded.
-    return np.asarray((vectors * np.maximum(values, variance.min())) @ vectors.T)
+    return of_map + np.diag(np.concatenate([one.point.sigma_m**2 for one in compared]))
 
 
 def write_check_points(table: CheckTable, path: Path) -> None:
