@@ -15,7 +15,7 @@ from v2hdm.hdmap.geodetic import geodetic_from_enu
 from v2hdm.records import FloatArray, GeodeticOrigin
 
 ORIGIN = GeodeticOrigin(53.54, 9.02, 45.0)
-"""Nearly at the edge of its UTM zone: the convergence is 0.02 degrees there, and 4.8 degrees in the next one."""
+"""Nearly at the edge of its UTM zone: the convergence is 0.02 degrees there, 4.8 in the next one."""
 
 PLACES = np.array([[0.0, 0.0, 0.0], [812.4, -350.2, 3.1], [-15.75, 620.04, -1.4]])
 

@@ -15,7 +15,7 @@ DRIFT_M, OWN_M = 0.1, 0.01
 def dashes(count: int = 12) -> FloatArray:
     """Corners (4 count, 2) of dashes 12 cm wide, every 6 m along x and along y by turns."""
     turned = [DASH if k % 2 else DASH[:, ::-1] for k in range(count)]
-    return np.concatenate([one + [6.0 * k, 0.0] for k, one in enumerate(turned)])
+    return np.concatenate([one + np.array([6.0 * k, 0.0]) for k, one in enumerate(turned)])
 
 
 def covariance(count: int, drift_m: float = DRIFT_M) -> FloatArray:

@@ -1,4 +1,4 @@
-"""docs/survey.md does what it says: control points mend a drifted map, check points tell, and touch nothing."""
+"""docs/survey.md does what it says: control points mend a drifted map, check points only tell."""
 
 from __future__ import annotations
 
@@ -84,9 +84,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
     seen = [
         m for m, own in zip(truth.map.markings, driven_past(drive, truth, ("front",)), strict=True) if own
     ]
-    chosen = np.random.default_rng(4).permutation(len(seen))[:20].tolist()
-    corners = np.array([seen[k].corners_map[n % 4] for n, k in enumerate(chosen)])
-    kinds = [seen[k].kind for k in chosen]
+    chosen = np.random.default_rng(4).permutation(2 * len(seen))[:20].tolist()
+    corners = np.array([seen[n // 2].corners_map[2 * (n % 2)] for n in chosen])
+    kinds = [seen[n // 2].kind for n in chosen]
     (site.folder / "points.csv").write_text(survey(corners, kinds, drive.origin))
     (site.folder / "moved.csv").write_text(survey(corners, kinds, drive.origin, check_off_m=-0.12))
     only_check = (site.folder / "points.csv").read_text().replace("control", "check")

@@ -1,4 +1,4 @@
-"""What the verdict says of check points: chance passes, one bad point, a shifted datum and a bad map do not."""
+"""What the verdict says of check points: chance passes; a bad point, a shifted datum, a bad map do not."""
 
 from __future__ import annotations
 

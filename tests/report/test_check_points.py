@@ -30,7 +30,7 @@ def yard(rng: np.random.Generator | None = None, count: int = 12) -> HdMap:
     markings = []
     for k in range(count):
         own = np.zeros((4, 2)) if rng is None else OWN_M * rng.standard_normal((4, 2))
-        markings.append(Marking("diamond", SQUARE + [5.0 * k, 0.0] + shared + own, 9))
+        markings.append(Marking("diamond", SQUARE + np.array([5.0 * k, 0.0]) + shared + own, 9))
     return HdMap(tuple(markings))
 
 

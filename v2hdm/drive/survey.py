@@ -225,8 +225,8 @@ def _on_earth(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[FloatA
     where, crs = str(table.path), table.crs
     if origin is None:
         raise DriveError(
-            f"{where}: {table.frame.value} have a place on the earth, the drive's map has none; give the drive "
-            "an origin, or the points as x_m, y_m in the frame of its poses"
+            f"{where}: {table.frame.value} have a place on the earth, the drive's map has none; give the "
+            "drive an origin, or the points as x_m, y_m in the frame of its poses"
         )
     height_m = table.height_m
     if crs is not None:
@@ -355,8 +355,8 @@ def _frame(cells: Mapping[str, str], crs: str | None, path: Path) -> Frame:
         raise DriveError(f"{path}: has no column {missing[0]}; add it")
     if found[0] is Frame.GRID and crs is None:
         raise DriveError(
-            f"{path}: of which system are east and north? Set mapping.survey.crs, such as EPSG:32632, or call "
-            "the columns x_m, y_m if they are in the frame of the poses"
+            f"{path}: of which system are east and north? Set mapping.survey.crs, such as EPSG:32632, or "
+            "call the columns x_m, y_m if they are in the frame of the poses"
         )
     if found[0] is Frame.MAP and crs is not None:
         raise DriveError(

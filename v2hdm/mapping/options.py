@@ -91,9 +91,9 @@ class SizeOptions:
 
 @dataclass(kw_only=True)
 class ControlOptions:
-    """A corner of a marking that a survey has measured: ``position_map`` (x, y) and its ``sigma_m`` (x, y), m.
+    """A corner of a marking that a survey has measured.
 
-    ``id`` is its name in the survey.
+    ``id`` is its name in the survey, ``position_map`` its x and y and ``sigma_m`` theirs, m.
     """
 
     id: str

@@ -46,8 +46,7 @@ class Survey:
         """How many points have a corner of the map within reach: as stated (""), and read otherwise."""
         corners = KDTree(np.array([one.corners_map for one in result.hd_map.markings]).reshape(-1, 2))
         ways = {"": _positions(self.points), **(self.elsewhere or {})}
-        reach_m = self.mapping.survey.reach_m
-        return {says: int((corners.query(at)[0] <= reach_m).sum()) for says, at in ways.items()}
+        return {says: _places(corners, at, self.mapping.survey.reach_m) for says, at in ways.items()}
 
 
 def table_of(options: SurveyOptions) -> SurveyTable | None:
@@ -121,15 +120,24 @@ def _check_near(
                 ", ..." if len(far) > _NAMED else "",
             )  # fmt: skip
         return
-    near = {says: int((route.query(at)[0] <= range_m).sum()) for says, at in elsewhere.items()}
-    likeliest = max(near, key=lambda says: near[says], default="")
+    likeliest = max(elsewhere, key=lambda says: _places(route, elsewhere[says], range_m), default="")
+    near = int((route.query(elsewhere[likeliest])[0] <= range_m).sum()) if likeliest else 0
     advice = "mind datum, zone, units, the order of the columns and the origin of the drive"
-    if near.get(likeliest, 0):
-        advice = f"{near[likeliest]} would {likeliest}; mend the file or mapping.survey.crs"
+    if near:
+        advice = f"{near} would {likeliest}; mend the file or mapping.survey.crs"
     raise DriveError(
-        f"{table.path}: none of its {len(points)} points lies within {range_m:g} m of the route, the nearest is "
-        f"{away_m.min():.0f} m away: {advice}"
+        f"{table.path}: none of its {len(points)} points lies within {range_m:g} m of the route, the nearest "
+        f"is {away_m.min():.0f} m away: {advice}"
     )
+
+
+def _places(tree: KDTree, at: FloatArray, reach_m: float) -> int:
+    """How many of a tree's places points have within reach, each by its nearest.
+
+    Points that a wrong unit heaps up on one spot have a single one.
+    """
+    off_m, nearest = tree.query(at)
+    return len(np.unique(nearest[off_m <= reach_m]))
 
 
 def _positions(points: Sequence[SurveyedPoint]) -> FloatArray:

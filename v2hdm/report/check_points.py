@@ -1,9 +1,9 @@
-"""Check points: surveyed corners that no estimate has seen, against the map.
+r"""Check points: surveyed corners that no estimate has seen, against the map.
 
 The errors of a map's corners are not independent of each other: what is left of the receiver's drift moves
 all of them alike. The test of all points together therefore takes their joint covariance,
 
-.. math:: T = e' (C_\\text{map} + C_\\text{survey})^{-1} e,
+.. math:: T = e' (C_\text{map} + C_\text{survey})^{-1} e,
 
 which is chi-square with as many degrees of freedom as there are coordinates, where map and survey are as good
 as they say. T over these is the normalised estimation error squared (NEES), 1 on average.
@@ -39,8 +39,9 @@ COLUMNS: tuple[str, ...] = (
     *("dx_m", "dy_m", "distance_m", "sigma_x_m", "sigma_y_m", "map_sigma_x_m", "map_sigma_y_m"),
     *("normalised_error", "inside_95_percent", "dz_m", "not_compared_because"),
 )
-"""Differences are map minus survey. ``corner`` counts from 1. ``sigma_...`` are those of the difference: of map
-and survey together. ``normalised_error`` is the difference in its standard deviations, both axes together."""
+"""Differences are map minus survey. ``corner`` counts from 1. ``sigma_...`` are those of the difference: of
+map and survey together. ``normalised_error`` is the difference in its standard deviations, both axes in
+one."""
 
 
 @dataclass(frozen=True)
@@ -152,8 +153,8 @@ class CheckTable:
         inside = sum(one.is_inside for one in self.compared)
         return (
             f"check points: {len(self.compared)} of {total} compared, RMSE {100 * self.rmse_m:.1f} cm, mean "
-            f"{cm[0]:+.1f} cm in x and {cm[1]:+.1f} cm in y, 95 % within {100 * self._percentile_m():.1f} cm, "
-            f"{inside} of {len(self.compared)} inside what map and survey state for 95 %"
+            f"{cm[0]:+.1f} cm in x and {cm[1]:+.1f} cm in y, 95 % within {100 * self._percentile_m():.1f} "
+            f"cm, {inside} of {len(self.compared)} inside what map and survey state for 95 %"
         )
 
     def _percentile_m(self) -> float:
@@ -184,8 +185,8 @@ def compare(
 ) -> CheckTable:
     """Hold check points against the corners of a map.
 
-    Which corner a point is of, :func:`v2hdm.hdmap.surveyed.match` decides; what is reported is how far the two
-    are apart, of every point that has a corner within reach.
+    Which corner a point is of, :func:`v2hdm.hdmap.surveyed.match` decides; what is reported is how far the
+    two are apart, of every point that has a corner within reach.
 
     Args:
         hd_map: the map, with heights where the drive has them.
@@ -215,7 +216,9 @@ def compare(
             continue
         marking, corner = divmod(int(matched[k]), 4)
         found = hd_map.markings[marking]
-        has_height = found.heights_m is not None and point.height_m is not None
+        off_height_m = None
+        if found.heights_m is not None and point.height_m is not None:
+            off_height_m = float(found.heights_m[corner] - point.height_m)
         compared.append(
             CheckedPoint(
                 point,
@@ -225,14 +228,15 @@ def compare(
                 corner,
                 found.corners_map[corner] - point.position_map,
                 joint(np.array([marking]), np.array([corner])),
-                float(found.heights_m[corner] - point.height_m) if has_height else None,
+                off_height_m,
             )
         )
     return CheckTable(tuple(compared), tuple(unmatched), _joint(compared, joint))
 
 
 def _far(off_m: float, there: str, reach_m: float, route_m: float) -> str:
-    return f"no corner within {reach_m:g} m: the nearest, of {there}, is {off_m:.2f} m away, the route {route_m:.0f} m"
+    nearest = f"the nearest, of {there}, is {off_m:.2f} m away, the route {route_m:.0f} m"
+    return f"no corner within {reach_m:g} m: {nearest}"
 
 
 def _joint(compared: Sequence[CheckedPoint], joint: JointCovariance) -> FloatArray:
@@ -244,7 +248,7 @@ def _joint(compared: Sequence[CheckedPoint], joint: JointCovariance) -> FloatArr
 
 
 def write_check_points(table: CheckTable, path: Path) -> None:
-    """Write the table as CSV to ``path``, a row a check point: those compared, then the others with the reason."""
+    """Write the table as CSV to ``path``: a row a check point, those compared first, then the others."""
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(COLUMNS)

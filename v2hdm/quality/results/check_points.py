@@ -33,8 +33,8 @@ def check_points(table: CheckTable) -> Finding:
     value, limit = _ratio(table.squared, len(off_m)), _limit(len(off_m))
     if value <= limit:
         says = (
-            f"{len(table.compared)} of {total} lie {100 * table.rmse_m:.1f} cm off the map (RMSE), as far as map "
-            "and survey state"
+            f"{len(table.compared)} of {total} lie {100 * table.rmse_m:.1f} cm off the map (RMSE), as far as "
+            "map and survey state"
         )
         return Finding(CHECK, Status.PASS, value, limit, "", says, "map")
     status, says = _explained(table, off_m, covariance)
@@ -45,16 +45,16 @@ def check_frame(found: Mapping[str, int]) -> list[Finding]:
     """A survey that fits the map better when it is read in another way than stated.
 
     Args:
-        found: points that have a corner within reach, as stated ("") and by other ways to read the file.
+        found: corners that have a point within reach, as stated ("") and by other ways to read the file.
     """
     others = {says: count for says, count in found.items() if says}
     likeliest = max(others, key=lambda says: others[says], default="")
     stated = found.get("", 0)
     if others.get(likeliest, 0) <= stated:
-        return [passed(FRAME, "survey", f"{stated} points have a corner of the map within reach", stated)]
+        return [passed(FRAME, "survey", f"{stated} corners of the map have a point within reach", stated)]
     says = (
-        f"{stated} points have a corner of the map within reach, and {others[likeliest]} would {likeliest}: mend "
-        "the file or mapping.survey.crs"
+        f"{stated} corners of the map have a point within reach, and {others[likeliest]} would {likeliest}: "
+        "mend the file or mapping.survey.crs"
     )
     return [Finding(FRAME, Status.WARN, float(stated), None, "", says, "survey")]
 
@@ -71,8 +71,8 @@ def _explained(table: CheckTable, off_m: FloatArray, covariance: FloatArray) -> 
     stated_m = float(np.sqrt(np.trace(covariance) / len(table.compared)))
     return Status.FAIL, (
         f"they lie {100 * table.rmse_m:.1f} cm off the map (RMSE), where map and survey state "
-        f"{100 * stated_m:.1f} cm: the map is worse than it says; state larger pose_noise, drift above all, and "
-        "let some of them be control points"
+        f"{100 * stated_m:.1f} cm: the map is worse than it says; state larger pose_noise, drift above all, "
+        "and let some of them be control points"
     )
 
 
@@ -85,9 +85,9 @@ def _all_alike(off_m: FloatArray, covariance: FloatArray) -> _Fault:
     weighed = np.linalg.solve(covariance, shift)
     by_m = np.linalg.solve(shift.T @ weighed, weighed.T @ off_m)
     says = (
-        f"the map lies {100 * by_m[0]:+.1f} cm in x and {100 * by_m[1]:+.1f} cm in y of all of them: survey and "
-        "poses have another datum or origin, or the receiver drifts by more than pose_noise says; let some of "
-        "them be control points"
+        f"the map lies {100 * by_m[0]:+.1f} cm in x and {100 * by_m[1]:+.1f} cm in y of all of them: survey "
+        "and poses have another datum or origin, or the receiver drifts by more than pose_noise says; let "
+        "some of them be control points"
     )
     return squared(off_m - shift @ by_m, covariance), (Status.FAIL, says)
 
@@ -97,8 +97,8 @@ def _without(table: CheckTable, k: int) -> _Fault:
     kept = np.delete(np.arange(2 * len(table.compared)), [2 * k, 2 * k + 1])
     one = table.compared[k]
     says = (
-        f"{one.point.id} lies {100 * one.distance_m:.1f} cm off its corner of {one.kind} {one.marking_id}, the "
-        "others where they should: measure it anew, and look at the paint there"
+        f"{one.point.id} lies {100 * one.distance_m:.1f} cm off its corner of {one.kind} {one.marking_id}, "
+        "the others where they should: measure it anew, and look at the paint there"
     )
     rest = squared(table.off_m.ravel()[kept], table.covariance_m2[np.ix_(kept, kept)]) if len(kept) else 0.0
     return rest, (Status.WARN, says)
