@@ -12,6 +12,7 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
+import yaml
 
 from v2hdm import __version__
 from v2hdm.door import version_line
@@ -148,3 +149,10 @@ def test_a_version_is_told_where_libraries_are_missing(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(metadata, "version", absent)
     assert version_line().startswith(f"v2hdm {__version__}, no torch, no onnxruntime, no numba, weights ")
+
+
+def test_every_file_that_states_the_version_states_the_same() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert project["version"] == citation["version"] == __version__
+    assert citation["license"] == project["license"]

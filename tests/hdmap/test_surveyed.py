@@ -51,3 +51,12 @@ def test_no_corner_has_two_points_and_none_is_out_of_reach() -> None:
     points = np.array([[0.05, 0.0], [0.01, 0.0], [9.3, 0.0]])
     assert match(points, corners, 0.25, covariance(3, 0.0)).tolist() == [-1, 0, -1]
     assert match(points[:0], corners, 0.25, np.zeros((0, 0))).tolist() == []
+
+
+def test_a_survey_of_another_datum_finds_its_corners_in_a_map_that_states_no_drift() -> None:
+    corners, rng, right = dashes(), np.random.default_rng(6), []
+    for _ in range(50):
+        chosen = 4 * rng.permutation(12)[:8] + rng.integers(4, size=8)
+        points = corners[chosen] - np.array([0.12, -0.12]) + OWN_M * rng.standard_normal((8, 2))
+        right.append((match(points, corners, 0.25, covariance(8, 0.0)) == chosen).all())
+    assert np.mean(right) > 0.9

@@ -88,7 +88,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
     corners = np.array([seen[n // 2].corners_map[2 * (n % 2)] for n in chosen])
     kinds = [seen[n // 2].kind for n in chosen]
     (site.folder / "points.csv").write_text(survey(corners, kinds, drive.origin))
-    (site.folder / "moved.csv").write_text(survey(corners, kinds, drive.origin, check_off_m=-0.12))
+    (site.folder / "moved.csv").write_text(survey(corners, kinds, drive.origin, check_off_m=-0.08))
     only_check = (site.folder / "points.csv").read_text().replace("control", "check")
     (site.folder / "check.csv").write_text(only_check)
     return site

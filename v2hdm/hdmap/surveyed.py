@@ -71,7 +71,7 @@ def _first(corner: IntArray, off_m: FloatArray, covariance: FloatArray, chance: 
         given = _unlikely(free, (off_m - mean[:, None])[others], left[others])
         total = float(alone[k, choice] + np.minimum(given.min(axis=1), chance).sum())
         if best is None or total < best[0]:
-            best = total, (k, choice, bool(alone[k, choice] < chance))
+            best = total, (k, choice, total < chance * len(corner))
     return None if best is None else best[1]
 
 
