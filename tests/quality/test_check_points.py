@@ -53,6 +53,12 @@ def test_a_map_worse_than_it_says_fails() -> None:
     assert "the map is worse than it says" in finding.says
 
 
+def test_a_survey_that_fits_the_map_nowhere_is_told() -> None:
+    (finding,) = check_frame({"": 0, "with x_m and y_m swapped": 0})
+    assert finding.status is Status.WARN
+    assert "no corner of the map has a surveyed point within reach" in finding.says
+
+
 def test_no_point_within_reach_is_told_with_the_distance() -> None:
     finding = check_points(checked(yard(), point(30.5, 8.0, "Q1")))
     assert finding.status is Status.WARN
@@ -64,7 +70,6 @@ def test_no_point_within_reach_is_told_with_the_distance() -> None:
     ("counts", "status"),
     [
         ({"": 9, "with x_m and y_m swapped": 1}, Status.PASS),
-        ({"": 0, "with x_m and y_m swapped": 0}, Status.PASS),
         ({"": 1, "with x_m and y_m swapped": 7, "in feet": 2}, Status.WARN),
         ({"": 3}, Status.PASS),
     ],

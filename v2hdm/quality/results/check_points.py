@@ -42,7 +42,7 @@ def check_points(table: CheckTable) -> Finding:
 
 
 def check_frame(found: Mapping[str, int]) -> list[Finding]:
-    """A survey that fits the map better when it is read in another way than stated.
+    """A survey that fits the map not at all, or better when it is read in another way than stated.
 
     Args:
         found: corners that have a point within reach, as stated ("") and by other ways to read the file.
@@ -50,6 +50,12 @@ def check_frame(found: Mapping[str, int]) -> list[Finding]:
     others = {says: count for says, count in found.items() if says}
     likeliest = max(others, key=lambda says: others[says], default="")
     stated = found.get("", 0)
+    if not stated and not others.get(likeliest, 0):
+        says = (
+            "no corner of the map has a surveyed point within reach: mind datum, zone and units, and "
+            "mapping.survey.reach_m"
+        )
+        return [Finding(FRAME, Status.WARN, 0.0, None, "", says, "survey")]
     if others.get(likeliest, 0) <= stated:
         return [passed(FRAME, "survey", f"{stated} corners of the map have a point within reach", stated)]
     says = (
