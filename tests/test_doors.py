@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
+import tomllib
+from importlib import metadata
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
+import yaml
+
+from v2hdm import __version__
+from v2hdm.door import version_line
 
 ROOT = Path(__file__).parents[1]
 PRESSED_TWICE = """
@@ -100,3 +108,51 @@ def test_openmp_waits_without_spinning_unless_the_user_says_so(
         monkeypatch.setenv("OMP_WAIT_POLICY", given)
     (tmp_path / "torch.py").write_text("import os; raise SystemExit(os.environ['OMP_WAIT_POLICY'])")
     assert run_door(tmp_path, "v2hdm.map", "+run=port2").stderr.strip() == expected
+
+
+SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+
+
+def test_every_console_script_is_a_door_and_resolves_to_a_callable() -> None:
+    assert {"v2hdm-map", "v2hdm-detect", "v2hdm-check", "v2hdm-export"} <= set(SCRIPTS)
+    for name, target in SCRIPTS.items():
+        assert callable(EntryPoint(name, target, "console_scripts").load()), name
+        assert (ROOT / "v2hdm" / f"{name.removeprefix('v2hdm-')}.py").is_file(), name
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_every_door_tells_its_version_as_a_module_and_as_a_script(script: str) -> None:
+    door = script.removeprefix("v2hdm-")
+    module, _, function = SCRIPTS[script].partition(":")
+    as_script = (
+        f"import sys; sys.argv[0] = {script!r}; from {module} import {function} as run; sys.exit(run())"
+    )
+    told = {
+        subprocess.run(
+            [sys.executable, *how, "--version"],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=True,
+        ).stdout
+        for how in (["-m", f"v2hdm.{door}"], ["-c", as_script])
+    }
+    line = f"v2hdm {re.escape(__version__)}, (torch|no torch).*, (onnxruntime|no onnx).*, (numba|no numba).*"
+    (only,) = told
+    assert re.fullmatch(line + ", weights [0-9a-f]{8}\n", only)
+
+
+def test_a_version_is_told_where_libraries_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(name: str) -> str:
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "version", absent)
+    assert version_line().startswith(f"v2hdm {__version__}, no torch, no onnxruntime, no numba, weights ")
+
+
+def test_every_file_that_states_the_version_states_the_same() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert project["version"] == citation["version"] == __version__
+    assert citation["license"] == project["license"]

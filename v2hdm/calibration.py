@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from v2hdm.door import EXIT_FAILED_VERDICT, answer_signals, open_door
+from v2hdm.door import EXIT_FAILED_VERDICT, ShowVersion, answer_signals, open_door
 
 if TYPE_CHECKING:
     from v2hdm.quality.movement import Movement
@@ -90,6 +90,7 @@ def _as_json(one: Movement) -> dict[str, object]:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m v2hdm.calibration", description=__doc__.split("\n\n")[0])
+    parser.add_argument("--version", action=ShowVersion)
     parser.add_argument("before", type=Path, help="result folder or calibration file of the earlier drive")
     parser.add_argument("after", type=Path, help="the same of the later drive")
     parser.add_argument("--json", action="store_true", help="print one JSON list instead of lines")

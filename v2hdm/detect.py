@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.door import answer_signals, open_door
+from v2hdm.door import ShowVersion, answer_signals, open_door
 
 _ROUGH_MOUNTING = (1.6, 5.0, 60.0)
 _INTERRUPTED = "interrupted before the last image; no --output was written"
@@ -31,6 +31,7 @@ def _watch(arguments: Sequence[str] | None) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m v2hdm.detect", description=__doc__.split("\n\n")[0])
+    parser.add_argument("--version", action=ShowVersion)
     parser.set_defaults(rough_mounting=_ROUGH_MOUNTING)
     parser.add_argument(
         "source", help="an image, a folder of images, a drive folder, a video file, or a camera's index"

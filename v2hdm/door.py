@@ -6,18 +6,28 @@ one line while torch is still being loaded, too.
 
 from __future__ import annotations
 
+import argparse
+import json
 import os
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from importlib import metadata
+from pathlib import Path
 
+from v2hdm import __version__
 from v2hdm.errors import V2hdmError
 
 EXIT_USER_ERROR = 2
 EXIT_FAILED_VERDICT = 3
 _ONE_PRESS_S = 2.0
 _OURS = ("v2hdm", "models", "train", "export")
+_TOLD = ("torch", "onnxruntime", "numba")
+"""Libraries whose version decides what a run gives, and how fast."""
+
+_WEIGHTS_DIGITS = 8
+"""Of the SHA-256 of the shipped network: enough to tell any two."""
 
 
 def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[], int | None]) -> int:
@@ -84,3 +94,38 @@ def answer_signals() -> None:
 
     signal.signal(signal.SIGINT, interrupt)
     signal.signal(signal.SIGTERM, interrupt)
+
+
+def version_line() -> str:
+    """What is installed, in one line: this package, the libraries that count, and the detector's weights.
+
+    Nothing of it is imported: it answers where an install is broken, too.
+    """
+    told = [f"v2hdm {__version__}"]
+    for name in _TOLD:
+        try:
+            told.append(f"{name} {metadata.version(name)}")
+        except metadata.PackageNotFoundError:
+            told.append(f"no {name}")
+    return ", ".join([*told, _weights()])
+
+
+def _weights() -> str:
+    manifest = Path(__file__).parent / "detection" / "weights" / "manifest.json"
+    try:
+        network = json.loads(manifest.read_text(encoding="utf-8"))["files"]["default.onnx"]["sha256"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return "no weights"
+    return f"weights {network[:_WEIGHTS_DIGITS]}"
+
+
+class ShowVersion(argparse.Action):
+    """``--version``: say what is installed, and end."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, **_: object) -> None:
+        super().__init__(option_strings, argparse.SUPPRESS, nargs=0, help="say what is installed, and end")
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        """Say it."""
+        print(version_line())
+        parser.exit()

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.door import answer_signals, open_door
+from v2hdm.door import ShowVersion, answer_signals, open_door
 
 _INTERRUPTED = "interrupted; files that were named are whole"
 
@@ -78,6 +78,7 @@ def _export_calibration(parsed: argparse.Namespace, folder: Path) -> list[Path]:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m v2hdm.export", description=__doc__.split("\n\n")[0])
+    parser.add_argument("--version", action=ShowVersion)
     parser.add_argument(
         "source", type=Path, metavar="MAP", help="map.geojson, map.gpkg or calibration_<camera>.yaml"
     )

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.door import EXIT_FAILED_VERDICT, answer_signals, open_door
+from v2hdm.door import EXIT_FAILED_VERDICT, ShowVersion, answer_signals, open_door
 
 _INTERRUPTED = "interrupted; nothing was written"
 
@@ -30,6 +30,7 @@ def _localise(parsed: argparse.Namespace) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m v2hdm.localize", description=__doc__.split("\n\n")[0])
+    parser.add_argument("--version", action=ShowVersion)
     parser.add_argument("map", type=Path, help="result folder of v2hdm.map, or the map.geojson in it")
     parser.add_argument("drive", type=Path, help="the drive's folder; see docs/drive-format.md")
     parser.add_argument(

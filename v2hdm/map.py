@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import sys
 
-from v2hdm.door import EXIT_FAILED_VERDICT, answer_signals, open_door
+from v2hdm.door import EXIT_FAILED_VERDICT, answer_signals, open_door, version_line
 
 _INTERRUPTED = "interrupted; finished renderings are kept in the cache, no result was written"
 _RUNS = "choose a run (+run=port1, +run=port2, +run=kitti drive.path=...) or set it on the command line"
 
 
 def main() -> int:
-    """Run the door, whose arguments are Hydra overrides (``--help`` lists them).
+    """Run the door, whose arguments are Hydra overrides (``--help`` lists them), or ``--version``.
 
     The exit code is 0, 2 where a user must mend something, or 3 where a verdict is FAIL.
     """
+    if "--version" in sys.argv[1:]:  # Hydra would tell its own
+        print(version_line())
+        return 0
     return open_door("v2hdm.map", "map", _INTERRUPTED, _map)
 
 

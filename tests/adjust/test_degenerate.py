@@ -116,10 +116,11 @@ def bad_problems():
         "intrinsic has shape": replace(problem, intrinsic=np.eye(3)),
         "twist_vehicle has shape": replace(problem, twist_vehicle=np.zeros((3, 6))),
         "control point 1 names corner -1": replace(
-            problem, control=ControlPoints(np.array([0, -1]), np.zeros((2, 2)), np.ones(2))
+            problem, control=ControlPoints(np.array([0, -1]), np.zeros((2, 2)), np.ones((2, 2)))
         ),
         "control point 0 is not finite": replace(
-            problem, control=ControlPoints(np.array([0, 1]), np.zeros((2, 2)), np.array([0.0, 1.0]))
+            problem,
+            control=ControlPoints(np.array([0, 1]), np.zeros((2, 2)), np.array([[1.0, 0.0], [1.0, 1.0]])),
         ),
         "there is no observation": with_observations(
             problem,
@@ -253,7 +254,7 @@ def test_in_utm_coordinates_the_solution_is_the_same(options):
     """Half a million metres east and five millions north: what is left of doubles there is a nanometre."""
     scene = make_scene(3, frames=40, jitter=PoseSigma(), start_error_deg=3.0)
     utm = np.array([500_000.0, 5_500_000.0])
-    control = ControlPoints(np.array([2]), scene.corners_map[2:3], np.array([0.01]))
+    control = ControlPoints(np.array([2]), scene.corners_map[2:3], np.array([[0.01, 0.02]]))
     here = replace(scene.problem, control=control)
     poses = here.map_from_vehicle.copy()
     poses[:, :2, 3] += utm

@@ -53,7 +53,7 @@ def known_beside(problem: Problem, truth: np.ndarray) -> Problem:
     return replace(
         problem,
         lengths=KnownLengths(first, first + 1, length_m, np.full(len(first), 0.003)),
-        control=ControlPoints(surveyed, truth[surveyed], np.full(len(surveyed), 0.005)),
+        control=ControlPoints(surveyed, truth[surveyed], np.tile([0.005, 0.008], (len(surveyed), 1))),
     )
 
 

@@ -39,7 +39,9 @@ def example(*, lengths=True, frames=40):
     first = np.concatenate([diamonds, diamonds + 1, diamonds[:3] + 2])
     second = np.concatenate([diamonds + 1, diamonds + 2, diamonds[:3] + 3])
     known = KnownLengths(first, second, np.full(len(first), 0.5), np.full(len(first), 0.004))
-    control = ControlPoints(np.array([3, 17]), scene.corners_map[[3, 17]] + 0.01, np.array([0.02, 0.05]))
+    control = ControlPoints(
+        np.array([3, 17]), scene.corners_map[[3, 17]] + 0.01, np.array([[0.02, 0.03], [0.05, 0.01]])
+    )
     return replace(
         problem,
         observations=replace(problem.observations, covariance_px=root @ root.transpose(0, 2, 1)),

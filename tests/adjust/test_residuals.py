@@ -33,7 +33,9 @@ POSES = PoseSigma(position_drift=Drift(0.016, 10.0), heading_drift=Drift(0.0006,
 def example(pose_states=POSE_STATES, size=0.0, max_range_m=15.0, frames=14, clock=False):
     scene = make_scene(3, frames=frames, jitter=POSES, max_range_m=max_range_m)
     twist = np.tile([5.0, 0.1, 0.0, 0.0, 0.0, 0.4], (frames, 1)) * np.linspace(0.8, 1.2, frames)[:, None]
-    control = ControlPoints(np.array([2, 5]), scene.corners_map[[2, 5]] + 0.01, np.array([0.01, 0.02]))
+    control = ControlPoints(
+        np.array([2, 5]), scene.corners_map[[2, 5]] + 0.01, np.array([[0.01, 0.02], [0.02, 0.005]])
+    )
     lengths = KnownLengths(np.array([0, 7, 6]), np.array([1, 4, 7]), np.full(3, 0.5), np.full(3, 0.01))
     problem = replace(scene.problem, twist_vehicle=twist, control=control, lengths=lengths)
     arrays = make_arrays(problem, pose_states, "cpu", clock)

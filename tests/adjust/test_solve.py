@@ -254,7 +254,7 @@ def test_two_control_points_undo_the_drift_of_the_receiver():
     sigma = PoseSigma(position_m=0.05, position_drift=Drift(0.05, 300.0))
     scene = make_scene(15, frames=60, jitter=sigma, prior_sigma_m=0.005)
     chosen = np.array([0, 5, scene.problem.corner_count - 2])
-    control = ControlPoints(chosen, scene.corners_map[chosen], np.full(3, 0.002))
+    control = ControlPoints(chosen, scene.corners_map[chosen], np.full((3, 2), 0.002))
     free, tied = solve(scene.problem), solve(replace(scene.problem, control=control))
     assert tied.status is Status.CONVERGED
     assert scene.corner_rmse_m(tied.corners_map) < 0.5 * scene.corner_rmse_m(free.corners_map)

@@ -107,7 +107,7 @@ def test_one_surveyed_point_off_is_told_from_all_off() -> None:
     chosen = np.arange(0, len(street.corners_map), 12)
     points = street.corners_map[chosen].copy()
     points[1] += (0.2, 0.0)
-    control = ControlPoints(chosen, points, np.full(len(chosen), 0.01))
+    control = ControlPoints(chosen, points, np.full((len(chosen), 2), 0.01))
     one = suspects(p := replace(street.problem, control=control), solve(p, OPTIONS))[0]
     assert (one.fault, one.item) == (Fault.CONTROL, 1)
     assert one.value == pytest.approx(0.2, abs=0.05)

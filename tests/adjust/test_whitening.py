@@ -29,7 +29,7 @@ def test_where_all_residuals_vanish_the_whitened_hessian_is_the_identity(pose_st
     scene = make_scene(2, frames=40, pixel_sigma=0.0, jitter=None, prior_sigma_m=0.03)
     centre = -np.einsum("cji,cj->ci", scene.cam_from_vehicle[:, :3, :3], scene.cam_from_vehicle[:, :3, 3])
     twist = np.tile([5.0, 0.0, 0.0, 0.0, 0.0, 0.3], (40, 1))
-    control = ControlPoints(np.array([3]), scene.corners_map[3:4], np.array([0.01]))
+    control = ControlPoints(np.array([3]), scene.corners_map[3:4], np.array([[0.01, 0.03]]))
     first, second = np.array([8, 9, 20, 12]), np.array([9, 11, 14, 13])
     length_m = np.linalg.norm(scene.corners_map[first] - scene.corners_map[second], axis=1)
     problem = replace(

@@ -242,7 +242,7 @@ def driven_again(scene: Scene, passes: int) -> Scene:
 def surveyed(scene: Scene, count: int) -> Scene:
     """So many corners, evenly along the route, surveyed to 5 mm."""
     corner = np.linspace(0, scene.problem.corner_count - 1, count).round().astype(np.int64)
-    control = ControlPoints(corner, scene.corners_map[corner], np.full(count, 0.005))
+    control = ControlPoints(corner, scene.corners_map[corner], np.full((count, 2), 0.005))
     return replace(scene, problem=replace(scene.problem, control=control))
 
 

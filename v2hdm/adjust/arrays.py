@@ -94,7 +94,7 @@ class Arrays:
         clock_twist: (J, 6, Q) how the vehicle moves with a camera's clock offset; Q is 1, or 0 where no
             offset is estimated.
         clock_information_root: 1 / sigma of a clock offset.
-        control, control_information: surveyed positions (N, 2) of the corners and 1 / sigma^2 (N,), 0 where
+        control, control_information: surveyed positions (N, 2) of the corners and 1 / sigma^2 (N, 2), 0 where
             there is no survey.
         lengths: known distances between corners.
         camera_prior: what earlier markings say of the cameras, None if nothing.

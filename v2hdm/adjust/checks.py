@@ -50,8 +50,8 @@ def _check_control(problem: Problem) -> None:
     if control is None:
         return
     count = len(control.corner)
-    if np.shape(control.points_map) != (count, 2) or np.shape(control.sigma_m) != (count,):
-        raise AdjustError(f"control points: {count} corners need as many points_map (x, y) and sigma_m")
+    if np.shape(control.points_map) != (count, 2) or np.shape(control.sigma_m) != (count, 2):
+        raise AdjustError(f"control points: {count} corners need as many points_map and sigma_m (x, y)")
     wrong = np.flatnonzero((control.corner < 0) | (control.corner >= problem.corner_count))
     if len(wrong):
         raise AdjustError(
@@ -59,7 +59,7 @@ def _check_control(problem: Problem) -> None:
         )
     if len(np.unique(control.corner)) < count:
         raise AdjustError("two control points name the same corner: keep one of them")
-    wrong = np.flatnonzero(~(np.isfinite(control.points_map).all(1) & (control.sigma_m > 0)))
+    wrong = np.flatnonzero(~(np.isfinite(control.points_map) & (control.sigma_m > 0)).all(1))
     if len(wrong):
         raise AdjustError(f"control point {wrong[0]} is not finite or its sigma_m is not above 0")
 

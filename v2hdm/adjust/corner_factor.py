@@ -112,7 +112,7 @@ def factorise_corners(
         damping: added to the diagonal, relative to it.
     """
     surveyed = arrays.control_information[corners]
-    xx, yx, yy = blocks[0] + surveyed, blocks[1], blocks[2] + surveyed
+    xx, yx, yy = blocks[0] + surveyed[:, 0], blocks[1], blocks[2] + surveyed[:, 1]
     grow = 1 + damping
     lower = cholesky_2x2(xx * grow + CORNER_FLOOR, yx, yy * grow + CORNER_FLOOR)
     joined = arrays.joined[corners]

@@ -176,8 +176,8 @@ def _root_information(covariance_px: FloatArray, focal: FloatArray) -> FloatArra
 
 
 def _control(problem: Problem) -> tuple[FloatArray, FloatArray]:
-    """Surveyed positions (N, 2) and 1 / sigma^2 (N,) of the problem's corners."""
-    points, information = np.zeros((problem.corner_count, 2)), np.zeros(problem.corner_count)
+    """Surveyed positions (N, 2) and 1 / sigma^2 (N, 2) of the problem's corners."""
+    points, information = np.zeros((problem.corner_count, 2)), np.zeros((problem.corner_count, 2))
     if problem.control is not None:
         points[problem.control.corner] = problem.control.points_map
         information[problem.control.corner] = 1 / problem.control.sigma_m**2

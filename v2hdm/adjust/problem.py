@@ -83,7 +83,7 @@ class Drift:
 
 @dataclass(frozen=True)
 class ControlPoints:
-    """M corners that a survey has measured: ``corner`` (M,), ``points_map`` (M, 2) and ``sigma_m`` (M,)."""
+    """M corners that a survey has measured: ``corner`` (M,), ``points_map`` and ``sigma_m`` (M, 2)."""
 
     corner: IntArray
     points_map: FloatArray

@@ -236,7 +236,7 @@ def corner_priors(arrays: Arrays, corners_map: Tensor) -> tuple[Tensor, Tensor]:
     """What the survey and what the known lengths cost."""
     off = corners_map - arrays.control
     length, _ = length_residual(arrays, corners_map)
-    return (off.square().sum(1) * arrays.control_information).sum() / 2, length.square().sum() / 2
+    return (off.square() * arrays.control_information).sum() / 2, length.square().sum() / 2
 
 
 def by_corner_priors(arrays: Arrays, estimate: Estimate, corners: slice) -> Tensor:
@@ -245,7 +245,7 @@ def by_corner_priors(arrays: Arrays, estimate: Estimate, corners: slice) -> Tens
     Corners that lengths join are all among them, or none.
     """
     off = estimate.corners_map[corners] - arrays.control[corners]
-    gradient = off * arrays.control_information[corners, None]
+    gradient = off * arrays.control_information[corners]
     if bool(arrays.joined[corners].any()):
         known = arrays.lengths
         residual, by_first = length_residual(arrays, estimate.corners_map)

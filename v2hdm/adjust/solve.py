@@ -220,6 +220,6 @@ def _variance_factors(
     of_priors = 2 * sum(float(value) for name, value in terms.items() if name != "observations")
     centres = int((arrays.centre_information_root > 0).sum())
     surveyed = int((arrays.control_information > 0).sum())
-    known = 2 * surveyed + centres + len(arrays.lengths.first)
+    known = surveyed + centres + len(arrays.lengths.first)
     free = 2 * arrays.corner_count + 6 * arrays.camera_count - known
     return variance_factors(squared, of_priors, free, scale)

@@ -157,7 +157,7 @@ class _Bench:
         views = [observe(run, whitening.table, estimate.corners_map) for run in arrays.runs()]
         root = torch.cat([whitening.weight(view) for view in views]).sqrt()
         length, _ = length_residual(arrays, estimate.corners_map)
-        off = (estimate.corners_map - arrays.control) * arrays.control_information.sqrt()[:, None]
+        off = (estimate.corners_map - arrays.control) * arrays.control_information.sqrt()
         residuals = _Column(
             torch.cat([view.residual for view in views], dim=1) * root,
             centre_residual(arrays, estimate),
@@ -181,7 +181,7 @@ class _Bench:
                 tally.pull(run, view, column.observations[:, run.observations])
         by_corner = tally.by_corner
         if column.control is not None:
-            by_corner = by_corner + column.control * arrays.control_information.sqrt()[:, None]
+            by_corner = by_corner + column.control * arrays.control_information.sqrt()
         if column.length is not None:
             _, by_first = length_residual(arrays, estimate.corners_map)
             pull = by_first * column.length[:, None]
@@ -265,8 +265,8 @@ def _control_points(problem: Problem, solution: Solution) -> Iterator[Suspect]:
     covariance = solution.corner_covariance(control.corner[:, None])
     for m, (point, sigma_m) in enumerate(zip(control.points_map, control.sigma_m, strict=True)):
         off = solution.corners_map[control.corner[m]] - point
-        expected = sigma_m**2 * np.eye(2) - covariance[m]
-        if np.linalg.eigvalsh(expected).min() <= _LEAST_TOLD * sigma_m**2:
+        expected = np.diag(sigma_m**2) - covariance[m]
+        if np.linalg.eigvalsh(expected).min() <= _LEAST_TOLD * np.max(sigma_m) ** 2:
             continue
         gain = float(off @ np.linalg.solve(expected, off))
         # Without the point its corner would lie farther from it, by the share that it had of the information.
@@ -368,7 +368,7 @@ def _survey(camera: int, axis: int) -> Callable[[_Bench], _Column]:
 def _datum(axis: int) -> Callable[[_Bench], _Column]:
     def column(bench: _Bench) -> _Column:
         out = torch.zeros_like(bench.arrays.control)
-        out[:, axis] = -bench.arrays.control_information.sqrt()
+        out[:, axis] = -bench.arrays.control_information[:, axis].sqrt()
         return _Column(control=out)
 
     return column

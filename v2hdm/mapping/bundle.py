@@ -269,7 +269,7 @@ def _known(
 
     ``rig`` is good enough to tell length from width, and one corner from the next.
     """
-    if not model.sizes.by_class_m and not model.survey.points_map:
+    if not model.sizes.by_class_m and not model.survey.control:
         return None, None
     located = locate(sightings, rig)
     located = replace(located, valid=located.valid & usable, informs=located.informs & usable)
@@ -278,7 +278,7 @@ def _known(
     kinds = group_kinds(association, sightings)
     return (
         known_lengths(model.sizes, [sightings.kinds[k] for k in kinds], points_map, corner_index),
-        control_points(model.survey, points_map, corner_index),
+        control_points(model.survey, points_map, corner_index, model.pose_sigma),
     )
 
 

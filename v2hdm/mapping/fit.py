@@ -9,6 +9,7 @@ import numpy as np
 from v2hdm.adjust import Fault, Suspect
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.evidence import CELLS, WINDOW_OBSERVATIONS, CameraFit, Contradiction
+from v2hdm.mapping.survey import name_of
 from v2hdm.records import FloatArray
 
 MEDIAN_SQUARED = 2 * float(np.log(2))
@@ -47,10 +48,11 @@ def length_of(bundle: Bundle, item: int) -> float:
     return float(np.unique(lengths.length_m)[item]) if lengths is not None else float("nan")
 
 
-def point_of(bundle: Bundle, item: int) -> FloatArray:
-    """The surveyed point (2,) that a suspect's ``item`` is."""
+def point_of(bundle: Bundle, item: int) -> str:
+    """The name of the surveyed point that a suspect's ``item`` is."""
     control = bundle.problem.control
-    return control.points_map[item] if control is not None else np.full(2, np.nan)
+    assert control is not None
+    return name_of(bundle.model.survey, control.points_map[item])
 
 
 def camera_fits(bundle: Bundle) -> dict[str, CameraFit]:
@@ -106,6 +108,5 @@ def _about(bundle: Bundle, suspect: Suspect) -> str:
         length_m = length_of(bundle, suspect.item)
         return f"{', '.join(sizes_of(bundle, length_m))} {length_m:.2f} m"
     if suspect.fault is Fault.CONTROL:
-        x, y = point_of(bundle, suspect.item)
-        return f"({x:.2f}, {y:.2f})"
+        return point_of(bundle, suspect.item)
     return ""

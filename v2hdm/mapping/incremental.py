@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from v2hdm.adjust import Observations
+from v2hdm.adjust import Observations, PoseSigma
 from v2hdm.adjust.incremental import IncrementalMap, Sighted
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.quadrilateral import align, diameters
@@ -201,7 +201,9 @@ class IncrementalMapper:
             sighted = replace(
                 sighted,
                 lengths=known_lengths(self._options.known_sizes, [kind], turned_map[None], numbers[None]),
-                control=control_points(self._options.survey, turned_map[None], numbers[None]),
+                control=control_points(
+                    self._options.survey, turned_map[None], numbers[None], PoseSigma(self._floor_m)
+                ),
             )
         count = len(self._places)
         number = count if marking is None else marking

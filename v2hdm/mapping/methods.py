@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from v2hdm.adjust import Status, observability
+from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.growth import grow_map
@@ -21,7 +22,7 @@ from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.naive import naive_markings
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.outlines import map_symbols
-from v2hdm.mapping.outputs import adjusted_poses, clock_offsets
+from v2hdm.mapping.outputs import JointCorners, adjusted_poses, clock_offsets
 from v2hdm.mapping.remedy import Inputs, Outcome, optimise
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.sightings.table import camera_of
@@ -63,6 +64,8 @@ def run_methods(
     """
     options = options or MappingOptions()
     check_options(options)
+    if options.survey.file is not None:
+        raise ConfigError(f"mapping.survey.file is {options.survey.file!r}: read it first, give its points")
     tell = progress or _silent
     tell("linking sightings")
     given = Inputs(drive, detections, cameras, options)
@@ -126,9 +129,9 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
         _log.warning(
             "%d of %d surveyed points are of no use, no corner of the map is nearest to them within %g m: %s",
             len(lost),
-            len(options.survey.points_map),
+            len(options.survey.control),
             options.survey.reach_m,
-            ", ".join(f"({x:.2f}, {y:.2f})" for x, y in lost),
+            ", ".join(lost),
         )
     ground = ground_by_rig(drive, cameras, optimised.bundle.rig)
     lanes = _lanes(inputs, ground)
@@ -158,6 +161,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
         evidence=outcome.evidence,
         poses=adjusted_poses(outcome),
         clocks=clock_offsets(outcome),
+        corners=JointCorners(optimised),
     )
 
 

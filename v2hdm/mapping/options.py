@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, is_dataclass
+from dataclasses import dataclass, field, is_dataclass, replace
 
 from v2hdm.adjust.problem import LOSSES
 from v2hdm.errors import ConfigError
@@ -90,17 +90,55 @@ class SizeOptions:
 
 
 @dataclass(kw_only=True)
+class ControlOptions:
+    """A corner of a marking that a survey has measured.
+
+    ``id`` is its name in the survey, ``position_map`` its x and y and ``sigma_m`` theirs, m.
+    """
+
+    id: str
+    position_map: list[float]
+    sigma_m: list[float]
+
+
+@dataclass(kw_only=True)
 class SurveyOptions:
     """Corners of markings that a survey has measured, as factors of the joint solve.
 
-    ``points_map`` are their x and y, m, in the frame of the recorded poses, as in ``[[3.21, 4.05]]``, known
-    up to ``sigma_m``. Each ties down the nearest corner of the map within ``reach_m``. Nothing else can tell
-    the drift of a receiver from the ground: no camera sees what moves the vehicle and its map alike.
+    ``file`` is a CSV of control points and of check points, which are held out (docs/survey.md); ``crs`` is
+    the projected system of its eastings and northings, such as ``EPSG:32632``, and ``geoid_m`` the height of
+    the geoid above the ellipsoid where its heights count from the sea.
+    ``points_map`` are x and y of control points, m, in the frame of the recorded poses, as in
+    ``[[3.21, 4.05]]``; ``points`` are such with names and sigmas of their own. The others are known up to
+    ``sigma_m``. Each ties down the nearest corner of the map within ``reach_m``. Nothing else can tell the
+    drift of a receiver from the ground: no camera sees what moves the vehicle and its map alike.
     """
 
+    file: str | None = None
+    crs: str | None = None
+    geoid_m: float | None = None
     points_map: list[list[float]] = field(default_factory=list)
+    points: list[ControlOptions] = field(default_factory=list)
     sigma_m: float = 0.01
     reach_m: float = 0.25
+
+    @property
+    def control(self) -> tuple[ControlOptions, ...]:
+        """All control points; those of ``points_map`` are named after where they lie."""
+        sigma_m = [self.sigma_m, self.sigma_m]
+        unnamed = (
+            ControlOptions(id=f"({x:.2f}, {y:.2f})", position_map=[x, y], sigma_m=sigma_m)
+            for x, y in self.points_map
+        )
+        return (*unnamed, *self.points)
+
+    def without(self, name: str) -> SurveyOptions:
+        """The survey without the control point of that name."""
+        return self.only([point for point in self.control if point.id != name])
+
+    def only(self, points: Sequence[ControlOptions]) -> SurveyOptions:
+        """The survey with these control points, and no file left to read."""
+        return replace(self, file=None, points_map=[], points=list(points))
 
 
 @dataclass(kw_only=True)
@@ -195,6 +233,16 @@ def _check_survey(options: MappingOptions) -> None:
     for number, point in enumerate(options.survey.points_map):
         if len(point) != 2 or not all(math.isfinite(value) for value in point):
             raise ConfigError(f"mapping.survey.points_map[{number}] is {list(point)}; give x and y in m.")
+    for number, one in enumerate(options.survey.points):
+        key = f"mapping.survey.points[{number}]"
+        if len(one.position_map) != 2 or not all(math.isfinite(value) for value in one.position_map):
+            raise ConfigError(f"{key}.position_map is {list(one.position_map)}; give x and y in m.")
+        if len(one.sigma_m) != 2 or not all(0 < value < math.inf for value in one.sigma_m):
+            raise ConfigError(f"{key}.sigma_m is {list(one.sigma_m)}; give those of x and y in m, above 0.")
+    names = [one.id for one in options.survey.control]
+    twice = next((name for number, name in enumerate(names) if name in names[:number]), None)
+    if twice is not None:
+        raise ConfigError(f"mapping.survey names the point {twice} twice; keep one of them.")
 
 
 def _check_sizes(options: MappingOptions, kinds: Sequence[str] | None) -> None:

@@ -1,13 +1,17 @@
-"""What an optimisation estimates besides map and mountings: the vehicle's poses and the cameras' clocks."""
+"""What an optimisation estimates besides map and mountings: poses, clocks, how errors hang together."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from v2hdm.adjust import Fault
+from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.remedy import Outcome
 from v2hdm.mapping.results import AdjustedPoses, ClockOffset
 from v2hdm.mapping.sightings.table import frames_of
+from v2hdm.records import FloatArray, IntArray
 
 
 def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
@@ -44,3 +48,35 @@ def clock_offsets(outcome: Outcome) -> dict[str, ClockOffset]:
             sigma_s = float(np.sqrt(sum(one.sigma**2 for one in tested))) if tested else float("inf")
         clocks[name] = ClockOffset(applied_s.get(name, 0.0) + beyond_s, sigma_s)
     return clocks
+
+
+@dataclass(frozen=True)
+class JointCorners:
+    """How the errors of an optimised map's corners hang together."""
+
+    optimised: Optimised
+
+    def covariance(self, marking: IntArray, corner: IntArray) -> FloatArray:
+        """Joint covariance (2N, 2N), m^2, of corners (N,) of markings (N,), stacked x0, y0, x1, ...
+
+        Within a marking it is what the map states. From one marking to another only the errors of the
+        adjustment are shared, drift above all: a corner that was not seen shares those of one that was.
+        """
+        optimised, bundle = self.optimised, self.optimised.bundle
+        index = bundle.corner_index[optimised.groups[marking]]
+        number = np.where(
+            index[np.arange(len(corner)), corner] >= 0,
+            index[np.arange(len(corner)), corner],
+            index.max(axis=1),
+        )
+        out = max(1.0, bundle.solution.chi2_per_dof) * bundle.solution.corner_covariance(number)
+        rows = 2 * corner[:, None] + np.arange(2)
+        for k in range(len(marking)):
+            stated = optimised.markings[marking[k]].covariance_m2
+            assert stated is not None
+            for other in np.flatnonzero(marking == marking[k]):
+                block = stated[np.ix_(rows[k], rows[other])]
+                out[2 * k : 2 * k + 2, 2 * other : 2 * other + 2] = block
+        # Put together from two sources, it may be negative along some direction, by a millimetre squared.
+        values, vectors = np.linalg.eigh(out)
+        return out if values[0] >= 0 else np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

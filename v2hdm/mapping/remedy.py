@@ -29,7 +29,7 @@ from v2hdm.mapping.fit import (
 )
 from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.optimise import Optimiser
-from v2hdm.mapping.options import INCREMENTAL, MappingOptions
+from v2hdm.mapping.options import INCREMENTAL, MappingOptions, SurveyOptions
 from v2hdm.mapping.sightings.table import Sightings, collect_sightings
 from v2hdm.mapping.sightings.views import views_of
 from v2hdm.records import Drive, ImageDetections
@@ -132,6 +132,7 @@ def optimise(inputs: Inputs, tell: Callable[[str], None]) -> tuple[Outcome, Opti
         MappingError: There is nothing to map.
     """
     corrected: list[Contradiction] = []
+    survey = inputs.options.survey
     while True:
         optimiser, drive = inputs.optimiser, inputs.drive
         if inputs.options.mode == INCREMENTAL:
@@ -156,7 +157,7 @@ def optimise(inputs: Inputs, tell: Callable[[str], None]) -> tuple[Outcome, Opti
         corrected.append(told)
         inputs = remedied
     optimised = optimiser.finish(settled, tell)
-    corrected = [_as_solved(one, settled) for one in corrected]
+    corrected = [_as_solved(one, settled) for one in corrected if _is_of_the_map(one, survey, optimised)]
     evidence = _evidence(
         settled, contradictions(settled, found), corrected, optimiser, optimised.bundle, inputs.sightings
     )
@@ -176,6 +177,21 @@ def _is_stated(one: Suspect, bundle: Bundle, drive: Drive) -> bool:
     names = list(bundle.camera_index)
     own = names if one.camera < 0 else [names[one.camera]]
     return all(drive.cameras[name].centre_prior is not None for name in own)
+
+
+def _is_of_the_map(one: Contradiction, survey: SurveyOptions, optimised: Optimised) -> bool:
+    """False of a surveyed point that was held to a candidate which did not enter the map.
+
+    A worn marking, or half of one, contradicts the survey of its corner; that it is none is told already.
+    """
+    if one.fault is not Fault.CONTROL:
+        return True
+    point_map = next(point.position_map for point in survey.control if point.id == one.about)
+    corners_map = np.array([marking.corners_map for marking in optimised.markings])
+    if np.linalg.norm(corners_map - point_map, axis=-1).min() <= survey.reach_m:
+        return True
+    _log.warning("the surveyed point %s is of no use: the marking there did not enter the map", one.about)
+    return False
 
 
 def _as_solved(one: Contradiction, bundle: Bundle) -> Contradiction:
@@ -263,11 +279,11 @@ def _remedied(inputs: Inputs, worst: Suspect, settled: Bundle) -> Inputs | None:
             inputs, options=replace(options, known_sizes=replace(options.known_sizes, by_class_m={}))
         )
     if worst.fault in (Fault.CONTROL, Fault.DATUM):
-        point = point_of(settled, worst.item) if worst.fault is Fault.CONTROL else None
-        points = [
-            one for one in options.survey.points_map if point is not None and tuple(one) != tuple(point)
-        ]
-        return replace(inputs, options=replace(options, survey=replace(options.survey, points_map=points)))
+        survey = options.survey
+        left = (
+            survey.without(point_of(settled, worst.item)) if worst.fault is Fault.CONTROL else survey.only([])
+        )
+        return replace(inputs, options=replace(options, survey=left))
     return None
 
 

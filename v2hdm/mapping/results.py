@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
 from v2hdm.mapping.evidence import SolveEvidence
-from v2hdm.records import BoolArray, Calibration, FloatArray, HdMap, Image, Marking
+from v2hdm.records import BoolArray, Calibration, FloatArray, HdMap, Image, IntArray, Marking
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,13 @@ class ClockOffset:
     sigma_s: float
 
 
+class Corners(Protocol):
+    """How the errors of a map's corners hang together."""
+
+    def covariance(self, marking: IntArray, corner: IntArray) -> FloatArray:
+        """Joint covariance (2N, 2N), m^2, of corners (N,) of markings (N,), stacked x0, y0, x1, ..."""
+
+
 @dataclass(frozen=True)
 class MethodResult:
     """The outcome of one method on one set of cameras.
@@ -76,7 +84,8 @@ class MethodResult:
     ``diagnostics`` are named figures for the log and the report; ``certainty`` says of each camera
     in a sentence what the drive determined and what rests on the survey; ``evidence`` is what the checks
     after the solve rest on, ``poses`` the vehicle's poses as the solve has adjusted them, ``clocks`` the
-    offsets of the cameras' clocks, corrections before the solve included.
+    offsets of the cameras' clocks, corrections before the solve included; ``corners`` how the errors of the
+    map's corners hang together, None where nothing tells.
     """
 
     name: str
@@ -92,3 +101,4 @@ class MethodResult:
     evidence: SolveEvidence | None = None
     poses: AdjustedPoses | None = None
     clocks: Mapping[str, ClockOffset] = field(default_factory=dict)
+    corners: Corners | None = None

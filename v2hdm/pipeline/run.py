@@ -10,7 +10,7 @@ import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -29,10 +29,12 @@ from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.pipeline.evaluate import CameraSets, evaluate
 from v2hdm.pipeline.inspect import Inspection, inspect
-from v2hdm.pipeline.write import write_results
+from v2hdm.pipeline.survey import Survey, check_survey, table_of, take_survey
+from v2hdm.pipeline.write import BEST, write_results
 from v2hdm.quality import Finding, Status, Verdict
 from v2hdm.quality.results.result import check_result
 from v2hdm.records import Drive, ImageDetections
+from v2hdm.report.check_points import write_check_points
 from v2hdm.report.outputs import result_folder, write_json
 from v2hdm.simulate import PortConfig, rendered_drive
 
@@ -133,11 +135,13 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
         drive_folder = _drive_folder(config, seconds, progress)
         drive = read_drive(drive_folder, config.drive)
         log.info("drive %s: %d images of cameras %s", drive.name, len(drive.images), ", ".join(drive.cameras))
+        survey = take_survey(drive, config.mapping)
+        config = replace(config, mapping=survey.mapping)
         with _timed(seconds, "check"):
             inspection = inspect(drive, config.drive.max_gap_s, _workers(config), partial(progress, "check"))
         about = {"name": name, "version": __version__}
         try:
-            result = _map_and_judge(config, inspection, folder, about, seconds, progress)
+            result = _map_and_judge(config, inspection, survey, folder, about, seconds, progress)
         except (MappingError, AdjustError) as failure:
             if not inspection.has_failed:
                 raise
@@ -150,6 +154,7 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
 def _map_and_judge(
     config: RunConfig,
     inspection: Inspection,
+    survey: Survey,
     folder: Path,
     about: Mapping[str, Any],
     seconds: dict[str, float],
@@ -163,15 +168,21 @@ def _map_and_judge(
         methods = _map_camera_sets(config, drive, detections, progress)
     with _timed(seconds, "judge"):
         found = check_result(drive, methods, inspection.ground)
-        verdict = Verdict.of([*inspection.findings, *found])
+        checked, surveyed = check_survey(survey, drive, list(methods.values())[-1][BEST])
+        verdict = Verdict.of([*inspection.findings, *found, *surveyed])
     with _timed(seconds, "evaluate"):
         described = inspection.drive_as_described
         judgement = evaluate(described, detections, methods, config.mapping, partial(progress, "evaluate"))
     metrics = {**about, "verdict": verdict.as_json(), **judgement.metrics, "seconds": seconds}
+    headlines = judgement.headlines
+    if checked is not None:
+        metrics["check_points"] = checked.figures()
+        headlines = [*headlines, checked.headline]
+        write_check_points(checked, folder / "check_points.csv")
     write_results(
         folder, described, detections, methods, judgement, metrics, verdict, config.all_maps, config.export
     )
-    return RunResult(Path(config.output) / about["name"], metrics, judgement.headlines, verdict)
+    return RunResult(Path(config.output) / about["name"], metrics, headlines, verdict)
 
 
 def _without_map(
@@ -230,6 +241,9 @@ def _map_camera_sets(
         growth_steps = GROWTH_STEPS if drive.truth_dir and done == len(sets) - 1 else 0
         tell, begin_s = partial(log.debug, "%s: %s", name), time.perf_counter()
         found[name] = run_methods(drive, detections, cameras, config.mapping, tell, growth_steps)
+        if done < len(sets) - 1:
+            # The factors of the adjustment are large, and only the whole rig's map is checked.
+            found[name]["Opt"] = replace(found[name]["Opt"], corners=None)
         took_s = time.perf_counter() - begin_s
         log.info("mapped with %s: %d markings, %.1f s", name, len(found[name]["Opt"].hd_map.markings), took_s)
         for exclusion in found[name]["Opt"].excluded:
@@ -254,6 +268,7 @@ def _check(config: RunConfig) -> str:
     _workers(config)
     detector = Detector.load(options=config.detector)
     check_options(config.mapping, detector.catalogue.cornered)
+    table_of(config.mapping.survey)
     check_formats(config.export, "export")
     _check_device(config.mapping.device)
     return name

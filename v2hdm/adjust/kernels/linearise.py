@@ -195,8 +195,8 @@ def linearise(
                         for p in range(6):
                             rows[i, column + 6] += coupling[j, p] * clock[layout.pair[k], p]
                             rows[i + 1, column + 6] += coupling[j, 6 + p] * clock[layout.pair[k], p]
-                surveyed = layout.control_information[c]
-                block[i, i], block[i + 1, i], block[i + 1, i + 1] = xx + surveyed, yx, yy + surveyed
+                block[i, i] = xx + layout.control_information[c, 0]
+                block[i + 1, i], block[i + 1, i + 1] = yx, yy + layout.control_information[c, 1]
                 gradient[i], gradient[i + 1] = gx, gy
             add_corner_priors(layout, u, corners, gradient, out.costs[q])
             _add_lengths(layout, u, corners, block)

@@ -1,0 +1,198 @@
+"""docs/survey.md does what it says: control points mend a drifted map, check points only tell."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from tests.pipeline.test_run import run_config, short_port
+from v2hdm.drive import read_drive
+from v2hdm.drive.truth import read_truth
+from v2hdm.drive.tum import read_tum, write_tum
+from v2hdm.errors import DriveError
+from v2hdm.hdmap.geodetic import geodetic_from_enu
+from v2hdm.mapping.options import MappingOptions, SurveyOptions
+from v2hdm.pipeline import DriveConfig, RunConfig, run
+from v2hdm.records import FloatArray, Trajectory
+from v2hdm.report.metrics import driven_past
+from v2hdm.simulate import render_drive
+
+COMMANDS = re.findall(
+    r"^python -m (.*)$", (Path(__file__).parents[2] / "docs/survey.md").read_text(), re.MULTILINE
+)
+DRIFT_M = np.array([0.06, -0.05])
+SIGMA_M = 0.005
+
+
+@dataclass(frozen=True)
+class Site:
+    """A folder with ``drives/mysite``, whose receiver has drifted, and surveys of its painted corners."""
+
+    folder: Path
+
+    @property
+    def drive(self) -> Path:
+        return self.folder / "drives/mysite"
+
+    def config(self, output: Path, survey: SurveyOptions) -> RunConfig:
+        mapping = MappingOptions(survey=survey)
+        drive = DriveConfig(path=str(self.drive), cameras=["front"])
+        return replace(run_config(self.drive, output, mapping=mapping, all_maps=True), drive=drive)
+
+
+def drifted(recorded: Trajectory) -> Trajectory:
+    """Poses that are off by as much as 8 cm, more at the start than at the end."""
+    poses = recorded.map_from_vehicle.copy()
+    share = np.linspace(1.0, 0.6, len(poses))
+    poses[:, :2, 3] += share[:, None] * DRIFT_M
+    return Trajectory(recorded.stamp_s, poses)
+
+
+def survey(corners_map: FloatArray, kinds: list[str], origin: object, check_off_m: float = 0.0) -> str:
+    """Every other point is a check point, those off by ``check_off_m`` more than their sigma."""
+    rng = np.random.default_rng(8)
+    measured = corners_map + SIGMA_M * rng.standard_normal(corners_map.shape)
+    measured[1::2] += check_off_m
+    positions = geodetic_from_enu(origin, np.column_stack([measured, np.zeros(len(measured))]))  # type: ignore[arg-type]
+    rows = ["id,latitude_deg,longitude_deg,sigma_m,role,description"]
+    for k, ((lat, lon, _), kind) in enumerate(zip(positions, kinds, strict=True)):
+        rows.append(f"P{k},{lat:.10f},{lon:.10f},{SIGMA_M},{'check' if k % 2 else 'control'},{kind}")
+    return "\n".join(rows) + "\n"
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
+    site = Site(tmp_path_factory.mktemp("site"))
+    render_drive(short_port(), site.drive, 1, lambda done, total: None)
+    drive = read_drive(site.drive)
+    truth = read_truth(drive)
+    write_tum(drifted(read_tum(site.drive / "poses.tum")), site.drive / "poses.tum")
+    described = yaml.safe_load((site.drive / "drive.yaml").read_text())
+    described["pose_noise"] |= {"position_m": 0.062, "position_drift_m": 0.06, "position_drift_over_m": 150.0}
+    (site.drive / "drive.yaml").write_text(yaml.safe_dump(described))
+    seen = [
+        m for m, own in zip(truth.map.markings, driven_past(drive, truth, ("front",)), strict=True) if own
+    ]
+    chosen = np.random.default_rng(4).permutation(2 * len(seen))[:20].tolist()
+    corners = np.array([seen[n // 2].corners_map[2 * (n % 2)] for n in chosen])
+    kinds = [seen[n // 2].kind for n in chosen]
+    (site.folder / "points.csv").write_text(survey(corners, kinds, drive.origin))
+    (site.folder / "moved.csv").write_text(survey(corners, kinds, drive.origin, check_off_m=-0.08))
+    only_check = (site.folder / "points.csv").read_text().replace("control", "check")
+    (site.folder / "check.csv").write_text(only_check)
+    return site
+
+
+@pytest.fixture(scope="module")
+def documented(site: Site) -> tuple[Path, str]:
+    """The result of the documented command, with one camera and every map, and what it printed."""
+    (command,) = COMMANDS
+    settings = ["drive.cameras=[front]", "all_maps=true", "workers=1", "output=outputs", "name=short"]
+    done = subprocess.run(
+        [sys.executable, "-m", *shlex.split(command), *settings],
+        cwd=site.folder,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert done.returncode in (0, 3), done.stderr
+    return site.folder / "outputs/short", done.stdout
+
+
+def figures(result: Path) -> dict[str, float]:
+    metrics = json.loads((result / "metrics.json").read_text())
+    return dict(metrics["check_points"])
+
+
+def test_the_documented_command_ends_in_a_table_a_line_and_a_finding(documented: tuple[Path, str]) -> None:
+    result, printed = documented
+    with (result / "check_points.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["id"] for row in rows} == {f"P{k}" for k in range(1, 20, 2)}
+    compared = [row for row in rows if row["dx_m"]]
+    assert len(compared) == figures(result)["compared"] >= 6
+    assert all(row["not_compared_because"] for row in rows if not row["dx_m"])
+    squared = [float(row["dx_m"]) ** 2 + float(row["dy_m"]) ** 2 for row in compared]
+    assert figures(result)["rmse_m"] == pytest.approx(np.sqrt(np.mean(squared)), abs=1e-4)
+    assert re.search(r"check points: \d+ of 10 compared, RMSE \d", " ".join(printed.split()))
+    verdict = json.loads((result / "metrics.json").read_text())["verdict"]
+    passed = {one["check"]: one for one in verdict["passed"]}
+    assert {"check points", "survey frame", "surveyed points"} <= set(passed), verdict["findings"]
+
+
+def test_control_points_bring_check_points_down_to_what_map_and_survey_state(
+    site: Site, documented: tuple[Path, str], tmp_path: Path
+) -> None:
+    mended = figures(documented[0])
+    left = figures(run(site.config(tmp_path, SurveyOptions(file=str(site.folder / "check.csv")))).folder)
+    assert left["points"] == 20
+    assert left["rmse_m"] > 0.05
+    assert mended["rmse_m"] < 0.5 * left["rmse_m"]
+    # A drift that pose_noise knows of contradicts nothing, with control points or without.
+    assert 0.3 < mended["nees"] < 2.0
+    assert left["nees"] < 2.0
+
+
+def test_check_points_touch_no_part_of_the_map(
+    site: Site, documented: tuple[Path, str], tmp_path: Path
+) -> None:
+    moved = run(site.config(tmp_path, SurveyOptions(file=str(site.folder / "moved.csv"))))
+    names = ["trajectory.tum", "trajectory_sigma.csv", "excluded.geojson"]
+    names += [f"maps/{path.name}" for path in (documented[0] / "maps").iterdir()]
+    assert "maps/front_Opt.geojson" in names
+    for name in names:
+        assert (moved.folder / name).read_bytes() == (documented[0] / name).read_bytes(), name
+    assert figures(moved.folder)["rmse_m"] > 0.1
+    (finding,) = [one for one in moved.verdict.raised if one.check == "check points"]
+    assert "another datum or origin" in finding.says
+
+
+@pytest.mark.parametrize(
+    ("swap", "message"),
+    [
+        (
+            ("latitude_deg,longitude_deg", "longitude_deg,latitude_deg"),
+            "no place on the earth; are they swapped",
+        ),
+        (("latitude_deg,longitude_deg", "x_m,y_m"), r"none of its 20 .*: 20 would as latitude and longitude"),
+    ],
+)
+def test_a_survey_in_the_wrong_frame_is_refused_before_any_long_work(
+    site: Site, swap: tuple[str, str], message: str, tmp_path: Path
+) -> None:
+    wrong = tmp_path / "wrong.csv"
+    wrong.write_text((site.folder / "points.csv").read_text().replace(*swap))
+    with pytest.raises(DriveError, match=message) as caught:
+        run(site.config(tmp_path / "out", SurveyOptions(file=str(wrong))))
+    assert "\n" not in str(caught.value)
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_a_survey_that_cannot_be_read_is_refused_before_the_drive_is(tmp_path: Path) -> None:
+    config = run_config(
+        tmp_path / "no drive", tmp_path, mapping=MappingOptions(survey=SurveyOptions(file="none.csv"))
+    )
+    with pytest.raises(DriveError, match=r"none\.csv: no such file"):
+        run(config)
+
+
+def test_places_on_the_earth_are_refused_for_a_drive_without_an_origin(site: Site, tmp_path: Path) -> None:
+    shutil.copytree(site.drive, tmp_path / "drives/mysite")
+    description = tmp_path / "drives/mysite/drive.yaml"
+    described = yaml.safe_load(description.read_text())
+    del described["origin"], described["truth"]
+    description.write_text(yaml.safe_dump(described))
+    lost = Site(tmp_path).config(tmp_path / "out", SurveyOptions(file=str(site.folder / "points.csv")))
+    with pytest.raises(DriveError, match="the drive's map has none; give the drive an origin"):
+        run(lost)

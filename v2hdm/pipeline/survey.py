@@ -1,0 +1,144 @@
+"""A run's survey: control points go into the mapping, check points wait until the map is made."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from v2hdm.drive.survey import SurveyedPoint, SurveyTable, in_map, misreadings, read_survey
+from v2hdm.errors import DriveError
+from v2hdm.hdmap.heights import with_heights
+from v2hdm.mapping.options import ControlOptions, MappingOptions, SurveyOptions
+from v2hdm.mapping.results import MethodResult
+from v2hdm.quality import Finding
+from v2hdm.quality.results.check_points import check_frame, check_points
+from v2hdm.records import Drive, FloatArray
+from v2hdm.report.check_points import CheckTable, compare
+
+_log = logging.getLogger(__name__)
+
+_NAMED = 5
+"""Points that a line of the log names."""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What a run takes of a survey.
+
+    Attributes:
+        mapping: the settings of the mapping, with the control points in place of the file.
+        check: what the mapping is not told of.
+        points: all points of the file.
+        elsewhere: where they would lie, had the file meant something else, by what (N, 2).
+    """
+
+    mapping: MappingOptions
+    check: tuple[SurveyedPoint, ...] = ()
+    points: tuple[SurveyedPoint, ...] = ()
+    elsewhere: dict[str, FloatArray] | None = None
+
+    def found(self, result: MethodResult) -> dict[str, int]:
+        """How many points have a corner of the map within reach: as stated (""), and read otherwise."""
+        corners = KDTree(np.array([one.corners_map for one in result.hd_map.markings]).reshape(-1, 2))
+        ways = {"": _positions(self.points), **(self.elsewhere or {})}
+        return {says: _places(corners, at, self.mapping.survey.reach_m) for says, at in ways.items()}
+
+
+def table_of(options: SurveyOptions) -> SurveyTable | None:
+    """The file of a survey as it states its points; None where there is none.
+
+    Raises:
+        DriveError: It cannot be read.
+    """
+    if options.file is None:
+        return None
+    return read_survey(Path(options.file), options.crs, options.geoid_m, options.sigma_m)
+
+
+def take_survey(drive: Drive, options: MappingOptions) -> Survey:
+    """The survey of a drive, before anything is estimated.
+
+    Raises:
+        DriveError: The file cannot be read, or none of its points is where the drive could see it; says how
+            else the file may be meant.
+    """
+    table = table_of(options.survey)
+    if table is None:
+        return Survey(options)
+    points = in_map(table, drive.origin)
+    elsewhere = misreadings(table, drive.origin)
+    _check_near(table, points, elsewhere, drive, options.max_range_m)
+    control = [
+        ControlOptions(id=one.id, position_map=one.position_map.tolist(), sigma_m=one.sigma_m.tolist())
+        for one in points
+        if not one.is_check
+    ]
+    survey = options.survey.only([*options.survey.control, *control])
+    check = tuple(one for one in points if one.is_check)
+    _log.info("%s: %d control points and %d check points", table.path, len(control), len(check))
+    return Survey(replace(options, survey=survey), check, points, elsewhere)
+
+
+def check_survey(survey: Survey, drive: Drive, best: MethodResult) -> tuple[CheckTable | None, list[Finding]]:
+    """The check points against the map of ``best``, None where there are none; and what follows."""
+    findings = check_frame(survey.found(best)) if survey.points else []
+    if not survey.check:
+        return None, findings
+    assert best.corners is not None
+    hd_map, reach_m = with_heights(best.hd_map, drive.road), survey.mapping.survey.reach_m
+    table = compare(hd_map, survey.check, reach_m, best.corners.covariance, route_of(drive))
+    return table, [check_points(table), *findings]
+
+
+def route_of(drive: Drive) -> FloatArray:
+    """Where the vehicle was (F, 2)."""
+    return np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
+
+
+def _check_near(
+    table: SurveyTable,
+    points: Sequence[SurveyedPoint],
+    elsewhere: dict[str, FloatArray],
+    drive: Drive,
+    range_m: float,
+) -> None:
+    """Tell of points that no image can show; refuse a survey all of whose points are."""
+    route = KDTree(route_of(drive))
+    away_m = route.query(_positions(points))[0]
+    far = np.flatnonzero(away_m > range_m)
+    if len(far) < len(points):
+        if len(far):
+            names = ", ".join(points[k].id for k in far[:_NAMED])
+            _log.warning(
+                "%s: %d of %d points lie farther than %g m from the route, up to %.0f m: %s%s",
+                table.path, len(far), len(points), range_m, away_m.max(), names,
+                ", ..." if len(far) > _NAMED else "",
+            )  # fmt: skip
+        return
+    likeliest = max(elsewhere, key=lambda says: _places(route, elsewhere[says], range_m), default="")
+    near = int((route.query(elsewhere[likeliest])[0] <= range_m).sum()) if likeliest else 0
+    advice = "mind datum, zone, units, the order of the columns and the origin of the drive"
+    if near:
+        advice = f"{near} would {likeliest}; mend the file or mapping.survey.crs"
+    raise DriveError(
+        f"{table.path}: none of its {len(points)} points lies within {range_m:g} m of the route, the nearest "
+        f"is {away_m.min():.0f} m away: {advice}"
+    )
+
+
+def _places(tree: KDTree, at: FloatArray, reach_m: float) -> int:
+    """How many of a tree's places points have within reach, each by its nearest.
+
+    Points that a wrong unit heaps up on one spot have a single one.
+    """
+    off_m, nearest = tree.query(at)
+    return len(np.unique(nearest[off_m <= reach_m]))
+
+
+def _positions(points: Sequence[SurveyedPoint]) -> FloatArray:
+    return np.array([one.position_map for one in points]).reshape(-1, 2)

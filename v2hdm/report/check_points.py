@@ -1,0 +1,278 @@
+r"""Check points: surveyed corners that no estimate has seen, against the map.
+
+The errors of a map's corners are not independent of each other: what is left of the receiver's drift moves
+all of them alike. The test of all points together therefore takes their joint covariance,
+
+.. math:: T = e' (C_\text{map} + C_\text{survey})^{-1} e,
+
+which is chi-square with as many degrees of freedom as there are coordinates, where map and survey are as good
+as they say. T over these is the normalised estimation error squared (NEES), 1 on average.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import KDTree
+from scipy.stats import chi2
+
+from v2hdm.drive.survey import SurveyedPoint
+from v2hdm.files import replace_text
+from v2hdm.hdmap.features import features_of
+from v2hdm.hdmap.surveyed import match
+from v2hdm.records import FloatArray, HdMap, IntArray
+
+JointCovariance = Callable[[IntArray, IntArray], FloatArray]
+"""Joint covariance (2N, 2N), m^2, of the corners (N,) of markings (N,) of a map, stacked x0, y0, x1, ..."""
+
+INSIDE = 0.95
+"""Probability of the ellipse that a point is reported to lie in or not."""
+
+COLUMNS: tuple[str, ...] = (
+    *("id", "description", "x_map_m", "y_map_m", "marking", "class", "corner"),
+    *("dx_m", "dy_m", "distance_m", "sigma_x_m", "sigma_y_m", "map_sigma_x_m", "map_sigma_y_m"),
+    *("normalised_error", "inside_95_percent", "dz_m", "not_compared_because"),
+)
+"""Differences are map minus survey. ``corner`` counts from 1. ``sigma_...`` are those of the difference: of
+map and survey together. ``normalised_error`` is the difference in its standard deviations, both axes in
+one."""
+
+
+@dataclass(frozen=True)
+class CheckedPoint:
+    """One check point beside the corner of the map that is nearest to it.
+
+    Attributes:
+        point: as surveyed.
+        marking: which marking of the map.
+        marking_id: its id in the map's files.
+        kind: its class.
+        corner: which of its corners, 0 to 3.
+        off_m: (2,) map minus survey.
+        map_covariance_m2: (2, 2) of the map's corner.
+        off_height_m: map minus survey; None where one of them has no height.
+    """
+
+    point: SurveyedPoint
+    marking: int
+    marking_id: int
+    kind: str
+    corner: int
+    off_m: FloatArray
+    map_covariance_m2: FloatArray
+    off_height_m: float | None
+
+    @property
+    def covariance_m2(self) -> FloatArray:
+        """Covariance (2, 2) of the difference."""
+        return np.asarray(self.map_covariance_m2 + np.diag(self.point.sigma_m**2))
+
+    @property
+    def distance_m(self) -> float:
+        """How far apart they are."""
+        return float(np.linalg.norm(self.off_m))
+
+    @property
+    def normalised(self) -> float:
+        """The difference in its standard deviations."""
+        return float(np.sqrt(self.off_m @ np.linalg.solve(self.covariance_m2, self.off_m)))
+
+    @property
+    def is_inside(self) -> bool:
+        """Whether it is within its ellipse of 95 %."""
+        return bool(self.normalised**2 <= chi2.ppf(INSIDE, 2))
+
+
+@dataclass(frozen=True)
+class CheckTable:
+    """All check points of a survey against a map.
+
+    Attributes:
+        compared: those that have a corner of the map, in the survey's order.
+        unmatched: the others, and why.
+        covariance_m2: (2N, 2N) joint covariance of the differences, stacked x0, y0, x1, ...
+    """
+
+    compared: tuple[CheckedPoint, ...]
+    unmatched: tuple[tuple[SurveyedPoint, str], ...]
+    covariance_m2: FloatArray
+
+    @property
+    def off_m(self) -> FloatArray:
+        """Differences (N, 2), map minus survey."""
+        return np.array([one.off_m for one in self.compared]).reshape(-1, 2)
+
+    @property
+    def rmse_m(self) -> float:
+        """Root of the mean squared distance."""
+        return float(np.sqrt(np.mean(np.sum(self.off_m**2, axis=1))))
+
+    @property
+    def squared(self) -> float:
+        """T of all differences together."""
+        return squared(self.off_m.ravel(), self.covariance_m2)
+
+    def figures(self) -> dict[str, Any]:
+        """What goes into ``metrics.json``."""
+        out: dict[str, Any] = {"points": len(self.compared) + len(self.unmatched)}
+        out |= {"compared": len(self.compared), "unmatched": {p.id: why for p, why in self.unmatched}}
+        if not self.compared:
+            return out
+        degrees = 2 * len(self.compared)
+        east_m, north_m = self.off_m.mean(axis=0).tolist()
+        out |= {
+            "rmse_m": self.rmse_m,
+            "rmse_x_m": float(np.sqrt(np.mean(self.off_m[:, 0] ** 2))),
+            "rmse_y_m": float(np.sqrt(np.mean(self.off_m[:, 1] ** 2))),
+            "mean_x_m": east_m,
+            "mean_y_m": north_m,
+            "percentile_95_m": self._percentile_m(),
+            "largest_m": max(one.distance_m for one in self.compared),
+            "inside_95_percent": sum(one.is_inside for one in self.compared),
+            "chi_square": self.squared,
+            "degrees_of_freedom": degrees,
+            "nees": self.squared / degrees,
+            "probability": float(chi2.sf(self.squared, degrees)),
+            "height": self._height_figures(),
+        }
+        return out
+
+    @property
+    def headline(self) -> str:
+        """All of it in one line for a reader."""
+        total = len(self.compared) + len(self.unmatched)
+        if not self.compared:
+            return f"check points: none of {total} has a corner of the map within reach"
+        cm = 100 * self.off_m.mean(axis=0)
+        inside = sum(one.is_inside for one in self.compared)
+        return (
+            f"check points: {len(self.compared)} of {total} compared, RMSE {100 * self.rmse_m:.1f} cm, mean "
+            f"{cm[0]:+.1f} cm in x and {cm[1]:+.1f} cm in y, 95 % within {100 * self._percentile_m():.1f} "
+            f"cm, {inside} of {len(self.compared)} inside what map and survey state for 95 %"
+        )
+
+    def _percentile_m(self) -> float:
+        return float(np.percentile([one.distance_m for one in self.compared], 100 * INSIDE))
+
+    def _height_figures(self) -> dict[str, Any]:
+        off_m = [one.off_height_m for one in self.compared if one.off_height_m is not None]
+        if not off_m:
+            return {"compared": 0, "because": "the survey, or the map of this drive, has no heights"}
+        return {
+            "compared": len(off_m),
+            "mean_z_m": float(np.mean(off_m)),
+            "rmse_z_m": float(np.sqrt(np.mean(np.square(off_m)))),
+        }
+
+
+def squared(off_m: FloatArray, covariance_m2: FloatArray) -> float:
+    """Stacked differences (2N,) in their joint standard deviations, squared: chi-square of 2N degrees."""
+    return float(off_m @ np.linalg.solve(covariance_m2, off_m))
+
+
+def compare(
+    hd_map: HdMap,
+    points: Sequence[SurveyedPoint],
+    reach_m: float,
+    joint: JointCovariance,
+    route_map: FloatArray,
+) -> CheckTable:
+    """Hold check points against the corners of a map.
+
+    Which corner a point is of, :func:`v2hdm.hdmap.surveyed.match` decides; what is reported is how far the
+    two are apart, of every point that has a corner within reach.
+
+    Args:
+        hd_map: the map, with heights where the drive has them.
+        points: check points in the map.
+        reach_m: how far a corner may lie from its point.
+        joint: of corners of the map.
+        route_map: (F, 2) where the vehicle was.
+    """
+    corners = np.array([marking.corners_map for marking in hd_map.markings]).reshape(-1, 2)
+    positions = np.array([point.position_map for point in points]).reshape(-1, 2)
+    off_m, nearest = KDTree(corners).query(positions)
+    route_m = KDTree(route_map).query(positions)[0]
+    ids = [feature.id for feature in features_of(hd_map)]
+    of_map = joint(*np.divmod(nearest, 4))
+    own = np.diag(np.concatenate([point.sigma_m**2 for point in points]))
+    matched = match(positions, corners, reach_m, of_map + own)
+    compared, unmatched = [], []
+    for k, point in enumerate(points):
+        if matched[k] < 0:
+            there = f"{hd_map.markings[nearest[k] // 4].kind} {ids[nearest[k] // 4]}"
+            if off_m[k] > reach_m:
+                why = _far(off_m[k], there, reach_m, route_m[k])
+            else:
+                better = points[int(np.argmax(matched == nearest[k]))].id
+                why = f"{better} fits the only corner within reach better, of {there}"
+            unmatched.append((point, why))
+            continue
+        marking, corner = divmod(int(matched[k]), 4)
+        found = hd_map.markings[marking]
+        off_height_m = None
+        if found.heights_m is not None and point.height_m is not None:
+            off_height_m = float(found.heights_m[corner] - point.height_m)
+        compared.append(
+            CheckedPoint(
+                point,
+                marking,
+                ids[marking],
+                found.kind,
+                corner,
+                found.corners_map[corner] - point.position_map,
+                joint(np.array([marking]), np.array([corner])),
+                off_height_m,
+            )
+        )
+    return CheckTable(tuple(compared), tuple(unmatched), _joint(compared, joint))
+
+
+def _far(off_m: float, there: str, reach_m: float, route_m: float) -> str:
+    nearest = f"the nearest, of {there}, is {off_m:.2f} m away, the route {route_m:.0f} m"
+    return f"no corner within {reach_m:g} m: {nearest}"
+
+
+def _joint(compared: Sequence[CheckedPoint], joint: JointCovariance) -> FloatArray:
+    """Joint covariance (2N, 2N) of the differences."""
+    if not compared:
+        return np.zeros((0, 0))
+    of_map = joint(np.array([one.marking for one in compared]), np.array([one.corner for one in compared]))
+    return of_map + np.diag(np.concatenate([one.point.sigma_m**2 for one in compared]))
+
+
+def write_check_points(table: CheckTable, path: Path) -> None:
+    """Write the table as CSV to ``path``: a row a check point, those compared first, then the others."""
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(COLUMNS)
+    for one in table.compared:
+        point = one.point
+        sigma = np.sqrt(np.diag(one.covariance_m2))
+        own_sigma = np.sqrt(np.diag(one.map_covariance_m2))
+        rows.writerow(
+            [
+                *(point.id, point.description, *_metres(point.position_map)),
+                *(one.marking_id, one.kind, one.corner + 1),
+                *_metres([*one.off_m, one.distance_m, *sigma, *own_sigma]),
+                f"{one.normalised:.3f}",
+                "yes" if one.is_inside else "no",
+                "" if one.off_height_m is None else _metres([one.off_height_m])[0],
+                "",
+            ]
+        )
+    for point, why in table.unmatched:
+        empty = [""] * (len(COLUMNS) - 5)
+        rows.writerow([point.id, point.description, *_metres(point.position_map), *empty, why])
+    replace_text(path, text.getvalue())
+
+
+def _metres(values: Sequence[float] | FloatArray) -> list[str]:
+    """To a tenth of a millimetre."""
+    return [f"{value:.4f}" for value in values]
