@@ -39,8 +39,8 @@ def _parser() -> argparse.ArgumentParser:
         "--camera",
         type=Path,
         metavar="FILE",
-        help="the camera's calibration: gives metres; or its intrinsics, as Kalibr, OpenCV, ROS or COLMAP write "
-        "them",
+        help="the camera's calibration: gives metres; or its intrinsics, as written by Kalibr, OpenCV, ROS "
+        "or COLMAP",
     )
     parser.add_argument("--camera-name", metavar="NAME", help="which camera of intrinsics that hold several")
     parser.add_argument(

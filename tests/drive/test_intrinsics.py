@@ -1,4 +1,4 @@
-"""Intrinsics as Kalibr, OpenCV, ROS and COLMAP write them, judged by cv2's and the formats' own projection."""
+"""Intrinsics as Kalibr, OpenCV, ROS and COLMAP write them, judged by the projection of cv2."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ def write_colmap(path: Path, *lines: str) -> Path:
 @pytest.mark.parametrize("model", COLMAP_MODELS)
 def test_colmap_s_pixels_begin_at_the_corner_of_the_first(tmp_path: Path, model: str) -> None:
     values, expected = COLMAP_LENSES[model]
-    focals = 2 if "PINHOLE" == model or "OPENCV" in model else 1
+    focals = 2 if model == "PINHOLE" or "OPENCV" in model else 1
     # In COLMAP the centre of the first pixel is (0.5, 0.5).
     numbers = [*values[:focals], *(MATRIX[:2, 2] + 0.5), *values[focals:]]
     path = write_colmap(
@@ -350,8 +350,8 @@ MISTAKES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "missing": (lambda folder: folder / "none.yaml", "no such file"),
     "folder": (lambda folder: folder, "is a folder"),
     "uncalibrated message": (
-        text_mistake("a.yaml", re.sub(r"k:.*\nr:", f"k: {[0.0] * 9}\nr:", ECHO.format(model="plumb_bob", d=[]),
-                                      flags=re.DOTALL)),
+        text_mistake("a.yaml", ECHO.format(model="plumb_bob", d=[]).replace("- 905.5", "- 0").replace(
+            "- 641.25", "- 0").replace("- 903.25", "- 0").replace("- 352.75", "- 0").replace("- 1.0", "- 0")),
         "not calibrated",
     ),
 }  # fmt: skip

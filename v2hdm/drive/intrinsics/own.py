@@ -26,7 +26,7 @@ def read_own(document: Document, name: str) -> CameraInfo:
         raise DriveError(str(error)) from None
     if len(info.distortion) != DISTORTION_COEFFICIENTS.get(info.distortion_model):
         raise DriveError(
-            f"{document.path}: {info.distortion_model} with {len(info.distortion)} coefficients is no lens of "
-            f"ours; known are {', '.join(DISTORTION_COEFFICIENTS)}"
+            f"{document.path}: {info.distortion_model} with {len(info.distortion)} coefficients is no lens "
+            f"of ours; known are {', '.join(DISTORTION_COEFFICIENTS)}"
         )
     return info
