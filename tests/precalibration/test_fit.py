@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.precalibration.site import INFO, PLACES, clicked, mounting, project
+from v2hdm.geometry.ipm import apply_in_front, facing_ipm, ipm_from_extrinsic
+from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import exp, inverse, log
 from v2hdm.precalibration.fit import Fit, fit_mountings
 from v2hdm.precalibration.likelihood import Noise, Seen
 from v2hdm.precalibration.points import SurveyedPoints
 from v2hdm.precalibration.residuals import known_ground, lens, residuals
-from v2hdm.records import FloatArray
+from v2hdm.records import CameraInfo, FloatArray
 
 NAMES = tuple(f"P{n}" for n in range(1, 11))
 
@@ -139,3 +142,35 @@ def test_a_wrong_focal_length_is_told_with_its_size() -> None:
     right = lens(fit(px, places, Noise()))
     assert right.probability > 1e-3
     assert abs(right.focal[0]) < 4 * right.focal[1]
+
+
+MOUNTINGS = {
+    "rear": ((-0.5, 17.0, 180.0), (-1.0, 0.0, 2.6)),
+    "left": ((0.0, 25.0, 90.0), (2.0, 0.9, 2.2)),
+    "straight down": ((0.0, 89.0, 0.0), (4.0, 0.0, 3.0)),
+    "on its head": ((180.0, -16.0, 0.0), (3.6, 0.0, 2.4)),
+}
+
+
+@pytest.mark.parametrize("where", MOUNTINGS)
+@pytest.mark.parametrize("model", ["plumb_bob", "equidistant"])
+def test_cameras_that_look_any_way_through_any_lens_are_found(where: str, model: str) -> None:
+    angles, centre = MOUNTINGS[where]
+    truth = mounting(angles, np.array(centre))
+    lens = INFO.distortion if model == "plumb_bob" else (0.012, -0.004, 0.0011, -0.0003)
+    info = replace(INFO, distortion_model=model, distortion=lens)
+    px = np.array([[u, v] for u in (200.0, 640.0, 1100.0) for v in (350.0, 500.0, 650.0)])
+    if where == "on its head":
+        px[:, 1] = 719 - px[:, 1]
+    ipm = facing_ipm(ipm_from_extrinsic(info, truth), seen_ahead(info, truth))
+    places = apply_in_front(ipm, undistort_points(info, px))
+    assert np.isfinite(places).all()
+    found = fit_mountings(Seen.of_pixels(px, places, info, Noise()), starts=1)[0]
+    np.testing.assert_allclose(found.cam_from_vehicle, truth, atol=1e-5)
+
+
+def seen_ahead(info: CameraInfo, cam_from_vehicle: FloatArray) -> FloatArray:
+    """The ground on a ray through the image, below the horizon."""
+    vehicle_from_cam = inverse(cam_from_vehicle)
+    ray = vehicle_from_cam[:3, :3] @ [0.0, 0.2 * np.sign(vehicle_from_cam[2, 1]) * -1.0, 1.0]
+    return np.asarray((vehicle_from_cam[:3, 3] - ray * vehicle_from_cam[2, 3] / ray[2])[:2])

@@ -25,6 +25,9 @@ _HEIGHT_IN = 6.4
 _ARROW_SHARE = 0.06
 """Length of the longest arrow of a right point, as a share of the picture's width."""
 
+_SHORTEST = 1e-4
+"""Arrows shorter than this share of the width are not magnified further."""
+
 _GRID_LINES = 14
 """Grid lines at most each way; their spacing is the least of :data:`_SPACINGS_M` that needs no more."""
 
@@ -133,7 +136,7 @@ def _label_line(
         return
     at = inside[-1] if text.startswith("x") else inside[0]
     if all(np.hypot(*(at - other)) > apart for other in labelled):
-        axes.annotate(text, at, color=_GRID, fontsize=8, path_effects=_HALO)
+        axes.annotate(text, (at[0], at[1]), color=_GRID, fontsize=8, path_effects=_HALO)
         labelled.append(at)
 
 
@@ -146,7 +149,9 @@ def _draw_plan(axes: Axes, scene: _Scene) -> None:
     tip = centre + 0.12 * span * view / max(float(np.hypot(*view)), 1e-9)
     axes.add_patch(Polygon(scene.roi_vehicle[:, ::-1], closed=True, fill=False, ec=_ROI, lw=1.5, label="ROI"))
     axes.plot(centre[1], centre[0], "s", color="k", ms=5, label="camera")
-    axes.annotate("", tip[::-1], centre[::-1], arrowprops={"arrowstyle": "-|>", "color": "k"})
+    axes.annotate(
+        "", (tip[1], tip[0]), (centre[1], centre[0]), arrowprops={"arrowstyle": "-|>", "color": "k"}
+    )
     factor = _draw_residuals(axes, scene, points, scene.residuals.off_m, span, "cm")
     angles = np.linspace(0, 2 * np.pi, 60)
     circle = np.column_stack([np.cos(angles), np.sin(angles)])
@@ -160,7 +165,7 @@ def _draw_plan(axes: Axes, scene: _Scene) -> None:
     axes.set_axisbelow(True)
     axes.set_xlabel("y, left (m)")
     axes.set_ylabel("x, forward (m)")
-    axes.set_title("arrows: surveyed to seen; circles: 2 sigmas")
+    axes.set_title("from above; circles: 2 sigmas")
     axes.legend(loc="upper right", fontsize=8)
 
 
@@ -168,23 +173,22 @@ def _draw_residuals(
     axes: Axes, scene: _Scene, at: FloatArray, off: FloatArray, size: float, unit: str
 ) -> float:
     """Draw points and residuals, those of right points magnified by the factor that is returned."""
-    fit, turned = scene.fit, slice(None, None, -1 if unit == "cm" else 1)
+    right = scene.fit.is_right
     length = np.hypot(*off.T)
-    known = np.isfinite(length)
-    right = fit.is_right & known
-    longest = float(length[right].max()) if right.any() else 1.0
-    factor = _ARROW_SHARE * size / max(longest, 1e-12)
-    for k in np.flatnonzero(known).tolist():
-        colour = _RIGHT if right[k] else _WRONG
+    longest = float(np.nanmax(length[right], initial=0.0))
+    factor = _ARROW_SHARE * size / max(longest, _SHORTEST * size)
+    for k, (label, is_right) in enumerate(zip(scene.labels, right.tolist(), strict=True)):
         # That of a wrong point may be as long as the picture: it is drawn true to scale.
-        tip = at[k] + (factor if right[k] else 1.0) * off[k]
-        arrow = {"arrowstyle": "->", "color": colour, "lw": 1.8, "shrinkA": 0, "shrinkB": 0}
-        axes.plot(*at[k, turned], "o", ms=6, mfc="none", mec=colour, mew=1.8)
-        axes.annotate("", tip[turned], at[k, turned], arrowprops=arrow, annotation_clip=True)
+        tip = at[k] + (factor if is_right else 1.0) * off[k]
+        (a, b), (c, d) = (at[k], tip) if unit == "px" else (at[k, ::-1], tip[::-1])
+        colour = _RIGHT if is_right else _WRONG
+        axes.plot(a, b, "o", ms=6, mfc="none", mec=colour, mew=1.8)
         axes.annotate(
-            scene.labels[k], at[k, turned], (6, -10), textcoords="offset points",
-            color=colour, fontsize=8, path_effects=_HALO,
-        )  # fmt: skip
+            label, (a, b), (6, -10), textcoords="offset points", color=colour, fontsize=8, path_effects=_HALO
+        )
+        if np.isfinite(tip).all():
+            arrow = {"arrowstyle": "->", "color": colour, "lw": 1.8, "shrinkA": 0, "shrinkB": 0}
+            axes.annotate("", (c, d), (a, b), arrowprops=arrow, annotation_clip=True)
     if unit == "cm":
         words = f"arrows and circles {factor:.0f} times as large; longest arrow {100 * longest:.1f} cm"
     else:

@@ -52,9 +52,9 @@ def read_kalibr(document: Document, name: str) -> CameraInfo:
         )
     model = take_text(entry["distortion_model"], f"{where}, distortion_model", DriveError)
     given = entry.get("distortion_coeffs")
-    values = (
-        [] if given in (None, []) else take_array(given, (-1,), f"{where}, distortion_coeffs", DriveError)
-    )
+    values: list[float] = []
+    if given not in (None, []):
+        values = take_array(given, (-1,), f"{where}, distortion_coeffs", DriveError).tolist()
     if model in _EQUIDISTANT:
         if len(values) != 4:
             raise DriveError(f"{where}, distortion_coeffs: {model} has 4 coefficients, got {len(values)}")
