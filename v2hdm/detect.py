@@ -36,14 +36,23 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "source", help="an image, a folder of images, a drive folder, a video file, or a camera's index"
     )
-    parser.add_argument("--camera", type=Path, metavar="YAML", help="the camera's calibration: gives metres")
+    parser.add_argument(
+        "--camera",
+        type=Path,
+        metavar="FILE",
+        help="the camera's calibration: gives metres; or its intrinsics, as written by Kalibr, OpenCV, ROS "
+        "or COLMAP",
+    )
+    parser.add_argument("--camera-name", metavar="NAME", help="which camera of intrinsics that hold several")
     parser.add_argument(
         "--mounting",
         type=float,
         nargs=3,
         metavar=("HEIGHT_M", "PITCH_DEG", "FOV_DEG"),
         help="without a calibration: about how high the camera is, how far it looks down, its horizontal "
-        "field of view (default: {:g} {:g} {:g})".format(*_ROUGH_MOUNTING),
+        "field of view (default: {:g} {:g} {:g}); intrinsics of --camera overrule the last".format(
+            *_ROUGH_MOUNTING
+        ),
     )
     parser.add_argument(
         "--linear", action="store_true", help="grey values are proportional to light, not sRGB"

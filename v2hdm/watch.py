@@ -29,8 +29,10 @@ from v2hdm.detection.road import Road, RoadDetector
 from v2hdm.detection.stopwatch import Stopwatch, lap
 from v2hdm.detection.weights import unknown_network
 from v2hdm.drive import READERS, read_drive
+from v2hdm.drive.intrinsics import is_calibration, read_intrinsics
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.files import forget_stdout, whole_file
+from v2hdm.records import CameraInfo
 
 _ROUGH_RANGE_M = 40.0
 """Without a calibration distances may be wrong by a factor of two: nothing may be dropped for being far."""
@@ -58,16 +60,17 @@ def watch(parsed: argparse.Namespace) -> None:
     """
     cv2.setNumThreads(1)
     options = DetectorOptions(model=parsed.model, threads=parsed.threads)
-    if parsed.camera is None:
+    lens = _lens(parsed)
+    if parsed.camera is None or lens is not None:
         options.max_range_m = _ROUGH_RANGE_M
     detector = Detector.load(options=options)
     unknown = unknown_network(parsed.model) if parsed.model is not None else None
-    job = _job(parsed, detector)
+    job = _job(parsed, detector, lens)
     stopwatch = Stopwatch()
     failure = None
     with _lines(parsed.output) as stream:
         try:
-            for frame, road, found in _found(job, parsed, detector, stopwatch):
+            for frame, road, found in _found(job, parsed, detector, lens, stopwatch):
                 print(json.dumps(as_record(frame, road.camera.info.name, found)), file=stream)
                 if job.live:
                     stream.flush()
@@ -87,16 +90,29 @@ def watch(parsed: argparse.Namespace) -> None:
         raise failure
 
 
-def _job(parsed: argparse.Namespace, detector: Detector) -> _Job:
+def _lens(parsed: argparse.Namespace) -> CameraInfo | None:
+    """The intrinsics of ``--camera`` where they are all that the file holds, as other tools write it."""
+    if parsed.camera is None:
+        if parsed.camera_name is not None:
+            raise ConfigError("--camera-name: names a camera in the file of --camera; add that")
+        return None
+    if not is_calibration(parsed.camera):
+        return read_intrinsics(parsed.camera, parsed.camera_name, "--camera-name")
+    if parsed.camera_name is not None:
+        raise ConfigError(f"--camera-name: {parsed.camera} is the calibration of one camera; drop it")
+    if parsed.mounting is not None:
+        raise ConfigError(
+            "--camera and --mounting exclude each other: a calibration holds the mounting; drop one"
+        )
+    return None
+
+
+def _job(parsed: argparse.Namespace, detector: Detector, lens: CameraInfo | None) -> _Job:
     """What the source is, and which detector its frames want."""
     if parsed.limit is not None and parsed.limit < 1:
         raise ConfigError(f"--limit {parsed.limit}: give the number of images to stop after, 1 or more")
     road = None
-    if parsed.camera is not None:
-        if parsed.mounting is not None:
-            raise ConfigError(
-                "--camera and --mounting exclude each other: a calibration holds the mounting; drop one"
-            )
+    if parsed.camera is not None and lens is None:
         road = RoadDetector.calibrated(detector, parsed.camera, parsed.linear)
     path = Path(parsed.source)
     if parsed.source.isdecimal():
@@ -105,7 +121,7 @@ def _job(parsed: argparse.Namespace, detector: Detector) -> _Job:
                 f"{path}: a camera's index, and a file or folder here, too; write ./{path} for that, "
                 "or start from another folder for the camera"
             )
-        info = road and road.camera.info
+        info = lens or (road and road.camera.info)
         frames = camera_frames(int(parsed.source), (info.width, info.height) if info else None)
         return _Job(((frame, road) for frame in frames), live=True)
     if not path.exists():
@@ -115,18 +131,23 @@ def _job(parsed: argparse.Namespace, detector: Detector) -> _Job:
         if paths:
             return _Job((frame, road) for frame in image_frames(paths))
         if any(reader.accepts(path) for reader in READERS.values()):
-            return _Job(_drive_frames(path, detector, road))
+            return _Job(_drive_frames(path, detector, road, lens))
         raise DriveError(f"{path}: no images ({', '.join(IMAGE_SUFFIXES)}) and no drive in this folder")
     if READERS["bag"].accepts(path):
-        return _Job(_drive_frames(path, detector, road))
+        return _Job(_drive_frames(path, detector, road, lens))
     frames = image_frames([path]) if path.suffix.lower() in IMAGE_SUFFIXES else video_frames(path)
     return _Job((frame, road) for frame in frames)
 
 
 def _drive_frames(
-    path: Path, detector: Detector, road: RoadDetector | None
+    path: Path, detector: Detector, road: RoadDetector | None, lens: CameraInfo | None
 ) -> Iterator[tuple[Frame, RoadDetector]]:
     """The images of a drive; if a calibration was given, those of its camera."""
+    if lens is not None:
+        raise ConfigError(
+            "--camera: this file holds intrinsics alone, and a drive has its own; drop --camera, or name the "
+            "file as camera_info in drive.yaml"
+        )
     drive = read_drive(path)
     roads = {name: RoadDetector(detector, camera) for name, camera in drive.cameras.items()}
     if road is not None:
@@ -144,7 +165,11 @@ def _drive_frames(
 
 
 def _found(
-    job: _Job, parsed: argparse.Namespace, detector: Detector, stopwatch: Stopwatch
+    job: _Job,
+    parsed: argparse.Namespace,
+    detector: Detector,
+    lens: CameraInfo | None,
+    stopwatch: Stopwatch,
 ) -> Iterator[tuple[Frame, RoadDetector, Road]]:
     """Every frame with what it shows."""
     frames = iter(job.frames if parsed.limit is None else islice(job.frames, parsed.limit))
@@ -158,7 +183,7 @@ def _found(
                 stopwatch.discard()
                 return
             if road is None:
-                road = rough = rough or _rough_road(frame, parsed, detector)
+                road = rough = rough or _rough_road(frame, parsed, detector, lens)
             _check_size(frame, road)
             found = road.detect(frame.pixels)
         yield frame, road, found
@@ -166,11 +191,15 @@ def _found(
             continue
         pitch_rad = vote.add([lane.image for lane in found.lanes], detector.view(road.camera))
         if pitch_rad is not None:
-            rough = _rough_road(frame, parsed, detector, float(np.rad2deg(pitch_rad)))
+            rough = _rough_road(frame, parsed, detector, lens, float(np.rad2deg(pitch_rad)))
 
 
 def _rough_road(
-    frame: Frame, parsed: argparse.Namespace, detector: Detector, seen_pitch_deg: float | None = None
+    frame: Frame,
+    parsed: argparse.Namespace,
+    detector: Detector,
+    lens: CameraInfo | None,
+    seen_pitch_deg: float | None = None,
 ) -> RoadDetector:
     """A detector for a camera of unknown mounting; it says what it takes that to be."""
     height_m, pitch_deg, fov_deg = parsed.mounting or parsed.rough_mounting
@@ -179,6 +208,8 @@ def _rough_road(
             f"--mounting {height_m:g} {pitch_deg:g} {fov_deg:g}: give a height above 0 m, a pitch "
             "of -45 to 85 deg (down is positive) and a field of view of 10 to 150 deg"
         )
+    if lens is not None:
+        fov_deg = float(2 * np.degrees(np.arctan(lens.width / 2 / lens.intrinsic[0, 0])))
     if seen_pitch_deg is not None:
         print(
             f"the lines of {frame.name} and images before it meet on a horizon: taking the camera to look "
@@ -187,13 +218,17 @@ def _rough_road(
         )
         pitch_deg = seen_pitch_deg
     elif parsed.mounting is None:
+        known = "no --camera" if lens is None else f"no mounting in {parsed.camera}"
         print(
-            f"no --camera: taking it to be {height_m:g} m up, {pitch_deg:g} deg down, {fov_deg:g} deg wide "
+            f"{known}: taking it to be {height_m:g} m up, {pitch_deg:g} deg down, {fov_deg:.3g} deg wide "
             "(--mounting says otherwise); positions in px only",
             file=sys.stderr,
         )
     rows, columns = frame.pixels.shape[:2]
-    calibration = rough_calibration("camera", columns, rows, height_m, pitch_deg, fov_deg)
+    name = "camera" if lens is None else lens.name
+    calibration = rough_calibration(name, columns, rows, height_m, pitch_deg, fov_deg)
+    if lens is not None:
+        calibration = replace(calibration, info=lens)
     return RoadDetector(detector, camera_from_calibration(calibration, parsed.linear))
 
 

@@ -24,6 +24,8 @@ from v2hdm.detection.draw import draw_detections
 from v2hdm.detection.road import RoadDetector
 from v2hdm.detection.stopwatch import Stopwatch, lap
 from v2hdm.hdmap import write_calibration
+from v2hdm.hdmap.calibration import Provenance
+from v2hdm.hdmap.calibration_formats import write_calibration_as
 from v2hdm.records import Calibration, LaneDetection, MarkingDetection
 
 DIAMONDS = [diamond(8.0, 0.5), diamond(11.0, -0.5)]
@@ -101,6 +103,24 @@ def test_without_a_calibration_there_are_pixels_only_and_a_word_about_it(bench, 
     out, err = capsys.readouterr()
     assert ["corners_px" in marking for marking in lines(out)[0]["markings"]] == [True, True]
     assert "no --camera" not in err
+
+
+def test_intrinsics_of_another_tool_give_the_lens_and_pixels(bench, tmp_path, capsys):
+    info = make_camera().info
+    write_calibration_as("kalibr", Calibration(info, extrinsic()), Provenance(), tmp_path, "front")
+    file = tmp_path / "front_kalibr.yaml"
+    assert bench.run(bench.folder / "0.png", "--camera", file) == 0
+    out, err = capsys.readouterr()
+    assert all("corners_px" in marking for marking in lines(out)[0]["markings"])
+    assert all("corners_vehicle" not in marking for marking in lines(out)[0]["markings"])
+    wide = 2 * np.degrees(np.arctan(info.width / 2 / info.intrinsic[0, 0]))
+    assert f"no mounting in {file}: taking it to be 1.6 m up, 5 deg down, {wide:.3g} deg wide" in err
+    assert bench.run(bench.folder / "0.png", "--camera", file, "--mounting", 2.2, 14, 63) == 0
+    assert "no mounting" not in capsys.readouterr().err
+    assert bench.run(bench.folder / "0.png", "--camera", file, "--camera-name", "cam1") == 2
+    assert "no camera 'cam1' in this file; it holds: cam0" in capsys.readouterr().err
+    assert bench.run(bench.folder / "0.png", "--camera-name", "cam0") == 2
+    assert "is the calibration of one camera" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")

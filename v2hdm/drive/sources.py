@@ -26,6 +26,7 @@ from v2hdm.drive.bag.streams import (
 from v2hdm.drive.bag.tf import TF_TOPIC
 from v2hdm.drive.camera_info import read_camera_info
 from v2hdm.drive.images import ImageFiles
+from v2hdm.drive.intrinsics import read_intrinsics
 from v2hdm.drive.poses.kitti_rows import read_stamps
 from v2hdm.drive.poses.readings import Attitudes, Readings
 from v2hdm.drive.stamp_units import UNITS
@@ -100,10 +101,21 @@ def plan_info(content: object, camera: str, sources: Sources, where: str) -> Cal
     """How to read the intrinsics that ``camera_info`` of a camera names, a file or a topic."""
     if not isinstance(content, dict):
         path = sources.root / take_text(content, where, DriveError)
-        return lambda: read_camera_info(path)
+        return lambda: _read_info(path, None)
+    if "file" in content:
+        check_keys(content, ("file",), ("camera",), where, DriveError)
+        named = sources.root / take_text(content["file"], f"{where}, file", DriveError)
+        chosen = content.get("camera")
+        if chosen is not None and not isinstance(chosen, int):  # COLMAP numbers its cameras
+            chosen = take_text(chosen, f"{where}, camera", DriveError)
+        return lambda: _read_info(named, None if chosen is None else str(chosen))
     check_keys(content, ("topic",), (), where, DriveError)
     folder = sources.want(InfoStream(take_text(content["topic"], f"{where}, topic", DriveError), where))
     return lambda: replace(read_camera_info(folder() / INFO_FILE), name=camera)
+
+
+def _read_info(path: Path, camera: str | None) -> CameraInfo:
+    return read_intrinsics(path, camera, f"camera_info: {{file: {path.name}, camera: NAME}}")
 
 
 def plan_topic_poses(
