@@ -255,7 +255,7 @@ def _check(config: RunConfig) -> str:
     detector = Detector.load(options=config.detector)
     check_options(config.mapping, detector.catalogue.cornered)
     check_formats(config.export, "export")
-    _check_device(config.mapping.device)
+    check_device(config.mapping.device)
     return name
 
 
@@ -270,7 +270,7 @@ def run_name(config: RunConfig) -> str:
     return drive_name(Path(config.drive.path))
 
 
-def _check_device(device: str) -> None:
+def check_device(device: str) -> None:
     if device not in ("cpu", "cuda"):
         raise ConfigError(f"device is {device!r}: choose cpu or cuda")
     if device == "cuda" and not torch.cuda.is_available():

@@ -1,0 +1,108 @@
+"""How sharp the paint of a mosaic is: the width of its edges, which says nothing of where they lie.
+
+Across every side of every mapped marking a profile of grey values is taken, the mean over the side's middle part.
+The width of an edge is the paint's contrast over the steepest slope of that profile: the distance over which a
+ramp of that slope rises from ground to paint. The steepest slope is looked for within :data:`REACH_M` to either
+side, so that paint which is out of place is not held to be blurred. Where paint appears twice, each image of it
+has half the contrast and half the slope, and the width says so, for the contrast is one for all mosaics that are
+compared: the largest that any of them shows there. Blending only ever lowers it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from v2hdm.geometry.ipm import apply_homography
+from v2hdm.orthophoto.canvas import Canvas
+from v2hdm.records import FloatArray, HdMap
+
+REACH_M = 0.75
+"""Half of the length of a profile, m: misplaced paint is found within it."""
+
+_MIDDLE = (0.2, 0.8)
+"""Part of a side over which its profile is averaged: without its corners."""
+
+_SAMPLES = 12
+"""Places along a side's middle part."""
+
+_LEAST_SIDE_M = 0.4
+"""Shorter sides have no middle part that a pixel of 2 cm would resolve."""
+
+_OVER_M = 0.04
+"""Slopes are taken over this distance, m: two pixels of 2 cm."""
+
+_STEP_M = 0.01
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Of S paint sides: the largest ``slope`` (S,), grey values a m, and the ``contrast`` (S,), grey values.
+
+    Both are nan where the mosaic does not show the whole profile.
+    """
+
+    slope: FloatArray
+    contrast: FloatArray
+
+    def with_those_of(self, other: Edges) -> Edges:
+        """Those of the same sides in another part of the same mosaic, where this part has none."""
+        known = np.isfinite(self.slope)
+        return Edges(
+            np.where(known, self.slope, other.slope), np.where(known, self.contrast, other.contrast)
+        )
+
+
+def paint_sides(hd_map: HdMap) -> FloatArray:
+    """The sides (S, 2, 2), m, of markings and symbols from end to end."""
+    outlines = [m.corners_map for m in hd_map.markings] + [s.outline_map for s in hd_map.symbols]
+    sides = [np.stack([o, np.roll(o, -1, axis=0)], axis=1) for o in outlines if np.isfinite(o).all()]
+    out = np.concatenate(sides) if sides else np.empty((0, 2, 2))
+    return out[np.linalg.norm(out[:, 1] - out[:, 0], axis=1) >= _LEAST_SIDE_M]
+
+
+def no_edges(count: int) -> Edges:
+    """What is known of ``count`` sides before a mosaic was looked at."""
+    return Edges(np.full(count, np.nan), np.full(count, np.nan))
+
+
+def measure_edges(rgba: np.ndarray, canvas: Canvas, sides: FloatArray) -> Edges:
+    """The edges across sides (S, 2, 2), m, in a mosaic (rows, columns, 4)."""
+    out = no_edges(len(sides))
+    points = apply_homography(np.linalg.inv(canvas.map_from_canvas), _profiles(sides))
+    low, high = points.min(axis=(1, 2)), points.max(axis=(1, 2))
+    inside = (low >= 0).all(axis=1) & (high <= [canvas.columns - 1, canvas.rows - 1]).all(axis=1)
+    if not inside.any():
+        return out
+    grey = cv2.cvtColor(np.ascontiguousarray(rgba[..., :3]), cv2.COLOR_RGB2GRAY).astype(np.float32)
+    seen = rgba[..., 3].astype(np.float32)
+    lag = round(_OVER_M / _STEP_M)
+    for k in np.flatnonzero(inside):
+        x, y = points[k].astype(np.float32).transpose(2, 0, 1)
+        if cv2.remap(seen, x, y, cv2.INTER_NEAREST).min() == 0:
+            continue
+        profile = cv2.remap(grey, x, y, cv2.INTER_LINEAR).mean(axis=0)
+        out.slope[k] = np.abs(profile[lag:] - profile[:-lag]).max() / _OVER_M
+        out.contrast[k] = np.ptp(profile)
+    return out
+
+
+def edge_widths_m(mosaics: Sequence[Edges]) -> list[FloatArray]:
+    """The widths, m, of those edges that all mosaics show, for each mosaic: contrast over slope."""
+    contrast = np.max([one.contrast for one in mosaics], axis=0)
+    shown = np.all([np.isfinite(one.slope) & (one.slope > 0) for one in mosaics], axis=0)
+    return [contrast[shown] / one.slope[shown] for one in mosaics]
+
+
+def _profiles(sides: FloatArray) -> FloatArray:
+    """Points (S, along, across, 2), m, of the profiles across sides (S, 2, 2)."""
+    along = sides[:, 1] - sides[:, 0]
+    unit = along / np.linalg.norm(along, axis=1, keepdims=True)
+    normal = np.stack([-unit[:, 1], unit[:, 0]], axis=1)
+    at = np.linspace(*_MIDDLE, _SAMPLES)
+    across = np.linspace(-REACH_M, REACH_M, round(2 * REACH_M / _STEP_M) + 1)
+    middle = sides[:, 0, None] + at[:, None] * along[:, None]
+    return np.asarray(middle[:, :, None] + across[:, None] * normal[:, None, None])
