@@ -38,7 +38,9 @@ def drive_of_result(folder: Path, path: Path | None = None) -> Drive:
     except OmegaConfBaseException:
         config = None
     if not isinstance(config, RunConfig):
-        raise MapFileError(f"{folder / 'config.yaml'} is no configuration of v2hdm.map; give its result folder")
+        raise MapFileError(
+            f"{folder / 'config.yaml'} is no configuration of v2hdm.map; give its result folder"
+        )
     if path is None and config.simulate is not None:
         workers = config.workers or os.cpu_count() or 1
         path = rendered_drive(config.simulate, Path(config.cache), workers, lambda done, total: None)
@@ -64,7 +66,10 @@ def mosaic_of_result(parsed: argparse.Namespace) -> list[str]:
         raise MapFileError(f"{parsed.result}: no such folder; give the result folder of v2hdm.map")
     drive = drive_of_result(parsed.result, parsed.drive)
     resolution_m = RESOLUTION_M if parsed.resolution is None else parsed.resolution
-    found = write_mosaic(parsed.result, drive, resolution_m, parsed.device, _tell)
+    try:
+        found = write_mosaic(parsed.result, drive, resolution_m, parsed.device, _tell)
+    except OSError as error:
+        raise ConfigError(f"{parsed.result}: the mosaic cannot be written there ({error})") from None
     sharpness = found["sharpness"]
     lines = []
     if sharpness["edges"]:

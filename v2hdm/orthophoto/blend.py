@@ -14,7 +14,9 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -49,7 +51,9 @@ _KEPT_IMAGES = 96
 class Sheet:
     """A finished part of a canvas, its first pixel at (``row``, ``column``).
 
-    ``rgba`` (rows, columns, 4) uint8; alpha is 255 where any image shows the ground, else 0 and all black.
+    ``rgba`` (rows, columns, 4) uint8. Alpha is 255 where the images together show the ground at least as finely
+    as a single one shows the farthest ground that it is trusted for, less where more coarsely, and 0 with black
+    where none shows it.
     """
 
     row: int
@@ -57,7 +61,9 @@ class Sheet:
     rgba: np.ndarray
 
 
-def whole(canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Lens], device: str = "cpu") -> np.ndarray:
+def whole(
+    canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Lens], device: str = "cpu"
+) -> np.ndarray:
     """A canvas in one piece: (rows, columns, 4) uint8 RGBA."""
     out = np.zeros((canvas.rows, canvas.columns, 4), dtype=np.uint8)
     for sheet in blend(canvas, shots, lenses, device):
@@ -87,19 +93,20 @@ def blend(
     """
     tiling = Tiling.of(canvas, shots, lenses)
     plan = _plan(canvas, shots, lenses, tiling.side_px)
-    sources = _Sources(lenses, device)
-    total, done = sum(len(views) for _, views in plan), 0
+    full_weight = _full_weight(canvas, shots, lenses)
+    order = [index for _, views in plan for index, _ in views]
+    sources = _Sources(shots, lenses, device).of(order)
+    done = 0
     for (row, column), views in plan:
         rows, columns = min(SHEET_PX, canvas.rows - row), min(SHEET_PX, canvas.columns - column)
         sums = _Sums((rows, columns), views, tiling, device)
         map_from_sheet = canvas.window(row, column, rows, columns).map_from_canvas
         for index, tiles in views:
-            shot = shots[index]
-            sums.add(sources.of(shot), shot.pinhole_px_from_map @ map_from_sheet, tiles)
+            sums.add(next(sources), shots[index].pinhole_px_from_map @ map_from_sheet, tiles)
             done += 1
             if progress:
-                progress(done, total)
-        yield Sheet(row, column, sums.mean())
+                progress(done, len(order))
+        yield Sheet(row, column, sums.mean(full_weight))
 
 
 _Views = list[tuple[int, FloatArray]]
@@ -122,6 +129,19 @@ def _plan(
             key = (int(sheet[1]) * SHEET_PX, int(sheet[0]) * SHEET_PX)
             plan.setdefault(key, []).append((index, mine))
     return list(plan.items())
+
+
+def _full_weight(canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Lens]) -> float:
+    """The least weight of ground that an image is trusted for: in px of the image a px of the canvas."""
+    least = []
+    for shot in {shot.camera: shot for shot in shots}.values():
+        px_from_canvas = shot.pinhole_px_from_map @ canvas.map_from_canvas
+        outline = apply_homography(
+            np.linalg.inv(canvas.map_from_canvas), shot.outline_map(lenses[shot.camera])
+        )
+        third = outline @ px_from_canvas[2, :2] + px_from_canvas[2, 2]
+        least.append(float((np.linalg.det(px_from_canvas) / third**3).min()))
+    return min(least, default=1.0)
 
 
 def _tiles_under(polygon: FloatArray, limit: np.ndarray, side_px: int) -> np.ndarray:
@@ -152,36 +172,49 @@ class _Source:
 
 
 class _Sources:
-    """Decoded images, the last used of which are kept."""
+    """The images of shots in the order in which they are asked for; the next is decoded meanwhile.
 
-    def __init__(self, lenses: Mapping[str, Lens], device: str):
-        self._lenses, self._device = lenses, device
-        self._kept: OrderedDict[object, np.ndarray] = OrderedDict()
+    The last used are kept, cut to what is trusted.
+    """
+
+    def __init__(self, shots: Sequence[Shot], lenses: Mapping[str, Lens], device: str):
+        self._shots, self._lenses, self._device = shots, lenses, device
+        self._kept: OrderedDict[Path, np.ndarray] = OrderedDict()
         self._boxes = {name: _box(lens.trust) for name, lens in lenses.items()}
         self._trust = {
             name: torch.from_numpy(lens.trust[self._boxes[name]].copy()).to(device)
             for name, lens in lenses.items()
         }
 
-    def of(self, shot: Shot) -> _Source:
-        lens, box, trust = self._lenses[shot.camera], self._boxes[shot.camera], self._trust[shot.camera]
-        pixels = self._pixels(shot, lens, box)
+    def of(self, order: Sequence[int]) -> Iterator[_Source]:
+        """The images of these indices of shots."""
+        with ThreadPoolExecutor(1) as decoder:
+            ahead = decoder.submit(self._pixels, self._shots[order[0]]) if order else None
+            for position, index in enumerate(order):
+                assert ahead is not None
+                pixels = ahead.result()
+                if position + 1 < len(order):
+                    ahead = decoder.submit(self._pixels, self._shots[order[position + 1]])
+                yield self._source(self._shots[index], pixels)
+
+    def _source(self, shot: Shot, pixels: np.ndarray) -> _Source:
+        box, trust = self._boxes[shot.camera], self._trust[shot.camera]
         values = torch.empty((4, *trust.shape), dtype=torch.float32, device=self._device)
         values[:3] = torch.from_numpy(pixels).to(self._device).permute(2, 0, 1)
         values[3] = trust
-        return _Source(values, (box[1].start, box[0].start), lens)
+        return _Source(values, (box[1].start, box[0].start), self._lenses[shot.camera])
 
-    def _pixels(self, shot: Shot, lens: Lens, box: tuple[slice, slice]) -> np.ndarray:
+    def _pixels(self, shot: Shot) -> np.ndarray:
         if shot.path in self._kept:
             self._kept.move_to_end(shot.path)
             return self._kept[shot.path]
-        pixels = read_bgr(shot.path)
+        pixels, lens = read_bgr(shot.path), self._lenses[shot.camera]
         if pixels.shape[:2] != lens.trust.shape:
             raise DriveError(
                 f"{shot.path}: the image is {pixels.shape[1]}x{pixels.shape[0]} but camera {shot.camera!r} has "
                 f"{lens.info.width}x{lens.info.height}; mend the camera_info or the image list"
             )
-        self._kept[shot.path] = cut = pixels[box].copy()
+        self._kept[shot.path] = cut = pixels[self._boxes[shot.camera]].copy()
         if len(self._kept) > _KEPT_IMAGES:
             self._kept.popitem(last=False)
         return cut
@@ -231,7 +264,7 @@ class Tiling:
         if min(third.min(), third_nodes.min()) <= 0:
             return np.inf
         across = self.pixels_from_nodes
-        found = np.einsum("pr,trcx,qc->tpqx", across, _distorted(lens, nodes), across)
+        found = np.moveaxis(across @ np.moveaxis(_distorted(lens, nodes), 3, 1) @ across.T, 1, 3)
         return float(np.abs(found - _distorted(lens, exact)).max())
 
 
@@ -292,12 +325,12 @@ class _Sums:
         grid = self._rows @ pairs.reshape(len(tiles), _NODES, 2 * _NODES) @ self._pairs
         return grid.reshape(len(tiles), side, side, 2), self._rows @ density @ self._rows.mT
 
-    def mean(self) -> np.ndarray:
-        """The sheet as (rows, columns, 4) uint8 RGBA."""
+    def mean(self, full_weight: float) -> np.ndarray:
+        """The sheet as (rows, columns, 4) uint8 RGBA, opaque from ``full_weight`` on."""
         weight = self._sums[:, 3:]
-        seen = weight > 0
-        colours = (self._sums[:, [2, 1, 0]] / weight.where(seen, torch.ones_like(weight))).round()
-        rgba = torch.cat([colours, 255 * seen], dim=1).to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
+        colours = self._sums[:, [2, 1, 0]] / weight.where(weight > 0, torch.ones_like(weight))
+        alpha = (255 / full_weight * weight).clamp(max=255)
+        rgba = torch.cat([colours, alpha], dim=1).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
         (rows, columns), side = self._shape, self._tiling.side_px
         down, across = -(-rows // side), -(-columns // side)
         out = np.zeros((down, side, across, side, 4), dtype=np.uint8)

@@ -27,17 +27,16 @@ def richest_place(drive: Drive, hd_map: HdMap) -> FloatArray:
     """The pose (4, 4) ahead of which the most paint edge was seen most often.
 
     Each image's pose is a candidate, its place the ground about it. It is worth the sum over all markings and
-    symbols that lie on it whole of their circumference times the images that they were found in.
+    symbols that lie on it whole of their number of sides times the images that they were found in.
     """
     outlines = [(m.corners_map, m.sightings) for m in hd_map.markings]
     outlines += [(s.outline_map, s.sightings) for s in hd_map.symbols]
     poses = np.stack([image.map_from_vehicle for image in drive.images])
     worth = np.zeros(len(poses))
     for outline, sightings in outlines:
-        length_m = np.linalg.norm(outline - np.roll(outline, 1, axis=0), axis=1).sum()
         offset = outline - poses[:, None, :2, 3]
         inside = (np.abs(offset @ poses[:, :2, :2]) <= [AHEAD_M / 2, ACROSS_M / 2]).all(axis=(1, 2))
-        worth += inside * length_m * sightings
+        worth += inside * len(outline) * sightings
     return np.asarray(poses[int(np.argmax(worth))])
 
 
@@ -73,8 +72,12 @@ def save_comparison(
     levels = _levels(list(panels.values())[-1])
     height_in = _PANEL_IN * AHEAD_M / ACROSS_M + 0.8
     with style.figure(path, _PANEL_IN * len(panels) + 0.1, height_in) as fig:
-        for axes, (title, rgba) in zip(np.atleast_1d(fig.subplots(1, len(panels))), panels.items(), strict=True):
-            axes.imshow(_brightened(rgba, levels), extent=(0, ACROSS_M, 0, AHEAD_M), interpolation="antialiased")
+        for axes, (title, rgba) in zip(
+            np.atleast_1d(fig.subplots(1, len(panels))), panels.items(), strict=True
+        ):
+            axes.imshow(
+                _brightened(rgba, levels), extent=(0, ACROSS_M, 0, AHEAD_M), interpolation="antialiased"
+            )
             axes.set_title(title)
             axes.set_xlabel(captions[title])
             axes.set(xticks=[], yticks=[])
@@ -100,4 +103,5 @@ def _brightened(rgba: np.ndarray, levels: tuple[float, float]) -> np.ndarray:
     """The picture with its levels stretched; white where nothing was seen."""
     low, high = levels
     stretched = np.clip((rgba[..., :3].astype(np.float32) - 0.5 * low) / (high - 0.5 * low), 0, 1)
-    return np.where(rgba[..., 3:] > 0, stretched, 1.0)
+    seen = rgba[..., 3:].astype(np.float32) / 255
+    return 1 - seen * (1 - stretched)

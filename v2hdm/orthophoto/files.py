@@ -17,14 +17,17 @@ from v2hdm.orthophoto.blend import Sheet
 from v2hdm.orthophoto.canvas import Canvas
 from v2hdm.records import GeodeticOrigin
 
-LARGEST_PICTURE_PX = 4096
-"""Of either side of the picture: what every browser and phone can draw."""
+LARGEST_PICTURE_PX = 8192
+"""Of either side of the picture: what graphics cards of computers and phones alike can draw."""
 
 MULTIPLE_PX = 256
 """Sides of a canvas are multiples of it, so that pictures reduced by up to that factor fit it exactly."""
 
 _PICTURE_QUALITY = 80
 _JPEG_QUALITY = 90
+_SEEN_ALPHA = 128
+"""A GeoTIFF's mask knows but seen and unseen."""
+
 _BLOCK_PX = 512
 _OVERVIEWS = (2, 4, 8, 16)
 _SEMI_MAJOR_M = 6378137.0
@@ -62,7 +65,7 @@ class GeoTiff:
         rows, columns = sheet.rgba.shape[:2]
         window = self._rasterio.windows.Window(sheet.column, sheet.row, columns, rows)
         self._dataset.write(np.moveaxis(sheet.rgba[..., :3], 2, 0), window=window)
-        self._dataset.write_mask(sheet.rgba[..., 3], window=window)
+        self._dataset.write_mask(sheet.rgba[..., 3] >= _SEEN_ALPHA, window=window)
 
 
 @contextmanager
@@ -73,7 +76,6 @@ def geotiff(path: Path, canvas: Canvas, origin: GeodeticOrigin | None) -> Iterat
         ConfigError: rasterio is not installed.
     """
     rasterio = need("rasterio", "gis", path.name, ConfigError)
-    need("rasterio.windows", "gis", path.name, ConfigError)
     west, _, _, north = canvas.bounds_m
     profile = {
         "driver": "GTiff", "width": canvas.columns, "height": canvas.rows, "count": 3, "dtype": "uint8",

@@ -38,7 +38,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class _Ground:
+class Ground:
     """Cameras, images under the adjusted and under the initial calibration, and the canvas for both."""
 
     lenses: Mapping[str, Lens]
@@ -71,7 +71,7 @@ def write_mosaic(
     if not resolution_m > 0:
         raise ConfigError(f"a resolution of {resolution_m:g} m a pixel makes no mosaic; give a positive one")
     hd_map = read_geojson(folder / "map.geojson")
-    ground = _ground(folder, drive, resolution_m)
+    ground = ground_of(folder, drive, resolution_m)
     sides = paint_sides(hd_map)
     before, after = no_edges(len(sides)), no_edges(len(sides))
     picture = Picture(ground.canvas)
@@ -123,7 +123,8 @@ def _sharpness(before_m: FloatArray, after_m: FloatArray) -> dict[str, float | i
     }
 
 
-def _ground(folder: Path, drive: Drive, resolution_m: float) -> _Ground:
+def ground_of(folder: Path, drive: Drive, resolution_m: float) -> Ground:
+    """The ground that a run's images show, and the canvas around it; errors as :func:`write_mosaic`."""
     calibrations, clock_s = _calibrations(folder)
     missing = [name for name in drive.cameras if name not in calibrations]
     if len(missing) == len(drive.cameras):
@@ -151,7 +152,7 @@ def _ground(folder: Path, drive: Drive, resolution_m: float) -> _Ground:
     seen = np.concatenate([shot.outline_map(lenses[shot.camera]) for shot in after])
     if not np.isfinite(seen).all():
         raise DriveError(f"drive {drive.name}: an ROI reaches the horizon; draw it nearer to the camera")
-    return _Ground(lenses, after, before, Canvas.around(seen, resolution_m, MULTIPLE_PX))
+    return Ground(lenses, after, before, Canvas.around(seen, resolution_m, MULTIPLE_PX))
 
 
 def _calibrations(folder: Path) -> tuple[dict[str, Calibration], dict[str, float]]:
@@ -170,13 +171,15 @@ def _calibrations(folder: Path) -> tuple[dict[str, Calibration], dict[str, float
 
 
 def _compare(
-    path: Path, drive: Drive, ground: _Ground, pose: FloatArray, sharpness: Mapping[str, float], device: str
+    path: Path, drive: Drive, ground: Ground, pose: FloatArray, sharpness: Mapping[str, float], device: str
 ) -> None:
     initial = {camera.initial_ipm for camera in drive.cameras.values()}
     whose = "a borrowed calibration" if initial == {"estimated"} else "the initial calibration"
     titles = f"before: {whose}, recorded poses", "after: optimised calibration, adjusted poses"
     widths = [sharpness.get(f"edge_width_{when}_m") for when in ("before", "after")]
-    captions = ["" if width is None else f"paint edges {100 * width:.1f} cm wide (median)" for width in widths]
+    captions = [
+        "" if width is None else f"paint edges {100 * width:.1f} cm wide (median)" for width in widths
+    ]
     save_comparison(
         path,
         pose,

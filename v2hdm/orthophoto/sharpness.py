@@ -2,7 +2,7 @@
 
 Across every side of every mapped marking a profile of grey values is taken, the mean over the side's middle part.
 The width of an edge is the paint's contrast over the steepest slope of that profile: the distance over which a
-ramp of that slope rises from ground to paint. The steepest slope is looked for within :data:`REACH_M` to either
+ramp of that slope rises from ground to paint. Slopes are taken over one pixel of the mosaic. The steepest slope is looked for within :data:`REACH_M` to either
 side, so that paint which is out of place is not held to be blurred. Where paint appears twice, each image of it
 has half the contrast and half the slope, and the width says so, for the contrast is one for all mosaics that are
 compared: the largest that any of them shows there. Blending only ever lowers it.
@@ -30,12 +30,10 @@ _SAMPLES = 12
 """Places along a side's middle part."""
 
 _LEAST_SIDE_M = 0.4
-"""Shorter sides have no middle part that a pixel of 2 cm would resolve."""
+"""Shorter sides have no middle part that pixels of some centimetres would resolve, m."""
 
-_OVER_M = 0.04
-"""Slopes are taken over this distance, m: two pixels of 2 cm."""
-
-_STEP_M = 0.01
+_SEEN_ALPHA = 128
+"""Alpha from which the mosaic counts as showing the ground."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +49,7 @@ class Edges:
     def with_those_of(self, other: Edges) -> Edges:
         """Those of the same sides in another part of the same mosaic, where this part has none."""
         known = np.isfinite(self.slope)
-        return Edges(
-            np.where(known, self.slope, other.slope), np.where(known, self.contrast, other.contrast)
-        )
+        return Edges(np.where(known, self.slope, other.slope), np.where(known, self.contrast, other.contrast))
 
 
 def paint_sides(hd_map: HdMap) -> FloatArray:
@@ -72,20 +68,19 @@ def no_edges(count: int) -> Edges:
 def measure_edges(rgba: np.ndarray, canvas: Canvas, sides: FloatArray) -> Edges:
     """The edges across sides (S, 2, 2), m, in a mosaic (rows, columns, 4)."""
     out = no_edges(len(sides))
-    points = apply_homography(np.linalg.inv(canvas.map_from_canvas), _profiles(sides))
+    points = apply_homography(np.linalg.inv(canvas.map_from_canvas), _profiles(sides, canvas.cell_m / 2))
     low, high = points.min(axis=(1, 2)), points.max(axis=(1, 2))
     inside = (low >= 0).all(axis=1) & (high <= [canvas.columns - 1, canvas.rows - 1]).all(axis=1)
     if not inside.any():
         return out
     grey = cv2.cvtColor(np.ascontiguousarray(rgba[..., :3]), cv2.COLOR_RGB2GRAY).astype(np.float32)
     seen = rgba[..., 3].astype(np.float32)
-    lag = round(_OVER_M / _STEP_M)
     for k in np.flatnonzero(inside):
         x, y = points[k].astype(np.float32).transpose(2, 0, 1)
-        if cv2.remap(seen, x, y, cv2.INTER_NEAREST).min() == 0:
+        if cv2.remap(seen, x, y, cv2.INTER_NEAREST).min() < _SEEN_ALPHA:
             continue
         profile = cv2.remap(grey, x, y, cv2.INTER_LINEAR).mean(axis=0)
-        out.slope[k] = np.abs(profile[lag:] - profile[:-lag]).max() / _OVER_M
+        out.slope[k] = np.abs(profile[2:] - profile[:-2]).max() / canvas.cell_m
         out.contrast[k] = np.ptp(profile)
     return out
 
@@ -97,12 +92,12 @@ def edge_widths_m(mosaics: Sequence[Edges]) -> list[FloatArray]:
     return [contrast[shown] / one.slope[shown] for one in mosaics]
 
 
-def _profiles(sides: FloatArray) -> FloatArray:
+def _profiles(sides: FloatArray, step_m: float) -> FloatArray:
     """Points (S, along, across, 2), m, of the profiles across sides (S, 2, 2)."""
     along = sides[:, 1] - sides[:, 0]
     unit = along / np.linalg.norm(along, axis=1, keepdims=True)
     normal = np.stack([-unit[:, 1], unit[:, 0]], axis=1)
     at = np.linspace(*_MIDDLE, _SAMPLES)
-    across = np.linspace(-REACH_M, REACH_M, round(2 * REACH_M / _STEP_M) + 1)
+    across = np.linspace(-REACH_M, REACH_M, round(2 * REACH_M / step_m) + 1)
     middle = sides[:, 0, None] + at[:, None] * along[:, None]
     return np.asarray(middle[:, :, None] + across[:, None] * normal[:, None, None])

@@ -10,7 +10,13 @@ import cv2
 import numpy as np
 
 from v2hdm.drive.trajectory import interpolate
-from v2hdm.geometry.ipm import apply_homography, facing_ipm, flat_motion, pinhole_px_from_ground, project_ground
+from v2hdm.geometry.ipm import (
+    apply_homography,
+    facing_ipm,
+    flat_motion,
+    pinhole_px_from_ground,
+    project_ground,
+)
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.rigid import inverse
 from v2hdm.records import Calibration, Camera, CameraInfo, Drive, FloatArray, Trajectory
@@ -69,8 +75,12 @@ def lens_of(camera: Camera, cam_from_vehicle: FloatArray) -> Lens:
     inside[[0, -1]] = inside[:, [0, -1]] = 0
     depth_px = cv2.distanceTransform(inside, cv2.DIST_L2, 5)[1:-1, 1:-1]
     trust = np.clip(depth_px / FEATHER_PX, 0, 1).astype(np.float32)
-    edge = np.concatenate([c[::_OUTLINE_STEP_PX, 0] for c in cv2.findContours(
-        inside[1:-1, 1:-1], cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]])
+    edge = np.concatenate(
+        [
+            c[::_OUTLINE_STEP_PX, 0]
+            for c in cv2.findContours(inside[1:-1, 1:-1], cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+        ]
+    )
     hull = cv2.convexHull(undistort_points(info, edge.astype(np.float64)).astype(np.float32))[:, 0]
     return Lens(info, trust, hull.astype(np.float64))
 

@@ -27,6 +27,7 @@ from v2hdm.errors import AdjustError, ConfigError, MappingError, V2hdmError
 from v2hdm.hdmap.formats import check_formats
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions, check_options
+from v2hdm.orthophoto.result import write_mosaic
 from v2hdm.pipeline.evaluate import CameraSets, evaluate
 from v2hdm.pipeline.inspect import Inspection, inspect
 from v2hdm.pipeline.write import write_results
@@ -81,6 +82,7 @@ class RunConfig:
         device: what ``conf/map.yaml`` hands on as ``mapping.device``, ``cpu`` or ``cuda``.
         all_maps: whether the map of every method and camera set is written, into ``maps/``.
         mode: what it hands on as ``mapping.mode``, ``batch`` or ``incremental``.
+        mosaic: whether the ground is shown from above, too (docs/mosaic.md).
         export: formats of the map: ``geojson``, ``csv``, ``gpkg``, ``lanelet2``, ``dxf`` (docs/exports.md).
     """
 
@@ -95,6 +97,7 @@ class RunConfig:
     device: str = "cpu"
     mode: str = "batch"
     all_maps: bool = False
+    mosaic: bool = False
     export: list[str] = field(default_factory=lambda: ["geojson"])
 
 
@@ -171,6 +174,9 @@ def _map_and_judge(
     write_results(
         folder, described, detections, methods, judgement, metrics, verdict, config.all_maps, config.export
     )
+    if config.mosaic:
+        with _timed(seconds, "mosaic"):
+            write_mosaic(folder, described, device=config.mapping.device, progress=partial(progress, "mosaic"))
     return RunResult(Path(config.output) / about["name"], metrics, judgement.headlines, verdict)
 
 
