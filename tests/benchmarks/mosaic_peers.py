@@ -2,11 +2,11 @@
 
     python -m tests.benchmarks.mosaic_peers RESULT [--images 200] [--threads 1] [--rounds 3]
 
-The loop removes the distortion of each whole image (``cv2.undistort``), warps it onto the part of the canvas that
-it shows (``cv2.warpPerspective``) and adds it there with the same weights, in numpy. ``cached`` is that loop with
-the lens's maps made once a camera. All decode the same files by the same call. They take turns within each
-round; the least of the rounds counts, as CPU seconds of the process, which neighbours on the machine hardly touch,
-and as wall seconds.
+The loop removes the distortion of each whole image (``cv2.undistort``), warps it onto the part of the canvas
+that it shows (``cv2.warpPerspective``) and adds it there with the same weights, in numpy. ``cached`` is that
+loop with the lens's maps made once a camera. All decode the same files by the same call. They take turns
+within each round; the least of the rounds counts, as CPU seconds of the process, which neighbours on the
+machine hardly touch, and as wall seconds.
 """
 
 from __future__ import annotations

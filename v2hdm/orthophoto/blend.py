@@ -1,9 +1,9 @@
 """All images of a drive on one canvas: the mean of what they show, weighted by how finely they show it.
 
 An image counts with the number of its pixels that a pixel of the canvas covers: the determinant of the
-homography between the two. With ``w`` the third coordinate of the canvas point, which is proportional to its
-depth, that is ``det(H) / w^3`` (Hartley and Zisserman, Multiple View Geometry, 2nd ed., section 2.3). Near views
-so outweigh far ones. What the image is trusted for and that weight are warped with its colours, in one pass.
+derivative of the homography ``H`` from canvas to image, which is ``det(H) / w^3``, with ``w`` the third
+coordinate of the mapped point. That is proportional to its depth, so that near views outweigh far ones. What
+the image is trusted for is warped with its colours, in one pass.
 
 The canvas is done in sheets, so that memory does not grow with the drive, and each sheet in tiles of which an
 image touches only those that it shows. Within a tile lens, projection and weight are smooth: kornia evaluates
@@ -51,9 +51,9 @@ _KEPT_IMAGES = 96
 class Sheet:
     """A finished part of a canvas, its first pixel at (``row``, ``column``).
 
-    ``rgba`` (rows, columns, 4) uint8. Alpha is 255 where the images together show the ground at least as finely
-    as a single one shows the farthest ground that it is trusted for, less where more coarsely, and 0 with black
-    where none shows it.
+    ``rgba`` (rows, columns, 4) uint8. Alpha is 255 where the images together show the ground at least as
+    finely as a single one shows the farthest ground that it is trusted for, less where more coarsely, and 0
+    with black where none shows it.
     """
 
     row: int
@@ -117,7 +117,7 @@ def _plan(
     canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Lens], side_px: int
 ) -> list[tuple[tuple[int, int], _Views]]:
     """By the first pixel (row, column) of each sheet, in the order of the first image: its views."""
-    canvas_from_map = np.linalg.inv(canvas.map_from_canvas)
+    canvas_from_map = canvas.canvas_from_map
     in_sheet = SHEET_PX // side_px
     limit = np.ceil([canvas.columns / side_px, canvas.rows / side_px]).astype(int)
     plan: dict[tuple[int, int], _Views] = {}
@@ -136,9 +136,7 @@ def _full_weight(canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Len
     least = []
     for shot in {shot.camera: shot for shot in shots}.values():
         px_from_canvas = shot.pinhole_px_from_map @ canvas.map_from_canvas
-        outline = apply_homography(
-            np.linalg.inv(canvas.map_from_canvas), shot.outline_map(lenses[shot.camera])
-        )
+        outline = apply_homography(canvas.canvas_from_map, shot.outline_map(lenses[shot.camera]))
         third = outline @ px_from_canvas[2, :2] + px_from_canvas[2, 2]
         least.append(float((np.linalg.det(px_from_canvas) / third**3).min()))
     return min(least, default=1.0)
@@ -211,8 +209,8 @@ class _Sources:
         pixels, lens = read_bgr(shot.path), self._lenses[shot.camera]
         if pixels.shape[:2] != lens.trust.shape:
             raise DriveError(
-                f"{shot.path}: the image is {pixels.shape[1]}x{pixels.shape[0]} but camera {shot.camera!r} has "
-                f"{lens.info.width}x{lens.info.height}; mend the camera_info or the image list"
+                f"{shot.path}: the image is {pixels.shape[1]}x{pixels.shape[0]} but camera "
+                f"{shot.camera!r} has {lens.info.width}x{lens.info.height}; mend the camera_info or the images"
             )
         self._kept[shot.path] = cut = pixels[self._boxes[shot.camera]].copy()
         if len(self._kept) > _KEPT_IMAGES:
@@ -251,11 +249,11 @@ class Tiling:
         )
 
     def error_px(self, cell_m: float, shot: Shot, lens: Lens) -> float:
-        """By how much at most interpolated positions in an image are off, px, over the tiles that it shows."""
+        """The largest error, px, of interpolated positions in an image over the tiles that it shows."""
         outline_map = shot.outline_map(lens)
         canvas = Canvas.around(outline_map, cell_m)
         px_from_canvas = shot.pinhole_px_from_map @ canvas.map_from_canvas
-        outline = apply_homography(np.linalg.inv(canvas.map_from_canvas), outline_map)
+        outline = apply_homography(canvas.canvas_from_map, outline_map)
         tiles = _tiles_under(outline, np.full(2, np.iinfo(np.int64).max), self.side_px)
         at = np.arange(self.side_px)
         pixels = np.stack(np.meshgrid(at, at), axis=-1)
@@ -269,9 +267,9 @@ class Tiling:
 
 
 def _project(
-    px_from_canvas: FloatArray, at: FloatArray, corners: np.ndarray
+    px_from_canvas: FloatArray, at: np.ndarray, corners: np.ndarray
 ) -> tuple[FloatArray, FloatArray]:
-    """Pinhole pixels (T, ..., 2) and third coordinates (T, ...) of points in tiles with first pixels (T, 2)."""
+    """Pinhole pixels (T, ..., 2) and third coordinates (T, ...) of points in tiles that begin at (T, 2)."""
     homogeneous = (at + corners[:, None, None]) @ px_from_canvas[:, :2].T + px_from_canvas[:, 2]
     return homogeneous[..., :2] / homogeneous[..., 2:], homogeneous[..., 2]
 

@@ -25,6 +25,11 @@ class Canvas:
     right_map: tuple[float, float] = (1.0, 0.0)
 
     @property
+    def canvas_from_map(self) -> FloatArray:
+        """The inverse of :attr:`map_from_canvas`."""
+        return np.asarray(np.linalg.inv(self.map_from_canvas), dtype=np.float64)
+
+    @property
     def map_from_canvas(self) -> FloatArray:
         """The homography (3, 3) to the map of (column, row); (0, 0) is the centre of the first pixel."""
         x, y = self.right_map

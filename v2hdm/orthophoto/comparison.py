@@ -104,4 +104,4 @@ def _brightened(rgba: np.ndarray, levels: tuple[float, float]) -> np.ndarray:
     low, high = levels
     stretched = np.clip((rgba[..., :3].astype(np.float32) - 0.5 * low) / (high - 0.5 * low), 0, 1)
     seen = rgba[..., 3:].astype(np.float32) / 255
-    return 1 - seen * (1 - stretched)
+    return np.asarray(1 - seen * (1 - stretched))

@@ -1,4 +1,4 @@
-"""A mosaic on disk: the GeoTIFF at full resolution, the picture for a map's background, its extent as JSON."""
+"""A mosaic on disk: the GeoTIFF at full resolution and the picture for a map's background."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ _ENGINEERING = (
 def crs_of(origin: GeodeticOrigin | None) -> str:
     """The coordinate system of the map frame, as PROJ or WKT text.
 
-    With an origin it is a transverse Mercator projection about it, scaled to its height above the ellipsoid, which
-    agrees with the frame's tangent plane to a millimetre within 2 km and which every GIS knows. Without, the
+    With an origin it is a transverse Mercator projection about it, scaled to its height above the ellipsoid:
+    it agrees with the frame's tangent plane to a millimetre within 2 km, and every GIS knows it. Without, the
     frame is an engineering system: metres that belong nowhere on the earth.
     """
     if origin is None:

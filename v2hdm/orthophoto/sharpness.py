@@ -1,11 +1,13 @@
-"""How sharp the paint of a mosaic is: the width of its edges, which says nothing of where they lie.
+"""How sharp the paint of a mosaic is: the width of its edges, wherever they lie.
 
-Across every side of every mapped marking a profile of grey values is taken, the mean over the side's middle part.
-The width of an edge is the paint's contrast over the steepest slope of that profile: the distance over which a
-ramp of that slope rises from ground to paint. Slopes are taken over one pixel of the mosaic. The steepest slope is looked for within :data:`REACH_M` to either
-side, so that paint which is out of place is not held to be blurred. Where paint appears twice, each image of it
-has half the contrast and half the slope, and the width says so, for the contrast is one for all mosaics that are
-compared: the largest that any of them shows there. Blending only ever lowers it.
+Across every side of every mapped marking a profile of grey values is taken, the mean over the side's middle
+part. The width of an edge is the paint's contrast over the steepest slope of that profile: the distance over
+which a ramp of that slope rises from ground to paint. Slopes are taken over one pixel of the mosaic.
+
+The steepest slope is looked for within :data:`REACH_M` to either side, so that paint which is out of place is
+not held to be blurred. Where paint appears twice, each image of it has half the contrast and half the slope,
+and the width says so, for all mosaics that are compared share one contrast: the largest that any of them
+shows there. Blending only ever lowers it.
 """
 
 from __future__ import annotations
@@ -57,7 +59,7 @@ def paint_sides(hd_map: HdMap) -> FloatArray:
     outlines = [m.corners_map for m in hd_map.markings] + [s.outline_map for s in hd_map.symbols]
     sides = [np.stack([o, np.roll(o, -1, axis=0)], axis=1) for o in outlines if np.isfinite(o).all()]
     out = np.concatenate(sides) if sides else np.empty((0, 2, 2))
-    return out[np.linalg.norm(out[:, 1] - out[:, 0], axis=1) >= _LEAST_SIDE_M]
+    return np.asarray(out[np.linalg.norm(out[:, 1] - out[:, 0], axis=1) >= _LEAST_SIDE_M])
 
 
 def no_edges(count: int) -> Edges:
@@ -68,7 +70,7 @@ def no_edges(count: int) -> Edges:
 def measure_edges(rgba: np.ndarray, canvas: Canvas, sides: FloatArray) -> Edges:
     """The edges across sides (S, 2, 2), m, in a mosaic (rows, columns, 4)."""
     out = no_edges(len(sides))
-    points = apply_homography(np.linalg.inv(canvas.map_from_canvas), _profiles(sides, canvas.cell_m / 2))
+    points = apply_homography(canvas.canvas_from_map, _profiles(sides, canvas.cell_m / 2))
     low, high = points.min(axis=(1, 2)), points.max(axis=(1, 2))
     inside = (low >= 0).all(axis=1) & (high <= [canvas.columns - 1, canvas.rows - 1]).all(axis=1)
     if not inside.any():

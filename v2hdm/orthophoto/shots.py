@@ -54,7 +54,9 @@ class Shot:
 
     def outline_map(self, lens: Lens) -> FloatArray:
         """The ground (N, 2), m, that is trusted: a convex polygon."""
-        return apply_homography(np.linalg.inv(self.pinhole_px_from_map), lens.outline_pinhole_px)
+        return apply_homography(
+            np.asarray(np.linalg.inv(self.pinhole_px_from_map), dtype=np.float64), lens.outline_pinhole_px
+        )
 
 
 def lens_of(camera: Camera, cam_from_vehicle: FloatArray) -> Lens:

@@ -176,7 +176,8 @@ def _map_and_judge(
     )
     if config.mosaic:
         with _timed(seconds, "mosaic"):
-            write_mosaic(folder, described, device=config.mapping.device, progress=partial(progress, "mosaic"))
+            tell = partial(progress, "mosaic")
+            write_mosaic(folder, described, device=config.mapping.device, progress=tell)
     return RunResult(Path(config.output) / about["name"], metrics, judgement.headlines, verdict)
 
 
@@ -277,6 +278,11 @@ def run_name(config: RunConfig) -> str:
 
 
 def check_device(device: str) -> None:
+    """Refuse a device of torch that is not ``cpu`` or ``cuda``, or not there.
+
+    Raises:
+        ConfigError: says which.
+    """
     if device not in ("cpu", "cuda"):
         raise ConfigError(f"device is {device!r}: choose cpu or cuda")
     if device == "cuda" and not torch.cuda.is_available():
