@@ -210,7 +210,7 @@ class _Sources:
         if pixels.shape[:2] != lens.trust.shape:
             raise DriveError(
                 f"{shot.path}: the image is {pixels.shape[1]}x{pixels.shape[0]} but camera "
-                f"{shot.camera!r} has {lens.info.width}x{lens.info.height}; mend the camera_info or the images"
+                f"{shot.camera!r} has {lens.info.width}x{lens.info.height}; mend its camera_info or images"
             )
         self._kept[shot.path] = cut = pixels[self._boxes[shot.camera]].copy()
         if len(self._kept) > _KEPT_IMAGES:

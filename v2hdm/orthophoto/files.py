@@ -80,7 +80,7 @@ def geotiff(path: Path, canvas: Canvas, origin: GeodeticOrigin | None) -> Iterat
     profile = {
         "driver": "GTiff", "width": canvas.columns, "height": canvas.rows, "count": 3, "dtype": "uint8",
         "crs": rasterio.crs.CRS.from_user_input(crs_of(origin)),
-        "transform": rasterio.transform.from_origin(west, north, canvas.cell_m, canvas.cell_m),
+        "transform": rasterio.Affine(canvas.cell_m, 0, west, 0, -canvas.cell_m, north),
         "tiled": True, "blockxsize": _BLOCK_PX, "blockysize": _BLOCK_PX, "compress": "jpeg",
         "photometric": "ycbcr", "jpeg_quality": _JPEG_QUALITY, "bigtiff": "if_safer", "sparse_ok": True,
     }  # fmt: skip

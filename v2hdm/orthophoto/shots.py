@@ -21,8 +21,8 @@ from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.rigid import inverse
 from v2hdm.records import Calibration, Camera, CameraInfo, Drive, FloatArray, Trajectory
 
-FEATHER_PX = 48
-"""Width of the band at the edge of what is trusted in an image over which its weight rises from 0 to 1."""
+FEATHER = 1 / 15
+"""Band at the edge of what is trusted over which the weight rises from 0 to 1, as a share of the image height."""
 
 _OUTLINE_STEP_PX = 16
 """Distance of the points by which the outline of what is trusted is laid on the ground."""
@@ -76,7 +76,7 @@ def lens_of(camera: Camera, cam_from_vehicle: FloatArray) -> Lens:
     # The frame of zeros makes the image's border an edge, too.
     inside[[0, -1]] = inside[:, [0, -1]] = 0
     depth_px = cv2.distanceTransform(inside, cv2.DIST_L2, 5)[1:-1, 1:-1]
-    trust = np.clip(depth_px / FEATHER_PX, 0, 1).astype(np.float32)
+    trust = np.clip(depth_px / (FEATHER * info.height), 0, 1).astype(np.float32)
     edge = np.concatenate(
         [
             c[::_OUTLINE_STEP_PX, 0]
