@@ -11,7 +11,7 @@ from v2hdm.records import HdMap, Marking
 
 CANVAS = Canvas(np.array([0.0, 6.0]), 0.02, 300, 300)
 SQUARE = np.array([[2.0, 2.0], [4.0, 2.0], [4.0, 4.0], [2.0, 4.0]])
-SIDES = paint_sides(HdMap((Marking("diamond", SQUARE, 3),)))
+SIDES = paint_sides(HdMap((Marking("diamond", SQUARE, 3),))).ends_map
 
 
 def painted(width_m: float, shift_m: float = 0.0) -> np.ndarray:
@@ -48,5 +48,5 @@ def test_edges_that_a_mosaic_does_not_show_whole_are_left_out_of_all() -> None:
 
 
 def test_short_sides_are_no_edges() -> None:
-    assert not len(paint_sides(HdMap((Marking("diamond", 0.1 * SQUARE, 3),))))
-    assert not len(paint_sides(HdMap(())))
+    assert not len(paint_sides(HdMap((Marking("diamond", 0.1 * SQUARE, 3),))).ends_map)
+    assert not len(paint_sides(HdMap(())).sightings)

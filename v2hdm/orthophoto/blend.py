@@ -52,8 +52,7 @@ class Sheet:
     """A finished part of a canvas, its first pixel at (``row``, ``column``).
 
     ``rgba`` (rows, columns, 4) uint8. Alpha is 255 where the images together show the ground at least as
-    finely as a single one shows the farthest ground that it is trusted for, less where more coarsely, and 0
-    with black where none shows it.
+    finely as a single one shows the farthest ground that it is trusted for, less where more coarsely.
     """
 
     row: int

@@ -11,11 +11,12 @@ from matplotlib.axes import Axes
 
 from v2hdm.orthophoto.blend import whole
 from v2hdm.orthophoto.canvas import Canvas
+from v2hdm.orthophoto.sharpness import PaintSides
 from v2hdm.orthophoto.shots import Lens, Shot
-from v2hdm.records import Drive, FloatArray, HdMap
+from v2hdm.records import Drive, FloatArray
 from v2hdm.report import style
 
-AHEAD_M, ACROSS_M = 12.0, 8.4
+AHEAD_M, ACROSS_M = 12.0, 8.0
 """Length and width of the ground that is compared."""
 
 _CELL_M = 0.01
@@ -23,21 +24,25 @@ _PANEL_IN = 5.2
 _BAR_M = 2.0
 
 
-def richest_place(drive: Drive, hd_map: HdMap) -> FloatArray:
-    """The pose (4, 4) ahead of which the most paint edge was seen most often.
+def richest_place(drive: Drive, sides: PaintSides, contrast: FloatArray) -> FloatArray:
+    """The pose (4, 4) about which the most paint edges are to be seen, and were seen most often.
 
-    Each image's pose is a candidate, its place the ground about it. It is worth the sum over all markings and
-    symbols that lie on it whole of their number of sides times the images that they were found in.
+    Each image's pose is a candidate, its place the ground about it. Its worth is the sum, over the sides that
+    lie on it whole, of their contrast in the mosaic times the number of images that they were found in.
+
+    Args:
+        drive: the poses.
+        sides: of the map.
+        contrast: theirs (S,) in the mosaic, nan where it does not show them whole.
     """
-    outlines = [(m.corners_map, m.sightings) for m in hd_map.markings]
-    outlines += [(s.outline_map, s.sightings) for s in hd_map.symbols]
+    worth = np.nan_to_num(contrast) * sides.sightings
     poses = np.stack([image.map_from_vehicle for image in drive.images])
-    worth = np.zeros(len(poses))
-    for outline, sightings in outlines:
-        offset = outline - poses[:, None, :2, 3]
-        inside = (np.abs(offset @ poses[:, :2, :2]) <= [AHEAD_M / 2, ACROSS_M / 2]).all(axis=(1, 2))
-        worth += inside * len(outline) * sightings
-    return np.asarray(poses[int(np.argmax(worth))])
+    of_place = []
+    for pose in poses:
+        offset = (sides.ends_map - pose[:2, 3]) @ pose[:2, :2]
+        inside = (np.abs(offset) <= [AHEAD_M / 2, ACROSS_M / 2]).all(axis=(1, 2))
+        of_place.append(worth[inside].sum())
+    return np.asarray(poses[int(np.argmax(of_place))])
 
 
 def close_up_canvas(map_from_vehicle: FloatArray) -> Canvas:

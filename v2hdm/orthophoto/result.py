@@ -73,7 +73,7 @@ def write_mosaic(
     hd_map = read_geojson(folder / "map.geojson")
     ground = ground_of(folder, drive, resolution_m)
     sides = paint_sides(hd_map)
-    before, after = no_edges(len(sides)), no_edges(len(sides))
+    before, after = (no_edges(len(sides.ends_map)) for _ in range(2))
     picture = Picture(ground.canvas)
     tell = _two_passes(progress)
     with ExitStack() as stack:
@@ -86,9 +86,11 @@ def write_mosaic(
             if tiff is not None:
                 tiff.put(sheet)
             picture.put(sheet)
-            after = after.with_those_of(measure_edges(sheet.rgba, _part(ground.canvas, sheet), sides))
+            after = after.with_those_of(
+                measure_edges(sheet.rgba, _part(ground.canvas, sheet), sides.ends_map)
+            )
     for sheet in blend(ground.canvas, ground.before, ground.lenses, device, tell(1)):
-        before = before.with_those_of(measure_edges(sheet.rgba, _part(ground.canvas, sheet), sides))
+        before = before.with_those_of(measure_edges(sheet.rgba, _part(ground.canvas, sheet), sides.ends_map))
     picture.write(folder / PICTURE)
     sharpness = _sharpness(*edge_widths_m([before, after]))
     content = {
@@ -100,7 +102,7 @@ def write_mosaic(
         "crs": crs_of(drive.origin),
         "sharpness": sharpness,
     }
-    _compare(folder / COMPARISON, drive, ground, richest_place(drive, hd_map), sharpness, device)
+    _compare(folder / COMPARISON, ground, richest_place(drive, sides, after.contrast), sharpness, device)
     write_json(folder / EXTENT, content)
     return content
 
@@ -171,11 +173,9 @@ def _calibrations(folder: Path) -> tuple[dict[str, Calibration], dict[str, float
 
 
 def _compare(
-    path: Path, drive: Drive, ground: Ground, pose: FloatArray, sharpness: Mapping[str, float], device: str
+    path: Path, ground: Ground, pose: FloatArray, sharpness: Mapping[str, float], device: str
 ) -> None:
-    initial = {camera.initial_ipm for camera in drive.cameras.values()}
-    whose = "a borrowed calibration" if initial == {"estimated"} else "the initial calibration"
-    titles = f"before: {whose}, recorded poses", "after: optimised calibration, adjusted poses"
+    titles = "before: initial calibration, recorded poses", "after: optimised calibration, adjusted poses"
     widths = [sharpness.get(f"edge_width_{when}_m") for when in ("before", "after")]
     captions = [
         "" if width is None else f"paint edges {100 * width:.1f} cm wide (median)" for width in widths

@@ -54,12 +54,23 @@ class Edges:
         return Edges(np.where(known, self.slope, other.slope), np.where(known, self.contrast, other.contrast))
 
 
-def paint_sides(hd_map: HdMap) -> FloatArray:
-    """The sides (S, 2, 2), m, of markings and symbols from end to end."""
-    outlines = [m.corners_map for m in hd_map.markings] + [s.outline_map for s in hd_map.symbols]
-    sides = [np.stack([o, np.roll(o, -1, axis=0)], axis=1) for o in outlines if np.isfinite(o).all()]
-    out = np.concatenate(sides) if sides else np.empty((0, 2, 2))
-    return np.asarray(out[np.linalg.norm(out[:, 1] - out[:, 0], axis=1) >= _LEAST_SIDE_M])
+@dataclass(frozen=True)
+class PaintSides:
+    """S sides of markings and symbols: ``ends_map`` (S, 2, 2), m, and how many ``sightings`` (S,) each has."""
+
+    ends_map: FloatArray
+    sightings: FloatArray
+
+
+def paint_sides(hd_map: HdMap) -> PaintSides:
+    """The sides of a map's markings and symbols that are long enough to be measured."""
+    painted = [(m.corners_map, m.sightings) for m in hd_map.markings]
+    painted += [(s.outline_map, s.sightings) for s in hd_map.symbols]
+    ends = [np.stack([outline, np.roll(outline, -1, axis=0)], axis=1) for outline, _ in painted]
+    all_ends = np.concatenate([np.empty((0, 2, 2)), *ends])
+    sightings = np.repeat([float(seen) for _, seen in painted], [len(own) for own in ends])
+    long = np.linalg.norm(all_ends[:, 1] - all_ends[:, 0], axis=1) >= _LEAST_SIDE_M
+    return PaintSides(all_ends[long], sightings[long])
 
 
 def no_edges(count: int) -> Edges:

@@ -22,7 +22,7 @@ from v2hdm.geometry.rigid import inverse
 from v2hdm.records import Calibration, Camera, CameraInfo, Drive, FloatArray, Trajectory
 
 FEATHER = 1 / 15
-"""Band at the edge of what is trusted over which the weight rises from 0 to 1, as a share of the image height."""
+"""Band at the edge of what is trusted over which the weight rises from 0 to 1, in heights of the image."""
 
 _OUTLINE_STEP_PX = 16
 """Distance of the points by which the outline of what is trusted is laid on the ground."""
