@@ -1,6 +1,6 @@
 """The mosaic against the plain loop over images in OpenCV: the same output, how many seconds.
 
-    python -m tests.benchmarks.mosaic_peers RESULT [--images 200] [--threads 1] [--rounds 3]
+    python -m tests.benchmarks.mosaic_peers RESULT [--images 120] [--threads 1] [--rounds 3]
 
 The loop removes the distortion of each whole image (``cv2.undistort``), warps it onto the part of the canvas
 that it shows (``cv2.warpPerspective``) and adds it there with the same weights, in numpy. ``cached`` is that
@@ -94,7 +94,7 @@ def main() -> None:
     """Print the seconds and how far the outputs differ."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("result", type=Path)
-    parser.add_argument("--images", type=int, default=200)
+    parser.add_argument("--images", type=int, help="only the first (default: all)")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--resolution", type=float, default=RESOLUTION_M)

@@ -56,7 +56,7 @@ class Edges:
 
 @dataclass(frozen=True)
 class PaintSides:
-    """S sides of markings and symbols: ``ends_map`` (S, 2, 2), m, and how many ``sightings`` (S,) each has."""
+    """S sides of markings and symbols: ``ends_map`` (S, 2, 2), m, and the ``sightings`` (S,) of each."""
 
     ends_map: FloatArray
     sightings: FloatArray
