@@ -57,7 +57,7 @@ def run_config(drive: Path, output: Path, **changes: object) -> RunConfig:
 @pytest.fixture(scope="module")
 def result(drive_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("outputs")
-    return run(run_config(drive_folder, output, export=list(FORMATS))).folder
+    return run(run_config(drive_folder, output, export=list(FORMATS), mosaic=True)).folder
 
 
 def test_every_method_is_judged_on_every_camera_set(result: Path) -> None:
@@ -131,6 +131,14 @@ def test_the_files_of_a_result_can_be_read_back(result: Path) -> None:
         assert image.std() > 5.0
     assert (result / "config.yaml").stat().st_size > 0
     assert "detected" in (result / "run.log").read_text()
+
+
+def test_paint_seen_from_above_is_sharp_after_the_optimisation(result: Path) -> None:
+    sharpness = json.loads((result / "mosaic.json").read_text())["sharpness"]
+    assert sharpness["edges"] > 20
+    assert sharpness["edge_width_after_m"] < 0.08
+    assert sharpness["after_over_before"] > 2
+    assert cv2.imread(str(result / "mosaic_before_after.png")) is not None
 
 
 def test_lane_lines_run_as_the_drive_passed_them(result: Path, drive_folder: Path) -> None:

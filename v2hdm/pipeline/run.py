@@ -27,6 +27,7 @@ from v2hdm.errors import AdjustError, ConfigError, MappingError, V2hdmError
 from v2hdm.hdmap.formats import check_formats
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions, check_options
+from v2hdm.orthophoto.result import write_mosaic
 from v2hdm.pipeline.evaluate import CameraSets, evaluate
 from v2hdm.pipeline.inspect import Inspection, inspect
 from v2hdm.pipeline.survey import Survey, check_survey, table_of, take_survey
@@ -83,6 +84,7 @@ class RunConfig:
         device: what ``conf/map.yaml`` hands on as ``mapping.device``, ``cpu`` or ``cuda``.
         all_maps: whether the map of every method and camera set is written, into ``maps/``.
         mode: what it hands on as ``mapping.mode``, ``batch`` or ``incremental``.
+        mosaic: whether the ground is shown from above, too (docs/mosaic.md).
         export: formats of the map: ``geojson``, ``csv``, ``gpkg``, ``lanelet2``, ``dxf`` (docs/exports.md).
     """
 
@@ -97,6 +99,7 @@ class RunConfig:
     device: str = "cpu"
     mode: str = "batch"
     all_maps: bool = False
+    mosaic: bool = False
     export: list[str] = field(default_factory=lambda: ["geojson"])
 
 
@@ -182,6 +185,10 @@ def _map_and_judge(
     write_results(
         folder, described, detections, methods, judgement, metrics, verdict, config.all_maps, config.export
     )
+    if config.mosaic:
+        with _timed(seconds, "mosaic"):
+            tell = partial(progress, "mosaic")
+            write_mosaic(folder, described, device=config.mapping.device, progress=tell)
     return RunResult(Path(config.output) / about["name"], metrics, headlines, verdict)
 
 
@@ -270,7 +277,7 @@ def _check(config: RunConfig) -> str:
     check_options(config.mapping, detector.catalogue.cornered)
     table_of(config.mapping.survey)
     check_formats(config.export, "export")
-    _check_device(config.mapping.device)
+    check_device(config.mapping.device)
     return name
 
 
@@ -285,7 +292,12 @@ def run_name(config: RunConfig) -> str:
     return drive_name(Path(config.drive.path))
 
 
-def _check_device(device: str) -> None:
+def check_device(device: str) -> None:
+    """Refuse a device of torch that is not ``cpu`` or ``cuda``, or not there.
+
+    Raises:
+        ConfigError: says which.
+    """
     if device not in ("cpu", "cuda"):
         raise ConfigError(f"device is {device!r}: choose cpu or cuda")
     if device == "cuda" and not torch.cuda.is_available():
