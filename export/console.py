@@ -11,6 +11,7 @@ from export.config import ExportConfig, Precision
 from export.manifest import record_network
 from export.onnx_file import Tell, export_float, export_int8
 from export.source import Source, read_source
+from v2hdm.inputs import note_input, refuse_input
 
 
 def run(config: ExportConfig, tell: Tell = lambda share, doing: None) -> str:
@@ -46,6 +47,8 @@ def _export(source: Source, output: Path, config: ExportConfig, tell: Tell) -> s
 
 def export(config: ExportConfig) -> None:
     """Export a checkpoint to ONNX."""
+    note_input(Path(config.checkpoint))
+    refuse_input(Path(config.output))
     console = Console(stderr=True)
     columns = (
         BarColumn(),

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 
 from v2hdm.errors import V2hdmError
+from v2hdm.inputs import protected_inputs
 
 EXIT_USER_ERROR = 2
 EXIT_FAILED_VERDICT = 3
@@ -35,7 +36,8 @@ def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[],
     # as soon as the machine is busy otherwise. Libraries read this when they are loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
-        return _to_the_end(work)
+        with protected_inputs():
+            return _to_the_end(work)
     except BrokenPipeError:  # the reader of our output has had enough
         from v2hdm.files import forget_stdout
 
@@ -51,6 +53,15 @@ def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[],
         )
     except KeyboardInterrupt:
         return _fail(interrupted)
+    except MemoryError:
+        return _fail("the memory is not enough for this; give less at once, or fewer workers")
+    except OSError as error:
+        # Disks that are full, gone or read-only can fail any call; files that are wrong have their own errors.
+        if isinstance(error, ConnectionError):
+            raise
+        _forget_full_stdout()
+        where = f"{error.filename}: " if error.filename else ""
+        return _fail(f"{where}{error.strerror or error}; free space or check the disk, then start again")
 
 
 def _to_the_end(work: Callable[[], int | None]) -> int:
@@ -64,8 +75,20 @@ def _to_the_end(work: Callable[[], int | None]) -> int:
     return code
 
 
+def _forget_full_stdout() -> None:
+    """Keep Python from failing once more at its end, where nothing can be printed."""
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError):
+        from v2hdm.files import forget_stdout
+
+        forget_stdout()
+
+
 def _fail(message: str) -> int:
-    print(f"error: {message}", file=sys.stderr)
+    # Names and values in it come from files of strangers: none may end the line or move the cursor.
+    line = " ".join(message.split())
+    print(f"error: {''.join(c if c.isprintable() else '?' for c in line)}", file=sys.stderr)
     return EXIT_USER_ERROR
 
 

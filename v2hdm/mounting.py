@@ -67,4 +67,4 @@ def _write(drive: Drive, estimate: GroundEstimate, folder: Path, verdict: Verdic
     path = folder / f"calibration_{estimate.camera}.yaml"
     told = verdict.as_json()
     write_calibration(estimate.calibration, path, verdict=told, about=Provenance.today(drive.name, told))
-    cv2.imwrite(str(folder / f"ground_{estimate.camera}.png"), picture)
+    (folder / f"ground_{estimate.camera}.png").write_bytes(png(picture))

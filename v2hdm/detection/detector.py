@@ -191,6 +191,6 @@ def _check_image(image_bgr: np.ndarray, camera: Camera) -> None:
     expected = (camera.info.height, camera.info.width, 3)
     if image_bgr.dtype != np.uint8 or image_bgr.shape != expected:
         raise DetectorError(
-            f"camera {camera.info.name!r}: got an image {image_bgr.shape} {image_bgr.dtype}, its camera_info "
+            f"camera '{camera.info.name}': got an image {image_bgr.shape} {image_bgr.dtype}, its camera_info "
             f"says {expected} uint8; mend the camera_info or pick the images that belong to it"
         )

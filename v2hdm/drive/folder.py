@@ -34,6 +34,7 @@ from v2hdm.errors import DriveError
 from v2hdm.fields import take_origin
 from v2hdm.files import check_keys, dump_yaml, load_yaml, replace_text, take_mapping, take_number, take_text
 from v2hdm.records import DRIFTS, BoolArray, Camera, CameraInfo, Drive, PoseNoise, Trajectory
+from v2hdm.texts import shown, take_camera_name, take_name
 
 DRIVE_FILE = "drive.yaml"
 POSES_FILE = "poses.tum"
@@ -71,6 +72,7 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
     """
     check_keys(content, *_DRIVE_KEYS, where, DriveError)
     entries = take_mapping(content["cameras"], f"{where}: cameras", DriveError)
+    entries = {take_camera_name(name, f"{where}: cameras", DriveError): one for name, one in entries.items()}
     if not entries:
         raise DriveError(f"{where}: names no camera; add one under 'cameras'")
     bag = None
@@ -78,7 +80,7 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
         bag = path / take_text(content["bag"], f"{where}: bag", DriveError)
     sources = Sources(path, Path(options.cache), bag, options.max_gap_s)
     planned = {}
-    for name in select_cameras([str(name) for name in entries], options.cameras, Path(where)):
+    for name in select_cameras(list(entries), options.cameras, Path(where)):
         place = f"{where}: camera '{name}'"
         entry = take_mapping(entries[name], place, DriveError)
         check_keys(entry, *_CAMERA_KEYS, place, DriveError)
@@ -158,7 +160,7 @@ def write_drive(folder: Path, drive: Drive, trajectory: Trajectory) -> None:
 
 
 def _name(content: dict[str, Any], path: Path) -> str:
-    return take_text(content.get("name", path.resolve().name), f"{path / DRIVE_FILE}: name", DriveError)
+    return take_name(content.get("name", path.resolve().name), f"{path / DRIVE_FILE}: name", DriveError)
 
 
 def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str) -> Camera:
@@ -174,7 +176,7 @@ def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str
         ipm = {"estimated": ipm_from_guess(info, entry["cam_from_vehicle"], f"{where}, cam_from_vehicle")}
     linear = entry.get("linear_response", False)
     if not isinstance(linear, bool):
-        raise DriveError(f"{where}, linear_response: expected true or false, got {linear!r}")
+        raise DriveError(f"{where}, linear_response: expected true or false, got {shown(linear)}")
     prior = entry.get("centre_prior")
     if prior is not None:
         prior_where = f"{where}, centre_prior"

@@ -35,6 +35,7 @@ from v2hdm.quality.results.result import check_result
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.outputs import result_folder, write_json
 from v2hdm.simulate import PortConfig, rendered_drive
+from v2hdm.texts import shown, take_camera_name, take_name
 
 log = logging.getLogger(__name__)
 
@@ -247,10 +248,11 @@ def _check(config: RunConfig) -> str:
         DetectorError: ``detector.model`` cannot be used.
     """
     name = run_name(config)
-    if not name.strip(".") or set(name) & {"/", os.sep}:
-        raise ConfigError(
-            f"name is {name!r}: give the name of a folder within {config.output!r}, without '/'"
-        )
+    take_name(name, "name", ConfigError)
+    if config.simulate is not None:
+        take_name(config.simulate.name, "simulate.name", ConfigError)
+        for camera in config.simulate.cameras:
+            take_camera_name(camera, "simulate.cameras", ConfigError)
     _workers(config)
     detector = Detector.load(options=config.detector)
     check_options(config.mapping, detector.catalogue.cornered)
@@ -272,7 +274,7 @@ def run_name(config: RunConfig) -> str:
 
 def _check_device(device: str) -> None:
     if device not in ("cpu", "cuda"):
-        raise ConfigError(f"device is {device!r}: choose cpu or cuda")
+        raise ConfigError(f"device is {shown(device)}: choose cpu or cuda")
     if device == "cuda" and not torch.cuda.is_available():
         raise ConfigError(
             "device is 'cuda' but torch sees no GPU: check the driver and torch build, or set device=cpu"
@@ -306,7 +308,15 @@ def logging_to(handler: logging.Handler) -> Iterator[None]:
         handler.close()
 
 
+class _LogFile(logging.FileHandler):
+    """A log that is part of a result: where it cannot be written, the result cannot."""
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
+        """Raise what went wrong; logging itself would print a traceback and go on."""
+        raise
+
+
 def _log_file(path: Path) -> logging.Handler:
-    handler = logging.FileHandler(path, encoding="utf-8")
+    handler = _LogFile(path, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     return handler
