@@ -46,7 +46,7 @@ def check_up(parsed: argparse.Namespace) -> bool:
     cv2.setNumThreads(1)
     drive = read_drive(parsed.drive, ReadOptions(cameras=parsed.camera))
     folder = parsed.output or Path("outputs") / f"{drive.name}-check"
-    with result_folder(folder) as unfinished:
+    with result_folder(folder, "--output") as unfinished:
         ground: Mapping[str, GroundEstimate] = {}
         if parsed.ground:
             ground = estimate_cameras(drive, parsed.workers or os.cpu_count() or 1, _quietly)

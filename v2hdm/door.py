@@ -56,7 +56,7 @@ def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[],
     except MemoryError:
         return _fail("the memory is not enough for this; give less at once, or fewer workers")
     except OSError as error:
-        # Disks that are full, gone or read-only can fail any call; files that are wrong have their own errors.
+        # Disks that are full, gone or read-only can fail any call.
         if isinstance(error, ConnectionError):
             raise
         _forget_full_stdout()

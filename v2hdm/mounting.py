@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 
 from v2hdm.drive import ReadOptions, read_drive
+from v2hdm.drive.lossless import png
 from v2hdm.errors import ConfigError
 from v2hdm.ground import GroundEstimate, estimate_cameras
 from v2hdm.ground.picture import draw_matched_ground
@@ -38,7 +39,7 @@ def estimate_mountings(parsed: argparse.Namespace) -> bool:
     cv2.setNumThreads(1)
     drive = read_drive(parsed.drive, ReadOptions(format=parsed.format, cameras=parsed.camera))
     folder = parsed.output or Path("outputs") / f"{drive.name}-extrinsic"
-    with result_folder(folder) as unfinished:
+    with result_folder(folder, "--output") as unfinished:
         ground = estimate_cameras(drive, parsed.workers or os.cpu_count() or 1, _tell)
         verdict = Verdict.of(check_drive(drive, ground))
         settings = {"drive": str(parsed.drive), "cameras": list(drive.cameras)}

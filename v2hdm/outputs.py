@@ -1,8 +1,8 @@
 """Folders of results: each belongs to one process at a time, and only what is ours is ever replaced.
 
 A folder that we wrote holds a list of our files with their hashes, ``.v2hdm-results.jsonl``. What is not on
-the list is the user's and stays through a rerun; where a file on it was changed, the rerun is refused with one
-line. A lock beside the folder is held by the process that writes and released by its end, whatever ends it.
+the list is the user's and stays through a rerun; where a file on it was changed, the rerun is refused. A
+lock beside the folder is held by the process that writes and released by its end, whatever ends it.
 """
 
 from __future__ import annotations
@@ -31,29 +31,29 @@ _HEAD = {"about": "files that v2hdm wrote here; a rerun replaces these and no ot
 
 
 @contextmanager
-def result_folder(folder: Path) -> Iterator[Path]:
+def result_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
     """A hidden folder beside ``folder`` to write into, which takes its place when the block succeeds.
 
     An earlier result stays untouched until then; after an error nothing new is left. Files of the user's in
-    an earlier result are kept.
+    an earlier result are kept. Errors name the ``option`` that says which folder it is.
 
     Raises:
         ConfigError: The folder cannot be written, holds something that is no earlier result of ours, or
             another process is writing it.
     """
-    target = _resolved(folder)
+    target = _resolved(folder, option)
     with ExitStack() as stack:
-        with _explained(folder):
+        with _explained(folder, option):
             stack.enter_context(_parents(target))
-            stack.enter_context(_locked(target, folder))
+            stack.enter_context(_locked(target, folder, option))
             unfinished, previous = _hidden(target, "part"), _hidden(target, "previous")
-            _recover(target, unfinished, previous)
-            ours = _ours(target, folder)
+            _recover(target, unfinished, previous, option)
+            ours = _ours(target, folder, option)
             unfinished.mkdir()
             (unfinished / MARKER).write_text(json.dumps(_HEAD) + "\n", encoding="utf-8")
         try:
             yield unfinished
-            with _explained(folder):
+            with _explained(folder, option):
                 _list(unfinished)
                 if ours is not None:
                     _bring_over(target, unfinished, ours)
@@ -63,7 +63,7 @@ def result_folder(folder: Path) -> Iterator[Path]:
                 unfinished.replace(target)
         except OSError as failure:
             if failure.errno in _FULL:
-                raise _cannot_write(folder, failure) from None
+                raise _cannot_write(folder, failure, option) from None
             raise
         finally:
             shutil.rmtree(unfinished, ignore_errors=True)
@@ -74,8 +74,13 @@ def result_folder(folder: Path) -> Iterator[Path]:
 class GrowingFolder:
     """A folder whose files are written one by one, each at once."""
 
-    def __init__(self, target: Path, shown: Path, ours: dict[str, str]) -> None:
-        self._target, self._shown, self._ours = target, shown, ours
+    def __init__(self, target: Path, shown: Path, ours: dict[str, str], option: str) -> None:
+        self._target, self._shown, self._ours, self._option = target, shown, ours, option
+
+    @property
+    def has_files(self) -> bool:
+        """Whether any file of it is ours."""
+        return bool(self._ours)
 
     def write(self, name: str, data: bytes) -> None:
         """Write the file ``name``.
@@ -85,9 +90,9 @@ class GrowingFolder:
         """
         path = self._target / name
         if path.exists() and self._ours.get(name) != _digest(path):
-            raise ConfigError(f"{self._shown / name}: is no file of ours; name another folder")
+            raise ConfigError(f"{self._shown / name}: is no file of ours; give another {self._option}")
         digest = hashlib.sha256(data).hexdigest()
-        with _explained(self._shown):
+        with _explained(self._shown, self._option):
             with (self._target / MARKER).open("a", encoding="utf-8") as stream:
                 stream.write(json.dumps({"file": name, "sha256": digest}) + "\n")
             with whole_file(path) as partial:
@@ -96,36 +101,43 @@ class GrowingFolder:
 
 
 @contextmanager
-def growing_folder(folder: Path) -> Iterator[GrowingFolder]:
+def growing_folder(folder: Path, option: str) -> Iterator[GrowingFolder]:
     """``folder`` to write single files into.
 
     Raises:
         ConfigError: as :func:`result_folder`.
     """
-    target = _resolved(folder)
+    target = _resolved(folder, option)
     with ExitStack() as stack:
-        with _explained(folder):
+        with _explained(folder, option):
             stack.enter_context(_parents(target))
-            stack.enter_context(_locked(target, folder))
-            ours = _ours(target, folder, unchanged=False)
+            stack.enter_context(_locked(target, folder, option))
+            ours = _ours(target, folder, option, unchanged=False)
             target.mkdir(exist_ok=True)
             if ours is None:
                 (target / MARKER).write_text(json.dumps(_HEAD) + "\n", encoding="utf-8")
-        yield GrowingFolder(target, folder, ours or {})
+        growing = GrowingFolder(target, folder, ours or {}, option)
+        try:
+            yield growing
+        finally:
+            if ours is None and not growing.has_files:
+                (target / MARKER).unlink(missing_ok=True)
+                with suppress(OSError):
+                    target.rmdir()
 
 
 @contextmanager
-def locked_folder(folder: Path) -> Iterator[None]:
+def locked_folder(folder: Path, option: str = "output=") -> Iterator[None]:
     """Keep other processes of ours from writing ``folder`` at the same time.
 
     Raises:
         ConfigError: one does already; the message names it.
     """
-    target = _resolved(folder)
+    target = _resolved(folder, option)
     with ExitStack() as stack:
-        with _explained(folder):
+        with _explained(folder, option):
             stack.enter_context(_parents(target))
-            stack.enter_context(_locked(target, folder))
+            stack.enter_context(_locked(target, folder, option))
         yield
 
 
@@ -134,30 +146,30 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
 
 
 @contextmanager
-def _explained(folder: Path) -> Iterator[None]:
+def _explained(folder: Path, option: str) -> Iterator[None]:
     try:
         yield
     except OSError as failure:
-        raise _cannot_write(folder, failure) from None
+        raise _cannot_write(folder, failure, option) from None
 
 
-def _cannot_write(folder: Path, failure: OSError) -> ConfigError:
+def _cannot_write(folder: Path, failure: OSError, option: str) -> ConfigError:
     return ConfigError(
         f"output folder {folder} cannot be written: {failure.strerror}; nothing new is left: free space "
-        "or name another output"
+        f"or give another {option}"
     )
 
 
-def _resolved(folder: Path) -> Path:
+def _resolved(folder: Path, option: str) -> Path:
     """Where ``folder`` leads; a folder that cannot be put aside is refused before any work."""
     try:
         target = folder.resolve()
     except (OSError, RuntimeError, ValueError):
-        raise ConfigError(f"output folder {folder}: leads nowhere; name another output") from None
+        raise ConfigError(f"output folder {folder}: leads nowhere; give another {option}") from None
     if target.is_mount():
-        raise ConfigError(f"output folder {folder} is a disk of its own; name a folder within it as output")
+        raise ConfigError(f"output folder {folder} is a disk of its own; give a folder within it")
     if target.exists() and not target.is_dir():
-        raise ConfigError(f"output folder {folder} is a file; name another output")
+        raise ConfigError(f"output folder {folder} is a file; give another {option}")
     return target
 
 
@@ -178,12 +190,12 @@ def _parents(target: Path) -> Iterator[None]:
                 parent.rmdir()
 
 
-def _recover(target: Path, unfinished: Path, previous: Path) -> None:
+def _recover(target: Path, unfinished: Path, previous: Path, option: str) -> None:
     """Tidy up after a process that was killed: its work is dropped, an earlier result put back."""
     for left in (unfinished, previous):
         if left.exists() and not (left / MARKER).is_file() and any(left.iterdir()):
             raise ConfigError(
-                f"{left}: is in the way of our work and not ours; move it, or name another output"
+                f"{left}: is in the way of our work and not ours; move it, or give another {option}"
             )
     if previous.exists() and not target.exists():
         previous.replace(target)
@@ -192,7 +204,7 @@ def _recover(target: Path, unfinished: Path, previous: Path) -> None:
             shutil.rmtree(left)
 
 
-def _ours(target: Path, shown: Path, unchanged: bool = True) -> dict[str, str] | None:
+def _ours(target: Path, shown: Path, option: str, unchanged: bool = True) -> dict[str, str] | None:
     """Hashes of our files in ``target`` by their names; None if there is nothing yet.
 
     Raises:
@@ -203,7 +215,7 @@ def _ours(target: Path, shown: Path, unchanged: bool = True) -> dict[str, str] |
     marker = target / MARKER
     if not marker.is_file():
         raise ConfigError(
-            f"output folder {shown} holds files that are no results of ours: name another with output="
+            f"output folder {shown} holds files that are no results of ours: give another {option}"
         )
     listed: dict[str, str] = {}
     try:
@@ -211,14 +223,14 @@ def _ours(target: Path, shown: Path, unchanged: bool = True) -> dict[str, str] |
             entry = json.loads(line)
             listed[str(entry["file"])] = str(entry["sha256"])
     except (ValueError, TypeError, LookupError, RecursionError):
-        raise ConfigError(f"{shown / MARKER}: is damaged; name another output=") from None
+        raise ConfigError(f"{shown / MARKER}: is damaged; give another {option}") from None
     if unchanged:
         for name, digest in listed.items():
             path = target / name
             if path.is_file() and _digest(path) != digest:
                 raise ConfigError(
-                    f"{shown / name}: was changed after we wrote it and is not replaced; move it, or name "
-                    "another output="
+                    f"{shown / name}: was changed after we wrote it and is not replaced; move it, or give "
+                    f"another {option}"
                 )
     return listed
 
@@ -261,7 +273,7 @@ def _is_ours(path: Path, folder: Path, ours: dict[str, str]) -> bool:
 
 
 @contextmanager
-def _locked(target: Path, shown: Path) -> Iterator[None]:
+def _locked(target: Path, shown: Path, option: str) -> Iterator[None]:
     """Hold the lock of ``target``, a file beside it, until the block or the process ends."""
     path = _hidden(target, "lock")
     while True:
@@ -272,7 +284,7 @@ def _locked(target: Path, shown: Path) -> Iterator[None]:
             stream.close()
             raise ConfigError(
                 f"output folder {shown} is being written by {holder or 'another process'}; wait for it, or "
-                "name another output="
+                f"give another {option}"
             )
         # The last holder may have removed the file between our opening and locking it.
         with suppress(OSError):

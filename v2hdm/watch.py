@@ -268,7 +268,7 @@ def _drawings(folder: Path | None) -> Iterator[GrowingFolder | None]:
     if folder is None:
         yield None
         return
-    with growing_folder(folder) as drawings:
+    with growing_folder(folder, "--draw") as drawings:
         yield drawings
 
 

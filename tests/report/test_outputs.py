@@ -149,16 +149,22 @@ def test_a_folder_that_another_process_writes_is_refused_by_its_name_until_it_di
 
 def test_single_files_are_added_and_replaced_but_never_the_users(tmp_path: Path) -> None:
     for text in (b"first", b"second"):
-        with growing_folder(tmp_path / "drawn") as folder:
+        with growing_folder(tmp_path / "drawn", "--draw") as folder:
             folder.write("a.jpg", text)
     assert (tmp_path / "drawn" / "a.jpg").read_bytes() == b"second"
     (tmp_path / "drawn" / "b.jpg").write_bytes(b"mine")
-    with growing_folder(tmp_path / "drawn") as folder, pytest.raises(ConfigError, match="no file of ours"):
+    with (
+        growing_folder(tmp_path / "drawn", "--draw") as folder,
+        pytest.raises(ConfigError, match="no file of ours"),
+    ):
         folder.write("b.jpg", b"ours")
     assert (tmp_path / "drawn" / "b.jpg").read_bytes() == b"mine"
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "a.jpg").write_bytes(b"mine")
-    with pytest.raises(ConfigError, match="no results of ours"), growing_folder(tmp_path / "photos"):
+    with (
+        pytest.raises(ConfigError, match="no results of ours"),
+        growing_folder(tmp_path / "photos", "--draw"),
+    ):
         pass
 
 

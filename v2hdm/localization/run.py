@@ -209,7 +209,7 @@ def localise_drive(parsed: argparse.Namespace) -> bool:
     drive = read_drive(parsed.drive, ReadOptions(format=parsed.format, cameras=parsed.camera))
     _check_together(hd_map, calibrations, drive)
     folder = parsed.output or Path("outputs") / f"{drive.name}-localized"
-    with result_folder(folder) as unfinished:
+    with result_folder(folder, "--output") as unfinished:
         detections = detect_all(
             drive, DetectorOptions.for_mapping(), parsed.workers or os.cpu_count() or 1, _tell
         )
