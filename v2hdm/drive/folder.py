@@ -33,6 +33,7 @@ from v2hdm.drive.tum import write_image_list, write_tum
 from v2hdm.errors import DriveError
 from v2hdm.fields import take_origin
 from v2hdm.files import check_keys, dump_yaml, load_yaml, replace_text, take_mapping, take_number, take_text
+from v2hdm.pixels import read_pixels
 from v2hdm.records import DRIFTS, BoolArray, Camera, CameraInfo, Drive, PoseNoise, Trajectory
 from v2hdm.texts import shown, take_camera_name, take_name
 
@@ -202,9 +203,8 @@ def _read_mask(entry: dict[str, Any], root: Path, info: CameraInfo, where: str) 
     if "mask" not in entry:
         return None
     path = root / take_text(entry["mask"], f"{where}, mask", DriveError)
-    data = np.fromfile(path, dtype=np.uint8) if path.is_file() else np.zeros(0, dtype=np.uint8)
-    mask = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
-    if mask is None or mask.shape != (info.height, info.width):
+    mask = read_pixels(path, cv2.IMREAD_GRAYSCALE)
+    if mask.shape != (info.height, info.width):
         raise DriveError(
             f"{where}, mask: {path} is no image of {info.width} x {info.height} px; draw the vehicle white "
             "on black over one of the camera's images"

@@ -10,9 +10,9 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from v2hdm.errors import DriveError
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import distort_points
+from v2hdm.pixels import read_pixels
 from v2hdm.quality.judgement import judge
 from v2hdm.quality.verdict import Finding, Status
 from v2hdm.records import Camera, Drive, Image
@@ -142,10 +142,7 @@ def _alike(first: Path, second: Path) -> bool:
 
 def _read(path: Path) -> np.ndarray:
     """Grey values of an image at a quarter of its size."""
-    grey = cv2.imread(str(path), cv2.IMREAD_REDUCED_GRAYSCALE_4)
-    if grey is None:
-        raise DriveError(f"{path}: the image is damaged; copy it again or drop it from the list")
-    return np.asarray(grey)
+    return read_pixels(path, cv2.IMREAD_REDUCED_GRAYSCALE_4)
 
 
 def _roi_mask(camera: Camera, grey: np.ndarray) -> np.ndarray:
