@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import Enum
 
+from v2hdm.settings import COUNT, POSITIVE, SEED, SHARE, Within, check_settings
+
 
 class Precision(Enum):
     """What the exported network computes with."""
@@ -56,3 +58,23 @@ class ExportConfig:
     opset: int = 18
     tolerance: float = 1e-3
     int8: Int8Config = field(default_factory=Int8Config)
+
+
+_RANGES = {
+    "opset": Within(18, 23),
+    "tolerance": POSITIVE,
+    "int8.frames": COUNT,
+    "int8.parity_frames": COUNT,
+    "int8.seed": SEED,
+    **{f"int8.bounds.{name}": SHARE for name in ("paint_changed", "kinds_agree", "lanes_agree")},
+    **{f"int8.bounds.{name}": POSITIVE for name in ("outline_px", "outline_bias_px", "lane_offset_px")},
+}
+
+
+def check_export(config: ExportConfig) -> None:
+    """Refuse settings that no export can work with.
+
+    Raises:
+        ConfigError: a value is out of range; the message names the key.
+    """
+    check_settings(config, _RANGES)

@@ -29,6 +29,7 @@ from v2hdm.drive.options import ReadOptions
 from v2hdm.drive.poses import read_poses
 from v2hdm.drive.road import lay_flat, tell
 from v2hdm.drive.sources import Sources, plan_images, plan_info, plan_topic_poses
+from v2hdm.drive.trajectory import check_trajectory
 from v2hdm.drive.tum import write_image_list, write_tum
 from v2hdm.errors import DriveError
 from v2hdm.fields import take_origin
@@ -79,6 +80,8 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
     bag = None
     if "bag" in content:
         bag = path / take_text(content["bag"], f"{where}: bag", DriveError)
+        if not bag.exists():
+            raise DriveError(f"{where}: bag: {bag}: no such bag; check the path or drop the key")
     sources = Sources(path, Path(options.cache), bag, options.max_gap_s)
     planned = {}
     for name in select_cameras(list(entries), options.cameras, Path(where)):
@@ -102,6 +105,7 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
         cameras[name] = _read_camera(entry, named, path, f"{where}: camera '{name}'")
         files.append(list_images())
     recorded = read_poses(poses, path, origin, options.max_gap_s, poses_at, read_topic)
+    check_trajectory(recorded.trajectory, recorded.origin, poses_at)
     pose_noise = _read_pose_noise(content.get("pose_noise"), recorded.noise, f"{where}: pose_noise")
     laid = lay_flat(recorded.trajectory, pose_noise.position_m)
     tell(laid, path)

@@ -15,6 +15,7 @@ from v2hdm.drive.mounting import ipm_from_guess, roi_ahead
 from v2hdm.drive.options import ReadOptions
 from v2hdm.drive.poses.rising import in_order
 from v2hdm.drive.road import lay_flat, tell
+from v2hdm.drive.trajectory import check_trajectory
 from v2hdm.errors import DriveError
 from v2hdm.fields import check_camera, take_size_px
 from v2hdm.files import take_array, take_number, take_text
@@ -58,6 +59,7 @@ def read_nuscenes_drive(path: Path, options: ReadOptions) -> Drive:
             raise DriveError(f"{folder}: two images of {name} at one time; give one recording, not several")
         files.append(ImageFiles(name, stamp_s, [path / _file(row, folder) for row in rows]))
     recorded = _trajectory(egos, folder)
+    check_trajectory(recorded, None, f"{folder}: ego_pose")
     noise = PoseNoise.as_far_as_stated()
     laid = lay_flat(recorded, noise.position_m)
     tell(laid, path)
