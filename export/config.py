@@ -21,6 +21,12 @@ class BoundsConfig:
 
     The names are those of :class:`export.parity.Parity`, which says what they mean; of ``kinds_agree`` and
     ``lanes_agree`` these are the least, of the others the most.
+
+    Attributes:
+        paint_changed: share of the paint that may change.
+        outline_px: how far its outline may move.
+        outline_bias_px: how far it may move outwards on the whole.
+        lane_offset_px: how far lanes may move.
     """
 
     paint_changed: float = 0.06
@@ -50,6 +56,10 @@ class ExportConfig:
 
     ``checkpoint`` may also be an exported file of float32. ``tolerance`` is how far any logit of a float32
     file may be from the network's before it is refused; an int8 file has bounds of its own.
+
+    Attributes:
+        precision: what the network computes with.
+        opset: ONNX operator set, 18 to 23.
     """
 
     checkpoint: str

@@ -62,6 +62,11 @@ class LossConfig:
     """Weights of the terms: Dice of the paint, its class, and the lanes, beside the paint's cross entropy.
 
     ``paint_weight`` and ``lane_weight`` are what a cell of paint or a crossing weighs against one of nothing.
+
+    Attributes:
+        dice: weight of the Dice loss of the paint.
+        kinds: weight of the class of paint.
+        lanes: weight of the lanes.
     """
 
     paint_weight: float = 2.0
@@ -73,7 +78,12 @@ class LossConfig:
 
 @dataclass(kw_only=True)
 class ValidationConfig:
-    """A fixed set of renders of full difficulty, scored every so many minutes."""
+    """A fixed set of renders of full difficulty, scored every so many minutes.
+
+    Attributes:
+        images: number of renders; 0 validates nothing.
+        every_minutes: time between two validations.
+    """
 
     images: int = 64
     every_minutes: float = 8.0
@@ -91,6 +101,14 @@ class TrainConfig:
     weights and place in the sequence of renders this one starts from: to learn on, or to learn users' own
     labels. ``catalogue`` is a YAML file of users' own classes, see `docs/own-class.md`; None takes those that
     ``start`` knows.
+
+    Attributes:
+        seed: of the network's first weights and of the renders.
+        device: auto, cpu or cuda.
+        batch: images an update, on each member of a team.
+        weight_decay: of AdamW.
+        threads: of torch, for each process.
+        checkpoint_minutes: time between two checkpoints.
     """
 
     output: str = "runs/train"

@@ -88,6 +88,8 @@ def work_on(
 
         print(help_text(about, schema, conf_dir()))
         return 0
+    for path in _own_files(sys.argv[1:]):
+        read_yaml(path, ConfigError)  # OmegaConf would expand whatever aliases repeat
     register(name, schema)
     task = _Task(work, settle, tuple(sys.argv[1:]))
     compose = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=name)(task)
@@ -187,10 +189,6 @@ def _composition_error(error: Exception, schema: type[Any], arguments: list[str]
             f"{error.filename}: no folder can be made there ({error.strerror}); set another output="
         )
     for path in _own_files(arguments):
-        try:
-            read_yaml(path, ConfigError)
-        except ConfigError as damaged:
-            return damaged
         if path.parent.name == "run" and not _GLOBAL.search(path.read_text(encoding="utf-8-sig")):
             return ConfigError(f"{path}: its first line must be '# @package _global_'; add it")
     return explain(error, schema, arguments)

@@ -5,6 +5,7 @@ The docstrings are the only source: an entry of ``Attributes``, else the sentenc
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import re
 import textwrap
@@ -89,12 +90,22 @@ def meaning_of(schema: type[Any], name: str) -> str:
         for entry in re.split(r"\n(?=    \w+: )", "\n" + attributes):
             key, found, meaning = entry.strip().partition(": ")
             if found and key == name:
-                return " ".join(meaning.split("\n\n")[0].split())
+                return _plain(" ".join(meaning.split("\n\n")[0].split()))
         sentences = re.split(r"(?<=[.;:])\s+(?=[`A-Z])", " ".join(prose.split()))
         told = [sentence for sentence in sentences if f"``{name}``" in sentence]
         if told:
-            return re.sub(r"``|:\w+:", "", " ".join(told)).replace("`", "")
+            return _plain(" ".join(told))
+        for module, other in re.findall(r":class:`~?([\w.]+)\.(\w+)`", text):
+            described = getattr(importlib.import_module(module), other)
+            if _is_schema(described) and (meaning := meaning_of(described, name)):
+                return meaning
     return ""
+
+
+def _plain(text: str) -> str:
+    """A docstring's sentence without its markup, in the words of YAML."""
+    text = re.sub(r":\w+:`~?(?:[\w.]+\.)?(\w+)`", r"\1", text)
+    return re.sub(r"\bNone\b", "null", text.replace("`", ""))
 
 
 def _is_schema(kind: Any) -> bool:

@@ -11,7 +11,6 @@ import codecs
 import json
 import re
 import stat
-import unicodedata
 from collections.abc import Hashable
 from pathlib import Path
 from typing import Any, Never
@@ -40,9 +39,6 @@ MOST_DIGITS = 64
 MOST_NAME_LETTERS = 64
 _MOST_NAME_BYTES = 200
 """File systems end at 255 bytes, and a file's name has more than its camera's in it."""
-
-_HIDDEN = ("Cc", "Cf", "Cs", "Zl", "Zp")
-"""Categories of letters that a terminal does not show or that turn its line around."""
 
 _SHORT, _FEW = 60, 4
 
@@ -185,7 +181,7 @@ def take_name(content: object, where: str, error: type[V2hdmError]) -> str:
     fault = None
     if set(content) & set("/\\"):
         fault = "has a separator of folders"
-    elif any(unicodedata.category(letter) in _HIDDEN for letter in content):
+    elif not content.isprintable():
         fault = "has a letter that does not show, such as a line's end"
     elif content.startswith("."):
         fault = "begins with a dot"
@@ -227,7 +223,7 @@ def shown(content: object) -> str:
     if isinstance(content, int) and abs(content) >= 10**MOST_DIGITS:
         return "a number of very many digits"
     text = "".join(
-        letter if unicodedata.category(letter) not in _HIDDEN else "\N{REPLACEMENT CHARACTER}"
+        letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}"
         for letter in str(content)[: _SHORT + 1]
     )
     if len(text) > _SHORT:
@@ -250,7 +246,7 @@ class _Loader(yaml.SafeLoader):
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         """The next node, with all that is in it."""
-        event = self.peek_event()
+        event: yaml.Event = self.peek_event()  # type: ignore[no-untyped-call]
         self._depth += 1
         if self._depth > MOST_DEPTH:
             _refuse(f"nested deeper than {MOST_DEPTH} levels", event.start_mark)
@@ -304,7 +300,7 @@ def _one_line(text: object) -> str:
     return " ".join(str(text).split())
 
 
-def _refuse(problem: str, mark: yaml.Mark | None) -> Never:
+def _refuse(problem: str, mark: Any) -> Never:
     raise yaml.constructor.ConstructorError(None, None, problem, mark)
 
 

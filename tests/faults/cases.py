@@ -462,23 +462,23 @@ def outputs() -> Iterator[Case]:
         yield Case(f"result into {name}", CHECK, CHECKED, _both(drive(), make), "no results of ours")
     yield Case("result onto a file", CHECK, CHECKED, _both(drive(), write("out", "x")), "is a file")
     yield Case(
-        "result within a file", CHECK, (*CHECKED[:-1], "precious.txt/x"), drive(), "cannot be written|is a file"
+        "result within a file", CHECK, (*CHECKED[:-1], "precious.txt/x"), drive(), "cannot be written|is a "
+        "file"
     )  # fmt: skip
     yield Case("result into the drive", CHECK, (*CHECKED[:-1], "drive"), drive(), "no results of ours")
     yield Case(
         "result onto a link in a circle", CHECK, CHECKED, _both(drive(), _circle), "leads nowhere|cannot"
     )
     for most in (0, 10, 1000, 5000):
-        yield Case(
-            f"result on a disk with room for {most} bytes", CHECK, CHECKED, drive(), "cannot be written", disk_bytes=most
-        )  # fmt: skip
+        name = f"result on a disk with room for {most} bytes"
+        yield Case(name, CHECK, CHECKED, drive(), "cannot be written", disk_bytes=most)
     yield Case(
         "export onto the map", "v2hdm.export", ("map.geojson", "--format", "geojson"),
         lambda root: write_geojson(make_map(), root / "map.geojson"), "written over",
     )  # fmt: skip
     yield Case(
-        "export onto a link to the map", "v2hdm.export", ("map.geojson", "--format", "csv", "--output", "there"),
-        _linked_map, "written over",
+        "export onto a link to the map", "v2hdm.export",
+        ("map.geojson", "--format", "csv", "--output", "there"), _linked_map, "written over",
     )  # fmt: skip
 
 

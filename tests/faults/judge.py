@@ -1,8 +1,8 @@
 """The judge of a bad input: what the door may do with it, and what it may not.
 
 A case makes a folder of inputs and names a door with its arguments. The judge runs that door in this process
-and asserts its exit code, exactly one line of error without a traceback, that every file that was there is what
-it was, that nothing new is left, and that it ended in time.
+and asserts its exit code, exactly one line of error without a traceback, that every file that was there is
+what it was, that nothing new is left, and that it ended in time.
 """
 
 from __future__ import annotations
