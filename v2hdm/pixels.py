@@ -131,7 +131,7 @@ def _checked(data: bytes, path: Path) -> Header:
         )
     try:
         header = _header(data)
-    except (struct.error, IndexError, ValueError):
+    except (struct.error, LookupError, ValueError):
         header = None
     if header is None or not _is_whole(data):
         raise DriveError(f"{path}: image is truncated or damaged; restore it or drop it from the list")
