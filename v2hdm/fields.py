@@ -17,6 +17,9 @@ _LONGEST_FOCAL_PX = 1e6
 _ROUNDING = 1e-3
 """Parts of a covariance by which it may be off for having been rounded."""
 
+_MIDDLE = 1.0
+"""Focal lengths from the axis to 45 degrees from it: farther out radial terms prevail."""
+
 _WIDEST_RAD = np.deg2rad(89.5)
 """Rays farther from the axis have no pixel in the pinhole image."""
 
@@ -100,7 +103,7 @@ def _check_tangential(info: CameraInfo, where: str, error: type[V2hdmError]) -> 
     if info.distortion_model == "equidistant" or len(info.distortion) < 4:
         return
     tangential = float(np.hypot(info.distortion[2], info.distortion[3]))
-    if 6 * tangential * max(_sides(info)) >= 1:
+    if 6 * tangential * min(max(_sides(info)), _MIDDLE) >= 1:
         raise error(
             f"{where}: distortion_coefficients: p1 and p2 of {info.distortion[2]:g} and "
             f"{info.distortion[3]:g} "
