@@ -282,7 +282,9 @@ def texts() -> Iterator[Case]:
         yield Case(
             f"{file}: a folder", CHECK, CHECKED, drive(folder_instead(file)), "folder|not a drive|no image"
         )
-        yield Case(f"{file}: utf-16", CHECK, CHECKED, drive(write(file, "a: b\n".encode("utf-16"))), "UTF-16")
+        yield Case(
+            f"{file}: all of utf-16", CHECK, CHECKED, drive(write(file, "a: b\n".encode("utf-16"))), "UTF-16"
+        )
         yield Case(f"{file}: zeros", CHECK, CHECKED, drive(write(file, bytes(99))), "zero byte")
     poses = "front/images.txt", "poses.tum"
     lines = {
