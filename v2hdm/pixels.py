@@ -126,9 +126,7 @@ def _checked(data: bytes, path: Path) -> Header:
     if not data:
         raise DriveError(f"{path}: image file is empty; restore it or drop it from the list")
     if not _known(data):
-        raise DriveError(
-            f"{path}: not a PNG, JPEG, TIFF, BMP or WebP image; convert it, or drop it"
-        )
+        raise DriveError(f"{path}: not a PNG, JPEG, TIFF, BMP or WebP image; convert it, or drop it")
     try:
         header = _header(data)
     except (struct.error, LookupError, ValueError):
