@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import Enum
 
+from v2hdm.settings import COUNT, POSITIVE, SEED, SHARE, Within, check_settings
+
 
 class Precision(Enum):
     """What the exported network computes with."""
@@ -19,6 +21,12 @@ class BoundsConfig:
 
     The names are those of :class:`export.parity.Parity`, which says what they mean; of ``kinds_agree`` and
     ``lanes_agree`` these are the least, of the others the most.
+
+    Attributes:
+        paint_changed: share of the paint that may change.
+        outline_px: how far its outline may move.
+        outline_bias_px: how far it may move outwards on the whole.
+        lane_offset_px: how far lanes may move.
     """
 
     paint_changed: float = 0.06
@@ -48,6 +56,10 @@ class ExportConfig:
 
     ``checkpoint`` may also be an exported file of float32. ``tolerance`` is how far any logit of a float32
     file may be from the network's before it is refused; an int8 file has bounds of its own.
+
+    Attributes:
+        precision: what the network computes with.
+        opset: ONNX operator set, 18 to 23.
     """
 
     checkpoint: str
@@ -56,3 +68,23 @@ class ExportConfig:
     opset: int = 18
     tolerance: float = 1e-3
     int8: Int8Config = field(default_factory=Int8Config)
+
+
+_RANGES = {
+    "opset": Within(18, 23),
+    "tolerance": POSITIVE,
+    "int8.frames": COUNT,
+    "int8.parity_frames": COUNT,
+    "int8.seed": SEED,
+    **{f"int8.bounds.{name}": SHARE for name in ("paint_changed", "kinds_agree", "lanes_agree")},
+    **{f"int8.bounds.{name}": POSITIVE for name in ("outline_px", "outline_bias_px", "lane_offset_px")},
+}
+
+
+def check_export(config: ExportConfig) -> None:
+    """Refuse settings that no export can work with.
+
+    Raises:
+        ConfigError: a value is out of range; the message names the key.
+    """
+    check_settings(config, _RANGES)

@@ -7,10 +7,11 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from export.config import ExportConfig, Precision
+from export.config import ExportConfig, Precision, check_export
 from export.manifest import record_network
 from export.onnx_file import Tell, export_float, export_int8
 from export.source import Source, read_source
+from v2hdm.inputs import note_input, refuse_input
 
 
 def run(config: ExportConfig, tell: Tell = lambda share, doing: None) -> str:
@@ -20,6 +21,7 @@ def run(config: ExportConfig, tell: Tell = lambda share, doing: None) -> str:
         ConfigError: The checkpoint cannot be read or the file cannot be written.
         DetectorError: The file would not do what the network does.
     """
+    check_export(config)
     source = read_source(Path(config.checkpoint))
     output = Path(config.output)
     parity = _export(source, output, config, tell)
@@ -46,6 +48,8 @@ def _export(source: Source, output: Path, config: ExportConfig, tell: Tell) -> s
 
 def export(config: ExportConfig) -> None:
     """Export a checkpoint to ONNX."""
+    note_input(Path(config.checkpoint))
+    refuse_input(Path(config.output))
     console = Console(stderr=True)
     columns = (
         BarColumn(),

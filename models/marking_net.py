@@ -44,6 +44,11 @@ class NetConfig:
     is large; ``lanes`` adds the head of row anchors; ``wide_kinds`` lets the features at 1/8, which know a
     marking's whole shape and its surroundings, speak on its class. They are switches to measure what each
     costs and brings.
+
+    Attributes:
+        widths: channels at 1/4, 1/8, 1/16 and at the bottom.
+        dilations: of the blocks at the bottom, one each.
+        head_width: channels of the paint's head.
     """
 
     widths: list[int] = field(default_factory=lambda: [32, 64, 96, 128])

@@ -18,6 +18,7 @@ from train.growth import can_grow, class_count, grow, recorded_net, with_classes
 from v2hdm.catalogue import SHIPPED, Catalogue, load_catalogue
 from v2hdm.errors import ConfigError
 from v2hdm.files import whole_file
+from v2hdm.inputs import note_input, refuse_input
 
 # What may differ between the parts of a resumed run without making it another experiment.
 _FREE_TO_CHANGE = (
@@ -80,6 +81,9 @@ def fresh_checkpoint(config: TrainConfig, catalogue: Catalogue | None = None) ->
     if config.start is None:
         return state
     path = Path(config.start)
+    note_input(path)
+    for name in ("last.pt", "best.pt"):
+        refuse_input(Path(config.output) / name)
     earlier = read_exported(path) if path.suffix == ".onnx" else load_checkpoint(path)
     then = recorded_net(earlier.config["net"])
     if not can_grow(then, config.net):

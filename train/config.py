@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from models import NetConfig
+from models.marking_net import MULTIPLE
+from v2hdm.errors import ConfigError
+from v2hdm.settings import COUNT, MOST_PROCESSES, NOT_NEGATIVE, POSITIVE, SEED, SHARE, Within, check_settings
 
 
 @dataclass(kw_only=True)
@@ -59,6 +62,11 @@ class LossConfig:
     """Weights of the terms: Dice of the paint, its class, and the lanes, beside the paint's cross entropy.
 
     ``paint_weight`` and ``lane_weight`` are what a cell of paint or a crossing weighs against one of nothing.
+
+    Attributes:
+        dice: weight of the Dice loss of the paint.
+        kinds: weight of the class of paint.
+        lanes: weight of the lanes.
     """
 
     paint_weight: float = 2.0
@@ -70,7 +78,12 @@ class LossConfig:
 
 @dataclass(kw_only=True)
 class ValidationConfig:
-    """A fixed set of renders of full difficulty, scored every so many minutes."""
+    """A fixed set of renders of full difficulty, scored every so many minutes.
+
+    Attributes:
+        images: number of renders; 0 validates nothing.
+        every_minutes: time between two validations.
+    """
 
     images: int = 64
     every_minutes: float = 8.0
@@ -88,6 +101,14 @@ class TrainConfig:
     weights and place in the sequence of renders this one starts from: to learn on, or to learn users' own
     labels. ``catalogue`` is a YAML file of users' own classes, see `docs/own-class.md`; None takes those that
     ``start`` knows.
+
+    Attributes:
+        seed: of the network's first weights and of the renders.
+        device: auto, cpu or cuda.
+        batch: images an update, on each member of a team.
+        weight_decay: of AdamW.
+        threads: of torch, for each process.
+        checkpoint_minutes: time between two checkpoints.
     """
 
     output: str = "runs/train"
@@ -110,3 +131,65 @@ class TrainConfig:
     data: DataConfig = field(default_factory=DataConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     validation: ValidationConfig = field(default_factory=ValidationConfig)
+
+
+_SIDE = Within(MULTIPLE, 2**13, step=MULTIPLE)
+_RENDER_SIDE = Within(MULTIPLE, 2**14)
+_LEVELS = 4
+"""The network has this many widths."""
+
+_RANGES = {
+    "seed": SEED,
+    "minutes": Within(0, 1e7, open=True),
+    "steps": COUNT,
+    "batch": Within(1, 2**16),
+    "learning_rate": Within(0, 10, open=True),
+    "weight_decay": Within(0, 10),
+    "warmup": Within(0, 0.9),
+    "ema_updates": COUNT,
+    "threads": Within(1, MOST_PROCESSES),
+    "checkpoint_minutes": POSITIVE,
+    "net.widths": Within(8, 2**12, step=8),
+    "net.dilations": Within(1, 256),
+    "net.head_width": Within(1, 2**10),
+    "data.width": _SIDE,
+    "data.height": _SIDE,
+    "data.render_width": _RENDER_SIDE,
+    "data.render_height": _RENDER_SIDE,
+    "data.views_per_render": COUNT,
+    "data.reservoir": COUNT,
+    "data.easy_samples": NOT_NEGATIVE,
+    "data.workers": Within(0, MOST_PROCESSES),
+    "data.labelled_share": SHARE,
+    **{
+        f"data.{name}": Within(0, 100)
+        for name in (
+            "shadows_on_paint", "things_beside", "faint", "seams", "side_seams", "pavements", "bleached",
+            "overexposed", "blue_shade", "tight_bends", "kerbs", "junctions", "mountings", "aside",
+        )
+    },
+    **{f"loss.{name}": NOT_NEGATIVE for name in ("paint_weight", "dice", "kinds", "lanes", "lane_weight")},
+    "validation.images": Within(0, 2**20),
+    "validation.every_minutes": POSITIVE,
+}  # fmt: skip
+
+
+def check_training(config: TrainConfig) -> None:
+    """Refuse settings that no training can work with, or that would never end.
+
+    Raises:
+        ConfigError: a value is out of range; the message names the key.
+    """
+    check_settings(config, _RANGES)
+    if config.minutes is None and config.steps is None:
+        raise ConfigError("the training has no end: set minutes= or steps=")
+    if len(config.net.widths) != _LEVELS or not config.net.dilations:
+        raise ConfigError(
+            f"net.widths has {len(config.net.widths)} entries: give {_LEVELS}, and some dilations"
+        )
+    data = config.data
+    if data.width > data.render_width or data.height > data.render_height:
+        raise ConfigError(
+            f"data.width x data.height is {data.width} x {data.height}, and a render has "
+            f"{data.render_width} x {data.render_height}: set it no larger"
+        )

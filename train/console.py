@@ -6,21 +6,29 @@ import logging
 import multiprocessing
 import signal
 import sys
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from rich.console import Console
 from rich.logging import RichHandler
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from train.config import TrainConfig
+from train.config import TrainConfig, check_training
 from train.distributed import Team, joined_team
 from train.loop import Trainer
+from v2hdm.outputs import locked_folder
 
 
 def train(config: TrainConfig) -> None:
     """Train the detector's network, in the team that this process is part of."""
-    with joined_team(config.device) as team:
+    check_training(config)
+    with joined_team(config.device) as team, _alone(config, team):
         _train(config, team)
+
+
+def _alone(config: TrainConfig, team: Team) -> AbstractContextManager[None]:
+    """Keep a second training out of the folder of this one."""
+    return locked_folder(Path(config.output)) if team.leads else nullcontext()
 
 
 def _train(config: TrainConfig, team: Team) -> None:

@@ -19,8 +19,8 @@ from train.scenes.scenes import TrainingSample
 from train.targets import IGNORE, Targets, targets
 from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.detection.image_file import read_bgr
-from v2hdm.drive.image_header import image_size
 from v2hdm.errors import ConfigError, DriveError, LabelError
+from v2hdm.pixels import read_header
 
 _NEAR_A_LABEL = 0.75
 """How often a view is taken around something that is labelled; the rest is taken anywhere."""
@@ -124,11 +124,11 @@ def _folder(labels: str, images: str | None) -> Path:
 def _check(image: LabelledImage, config: DataConfig) -> None:
     """Refuse what would stop a training in its midst."""
     try:
-        size = image_size(image.path)
+        header = read_header(image.path)
     except DriveError as error:
         raise LabelError(f"{image.where}: {error}") from error
-    if size is None:
-        size = tuple(reversed(read_bgr(image.path).shape[:2]))
+    turned = header.orientation >= 5  # by a quarter: decoded as it is shown, which is how it was labelled
+    size = (header.height, header.width) if turned else (header.width, header.height)
     if image.size is not None and image.size != size:
         raise LabelError(
             f"{image.where}: {image.path} is {size[0]}x{size[1]} but its labels are for "

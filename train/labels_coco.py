@@ -13,6 +13,7 @@ from v2hdm.catalogue import NOT_PAINT, PAINT_CLASSES
 from v2hdm.errors import LabelError
 from v2hdm.files import load_json
 from v2hdm.records import FloatArray
+from v2hdm.texts import shown
 
 _HALF_PX = 0.5
 """COCO counts from the top-left pixel's corner, this project from its centre."""
@@ -49,9 +50,11 @@ def read_coco(
     ):
         where = f"{path}: annotation {entry.get('id', number)}"
         if entry["category_id"] not in names:
-            raise LabelError(f"{where}: its category {entry['category_id']!r} is not in the file; add it")
+            raise LabelError(
+                f"{where}: its category {shown(entry['category_id'])} is not in the file; add it"
+            )
         if entry["image_id"] not in shapes:
-            raise LabelError(f"{where}: its image {entry['image_id']!r} is not in the file; add it")
+            raise LabelError(f"{where}: its image {shown(entry['image_id'])} is not in the file; add it")
         kind = _kind(names[entry["category_id"]], kinds, known, where)
         if kind != NOT_PAINT:
             shapes[entry["image_id"]].append(Shape(kind, _rings(entry["segmentation"], where)))
@@ -75,11 +78,13 @@ def _kinds(
     for name, kind in classes.items():
         if name not in names.values():
             raise LabelError(
-                f"data.coco_classes: {path} has no category {name!r} but {', '.join(names.values())}; mend it"
+                f"data.coco_classes: {path} has no category {shown(name)}, only "
+                f"{', '.join(names.values())}; mend it"
             )
         if kind not in (*known, NOT_PAINT):
             raise LabelError(
-                f"data.coco_classes: {name!r} is to be {kind!r}; choose from: {', '.join(known)}, {NOT_PAINT}"
+                f"data.coco_classes: {shown(name)} is to be {shown(kind)}; choose from: "
+                f"{', '.join(known)}, {NOT_PAINT}"
             )
     alike = {name: name.strip().lower().replace(" ", "_").replace("-", "_") for name in names.values()}
     by_name = {kind.lower(): kind for kind in known}
@@ -89,7 +94,7 @@ def _kinds(
 def _kind(name: str, kinds: Mapping[str, str], known: Sequence[str], where: str) -> str:
     if name not in kinds:
         raise LabelError(
-            f"{where}: category {name!r} is no class of the detector; say which it is with "
+            f"{where}: category {shown(name)} is no class of the detector; say which it is with "
             f"'+data.coco_classes={{{name}: CLASS}}', CLASS one of: {', '.join(known)}, {NOT_PAINT}"
         )
     return kinds[name]
@@ -121,9 +126,14 @@ def _entries(
     """The list of objects under a key, each with the keys that are needed."""
     entries = content.get(key)
     if not isinstance(entries, list):
-        raise LabelError(f"{path}: has no list {key!r}; is it a COCO instances file?")
+        raise LabelError(f"{path}: has no list {shown(key)}; is it a COCO instances file?")
     for number, entry in enumerate(entries):
         missing = [name for name in needed if not isinstance(entry, dict) or name not in entry]
         if missing:
-            raise LabelError(f"{path}: {key}[{number}] has no {missing[0]!r}; add it")
+            raise LabelError(f"{path}: {key}[{number}] has no {shown(missing[0])}; add it")
+        for name in {"id", "image_id", "category_id"} & set(needed):
+            if not isinstance(entry[name], int | str):
+                raise LabelError(
+                    f"{path}: {key}[{number}]: {name}: expected a number, got {shown(entry[name])}"
+                )
     return entries

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from train.labels_image import LabelledImage
 from v2hdm.errors import LabelError
 from v2hdm.files import read_text
 from v2hdm.records import FloatArray
+from v2hdm.texts import parse_json, shown
 
 _KEYS = ("raw_file", "lanes", "h_samples")
 _LEAST_POINTS = 2
@@ -38,13 +38,10 @@ def read_tusimple(path: Path, images: Path) -> list[LabelledImage]:
 
 
 def _image(line: str, where: str, images: Path) -> LabelledImage:
-    try:
-        entry = json.loads(line)
-    except json.JSONDecodeError as error:
-        raise LabelError(f"{where}: JSON syntax error: {error.msg}; mend that line") from None
+    entry = parse_json(line, where, LabelError)
     missing = [key for key in _KEYS if not isinstance(entry, dict) or key not in entry]
     if missing:
-        raise LabelError(f"{where}: has no {missing[0]!r}; it takes {', '.join(_KEYS)}")
+        raise LabelError(f"{where}: has no {shown(missing[0])}; it takes {', '.join(_KEYS)}")
     rows = _numbers(entry["h_samples"], f"{where}: h_samples")
     if not isinstance(entry["lanes"], list):
         raise LabelError(f"{where}: lanes is no list; give one list of columns a lane")

@@ -24,13 +24,12 @@ from train.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from train.config import TrainConfig
+from train.config import TrainConfig, check_training
 from train.data import Pair, training_batches, validation_pairs
 from train.distributed import Team, choose_device, has_bfloat16
 from train.losses import total_loss
 from train.metrics import Score, Tally
 from train.targets import Targets
-from v2hdm.errors import ConfigError
 
 _LOG = logging.getLogger(__name__)
 
@@ -51,8 +50,7 @@ class Trainer:
 
     def __post_init__(self) -> None:
         config = self.config
-        if config.minutes is None and config.steps is None:
-            raise ConfigError("the training has no end: set minutes= or steps=")
+        check_training(config)
         torch.manual_seed(config.seed)
         torch.set_num_threads(config.threads)
         self._team = self.team or Team(choose_device(config.device))

@@ -13,10 +13,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from v2hdm.errors import ConfigError
 from v2hdm.records import LANE_BOUNDARY
+from v2hdm.texts import read_yaml, shown
 
 CATALOGUE_FILE = Path(__file__).with_name("catalogue.yaml")
 
@@ -126,11 +125,13 @@ class Catalogue:
         for name in entries:
             if not (isinstance(name, str) and _NAME.fullmatch(name)):
                 raise ConfigError(
-                    f"{where}: a class is called {name!r}; use letters, digits and underscores, 64 at most"
+                    f"{where}: class {shown(name)}: use letters, digits and underscores, 64 at most"
                 )
             if name.lower() in taken:
                 other = taken[name.lower()]
-                raise ConfigError(f"{where}: {name!r} is the name of {other!r} already; choose another")
+                raise ConfigError(
+                    f"{where}: {shown(name)} is the name of {shown(other)} already; choose another"
+                )
             taken[name.lower()] = name
         own = {name: _read_class(name, entry, where) for name, entry in entries.items()}
         groups = {one.group for one in self.classes.values()}
@@ -138,13 +139,14 @@ class Catalogue:
         for name, one in own.items():
             if one.family == LINE or one.group in lanes:
                 raise ConfigError(
-                    f"{where}: {name!r} would be paint of lanes, which know their own classes only "
+                    f"{where}: {shown(name)} would be paint of lanes, which know their own classes only "
                     f"({', '.join(self.lane_paint)}); choose another family and group"
                 )
             if one.group not in groups | set(own):
                 known = ", ".join(sorted(groups - lanes))
                 raise ConfigError(
-                    f"{where}: group of {name!r} is {one.group!r}; name one of {known}, or a class of yours"
+                    f"{where}: group of {shown(name)} is {shown(one.group)}; name one of {known}, "
+                    "or a class of yours"
                 )
         if len(self.classes) + len(own) > _MOST_CLASSES:
             raise ConfigError(f"{where}: more than {_MOST_CLASSES} classes in all; drop some")
@@ -160,24 +162,8 @@ def load_catalogue(path: Path | None = None) -> Catalogue:
     return SHIPPED if path is None else SHIPPED.with_own(_read_entries(path), str(path))
 
 
-class _Loader(yaml.SafeLoader):
-    """Refuses a key that is there twice, of which YAML would take the last."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """The mapping of a node."""
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        twice = next((key for n, key in enumerate(keys) if key in keys[:n]), None)
-        if twice is not None:
-            raise yaml.constructor.ConstructorError(None, None, f"{twice!r} is there twice", node.start_mark)
-        return super().construct_mapping(node, deep)
-
-
 def _read_entries(path: Path) -> dict[Any, Any]:
-    try:
-        content = yaml.load(path.read_text(encoding="utf-8"), _Loader)
-    except (OSError, UnicodeError, yaml.YAMLError) as error:
-        reason = " ".join(str(error).split())
-        raise ConfigError(f"{path}: cannot be read as a catalogue of markings ({reason}); mend it") from error
+    content = read_yaml(path, ConfigError)
     entries = content.get("classes") if isinstance(content, dict) else None
     if not isinstance(entries, dict) or not entries:
         raise ConfigError(f"{path}: no `classes` in it; list them as v2hdm/catalogue.yaml does")
@@ -186,10 +172,14 @@ def _read_entries(path: Path) -> dict[Any, Any]:
 
 def _read_class(name: str, entry: Any, where: str) -> MarkingClass:
     if not isinstance(entry, dict) or not set(entry) <= _KEYS:
-        raise ConfigError(f"{where}: class {name!r} may have {', '.join(sorted(_KEYS))} and nothing else")
+        raise ConfigError(
+            f"{where}: class {shown(name)} may have {', '.join(sorted(_KEYS))} and nothing else"
+        )
     family = entry.get("family")
     if family not in FAMILIES:
-        raise ConfigError(f"{where}: family of {name!r} is {family!r}; choose from {', '.join(FAMILIES)}")
+        raise ConfigError(
+            f"{where}: family of {shown(name)} is {shown(family)}; choose from {', '.join(FAMILIES)}"
+        )
     ranges = {}
     for key in ("length_m", "width_m"):
         value = entry.get(key)
@@ -200,14 +190,14 @@ def _read_class(name: str, entry: Any, where: str) -> MarkingClass:
             and 0 <= value[0] <= value[1]
             and value[1] > 0
         ):
-            raise ConfigError(f"{where}: {key} of {name!r} is {value!r}; give [from, to] in m")
+            raise ConfigError(f"{where}: {key} of {shown(name)} is {shown(value)}; give [from, to] in m")
         ranges[key] = (float(value[0]), float(value[1]))
     softness = entry.get("softness", _SOFTNESS)
     if not (_is_number(softness) and 0 < softness < math.inf):
-        raise ConfigError(f"{where}: softness of {name!r} is {softness!r}; give a positive number")
+        raise ConfigError(f"{where}: softness of {shown(name)} is {shown(softness)}; give a positive number")
     group = entry.get("group", name)
     if not isinstance(group, str):
-        raise ConfigError(f"{where}: group of {name!r} is {group!r}; give the name of a group")
+        raise ConfigError(f"{where}: group of {shown(name)} is {shown(group)}; give the name of a group")
     return MarkingClass(name, family, ranges["length_m"], ranges["width_m"], group, float(softness))
 
 

@@ -14,7 +14,6 @@ import numpy as np
 
 from v2hdm.detection.image_file import read_bgr
 from v2hdm.drive import ReadOptions, read_drive
-from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.ground import GroundEstimate
 from v2hdm.ground.rig import estimate_cameras
@@ -23,6 +22,7 @@ from v2hdm.records import Drive, FloatArray, Trajectory
 from v2hdm.report.camera_grid import save_grid
 from v2hdm.report.outputs import result_folder, write_json
 from v2hdm.report.route import save_route
+from v2hdm.settings import check_workers
 
 _PICTURES = 3
 """Sample images of each camera: near the start, in the middle and near the end."""
@@ -40,13 +40,12 @@ def check_up(parsed: argparse.Namespace) -> bool:
     Raises:
         V2hdmError: the drive cannot be read, or the pictures cannot be written.
     """
-    if parsed.workers < 0:
-        raise ConfigError(f"--workers {parsed.workers}: give a number of processes, or 0 for one per core")
+    check_workers(parsed.workers)
     logging.basicConfig(format="%(message)s")
     cv2.setNumThreads(1)
     drive = read_drive(parsed.drive, ReadOptions(cameras=parsed.camera))
     folder = parsed.output or Path("outputs") / f"{drive.name}-check"
-    with result_folder(folder) as unfinished:
+    with result_folder(folder, "--output") as unfinished:
         ground: Mapping[str, GroundEstimate] = {}
         if parsed.ground:
             ground = estimate_cameras(drive, parsed.workers or os.cpu_count() or 1, _quietly)

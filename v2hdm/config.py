@@ -7,20 +7,24 @@ before anything is read.
 from __future__ import annotations
 
 import difflib
+import itertools
 import os
 import re
 import sys
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_type_hints
 
 import hydra
 from hydra.core.config_store import ConfigStore
-from hydra.errors import HydraException
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from v2hdm.errors import ConfigError
+from v2hdm.errors import ConfigError, V2hdmError
+from v2hdm.texts import read_yaml
 
 _PACKAGE = Path(__file__).resolve().parent
 _Schema = TypeVar("_Schema")
@@ -37,30 +41,173 @@ def register(name: str, schema: type[Any]) -> None:
     ConfigStore.instance().store(name=f"{name}_schema", node=schema)
 
 
-def compositions(name: str, schema: type[Any]) -> list[DictConfig]:
-    """``conf/<name>.yaml`` composed with the command line.
+@dataclass(frozen=True)
+class Job:
+    """One configuration to work on.
 
-    One as a rule; none after ``--help``, and several after ``--multirun``.
+    Attributes:
+        composed: the configuration.
+        label: of a sweep (``--multirun``) the job's number and what it sets, as part of a file's name; None
+            where there is one job only.
+    """
+
+    composed: DictConfig
+    label: str | None
+
+    def folder(self, output: str) -> str:
+        """The folder ``output``, of a sweep one within it for this job."""
+        return output if self.label is None else str(Path(output) / self.label)
+
+
+def work_on(
+    name: str,
+    schema: type[Any],
+    work: Callable[[Job], int | None],
+    settle: Callable[[Callable[[], int | None]], int],
+    about: str,
+) -> int:
+    """Compose ``conf/<name>.yaml`` with the command line and work on it, once as a rule.
+
+    Nothing is done after ``--help``. A sweep (``--multirun``) works on each of its configurations, perhaps in
+    other processes, and ends with the code of the first that failed.
+
+    Args:
+        name: of the configuration.
+        schema: the dataclass that it builds on.
+        work: what to do; returns an exit code, or None for 0.
+        settle: does the work of a job of a sweep and tells on the terminal what went wrong with it.
+        about: what ``--help`` begins with.
 
     Raises:
         ConfigError: A key or value is wrong, or Hydra cannot make the output folder.
     """
     # Hydra prints composition errors its own way and exits with 1 unless told to raise them.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+    if {"--help", "-h"} & set(sys.argv[1:]):
+        from v2hdm.config_help import help_text
+
+        print(help_text(about, schema, conf_dir()))
+        return 0
+    for path in _own_files(sys.argv[1:]):
+        read_yaml(path, ConfigError)  # OmegaConf would expand whatever aliases repeat
     register(name, schema)
-    composed: list[DictConfig] = []
-    compose = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=name)(composed.append)
+    task = _Task(work, settle, tuple(sys.argv[1:]))
+    compose = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=name)(task)
+    given = sys.argv
+    sys.argv = [given[0], *_options_first(given[1:])]
     try:
         compose()
-    except (HydraException, OmegaConfBaseException) as error:
-        raise explain(error, schema, sys.argv[1:]) from error
-    except BrokenPipeError:  # --help has met a reader who has had enough
+    except _JobFailed as failure:
+        return failure.code
+    except BrokenPipeError:  # --hydra-help has met a reader who has had enough
         raise
-    except OSError as error:
-        raise ConfigError(
+    except Exception as error:  # whatever Hydra, OmegaConf and PyYAML raise about texts that users wrote
+        if _OF_WORK in getattr(error, "__notes__", ()):
+            raise
+        raise _composition_error(error, schema, given[1:]) from error
+    finally:
+        sys.argv = given
+    if task.failure:
+        raise task.failure[0]
+    return task.codes[0] if task.codes else 0
+
+
+class _JobFailed(Exception):  # noqa: N818  # told already: it only carries a code between processes
+    """A job of a sweep did not end well."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(code)
+        self.code = code
+
+
+_OF_WORK = "while working, after the configuration was composed"
+
+
+@dataclass
+class _Task:
+    """What Hydra calls with each composed configuration; launchers take it into other processes."""
+
+    work: Callable[[Job], int | None]
+    settle: Callable[[Callable[[], int | None]], int]
+    arguments: tuple[str, ...]
+    codes: list[int] = field(default_factory=list)
+    failure: list[BaseException] = field(default_factory=list)
+
+    def __call__(self, composed: DictConfig) -> int:
+        running = HydraConfig.get()
+        if running.mode is not RunMode.MULTIRUN:
+            try:
+                self.codes.append(self.work(Job(composed, None)) or 0)
+            except Exception as error:  # Hydra would take it for one of its own
+                self.failure.append(error)
+            return 0
+        swept = [one for one in running.overrides.task if one not in self.arguments]
+        label = re.sub(r"[^\w.=,+-]+", "_", f"{running.job.num}-{','.join(swept)}")[:_LABEL_LETTERS]
+        try:
+            code = self.settle(lambda: self._labelled(Job(composed, label.rstrip("-."))))
+        except Exception as error:
+            error.add_note(_OF_WORK)
+            raise
+        if code:
+            raise _JobFailed(code)
+        return 0
+
+    def _labelled(self, job: Job) -> int | None:
+        try:
+            return self.work(job)
+        except V2hdmError as error:
+            raise type(error)(f"job {job.label}: {error}") from error
+
+
+_LABEL_LETTERS = 100
+
+_WITH_VALUE = {
+    "--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn", "--package", "-p",
+    "--experimental-rerun",
+}  # fmt: skip
+"""Options of Hydra that are followed by a value."""
+
+
+def _options_first(arguments: Sequence[str]) -> list[str]:
+    """The arguments with Hydra's options before all overrides: it takes no override after an option."""
+    options, overrides = [], []
+    rest = iter(arguments)
+    for argument in rest:
+        if argument.startswith("-"):
+            options.append(argument)
+            if argument in _WITH_VALUE:
+                options += [value for value in [next(rest, None)] if value is not None]
+        else:
+            overrides.append(argument)
+    return [*options, *overrides]
+
+
+def _composition_error(error: Exception, schema: type[Any], arguments: list[str]) -> ConfigError:
+    """One line for what is wrong with a configuration, and in which file where it is one."""
+    if isinstance(error, OSError) and error.filename:
+        return ConfigError(
             f"{error.filename}: no folder can be made there ({error.strerror}); set another output="
-        ) from None
-    return composed
+        )
+    for path in _own_files(arguments):
+        if path.parent.name == "run" and not _GLOBAL.search(path.read_text(encoding="utf-8-sig")):
+            return ConfigError(f"{path}: its first line must be '# @package _global_'; add it")
+    return explain(error, schema, arguments)
+
+
+_GLOBAL = re.compile(r"^#\s*@package\s+_global_\s*$", re.MULTILINE)
+
+
+def _own_files(arguments: Sequence[str]) -> list[Path]:
+    """The configuration files of the user's own that a command line has chosen."""
+    files = sorted((conf_dir() / "local").glob("*.yaml"))
+    for argument, value in itertools.pairwise([*arguments, ""]):
+        name, _, rest = argument.partition("=")
+        if name in ("--config-dir", "-cd"):
+            folder = Path(rest or value)
+            for choice in (one.lstrip("+") for one in arguments if not one.startswith("-")):
+                group, _, names = choice.partition("=")
+                files += [folder / group / f"{one}.yaml" for one in names.split(",")]
+    return [path for path in files if path.is_file()]
 
 
 def to_dataclass(composed: DictConfig, schema: type[_Schema], advice: str) -> _Schema:
@@ -94,9 +241,19 @@ def explain(error: Exception, schema: type[Any], overrides: list[str]) -> Config
     message = "; ".join(dict.fromkeys(line for line in lines if not _NOISE.match(line)))
     key = re.search(r"full_key: (\S+)", f"{error}\n{root}")
     place = f" of {key.group(1)}" if key and key.group(1) not in message else ""
-    where = f" (in {' '.join(overrides)})" if overrides else ""
+    if "missing EQUAL" in message:
+        bare = [one for one in overrides if "=" not in one and not one.startswith(("-", "~"))]
+        named = " ".join(bare[:1]) or "an argument"
+        return ConfigError(
+            f"configuration: '{named}' is no key=value; write drive.path={named}, or see --help"
+        )
+    # Of a long command line only what the message is about: the override that has the key it names.
+    about = [one for one in overrides if one.lstrip("+~").split("=")[0] in message + place]
+    where = f" (in {' '.join(about or overrides)})" if len(about or overrides) <= _FEW_OVERRIDES else ""
     return ConfigError(f"configuration{where}: {message}{place}; {_advice(message, schema)}")
 
+
+_FEW_OVERRIDES = 3
 
 _NOISE = re.compile(
     r"(\^$|full_key|To append to your config|reference_type|object_type|Config search path|provider="

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
@@ -14,6 +15,9 @@ from v2hdm import pipeline
 from v2hdm.pipeline.run import logging_to
 from v2hdm.quality import Status, Verdict
 from v2hdm.report.table import results_table
+
+_EVERY_S = 10.0
+"""Between two lines on one task."""
 
 _STYLES = {Status.PASS: "bold green", Status.WARN: "bold yellow", Status.FAIL: "bold red"}
 
@@ -38,9 +42,25 @@ def run_on_terminal(config: pipeline.RunConfig, config_yaml: str) -> Verdict:
     return result.verdict
 
 
+def progress_lines(write: Callable[[str], None]) -> pipeline.Progress:
+    """Progress for a log file or a service: a line when a task begins and ends, and every few seconds."""
+    told_s: dict[str, float] = {}
+
+    def advance(task: str, done: int, total: int) -> None:
+        now_s = time.monotonic()
+        if task not in told_s or done == total or now_s - told_s[task] >= _EVERY_S:
+            told_s[task] = now_s
+            write(f"{task}: {done} of {total}")
+
+    return advance
+
+
 @contextmanager
 def _bars(console: Console) -> Iterator[pipeline.Progress]:
-    """A progress bar per task, made the first time that a task reports."""
+    """A progress bar per task, made the first time that a task reports; lines where there is no terminal."""
+    if not console.is_terminal:
+        yield progress_lines(console.print)
+        return
     columns = (
         TextColumn("{task.description:<28}"),
         BarColumn(40),

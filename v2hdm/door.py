@@ -18,6 +18,7 @@ from pathlib import Path
 
 from v2hdm import __version__
 from v2hdm.errors import V2hdmError
+from v2hdm.inputs import protected_inputs
 
 EXIT_USER_ERROR = 2
 EXIT_FAILED_VERDICT = 3
@@ -45,7 +46,8 @@ def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[],
     # as soon as the machine is busy otherwise. Libraries read this when they are loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
-        return _to_the_end(work)
+        with protected_inputs():
+            return _to_the_end(work)
     except BrokenPipeError:  # the reader of our output has had enough
         from v2hdm.files import forget_stdout
 
@@ -61,6 +63,15 @@ def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[],
         )
     except KeyboardInterrupt:
         return _fail(interrupted)
+    except MemoryError:
+        return _fail("the memory is not enough for this; give less at once, or fewer workers")
+    except OSError as error:
+        # Disks that are full, gone or read-only can fail any call.
+        if isinstance(error, ConnectionError):
+            raise
+        _forget_full_stdout()
+        where = f"{error.filename}: " if error.filename else ""
+        return _fail(f"{where}{error.strerror or error}; free space or check the disk, then start again")
 
 
 def _to_the_end(work: Callable[[], int | None]) -> int:
@@ -74,8 +85,20 @@ def _to_the_end(work: Callable[[], int | None]) -> int:
     return code
 
 
+def _forget_full_stdout() -> None:
+    """Keep Python from failing once more at its end, where nothing can be printed."""
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError):
+        from v2hdm.files import forget_stdout
+
+        forget_stdout()
+
+
 def _fail(message: str) -> int:
-    print(f"error: {message}", file=sys.stderr)
+    # Names and values in it come from files of strangers: none may end the line or move the cursor.
+    line = " ".join(message.split())
+    print(f"error: {''.join(c if c.isprintable() else '?' for c in line)}", file=sys.stderr)
     return EXIT_USER_ERROR
 
 

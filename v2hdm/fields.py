@@ -17,6 +17,9 @@ _LONGEST_FOCAL_PX = 1e6
 _ROUNDING = 1e-3
 """Parts of a covariance by which it may be off for having been rounded."""
 
+_MIDDLE = 1.0
+"""Focal lengths from the axis to 45 degrees from it: farther out radial terms prevail."""
+
 _WIDEST_RAD = np.deg2rad(89.5)
 """Rays farther from the axis have no pixel in the pinhole image."""
 
@@ -77,6 +80,7 @@ def check_camera(info: CameraInfo, where: str, error: type[V2hdmError]) -> None:
         )
     if max(fx, fy, abs(skew), abs(cx), abs(cy)) > _LONGEST_FOCAL_PX:
         raise error(f"{where}: camera_matrix: beyond {_LONGEST_FOCAL_PX:g} px; mend it")
+    _check_tangential(info, where, error)
     reach, sides = lens_reach(info), _sides(info)
     if reach >= np.hypot(*sides):
         return
@@ -88,6 +92,23 @@ def check_camera(info: CameraInfo, where: str, error: type[V2hdmError]) -> None:
     if reach < max(sides):
         raise error(f"{problem}; calibrate it again with points up to the image's corners")
     _log.warning("%s: do not trust what lies in its corners; calibrate with points up to there", problem)
+
+
+def _check_tangential(info: CameraInfo, where: str, error: type[V2hdmError]) -> None:
+    """Refuse a lens off its axis by so much that the image's middle is turned over or torn.
+
+    The tangential part moves a point at r focal lengths by up to 3 p r^2, so that neighbours change places
+    where 6 p r reaches 1; every real lens is below a tenth of that.
+    """
+    if info.distortion_model == "equidistant" or len(info.distortion) < 4:
+        return
+    tangential = float(np.hypot(info.distortion[2], info.distortion[3]))
+    if 6 * tangential * min(max(_sides(info)), _MIDDLE) >= 1:
+        raise error(
+            f"{where}: distortion_coefficients: p1 and p2 of {info.distortion[2]:g} and "
+            f"{info.distortion[3]:g} "
+            "turn the image over; their order is k1 k2 p1 p2 k3, mend them"
+        )
 
 
 def lens_reach(info: CameraInfo) -> float:

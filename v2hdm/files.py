@@ -7,7 +7,6 @@ and a damaged map report as what they are. Writers never leave half a file behin
 from __future__ import annotations
 
 import difflib
-import json
 import os
 import sys
 from collections.abc import Collection, Iterator, Mapping
@@ -18,8 +17,26 @@ from typing import Any
 import numpy as np
 import yaml
 
-from v2hdm.errors import V2hdmError
+from v2hdm.errors import ConfigError, V2hdmError
+from v2hdm.inputs import refuse_input
 from v2hdm.records import FloatArray
+from v2hdm.texts import read_json, read_text, read_yaml, shown
+
+__all__ = [
+    "check_keys",
+    "dump_yaml",
+    "forget_stdout",
+    "load_json",
+    "load_yaml",
+    "read_text",
+    "replace_text",
+    "take_array",
+    "take_choice",
+    "take_mapping",
+    "take_number",
+    "take_text",
+    "whole_file",
+]
 
 _LARGEST = sys.float_info.max
 
@@ -32,12 +49,17 @@ def whole_file(path: Path) -> Iterator[Path]:
     folder is created when absent.
 
     Raises:
+        ConfigError: ``path`` is an input of this door, or no plain file.
         OSError: it cannot be written there.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
+    refuse_input(path)
+    if path.exists() and not path.is_file():
+        raise ConfigError(f"{path}: is no plain file, and nothing is put in its place; name another output")
     partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         yield partial
+        refuse_input(path)
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
@@ -49,42 +71,17 @@ def replace_text(path: Path, text: str) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
-def read_text(path: Path, error: type[V2hdmError]) -> str:
-    """The text of ``path``.
-
-    Raises:
-        V2hdmError: of type ``error``, when the file is missing, unreadable or not UTF-8.
-    """
-    try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise error(f"{path}: no such file; check the path or restore it") from None
-    except UnicodeDecodeError:
-        raise error(f"{path}: not a UTF-8 text file; replace it by a text file") from None
-    except OSError as failure:
-        raise error(
-            f"{path}: cannot be read ({failure.strerror}); check the path and its permissions"
-        ) from None
-
-
 def load_yaml(path: Path, error: type[V2hdmError]) -> dict[str, Any]:
-    """The mapping at the top of a YAML file.
+    """The mapping at the top of a YAML file, whose keys are texts; see :func:`v2hdm.texts.read_yaml`.
 
     Raises:
         V2hdmError: of type ``error``, when the file is missing, has a syntax error (with its line)
             or holds anything but a mapping.
     """
-    try:
-        # OpenCV and old ROS tools begin their files with a directive that YAML 1.1 refuses.
-        content = yaml.safe_load(read_text(path, error).removeprefix("%YAML:1.0"))
-    except yaml.YAMLError as failure:
-        mark = getattr(failure, "problem_mark", None)
-        line = f" line {mark.line + 1}" if mark is not None else ""
-        problem = getattr(failure, "problem", None) or "not readable"
-        raise error(f"{path}:{line} YAML syntax error: {problem}; mend that line") from None
+    content = read_yaml(path, error)
     if not isinstance(content, dict):
         raise error(
-            f"{path}: expected 'key: value' entries, got {_describe(content)}; see the format's description"
+            f"{path}: expected 'key: value' entries, got {shown(content)}; see the format's description"
         )
     return content
 
@@ -96,21 +93,16 @@ def dump_yaml(content: Mapping[str, Any]) -> str:
 
 def load_json(path: Path, error: type[V2hdmError]) -> dict[str, Any]:
     """The object at the top of a JSON file; errors as in :func:`load_yaml`."""
-    try:
-        content = json.loads(read_text(path, error))
-    except json.JSONDecodeError as failure:
-        raise error(
-            f"{path}: line {failure.lineno} JSON syntax error: {failure.msg}; mend that line"
-        ) from None
+    content = read_json(path, error)
     if not isinstance(content, dict):
-        raise error(f"{path}: expected a JSON object, got {_describe(content)}")
+        raise error(f"{path}: expected a JSON object, got {shown(content)}")
     return content
 
 
 def take_mapping(content: object, where: str, error: type[V2hdmError]) -> dict[str, Any]:
     """``content`` itself if it is a mapping, else an ``error`` that names ``where``."""
     if not isinstance(content, dict):
-        raise error(f"{where}: expected 'key: value' entries, got {_describe(content)}")
+        raise error(f"{where}: expected 'key: value' entries, got {shown(content)}")
     return content
 
 
@@ -127,7 +119,7 @@ def check_keys(
         if key not in valid:
             near = difflib.get_close_matches(str(key), valid, n=1, cutoff=0.5)
             advice = f"did you mean '{near[0]}'?" if near else f"valid keys: {', '.join(valid)}"
-            raise error(f"{where}: unknown key '{key}'; {advice}")
+            raise error(f"{where}: unknown key {shown(key)}; {advice}")
     missing = [key for key in required if key not in content]
     if missing:
         raise error(f"{where}: missing key '{missing[0]}'; add it")
@@ -141,9 +133,12 @@ def take_array(content: object, shape: tuple[int, ...], where: str, error: type[
     """
     wanted = " x ".join("N" if length < 0 else str(length) for length in shape)
     try:
-        array = np.array(content, dtype=np.float64)
+        raw = np.array(content)
+        if raw.dtype.kind not in "iuf" and raw.size:  # NumPy would make numbers of texts
+            raise TypeError
+        array = raw.astype(np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise error(f"{where}: expected {wanted} numbers, got {_describe(content)}") from None
+        raise error(f"{where}: expected {wanted} numbers, got {shown(content)}") from None
     fits = array.ndim == len(shape) and all(w in (-1, n) for w, n in zip(shape, array.shape, strict=True))
     if not fits:
         got = " x ".join(map(str, array.shape)) or "a single number"
@@ -157,19 +152,21 @@ def take_number(content: object, where: str, error: type[V2hdmError]) -> float:
     """``content`` as a finite float, else an ``error`` that names ``where``."""
     if isinstance(content, int | float) and not isinstance(content, bool) and abs(content) <= _LARGEST:
         return float(content)
-    raise error(f"{where}: expected a finite number, got {_describe(content)}")
+    raise error(f"{where}: expected a finite number, got {shown(content)}")
 
 
 def take_text(content: object, where: str, error: type[V2hdmError]) -> str:
     """``content`` as a string that is not empty, else an ``error`` that names ``where``."""
     if not isinstance(content, str) or not content:
-        raise error(f"{where}: expected a text, got {_describe(content)}")
+        raise error(f"{where}: expected a text, got {shown(content)}")
     return content
 
 
-def _describe(content: object) -> str:
-    text = repr(content)
-    return "nothing" if content is None else text if len(text) <= 60 else f"{text[:57]}..."
+def take_choice(content: object, choices: Collection[str], where: str, error: type[V2hdmError]) -> str:
+    """``content`` as one of a few texts, else an ``error`` that names them."""
+    if not isinstance(content, str) or content not in choices:
+        raise error(f"{where}: expected one of {', '.join(choices)}, got {shown(content)}")
+    return content
 
 
 def forget_stdout() -> None:

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
+from typing import TYPE_CHECKING
 
 from v2hdm.door import EXIT_FAILED_VERDICT, answer_signals, open_door, version_line
+
+if TYPE_CHECKING:
+    from v2hdm.config import Job
 
 _INTERRUPTED = "interrupted; finished renderings are kept in the cache, no result was written"
 _RUNS = "choose a run (+run=port1, +run=port2, +run=kitti drive.path=...) or set it on the command line"
@@ -18,20 +23,29 @@ def main() -> int:
     if "--version" in sys.argv[1:]:  # Hydra would tell its own
         print(version_line())
         return 0
-    return open_door("v2hdm.map", "map", _INTERRUPTED, _map)
+    return _settle(_map)
+
+
+_settle = partial(open_door, "v2hdm.map", "map", _INTERRUPTED)
 
 
 def _map() -> int:
     import torch  # noqa: F401  # its absence is told before that of what is built on it
 
+    from v2hdm.config import work_on
+    from v2hdm.pipeline import RunConfig
+
+    return work_on("map", RunConfig, _run, _settle, __doc__ or "")
+
+
+def _run(job: Job) -> int:
     from v2hdm import config, console
     from v2hdm.pipeline import RunConfig
     from v2hdm.quality import Status
 
-    failed = False
-    for composed in config.compositions("map", RunConfig):
-        run = config.to_dataclass(composed, RunConfig, _RUNS)
-        failed |= console.run_on_terminal(run, config.to_yaml(composed)).status is Status.FAIL
+    run = config.to_dataclass(job.composed, RunConfig, _RUNS)
+    run.output = job.folder(run.output)
+    failed = console.run_on_terminal(run, config.to_yaml(job.composed)).status is Status.FAIL
     return EXIT_FAILED_VERDICT if failed else 0
 
 

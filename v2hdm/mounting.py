@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 
 from v2hdm.drive import ReadOptions, read_drive
-from v2hdm.errors import ConfigError
+from v2hdm.drive.lossless import png
 from v2hdm.ground import GroundEstimate, estimate_cameras
 from v2hdm.ground.picture import draw_matched_ground
 from v2hdm.ground.say import lines
@@ -19,6 +19,7 @@ from v2hdm.hdmap.calibration import Provenance, write_calibration
 from v2hdm.quality import Status, Verdict, check_drive
 from v2hdm.records import Drive
 from v2hdm.report.outputs import result_folder, write_json
+from v2hdm.settings import check_workers
 
 
 def estimate_mountings(parsed: argparse.Namespace) -> bool:
@@ -33,12 +34,11 @@ def estimate_mountings(parsed: argparse.Namespace) -> bool:
     Raises:
         V2hdmError: the drive cannot be read, or the results cannot be written.
     """
-    if parsed.workers < 0:
-        raise ConfigError(f"--workers {parsed.workers}: give a number of processes, or 0 for one per core")
+    check_workers(parsed.workers)
     cv2.setNumThreads(1)
     drive = read_drive(parsed.drive, ReadOptions(format=parsed.format, cameras=parsed.camera))
     folder = parsed.output or Path("outputs") / f"{drive.name}-extrinsic"
-    with result_folder(folder) as unfinished:
+    with result_folder(folder, "--output") as unfinished:
         ground = estimate_cameras(drive, parsed.workers or os.cpu_count() or 1, _tell)
         verdict = Verdict.of(check_drive(drive, ground))
         settings = {"drive": str(parsed.drive), "cameras": list(drive.cameras)}
@@ -67,4 +67,4 @@ def _write(drive: Drive, estimate: GroundEstimate, folder: Path, verdict: Verdic
     path = folder / f"calibration_{estimate.camera}.yaml"
     told = verdict.as_json()
     write_calibration(estimate.calibration, path, verdict=told, about=Provenance.today(drive.name, told))
-    cv2.imwrite(str(folder / f"ground_{estimate.camera}.png"), picture)
+    (folder / f"ground_{estimate.camera}.png").write_bytes(png(picture))

@@ -7,7 +7,7 @@ import errno
 import json
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import islice
@@ -32,10 +32,15 @@ from v2hdm.drive import READERS, read_drive
 from v2hdm.drive.intrinsics import is_calibration, read_intrinsics
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.files import forget_stdout, whole_file
-from v2hdm.records import CameraInfo
+from v2hdm.inputs import note_input, refuse_input
+from v2hdm.outputs import GrowingFolder, growing_folder
+from v2hdm.records import CameraInfo, Drive
 
 _ROUGH_RANGE_M = 40.0
 """Without a calibration distances may be wrong by a factor of two: nothing may be dropped for being far."""
+
+_FIRST = b'{"source": '
+"""What every line of detections begins with."""
 
 _STAGES = ("read", "net", "propose", "lanes", "fit", "judge")
 
@@ -68,14 +73,14 @@ def watch(parsed: argparse.Namespace) -> None:
     job = _job(parsed, detector, lens)
     stopwatch = Stopwatch()
     failure = None
-    with _lines(parsed.output) as stream:
+    with _drawings(parsed.draw) as drawings, _lines(parsed.output) as stream:
         try:
             for frame, road, found in _found(job, parsed, detector, lens, stopwatch):
                 print(json.dumps(as_record(frame, road.camera.info.name, found)), file=stream)
                 if job.live:
                     stream.flush()
-                if parsed.draw is not None:
-                    _draw(parsed.draw / f"{frame.name}.jpg", frame, found)
+                if drawings is not None:
+                    _draw(drawings, frame, found)
         except KeyboardInterrupt:
             if not job.live:
                 raise
@@ -129,10 +134,13 @@ def _job(parsed: argparse.Namespace, detector: Detector, lens: CameraInfo | None
     if path.is_dir():
         paths = list_images(path)
         if paths:
+            for image in paths:
+                note_input(image)
             return _Job((frame, road) for frame in image_frames(paths))
         if any(reader.accepts(path) for reader in READERS.values()):
             return _Job(_drive_frames(path, detector, road, lens))
         raise DriveError(f"{path}: no images ({', '.join(IMAGE_SUFFIXES)}) and no drive in this folder")
+    note_input(path)
     if READERS["bag"].accepts(path):
         return _Job(_drive_frames(path, detector, road, lens))
     frames = image_frames([path]) if path.suffix.lower() in IMAGE_SUFFIXES else video_frames(path)
@@ -149,14 +157,21 @@ def _drive_frames(
             "file as camera_info in drive.yaml"
         )
     drive = read_drive(path)
+    for image in drive.images:
+        note_input(image.path)
     roads = {name: RoadDetector(detector, camera) for name, camera in drive.cameras.items()}
     if road is not None:
         name = road.camera.info.name
         if name not in drive.cameras:
             raise DriveError(
-                f"{path}: no camera {name!r}, as the calibration calls it; this drive has {', '.join(roads)}"
+                f"{path}: no camera '{name}', as the calibration calls it; this drive has {', '.join(roads)}"
             )
         roads = {name: road}
+    return _frames_of(drive, roads)
+
+
+def _frames_of(drive: Drive, roads: Mapping[str, RoadDetector]) -> Iterator[tuple[Frame, RoadDetector]]:
+    """Each of the images, read when its turn comes, with the detector of its camera."""
     for image in drive.images:
         if image.camera in roads:
             (frame,) = image_frames([image.path])
@@ -238,7 +253,7 @@ def _check_size(frame: Frame, road: RoadDetector) -> None:
     if (width, height) != (info.width, info.height):
         where = "the calibration" if road.footprint else "what is known"
         raise DriveError(
-            f"{frame.source}: the image is {width}x{height}, but {where} of camera {info.name!r} is for "
+            f"{frame.source}: the image is {width}x{height}, but {where} of camera '{info.name}' is for "
             f"{info.width}x{info.height}; give images of that size, or the calibration of these"
         )
 
@@ -261,23 +276,43 @@ def _lines(output: Path | None) -> Iterator[TextIO]:
     try:
         if output.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        refuse_input(output)
+        if output.is_file() and not _is_ours(output):
+            raise ConfigError(f"{output}: is there already and holds no detections; give another --output")
+        if output.exists() and not output.is_file():  # a pipe, or /dev/null
+            with output.open("w", encoding="utf-8") as stream:
+                yield stream
+            return
         with whole_file(output) as partial, partial.open("w", encoding="utf-8") as stream:
             yield stream
     except OSError as error:
         raise DriveError(f"{output}: cannot write there ({error.strerror}); give another --output") from error
 
 
-def _draw(path: Path, frame: Frame, found: Road) -> None:
+def _is_ours(output: Path) -> bool:
+    """Whether a file holds JSON lines of ours, or nothing."""
+    with output.open("rb") as stream:
+        begin = stream.read(len(_FIRST))
+    return begin in (b"", _FIRST)
+
+
+@contextmanager
+def _drawings(folder: Path | None) -> Iterator[GrowingFolder | None]:
+    """The folder of the drawings, if any are wanted."""
+    if folder is None:
+        yield None
+        return
+    with growing_folder(folder, "--draw") as drawings:
+        yield drawings
+
+
+def _draw(drawings: GrowingFolder, frame: Frame, found: Road) -> None:
     """Write the frame with its detections drawn, at once or not at all."""
     drawn = draw_detections(
         frame.pixels, [marking.image for marking in found.markings], [lane.image for lane in found.lanes]
     )
     _, packed = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, 92])
-    try:
-        with whole_file(path) as partial:
-            partial.write_bytes(packed.tobytes())
-    except OSError as error:
-        raise DriveError(f"{path}: cannot write there ({error.strerror}); give another --draw") from error
+    drawings.write(f"{frame.name}.jpg", packed.tobytes())
 
 
 def _report(stopwatch: Stopwatch) -> None:

@@ -179,7 +179,7 @@ def test_ids_are_unique_and_stay_when_features_go_or_are_copied(
         ({"geometry": None, "corners_map": None}, "four corners, this has 0"),
         ({"id": "three"}, "id: expected a finite number"),
         ({"id": 2**40}, "id: expected a whole number"),
-        ({"class": None}, "class: expected a text"),
+        ({"class": None}, "class: expected a text as name"),
     ],
 )
 def test_an_edit_that_makes_no_map_is_refused_by_name(

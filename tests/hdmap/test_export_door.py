@@ -14,7 +14,7 @@ import pytest
 from tests.drive.example import camera_info, looking_forward
 from tests.hdmap.gis import street
 from v2hdm import export
-from v2hdm.config import compositions, to_dataclass
+from v2hdm.config import Job, to_dataclass, work_on
 from v2hdm.hdmap import read_geojson, write_calibration, write_geojson
 from v2hdm.hdmap.formats import FORMATS, check_formats
 from v2hdm.hdmap.geopackage import read_geopackage_verdict, write_geopackage
@@ -61,8 +61,9 @@ def test_every_format_of_a_map_is_documented() -> None:
 def test_the_documented_run_composes_with_its_formats(monkeypatch: pytest.MonkeyPatch) -> None:
     (command,) = [line for line in COMMANDS if "v2hdm.map" in line]
     monkeypatch.setattr(sys, "argv", ["v2hdm.map", *shlex.split(command)[3:]])
-    (composed,) = compositions("map", RunConfig)
-    config = to_dataclass(composed, RunConfig, "")
+    composed: list[Job] = []
+    assert work_on("map", RunConfig, composed.append, lambda work: work() or 0, "") == 0
+    config = to_dataclass(composed[0].composed, RunConfig, "")
     assert config.export == list(FORMATS)
     check_formats(config.export, "export")
 

@@ -186,7 +186,7 @@ def damaged_map(origin: object = None, **properties: object) -> str:
         (damaged_map(sightings=10**400), "feature 0, sightings: expected a finite number"),
         (
             damaged_map(corners_map=[[10**400, 0], [1, 0], [1, 1], [0, 1]]),
-            "corners_map: expected 4 x 2 numbers",
+            "corners_map: holds a number that is not finite",
         ),
         (damaged_map(covariance_m2=(-np.eye(8)).tolist()), "covariance_m2: not symmetric or negative"),
     ],

@@ -1,40 +1,171 @@
-"""A result folder is whole or absent."""
+"""A result folder is whole or absent, belongs to one process, and keeps what is the user's."""
 
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from v2hdm.errors import ConfigError
-from v2hdm.report.outputs import result_folder, write_json
+from v2hdm.outputs import MARKER, growing_folder, result_folder
+from v2hdm.report.outputs import write_json
+
+ROOT = Path(__file__).parents[2]
+
+
+def write(target: Path, **files: str) -> None:
+    with result_folder(target) as folder:
+        for name, text in files.items():
+            (folder / name).write_text(text)
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.name != MARKER)
 
 
 def test_a_failed_run_leaves_the_earlier_result_untouched(tmp_path: Path) -> None:
     target = tmp_path / "run"
-    with result_folder(target) as folder:
-        (folder / "config.yaml").write_text("first")
+    write(target, config="first")
     with pytest.raises(ZeroDivisionError), result_folder(target) as folder:
-        (folder / "config.yaml").write_text(f"second {1 / 0}")
-    assert (target / "config.yaml").read_text() == "first"
+        (folder / "config").write_text(f"second {1 / 0}")
+    assert (target / "config").read_text() == "first"
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
 
 
+def test_a_failed_first_run_leaves_no_folder_that_it_made(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError), result_folder(tmp_path / "outputs" / "run"):
+        print(1 / 0)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_second_run_replaces_the_first_whole(tmp_path: Path) -> None:
-    for name in ("first", "second"):
-        with result_folder(tmp_path / "run") as folder:
-            (folder / "config.yaml").write_text(name)
-            (folder / name).touch()
-    assert sorted(p.name for p in (tmp_path / "run").iterdir()) == ["config.yaml", "second"]
+    write(tmp_path / "run", config="first", first="")
+    write(tmp_path / "run", config="second", second="")
+    assert names(tmp_path / "run") == ["config", "second"]
 
 
-def test_somebody_elses_folder_is_not_replaced(tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").touch()
-    with pytest.raises(ConfigError, match="output="), result_folder(tmp_path):
+def test_notes_of_the_user_survive_a_rerun(tmp_path: Path) -> None:
+    target = tmp_path / "run"
+    write(target, config="first")
+    (target / "notes.md").write_text("mine")
+    (target / "photos" / "deep").mkdir(parents=True)
+    (target / "photos" / "deep" / "a.jpg").write_text("photo")
+    (target / "empty").mkdir()
+    (target / "link").symlink_to(tmp_path)
+    for text in ("second", "third"):
+        write(target, config=text)
+    assert (target / "config").read_text() == "third"
+    assert (target / "notes.md").read_text() == "mine"
+    assert (target / "photos" / "deep" / "a.jpg").read_text() == "photo"
+    assert (target / "empty").is_dir()
+    assert (target / "link").is_symlink()
+
+
+def test_a_file_of_the_users_that_we_write_too_is_kept_beside_ours(tmp_path: Path) -> None:
+    target = tmp_path / "run"
+    write(target, config="first")
+    (target / "figure.png").write_text("mine")
+    write(target, config="second", **{"figure.png": "ours"})
+    assert (target / "figure.png").read_text() == "ours"
+    assert (target / "figure.kept.png").read_text() == "mine"
+
+
+def test_a_result_that_was_edited_is_not_replaced(tmp_path: Path) -> None:
+    write(tmp_path / "run", map="first")
+    (tmp_path / "run" / "map").write_text("edited")
+    with pytest.raises(ConfigError, match="was changed after we wrote it"):
+        write(tmp_path / "run", map="second")
+    assert (tmp_path / "run" / "map").read_text() == "edited"
+
+
+@pytest.mark.parametrize("name", ["thesis.tex", "config.yaml", "drive.yaml"])
+def test_somebody_elses_folder_is_not_replaced(tmp_path: Path, name: str) -> None:
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / name).touch()
+    with pytest.raises(ConfigError, match="output="):
+        write(tmp_path / "thesis", config="")
+    assert names(tmp_path) == ["thesis", f"thesis/{name}"]
+
+
+def test_a_link_to_a_result_goes_on_leading_there(tmp_path: Path) -> None:
+    write(tmp_path / "run", config="first")
+    (tmp_path / "latest").symlink_to("run")
+    write(tmp_path / "latest", config="second")
+    assert (tmp_path / "latest").is_symlink()
+    assert (tmp_path / "run" / "config").read_text() == "second"
+
+
+def test_a_file_where_the_folder_is_to_be_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "run").touch()
+    with pytest.raises(ConfigError, match="is a file"):
+        write(tmp_path / "run", config="")
+
+
+def test_a_damaged_list_of_ours_is_one_line(tmp_path: Path) -> None:
+    write(tmp_path / "run", config="first")
+    (tmp_path / "run" / MARKER).write_text("{}\n[" * 9000)
+    with pytest.raises(ConfigError, match="damaged"):
+        write(tmp_path / "run", config="")
+
+
+def test_an_earlier_result_that_a_kill_left_aside_is_put_back(tmp_path: Path) -> None:
+    write(tmp_path / "run", config="first")
+    (tmp_path / "run").rename(tmp_path / ".run.previous")
+    (tmp_path / ".run.part").mkdir()
+    with pytest.raises(ZeroDivisionError), result_folder(tmp_path / "run"):
+        print(1 / 0)
+    assert (tmp_path / "run" / "config").read_text() == "first"
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from v2hdm.outputs import result_folder
+with result_folder(Path(sys.argv[1])) as folder:
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_folder_that_another_process_writes_is_refused_by_its_name_until_it_dies(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", HOLDER, str(tmp_path / "run")]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        with pytest.raises(ConfigError, match=f"being written by process {holder.pid} on "):
+            write(tmp_path / "run", config="mine")
+        holder.send_signal(signal.SIGKILL)
+    write(tmp_path / "run", config="mine")
+    assert names(tmp_path) == ["run", "run/config"]
+
+
+def test_single_files_are_added_and_replaced_but_never_the_users(tmp_path: Path) -> None:
+    for text in (b"first", b"second"):
+        with growing_folder(tmp_path / "drawn", "--draw") as folder:
+            folder.write("a.jpg", text)
+    assert (tmp_path / "drawn" / "a.jpg").read_bytes() == b"second"
+    (tmp_path / "drawn" / "b.jpg").write_bytes(b"mine")
+    with (
+        growing_folder(tmp_path / "drawn", "--draw") as folder,
+        pytest.raises(ConfigError, match="no file of ours"),
+    ):
+        folder.write("b.jpg", b"ours")
+    assert (tmp_path / "drawn" / "b.jpg").read_bytes() == b"mine"
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.jpg").write_bytes(b"mine")
+    with (
+        pytest.raises(ConfigError, match="no results of ours"),
+        growing_folder(tmp_path / "photos", "--draw"),
+    ):
         pass
-    assert (tmp_path / "thesis.tex").exists()
 
 
 def test_json_leaves_out_what_does_not_exist(tmp_path: Path) -> None:

@@ -245,7 +245,7 @@ def test_damaged_and_missing_files_and_settings_that_cannot_be_are_named(tmp_pat
         read_labels(config(coco=str(tmp_path / "none.json")))
     with pytest.raises(LabelError, match="line 1: has no 'lanes'"):
         read_labels(config(tusimple=str(tmp_path / "bad.json")))
-    with pytest.raises(LabelError, match="has no category 'stripe' but Arrow, zebra"):
+    with pytest.raises(LabelError, match="has no category 'stripe', only Arrow, zebra"):
         read_labels(config(coco=str(path), coco_classes={"stripe": ARROW}))
     with pytest.raises(LabelError, match="'zebra' is to be 'stripes'; choose from: diamond"):
         read_labels(config(coco=str(path), coco_classes={"zebra": "stripes"}))

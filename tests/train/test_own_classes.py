@@ -200,7 +200,7 @@ def test_a_checkpoint_of_before_there_were_own_classes_is_read(tmp_path: Path, s
 
 
 def test_a_catalogue_that_is_missing_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"none\.yaml: cannot be read"):
+    with pytest.raises(ConfigError, match=r"none\.yaml: no such file"):
         fresh_checkpoint(replace(tiny(tmp_path), catalogue=str(tmp_path / "none.yaml")))
 
 

@@ -111,11 +111,11 @@ def check_options(options: SolveOptions) -> None:
     """Raise :class:`AdjustError` for an option out of range."""
     unknown = [name for name in options.pose_states if name not in POSE_STATES]
     if unknown:
-        raise AdjustError(f"unknown pose state {unknown[0]!r}: choose from {', '.join(POSE_STATES)}")
+        raise AdjustError(f"unknown pose state '{unknown[0]}': choose from {', '.join(POSE_STATES)}")
     if options.loss not in LOSSES:
-        raise AdjustError(f"unknown loss {options.loss!r}: choose from {', '.join(LOSSES)}")
+        raise AdjustError(f"unknown loss '{options.loss}': choose from {', '.join(LOSSES)}")
     if options.solver not in SOLVERS:
-        raise AdjustError(f"unknown solver {options.solver!r}: choose from {', '.join(SOLVERS)}")
+        raise AdjustError(f"unknown solver '{options.solver}': choose from {', '.join(SOLVERS)}")
     if not 0 < options.gate_probability < 1:
         raise AdjustError(f"gate_probability is {options.gate_probability}: give a share between 0 and 1")
     for name in ("gap_tolerance", "max_refreshes", "max_evaluations"):

@@ -28,7 +28,7 @@ def loss(name: str, squared: Tensor, scale: float) -> tuple[Tensor, Tensor]:
         return cut * torch.log1p(ratio), 1 / (1 + ratio)
     if name == "geman_mcclure":
         return squared / (1 + ratio), (1 + ratio).square().reciprocal()
-    raise ValueError(f"unknown loss {name!r}")
+    raise ValueError(f"unknown loss '{name}'")
 
 
 def annealed_scale(squared: Tensor, scale: float) -> float:

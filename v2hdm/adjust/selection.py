@@ -65,9 +65,9 @@ class Selection:
     def sentence(self) -> str:
         """What was chosen over what."""
         if not self.scores:
-            return f"pose model {self.name!r}, since too few observations repeat to choose by them"
+            return f"pose model '{self.name}', since too few observations repeat to choose by them"
         scores = ", ".join(f"{name} {score:.2f}" for name, score in self.scores.items())
-        return f"pose model {self.name!r} predicts held-out observations best (mean loss: {scores})"
+        return f"pose model '{self.name}' predicts held-out observations best (mean loss: {scores})"
 
 
 def with_model(options: SolveOptions, model: Model) -> SolveOptions:
@@ -97,7 +97,7 @@ def select_model(
     """
     unknown = [name for name in names if name not in MODELS]
     if unknown:
-        raise AdjustError(f"unknown model {unknown[0]!r}: choose from {', '.join(MODELS)}")
+        raise AdjustError(f"unknown model '{unknown[0]}': choose from {', '.join(MODELS)}")
     candidates = [
         name for name in names if problem.twist_vehicle is not None or not MODELS[name].clock_offset
     ]

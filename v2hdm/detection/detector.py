@@ -24,6 +24,7 @@ from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.weights import check_weights
 from v2hdm.errors import DetectorError
 from v2hdm.records import BoolArray, Camera, LaneDetection, MarkingDetection
+from v2hdm.texts import shown
 
 _NO_PAINT = -20.0
 """Log odds of paint where the vehicle itself is."""
@@ -189,8 +190,13 @@ def _is_among(symbol: MarkingDetection, quads: Sequence[MarkingDetection]) -> bo
 
 def _check_image(image_bgr: np.ndarray, camera: Camera) -> None:
     expected = (camera.info.height, camera.info.width, 3)
+    if not isinstance(image_bgr, np.ndarray):
+        raise DetectorError(
+            f"camera '{camera.info.name}': got no image but {shown(image_bgr)}; cv2.imread gives None where "
+            "there is no file"
+        )
     if image_bgr.dtype != np.uint8 or image_bgr.shape != expected:
         raise DetectorError(
-            f"camera {camera.info.name!r}: got an image {image_bgr.shape} {image_bgr.dtype}, its camera_info "
+            f"camera '{camera.info.name}': got an image {image_bgr.shape} {image_bgr.dtype}, its camera_info "
             f"says {expected} uint8; mend the camera_info or pick the images that belong to it"
         )

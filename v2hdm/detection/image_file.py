@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import DriveError
+from v2hdm.pixels import read_pixels
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 """What counts as an image in a folder."""
@@ -20,17 +21,9 @@ def read_bgr(path: Path) -> np.ndarray:
     """Decode an image file, in colour or grey, to (H, W, 3) uint8 BGR.
 
     Raises:
-        DriveError: the file is missing, truncated or not of 8 bits.
+        DriveError: the file is missing, truncated, damaged or not of 8 bits.
     """
-    try:
-        data = np.fromfile(path, dtype=np.uint8)
-    except OSError as error:
-        raise DriveError(
-            f"{path}: cannot read this image ({error.strerror}); restore it or drop it from the list"
-        ) from error
-    pixels = cv2.imdecode(data, _AS_STORED) if _is_whole(data) else None
-    if pixels is None:
-        raise DriveError(f"{path}: the image is truncated or damaged; copy it again or drop it from the list")
+    pixels = read_pixels(path, _AS_STORED)
     if pixels.dtype != np.uint8:
         raise DriveError(
             f"{path}: the image has {8 * pixels.dtype.itemsize} bits a channel; convert it to 8 bits"
@@ -38,16 +31,3 @@ def read_bgr(path: Path) -> np.ndarray:
     if pixels.ndim == 2:
         pixels = cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR)
     return np.asarray(pixels)
-
-
-def _is_whole(data: np.ndarray) -> bool:
-    """Whether a JPEG or PNG has its end marker.
-
-    OpenCV decodes a truncated file to half an image without a word.
-    """
-    tail = data[-4096:].tobytes()
-    if data[:2].tobytes() == b"\xff\xd8":
-        return b"\xff\xd9" in tail
-    if data[:4].tobytes() == b"\x89PNG":
-        return b"IEND" in tail
-    return len(data) > 0

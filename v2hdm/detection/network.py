@@ -164,7 +164,7 @@ def _read_info(session: Any, path: Path) -> NetworkInfo:
         raise DetectorError(f"{path}: {error}") from error
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise DetectorError(
-            f"{path}: no usable {METADATA_KEY!r} metadata ({_one_line(error)}); "
+            f"{path}: no usable '{METADATA_KEY}' metadata ({_one_line(error)}); "
             "this is not a model written by `python -m export`"
         ) from error
     unknown = [name for name in info.classes if name not in info.catalogue.classes]

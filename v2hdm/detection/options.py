@@ -5,9 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from v2hdm.errors import ConfigError
+from v2hdm.settings import NOT_NEGATIVE, POSITIVE, check_settings
 
 _MOST_THREADS = 256
 """More take the machine's memory before they do any work."""
+
+
+_RANGES = dict.fromkeys(("max_range_m", "max_corner_sigma_px", "lane_step_m"), POSITIVE) | {
+    "border_px": NOT_NEGATIVE
+}
 
 
 @dataclass(kw_only=True)
@@ -52,13 +58,11 @@ class DetectorOptions:
         Raises:
             ConfigError: a value is out of range.
         """
+        check_settings(self, _RANGES, "detector.")
         if not 1 <= self.threads <= _MOST_THREADS:
             raise ConfigError(f"detector.threads is {self.threads}: set 1 to {_MOST_THREADS}")
         if self.blur_px is not None and not 0.2 <= self.blur_px <= 3.0:
             raise ConfigError(f"detector.blur_px is {self.blur_px}: set 0.2 to 3.0 px, or none to measure it")
-        for name in ("max_range_m", "max_corner_sigma_px", "lane_step_m"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"detector.{name} is {getattr(self, name)}: set a positive number")
         for name in ("min_score", "min_confidence"):
             if not 0 <= getattr(self, name) < 1:
                 raise ConfigError(f"detector.{name} is {getattr(self, name)}: set a probability in [0, 1)")

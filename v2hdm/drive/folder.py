@@ -29,11 +29,14 @@ from v2hdm.drive.options import ReadOptions
 from v2hdm.drive.poses import read_poses
 from v2hdm.drive.road import lay_flat, tell
 from v2hdm.drive.sources import Sources, plan_images, plan_info, plan_topic_poses
+from v2hdm.drive.trajectory import check_trajectory
 from v2hdm.drive.tum import write_image_list, write_tum
 from v2hdm.errors import DriveError
 from v2hdm.fields import take_origin
 from v2hdm.files import check_keys, dump_yaml, load_yaml, replace_text, take_mapping, take_number, take_text
+from v2hdm.pixels import read_pixels
 from v2hdm.records import DRIFTS, BoolArray, Camera, CameraInfo, Drive, PoseNoise, Trajectory
+from v2hdm.texts import shown, take_camera_name, take_name
 
 DRIVE_FILE = "drive.yaml"
 POSES_FILE = "poses.tum"
@@ -71,14 +74,17 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
     """
     check_keys(content, *_DRIVE_KEYS, where, DriveError)
     entries = take_mapping(content["cameras"], f"{where}: cameras", DriveError)
+    entries = {take_camera_name(name, f"{where}: cameras", DriveError): one for name, one in entries.items()}
     if not entries:
         raise DriveError(f"{where}: names no camera; add one under 'cameras'")
     bag = None
     if "bag" in content:
         bag = path / take_text(content["bag"], f"{where}: bag", DriveError)
+        if not bag.exists():
+            raise DriveError(f"{where}: bag: {bag}: no such bag; check the path or drop the key")
     sources = Sources(path, Path(options.cache), bag, options.max_gap_s)
     planned = {}
-    for name in select_cameras([str(name) for name in entries], options.cameras, Path(where)):
+    for name in select_cameras(list(entries), options.cameras, Path(where)):
         place = f"{where}: camera '{name}'"
         entry = take_mapping(entries[name], place, DriveError)
         check_keys(entry, *_CAMERA_KEYS, place, DriveError)
@@ -99,6 +105,7 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
         cameras[name] = _read_camera(entry, named, path, f"{where}: camera '{name}'")
         files.append(list_images())
     recorded = read_poses(poses, path, origin, options.max_gap_s, poses_at, read_topic)
+    check_trajectory(recorded.trajectory, recorded.origin, poses_at)
     pose_noise = _read_pose_noise(content.get("pose_noise"), recorded.noise, f"{where}: pose_noise")
     laid = lay_flat(recorded.trajectory, pose_noise.position_m)
     tell(laid, path)
@@ -158,7 +165,7 @@ def write_drive(folder: Path, drive: Drive, trajectory: Trajectory) -> None:
 
 
 def _name(content: dict[str, Any], path: Path) -> str:
-    return take_text(content.get("name", path.resolve().name), f"{path / DRIVE_FILE}: name", DriveError)
+    return take_name(content.get("name", path.resolve().name), f"{path / DRIVE_FILE}: name", DriveError)
 
 
 def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str) -> Camera:
@@ -174,7 +181,7 @@ def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str
         ipm = {"estimated": ipm_from_guess(info, entry["cam_from_vehicle"], f"{where}, cam_from_vehicle")}
     linear = entry.get("linear_response", False)
     if not isinstance(linear, bool):
-        raise DriveError(f"{where}, linear_response: expected true or false, got {linear!r}")
+        raise DriveError(f"{where}, linear_response: expected true or false, got {shown(linear)}")
     prior = entry.get("centre_prior")
     if prior is not None:
         prior_where = f"{where}, centre_prior"
@@ -200,9 +207,8 @@ def _read_mask(entry: dict[str, Any], root: Path, info: CameraInfo, where: str) 
     if "mask" not in entry:
         return None
     path = root / take_text(entry["mask"], f"{where}, mask", DriveError)
-    data = np.fromfile(path, dtype=np.uint8) if path.is_file() else np.zeros(0, dtype=np.uint8)
-    mask = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
-    if mask is None or mask.shape != (info.height, info.width):
+    mask = read_pixels(path, cv2.IMREAD_GRAYSCALE)
+    if mask.shape != (info.height, info.width):
         raise DriveError(
             f"{where}, mask: {path} is no image of {info.width} x {info.height} px; draw the vehicle white "
             "on black over one of the camera's images"

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.drive.image_header import image_size
 from v2hdm.drive.stamp_units import why_no_pose
 from v2hdm.drive.trajectory import interpolate
 from v2hdm.errors import DriveError
+from v2hdm.pixels import read_header
 from v2hdm.records import Camera, FloatArray, Image, Trajectory
 
 _log = logging.getLogger(__name__)
@@ -78,12 +78,17 @@ def check_image_files(images: Sequence[Image], cameras: Mapping[str, Camera]) ->
         DriveError: naming the first such image.
     """
     for image in images:
-        size = image_size(image.path)
+        header = read_header(image.path)
         info = cameras[image.camera].info
-        if size is not None and size != (info.width, info.height):
+        if (header.width, header.height) != (info.width, info.height):
             raise DriveError(
-                f"{image.path}: image is {size[0]} x {size[1]}, but camera_info of '{image.camera}' says "
-                f"{info.width} x {info.height}; give the calibration of this resolution"
+                f"{image.path}: image is {header.width} x {header.height}, but camera_info of "
+                f"'{image.camera}' says {info.width} x {info.height}; give the calibration of this resolution"
+            )
+        if header.orientation != 1:
+            raise DriveError(
+                f"{image.path}: its EXIF orientation {header.orientation} says to turn it, and a "
+                "calibration is of pixels as they are stored: take the orientation out of the images"
             )
 
 

@@ -18,6 +18,7 @@ from v2hdm.drive.images import ImageFiles, check_image_files, count_unposed, pos
 from v2hdm.drive.kitti_calibration import KittiCamera, read_kitti_camera
 from v2hdm.drive.options import KittiOptions, ReadOptions
 from v2hdm.drive.road import lay_flat, tell
+from v2hdm.drive.trajectory import check_geodetic, check_trajectory
 from v2hdm.errors import DriveError
 from v2hdm.files import read_text
 from v2hdm.geometry.ipm import ipm_from_extrinsic
@@ -70,6 +71,7 @@ def read_kitti_drive(path: Path, options: ReadOptions) -> Drive:
     calibrations = {name: read_kitti_camera(path.parent, name) for name in names}
     stamp_s, oxts = _read_oxts(path, names[0])
 
+    check_geodetic(oxts[:, :3], f"{path / 'oxts'}")
     origin_imu = GeodeticOrigin(float(oxts[0, 0]), float(oxts[0, 1]), float(oxts[0, 2]))
     position_enu = enu_from_geodetic(origin_imu, oxts[:, :3])
     enu_from_imu = np.tile(np.eye(4), (len(oxts), 1, 1))
@@ -80,6 +82,7 @@ def read_kitti_drive(path: Path, options: ReadOptions) -> Drive:
     enu_from_vehicle = enu_from_imu @ np.linalg.inv(vehicle_from_imu)
     enu_from_vehicle[:, 2, 3] += vehicle_from_imu[2, 3]  # the map's origin is on the road
     recorded = Trajectory(stamp_s, enu_from_vehicle)
+    check_trajectory(recorded, origin_imu, f"{path / 'oxts'}")
     laid = lay_flat(recorded, _POSE_NOISE.position_m)
     cameras = {
         name: _mount(calibration, vehicle_from_imu, options.kitti)

@@ -5,7 +5,6 @@ The vehicle frame is the ego's, on the ground under the rear axle; images are re
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +15,13 @@ from v2hdm.drive.mounting import ipm_from_guess, roi_ahead
 from v2hdm.drive.options import ReadOptions
 from v2hdm.drive.poses.rising import in_order
 from v2hdm.drive.road import lay_flat, tell
+from v2hdm.drive.trajectory import check_trajectory
 from v2hdm.errors import DriveError
 from v2hdm.fields import check_camera, take_size_px
-from v2hdm.files import read_text, take_array, take_number, take_text
+from v2hdm.files import take_array, take_number, take_text
 from v2hdm.geometry.rigid import inverse, rotation_from_quaternion
 from v2hdm.records import Camera, CameraInfo, Drive, FloatArray, PoseNoise, Trajectory
+from v2hdm.texts import read_json, take_camera_name
 
 _TABLES = ("sensor", "calibrated_sensor", "ego_pose", "sample_data")
 _MICROSECONDS = 1e6
@@ -44,7 +45,8 @@ def read_nuscenes_drive(path: Path, options: ReadOptions) -> Drive:
     for row in data.values():
         sensor = _of(sensors, _of(calibrated, row, "calibrated_sensor_token", folder), "sensor_token", folder)
         if sensor.get("modality") == "camera":
-            shots.setdefault(str(sensor.get("channel")), []).append(row)
+            name = take_camera_name(sensor.get("channel"), f"{folder}: sensor, channel", DriveError)
+            shots.setdefault(name, []).append(row)
     if not shots:
         raise DriveError(f"{folder}: no image of a camera in sample_data.json")
     cameras: dict[str, Camera] = {}
@@ -57,6 +59,7 @@ def read_nuscenes_drive(path: Path, options: ReadOptions) -> Drive:
             raise DriveError(f"{folder}: two images of {name} at one time; give one recording, not several")
         files.append(ImageFiles(name, stamp_s, [path / _file(row, folder) for row in rows]))
     recorded = _trajectory(egos, folder)
+    check_trajectory(recorded, None, f"{folder}: ego_pose")
     noise = PoseNoise.as_far_as_stated()
     laid = lay_flat(recorded, noise.position_m)
     tell(laid, path)
@@ -85,10 +88,7 @@ def _tables_folder(path: Path) -> Path | None:
 
 def _table(path: Path) -> dict[str, Row]:
     """The rows of a table by their tokens."""
-    try:
-        rows = json.loads(read_text(path, DriveError))
-    except json.JSONDecodeError as failure:
-        raise DriveError(f"{path}: line {failure.lineno} JSON syntax error: {failure.msg}; mend it") from None
+    rows = read_json(path, DriveError)
     if not isinstance(rows, list) or not all(isinstance(row, dict) and "token" in row for row in rows):
         raise DriveError(f"{path}: expected a list of rows with a 'token' each; restore the table")
     return {str(row["token"]): row for row in rows}

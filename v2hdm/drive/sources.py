@@ -34,7 +34,7 @@ from v2hdm.drive.tum import read_image_list
 from v2hdm.drive.video import IMAGE_LIST as VIDEO_LIST
 from v2hdm.drive.video import import_video
 from v2hdm.errors import DriveError
-from v2hdm.files import check_keys, take_mapping, take_number, take_text
+from v2hdm.files import check_keys, take_choice, take_mapping, take_number, take_text
 from v2hdm.records import CameraInfo
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -167,9 +167,7 @@ def _of_list(camera: str, path: Path, start_s: float) -> ImageFiles:
 
 def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> Callable[[], ImageFiles]:
     folder = sources.root / take_text(entry["folder"], f"{where}, folder", DriveError)
-    unit = entry.get("unit", "s")
-    if unit not in UNITS:
-        raise DriveError(f"{where}, unit: expected one of {', '.join(UNITS)}, got {unit!r}")
+    unit = take_choice(entry.get("unit", "s"), UNITS, f"{where}, unit", DriveError)
 
     def images() -> ImageFiles:
         if not folder.is_dir():
@@ -229,10 +227,7 @@ def _of_topic(entry: dict[str, Any], camera: str, sources: Sources, where: str) 
 
 
 def _take_stamps(entry: Mapping[str, Any], where: str) -> str:
-    stamps = entry.get("stamps", STAMPS[0])
-    if stamps not in STAMPS:
-        raise DriveError(f"{where}, stamps: expected one of {', '.join(STAMPS)}, got {stamps!r}")
-    return str(stamps)
+    return take_choice(entry.get("stamps", STAMPS[0]), STAMPS, f"{where}, stamps", DriveError)
 
 
 @dataclass(frozen=True)

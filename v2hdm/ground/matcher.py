@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 
-from v2hdm.errors import DriveError
 from v2hdm.ground.adjust import Observations
 from v2hdm.ground.motion import Motion
 from v2hdm.ground.mount import Mount
 from v2hdm.ground.options import GroundOptions
 from v2hdm.ground.patches import ImageArray, Matches, View, match_pair, patch_centres
+from v2hdm.pixels import read_pixels
 from v2hdm.records import Drive, FloatArray, IntArray
 
 _PATH_STEP_M = 0.5
@@ -102,10 +103,4 @@ def read_grey(path: str) -> ImageArray:
     Raises:
         DriveError: it cannot be read.
     """
-    try:
-        image = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
-    except (OSError, cv2.error):
-        image = None
-    if image is None:
-        raise DriveError(f"{path}: cannot read this image; copy it again or drop it from the list")
-    return np.asarray(image)
+    return read_pixels(Path(path), cv2.IMREAD_GRAYSCALE)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, date, datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from v2hdm.fields import check_camera, take_covariance, take_size_px
 from v2hdm.files import check_keys, dump_yaml, load_yaml, replace_text, take_array, take_text
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.records import DISTORTION_COEFFICIENTS, Calibration, CameraInfo
+from v2hdm.texts import take_camera_name
 
 _REQUIRED = (
     "camera_name",
@@ -119,7 +120,7 @@ def read_calibration(path: Path) -> Calibration:
         return take_array(content[key], shape, f"{path}: {key}", MapFileError)
 
     info = CameraInfo(
-        name=take_text(content["camera_name"], f"{path}: camera_name", MapFileError),
+        name=take_camera_name(content["camera_name"], f"{path}: camera_name", MapFileError),
         width=take_size_px(content["image_width"], f"{path}: image_width", MapFileError),
         height=take_size_px(content["image_height"], f"{path}: image_height", MapFileError),
         intrinsic=array("camera_matrix", 3, 3),
@@ -168,7 +169,5 @@ def read_provenance(path: Path) -> Provenance:
     status = verdict.get("status") if isinstance(verdict, dict) else None
     texts = {}
     for key, value in (("drive", content.get("drive")), ("date", content.get("date")), ("verdict", status)):
-        # YAML takes a plain date for one.
-        plain = value.isoformat() if isinstance(value, date) else value
-        texts[key] = None if plain is None else take_text(plain, f"{path}: {key}", MapFileError)
+        texts[key] = None if value is None else take_text(value, f"{path}: {key}", MapFileError)
     return Provenance(**texts)

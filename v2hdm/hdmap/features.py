@@ -15,10 +15,11 @@ import numpy as np
 
 from v2hdm.errors import MapFileError
 from v2hdm.fields import take_covariance, take_whole
-from v2hdm.files import take_array, take_number, take_text
+from v2hdm.files import take_array, take_number
 from v2hdm.geometry.planar import signed_area
 from v2hdm.hdmap.geodetic import enu_from_geodetic, geodetic_from_enu
 from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, IntArray, Lane, Marking, Symbol
+from v2hdm.texts import take_name
 
 _log = logging.getLogger(__name__)
 
@@ -339,7 +340,7 @@ def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
     least = -LARGEST_ID
     return Feature(
         id=0 if number is None else take_whole(number, least, LARGEST_ID, f"{where}, id", MapFileError),
-        kind=take_text(properties.get("class"), f"{where}, class", MapFileError),
+        kind=take_name(properties.get("class"), f"{where}, class", MapFileError),
         points_map=points,
         sightings=0
         if sightings is None

@@ -33,6 +33,7 @@ from v2hdm.hdmap.features import (
 from v2hdm.hdmap.needs import need
 from v2hdm.hdmap.qgis_style import qgis_style
 from v2hdm.records import GeodeticOrigin, HdMap
+from v2hdm.texts import parse_json
 
 _WGS84 = "EPSG:4326"
 _LOCAL = (
@@ -260,7 +261,4 @@ def _json(text: object, where: str) -> object:
     """A column that holds JSON; None where it is empty."""
     if text is None:
         return None
-    try:
-        return json.loads(str(text))
-    except json.JSONDecodeError as failure:
-        raise MapFileError(f"{where}: JSON syntax error: {failure.msg}; mend it or leave it empty") from None
+    return parse_json(str(text), where, MapFileError)

@@ -18,7 +18,7 @@ from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.drive import ReadOptions, read_drive
 from v2hdm.drive.tum import write_tum
-from v2hdm.errors import ConfigError, MapFileError
+from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.hdmap.calibration import trusted_calibrations
@@ -29,6 +29,7 @@ from v2hdm.localization.motion import State, predict, start
 from v2hdm.mapping.sightings.table import Sightings, collect_sightings
 from v2hdm.records import Calibration, Drive, FloatArray, HdMap, ImageDetections, Trajectory
 from v2hdm.report.outputs import result_folder, write_json
+from v2hdm.settings import check_workers
 
 START_SIGMA_M, START_SIGMA_RAD = 0.5, float(np.deg2rad(3.0))
 """How well the first pose is known: a coordinate of a place that RTK has once fixed, and a compass."""
@@ -200,8 +201,7 @@ def localise_drive(parsed: argparse.Namespace) -> bool:
     Raises:
         V2hdmError: map, calibrations or drive cannot be read or do not belong together.
     """
-    if parsed.workers < 0:
-        raise ConfigError(f"--workers {parsed.workers}: give a number of processes, or 0 for one per core")
+    check_workers(parsed.workers)
     logging.basicConfig(format="%(message)s")
     cv2.setNumThreads(1)
     hd_map = read_geojson(parsed.map / "map.geojson" if parsed.map.is_dir() else parsed.map)
@@ -209,7 +209,7 @@ def localise_drive(parsed: argparse.Namespace) -> bool:
     drive = read_drive(parsed.drive, ReadOptions(format=parsed.format, cameras=parsed.camera))
     _check_together(hd_map, calibrations, drive)
     folder = parsed.output or Path("outputs") / f"{drive.name}-localized"
-    with result_folder(folder) as unfinished:
+    with result_folder(folder, "--output") as unfinished:
         detections = detect_all(
             drive, DetectorOptions.for_mapping(), parsed.workers or os.cpu_count() or 1, _tell
         )

@@ -200,13 +200,13 @@ def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -
         "survey.reach_m": options.survey.reach_m,
     }
     if options.mode not in (BATCH, INCREMENTAL):
-        raise ConfigError(f"mapping.mode is {options.mode!r}; choose {BATCH} or {INCREMENTAL}.")
+        raise ConfigError(f"mapping.mode is '{options.mode}'; choose {BATCH} or {INCREMENTAL}.")
     if options.pose_model not in POSE_MODELS:
         raise ConfigError(
-            f"mapping.pose_model is {options.pose_model!r}; choose from {', '.join(POSE_MODELS)}."
+            f"mapping.pose_model is '{options.pose_model}'; choose from {', '.join(POSE_MODELS)}."
         )
     if options.loss not in LOSSES:
-        raise ConfigError(f"mapping.loss is {options.loss!r}; choose from {', '.join(LOSSES)}.")
+        raise ConfigError(f"mapping.loss is '{options.loss}'; choose from {', '.join(LOSSES)}.")
     for key, value in positive.items():
         if not value > 0:
             raise ConfigError(f"mapping.{key} is {value}; it must be greater than zero.")

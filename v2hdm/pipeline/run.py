@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 
 from v2hdm import __version__
@@ -25,8 +26,9 @@ from v2hdm.detection.weights import unknown_network
 from v2hdm.drive import ReadOptions, drive_name, read_drive
 from v2hdm.errors import AdjustError, ConfigError, MappingError, V2hdmError
 from v2hdm.hdmap.formats import check_formats
+from v2hdm.mapping.known_sizes import known_lengths
 from v2hdm.mapping.methods import run_methods
-from v2hdm.mapping.options import MappingOptions, check_options
+from v2hdm.mapping.options import MappingOptions, SizeOptions, check_options
 from v2hdm.orthophoto.result import write_mosaic
 from v2hdm.pipeline.evaluate import CameraSets, evaluate
 from v2hdm.pipeline.inspect import Inspection, inspect
@@ -37,7 +39,9 @@ from v2hdm.quality.results.result import check_result
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.check_points import write_check_points
 from v2hdm.report.outputs import result_folder, write_json
+from v2hdm.settings import MOST_PROCESSES, NOT_NEGATIVE, POSITIVE, SEED, SHARE, Within, check_settings
 from v2hdm.simulate import PortConfig, rendered_drive
+from v2hdm.texts import shown, take_camera_name, take_name
 
 log = logging.getLogger(__name__)
 
@@ -48,6 +52,44 @@ _NO_DRIVE = (
 
 GROWTH_STEPS = 8
 """Sizes of the growing map at which its error is drawn."""
+
+
+_RANGES = {
+    "workers": Within(0, MOST_PROCESSES),
+    "drive.max_gap_s": POSITIVE,
+    **{f"drive.kitti.{name}": POSITIVE for name in ("camera_height_m", "centre_sigma_m", "roi_half_width_m")},
+    "simulate.seed": SEED,
+    "simulate.visit": NOT_NEGATIVE,
+    "simulate.cameras.*.width": Within(64, 2**13),
+    "simulate.cameras.*.height": Within(64, 2**13),
+    "simulate.cameras.*.focal_px": Within(10, 1e5),
+    "simulate.cameras.*.psf_sigma_px": NOT_NEGATIVE,
+    "simulate.cameras.*.vignetting": SHARE,
+    "simulate.cameras.*.distortion": Within(-2, 2),
+    **{f"simulate.cameras.*.{mount}.z_m": Within(0.2, 20) for mount in ("mount", "borrowed_mount")},
+    "simulate.route.pieces": Within(-1e5, 1e5),
+    "simulate.route.image_spacing_m": Within(0.01, 1e3),
+    "simulate.route.pose_rate_hz": Within(0.1, 1e4),
+    "simulate.exposure.exposure_s": Within(0, 1),
+    "simulate.exposure.level": Within(0, 1, open=True),
+    "simulate.exposure.full_well_electrons": POSITIVE,
+    **{
+        f"simulate.disturbance.{name}": NOT_NEGATIVE
+        for name in ("roll_pitch_deg", "heave_m", "rtk_white_m", "rtk_correlated_m", "heading_deg")
+    },
+    **{
+        f"simulate.disturbance.{name}": POSITIVE
+        for name in ("jitter_correlation_s", "rtk_correlation_m", "heading_correlation_s")
+    },
+    **{f"simulate.surface.{name}": SHARE for name in ("albedo", "wet_fraction")},
+    **{f"simulate.surface.{name}": Within(0, 1e5) for name in ("patches", "oil_stains")},
+    **{
+        f"simulate.yard.{name}": Within(0, 1e4)
+        for name in ("parked_trucks", "barriers", "lamp_posts", "moving_trucks", "shadow_strips")
+    },
+    "simulate.yard.haze_m": POSITIVE,
+    "mapping.rounds": Within(1, 100),
+}  # fmt: skip
 
 
 class Progress(Protocol):
@@ -172,7 +214,8 @@ def _map_and_judge(
     with _timed(seconds, "judge"):
         found = check_result(drive, methods, inspection.ground)
         checked, surveyed = check_survey(survey, drive, list(methods.values())[-1][BEST])
-        verdict = Verdict.of([*inspection.findings, *found, *surveyed])
+        unfit = _unfit_sizes(config.mapping.known_sizes, methods)
+        verdict = Verdict.of([*inspection.findings, *found, *unfit, *surveyed])
     with _timed(seconds, "evaluate"):
         described = inspection.drive_as_described
         judgement = evaluate(described, detections, methods, config.mapping, partial(progress, "evaluate"))
@@ -190,6 +233,27 @@ def _map_and_judge(
             tell = partial(progress, "mosaic")
             write_mosaic(folder, described, device=config.mapping.device, progress=tell)
     return RunResult(Path(config.output) / about["name"], metrics, headlines, verdict)
+
+
+def _unfit_sizes(sizes: SizeOptions, sets: CameraSets) -> list[Finding]:
+    """Known sizes that no marking of the map has: a class or a size is wrong."""
+    found = []
+    for name, size in sizes.by_class_m.items():
+        markings = [one for one in list(sets.values())[-1]["Opt"].hd_map.markings if one.kind == name]
+        corners_map = np.array([one.corners_map for one in markings]).reshape(-1, 4, 2)
+        numbers = np.arange(4 * len(markings)).reshape(-1, 4)
+        if known_lengths(
+            replace(sizes, by_class_m={name: size}), [name] * len(markings), corners_map, numbers
+        ):
+            continue
+        says = (
+            f"none of the {len(markings)} markings of class {name} is about {size[0]:g} m by {size[1]:g} "
+            "m, so that "
+            "the size was not used; mend or drop it"
+        )
+        about = f"mapping.known_sizes.by_class_m.{name}"
+        found.append(Finding("known size", Status.WARN, 0.0, None, "", says, about))
+    return found
 
 
 def _without_map(
@@ -268,11 +332,12 @@ def _check(config: RunConfig) -> str:
         DetectorError: ``detector.model`` cannot be used.
     """
     name = run_name(config)
-    if not name.strip(".") or set(name) & {"/", os.sep}:
-        raise ConfigError(
-            f"name is {name!r}: give the name of a folder within {config.output!r}, without '/'"
-        )
-    _workers(config)
+    take_name(name, "name", ConfigError)
+    if config.simulate is not None:
+        take_name(config.simulate.name, "simulate.name", ConfigError)
+        for camera in config.simulate.cameras:
+            take_camera_name(camera, "simulate.cameras", ConfigError)
+    check_settings(config, _RANGES)
     detector = Detector.load(options=config.detector)
     check_options(config.mapping, detector.catalogue.cornered)
     table_of(config.mapping.survey)
@@ -299,7 +364,7 @@ def check_device(device: str) -> None:
         ConfigError: says which.
     """
     if device not in ("cpu", "cuda"):
-        raise ConfigError(f"device is {device!r}: choose cpu or cuda")
+        raise ConfigError(f"device is {shown(device)}: choose cpu or cuda")
     if device == "cuda" and not torch.cuda.is_available():
         raise ConfigError(
             "device is 'cuda' but torch sees no GPU: check the driver and torch build, or set device=cpu"
@@ -307,8 +372,6 @@ def check_device(device: str) -> None:
 
 
 def _workers(config: RunConfig) -> int:
-    if config.workers < 0:
-        raise ConfigError(f"workers is {config.workers}: set 0 for one per core, or a positive number")
     return config.workers or os.cpu_count() or 1
 
 
@@ -333,7 +396,15 @@ def logging_to(handler: logging.Handler) -> Iterator[None]:
         handler.close()
 
 
+class _LogFile(logging.FileHandler):
+    """A log that is part of a result: where it cannot be written, the result cannot."""
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
+        """Raise what went wrong; logging itself would print a traceback and go on."""
+        raise
+
+
 def _log_file(path: Path) -> logging.Handler:
-    handler = logging.FileHandler(path, encoding="utf-8")
+    handler = _LogFile(path, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     return handler

@@ -98,9 +98,9 @@ def turned_alike(movements: Sequence[Movement]) -> bool:
 
 def _check_comparable(before: Calibration, after: Calibration) -> None:
     first, second = before.info, after.info
-    who = f"camera {first.name!r}"
+    who = f"camera '{first.name}'"
     if first.name != second.name:
-        raise MapFileError(f"{who} and {second.name!r}: these are two cameras; give two calibrations of one")
+        raise MapFileError(f"{who} and '{second.name}': these are two cameras; give two calibrations of one")
     if (first.width, first.height, first.distortion_model) != (
         second.width,
         second.height,

@@ -1,49 +1,16 @@
-"""The folder of a run's results: it appears whole, or not at all."""
+"""Figures of a run as a file, in its folder of results."""
 
 from __future__ import annotations
 
 import json
 import math
-import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from v2hdm.errors import ConfigError
+from v2hdm.outputs import result_folder
 
-
-@contextmanager
-def result_folder(folder: Path) -> Iterator[Path]:
-    """A hidden folder beside ``folder`` to write into, which takes its place when the block succeeds.
-
-    An earlier result stays untouched until then; after an error nothing new is left.
-
-    Raises:
-        ConfigError: The folder cannot be written, or holds something that is no earlier result.
-    """
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / "config.yaml").is_file():
-        raise ConfigError(
-            f"output folder {folder} holds files that are no results of ours: name another with output="
-        )
-    unfinished = folder.with_name(f".{folder.name}.part")
-    previous = folder.with_name(f".{folder.name}.previous")
-    try:
-        shutil.rmtree(unfinished, ignore_errors=True)
-        unfinished.mkdir(parents=True)
-    except OSError as error:
-        raise ConfigError(
-            f"output folder {folder} cannot be written: {error.strerror}; set output="
-        ) from error
-    try:
-        yield unfinished
-        shutil.rmtree(previous, ignore_errors=True)
-        if folder.exists():
-            folder.replace(previous)
-        unfinished.replace(folder)
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
-        shutil.rmtree(previous, ignore_errors=True)
+__all__ = ["result_folder", "write_json"]
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -60,7 +60,7 @@ def _seen_ground(calibration: Calibration) -> FloatArray:
     seen_vehicle = apply_in_front(ground, below_px)[0]
     if not np.isfinite(seen_vehicle).all():
         raise MapFileError(
-            f"calibration of camera {info.name!r}: the image's lowest row is above the horizon; "
+            f"calibration of camera '{info.name}': the image's lowest row is above the horizon; "
             "mend cam_from_vehicle"
         )
     return np.asarray(seen_vehicle + _BELOW_M * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]))
@@ -73,7 +73,7 @@ def _check(calibration: Calibration) -> None:
     problem = None
     if info.distortion_model not in DISTORTION_COEFFICIENTS:
         known = ", ".join(DISTORTION_COEFFICIENTS)
-        problem = f"unknown distortion_model {info.distortion_model!r}; known are {known}"
+        problem = f"unknown distortion_model '{info.distortion_model}'; known are {known}"
     elif len(info.distortion) != DISTORTION_COEFFICIENTS[info.distortion_model]:
         count = DISTORTION_COEFFICIENTS[info.distortion_model]
         problem = f"{info.distortion_model} has {count} coefficients, not {len(info.distortion)}; mend them"
@@ -90,4 +90,4 @@ def _check(calibration: Calibration) -> None:
     elif camera_centre(cam_from_vehicle)[2] <= 0:
         problem = "cam_from_vehicle puts the camera on or under the ground; mend it"
     if problem:
-        raise MapFileError(f"calibration of camera {info.name!r}: {problem}")
+        raise MapFileError(f"calibration of camera '{info.name}': {problem}")

@@ -15,7 +15,8 @@ import numpy as np
 
 from v2hdm.drive.poses.readings import Readings
 from v2hdm.drive.poses.settings import PoseSettings
-from v2hdm.drive.trajectory import interpolate
+from v2hdm.drive.stamp_units import why_no_pose
+from v2hdm.drive.trajectory import check_geodetic, interpolate
 from v2hdm.errors import DriveError
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.hdmap.geodetic import (
@@ -85,6 +86,8 @@ def assemble(
     rotation = rotation @ settings.vehicle_from_sensor.T
     stamp_s = readings.stamp_s[known] + settings.offset_s
     if readings.geodetic or settings.crs is not None:
+        if readings.geodetic:
+            check_geodetic(points, where)
         geodetic, north_rad = _on_earth(points, readings.geodetic, settings, where)
         datum = "WGS84" if settings.crs is None else datum_of(settings.crs, where, DriveError)
         origin = _origin(origin, geodetic[0], datum, settings, where)
@@ -137,8 +140,9 @@ def _rotation_at(readings: Readings, max_gap_s: float, where: str) -> tuple[Floa
     if not known.any():
         raise DriveError(
             f"{where}: no position ({readings.stamp_s[0]:.3f} to {readings.stamp_s[-1]:.3f} s) has a heading "
-            f"({attitudes.stamp_s[0]:.3f} to {attitudes.stamp_s[-1]:.3f} s) within {max_gap_s:g} s; put both "
-            "on one clock, or record the heading as long as the positions"
+            f"({attitudes.stamp_s[0]:.3f} to {attitudes.stamp_s[-1]:.3f} s) within {max_gap_s:g} s "
+            "(drive.max_gap_s): "
+            f"{why_no_pose(readings.stamp_s, attitudes.stamp_s, max_gap_s, 'positions', 'headings')}"
         )
     if not known.all():
         _log.warning(

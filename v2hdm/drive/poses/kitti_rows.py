@@ -10,7 +10,7 @@ import numpy as np
 from v2hdm.drive.poses.readings import Attitudes, Readings
 from v2hdm.drive.poses.rising import in_order
 from v2hdm.errors import DriveError
-from v2hdm.files import read_text, take_text
+from v2hdm.files import read_text, take_choice, take_text
 from v2hdm.records import FloatArray
 
 KEYS = ("stamps", "axes")
@@ -35,9 +35,7 @@ def read_kitti_rows(path: Path, entry: dict[str, Any], root: Path, where: str) -
     """
     if "stamps" not in entry:
         raise DriveError(f"{where}: KITTI's rows have no times: add stamps, a file with one time in s a line")
-    axes = entry.get("axes", "vehicle")
-    if axes not in ("vehicle", "camera"):
-        raise DriveError(f"{where}, axes: expected vehicle or camera, got {axes!r}")
+    axes = take_choice(entry.get("axes", "vehicle"), ("vehicle", "camera"), f"{where}, axes", DriveError)
     poses = _numbers(path, 12).reshape(-1, 3, 4)
     stamp_s = read_stamps(root / take_text(entry["stamps"], f"{where}, stamps", DriveError))
     if len(stamp_s) != len(poses):

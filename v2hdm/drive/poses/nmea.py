@@ -20,6 +20,7 @@ from v2hdm.errors import DriveError
 from v2hdm.files import take_text
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.records import FloatArray
+from v2hdm.texts import read_bytes, shown
 
 KEYS = ("date",)
 
@@ -36,16 +37,14 @@ def read_nmea(path: Path, entry: dict[str, Any], root: Path, where: str) -> Read
     Raises:
         DriveError: there is no position, no date, or most sentences are damaged.
     """
-    try:
-        lines = path.read_text(encoding="ascii", errors="replace").splitlines()
-    except OSError as failure:
-        raise DriveError(f"{path}: cannot be read ({failure.strerror}); check the path") from None
-    first = entry.get("date")
-    if first is not None and not isinstance(first, date):
+    lines = read_bytes(path, DriveError).decode("ascii", errors="replace").splitlines()
+    first = None
+    if "date" in entry:
+        day = take_text(entry["date"], f"{where}, date", DriveError)
         try:
-            first = date.fromisoformat(take_text(first, f"{where}, date", DriveError))
+            first = date.fromisoformat(day)
         except ValueError:
-            raise DriveError(f"{where}, date: expected a day such as 2024-05-17, got {first!r}") from None
+            raise DriveError(f"{where}, date: expected a day such as 2024-05-17, got {shown(day)}") from None
     return nmea_readings(lines, str(path), first)
 
 

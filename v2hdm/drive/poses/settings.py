@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.files import take_array, take_number, take_text
+from v2hdm.files import take_array, take_choice, take_number, take_text
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.records import FloatArray
 
@@ -62,8 +62,8 @@ def take_pose_settings(entry: Mapping[str, Any], where: str) -> PoseSettings:
         return None if key not in entry else take_array(entry[key], (3,), f"{where}, {key}", DriveError)
 
     heading = entry.get("heading")
-    if heading is not None and heading not in HEADINGS:
-        raise DriveError(f"{where}, heading: expected one of {', '.join(HEADINGS)}, got {heading!r}")
+    if heading is not None:
+        take_choice(heading, HEADINGS, f"{where}, heading", DriveError)
     max_sigma_m = number("max_sigma_m") if "max_sigma_m" in entry else _MAX_SIGMA_M
     assert max_sigma_m is not None
     if max_sigma_m <= 0:

@@ -86,6 +86,9 @@ def _coinciding_pairs(
     """Pairs (P, 2) of groups that may be one marking, their shifts (P,) and distances (P,) in sigmas."""
     usable = np.flatnonzero(fused.valid.sum(axis=1) >= 2)
     centre = np.nanmean(fused.corners_map[usable], axis=1)
+    # Of a drive of a few images the extrinsic is hardly known, and rays may meet the ground nowhere.
+    somewhere = np.isfinite(centre).all(axis=1)
+    usable, centre = usable[somewhere], centre[somewhere]
     kind = group_kinds(association, sightings)
     size_m = diameters(fused.corners_map, fused.valid)
     # Centres over different valid corners differ by up to half a diameter.

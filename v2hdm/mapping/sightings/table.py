@@ -162,7 +162,7 @@ def camera_of(drive: Drive, name: str) -> Camera:
     """
     if name not in drive.cameras:
         known = ", ".join(drive.cameras)
-        raise MappingError(f"drive {drive.name} has no camera {name!r}; choose among {known}.")
+        raise MappingError(f"drive {drive.name} has no camera '{name}'; choose among {known}.")
     return drive.cameras[name]
 
 

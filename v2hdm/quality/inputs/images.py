@@ -10,9 +10,9 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from v2hdm.errors import DriveError
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import distort_points
+from v2hdm.pixels import read_pixels
 from v2hdm.quality.judgement import judge
 from v2hdm.quality.verdict import Finding, Status
 from v2hdm.records import Camera, Drive, Image
@@ -33,6 +33,9 @@ _SAME_GREY = 0.5
 
 _FROZEN = 0.02
 """Share of repeated images on the way that passes: a dropped frame now and then, filled by the one before."""
+
+_STUCK = 3
+"""Repeats in a row that no single dropped frame makes."""
 
 _BRIGHTEST, _DARKEST = 250, 5
 """Grey values at which an image of 8 bits is clipped."""
@@ -81,6 +84,15 @@ def _frozen(name: str, images: Sequence[Image]) -> Finding:
         alike = [k for k in sampled if _alike(images[k - 1].path, images[k].path)]
         if len(alike) > 1:  # one alone may be a dropped frame
             share, at = len(alike) / len(sampled), alike
+    if share <= _FROZEN:
+        begin, length = _longest_run(copied)
+        if length >= _STUCK:
+            says = (
+                f"{length + 1} images in a row from {images[begin - 1].stamp_s:.2f} s on are one and the "
+                "same while "
+                "the vehicle moves: the camera froze there; drop the repeats from the list"
+            )
+            return Finding("frozen images", Status.WARN, float(length), _STUCK - 1.0, "", says, name)
     where = f", first at {images[at[0]].stamp_s:.2f} s" if at else ""
     return judge(
         "frozen images", name, share, _FROZEN, "",
@@ -88,6 +100,17 @@ def _frozen(name: str, images: Sequence[Image]) -> Finding:
         wrong=f"{100 * share:.0f} % of the images repeat the one before while the vehicle moves{where}: the "
         "camera froze, or one file is listed several times; drop the repeats from the list",
     )  # fmt: skip
+
+
+def _longest_run(numbers: Sequence[int]) -> tuple[int, int]:
+    """The first of the most successive ``numbers`` and how many these are."""
+    best, begin = (0, 0), 0
+    for k, number in enumerate(numbers):
+        if k and number != numbers[k - 1] + 1:
+            begin = k
+        if k + 1 - begin > best[1]:
+            best = numbers[begin], k + 1 - begin
+    return best
 
 
 def _exposure(name: str, camera: Camera, images: Sequence[Image]) -> list[Finding]:
@@ -142,10 +165,7 @@ def _alike(first: Path, second: Path) -> bool:
 
 def _read(path: Path) -> np.ndarray:
     """Grey values of an image at a quarter of its size."""
-    grey = cv2.imread(str(path), cv2.IMREAD_REDUCED_GRAYSCALE_4)
-    if grey is None:
-        raise DriveError(f"{path}: the image is damaged; copy it again or drop it from the list")
-    return np.asarray(grey)
+    return read_pixels(path, cv2.IMREAD_REDUCED_GRAYSCALE_4)
 
 
 def _roi_mask(camera: Camera, grey: np.ndarray) -> np.ndarray:

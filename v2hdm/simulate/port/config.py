@@ -10,7 +10,16 @@ from dataclasses import dataclass, field
 
 @dataclass(kw_only=True)
 class MountConfig:
-    """Where a camera sits on the vehicle: its centre, then yaw (left), pitch (down) and roll."""
+    """Where a camera sits on the vehicle: its centre, then yaw (left), pitch (down) and roll.
+
+    Attributes:
+        x_m: ahead of the vehicle's origin.
+        y_m: to its left.
+        z_m: above the ground.
+        yaw_deg: viewing direction, to the left.
+        pitch_deg: downwards.
+        roll_deg: about the viewing direction.
+    """
 
     x_m: float
     y_m: float
@@ -25,6 +34,14 @@ class CameraConfig:
     """One camera: lens, mount, and the mount of the same camera on the other vehicle, which lends its IPM.
 
     ``distortion`` are plumb_bob coefficients k1 k2 p1 p2 k3.
+
+    Attributes:
+        width: of an image, px.
+        height: of an image, px.
+        focal_px: focal length.
+        principal_offset_px: of the principal point from the image's centre, right and down.
+        psf_sigma_px: blur of the lens, standard deviation.
+        vignetting: loss of light in the corners, as a share.
     """
 
     mount: MountConfig
@@ -43,6 +60,11 @@ class CalibrationConfig:
     """The manual calibration: ground points surveyed and clicked in an image, and a survey of the camera.
 
     ``points_ahead_m`` are distance along the viewing direction and offset to the left, in m from the camera.
+
+    Attributes:
+        survey_sigma_m: standard deviation of a surveyed point.
+        click_sigma_px: standard deviation of a click.
+        centre_sigma_m: standard deviation of the surveyed camera centre, per axis.
     """
 
     points_ahead_m: list[list[float]] = field(
@@ -62,6 +84,15 @@ class DisturbanceConfig:
 
     Roll and pitch jitter have a white and a correlated part of equal power; so has the heading error. RTK's
     position error has a white part and one that is correlated over ``rtk_correlation_m`` of driving.
+
+    Attributes:
+        roll_pitch_deg: of the body's attitude.
+        heave_m: of the body's height.
+        jitter_correlation_s: time over which attitude and height are correlated.
+        rtk_white_m: of a position, independent at each time.
+        rtk_correlated_m: of a position, common to a stretch of road.
+        heading_deg: of the recorded heading.
+        heading_correlation_s: time over which the heading's error is correlated.
     """
 
     roll_pitch_deg: float = 0.11
@@ -76,7 +107,13 @@ class DisturbanceConfig:
 
 @dataclass(kw_only=True)
 class RouteConfig:
-    """The way: pieces of [length in m, turn to the left in degrees], driven at about ``speed_mps``."""
+    """The way: pieces of [length in m, turn to the left in degrees], driven at about ``speed_mps``.
+
+    Attributes:
+        pieces: [length in m, turn to the left in degrees] of each.
+        image_spacing_m: distance driven between two images.
+        pose_rate_hz: recorded poses a second.
+    """
 
     pieces: list[list[float]] = field(
         default_factory=lambda: [
@@ -109,6 +146,23 @@ class PaintConfig:
     Offsets are to the left of the route, in m; ``field_offsets_m`` are rows further out, on straights
     only. ``wear`` and ``dirt`` are the means of what varies from marking to marking. ``stencils`` are paint
     of users' own classes, by their names.
+
+    Attributes:
+        diamond_length_m: diagonal along the route.
+        diamond_width_m: diagonal across it.
+        diamond_spacing_m: along the route.
+        diamond_offsets_m: of the rows of diamonds.
+        placing_sigma_m: how far a marking is off its place.
+        placing_sigma_deg: how far it is turned.
+        solid_offsets_m: of solid lines.
+        dashed_offsets_m: of dashed lines.
+        line_width_m: of lane lines.
+        dash_length_m: of dashes.
+        dash_gap_m: between two dashes.
+        arrow_spacing_m: between two arrows.
+        stop_line_spacing_m: between two stop lines.
+        lettering_spacing_m: between two words.
+        yellow_diamonds: whether diamonds are yellow, not white.
     """
 
     diamond_length_m: float = 1.2
@@ -134,7 +188,19 @@ class PaintConfig:
 
 @dataclass(kw_only=True)
 class SurfaceConfig:
-    """The ground; see :class:`v2hdm.simulate.render.scene.Ground`. Lengths of 0 for ``slab_m``: no joints."""
+    """The ground; see :class:`v2hdm.simulate.render.scene.Ground`. Lengths of 0 for ``slab_m``: no joints.
+
+    Attributes:
+        texture: concrete or asphalt.
+        albedo: mean reflectance.
+        contrast: of the texture, as a share of the albedo.
+        stains: strength of large stains, as a share of the albedo.
+        joint_width_m: of the joints between slabs.
+        wet_fraction: share of the ground that is wet.
+        tyre_marks: how dark the lanes are driven.
+        patches: number of repaired places.
+        oil_stains: number of them.
+    """
 
     texture: str = "concrete"
     albedo: float = 0.3
@@ -154,6 +220,19 @@ class YardConfig:
 
     ``stack_fill`` is the fraction of the places beside the route with container stacks; parked trucks
     and barriers stand closer; moving trucks come the other way. Strips are shadows of cranes and beams.
+
+    Attributes:
+        stack_clearance_m: of container stacks from the route.
+        parked_trucks: number of them.
+        barriers: number of them.
+        lamp_posts: number of them.
+        moving_trucks: number of them.
+        moving_offset_m: of oncoming trucks, to the left of the route.
+        shadow_strips: number of them.
+        sun_azimuth_deg: direction of the sun, to the left of the map's x axis.
+        sun_elevation_deg: of the sun above the horizon.
+        sun_strength: of the direct light against that of the sky.
+        haze_m: distance at which haze takes most of the contrast.
     """
 
     stack_fill: float = 0.55
@@ -172,7 +251,14 @@ class YardConfig:
 
 @dataclass(kw_only=True)
 class ExposureConfig:
-    """The shutter and the sensor: the exposure aims at a mean of ``level``, varying by ``level_sigma``."""
+    """The shutter and the sensor: the exposure aims at a mean of ``level``, varying by ``level_sigma``.
+
+    Attributes:
+        exposure_s: time that the shutter is open.
+        full_well_electrons: that a pixel of full brightness holds; fewer are noisier.
+        read_noise: standard deviation, as a share of full brightness.
+        jpeg_quality: of the files, 50 to 100.
+    """
 
     exposure_s: float = 0.002
     level: float = 0.25
@@ -207,6 +293,10 @@ class PortConfig:
     ``initial_ipm`` is ``calibrated`` when the drive starts from this vehicle's own manual calibration,
     ``estimated`` when it starts from the other vehicle's. ``visit`` numbers drives through one port: the same
     paint, other noise of poses and images, other traffic. Equal values give equal files, byte for byte.
+
+    Attributes:
+        name: of the port and its drive.
+        seed: of everything that is drawn at random.
     """
 
     name: str = "port1"

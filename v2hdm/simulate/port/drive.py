@@ -18,10 +18,12 @@ import numpy as np
 from v2hdm.drive import write_drive
 from v2hdm.drive.folder import DRIVE_FILE, TRUTH_FOLDER
 from v2hdm.drive.truth import write_truth
+from v2hdm.drive.tum import read_image_list
 from v2hdm.errors import DriveError
 from v2hdm.files import whole_file
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.rigid import ground_in_vehicle
+from v2hdm.pixels import read_header
 from v2hdm.records import Drive, Image, Truth
 from v2hdm.simulate.port.build import Port, build_port
 from v2hdm.simulate.port.config import PortConfig
@@ -60,9 +62,23 @@ def rendered_drive(config: PortConfig, cache: Path, workers: int, progress: Prog
         del content["paint"]["stencils"]
     text = json.dumps([RENDERER_VERSION, content], sort_keys=True)
     folder = cache / f"{config.name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
-    if not (folder / DRIVE_FILE).is_file():
+    if not (folder / DRIVE_FILE).is_file() or _drop_damaged(folder):
         render_drive(config, folder, workers, progress)
     return folder
+
+
+def _drop_damaged(folder: Path) -> bool:
+    """Remove images that are not whole from a rendered drive; whether any is missing."""
+    missing = False
+    for listing in folder.glob("*/images.txt"):
+        for name in read_image_list(listing)[1]:
+            path = listing.parent / name
+            try:
+                read_header(path)
+            except DriveError:
+                path.unlink(missing_ok=True)
+                missing = True
+    return missing
 
 
 def render_drive(config: PortConfig, folder: Path, workers: int, progress: Progress) -> None:

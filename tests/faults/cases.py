@@ -1,0 +1,698 @@
+"""All bad inputs and situations, as a table; `python -m tests.benchmarks.bad_inputs` runs it."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+
+from tests.drive.example import camera_info, looking_forward, make_drive, make_map
+from tests.faults.judge import Case, Prepare
+from v2hdm.hdmap.calibration import write_calibration
+from v2hdm.hdmap.geojson import write_geojson
+from v2hdm.records import Calibration
+
+CHECK = "v2hdm.check"
+CHECKED = ("drive", "--no-ground", "--workers", "1", "--output", "out")
+
+
+def drive(*changes: Callable[[Path], object]) -> Prepare:
+    """The example drive in the folder ``drive``, changed."""
+
+    def prepare(root: Path) -> None:
+        _write_files(root / "drive", _example())
+        for change in changes:
+            change(root / "drive")
+
+    return prepare
+
+
+@lru_cache
+def _example() -> tuple[tuple[str, bytes], ...]:
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        make_drive(Path(folder) / "drive")
+        return _read_files(Path(folder) / "drive")
+
+
+def _read_files(folder: Path) -> tuple[tuple[str, bytes], ...]:
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return tuple((path.relative_to(folder).as_posix(), path.read_bytes()) for path in files)
+
+
+def _write_files(folder: Path, files: tuple[tuple[str, bytes], ...]) -> None:
+    for name, data in files:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(data)
+
+
+def write(name: str, data: str | bytes) -> Callable[[Path], object]:
+    """Put this into a file."""
+    return lambda root: (root / name).write_bytes(data.encode() if isinstance(data, str) else data)
+
+
+def edit(name: str, pattern: str, new: str) -> Callable[[Path], object]:
+    """Change the first match in a file."""
+
+    def change(root: Path) -> None:
+        text = (root / name).read_text()
+        assert re.search(pattern, text, re.MULTILINE), (name, pattern)
+        (root / name).write_text(re.sub(pattern, lambda _: new, text, count=1, flags=re.MULTILINE))
+
+    return change
+
+
+def described(change: Callable[[dict], object]) -> Callable[[Path], object]:
+    """Change the content of ``drive.yaml``."""
+
+    def apply(root: Path) -> None:
+        content = yaml.safe_load((root / "drive.yaml").read_text())
+        change(content)
+        (root / "drive.yaml").write_text(yaml.safe_dump(content, allow_unicode=True))
+
+    return apply
+
+
+def renamed(name: object) -> Callable[[Path], object]:
+    """Give the front camera another name."""
+
+    def change(content: dict) -> None:
+        content["cameras"][name] = content["cameras"].pop("front")
+
+    return described(change)
+
+
+def pipe(name: str) -> Callable[[Path], object]:
+    """A pipe that nobody writes to in the place of a file."""
+
+    def change(root: Path) -> None:
+        (root / name).unlink(missing_ok=True)
+        os.mkfifo(root / name)
+
+    return change
+
+
+def folder_instead(name: str) -> Callable[[Path], object]:
+    """A folder in the place of a file."""
+
+    def change(root: Path) -> None:
+        (root / name).unlink(missing_ok=True)
+        (root / name).mkdir()
+
+    return change
+
+
+ALIAS_BOMB = "a: &a [0,0,0,0,0,0,0,0,0]\n" + "".join(
+    f"{'bcdefghij'[n]}: &{'bcdefghij'[n]} [{','.join(['*' + 'abcdefghi'[n]] * 9)}]\n" for n in range(9)
+)
+
+YAML_TEXTS: dict[str, tuple[str | bytes, str]] = {
+    "empty": ("", "expected 'key: value' entries"),
+    "only a comment": ("# nothing\n", "expected 'key: value' entries"),
+    "a list": ("- a\n", "expected 'key: value' entries"),
+    "a text": ("words\n", "expected 'key: value' entries"),
+    "a number": ("3\n", "expected 'key: value' entries"),
+    "unclosed list": ("name: [a\n", "line \\d+ YAML syntax error"),
+    "unclosed quote": ('name: "a\n', "line \\d+ YAML syntax error"),
+    "tab": ("name:\n\tx: 1\n", "line 2 YAML syntax error: a tab"),
+    "two documents": ("name: a\n---\nname: b\n", "YAML syntax error"),
+    "utf-16": ("name: a\n".encode("utf-16"), "UTF-16"),
+    "latin-1": ("name: M\u00fcll\n".encode("latin-1"), "not a UTF-8"),
+    "zero bytes": (b"\0" * 64, "zero byte"),
+    "binary": (bytes(range(1, 256)), "not a UTF-8|special characters"),
+    "control letters": ("name: a\x07b\n", "special characters"),
+    "a key twice": ("name: a\nname: b\n", "line 2.*'name' is there twice"),
+    "nested 3000 deep": ("name: " + "[" * 3000 + "]" * 3000, "nested deeper"),
+    "mappings nested 3000 deep": ("name: " + "{a: " * 3000 + "}" * 3000, "nested deeper"),
+    "alias bomb": (ALIAS_BOMB, "aliases repeat"),
+    "alias of itself": ("name: &a [*a]\n", "alias of what it is part of"),
+    "unknown alias": ("name: *a\n", "YAML syntax error"),
+    "5000 digits": ("name: " + "9" * 5000 + "\n", "5000 digits"),
+    "5000 hex digits": ("name: 0x" + "f" * 5000 + "\n", "5002 digits"),
+    "int of letters": ("name: !!int abc\n", "'abc' is not what its tag says"),
+    "float of letters": ("name: !!float abc\n", "'abc' is not what its tag says"),
+    "bool of letters": ("name: !!bool abc\n", "'abc' is not what its tag says"),
+    "python object": ("name: !!python/object/apply:os.system [true]\n", "the tag"),
+    "python name": ("name: !!python/name:os.system\n", "the tag"),
+    "own tag": ("name: !secret x\n", "the tag"),
+    "binary tag": ("name: !!binary aGk=\n", "the tag"),
+    "set": ("name: !!set {a}\n", "the tag"),
+    "key that is a list": ("? [a, b]\n: 1\n", "a key that is a list"),
+    "mapping that is a list": ("name: !!map [1]\n", "YAML syntax error"),
+    "merge of a text": ("<<: words\n", "YAML syntax error"),
+}
+
+JSON_TEXTS: dict[str, tuple[str | bytes, str]] = {
+    "empty": ("", "JSON syntax error"),
+    "cut off": ('{"v2hdm": {', "JSON syntax error"),
+    "list": ("[]", "expected a JSON object"),
+    "number": ("7", "expected a JSON object"),
+    "utf-16": ("{}".encode("utf-16"), "UTF-16"),
+    "binary": (bytes(range(256)), "not a UTF-8"),
+    "nested 3000 deep": ('{"features": ' + "[" * 3000 + "]" * 3000 + "}", "nested deeper"),
+    "nested 100000 deep": ("[" * 100000, "nested deeper"),
+    "depth hidden in a text": ('{"a": "]]]]]]]", "b": ' + "[" * 3000 + "]" * 3000 + "}", "nested deeper"),
+    "a key twice": ('{"v2hdm": {}, "v2hdm": {}}', "'v2hdm' is there twice"),
+    "5000 digits": ('{"v2hdm": {"origin": ' + "9" * 5000 + '}, "features": []}', "origin"),
+    "not a number": ('{"v2hdm": {}, "features": [{"properties": {"corners_map": NaN}}]}', "feature 0"),
+    "no map": ('{"type": "FeatureCollection", "features": []}', "not a map written by v2hdm"),
+    "features that are a text": ('{"v2hdm": {}, "features": "x"}', "not a map written by v2hdm"),
+    "feature that is a list": ('{"v2hdm": {}, "features": [[]]}', "feature 0"),
+    "feature that is nothing": ('{"v2hdm": {}, "features": [null]}', "feature 0"),
+    "properties that are a list": ('{"v2hdm": {}, "features": [{"properties": [1]}]}', "feature 0"),
+    "origin that is a list": ('{"v2hdm": {"origin": [1]}, "features": []}', "origin"),
+    "byte order mark in the midst": ('{"v2hdm": \ufeff{}}', "JSON syntax error"),
+}
+
+BAD_NAMES: dict[str, tuple[object, str]] = {
+    "empty": ("", "name is empty"),
+    "parent": ("..", "begins with a dot"),
+    "hidden": (".front", "begins with a dot"),
+    "escape": ("../../x", "separator of folders"),
+    "absolute": ("/tmp/x", "separator of folders"),
+    "folder": ("a/b", "separator of folders"),
+    "backslash": ("a\\b", "separator of folders"),
+    "newline": ("a\nb", "does not show"),
+    "zero byte": ("a\0b", "does not show|special characters|zero byte"),
+    "escape sequence": ("a\x1b[31mb", "does not show|special characters"),
+    "turned around": ("a\u202eb", "does not show"),
+    "line separator": ("a\u2028b", "does not show"),
+    "blank at the end": ("front ", "blank"),
+    "too long": ("x" * 65, "longer than 64"),
+    "too many bytes": ("\U0001f697" * 64, "longer than 64"),
+}
+
+
+def _png_chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+def png_header(width: int, height: int) -> bytes:
+    """A PNG of few bytes that says it is large."""
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    data = _png_chunk(b"IDAT", zlib.compress(b"\0" * 64))
+    return b"\x89PNG\r\n\x1a\n" + _png_chunk(b"IHDR", header) + data + _png_chunk(b"IEND", b"")
+
+
+def picture(suffix: str = ".jpg", height: int = 48, width: int = 64, depth: type = np.uint8) -> bytes:
+    """A picture of noise."""
+    rng = np.random.default_rng(4)
+    pixels = rng.integers(0, 255, (height, width, 3)).astype(depth)
+    return cv2.imencode(suffix, pixels)[1].tobytes()
+
+
+def damaged_inside() -> bytes:
+    """A JPEG with its end, whose middle is zeros."""
+    data = bytearray(picture(height=480, width=640))
+    data[len(data) // 3 : len(data) // 2] = bytes(len(data) // 2 - len(data) // 3)
+    return bytes(data)
+
+
+def flipped_png() -> bytes:
+    """A PNG with one bit changed."""
+    data = bytearray(picture(".png"))
+    data[len(data) // 2] ^= 4
+    return bytes(data)
+
+
+def with_orientation(data: bytes, orientation: int) -> bytes:
+    """A JPEG with an EXIF orientation."""
+    entry = struct.pack("<HHIHH", 0x112, 3, 1, orientation, 0)
+    exif = b"Exif\0\0" + b"II*\0" + struct.pack("<IH", 8, 1) + entry + bytes(4)
+    return data[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + data[2:]
+
+
+IMAGES: dict[str, tuple[bytes, str]] = {
+    "empty": (b"", "empty"),
+    "text": (b"no image", "not a PNG"),
+    "zeros": (bytes(4096), "not a PNG"),
+    "one byte": (b"\xff", "not a PNG"),
+    "start of a jpeg": (b"\xff\xd8", "truncated"),
+    "end of a jpeg": (b"\xff\xd8\xff\xd9", "truncated"),
+    "start of a png": (b"\x89PNG\r\n\x1a\n", "truncated"),
+    "half a jpeg": (picture()[:700], "truncated"),
+    "half a png": (picture(".png")[:700], "truncated"),
+    "png with a flipped bit": (flipped_png(), "truncated or damaged"),
+    "1 x 1 px": (picture(height=1, width=1), "1 x 1 px"),
+    "1 x 1 px png": (picture(".png", height=1, width=1), "1 x 1 px"),
+    "3 x 2000 px": (picture(height=3, width=2000), "at least 16 px"),
+    "header of 60000 x 60000": (png_header(60000, 60000), "60000 x 60000 px, more than"),
+    "header of 2**31 x 1": (png_header(2**31 - 1, 1), "px"),
+    "header of 0 x 0": (png_header(0, 0), "0 x 0 px"),
+    "jpeg header of 65535 x 65535": (
+        b"\xff\xd8\xff\xc0" + struct.pack(">HBHHB", 11, 8, 65535, 65535, 1) + b"\1\x11\0" + b"\xff\xd9",
+        "65535 x 65535 px, more than",
+    ),
+    "gif": (b"GIF89a" + bytes(40), "not a PNG"),
+    "svg": (b"<svg xmlns='http://www.w3.org/2000/svg'/>", "not a PNG"),
+    "tiff with a loop": (b"II*\0" + struct.pack("<IH", 8, 65535) + bytes(12), "truncated"),
+    "bmp header only": (b"BM" + bytes(30), "px|truncated"),
+    "webp header only": (b"RIFF\x10\0\0\0WEBPVP8 ", "truncated"),
+}
+
+
+def texts() -> Iterator[Case]:
+    """Broken YAML, JSON and tables."""
+    for name, (text, says) in YAML_TEXTS.items():
+        for file in ("drive.yaml", "front/camera_info.yaml"):
+            yield Case(f"{file}: {name}", CHECK, CHECKED, drive(write(file, text)), says)
+        yield Case(
+            f"calibration: {name}", "v2hdm.calibration", ("a.yaml", "a.yaml"), write("a.yaml", text), says
+        )  # fmt: skip
+    for name, (text, says) in JSON_TEXTS.items():
+        yield Case(
+            f"map: {name}",
+            "v2hdm.export",
+            ("map.geojson", "--format", "csv", "--output", "there"),
+            write("map.geojson", text),
+            says,
+        )
+    for file in ("drive.yaml", "poses.tum", "front/camera_info.yaml", "front/images.txt"):
+        yield Case(f"{file}: a pipe", CHECK, CHECKED, drive(pipe(file)), "pipe|not a drive")
+        yield Case(
+            f"{file}: a folder", CHECK, CHECKED, drive(folder_instead(file)), "folder|not a drive|no image"
+        )
+        yield Case(
+            f"{file}: all of utf-16", CHECK, CHECKED, drive(write(file, "a: b\n".encode("utf-16"))), "UTF-16"
+        )
+        yield Case(f"{file}: zeros", CHECK, CHECKED, drive(write(file, bytes(99))), "zero byte")
+    poses = "front/images.txt", "poses.tum"
+    lines = {
+        "words": "one two\n",
+        "a letter for a number": "100.0 x 0 0 0 0 0 1\n",
+        "one column": "100.0\n",
+        "infinite": "100.0 inf 0 0 0 0 0 1\n",
+        "not a number": "nan 0 0 0 0 0 0 1\n",
+        "falling": "100.0 0 0 0 0 0 0 1\n99.0 0 0 0 0 0 0 1\n",
+        "twice": "100.0 0 0 0 0 0 0 1\n100.0 0 0 0 0 0 0 1\n",
+    }
+    for name, text in lines.items():
+        yield Case(f"poses: {name}", CHECK, CHECKED, drive(write(poses[1], text)), "poses.tum: line")
+    far = "\n".join(f"{100 + 0.1 * n:.1f} 1e300 0 0 0 0 0 1" for n in range(30))
+    yield Case("poses: 1e300", CHECK, CHECKED, drive(write(poses[1], far)), "off the earth")
+    utm = "\n".join(f"{100 + 0.1 * n:.1f} {560000 + n} 5930000 0 0 0 0 1" for n in range(30))
+    yield Case(
+        "poses: UTM and an origin elsewhere", CHECK, CHECKED, drive(write(poses[1], utm)), "such as UTM"
+    )
+    slow = "\n".join(f"{100 + n:.1f} {n} 0 0 0 0 0 1" for n in range(5))
+    yield Case("poses: 1 Hz", CHECK, CHECKED, drive(write(poses[1], slow)), "drive.max_gap_s")
+    ns = "\n".join(f"{(100 + 0.1 * n) * 1e9:.0f} {n} 0 0 0 0 0 1" for n in range(30))
+    yield Case("poses: ns", CHECK, CHECKED, drive(write(poses[1], ns)), "nanoseconds")
+    late = "\n".join(f"{9100 + 0.1 * n:.1f} {n} 0 0 0 0 0 1" for n in range(30))
+    yield Case("poses: of another day", CHECK, CHECKED, drive(write(poses[1], late)), "begin 9000 s later")
+
+
+def names() -> Iterator[Case]:
+    """Names that are no names."""
+    for name, (text, says) in BAD_NAMES.items():
+        yield Case(f"camera's name: {name}", CHECK, CHECKED, drive(renamed(text)), says)
+        if text:
+            change = described(lambda content, text=text: content.update(name=text))
+            yield Case(f"drive's name: {name}", CHECK, CHECKED[:-2], drive(change), says)
+        if isinstance(text, str):
+            yield Case(
+                f"class in a map: {name}",
+                "v2hdm.export",
+                ("map.geojson", "--format", "csv", "--output", "there"),
+                _map_of_class(text),
+                says,
+            )
+    for word in ("both", "all", "Both"):
+        yield Case(f"camera called {word}", CHECK, CHECKED, drive(renamed(word)), "results of all")
+    for number in (7, 1.5):
+        yield Case(
+            f"camera called {number}", CHECK, CHECKED, drive(renamed(number)), "verdict", code=0,
+            leaves="^work/here/out(/|$)", tells=True,
+        )  # fmt: skip
+
+
+def _map_of_class(kind: str) -> Prepare:
+    def prepare(root: Path) -> None:
+        write_geojson(make_map(), root / "map.geojson")
+        content = json.loads((root / "map.geojson").read_text())
+        content["features"][0]["properties"]["class"] = kind
+        (root / "map.geojson").write_text(json.dumps(content))
+
+    return prepare
+
+
+def images() -> Iterator[Case]:
+    """Broken images, one by one and in a drive."""
+    for name, (data, says) in IMAGES.items():
+        yield Case(f"image: {name}", "v2hdm.detect", ("a.jpg",), write("a.jpg", data), says)
+        yield Case(
+            f"image in a drive: {name}", CHECK, CHECKED, drive(write("front/images/000001.jpg", data)), says
+        )  # fmt: skip
+    yield Case(
+        "image: damaged inside", "v2hdm.detect", ("a.jpg",), write("a.jpg", damaged_inside()), "damaged"
+    )
+    deep = picture(".png", depth=np.uint16)
+    yield Case("image: 16 bits", "v2hdm.detect", ("a.png",), write("a.png", deep), "16 bits")
+    yield Case("image: a pipe", "v2hdm.detect", ("imgs",), _imgs(pipe("imgs/b.jpg")), "device")
+    yield Case("image: a folder", "v2hdm.detect", ("imgs",), _imgs(folder_instead("imgs/b.jpg")), "folder")
+    turned = with_orientation(picture(), 6)
+    yield Case(
+        "image in a drive: turned", CHECK, CHECKED, drive(write("front/images/000001.jpg", turned)), "EXIF"
+    )  # fmt: skip
+
+
+def _imgs(change: Callable[[Path], object]) -> Prepare:
+    def prepare(root: Path) -> None:
+        (root / "imgs").mkdir()
+        change(root)
+
+    return prepare
+
+
+def fields() -> Iterator[Case]:
+    """Values of ``drive.yaml`` and ``camera_info.yaml`` that cannot be."""
+    wrong: list[object] = [None, [], {}, "x", True, -1, 10**30, [[1]], float("nan"), float("inf")]
+    front = ("roi_vehicle", "initial_ipm", "ipm", "images", "camera_info", "centre_prior", "linear_response")
+    right = {"linear_response": (True,), "initial_ipm": (None,), "centre_prior": (None,)}
+    for key in front:
+        for value in wrong:
+            if any(value is one for one in right.get(key, ())):
+                continue
+
+            def change(content: dict, key: str = key, value: object = value) -> None:
+                content["cameras"]["front"][key] = value
+
+            yield Case(
+                f"front, {key}: {value!r:.20}", CHECK, CHECKED, drive(described(change)), _names(key, value)
+            )
+    for key in ("poses", "pose_noise", "origin", "truth", "bag", "cameras"):
+        for value in wrong:
+            if value is None and key in ("pose_noise", "origin", "truth"):
+                continue
+            if (key, value) == ("pose_noise", {}):
+                continue
+
+            def put(content: dict, key: str = key, value: object = value) -> None:
+                content[key] = value
+
+            yield Case(f"{key}: {value!r:.20}", CHECK, CHECKED, drive(described(put)), _names(key, value))
+    info = "front/camera_info.yaml"
+    numbers = {
+        "width 0": ("image_width: 64", "image_width: 0", "image_width"),
+        "width -1": ("image_width: 64", "image_width: -1", "image_width"),
+        "width 1e9": ("image_width: 64", "image_width: 1000000000", "image_width"),
+        "width 64.5": ("image_width: 64", "image_width: 64.5", "image_width"),
+        "width a text": ("image_width: 64", "image_width: wide", "image_width"),
+        "tangential 5": (r"0\.001, -0\.001", "5.0, 5.0", "p1 and p2"),
+        "radial -50": (r"-0\.1, 0\.02", "-50.0, 0.02", "folds over"),
+        "focal length 1e300": (r"60\.0", "1.0e+300", "camera_matrix"),
+        "focal length nan": (r"60\.0", ".nan", "camera_matrix"),
+        "lens": ("plumb_bob", "fisheye62", "unknown distortion_model"),
+        "lens that is a list": ("plumb_bob", "[a]", "distortion_model"),
+    }
+    for name, (old, new, says) in numbers.items():
+        yield Case(f"camera_info: {name}", CHECK, CHECKED, drive(edit(info, old, new)), says)
+
+
+def _names(key: str, value: object) -> str:
+    """What an error about a key must name: the key, or the file of the name that it gives."""
+    return f"{key}|drive/x: no such file" if value == "x" else key
+
+
+def outputs() -> Iterator[Case]:
+    """Outputs that are inputs, the user's, somebody else's or nowhere."""
+    imgs = _imgs(write("imgs/a.jpg", picture(height=240, width=320)))
+    detect = "v2hdm.detect"
+    yield Case("draw into the source", detect, ("imgs", "--draw", "imgs"), imgs, "no results of ours")
+    yield Case("output is the source", detect, ("imgs/a.jpg", "--output", "imgs/a.jpg"), imgs, "inputs")
+    yield Case(
+        "output is a link to the source", detect, ("imgs/a.jpg", "--output", "link"),
+        _both(imgs, lambda root: (root / "link").symlink_to("imgs/a.jpg")), "inputs",
+    )  # fmt: skip
+    yield Case(
+        "output is the source by another name", detect, ("imgs/a.jpg", "--output", "twin"),
+        _both(imgs, lambda root: os.link(root / "imgs/a.jpg", root / "twin")), "inputs",
+    )  # fmt: skip
+    yield Case("output is an image of the source", detect, ("imgs", "--output", "imgs/a.jpg"), imgs, "inputs")
+    yield Case(
+        "output is the calibration", detect, ("imgs/a.jpg", "--camera", "c.yaml", "--output", "c.yaml"),
+        _both(imgs, _calibration), "inputs",
+    )  # fmt: skip
+    yield Case(
+        "output is a file of the user's", detect, ("imgs", "--output", "precious.txt"), imgs, "holds no det"
+    )
+    yield Case("output is a folder", detect, ("imgs", "--output", "imgs"), imgs, "give another --output")
+    yield Case("output in a file", detect, ("imgs", "--output", "precious.txt/x"), imgs, "cannot write")
+    yield Case(
+        "output on a full disk", detect, ("imgs", "--output", "x.jsonl"), imgs, "cannot write", disk_bytes=1
+    )
+    yield Case(
+        "drawing on a full disk", detect, ("imgs", "--draw", "d"), imgs, "cannot be written", disk_bytes=200
+    )
+    for name, make in {
+        "somebody's folder": _folder_with("out", "thesis.tex"),
+        "a drive": lambda root: _write_files(root / "out", _example()),
+        "a folder with a config.yaml": _folder_with("out", "config.yaml"),
+        "a folder with a metrics.json": _folder_with("out", "metrics.json"),
+        "a folder with a folder": _folder_with("out/deep", "x"),
+    }.items():
+        yield Case(f"result into {name}", CHECK, CHECKED, _both(drive(), make), "no results of ours")
+    yield Case("result onto a file", CHECK, CHECKED, _both(drive(), write("out", "x")), "is a file")
+    yield Case(
+        "result within a file", CHECK, (*CHECKED[:-1], "precious.txt/x"), drive(), "cannot be written|is a "
+        "file"
+    )  # fmt: skip
+    yield Case("result into the drive", CHECK, (*CHECKED[:-1], "drive"), drive(), "no results of ours")
+    yield Case(
+        "result onto a link in a circle", CHECK, CHECKED, _both(drive(), _circle), "leads nowhere|cannot"
+    )
+    for most in (0, 10, 1000, 5000):
+        name = f"result on a disk with room for {most} bytes"
+        yield Case(name, CHECK, CHECKED, drive(), "cannot be written", disk_bytes=most)
+    yield Case(
+        "export onto the map", "v2hdm.export", ("map.geojson", "--format", "geojson"),
+        lambda root: write_geojson(make_map(), root / "map.geojson"), "written over",
+    )  # fmt: skip
+    yield Case(
+        "export onto a link to the map", "v2hdm.export",
+        ("map.geojson", "--format", "csv", "--output", "there"), _linked_map, "written over",
+    )  # fmt: skip
+
+
+def _both(*steps: Callable[[Path], object]) -> Prepare:
+    def prepare(root: Path) -> None:
+        for step in steps:
+            step(root)
+
+    return prepare
+
+
+def _folder_with(folder: str, name: str) -> Prepare:
+    def prepare(root: Path) -> None:
+        (root / folder).mkdir(parents=True)
+        (root / folder / name).write_text("mine")
+
+    return prepare
+
+
+def _circle(root: Path) -> None:
+    (root / "out").symlink_to("out")
+
+
+def _calibration(root: Path) -> None:
+    info = camera_info("front", 320, 240)
+    write_calibration(Calibration(info, looking_forward()), root / "c.yaml")
+
+
+def _linked_map(root: Path) -> None:
+    write_geojson(make_map(), root / "map.geojson")
+    (root / "there").mkdir()
+    (root / "there" / "map.csv").symlink_to("../map.geojson")
+
+
+def arguments() -> Iterator[Case]:
+    """Command lines that cannot be meant."""
+    for line, says in {
+        "nowhere --no-ground": "nowhere: no such drive",
+        "drive --workers -1": "--workers -1",
+        "drive --workers 99999999": "--workers 99999999",
+        "drive --camera left": "no camera 'left'",
+        "precious.txt": "not a drive",
+        ". --no-ground": "not a drive",
+    }.items():
+        yield Case(f"check {line}", CHECK, line.split(), drive(), says)
+    for line, says in {
+        "nowhere.jpg": "no such image",
+        "precious.txt": "neither an image nor a video",
+        "imgs --limit 0": "--limit 0",
+        "imgs --threads 0": "threads is 0",
+        "imgs --threads 99999": "threads is 99999",
+        "imgs --model nowhere.onnx": "nowhere.onnx",
+        "imgs --model precious.txt": "precious.txt",
+        "imgs --camera nowhere.yaml": "nowhere.yaml: no such file",
+        "imgs --camera precious.txt": "precious.txt",
+        "imgs --mounting 0 5 60": "--mounting 0",
+        "imgs --mounting nan 5 60": "--mounting nan",
+        "imgs --mounting 1.6 5 600": "--mounting",
+    }.items():
+        imgs = _imgs(write("imgs/a.jpg", picture(height=240, width=320)))
+        yield Case(f"detect {line}", "v2hdm.detect", line.split(), imgs, says)
+    for line, says in {
+        "nowhere nowhere": "nowhere",
+        "precious.txt precious.txt": "precious.txt",
+        ". .": "no calibration_",
+    }.items():
+        yield Case(f"calibration {line}", "v2hdm.calibration", line.split(), _both(), says)
+    for line, says in {
+        "nowhere.geojson --format csv": "nowhere.geojson",
+        "precious.txt --format csv": "precious",
+        "map.geojson --format pdf": "pdf",
+        ". --format csv": "",
+    }.items():
+        yield Case(f"export {line}", "v2hdm.export", line.split(), _both(), says)
+
+
+SETTINGS = {
+    "workers=-1": "workers is -1",
+    "workers=99999999999999999999": "workers is",
+    "workers=many": "workers=many",
+    "device=tpu": "device is 'tpu'",
+    "mode=x": "mode is 'x'",
+    "name=../x": "separator of folders",
+    "name=..": "begins with a dot",
+    "'name=\"a/b\"'": "separator of folders",
+    "mapping.max_range_m=nan": "max_range_m is nan",
+    "mapping.max_range_m=inf": "max_range_m is inf",
+    "mapping.max_range_m=0": "max_range_m is 0",
+    "mapping.rounds=0": "rounds is 0",
+    "mapping.loss=x": "loss is 'x'",
+    "mapping.pose_model=x": "pose_model is 'x'",
+    "mapping.lanes.min_length_m=-1": "min_length_m is -1",
+    "+mapping.known_sizes.by_class_m={squid: [1.0, 0.7]}": "there is no such class",
+    "+mapping.known_sizes.by_class_m={diamond: [1.0]}": "by_class_m",
+    "+mapping.known_sizes.by_class_m={diamond: [.nan, 1.0]}": "by_class_m",
+    "mapping.survey.points_map=[[1.0]]": "points_map",
+    "detector.threads=0": "threads is 0",
+    "detector.blur_px=99": "blur_px is 99",
+    "detector.max_range_m=-1": "max_range_m is -1",
+    "detector.min_score=nan": "min_score is nan",
+    "detector.border_px=-3": "border_px is -3",
+    "detector.model=nowhere.onnx": "nowhere.onnx",
+    "drive.max_gap_s=-1": "max_gap_s is -1",
+    "drive.max_gap_s=nan": "max_gap_s is nan",
+    "export=[pdf]": "pdf",
+    "maping.max_range_m=1": "did you mean mapping",
+    "drive": "is no key=value",
+    "+run=port9": "port9",
+    "drive.path=straße": "wants quotes",
+    "mapping=null": "mapping",
+    "drive.cameras=front": "drive.cameras",
+    "--config-name=x": "'x'",
+}
+
+SIMULATED = {
+    "simulate.name=../x": "separator of folders",
+    "simulate.seed=-1": "simulate.seed is -1",
+    "simulate.cameras.front.width=0": "width is 0",
+    "simulate.cameras.front.width=100000": "width is 100000",
+    "simulate.route.image_spacing_m=0": "image_spacing_m is 0",
+    "simulate.route.speed_mps=nan": "speed_mps is nan",
+    "simulate.exposure.full_well_electrons=0": "full_well_electrons is 0",
+    "simulate.yard.barriers=-5": "barriers is -5",
+    "+simulate.cameras.both=${simulate.cameras.front}": "results of all",
+}
+
+TRAINING = {
+    "batch=0": "batch is 0",
+    "batch=-4": "batch is -4",
+    "data.width=7": "data.width is 7",
+    "data.width=0": "data.width is 0",
+    "data.height=100": "data.height is 100",
+    "data.width=1024": "data.width x data.height",
+    "data.reservoir=0": "data.reservoir is 0",
+    "data.views_per_render=0": "views_per_render is 0",
+    "data.workers=-1": "data.workers is -1",
+    "data.kerbs=nan": "data.kerbs is nan",
+    "data.labelled_share=2": "labelled_share is 2",
+    "learning_rate=nan": "learning_rate is nan",
+    "learning_rate=-1": "learning_rate is -1",
+    "learning_rate=0": "learning_rate is 0",
+    "weight_decay=inf": "weight_decay is inf",
+    "minutes=-1": "minutes is -1",
+    "minutes=nan": "minutes is nan",
+    "minutes=inf": "minutes is inf",
+    "steps=0": "steps is 0",
+    "warmup=1": "warmup is 1",
+    "ema_updates=0": "ema_updates is 0",
+    "threads=0": "threads is 0",
+    "seed=-1": "seed is -1",
+    "checkpoint_minutes=0": "checkpoint_minutes is 0",
+    "net.widths=[8]": "net.widths",
+    "net.widths=[]": "net.widths",
+    "net.head_width=0": "net.head_width is 0",
+    "loss.dice=-1": "loss.dice is -1",
+    "validation.images=-1": "validation.images is -1",
+    "device=abacus": "device=abacus",
+    "start=nowhere.pt": "nowhere.pt",
+    "catalogue=nowhere.yaml": "nowhere.yaml",
+    "data.coco=nowhere.json": "nowhere.json",
+}
+
+EXPORTS = {
+    "opset=3": "opset is 3",
+    "opset=99": "opset is 99",
+    "tolerance=nan": "tolerance is nan",
+    "int8.frames=0": "int8.frames is 0",
+    "int8.bounds.kinds_agree=7": "kinds_agree is 7",
+    "checkpoint=nowhere.pt": "nowhere.pt",
+    "precision=int4": "precision",
+    "output=a.pt": "inputs",
+}
+
+
+def settings() -> Iterator[Case]:
+    """Settings of the doors that Hydra configures."""
+    for line, says in SETTINGS.items():
+        words = (line.strip("'"), "workers=1") if "workers" not in line else (line,)
+        yield Case(f"map {line}", "v2hdm.map", ("drive.path=drive", *words), drive(), says)
+    for line, says in SIMULATED.items():
+        yield Case(f"map {line}", "v2hdm.map", ("+run=port2", "workers=1", line), _both(), says)
+    for line, says in TRAINING.items():
+        end = () if line.startswith(("minutes", "steps")) else ("steps=1",)
+        words = (line, *end) if line.startswith("validation") else (line, *end, "validation.images=0")
+        yield Case(f"train {line}", "train.__main__", words, _both(), says)
+    for line, says in EXPORTS.items():
+        words = [
+            one for one in ("checkpoint=a.pt", "output=b.onnx") if one.split("=")[0] != line.split("=")[0]
+        ]
+        yield Case(f"export {line}", "export.__main__", (*words, line), write("a.pt", "x"), says)
+    run = ("drive.path=drive", "--config-dir", "conf", "+run=mine", "workers=1")
+    for name, (text, says) in YAML_TEXTS.items():
+        if name in ("empty", "only a comment"):
+            continue
+        header = b"# @package _global_\n" if name not in ("utf-16",) else b""
+        data = text.encode() if isinstance(text, str) else text
+        says = says if "expected" not in says else "mine|list|dict|config"
+        yield Case(
+            f"run file: {name}", "v2hdm.map", run, _run_file(header + data), f"{says}|mine.yaml|configuration"
+        )
+    yield Case("run file without its header", "v2hdm.map", run, _run_file(b"name: x\n"), "@package _global_")
+
+
+def _run_file(data: bytes) -> Prepare:
+    def prepare(root: Path) -> None:
+        drive()(root)
+        (root / "conf" / "run").mkdir(parents=True)
+        (root / "conf" / "run" / "mine.yaml").write_bytes(data)
+
+    return prepare
+
+
+def all_cases() -> list[Case]:
+    """The table."""
+    return [case for part in (texts, names, images, fields, outputs, arguments, settings) for case in part()]

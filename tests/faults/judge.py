@@ -1,0 +1,189 @@
+"""The judge of a bad input: what the door may do with it, and what it may not.
+
+A case makes a folder of inputs and names a door with its arguments. The judge runs that door in this process
+and asserts its exit code, exactly one line of error without a traceback, that every file that was there is
+what it was, that nothing new is left, and that it ended in time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib
+import io
+import logging
+import os
+import re
+import resource
+import signal
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+LONGEST_S = 60
+HYDRA_DOORS = ("v2hdm.map", "train.__main__", "export.__main__")
+
+Prepare = Callable[[Path], None]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One bad input or situation.
+
+    Attributes:
+        name: says what is wrong.
+        door: the module whose ``main`` is run.
+        arguments: of its command line.
+        prepare: makes the inputs in the folder that the door is run in.
+        says: what the line of error has in it, a regular expression.
+        code: exit code.
+        leaves: pattern of new files that may stay.
+        disk_bytes: the largest file that can be written, as on a disk that is full; None for any.
+        tells: whether the line may also be a warning or a finding, where the input can be worked on.
+    """
+
+    name: str
+    door: str
+    arguments: Sequence[str]
+    prepare: Prepare
+    says: str
+    code: int = 2
+    leaves: str = r"(?!)"
+    disk_bytes: int | None = None
+    tells: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a door did."""
+
+    code: int | str
+    error: str
+    output: str
+    before: dict[str, str]
+    after: dict[str, str]
+
+    def faults(self, case: Case) -> list[str]:
+        """What it may not have done."""
+        told = [line for line in self.error.splitlines() if line.startswith("error: ")]
+        found = []
+        if self.code != case.code:
+            found.append(f"exit code {self.code}, not {case.code}")
+        if "Traceback" in self.error or "Error:" in self.error.replace("error:", ""):
+            found.append("a traceback")
+        if case.code == 2 and len(told) != 1:
+            found.append(f"{len(told)} lines of error")
+        text = f"{self.error}\n{self.output}" if case.tells else "\n".join(told)
+        if not re.search(case.says, text):
+            found.append(f"does not say {case.says!r}")
+        if re.search(r"<class |object at 0x|None\b|\bdtype|array\(", "\n".join(told)):
+            found.append("speaks Python")
+        changed = [name for name, digest in self.before.items() if self.after.get(name) != digest]
+        if changed:
+            found.append(f"changed or removed {changed}")
+        new = [name for name in self.after if name not in self.before and not re.search(case.leaves, name)]
+        if new:
+            found.append(f"left {new}")
+        return found
+
+
+def judge(case: Case, folder: Path) -> Outcome:
+    """Run a case in an empty ``folder``."""
+    here = folder / "work" / "here"
+    here.mkdir(parents=True)
+    (folder / "precious.txt").write_text("not ours")
+    (here / "precious.txt").write_text("not ours")
+    case.prepare(here)
+    before = _state(folder)
+    with _in_folder(here):
+        code, error, output = _run(case)
+    return Outcome(code, error, output, before, _state(folder))
+
+
+class TookTooLongError(BaseException):
+    """A door did not end."""
+
+
+def _run(case: Case) -> tuple[int | str, str, str]:
+    module = importlib.import_module(case.door)
+    error, output = io.StringIO(), io.StringIO()
+    logger = logging.getLogger()
+    handlers, level = list(logger.handlers), logger.level
+    code: int | str
+    with pytest.MonkeyPatch.context() as patch, _in_time(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        patch.setattr(sys, "argv", [case.door, *case.arguments])
+        patch.setattr(sys, "stderr", error)
+        patch.setattr(sys, "stdout", output)
+        logger.handlers = []
+        with _full_disk(case.disk_bytes):
+            try:
+                main = module.main
+                code = main() if case.door in HYDRA_DOORS else main(list(case.arguments))
+            except SystemExit as exit_:
+                code = exit_.code if isinstance(exit_.code, int | str) else 0
+            except BaseException as failure:
+                code = type(failure).__name__
+                error.write(traceback.format_exc())
+    logger.handlers = handlers
+    logger.setLevel(level)
+    return code, error.getvalue(), output.getvalue()
+
+
+@contextlib.contextmanager
+def _in_folder(folder: Path) -> Iterator[None]:
+    given = Path.cwd()
+    os.chdir(folder)
+    try:
+        yield
+    finally:
+        os.chdir(given)
+
+
+@contextlib.contextmanager
+def _in_time() -> Iterator[None]:
+    def stop(*_: object) -> None:
+        raise TookTooLongError
+
+    given = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(LONGEST_S)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, given)
+
+
+@contextlib.contextmanager
+def _full_disk(most: int | None) -> Iterator[None]:
+    """Files end at ``most`` bytes: the kernel refuses what is written beyond."""
+    if most is None:
+        yield
+        return
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def _state(folder: Path) -> dict[str, str]:
+    """Kind and content of everything in a folder."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.is_symlink():
+            found[name] = f"link {path.readlink()}"
+        elif path.is_dir():
+            found[name] = "folder"
+        elif path.is_file():
+            found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        else:
+            found[name] = "special"
+    return found

@@ -1,0 +1,182 @@
+"""Whatever a file holds, readers give a value or one line of their own error: nothing else is ever raised."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from tests.drive.example import camera_info, looking_forward, make_map
+from tests.faults.cases import JSON_TEXTS, YAML_TEXTS, damaged_inside, picture
+from v2hdm.detection.image_file import read_bgr
+from v2hdm.drive.camera_info import read_camera_info, write_camera_info
+from v2hdm.drive.poses.kitti_rows import read_kitti_rows
+from v2hdm.drive.poses.nmea import read_nmea
+from v2hdm.drive.poses.table import read_table
+from v2hdm.drive.tum import read_image_list, read_tum
+from v2hdm.errors import DriveError, V2hdmError
+from v2hdm.hdmap.calibration import read_calibration, write_calibration
+from v2hdm.hdmap.geojson import read_geojson, write_geojson
+from v2hdm.records import Calibration
+from v2hdm.texts import parse_json, parse_yaml, shown, take_name
+
+
+def refusal(read: Callable[[], object], error: type[V2hdmError]) -> str | None:
+    """What a reader says of what it refuses; None where it reads."""
+    try:
+        read()
+    except error as refused:
+        return str(refused)
+    return None
+
+
+PLAIN = st.recursive(
+    st.none() | st.booleans() | st.integers(-(10**12), 10**12) | st.floats(allow_nan=False) | st.text(),
+    lambda below: st.lists(below, max_size=4) | st.dictionaries(st.text(), below, max_size=4),
+    max_leaves=12,
+)
+
+
+@given(st.dictionaries(st.text(), PLAIN, max_size=4))
+def test_what_yaml_writes_of_plain_values_is_read_as_it_was(content: dict[str, Any]) -> None:
+    try:
+        text = yaml.safe_dump(content, allow_unicode=True)
+        known = yaml.safe_load(text) == content
+    except yaml.YAMLError:
+        known = False
+    if known:
+        assert parse_yaml(text, "here", DriveError) == content
+
+
+@given(st.text() | st.binary().map(lambda data: data.decode("utf-8", "replace")))
+@example("\ufeff")
+@example("%YAML 9.9\n---\na: 1")
+@example("1: 2\n? \n")
+def test_any_text_is_plain_values_or_one_line(text: str) -> None:
+    for parse in (parse_yaml, parse_json):
+        assert "\n" not in (refusal(lambda parse=parse: parse(text, "here", DriveError), DriveError) or "")
+
+
+@given(st.text(max_size=80))
+def test_a_name_that_is_taken_names_one_entry_of_a_folder(text: str) -> None:
+    said = refusal(lambda: take_name(text, "here", DriveError), DriveError)
+    if said is not None:
+        assert said.isprintable()
+        return
+    name = take_name(text, "here", DriveError)
+    path = Path("/folder") / f"calibration_{name}.yaml"
+    assert path.parent == Path("/folder")
+    assert Path("/folder", name).parent == Path("/folder")
+    assert name.isprintable()
+    assert len(path.name.encode()) < 230
+
+
+@given(PLAIN)
+def test_what_is_shown_of_a_value_is_a_short_piece_of_one_line(content: object) -> None:
+    text = shown(content)
+    assert len(text) <= 300
+    assert "\n" not in text
+    assert "None" not in text or "None" in str(content)
+
+
+def tum(path: Path) -> None:
+    path.write_text("".join(f"{100 + n} {n}.5 0 0 0 0 0 1\n" for n in range(4)))
+
+
+def image_list(path: Path) -> None:
+    path.write_text("# timestamp filename\n100.0 a.jpg\n101.0 b.jpg\n")
+
+
+def table(path: Path) -> None:
+    path.write_text("stamp_s,x_m,y_m,yaw_deg,quality\n100.0,1,2,3,4\n100.5,2,2,3,4\n")
+
+
+def nmea(path: Path) -> None:
+    path.write_text(
+        "$GPGGA,123519,4807.038,N,01131.000,E,4,08,0.9,545.4,M,46.9,M,,*42\n$GPHDT,274.07,T*03\n"
+        "$GPRMC,123519,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W*6A\n"
+    )
+
+
+def rows(path: Path) -> None:
+    path.write_text("1 0 0 1 0 1 0 0 0 0 1 0\n1 0 0 2 0 1 0 0 0 0 1 0\n")
+    path.with_name("stamps").write_text("1.0\n2.0\n")
+
+
+def calibration(path: Path) -> None:
+    write_calibration(Calibration(camera_info(), looking_forward(), np.eye(6) * 1e-4), path)
+
+
+READERS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
+    "tum": (tum, read_tum),
+    "image list": (image_list, read_image_list),
+    "table": (table, lambda path: read_table(path, {}, path.parent, "here")),
+    "nmea": (nmea, lambda path: read_nmea(path, {}, path.parent, "here")),
+    "kitti rows": (rows, lambda path: read_kitti_rows(path, {"stamps": "stamps"}, path.parent, "here")),
+    "camera_info": (lambda path: write_camera_info(camera_info(), path), read_camera_info),
+    "calibration": (calibration, read_calibration),
+    "map": (lambda path: write_geojson(make_map(), path), read_geojson),
+    "jpeg": (lambda path: path.write_bytes(picture()), read_bgr),
+    "png": (lambda path: path.write_bytes(picture(".png")), read_bgr),
+    "tiff": (lambda path: path.write_bytes(picture(".tiff")), read_bgr),
+    "bmp": (lambda path: path.write_bytes(picture(".bmp")), read_bgr),
+    "webp": (lambda path: path.write_bytes(picture(".webp")), read_bgr),
+}
+
+Cut = tuple[float, float, bytes]
+CUTS = st.lists(
+    st.tuples(st.floats(0, 1), st.floats(0, 0.2), st.binary(max_size=6) | st.sampled_from(
+        [b"nan", b"1e999", b"-1", b"[", b"{", b"&a", b"*a", b"!!x ", b"\t", b"\n", b"null", b"true", b"\xff"]
+    )),
+    min_size=1, max_size=3,
+)  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", READERS)
+@settings(max_examples=40)
+@given(cuts=CUTS)
+def test_a_file_that_was_damaged_is_read_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, name: str, cuts: list[Cut]
+) -> None:
+    write, read = READERS[name]
+    path = tmp_path_factory.mktemp("damaged") / "file"
+    write(path)
+    data = path.read_bytes()
+    for at, length, new in cuts:
+        begin = int(at * len(data))
+        data = data[:begin] + new + data[begin + int(length * len(data)) :]
+    path.write_bytes(data)
+    assert "\n" not in (refusal(lambda: read(path), V2hdmError) or "")
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_what_is_whole_is_read(tmp_path: Path, name: str) -> None:
+    write, read = READERS[name]
+    write(tmp_path / "file")
+    assert read(tmp_path / "file") is not None
+
+
+def test_every_text_of_the_table_is_refused_by_the_gate_or_by_its_form() -> None:
+    for name, (text, _) in YAML_TEXTS.items():
+        if isinstance(text, str):
+            said = refusal(lambda text=text: parse_yaml(text, "here", DriveError), DriveError)
+            assert said is not None or not isinstance(parse_yaml(text, "here", DriveError), dict), name
+    for text, _ in JSON_TEXTS.values():
+        if isinstance(text, str):
+            refusal(lambda text=text: parse_json(text, "here", DriveError), DriveError)
+
+
+def test_the_decoders_complaints_are_kept_from_the_terminal(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a.jpg").write_bytes(damaged_inside())
+    with pytest.raises(DriveError, match="damaged"):
+        read_bgr(tmp_path / "a.jpg")
+    assert capfd.readouterr().err == ""

@@ -1,0 +1,64 @@
+"""A sweep does each of its jobs, wherever its launcher runs them, in a folder of its own."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from export.config import ExportConfig
+from v2hdm.config import Job, work_on
+from v2hdm.errors import ConfigError
+
+
+def sweep(monkeypatch: pytest.MonkeyPatch, folder: Path, launcher: str) -> None:
+    if launcher == "joblib":
+        pytest.importorskip(
+            "hydra_plugins.hydra_joblib_launcher", reason="hydra-joblib-launcher is not installed"
+        )
+    line = ("--multirun", "checkpoint=a", "opset=18,19", f"hydra/launcher={launcher}")
+    places = (f"output={folder / 'net.onnx'}", f"hydra.sweep.dir={folder}")
+    monkeypatch.setattr(sys, "argv", ["export", *line, *places])
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("launcher", ["basic", "joblib"])
+def test_each_job_has_a_folder_and_the_first_code_that_is_not_0_is_the_sweeps(
+    launcher: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def work(job: Job) -> int:
+        folder = Path(job.folder(str(tmp_path)))
+        folder.mkdir()
+        (folder / "opset").write_text(str(job.composed.opset))
+        return 3 if job.composed.opset == 19 else 0
+
+    sweep(monkeypatch, tmp_path, launcher)
+    assert work_on("export", ExportConfig, work, lambda do: do() or 0, "") == 3
+    written = {path.parent.name: path.read_text() for path in tmp_path.glob("*/opset")}
+    assert written == {"0-opset=18": "18", "1-opset=19": "19"}
+
+
+def test_a_job_that_fails_names_itself_and_the_others_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[int] = []
+
+    def work(job: Job) -> None:
+        if job.composed.opset == 18:
+            raise ConfigError("not this one")
+        done.append(job.composed.opset)
+
+    said: list[str] = []
+
+    def settle(do) -> int:
+        try:
+            return do() or 0
+        except ConfigError as error:
+            said.append(str(error))
+            return 2
+
+    sweep(monkeypatch, tmp_path, "basic")
+    assert work_on("export", ExportConfig, work, settle, "") == 2
+    assert done == [19]
+    assert said == ["job 0-opset=18: not this one"]
