@@ -14,7 +14,7 @@ import logging
 import os
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO
@@ -69,6 +69,43 @@ def result_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
             shutil.rmtree(unfinished, ignore_errors=True)
             if target.exists():
                 shutil.rmtree(previous, ignore_errors=True)
+
+
+@contextmanager
+def added_to(folder: Path, names: Sequence[str], option: str) -> Iterator[Path]:
+    """A finished result to write further files into, which are on its list afterwards.
+
+    Args:
+        folder: of the result.
+        names: of the files that may be written.
+        option: which says what folder it is, for errors.
+
+    Raises:
+        ConfigError: the folder is no result of ours, a file of these names in it is not ours, it cannot be
+            written, or another process is writing it.
+    """
+    target = _resolved(folder, option)
+    with ExitStack() as stack:
+        with _explained(folder, option):
+            stack.enter_context(_locked(target, folder, option))
+            ours = _ours(target, folder, option, unchanged=False)
+        if ours is None:
+            raise ConfigError(f"{folder}: is no result of ours; give another {option}")
+        for name in names:
+            if (target / name).exists() and ours.get(name) != _digest(target / name):
+                raise ConfigError(f"{folder / name}: is no file of ours; move it, or give another {option}")
+        try:
+            yield target
+        except OSError as failure:
+            if failure.errno in _FULL:
+                raise _cannot_write(folder, failure, option) from None
+            raise
+        finally:
+            with (target / MARKER).open("a", encoding="utf-8") as stream:
+                for name in names:
+                    if (target / name).is_file():
+                        entry = {"file": name, "sha256": _digest(target / name)}
+                        stream.write(json.dumps(entry) + "\n")
 
 
 class GrowingFolder:

@@ -14,7 +14,8 @@ from omegaconf.errors import OmegaConfBaseException
 from v2hdm.drive import read_drive
 from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.files import load_yaml
-from v2hdm.orthophoto.result import RESOLUTION_M, write_mosaic
+from v2hdm.orthophoto.result import MOSAIC_FILES, RESOLUTION_M, write_mosaic
+from v2hdm.outputs import added_to
 from v2hdm.pipeline.run import RunConfig, check_device
 from v2hdm.records import Drive
 from v2hdm.simulate import rendered_drive
@@ -66,10 +67,8 @@ def mosaic_of_result(parsed: argparse.Namespace) -> list[str]:
         raise MapFileError(f"{parsed.result}: no such folder; give the result folder of v2hdm.map")
     drive = drive_of_result(parsed.result, parsed.drive)
     resolution_m = RESOLUTION_M if parsed.resolution is None else parsed.resolution
-    try:
-        found = write_mosaic(parsed.result, drive, resolution_m, parsed.device, _tell)
-    except OSError as error:
-        raise ConfigError(f"{parsed.result}: the mosaic cannot be written there ({error})") from None
+    with added_to(parsed.result, MOSAIC_FILES, "RESULT") as folder:
+        found = write_mosaic(folder, drive, resolution_m, parsed.device, _tell)
     sharpness = found["sharpness"]
     lines = []
     if sharpness["edges"]:

@@ -337,8 +337,8 @@ MISTAKES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "no size": (opencv_mistake("image_width: 1280\n", ""), "missing key 'image_width'; add the size"),
     "six": (lambda folder: write_opencv(folder / "a.yml", [0.0] * 6), "6 distortion coefficients; expected"),
     "zero focal": (opencv_mistake(r"905\.5", "0."), "positive fx, fy"),
-    "cut yaml": (text_mistake("a.yaml", "cam0: {camera_model: pinhole"), "line 1: YAML syntax error"),
-    "cut json": (text_mistake("a.json", '{"camera_matrix": {"rows": 3'), "line 1: JSON syntax error"),
+    "cut yaml": (text_mistake("a.yaml", "cam0: {camera_model: pinhole"), "line 1 YAML syntax error"),
+    "cut json": (text_mistake("a.json", '{"camera_matrix": {"rows": 3'), "line 1 JSON syntax error"),
     "cut xml": (text_mistake("a.xml", "<?xml version='1.0'?>\n<opencv_storage><a>"), "XML syntax error"),
     "xml bomb": (
         text_mistake("a.xml", '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]><opencv_storage/>'),

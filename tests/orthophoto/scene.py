@@ -19,6 +19,7 @@ from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import exp, inverse
 from v2hdm.hdmap.calibration import write_calibration
 from v2hdm.hdmap.geojson import write_geojson
+from v2hdm.outputs import result_folder
 from v2hdm.records import (
     Calibration,
     Camera,
@@ -115,13 +116,13 @@ def drive_of(folder: Path, ground, offset_m: float = 0.0) -> Drive:
 
 def result_of(folder: Path, drive: Drive) -> Path:
     """The result folder of a run over a drive that has found mounting, poses and squares exactly."""
-    out = folder / "result"
-    out.mkdir()
-    write_drive(drive.root, drive, drive.recorded)
-    write_tum(replace(drive.recorded, map_from_vehicle=true_poses()), out / "trajectory.tum")
-    write_calibration(
-        Calibration(INFO, cam_from_vehicle()), out / "calibration_front.yaml", clock_s=(0.0, 0.001)
-    )
-    write_geojson(HdMap(tuple(Marking("diamond", s, 7) for s in SQUARES), origin=ORIGIN), out / "map.geojson")
-    (out / "config.yaml").write_text(dump_yaml({"name": "plane", "drive": {"path": str(drive.root)}}))
-    return out
+    with result_folder(folder / "result") as out:
+        write_drive(drive.root, drive, drive.recorded)
+        write_tum(replace(drive.recorded, map_from_vehicle=true_poses()), out / "trajectory.tum")
+        write_calibration(
+            Calibration(INFO, cam_from_vehicle()), out / "calibration_front.yaml", clock_s=(0.0, 0.001)
+        )
+        hd_map = HdMap(tuple(Marking("diamond", s, 7) for s in SQUARES), origin=ORIGIN)
+        write_geojson(hd_map, out / "map.geojson")
+        (out / "config.yaml").write_text(dump_yaml({"name": "plane", "drive": {"path": str(drive.root)}}))
+    return folder / "result"

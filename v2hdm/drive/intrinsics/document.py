@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
+import re
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from v2hdm.errors import DriveError
-from v2hdm.files import read_text
+from v2hdm.texts import parse_json, parse_yaml, read_text
 
 
 @dataclass(frozen=True)
@@ -23,17 +21,8 @@ class Document:
     entries: dict[str, Any]
 
 
-class _Loader(yaml.SafeLoader):
-    """Takes OpenCV's matrices for the entries that they are."""
-
-
-def _matrix(loader: _Loader, node: yaml.Node) -> dict[Any, Any]:
-    if not isinstance(node, yaml.MappingNode):
-        raise yaml.constructor.ConstructorError(None, None, "a matrix without rows, cols and data", None)
-    return loader.construct_mapping(node, deep=True)
-
-
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
+_END_OF_MESSAGE = re.compile(r"\n---\s*$")
+"""What ``ros2 topic echo`` writes ends with a second, empty document."""
 
 
 def read_document(path: Path) -> Document:
@@ -56,29 +45,14 @@ def read_document(path: Path) -> Document:
 
 
 def _of_yaml(path: Path, text: str) -> dict[str, Any]:
-    try:
-        # OpenCV 4 and others begin their files with a directive that YAML 1.1 refuses.
-        parts = list(yaml.load_all(text.removeprefix("%YAML:1.0"), _Loader))
-    except yaml.YAMLError as failure:
-        mark = getattr(failure, "problem_mark", None)
-        line = f" line {mark.line + 1}:" if mark is not None else ""
-        problem = getattr(failure, "problem", None) or "not readable"
-        raise DriveError(f"{path}:{line} YAML syntax error: {problem}; restore the file") from None
-    except RecursionError:
-        raise DriveError(f"{path}: nested too deep; restore the file") from None
-    # What `ros2 topic echo` writes ends with a second, empty document.
-    parts = [part for part in parts if part is not None]
-    if len(parts) != 1:
-        raise DriveError(f"{path}: {len(parts)} YAML documents; leave one of them in it")
-    return parts[0] if isinstance(parts[0], dict) else {}
+    # OpenCV 4 begins its files with a directive that YAML 1.1 refuses; its tag says no more than the keys.
+    plain = text.removeprefix("%YAML:1.0").replace("!!opencv-matrix", "")
+    content = parse_yaml(_END_OF_MESSAGE.sub("\n", plain), str(path), DriveError)
+    return content if isinstance(content, dict) else {}
 
 
 def _of_json(path: Path, text: str) -> dict[str, Any]:
-    try:
-        content = json.loads(text)
-    except (json.JSONDecodeError, RecursionError) as failure:
-        line = f" line {failure.lineno}:" if isinstance(failure, json.JSONDecodeError) else ""
-        raise DriveError(f"{path}:{line} JSON syntax error; restore the file") from None
+    content = parse_json(text, str(path), DriveError)
     return content if isinstance(content, dict) else {}
 
 
@@ -97,7 +71,7 @@ def _of_xml(path: Path, text: str) -> dict[str, Any]:
 def _xml_value(node: ET.Element) -> object:
     if node.get("type_id") == "opencv-matrix":
         entry: dict[str, object] = {child.tag: _scalar(child.text) for child in node}
-        entry["data"] = (node.findtext("data") or "").split()
+        entry["data"] = [_scalar(word) for word in (node.findtext("data") or "").split()]
         return entry
     return _scalar(node.text)
 
