@@ -23,7 +23,7 @@ from v2hdm.mapping.naive import naive_markings
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.outlines import map_symbols
-from v2hdm.mapping.outputs import adjusted_poses, clock_offsets
+from v2hdm.mapping.outputs import adjusted_poses, clock_offsets, residuals_of
 from v2hdm.mapping.remedy import Outcome, optimise
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.sightings.table import Sightings, camera_of, collect_sightings
@@ -174,6 +174,7 @@ def _optimised_result(
         evidence=outcome.evidence,
         poses=adjusted_poses(outcome),
         clocks=clock_offsets(outcome),
+        residuals=residuals_of(outcome, optimised),
     )
 
 

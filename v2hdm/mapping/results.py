@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from v2hdm.hdmap.residuals import Residuals
 from v2hdm.mapping.evidence import SolveEvidence
 from v2hdm.records import BoolArray, Calibration, FloatArray, HdMap, Image, Marking
 
@@ -76,7 +77,8 @@ class MethodResult:
     ``diagnostics`` are named figures for the log and the report; ``certainty`` says of each camera
     in a sentence what the drive determined and what rests on the survey; ``evidence`` is what the checks
     after the solve rest on, ``poses`` the vehicle's poses as the solve has adjusted them, ``clocks`` the
-    offsets of the cameras' clocks, corrections before the solve included.
+    offsets of the cameras' clocks, corrections before the solve included; ``residuals`` are those of the
+    corner observations that it accepted.
     """
 
     name: str
@@ -92,3 +94,4 @@ class MethodResult:
     evidence: SolveEvidence | None = None
     poses: AdjustedPoses | None = None
     clocks: Mapping[str, ClockOffset] = field(default_factory=dict)
+    residuals: Residuals | None = None

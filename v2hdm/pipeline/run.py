@@ -27,6 +27,7 @@ from v2hdm.errors import AdjustError, ConfigError, MappingError, V2hdmError
 from v2hdm.hdmap.formats import check_formats
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions, check_options
+from v2hdm.pipeline.about import describe_run
 from v2hdm.pipeline.evaluate import CameraSets, evaluate
 from v2hdm.pipeline.inspect import Inspection, inspect
 from v2hdm.pipeline.write import write_results
@@ -34,6 +35,7 @@ from v2hdm.quality import Finding, Status, Verdict
 from v2hdm.quality.results.result import check_result
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.outputs import result_folder, write_json
+from v2hdm.report.page.write import write_page
 from v2hdm.simulate import PortConfig, rendered_drive
 
 log = logging.getLogger(__name__)
@@ -135,7 +137,7 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
         log.info("drive %s: %d images of cameras %s", drive.name, len(drive.images), ", ".join(drive.cameras))
         with _timed(seconds, "check"):
             inspection = inspect(drive, config.drive.max_gap_s, _workers(config), partial(progress, "check"))
-        about = {"name": name, "version": __version__}
+        about = describe_run(name, drive, drive_folder, config.drive)
         try:
             result = _map_and_judge(config, inspection, folder, about, seconds, progress)
         except (MappingError, AdjustError) as failure:
@@ -171,6 +173,8 @@ def _map_and_judge(
     write_results(
         folder, described, detections, methods, judgement, metrics, verdict, config.all_maps, config.export
     )
+    with _timed(seconds, "report"):
+        write_page(folder, described)
     return RunResult(Path(config.output) / about["name"], metrics, judgement.headlines, verdict)
 
 
@@ -182,6 +186,7 @@ def _without_map(
     verdict = Verdict.of([*inspection.findings, failed])
     metrics = {**about, "verdict": verdict.as_json(), "results": {}}
     write_json(folder / "metrics.json", metrics)
+    write_page(folder, inspection.drive_as_described)
     return RunResult(Path(config.output) / about["name"], metrics, (), verdict)
 
 

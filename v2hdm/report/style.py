@@ -13,6 +13,17 @@ from matplotlib.figure import Figure
 
 from v2hdm.files import whole_file
 
+OKABE_ITO = {
+    "orange": "#e69f00",
+    "sky": "#56b4e9",
+    "green": "#009e73",
+    "yellow": "#f0e442",
+    "blue": "#0072b2",
+    "vermillion": "#d55e00",
+    "purple": "#cc79a7",
+}
+"""Colours that colour-blind people tell apart: Okabe and Ito, Color Universal Design, 2008."""
+
 TRUTH = "#9aa4ad"
 ROUTE = "#c9d3da"
 METHOD = {"CNI": "#e08a1e", "ENI": "#d0432b", "Opt": "#0b7a75", "ONI": "#3b6fb6"}
