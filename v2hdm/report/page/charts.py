@@ -86,7 +86,7 @@ def site_chart(hd_map: HdMap, route: Route | None, excluded: FloatArray) -> str:
     if route is not None:
         points.append(route.map_from_vehicle[:, :2, 3])
     spread = np.ptp(np.concatenate(points), axis=0) + 10.0
-    height_in = float(np.clip(7.2 * spread[1] / spread[0], 2.2, 6.4))
+    height_in = float(np.clip(6.4 * spread[1] / spread[0] + 0.8, 2.4, 6.2))
     with _chart("site", 7.2, height_in) as (figure, out):
         axes = figure.subplots()
         if route is not None:
@@ -154,7 +154,7 @@ def field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]]
     columns = min(2, len(names))
     rows = -(-len(names) // columns)
     panel_in = 7.2 / columns
-    with _chart("field", 7.2, rows * (panel_in * height_px / width_px + 0.75)) as (figure, out):
+    with _chart("field", 7.2, rows * (0.84 * panel_in * height_px / width_px + 0.75)) as (figure, out):
         panels = np.atleast_1d(figure.subplots(rows, columns)).ravel()
         for axes in panels[len(names) :]:
             axes.set_axis_off()

@@ -195,9 +195,9 @@ def _residual_charts(facts: Facts, residuals: GroundResiduals | None) -> tuple[C
         ),
         Chart(
             "Over range",
-            "In the image the residuals should hardly depend on the distance. On the ground they grow "
-            "with it, "
-            "since a far pixel covers more ground; the map is made of many such sightings and is better.",
+            "In the image near corners scatter more, for there a centimetre is more pixels; a rise at the "
+            "far end would be a wrong tilt or lens. On the ground residuals grow with range, since a far "
+            "pixel covers more of it. The map is made of many such sightings and is better than each.",
             charts.range_chart(residuals),
         ),
         Chart(

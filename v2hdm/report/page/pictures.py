@@ -65,14 +65,14 @@ def pictures(facts: Facts) -> dict[str, list[dict[str, Any]]]:
     if facts.drive is None or facts.residuals is None or facts.route is None or facts.hd_map is None:
         return {}
     images = {_name(image, facts.drive): image for image in facts.drive.images}
-    cuts = [cut for cut in _cuts(facts) if cut.image in images]
+    calibrations = {name: one.calibration for name, one in facts.cameras.items()}
+    cam_from_map = cams_from_map(facts.residuals, facts.route, calibrations)
+    cuts = [cut for cut in _cuts(facts, cam_from_map) if cut.image in images]
     cuts = sorted(cuts, key=lambda cut: cut.rank)[: BUDGET_BYTES // _USUAL_BYTES]
     made: list[tuple[int, str, dict[str, Any]]] = []
     by_image: dict[str, list[_Cut]] = {}
     for cut in cuts:
         by_image.setdefault(cut.image, []).append(cut)
-    calibrations = {name: one.calibration for name, one in facts.cameras.items()}
-    cam_from_map = cams_from_map(facts.residuals, facts.route, calibrations)
     for name, wanted in by_image.items():
         image = images[name]
         pixels = read_image(image, facts.drive.cameras[image.camera])
@@ -107,13 +107,13 @@ def _name(image: Image, drive: Drive) -> str:
     return path.relative_to(drive.root).as_posix() if path.is_relative_to(drive.root) else str(path)
 
 
-def _cuts(facts: Facts) -> Iterable[_Cut]:
+def _cuts(facts: Facts, cam_from_map: FloatArray) -> Iterable[_Cut]:
     assert facts.hd_map is not None
     yield from _of_markings(facts)
     for symbol in facts.hd_map.symbols:
-        yield from _of_place(facts, symbol_key(symbol.id), symbol.outline_map)
+        yield from _of_place(facts, cam_from_map, symbol_key(symbol.id), symbol.outline_map)
     for number, one in enumerate(facts.excluded):
-        yield from _of_place(facts, excluded_key(number), one.position_map[None])
+        yield from _of_place(facts, cam_from_map, excluded_key(number), one.position_map[None])
 
 
 def _of_markings(facts: Facts) -> Iterable[_Cut]:
@@ -147,13 +147,13 @@ def _of_markings(facts: Facts) -> Iterable[_Cut]:
                 yield _Cut(marking_key(marking), rank, residuals.image[row], row, corners[marking], seen_px)
 
 
-def _of_place(facts: Facts, key: str, shape_map: FloatArray) -> Iterable[_Cut]:
+def _of_place(
+    facts: Facts, cam_from_map: FloatArray, key: str, shape_map: FloatArray
+) -> Iterable[_Cut]:
     """Those that look at a place from near, one of each camera; other things may stand in the way."""
-    residuals, route = facts.residuals, facts.route
+    residuals = facts.residuals
     assert residuals is not None
-    assert route is not None
     centre = shape_map.mean(axis=0)
-    cam_from_map = _all_cams(facts)
     rank = 0
     for name, one in facts.cameras.items():
         rows = np.flatnonzero([camera == name for camera in residuals.camera])
@@ -170,14 +170,6 @@ def _of_place(facts: Facts, key: str, shape_map: FloatArray) -> Iterable[_Cut]:
             best = rows[near][np.argmin(depth_m[near, 0])]
             yield _Cut(key, rank, residuals.image[best], int(best), shape_map, np.empty((0, 2)))
             rank += 1
-
-
-def _all_cams(facts: Facts) -> FloatArray:
-    assert facts.residuals is not None
-    assert facts.route is not None
-    return cams_from_map(
-        facts.residuals, facts.route, {name: one.calibration for name, one in facts.cameras.items()}
-    )
 
 
 def _cut_out(

@@ -165,9 +165,9 @@ def truth_table(facts: Facts) -> Table | None:
         number(_inside(facts.hd_map.markings, facts), 0, 100),
     ])  # fmt: skip
     return table(
-        "The drive was rendered, so the truth is known; the mapper never sees it. Recall counts the "
-        "markings that "
-        "were driven past in full view. The last column tests the stated accuracy: 95 would be perfect.",
+        "The drive was rendered, so the truth is known; the mapper never sees it. Recall counts markings "
+        "that were driven past in full view. The last column tests the stated accuracy: 95 is exact, more "
+        "is cautious, less is too bold.",
         ("class", "markings", "false", "recall (%)", "RMSE (cm)", "bias (cm)", "in their 95 % ellipse (%)"),
         rows,
     )

@@ -7,11 +7,13 @@
   const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
   const at = ([x, y]) => [y, x];
   const words = (kind) => kind.replaceAll("_", " ");
-  const cm = (metres, digits = 1) => `${(100 * metres).toFixed(digits)} cm`;
+  const number = (value, digits) => value.toFixed(digits).replace("-", "\u2212");
+  const cm = (metres) => `${number(100 * metres, 1)} cm`;
   const SERIES = ["blue", "green", "vermillion", "purple", "orange", "sky"];
   const DASHES = [null, "7 4", "2 4", "8 3 2 3"];
   const MOST_IN_DETAIL = 1200; // markings in view up to which ellipses and arrows are drawn
-  const LEAST_PX = 3; // of an ellipse in true size below which it would be a dot
+  const LEAST_PX = 3; // half axis of an ellipse below which it would be a dot
+  const NEAR_PX = 6; // pixels of a metre from which ellipses and arrows are drawn
 
   let pictures = null; // parsed when first needed: most of the page's size
   const picturesOf = (key) => {
@@ -44,6 +46,7 @@
 
   // ---- layers ----
   const layers = {};
+  const small = { noClip: true, smoothFactor: 0 }; // four corners gain nothing by clipping and simplifying
   const still = (renderer) => ({ renderer, interactive: false });
   if (data.mosaic) {
     const [west, south, east, north] = data.mosaic.bounds;
@@ -52,7 +55,7 @@
   }
   if (data.truth) {
     layers.truth = L.featureGroup([
-      ...data.truth.markings.map((corners) => L.polygon(corners.map(at), still(below))),
+      ...data.truth.markings.map((corners) => L.polygon(corners.map(at), { ...still(below), ...small })),
       ...data.truth.lanes.map((line) => L.polyline(line.map(at), still(below))),
     ]);
   }
@@ -67,20 +70,15 @@
     return shape;
   };
   layers.markings = L.featureGroup([
-    ...data.markings.map((one) => feature(L.polygon(one.c.map(at)), { ...one, key: `m${one.id}`, what: "marking" })),
-    ...data.symbols.map((one) => feature(L.polygon(one.p.map(at)), { ...one, key: `s${one.id}`, what: "symbol" })),
+    ...data.markings.map((one) => feature(L.polygon(one.c.map(at), small), { ...one, key: `m${one.id}`, what: "marking" })),
+    ...data.symbols.map((one) => feature(L.polygon(one.p.map(at), small), { ...one, key: `s${one.id}`, what: "symbol" })),
   ]);
   layers.excluded = L.featureGroup(data.excluded.map((one, n) =>
-    feature(L.circleMarker(at(one.p), { radius: 5 }), { ...one, key: `x${n}`, what: "excluded" })));
+    feature(L.circleMarker(at(one.p), { radius: 4 }), { ...one, key: `x${n}`, what: "excluded" })));
   layers.ellipses = L.layerGroup();
   layers.arrows = L.layerGroup();
   const selection = L.layerGroup().addTo(map);
 
-  const extent = (values) => {
-    let [low, high] = [Infinity, -Infinity];
-    for (const value of values) if (Number.isFinite(value)) { low = Math.min(low, value); high = Math.max(high, value); }
-    return [low, high];
-  };
   const worst = (one) => (one.e && Array.isArray(one.e) ? Math.max(...one.e.map((ellipse) => ellipse[0])) : one.e ?? NaN);
   const SHADES = {
     class: { name: "class" },
@@ -112,7 +110,7 @@
     layers.recorded?.setStyle({ color: colour("vermillion"), weight: 1.2, dashArray: "2 5" });
     layers.adjusted?.setStyle({ color: ink, weight: 1.2, dashArray: null });
     layers.markings.eachLayer((shape) => shape.setStyle({ color: fill(shape.about), weight: 1.2, fillOpacity: 0.55, dashArray: shape.about.what === "symbol" ? "4 2" : null }));
-    layers.excluded.setStyle({ color: colour("vermillion"), weight: 1.6, dashArray: "2 2", fill: true, fillOpacity: 0 });
+    layers.excluded.setStyle({ color: colour("vermillion"), weight: 1.3, dashArray: "2 1.5", fill: true, fillOpacity: 0 });
     legend();
     detail();
   }
@@ -127,6 +125,7 @@
   }
 
   function inView() {
+    if (map.getZoomScale(map.getZoom(), 0) < NEAR_PX) return null;
     const bounds = map.getBounds().pad(0.1);
     const found = data.markings.filter((one) => bounds.contains(at(one.c[0])));
     return found.length <= MOST_IN_DETAIL ? found : null;
@@ -159,7 +158,7 @@
     const angle = Math.atan2(ey - y, ex - x);
     const wing = (turn) => [ey + head * Math.sin(angle + turn), ex + head * Math.cos(angle + turn)];
     return L.polyline([[[y, x], [ey, ex]], [wing(2.6), [ey, ex], wing(-2.6)]],
-      { ...still(above), color: colour(SERIES[(camera + 2) % SERIES.length]), weight: 1.8, dashArray: DASHES[camera % DASHES.length] });
+      { ...still(above), color: colour(SERIES[(camera + 3) % SERIES.length]), weight: 1.8, dashArray: DASHES[camera % DASHES.length] });
   }
 
   // ---- the panel ----
@@ -180,7 +179,7 @@
   const SWATCHES = {
     markings: ["var(--blue)", null, "box"], lanes: ["var(--sky)"], truth: ["var(--muted)", "3 3"], ellipses: ["var(--ink)", null, "ring"],
     adjusted: ["var(--ink)"], recorded: ["var(--vermillion)", "2 4"], excluded: ["var(--vermillion)", "2 2", "ring"],
-    arrows: ["var(--vermillion)", null, "arrow"], mosaic: ["var(--line)"],
+    arrows: ["var(--purple)", null, "arrow"], mosaic: ["var(--line)"],
   };
   const COUNTS = { markings: things.length - data.excluded.length, lanes: data.lanes.length, excluded: data.excluded.length, truth: data.truth?.markings.length };
   for (const name of Object.keys(NAMES)) {
@@ -217,7 +216,7 @@
       rows.push(element("div", { class: "ends" }, element("span", {}, text(range[0])), element("span", {}, `${text(range[1])} and more`)));
     }
     if (layers.arrows && map.hasLayer(layers.arrows)) {
-      data.cameras.forEach((name, n) => rows.push(element("div", {}, swatch(`var(--${SERIES[(n + 2) % SERIES.length]})`, DASHES[n % DASHES.length], "arrow"), `${name}: mean of map minus seen`)));
+      data.cameras.forEach((name, n) => rows.push(element("div", {}, swatch(`var(--${SERIES[(n + 3) % SERIES.length]})`, DASHES[n % DASHES.length], "arrow"), `${name}: mean of map minus seen`)));
     }
     byId("legend").replaceChildren(...rows);
   }
@@ -237,7 +236,7 @@
     const { about } = shape;
     const box = element("div", { "data-key": about.key }, element("b", {}, title(about)));
     for (const [name, value] of facts(about)) box.append(`${name}: ${value}`, element("br"));
-    if (about.c) about.c.forEach(([x, y], n) => box.append(`${n + 1}: ${x.toFixed(3)} E, ${y.toFixed(3)} N`, element("br")));
+    if (about.c) about.c.forEach(([x, y], n) => box.append(`${n + 1}: ${number(x, 3)} E, ${number(y, 3)} N`, element("br")));
     return box;
   }
   for (const name of ["markings", "excluded"]) {
@@ -281,7 +280,7 @@
     const head = ["corner", "east (m)", "north (m)", "95 % ellipse (cm)"].map((name, n) => element("th", { scope: "col", ...(n ? { class: "n" } : {}) }, name));
     const rows = about.c.map(([x, y], n) => {
       const ellipse = about.e ? `${(100 * about.e[n][0]).toFixed(1)} × ${(100 * about.e[n][1]).toFixed(1)}` : "–";
-      return element("tr", {}, element("th", { scope: "row" }, String(n + 1)), ...[x.toFixed(3), y.toFixed(3), ellipse].map((cell) => element("td", { class: "n" }, cell)));
+      return element("tr", {}, element("th", { scope: "row" }, String(n + 1)), ...[number(x, 3), number(y, 3), ellipse].map((cell) => element("td", { class: "n" }, cell)));
     });
     return element("table", {}, element("thead", {}, element("tr", {}, ...head)), element("tbody", {}, ...rows));
   }
@@ -301,7 +300,7 @@
   const place = L.control({ position: "bottomright" });
   place.onAdd = () => element("div", { id: "place" });
   place.addTo(map);
-  map.on("mousemove", ({ latlng }) => { byId("place").textContent = `${latlng.lng.toFixed(2)} E, ${latlng.lat.toFixed(2)} N m`; });
+  map.on("mousemove", ({ latlng }) => { byId("place").textContent = `${number(latlng.lng, 2)} m E, ${number(latlng.lat, 2)} m N`; });
 
   // ---- begin ----
   const everything = L.latLngBounds([]);
@@ -314,5 +313,5 @@
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", paint);
   paint();
   byId("map").dataset.ready = String(Math.round(performance.now()));
-  window.v2hdmMap = { map, things, layers }; // for tests and for those who want more of it
+  window.v2hdmMap = { map, things }; // for tests, and for those who want more of it
 })();
