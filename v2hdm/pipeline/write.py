@@ -81,7 +81,7 @@ def write_results(
     maps = {name: result.hd_map for name, result in methods.items()}
     route_map = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
     save_birdseye(folder / "birdseye.png", maps, BEST, route_map, judgement.truth)
-    if judgement.growth:
+    if any(judgement.growth.values()):
         save_growth(folder / "growth.png", judgement.growth)
     for name in best.calibrations:
         image = _fullest_image(drive, name, detections)

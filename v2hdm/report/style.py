@@ -26,8 +26,19 @@ OKABE_ITO = {
 
 TRUTH = "#9aa4ad"
 ROUTE = "#c9d3da"
-METHOD = {"CNI": "#e08a1e", "ENI": "#d0432b", "Opt": "#0b7a75", "ONI": "#3b6fb6"}
+METHOD = {
+    "CNI": OKABE_ITO["orange"],
+    "ENI": OKABE_ITO["vermillion"],
+    "Opt": OKABE_ITO["blue"],
+    "ONI": OKABE_ITO["green"],
+}
 """Colour of each method, the same in every figure."""
+
+LINE: dict[str, Any] = {"CNI": (0, (6, 2)), "ENI": (0, (1.5, 1.5)), "Opt": "-", "ONI": (0, (7, 2, 1.5, 2))}
+"""Line style of each method: they are told apart without colour, too."""
+
+MARKER = {"CNI": "s", "ENI": "^", "Opt": "o", "ONI": "D"}
+"""Marker of each method."""
 
 _RC: dict[Any, Any] = {
     "font.family": "sans-serif",

@@ -147,9 +147,7 @@ def _of_markings(facts: Facts) -> Iterable[_Cut]:
                 yield _Cut(marking_key(marking), rank, residuals.image[row], row, corners[marking], seen_px)
 
 
-def _of_place(
-    facts: Facts, cam_from_map: FloatArray, key: str, shape_map: FloatArray
-) -> Iterable[_Cut]:
+def _of_place(facts: Facts, cam_from_map: FloatArray, key: str, shape_map: FloatArray) -> Iterable[_Cut]:
     """Those that look at a place from near, one of each camera; other things may stand in the way."""
     residuals = facts.residuals
     assert residuals is not None
