@@ -10,6 +10,7 @@ import numpy as np
 
 from v2hdm.report.page import charts, tables
 from v2hdm.report.page.facts import Facts
+from v2hdm.report.page.ground import GroundPage, ground_page
 from v2hdm.report.page.layers import layers
 from v2hdm.report.page.pictures import overlays, pictures
 from v2hdm.report.page.sightings import GroundResiduals, ground_residuals
@@ -63,6 +64,7 @@ class Document:
     map_data: Mapping[str, Any]
     pictures: Mapping[str, Any]
     cameras: tuple[CameraPage, ...]
+    ground: GroundPage | None
     residuals: tuple[Chart, ...]
     excluded: Chart | None
     excluded_words: str
@@ -107,6 +109,7 @@ def document(facts: Facts) -> Document:
         map_data=layers(facts, residuals),
         pictures=pictures(facts),
         cameras=tables.camera_pages(facts, overlays(facts)),
+        ground=ground_page(facts.folder),
         residuals=_residual_charts(facts, residuals),
         excluded=_excluded(facts),
         excluded_words=_excluded_words(facts),

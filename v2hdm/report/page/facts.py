@@ -78,7 +78,7 @@ class Facts:
         cameras: by name.
         route: the adjusted poses.
         residuals: of the corner observations.
-        check_points: header and rows of ``check_points.csv``.
+        check_points: the rows of ``check_points.csv`` by its columns.
         drive: that was mapped.
         truth: of the drive, if it was rendered.
     """
@@ -91,7 +91,7 @@ class Facts:
     cameras: Mapping[str, CameraFacts]
     route: Route | None
     residuals: Residuals | None
-    check_points: tuple[tuple[str, ...], ...]
+    check_points: tuple[Mapping[str, str], ...]
     drive: Drive | None
     truth: Truth | None
 
@@ -138,7 +138,7 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
         cameras=_cameras(folder),
         route=_route(folder, drive),
         residuals=read_residuals(residuals) if residuals.is_file() else None,
-        check_points=_table(folder / "check_points.csv"),
+        check_points=_rows(folder / "check_points.csv"),
         drive=drive,
         truth=read_truth(drive) if drive is not None and drive.truth_dir is not None else None,
     )
@@ -194,3 +194,8 @@ def _table(path: Path) -> tuple[tuple[str, ...], ...]:
     if not path.is_file():
         return ()
     return tuple(tuple(row) for row in csv.reader(io.StringIO(read_text(path, MapFileError))) if row)
+
+
+def _rows(path: Path) -> tuple[Mapping[str, str], ...]:
+    heading, *rows = _table(path) or ((),)
+    return tuple(dict(zip(heading, row, strict=False)) for row in rows)

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from v2hdm.records import FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings
 from v2hdm.report.page.facts import Facts
+from v2hdm.report.page.ground import mosaic_layer
 from v2hdm.report.page.sightings import GroundResiduals
 
 SIGMAS_95 = 2.4477
 """Half axes of the ellipse that holds 95 % of a normal error in two dimensions, in standard deviations: the
 root of the chi-square quantile of two degrees of freedom."""
-
-MOSAIC_BYTES = 3_500_000
-"""Of a mosaic, as text in the page."""
 
 _LEAST_ARROW_SIGHTINGS = 4
 
@@ -101,12 +95,13 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
             {"k": one.kind, "p": _metres(one.position_map[None])[0], "n": one.sightings, "why": one.reason}
             for one in facts.excluded
         ],
+        "checks": _checks(facts),
         "truth": _truth(facts),
         "route": {
             "adjusted": [] if route is None else _metres(route.map_from_vehicle[:, :2, 3]),
             "recorded": [] if route is None or route.recorded is None else _metres(route.recorded[:, :2, 3]),
         },
-        "mosaic": mosaic(facts.folder),
+        "mosaic": mosaic_layer(facts.folder),
     }
 
 
@@ -126,6 +121,25 @@ def _errors(facts: Facts) -> dict[int, float]:
         off = corner_errors([mapped[row]], [true[column]])
         found[row] = float(np.sqrt((off**2).sum(axis=1).mean()))
     return found
+
+
+def _checks(facts: Facts) -> list[dict[str, Any]]:
+    """The surveyed check points: where, and by how much the map differs."""
+    checks = []
+    for one in facts.check_points:
+        place = [_number(one.get(key)) for key in ("x_map_m", "y_map_m")]
+        off = [_number(one.get(key)) for key in ("dx_m", "dy_m")]
+        if None not in place:
+            inside = one.get("inside_95_percent", "")
+            checks.append({"id": one.get("id", ""), "p": place, "off": off, "inside": inside})
+    return checks
+
+
+def _number(text: str | None) -> float | None:
+    try:
+        return float(text or "")
+    except ValueError:
+        return None
 
 
 def _truth(facts: Facts) -> dict[str, Any] | None:
@@ -156,52 +170,3 @@ def _arrows(residuals: GroundResiduals | None) -> dict[int, list[list[float]]]:
         mean = np.round(sums[one] / total[one], 5).tolist()
         out.setdefault(one // count, []).append([one % count, *mean, int(seen[one])])
     return out
-
-
-def mosaic(folder: Path) -> dict[str, Any] | None:
-    """The picture of the ground in the folder, if there is one: JPEG in base64 and its bounds in m.
-
-    ``mosaic.jpg``, ``.png``, ``.webp`` or ``.tif`` with its world file (``.jgw``, ``.pgw``, ``.tfw`` or
-    ``.wld``) in metres of the map.
-    """
-    for path in sorted(folder.glob("mosaic.*")):
-        if path.suffix.lower() not in (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff"):
-            continue
-        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        world = _world_file(path)
-        if pixels is None or world is None or pixels.ndim != 3:
-            continue
-        return _as_layer(pixels, world)
-    return None
-
-
-def _world_file(path: Path) -> Sequence[float] | None:
-    suffix = path.suffix
-    for ending in (f"{suffix[:2]}{suffix[-1]}w", ".wld", f"{suffix}w"):
-        beside = path.with_suffix(ending)
-        if beside.is_file():
-            try:
-                values = [float(one) for one in beside.read_text(encoding="utf-8").split()]
-            except ValueError:
-                return None
-            return values if len(values) == 6 and values[1] == values[2] == 0.0 else None
-    return None
-
-
-def _as_layer(pixels: np.ndarray, world: Sequence[float]) -> dict[str, Any]:
-    """``pixels`` no larger than the budget, and the edges (west, south, east, north) of the picture."""
-    step_x, _, _, step_y, west, north = world
-    height, width = pixels.shape[:2]
-    edges = [west - 0.5 * step_x, north - 0.5 * step_y]
-    edges += [edges[0] + width * step_x, edges[1] + height * step_y]
-    kind, mime = (".webp", "image/webp") if pixels.shape[2] == 4 else (".jpg", "image/jpeg")
-    while True:
-        options = [cv2.IMWRITE_WEBP_QUALITY, 70] if kind == ".webp" else [cv2.IMWRITE_JPEG_QUALITY, 75]
-        text = base64.b64encode(cv2.imencode(kind, pixels, options)[1].tobytes()).decode("ascii")
-        if len(text) <= MOSAIC_BYTES:
-            break
-        factor = 0.9 * float(np.sqrt(MOSAIC_BYTES / len(text)))
-        size = (max(1, round(pixels.shape[1] * factor)), max(1, round(pixels.shape[0] * factor)))
-        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-    bounds = [*np.minimum(edges[:2], edges[2:]).tolist(), *np.maximum(edges[:2], edges[2:]).tolist()]
-    return {"src": text, "type": mime, "bounds": bounds}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +13,7 @@ from v2hdm.detection.batch import read_image
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.records import Drive, FloatArray, Image
+from v2hdm.report.page.coding import jpeg
 from v2hdm.report.page.facts import Facts
 from v2hdm.report.page.layers import excluded_key, marking_key, symbol_key
 from v2hdm.report.page.sightings import cams_from_map
@@ -81,12 +81,6 @@ def pictures(facts: Facts) -> dict[str, list[dict[str, Any]]]:
             if picture is not None:
                 made.append((cut.rank, cut.key, {**picture, "image": name}))
     return _within_budget(made)
-
-
-def jpeg(pixels: np.ndarray, quality: int = _QUALITY) -> str:
-    """An image as JPEG in base64."""
-    coded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1])[1]
-    return base64.b64encode(coded.tobytes()).decode("ascii")
 
 
 def _within_budget(made: list[tuple[int, str, dict[str, Any]]]) -> dict[str, list[dict[str, Any]]]:
@@ -195,7 +189,7 @@ def _cut_out(
         size = (max(1, round(piece.shape[1] * factor)), max(1, round(piece.shape[0] * factor)))
         piece = cv2.resize(piece, size, interpolation=cv2.INTER_AREA)
     return {
-        "src": jpeg(piece),
+        "src": jpeg(piece, _QUALITY),
         "size": [piece.shape[1], piece.shape[0]],
         "camera": image.camera,
         "t": round(float(image.stamp_s), 3),
@@ -214,7 +208,8 @@ def overlays(facts: Facts) -> Mapping[str, str]:
     """By camera the folder's ``overlay_<camera>.png`` as JPEG in base64, where there is one."""
     found = {}
     for name in facts.cameras:
-        pixels = cv2.imread(str(facts.folder / f"overlay_{name}.png"))
+        path = facts.folder / f"overlay_{name}.png"
+        pixels = cv2.imread(str(path)) if path.is_file() else None
         if pixels is None:
             continue
         factor = min(1.0, 1200 / pixels.shape[1])

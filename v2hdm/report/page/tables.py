@@ -109,6 +109,10 @@ def key_figures(facts: Facts) -> tuple[Figure, ...]:
     if "corner_rmse_m" in best:
         note = "root mean square of all corners"
         figures.append(Figure("Against the truth", number(best["corner_rmse_m"], 1, 100), "cm", note))
+    checked = facts.metrics.get("check_points") or {}
+    if "rmse_m" in checked:
+        note = f"RMSE of {checked.get('compared')} surveyed points that no estimate has seen"
+        figures.append(Figure("Check points", number(checked["rmse_m"], 1, 100), "cm", note))
     if "reprojection_rmse_px" in best:
         before = number(best.get("initial_reprojection_rmse_px"), 2)
         figures.append(
@@ -188,34 +192,45 @@ def _inside(markings: Sequence[Marking], facts: Facts) -> float | None:
     return None if len(squared) < _LEAST_FOR_SHARE else float(np.mean(np.array(squared) <= SIGMAS_95**2))
 
 
+_CHECK_COLUMNS: Mapping[str, tuple[str, float | None, int]] = {
+    "id": ("point", None, 0),
+    "description": ("description", None, 0),
+    "marking": ("marking", None, 0),
+    "class": ("class", None, 0),
+    "corner": ("corner", 1.0, 0),
+    "dx_m": ("east (cm)", 100.0, 1),
+    "dy_m": ("north (cm)", 100.0, 1),
+    "distance_m": ("distance (cm)", 100.0, 1),
+    "normalised_error": ("in σ", 1.0, 1),
+    "inside_95_percent": ("inside 95 %", None, 0),
+    "dz_m": ("up (cm)", 100.0, 1),
+    "not_compared_because": ("not compared because", None, 0),
+}
+"""Of the columns of ``check_points.csv`` heading, factor (None for words) and digits."""
+
+
 def check_point_table(facts: Facts) -> Table | None:
-    """The rows of ``check_points.csv`` as they stand there."""
-    if len(facts.check_points) < 2:
+    """Surveyed points that no estimate has seen, beside the map: what ``check_points.csv`` says of them."""
+    rows = facts.check_points
+    shown = [name for name in _CHECK_COLUMNS if any(row.get(name) for row in rows)]
+    if not shown:
         return None
-    heading, *rows = facts.check_points
-    rows = [tuple(_short(cell) for cell in row) for row in rows if len(row) == len(heading)]
-    words = [any(not _is_number(row[n]) for row in rows) for n in range(len(heading))]
     return Table(
-        "Surveyed points that the adjustment was not told of.", tuple(name_of(one) for one in heading),
-        tuple(rows), tuple(not one for one in words),
-    )  # fmt: skip
+        "Surveyed corners that the adjustment was not told of: the map minus the survey.",
+        tuple(_CHECK_COLUMNS[name][0] for name in shown),
+        tuple(tuple(_check_cell(name, row.get(name, "")) for name in shown) for row in rows),
+        tuple(_CHECK_COLUMNS[name][1] is not None for name in shown),
+    )
 
 
-def _is_number(text: str) -> bool:
-    try:
-        float(text.replace("−", "-"))
-    except ValueError:
-        return not text
-    return True
-
-
-def _short(text: str) -> str:
-    """A number with no more digits than anyone reads, other texts as they are."""
-    try:
-        value = float(text)
-    except ValueError:
+def _check_cell(name: str, text: str) -> str:
+    _, factor, digits = _CHECK_COLUMNS[name]
+    if factor is None:
         return text
-    return text if len(text) <= 8 else number(value, 4)
+    try:
+        return number(float(text), digits, factor)
+    except ValueError:
+        return "–"
 
 
 @dataclass(frozen=True)
@@ -241,11 +256,11 @@ def camera_pages(facts: Facts, pictures: Mapping[str, str]) -> tuple[CameraPage,
             f"{info.width} × {info.height} px, focal length {info.intrinsic[0, 0]:.0f} px, "
             f"{name_of(info.distortion_model)}"
         )
-        out.append(CameraPage(name, words, lens, _mounting(name, one, found), pictures.get(name)))
+        out.append(CameraPage(name, words, lens, _mounting(one, found), pictures.get(name)))
     return tuple(out)
 
 
-def _mounting(name: str, one: CameraFacts, found: Mapping[str, Any]) -> Table:
+def _mounting(one: CameraFacts, found: Mapping[str, Any]) -> Table:
     calibration = one.calibration
     matrix, covariance = calibration.cam_from_vehicle, calibration.covariance
     centre, angles = camera_centre(matrix), np.rad2deg(mounting_angles(matrix))
@@ -268,9 +283,7 @@ def _mounting(name: str, one: CameraFacts, found: Mapping[str, Any]) -> Table:
             f"{number(one.clock_sigma_s, 1, 1e3)} ms", "–",
         ])  # fmt: skip
     return table(
-        f"Camera {name} in the vehicle’s frame: the value, its standard deviation, and what the run "
-        f"changed of "
-        "the calibration that it began with.",
+        "",
         ("", "value", "± 1 σ", "changed by"),
         rows,
     )

@@ -75,6 +75,8 @@
   ]);
   layers.excluded = L.featureGroup(data.excluded.map((one, n) =>
     feature(L.circleMarker(at(one.p), { radius: 4 }), { ...one, key: `x${n}`, what: "excluded" })));
+  layers.checks = L.featureGroup(data.checks.map((one, n) =>
+    feature(L.circleMarker(at(one.p), { radius: 6 }), { ...one, key: `c${n}`, what: "check" })));
   layers.ellipses = L.layerGroup();
   layers.arrows = L.layerGroup();
   const selection = L.layerGroup().addTo(map);
@@ -110,6 +112,7 @@
     layers.recorded?.setStyle({ color: colour("vermillion"), weight: 1.2, dashArray: "2 5" });
     layers.adjusted?.setStyle({ color: ink, weight: 1.2, dashArray: null });
     layers.markings.eachLayer((shape) => shape.setStyle({ color: fill(shape.about), weight: 1.2, fillOpacity: 0.55, dashArray: shape.about.what === "symbol" ? "4 2" : null }));
+    layers.checks.setStyle({ color: ink, weight: 2, fillColor: colour("orange"), fillOpacity: 0.9 });
     layers.excluded.setStyle({ color: colour("vermillion"), weight: 1.3, dashArray: "2 1.5", fill: true, fillOpacity: 0 });
     legend();
     detail();
@@ -163,10 +166,10 @@
 
   // ---- the panel ----
   const NAMES = {
-    markings: "markings and symbols", lanes: "lane lines", truth: "truth", ellipses: "95 % ellipses", adjusted: "route, adjusted",
+    markings: "markings and symbols", lanes: "lane lines", truth: "truth", checks: "check points", ellipses: "95 % ellipses", adjusted: "route, adjusted",
     recorded: "route, recorded", excluded: "left out", arrows: "residual arrows", mosaic: "ground mosaic",
   };
-  const ON = ["markings", "lanes", "adjusted", "excluded", "ellipses", "mosaic"];
+  const ON = ["markings", "lanes", "adjusted", "excluded", "checks", "ellipses", "mosaic"];
   const swatch = (stroke, dashes, shape = "line") => {
     const made = element("svg", { viewBox: "0 0 26 14", "aria-hidden": "true" });
     const look = { style: `stroke:${stroke};stroke-width:2;fill:none`, ...(dashes ? { "stroke-dasharray": dashes } : {}) };
@@ -177,11 +180,11 @@
     return made;
   };
   const SWATCHES = {
-    markings: ["var(--blue)", null, "box"], lanes: ["var(--sky)"], truth: ["var(--muted)", "3 3"], ellipses: ["var(--ink)", null, "ring"],
+    markings: ["var(--blue)", null, "box"], lanes: ["var(--sky)"], truth: ["var(--muted)", "3 3"], checks: ["var(--orange)", null, "ring"], ellipses: ["var(--ink)", null, "ring"],
     adjusted: ["var(--ink)"], recorded: ["var(--vermillion)", "2 4"], excluded: ["var(--vermillion)", "2 2", "ring"],
     arrows: ["var(--purple)", null, "arrow"], mosaic: ["var(--line)"],
   };
-  const COUNTS = { markings: things.length - data.excluded.length, lanes: data.lanes.length, excluded: data.excluded.length, truth: data.truth?.markings.length };
+  const COUNTS = { markings: data.markings.length + data.symbols.length, checks: data.checks.length, lanes: data.lanes.length, excluded: data.excluded.length, truth: data.truth?.markings.length };
   for (const name of Object.keys(NAMES)) {
     const empty = !layers[name] || (name === "arrows" && !data.markings.some((one) => one.a)) || COUNTS[name] === 0;
     if (empty) continue;
@@ -207,7 +210,7 @@
   function legend() {
     const rows = [];
     if (shade === "class") {
-      const used = new Set(things.filter((shape) => shape.about.what !== "excluded").map((shape) => shape.about.k));
+      const used = new Set(things.filter((shape) => ["marking", "symbol"].includes(shape.about.what)).map((shape) => shape.about.k));
       for (const k of [...used].sort((a, b) => a - b)) rows.push(element("div", {}, swatch(`var(--${SERIES[k % SERIES.length]})`, null, "box"), words(data.kinds[k])));
     } else {
       const { unit } = SHADES[shade];
@@ -222,14 +225,21 @@
   }
 
   // ---- pointing and selecting ----
-  const title = (about) => (about.what === "excluded" ? `Left out: ${words(about.k)}` : `${about.what === "symbol" ? "Symbol" : "Marking"} ${about.id}, ${words(data.kinds[about.k])}`);
+  const title = (about) => (about.what === "check" ? `Check point ${about.id}` : about.what === "excluded" ? `Left out: ${words(about.k)}` : `${about.what === "symbol" ? "Symbol" : "Marking"} ${about.id}, ${words(data.kinds[about.k])}`);
   function facts(about) {
+    if (about.what === "check") return checked(about);
     const rows = [];
     if (about.what === "excluded") rows.push(["reason", about.why]);
     rows.push(["sightings", `${about.n} ${about.n === 1 ? "image" : "images"}`]);
     if (Number.isFinite(about.r)) rows.push(["95 %, relative", cm(about.r)]);
     if (Number.isFinite(worst(about))) rows.push(["95 %, absolute", cm(worst(about))]);
     if (Number.isFinite(about.t)) rows.push(["off the truth", `${cm(about.t)} RMS`]);
+    return rows;
+  }
+  function checked({ off: [dx, dy], inside }) {
+    if (dx === null || dy === null) return [["map minus survey", "not compared"]];
+    const rows = [["map minus survey", `${cm(dx)} east, ${cm(dy)} north`]];
+    if (inside) rows.push(["inside its 95 % ellipse", inside]);
     return rows;
   }
   function tooltip(shape) {
@@ -239,7 +249,7 @@
     if (about.c) about.c.forEach(([x, y], n) => box.append(`${n + 1}: ${number(x, 3)} E, ${number(y, 3)} N`, element("br")));
     return box;
   }
-  for (const name of ["markings", "excluded"]) {
+  for (const name of ["markings", "excluded", "checks"]) {
     layers[name].bindTooltip(tooltip, { sticky: true, direction: "auto", opacity: 1 });
     layers[name].on("click", (event) => select(event.layer));
   }
@@ -288,7 +298,7 @@
   byId("find").addEventListener("submit", (event) => {
     event.preventDefault();
     const wanted = Number(byId("find-id").value);
-    const found = things.find((shape) => shape.about.id === wanted && shape.about.what !== "excluded");
+    const found = things.find((shape) => shape.about.id === wanted && ["marking", "symbol"].includes(shape.about.what));
     byId("find-id").setCustomValidity(found ? "" : "No marking of this number.");
     byId("find-id").reportValidity();
     if (!found) return;
