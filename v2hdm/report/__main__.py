@@ -28,7 +28,7 @@ def _report(parsed: argparse.Namespace) -> None:
 
     metrics = parsed.folder / "metrics.json"
     if not metrics.is_file():
-        raise MapFileError(f"{parsed.folder}: no metrics.json in it; give the folder of a run of v2hdm.map")
+        raise MapFileError(f"{parsed.folder}: no metrics.json in it; give the result folder of v2hdm.map")
     drive = drive_of(load_json(metrics, MapFileError), parsed.drive)
     path = write_page(parsed.folder, drive)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB" + ("" if drive else ", without the drive's images"))

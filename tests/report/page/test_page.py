@@ -5,8 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -256,17 +254,3 @@ def test_another_drive_than_that_of_the_result_is_refused(tmp_path: Path) -> Non
     metrics["drive"]["path"] = str(tmp_path / "gone")
     assert drive_of(metrics, None) is None
     assert read_drive(tmp_path / "a" / "drive").cameras["front"].info.width == INFO.width
-
-
-def test_a_missing_jinja2_is_one_line_that_names_the_extra(tmp_path: Path) -> None:
-    make_site(tmp_path / "site", 4)
-    (tmp_path / "jinja2.py").write_text('raise ModuleNotFoundError("not installed", name="jinja2")')
-    root = Path(__file__).parents[3]
-    done = subprocess.run(
-        [sys.executable, "-m", "v2hdm.report", str(tmp_path / "site")],
-        cwd=tmp_path, env={"PYTHONPATH": f"{tmp_path}:{root}", "PATH": "/usr/bin:/bin"},
-        capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
-    assert done.returncode == 2
-    assert "pip install 'v2hdm[map]'" in done.stderr
-    assert done.stderr.count("\n") == 1

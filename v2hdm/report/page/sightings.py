@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from v2hdm.geometry.ipm import apply_in_front, ground_from_pinhole_px
-from v2hdm.geometry.rigid import inverse
+from v2hdm.geometry.rigid import camera_centre, inverse
 from v2hdm.hdmap.residuals import Residuals
 from v2hdm.records import BoolArray, Calibration, FloatArray, IntArray
 from v2hdm.report.page.facts import Facts, Route
@@ -59,16 +59,14 @@ def ground_residuals(facts: Facts) -> GroundResiduals | None:
     row_image = residuals.row_image[rows]
     cam_from_map = cams_from_map(residuals, facts.route, calibrations)
     observed, off = residuals.observed_px[rows], residuals.residual_px[rows]
-    seen, range_m = np.full((len(rows), 2), np.nan), np.full(len(rows), np.nan)
-    projected = seen.copy()
-    for i in np.unique(row_image).tolist():
-        own = row_image == i
-        intrinsic = calibrations[residuals.camera[i]].info.intrinsic
-        map_from_px = ground_from_pinhole_px(intrinsic, cam_from_map[i])
-        seen[own] = apply_in_front(map_from_px, observed[own])
-        projected[own] = apply_in_front(map_from_px, observed[own] + off[own])
-        foot = inverse(cam_from_map[i])[:2, 3]
-        range_m[own] = np.linalg.norm(seen[own] - foot, axis=1)
+    known = np.flatnonzero(of_image >= 0)
+    intrinsic = np.array([calibrations[residuals.camera[i]].info.intrinsic for i in known])
+    map_from_px, foot_map = np.full((len(of_image), 3, 3), np.nan), np.full((len(of_image), 2), np.nan)
+    map_from_px[known] = ground_from_pinhole_px(intrinsic, cam_from_map[known])
+    foot_map[known] = camera_centre(cam_from_map[known])[:, :2]
+    seen, projected = (
+        apply_in_front(map_from_px[row_image], px[:, None])[:, 0] for px in (observed, observed + off)
+    )
     return GroundResiduals(
         cameras=names,
         camera=of_image[row_image],
@@ -79,7 +77,7 @@ def ground_residuals(facts: Facts) -> GroundResiduals | None:
         observed_px=observed,
         residual_px=off,
         distance_sigma=residuals.distance_sigma[rows],
-        range_m=range_m,
+        range_m=np.linalg.norm(seen - foot_map[row_image], axis=1),
         ground_m=projected - seen,
     )
 

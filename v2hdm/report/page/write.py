@@ -6,8 +6,8 @@ import json
 from importlib.resources import files
 from pathlib import Path
 
-from v2hdm.errors import ConfigError
-from v2hdm.extras import need
+import jinja2
+
 from v2hdm.files import replace_text
 from v2hdm.records import Drive
 from v2hdm.report.page.document import document
@@ -35,9 +35,7 @@ def write_page(folder: Path, drive: Drive | None) -> Path:
     Raises:
         MapFileError: the folder is no result, or a file in it is damaged.
         DriveError: an image or the truth of the drive is damaged.
-        ConfigError: jinja2 is not installed.
     """
-    jinja2 = need("jinja2", "map", "report.html", ConfigError)
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("v2hdm.report.page"),
         autoescape=True,
