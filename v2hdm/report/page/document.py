@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from v2hdm.report.page import charts, tables
+from v2hdm.report.page.cameras import CameraPage, camera_pages
+from v2hdm.report.page.cells import Figure, Table, in_words, pair_table
 from v2hdm.report.page.facts import Facts
 from v2hdm.report.page.ground import GroundPage, ground_page
 from v2hdm.report.page.layers import layers
 from v2hdm.report.page.pictures import overlays, pictures
 from v2hdm.report.page.sightings import GroundResiduals, ground_residuals
-from v2hdm.report.page.tables import CameraPage, Figure, Table
 
 _SAYS = {
     "PASS": "Every check is within its limit. Map and calibrations can be relied on as stated below.",
@@ -87,9 +88,9 @@ def document(facts: Facts) -> Document:
     residuals = ground_residuals(facts)
     accuracy = (tables.accuracy_table(facts), tables.truth_table(facts))
     about = (
-        tables.pair_table("The drive.", metrics.get("drive") or {}),
+        pair_table("The drive.", metrics.get("drive") or {}),
         tables.timing_table(facts),
-        tables.pair_table("Versions of what computed it.", metrics.get("versions") or {}),
+        pair_table("Versions of what computed it.", metrics.get("versions") or {}),
     )
     return Document(
         name=str(metrics.get("name", facts.folder.name)),
@@ -108,7 +109,7 @@ def document(facts: Facts) -> Document:
         check_points=tables.check_point_table(facts),
         map_data=layers(facts, residuals),
         pictures=pictures(facts),
-        cameras=tables.camera_pages(facts, overlays(facts)),
+        cameras=camera_pages(facts, overlays(facts)),
         ground=ground_page(facts.folder),
         residuals=_residual_charts(facts, residuals),
         excluded=_excluded(facts),
@@ -126,16 +127,16 @@ def _summary(facts: Facts) -> str:
     if facts.hd_map is None:
         return "No map came of this drive."
     words = [
-        tables.in_words(len(facts.hd_map.markings), "marking"),
-        tables.in_words(len(facts.hd_map.lanes), "lane line"),
+        in_words(len(facts.hd_map.markings), "marking"),
+        in_words(len(facts.hd_map.lanes), "lane line"),
     ]
     if facts.hd_map.symbols:
-        words.append(tables.in_words(len(facts.hd_map.symbols), "symbol"))
+        words.append(in_words(len(facts.hd_map.symbols), "symbol"))
     sentence = f"{', '.join(words[:-1])} and {words[-1]}"
     if facts.route is not None:
         sentence += f", mapped along {facts.route.way_m[-1]:.0f} m"
     if facts.cameras:
-        sentence += f" with {tables.in_words(len(facts.cameras), 'camera')} ({', '.join(facts.cameras)})"
+        sentence += f" with {in_words(len(facts.cameras), 'camera')} ({', '.join(facts.cameras)})"
     return f"{sentence}."
 
 
