@@ -51,7 +51,7 @@
   if (data.mosaic) {
     const [west, south, east, north] = data.mosaic.bounds;
     layers.mosaic = L.imageOverlay(`data:${data.mosaic.type};base64,${data.mosaic.src}`, [[south, west], [north, east]],
-      { zIndex: 1, interactive: false });
+      { pane: "tilePane", interactive: false });
   }
   if (data.truth) {
     layers.truth = L.featureGroup([
