@@ -64,15 +64,9 @@ def key_figures(facts: Facts) -> tuple[Figure, ...]:
         note = f"RMSE of {checked.get('compared')} surveyed points that no estimate has seen"
         figures.append(Figure("Check points", number(checked["rmse_m"], 1, 100), "cm", note))
     if "reprojection_rmse_px" in best:
-        before = number(best.get("initial_reprojection_rmse_px"), 2)
-        figures.append(
-            Figure(
-                "In the images",
-                number(best["reprojection_rmse_px"], 2),
-                "px",
-                f"reprojection; {before} px before",
-            )
-        )
+        before = best.get("initial_reprojection_rmse_px")
+        note = "reprojection" + ("" if before is None else f"; {number(before, 2)} px before")
+        figures.append(Figure("In the images", number(best["reprojection_rmse_px"], 2), "px", note))
     return tuple(figures)
 
 
