@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.ground.scene import CENTRE, INFO, extrinsic, make_drive, with_guess, with_trajectory
+from v2hdm.geometry.mounting import mounting_angles
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.ground import GroundOptions, GroundStatus, Reading, better_start, estimate_ground
-from v2hdm.ground.say import mounting_angles
 from v2hdm.records import Drive, FloatArray, Trajectory
 
 TRUE = extrinsic(roll_deg=0.5, pitch_deg=20.0, yaw_deg=-1.0)

@@ -21,6 +21,7 @@ from v2hdm.hdmap.calibration import read_calibration
 from v2hdm.hdmap.calibration_formats import CALIBRATION_FORMATS
 from v2hdm.hdmap.formats import FORMATS
 from v2hdm.hdmap.geojson import read_geojson
+from v2hdm.hdmap.residuals import read_residuals
 from v2hdm.mapping.options import AcceptanceOptions, LaneOptions, MappingOptions
 from v2hdm.pipeline import DriveConfig, RunConfig, run
 from v2hdm.pipeline.run import camera_sets, run_name
@@ -129,6 +130,12 @@ def test_the_files_of_a_result_can_be_read_back(result: Path) -> None:
         image = cv2.imread(str(result / picture))
         assert image is not None, picture
         assert image.std() > 5.0
+    residuals = read_residuals(result / "residuals.csv")
+    assert set(residuals.marking[residuals.marking > 0]) == {m.id for m in hd_map.markings}
+    assert set(residuals.camera) == {"front", "rear"}
+    report = (result / "report.html").read_text()
+    assert f'<dd class="value">{len(hd_map.markings)}</dd>' in report
+    assert report.count("data:image/jpeg;base64,") >= 2
     assert (result / "config.yaml").stat().st_size > 0
     assert "detected" in (result / "run.log").read_text()
 
@@ -232,6 +239,7 @@ def test_a_drive_past_nothing_fails_and_says_that_no_marking_was_found(
     assert outcome.verdict.status is Status.FAIL
     assert any("no marking was found" in finding.says for finding in outcome.verdict.raised)
     assert not (outcome.folder / "map.geojson").exists()
+    assert "no marking was found" in (outcome.folder / "report.html").read_text()
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from v2hdm.geometry.mounting import angle_sigmas, mounting_angles
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.ground.results import GroundEstimate, GroundStatus, Reading
-from v2hdm.records import FloatArray
 
 _NAMES = {
     "clock_s": ("clock", 1e3, "ms"),
@@ -25,36 +25,6 @@ _WHY = {
     GroundStatus.NO_MATCH: "the ground does not match between images: check poses, clock and guess",
     GroundStatus.TOO_LITTLE: "too little ground is seen by two images: drive further, or widen roi_vehicle",
 }
-
-
-def mounting_angles(cam_from_vehicle: FloatArray) -> FloatArray:
-    """Roll, pitch (down) and yaw (left) in rad: from a camera that looks along the vehicle's x axis.
-
-    The order is that of REP-103: about x, then y, then z.
-    """
-    # Columns: the camera's right, down and forward in a frame of forward, left and up.
-    level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    turn = cam_from_vehicle[:3, :3].T @ level.T
-    return np.array(
-        [
-            np.arctan2(turn[2, 1], turn[2, 2]),
-            -np.arcsin(np.clip(turn[2, 0], -1, 1)),
-            np.arctan2(turn[1, 0], turn[0, 0]),
-        ]
-    )
-
-
-def angle_sigmas(cam_from_vehicle: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Standard deviations (3,) of :func:`mounting_angles`, rad, from the left tangent's covariance (6, 6)."""
-    step = 1e-6
-    columns = []
-    for axis in range(3):
-        x, y, z = step * np.eye(3)[axis]
-        moved = cam_from_vehicle.copy()
-        moved[:3, :3] = (np.eye(3) + np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])) @ moved[:3, :3]
-        columns.append((mounting_angles(moved) - mounting_angles(cam_from_vehicle)) / step)
-    jacobian = np.column_stack(columns)
-    return np.asarray(np.sqrt(np.diag(jacobian @ covariance[3:, 3:] @ jacobian.T)))
 
 
 def lines(estimate: GroundEstimate) -> Iterator[str]:

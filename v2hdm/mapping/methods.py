@@ -22,7 +22,7 @@ from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.naive import naive_markings
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.outlines import map_symbols
-from v2hdm.mapping.outputs import JointCorners, adjusted_poses, clock_offsets
+from v2hdm.mapping.outputs import JointCorners, adjusted_poses, clock_offsets, residuals_of
 from v2hdm.mapping.remedy import Inputs, Outcome, optimise
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.sightings.table import camera_of
@@ -162,6 +162,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
         poses=adjusted_poses(outcome),
         clocks=clock_offsets(outcome),
         corners=JointCorners(optimised),
+        residuals=residuals_of(outcome, optimised),
     )
 
 

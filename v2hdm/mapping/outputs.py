@@ -1,12 +1,14 @@
-"""What an optimisation estimates besides map and mountings: poses, clocks, how errors hang together."""
+"""What an optimisation leaves besides map and mountings: poses, clocks, residuals, joint covariances."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from v2hdm.adjust import Fault
+from v2hdm.hdmap.residuals import Residuals
 from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.remedy import Outcome
 from v2hdm.mapping.results import AdjustedPoses, ClockOffset
@@ -80,3 +82,31 @@ class JointCorners:
         # Put together from two sources, it may be negative along some direction, by a millimetre squared.
         values, vectors = np.linalg.eigh(out)
         return out if values[0] >= 0 else np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+def residuals_of(outcome: Outcome, optimised: Optimised) -> Residuals:
+    """Those of the observations that the solve accepted, of markings and of candidates left out."""
+    drive, sightings, bundle = outcome.inputs.drive, outcome.inputs.sightings, optimised.bundle
+    seen, row_image = np.unique(sightings.image[bundle.row], return_inverse=True)
+    marking = np.zeros(bundle.association.count, dtype=np.int64)
+    # The ids of a map whose markings have none yet: by their order, as its files number them.
+    marking[optimised.groups] = np.arange(1, len(optimised.groups) + 1)
+    own_corner = bundle.association.corner_order()[bundle.row, bundle.corner]
+    images = [drive.images[i] for i in seen.tolist()]
+    return Residuals(
+        image=tuple(_below(image.path, drive.root) for image in images),
+        camera=tuple(image.camera for image in images),
+        taken_s=np.array([image.taken_s for image in images]),
+        row_image=row_image.astype(np.int64),
+        marking=marking[bundle.group],
+        corner=bundle.corner,
+        is_point=np.asarray(sightings.valid[bundle.row, own_corner]),
+        observed_px=sightings.corners_pinhole_px[bundle.row, own_corner],
+        residual_px=bundle.solution.residual_px,
+        distance_sigma=np.sqrt(bundle.solution.mahalanobis2),
+    )
+
+
+def _below(path: Path, root: Path) -> str:
+    """A path from ``root`` on, whole where it lies elsewhere."""
+    return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)

@@ -9,6 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
+from v2hdm.hdmap.residuals import Residuals
 from v2hdm.mapping.evidence import SolveEvidence
 from v2hdm.records import BoolArray, Calibration, FloatArray, HdMap, Image, IntArray, Marking
 
@@ -85,7 +86,8 @@ class MethodResult:
     in a sentence what the drive determined and what rests on the survey; ``evidence`` is what the checks
     after the solve rest on, ``poses`` the vehicle's poses as the solve has adjusted them, ``clocks`` the
     offsets of the cameras' clocks, corrections before the solve included; ``corners`` how the errors of the
-    map's corners hang together, None where nothing tells.
+    map's corners hang together, None where nothing tells; ``residuals`` are those of the corner observations
+    that it accepted.
     """
 
     name: str
@@ -102,3 +104,4 @@ class MethodResult:
     poses: AdjustedPoses | None = None
     clocks: Mapping[str, ClockOffset] = field(default_factory=dict)
     corners: Corners | None = None
+    residuals: Residuals | None = None

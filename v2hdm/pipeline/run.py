@@ -15,7 +15,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
 import torch
 
 from v2hdm import __version__
@@ -26,19 +25,21 @@ from v2hdm.detection.weights import unknown_network
 from v2hdm.drive import ReadOptions, drive_name, read_drive
 from v2hdm.errors import AdjustError, ConfigError, MappingError, V2hdmError
 from v2hdm.hdmap.formats import check_formats
-from v2hdm.mapping.known_sizes import known_lengths
 from v2hdm.mapping.methods import run_methods
-from v2hdm.mapping.options import MappingOptions, SizeOptions, check_options
+from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.orthophoto.result import write_mosaic
+from v2hdm.pipeline.about import describe_run
 from v2hdm.pipeline.evaluate import CameraSets, evaluate
 from v2hdm.pipeline.inspect import Inspection, inspect
 from v2hdm.pipeline.survey import Survey, check_survey, table_of, take_survey
 from v2hdm.pipeline.write import BEST, write_results
 from v2hdm.quality import Finding, Status, Verdict
+from v2hdm.quality.results.known_sizes import check_known_sizes
 from v2hdm.quality.results.result import check_result
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.check_points import write_check_points
 from v2hdm.report.outputs import result_folder, write_json
+from v2hdm.report.page.write import write_page
 from v2hdm.settings import MOST_PROCESSES, NOT_NEGATIVE, POSITIVE, SEED, SHARE, Within, check_settings
 from v2hdm.simulate import PortConfig, rendered_drive
 from v2hdm.texts import shown, take_camera_name, take_name
@@ -184,7 +185,7 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
         config = replace(config, mapping=survey.mapping)
         with _timed(seconds, "check"):
             inspection = inspect(drive, config.drive.max_gap_s, _workers(config), partial(progress, "check"))
-        about = {"name": name, "version": __version__}
+        about = describe_run(name, drive, drive_folder, config.drive)
         try:
             result = _map_and_judge(config, inspection, survey, folder, about, seconds, progress)
         except (MappingError, AdjustError) as failure:
@@ -214,7 +215,7 @@ def _map_and_judge(
     with _timed(seconds, "judge"):
         found = check_result(drive, methods, inspection.ground)
         checked, surveyed = check_survey(survey, drive, list(methods.values())[-1][BEST])
-        unfit = _unfit_sizes(config.mapping.known_sizes, methods)
+        unfit = check_known_sizes(config.mapping.known_sizes, list(methods.values())[-1][BEST])
         verdict = Verdict.of([*inspection.findings, *found, *unfit, *surveyed])
     with _timed(seconds, "evaluate"):
         described = inspection.drive_as_described
@@ -232,28 +233,9 @@ def _map_and_judge(
         with _timed(seconds, "mosaic"):
             tell = partial(progress, "mosaic")
             write_mosaic(folder, described, device=config.mapping.device, progress=tell)
+    with _timed(seconds, "report"):
+        write_page(folder, described)
     return RunResult(Path(config.output) / about["name"], metrics, headlines, verdict)
-
-
-def _unfit_sizes(sizes: SizeOptions, sets: CameraSets) -> list[Finding]:
-    """Known sizes that no marking of the map has: a class or a size is wrong."""
-    found = []
-    for name, size in sizes.by_class_m.items():
-        markings = [one for one in list(sets.values())[-1]["Opt"].hd_map.markings if one.kind == name]
-        corners_map = np.array([one.corners_map for one in markings]).reshape(-1, 4, 2)
-        numbers = np.arange(4 * len(markings)).reshape(-1, 4)
-        if known_lengths(
-            replace(sizes, by_class_m={name: size}), [name] * len(markings), corners_map, numbers
-        ):
-            continue
-        says = (
-            f"none of the {len(markings)} markings of class {name} is about {size[0]:g} m by {size[1]:g} "
-            "m, so that "
-            "the size was not used; mend or drop it"
-        )
-        about = f"mapping.known_sizes.by_class_m.{name}"
-        found.append(Finding("known size", Status.WARN, 0.0, None, "", says, about))
-    return found
 
 
 def _without_map(
@@ -264,6 +246,7 @@ def _without_map(
     verdict = Verdict.of([*inspection.findings, failed])
     metrics = {**about, "verdict": verdict.as_json(), "results": {}}
     write_json(folder / "metrics.json", metrics)
+    write_page(folder, inspection.drive_as_described)
     return RunResult(Path(config.output) / about["name"], metrics, (), verdict)
 
 

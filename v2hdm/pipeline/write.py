@@ -20,6 +20,8 @@ from v2hdm.hdmap.exclusions import ExcludedMarking, write_exclusions
 from v2hdm.hdmap.formats import write_map
 from v2hdm.hdmap.geojson import write_geojson
 from v2hdm.hdmap.heights import with_heights
+from v2hdm.hdmap.residuals import FILE as RESIDUALS
+from v2hdm.hdmap.residuals import write_residuals
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.evaluate import CameraSets, Judgement
 from v2hdm.pipeline.trajectory import write_trajectory
@@ -70,6 +72,8 @@ def write_results(
         _write_calibration_forms(calibration, about, path)
     if best.poses is not None:
         write_trajectory(best.poses, drive, folder)
+    if best.residuals is not None:
+        write_residuals(best.residuals, folder / RESIDUALS)
     _write_exclusions(folder / "excluded.geojson", drive, sets)
     if all_maps:
         _write_maps(folder / "maps", drive, sets)
@@ -77,7 +81,7 @@ def write_results(
     maps = {name: result.hd_map for name, result in methods.items()}
     route_map = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
     save_birdseye(folder / "birdseye.png", maps, BEST, route_map, judgement.truth)
-    if judgement.growth:
+    if any(judgement.growth.values()):
         save_growth(folder / "growth.png", judgement.growth)
     for name in best.calibrations:
         image = _fullest_image(drive, name, detections)

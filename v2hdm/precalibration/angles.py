@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from v2hdm.geometry.mounting import angle_sigmas, mounting_angles
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.ground.say import angle_sigmas, mounting_angles
 from v2hdm.records import FloatArray
 
 __all__ = ["angle_sigmas", "centre_sigmas", "mounting_angles", "mounting_lines"]

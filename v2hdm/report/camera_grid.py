@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,8 @@ from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import Camera, CameraInfo, FloatArray
+from v2hdm.report.drawing import Pen, draw_lines, with_legend
+from v2hdm.report.style import OKABE_ITO
 
 _FARTHEST_M = 40.0
 """Lines farther along the view lie on top of each other near the horizon."""
@@ -27,10 +30,17 @@ _HALF_WIDTH_M = 8.0
 _NEAREST_M = 0.3
 """Ground nearer than this to the camera's plane has no place in an image."""
 
-COLOURS: Mapping[str, tuple[int, int, int]] = {"guess": (40, 140, 255), "ground": (160, 190, 20)}
-"""Colour (BGR) of the grid under each mounting: the guess, and the one found from bare ground."""
+PENS: Mapping[str, Pen] = {
+    "guess": Pen(OKABE_ITO["orange"], dash_px=(8.0, 5.0), width=1),
+    "ground": Pen(OKABE_ITO["sky"], width=1),
+}
+"""How the grid is drawn under each mounting: the guess, and the one found from bare ground."""
 
-_ROI_BGR = (255, 255, 255)
+_WORDS: Mapping[str, str] = {"guess": "grid and horizon: the guess", "ground": "as bare ground says"}
+
+_ROI = Pen("#ffffff")
+
+_FONT, _TEXT_SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.45
 
 
 def save_grid(
@@ -42,23 +52,26 @@ def save_grid(
         path: where the picture goes.
         image: (H, W, 3) BGR, as recorded.
         camera: intrinsics and ROI.
-        mountings: ``cam_from_vehicle`` (4 x 4) by a name of :data:`COLOURS`.
-        caption: text in the picture's corner.
+        mountings: ``cam_from_vehicle`` (4 x 4) by a name of :data:`PENS`.
+        caption: text below the picture.
     """
     canvas = image.copy()
-    for row, (name, cam_from_vehicle) in enumerate(mountings.items()):
-        colour = COLOURS[name]
+    legend: list[tuple[Pen | None, str]] = [(None, caption)]
+    for name, cam_from_vehicle in mountings.items():
+        pen = PENS[name]
         for line in _grid_lines(cam_from_vehicle):
-            _draw(canvas, project_line(camera.info, cam_from_vehicle, line), colour, 1)
-        _draw(canvas, [_horizon(camera.info, cam_from_vehicle)], colour, 2)
-        _label(canvas, camera.info, cam_from_vehicle, colour, below=18 * row)
-        _write(canvas, name, (12, 52 + 24 * row), colour)
+            draw_lines(canvas, project_line(camera.info, cam_from_vehicle, line), pen)
+        draw_lines(canvas, [_horizon(camera.info, cam_from_vehicle)], replace(pen, width=2))
+        legend.append((pen, _WORDS[name]))
     closed = np.vstack([camera.roi_vehicle, camera.roi_vehicle[:1]])
     first = next(iter(mountings.values()))
-    _draw(canvas, project_line(camera.info, first, _dense(closed)), _ROI_BGR, 2)
-    _write(canvas, f"{caption}; white: roi_vehicle", (12, 26), _ROI_BGR)
+    draw_lines(canvas, project_line(camera.info, first, _dense(closed)), _ROI)
+    legend.append((_ROI, "roi_vehicle, by the guess"))
+    for number, (name, cam_from_vehicle) in enumerate(mountings.items()):
+        _label(canvas, camera.info, cam_from_vehicle, PENS[name], to_the_left=number == 0)
+    shown = with_legend(canvas, legend)
     with whole_file(path) as partial:
-        partial.write_bytes(cv2.imencode(path.suffix, canvas, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes())
+        partial.write_bytes(cv2.imencode(path.suffix, shown, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes())
 
 
 def project_line(
@@ -124,10 +137,10 @@ def _label(
     canvas: np.ndarray,
     info: CameraInfo,
     cam_from_vehicle: FloatArray,
-    colour: tuple[int, int, int],
-    below: int,
+    pen: Pen,
+    to_the_left: bool,
 ) -> None:
-    """Write the lines' coordinates in metres where they cross the middle of the view."""
+    """Write the lines' coordinates in metres beside the middle of the view."""
     foot, along, _ = _axes(cam_from_vehicle)
     last_v = np.inf
     for mark in sorted(_marks(cam_from_vehicle), key=lambda mark: abs(mark - foot[along])):
@@ -137,7 +150,9 @@ def _label(
         if not pieces or last_v - pieces[0][0, 1] < 16:
             continue
         u, last_v = pieces[0][0]
-        _write(canvas, f"{'xy'[along]} {mark:g} m", (int(u) + 6, int(last_v) - 4 + below), colour, 0.45)
+        text = f"{'xy'[along]} {mark:g} m"
+        left = -6 - cv2.getTextSize(text, _FONT, _TEXT_SIZE, 1)[0][0] if to_the_left else 6
+        _write(canvas, text, (int(u) + left, int(last_v) - 4), pen.bgr)
 
 
 def _dense(line: FloatArray) -> FloatArray:
@@ -145,16 +160,8 @@ def _dense(line: FloatArray) -> FloatArray:
     return np.concatenate([a + parts * (b - a) for a, b in itertools.pairwise(line)])
 
 
-def _draw(canvas: np.ndarray, pieces: list[FloatArray], colour: tuple[int, int, int], width: int) -> None:
-    for piece in pieces:
-        fixed = np.round(np.clip(piece, -1e4, 1e4) * 16).astype(np.int32)
-        cv2.polylines(canvas, [fixed], False, colour, width, cv2.LINE_AA, shift=4)
-
-
-def _write(
-    canvas: np.ndarray, text: str, at: tuple[int, int], colour: tuple[int, int, int], size: float = 0.6
-) -> None:
-    (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
+def _write(canvas: np.ndarray, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> None:
+    (width, height), below = cv2.getTextSize(text, _FONT, _TEXT_SIZE, 1)
     corner, opposite = (at[0] - 2, at[1] - height - 2), (at[0] + width + 2, at[1] + below)
     cv2.rectangle(canvas, corner, opposite, (40, 40, 40), cv2.FILLED)
-    cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
+    cv2.putText(canvas, text, at, _FONT, _TEXT_SIZE, colour, 1, cv2.LINE_AA)

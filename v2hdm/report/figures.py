@@ -16,11 +16,19 @@ from v2hdm.geometry.ipm import apply_in_front
 from v2hdm.geometry.lens import distort_points
 from v2hdm.records import CameraInfo, FloatArray, HdMap, Truth
 from v2hdm.report import metrics, style
+from v2hdm.report.drawing import Pen, draw_lines, with_legend
 
 _HEIGHT_IN = 7.6
 _BESIDE_ROUTE_M = 12.0
-_DETAIL_RADIUS_M = 5.0
+_DETAIL_RADIUS_M = 5.5
+_DETAIL_MARGIN_M = 0.15
 _OVERLAY_RANGE_M = 30.0
+
+_BEFORE = Pen(style.OKABE_ITO["orange"], dash_px=(9.0, 6.0))
+"""How the map is drawn by what a run began with."""
+
+OVERLAY = {"Opt": Pen(style.OKABE_ITO["sky"])}
+"""How it is drawn by what the run found."""
 
 
 def save_birdseye(
@@ -53,7 +61,7 @@ def save_birdseye(
             axes.set_aspect("equal")
             axes.set_xlabel("east (m)")
             axes.set_ylabel("north (m)")
-        site.legend(loc="best")
+        site.legend(loc="upper left", bbox_to_anchor=(0.0, -0.09), ncols=4, borderaxespad=0.0)
 
 
 def save_growth(path: Path, growth: Mapping[str, Sequence[tuple[int, float]]]) -> None:
@@ -62,7 +70,12 @@ def save_growth(path: Path, growth: Mapping[str, Sequence[tuple[int, float]]]) -
         axes = fig.subplots()
         for method, points in growth.items():
             counts, errors = np.array(points, dtype=np.float64).reshape(-1, 2).T
-            axes.plot(counts, 100 * errors, "o-", ms=4, color=style.METHOD.get(method, "k"), label=method)
+            if not len(counts):
+                continue
+            axes.plot(
+                counts, 100 * errors, ls=style.LINE.get(method, "-"), marker=style.MARKER.get(method, "."),
+                ms=4.5, color=style.METHOD.get(method, "k"), label=method,
+            )  # fmt: skip
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
         axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:g}"[0] in "25" else "")
@@ -70,7 +83,7 @@ def save_growth(path: Path, growth: Mapping[str, Sequence[tuple[int, float]]]) -
         axes.set_xlabel("markings mapped so far")
         axes.set_ylabel("corner RMSE (cm)")
         axes.set_title("Growth of the error with the map")
-        axes.legend(ncols=4, loc="best")
+        fig.legend(ncols=4, loc="outside lower center", handlelength=3.2)
 
 
 def save_overlay(
@@ -93,21 +106,22 @@ def save_overlay(
             coordinate is positive in front of the camera.
     """
     canvas = image.copy()
-    for row, (name, pinhole_px_from_map) in enumerate(views.items()):
-        colour = _bgr(style.METHOD.get(name, "#ffffff"))
+    legend: list[tuple[Pen | None, str]] = []
+    for name, pinhole_px_from_map in views.items():
+        pen = OVERLAY.get(name, _BEFORE)
         for line, closed in _lines_of(hd_map):
-            points_px = _project_line(line, closed, info, position_map, pinhole_px_from_map)
-            for piece in points_px:
-                fixed = np.round(piece * 16).astype(np.int32)
-                cv2.polylines(canvas, [fixed], False, colour, 2, cv2.LINE_AA, shift=4)
-        cv2.putText(canvas, name, (16, 34 + 30 * row), cv2.FONT_HERSHEY_SIMPLEX, 0.9, colour, 2, cv2.LINE_AA)
+            draw_lines(canvas, _project_line(line, closed, info, position_map, pinhole_px_from_map), pen)
+        said = "found by the run" if name in OVERLAY else "that the run began with"
+        legend.append((pen, f"{name}: the map by the calibration and pose {said}"))
     with whole_file(path) as partial:
-        partial.write_bytes(cv2.imencode(path.suffix, canvas)[1].tobytes())
+        partial.write_bytes(cv2.imencode(path.suffix, with_legend(canvas, legend))[1].tobytes())
 
 
 def _draw_truth(axes: Axes, truth: Truth) -> None:
     polygons = [m.corners_map for m in truth.map.markings]
-    axes.add_collection(PolyCollection(polygons, facecolors="#dfe4e8", edgecolors=style.TRUTH, lw=0.4))
+    axes.add_collection(
+        PolyCollection(polygons, facecolors="#dfe4e8", edgecolors=style.TRUTH, lw=0.4, label="truth")
+    )
     axes.add_collection(
         LineCollection([lane.points_map for lane in truth.map.lanes], colors="#dfe4e8", lw=2.2)
     )
@@ -118,11 +132,15 @@ def _draw_best(axes: Axes, hd_map: HdMap, truth: Truth | None) -> None:
     solid = style.METHOD["Opt"]
     axes.add_collection(
         LineCollection(
-            [lane.points_map for lane in hd_map.lanes], colors=style.METHOD["ONI"], lw=0.9, label="lanes"
+            [lane.points_map for lane in hd_map.lanes],
+            colors=style.OKABE_ITO["sky"],
+            lw=1.1,
+            label="lane lines",
         )
     )
     outlines = [symbol.outline_map for symbol in hd_map.symbols]
-    axes.add_collection(PolyCollection(outlines, facecolors="none", edgecolors=solid, lw=0.9))
+    symbols = PolyCollection(outlines, facecolors="none", edgecolors=solid, lw=0.9, label="symbols")
+    axes.add_collection(symbols)
     polygons = [m.corners_map for m in hd_map.markings]
     if truth is None:
         axes.add_collection(PolyCollection(polygons, facecolors=solid, edgecolors=solid, label="markings"))
@@ -142,27 +160,31 @@ def _draw_best(axes: Axes, hd_map: HdMap, truth: Truth | None) -> None:
 
 
 def _close_up(axes: Axes, maps: Mapping[str, HdMap], best: str, truth: Truth | None) -> None:
-    """The neighbourhood of one marking, every method beside the truth."""
+    """The neighbourhood of one marking, every method beside the truth; what would be cut off is left out."""
     if not maps[best].markings:
         axes.set_axis_off()
         return
     centre = _common_marking(maps, best)
     if truth is not None:
-        _draw_truth(axes, truth)
-    for method, hd_map in maps.items():
-        colour = style.METHOD.get(method, "k")
-        width = 1.8 if method == best else 1.1
-        polygons = PolyCollection(
-            [m.corners_map for m in hd_map.markings], facecolors="none", edgecolors=colour, lw=width
-        )
-        axes.add_collection(polygons)
-        axes.plot([], [], color=colour, lw=width, label=method)
-    if truth is not None:
+        polygons = _wholly_near(truth.map, centre)
+        axes.add_collection(PolyCollection(polygons, facecolors="#dfe4e8", edgecolors=style.TRUTH, lw=0.6))
         axes.fill([], [], facecolor="#dfe4e8", edgecolor=style.TRUTH, label="truth")
+    for method in sorted(maps, key=lambda name: name != best):
+        look = {"color": style.METHOD.get(method, "k"), "ls": style.LINE.get(method, "-")}
+        look |= {"lw": 2.2 if method == best else 1.5}
+        for number, polygon in enumerate(_wholly_near(maps[method], centre)):
+            closed = np.vstack([polygon, polygon[:1]])
+            axes.plot(*closed.T, label=None if number else method, **look)
     axes.set_xlim(centre[0] - _DETAIL_RADIUS_M, centre[0] + _DETAIL_RADIUS_M)
     axes.set_ylim(centre[1] - _DETAIL_RADIUS_M, centre[1] + _DETAIL_RADIUS_M)
-    axes.set_title("Close-up: every method")
-    axes.legend(loc="upper right", frameon=True, edgecolor="none")
+    axes.set_title("Close-up: the markings by every method")
+    axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.09), ncols=5, borderaxespad=0.0, handlelength=3.0)
+
+
+def _wholly_near(hd_map: HdMap, centre: FloatArray) -> list[FloatArray]:
+    """Corners (4, 2) of the markings that the close-up shows without cutting anything off."""
+    reach_m = _DETAIL_RADIUS_M - _DETAIL_MARGIN_M
+    return [m.corners_map for m in hd_map.markings if (np.abs(m.corners_map - centre) < reach_m).all()]
 
 
 def _common_marking(maps: Mapping[str, HdMap], best: str) -> FloatArray:
@@ -201,8 +223,3 @@ def _project_line(
     edges = np.flatnonzero(np.diff(np.concatenate([[0], visible.astype(int), [0]])))
     pieces = [points_pinhole_px[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
     return [distort_points(info, piece) for piece in pieces]
-
-
-def _bgr(colour: str) -> tuple[int, int, int]:
-    value = int(colour[1:], 16)
-    return value & 255, value >> 8 & 255, value >> 16

@@ -28,18 +28,18 @@ def save_route(path: Path, trajectory: Trajectory) -> None:
         if len(place) > 1:
             segments = np.stack([place[:-1], place[1:]], axis=1)
             speed = np.linalg.norm(np.diff(place, axis=0), axis=1) / np.diff(stamp_s)
-            line = LineCollection(list(segments), array=speed, cmap="viridis", lw=3)
+            line = LineCollection(list(segments), array=speed, cmap="cividis", lw=8, capstyle="round")
             line.set_clim(0.0, max(float(np.percentile(speed, 99)), 1e-9))
             axes.add_collection(line)
             fig.colorbar(line, ax=axes, shrink=0.7, label="speed (m/s)")
         _draw_headings(axes, poses)
-        axes.plot(*place[0], "o", color="k", ms=5, label="start")
+        axes.plot(*place[0], "o", color="white", mec="#1b1e21", ms=9, zorder=4, label="start")
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.08)
         axes.set_xlabel("x: east (m)")
         axes.set_ylabel("y: north (m)")
         axes.set_title("Route as recorded; arrows: the vehicle's x axis")
-        axes.legend(loc="best")
+        fig.legend(loc="outside lower left")
 
 
 def _draw_headings(axes: Axes, poses: FloatArray) -> None:
@@ -50,5 +50,6 @@ def _draw_headings(axes: Axes, poses: FloatArray) -> None:
     length = 0.05 * max(float(np.ptp(place, axis=0).max()), 1e-9)
     axes.quiver(
         *place[chosen].T, *(length * poses[chosen, :2, 0]).T,
-        angles="xy", scale_units="xy", scale=1, width=0.003, color="#d0432b", zorder=3,
+        angles="xy", scale_units="xy", scale=1, width=0.0028, color="white", edgecolor="#1b1e21",
+        linewidth=0.7, zorder=3,
     )  # fmt: skip

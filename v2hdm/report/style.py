@@ -13,10 +13,32 @@ from matplotlib.figure import Figure
 
 from v2hdm.files import whole_file
 
+OKABE_ITO = {
+    "orange": "#e69f00",
+    "sky": "#56b4e9",
+    "green": "#009e73",
+    "yellow": "#f0e442",
+    "blue": "#0072b2",
+    "vermillion": "#d55e00",
+    "purple": "#cc79a7",
+}
+"""Colours that colour-blind people tell apart: Okabe and Ito, Color Universal Design, 2008."""
+
 TRUTH = "#9aa4ad"
 ROUTE = "#c9d3da"
-METHOD = {"CNI": "#e08a1e", "ENI": "#d0432b", "Opt": "#0b7a75", "ONI": "#3b6fb6"}
+METHOD = {
+    "CNI": OKABE_ITO["orange"],
+    "ENI": OKABE_ITO["vermillion"],
+    "Opt": OKABE_ITO["blue"],
+    "ONI": OKABE_ITO["green"],
+}
 """Colour of each method, the same in every figure."""
+
+LINE: dict[str, Any] = {"CNI": (0, (6, 2)), "ENI": (0, (1.5, 1.5)), "Opt": "-", "ONI": (0, (7, 2, 1.5, 2))}
+"""Line style of each method: they are told apart without colour, too."""
+
+MARKER = {"CNI": "s", "ENI": "^", "Opt": "o", "ONI": "D"}
+"""Marker of each method."""
 
 _RC: dict[Any, Any] = {
     "font.family": "sans-serif",

@@ -1,0 +1,183 @@
+"""The report in a browser: it draws, answers the pointer, and asks for nothing beyond itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.report.page.browser import Watched, browser_path, opened
+from tests.report.page.folder import NASTY, PLACES, make_result
+from v2hdm.report.page.write import write_page
+
+WINDOWS = [(1280, 800, "light"), (1280, 800, "dark"), (390, 844, "light"), (390, 844, "dark")]
+
+ON_SCREEN = """([east, north]) => {
+    const { map } = window.v2hdmMap;
+    map.setView([north, east], 6, { animate: false });
+    const box = map.getContainer().getBoundingClientRect();
+    const point = map.latLngToContainerPoint([north, east]);
+    return [box.left + point.x, box.top + point.y];
+}"""
+PAINTED = """() => [...document.querySelectorAll("#map canvas")].map((canvas) => {
+    const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+    let painted = 0;
+    for (let n = 3; n < data.length; n += 4) painted += data[n] > 0;
+    return painted;
+}).reduce((sum, painted) => sum + painted, 0)"""
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("report")
+    drive = make_result(folder)
+    return write_page(folder / "result", drive)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    path = browser_path()
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        launched = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield launched
+        launched.close()
+
+
+def is_quiet(watched: Watched) -> None:
+    """No error on the console, no request but that for the page itself."""
+    assert watched.said == []
+    assert [url for url in watched.requests if not url.startswith(("file:", "data:"))] == []
+    assert len([url for url in watched.requests if url.startswith("file:")]) == 1
+
+
+@pytest.mark.parametrize(("width", "height", "scheme"), WINDOWS)
+def test_the_map_is_drawn_and_fits_its_window(
+    browser: Any, report: Path, width: int, height: int, scheme: str
+) -> None:
+    with opened(browser, report, width, height, scheme) as watched:
+        page = watched.page
+        assert page.evaluate(PAINTED) > 300
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
+        assert (paper == "rgb(255, 255, 255)") == (scheme == "light")
+        is_quiet(watched)
+
+
+def test_every_layer_changes_the_picture_when_it_is_switched(browser: Any, report: Path) -> None:
+    with opened(browser, report) as watched:
+        page = watched.page
+        page.evaluate(ON_SCREEN, PLACES[0].tolist())
+        boxes = page.locator("#layers input")
+        assert boxes.count() == 6  # no truth, no mosaic
+        for number in range(boxes.count()):
+            if not boxes.nth(number).is_checked():
+                boxes.nth(number).check()
+        page.wait_for_timeout(100)
+        for number in range(boxes.count()):
+            before = page.evaluate(PAINTED)
+            boxes.nth(number).uncheck()
+            page.wait_for_timeout(100)
+            assert page.evaluate(PAINTED) < before, boxes.nth(number).get_attribute("id")
+        is_quiet(watched)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])
+def test_pointing_names_the_marking_and_selecting_shows_its_images(
+    browser: Any, report: Path, width: int, height: int
+) -> None:
+    with opened(browser, report, width, height) as watched:
+        page = watched.page
+        page.locator("#map").scroll_into_view_if_needed()
+        for number, place in enumerate(PLACES, start=1):
+            page.mouse.move(*page.evaluate(ON_SCREEN, place.tolist()))
+            page.wait_for_timeout(100)
+            tooltip = page.locator(".leaflet-tooltip:not(.corner)")
+            assert tooltip.locator("b").inner_text() == f"Marking {number}, diamond"
+            text = tooltip.inner_text()
+            assert "sightings: 4 images" in text
+            assert "95 %, relative: 1.0 cm" in text
+            assert "95 %, absolute: 2.4 cm" in text
+            assert f"1: {place[0] + 0.5:.3f} E" in text
+            page.mouse.down()
+            page.mouse.up()
+            assert page.locator(f"#details [data-key=m{number}]").count() == 1
+            shots = page.locator("#details .shots figure")
+            assert shots.count() == 2
+            assert "front/" in shots.first.inner_text()
+            size = page.evaluate("document.querySelector('.shots image').getBBox().width")
+            assert size > 30
+        is_quiet(watched)
+
+
+def test_the_outline_lies_on_the_paint_of_its_picture(browser: Any, report: Path) -> None:
+    with opened(browser, report) as watched:
+        page = watched.page
+        shots = page.evaluate("JSON.parse(document.getElementById('pictures').textContent).m1")
+        brightness = page.evaluate(
+            """async ({ src, size, map }) => {
+                const image = new Image();
+                image.src = `data:image/jpeg;base64,${src}`;
+                await image.decode();
+                const canvas = document.createElement("canvas");
+                [canvas.width, canvas.height] = size;
+                const draw = canvas.getContext("2d");
+                draw.drawImage(image, 0, 0);
+                const at = ([u, v]) => draw.getImageData(Math.floor(u), Math.floor(v), 1, 1).data[0];
+                const [u, v] = [0, 1].map((a) => map.reduce((sum, point) => sum + point[a], 0) / map.length);
+                const out = map.map((point) => at([u + 1.25 * (point[0] - u), v + 1.25 * (point[1] - v)]));
+                const inside = map.map((point) => at([u + 0.7 * (point[0] - u), v + 0.7 * (point[1] - v)]));
+                return { out, inside };
+            }""",
+            shots[0],
+        )
+        assert min(brightness["inside"]) > 180
+        assert max(brightness["out"]) < 140
+        seen, mapped = np.array(shots[0]["seen"]), np.array(shots[0]["map"])
+        assert np.abs(np.sort(seen[:, 0]) - np.sort(mapped[:, 0])).max() < 1.0
+
+
+def test_what_was_left_out_tells_its_reason_and_a_number_finds_its_marking(
+    browser: Any, report: Path
+) -> None:
+    with opened(browser, report) as watched:
+        page = watched.page
+        page.locator("#map").scroll_into_view_if_needed()
+        page.mouse.move(*page.evaluate(ON_SCREEN, [8.0, 2.0]))
+        page.wait_for_timeout(100)
+        tooltip = page.locator(".leaflet-tooltip:not(.corner)")
+        assert f"reason: its place is unsure {NASTY}" in tooltip.inner_text()
+        page.fill("#find-id", "3")
+        page.click("#find button")
+        assert page.locator("#details h3").inner_text() == "Marking 3, diamond"
+        page.fill("#find-id", "77")
+        page.click("#find button")
+        assert page.locator("#details h3").inner_text() == "Marking 3, diamond"
+        is_quiet(watched)
+
+
+def test_names_of_people_are_text_and_never_markup(browser: Any, tmp_path: Path) -> None:
+    drive = make_result(tmp_path, name=NASTY.replace("/", ""), kind=NASTY, status="FAIL")
+    path = write_page(tmp_path / "result", drive)
+    with opened(browser, path) as watched:
+        page = watched.page
+        assert page.locator("h1").inner_text() == NASTY.replace("/", "")
+        assert NASTY in page.locator(".findings").first.inner_text()
+        page.locator("#map").scroll_into_view_if_needed()
+        page.mouse.move(*page.evaluate(ON_SCREEN, PLACES[1].tolist()))
+        page.wait_for_timeout(100)
+        assert NASTY in page.locator(".leaflet-tooltip:not(.corner)").inner_text()
+        assert page.locator("img[onerror]").count() == 0
+        is_quiet(watched)
+
+
+def test_colours_by_accuracy_have_a_scale_in_centimetres(browser: Any, report: Path) -> None:
+    with opened(browser, report) as watched:
+        page = watched.page
+        page.select_option("#colour", "absolute")
+        assert page.locator("#legend .ends").inner_text().startswith("2.4 cm")
+        is_quiet(watched)

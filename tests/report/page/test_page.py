@@ -1,0 +1,256 @@
+"""What the page says is what the folder's files say, and what it lacks it tells."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.report.page.folder import DIAMOND_M, INFO, NASTY, PLACES, SHIFT_PX, make_result, make_site
+from v2hdm.drive import read_drive
+from v2hdm.errors import DriveError, MapFileError
+from v2hdm.hdmap.residuals import COLUMNS, read_residuals
+from v2hdm.records import DIAMOND, Drive, Marking
+from v2hdm.report.__main__ import main
+from v2hdm.report.outputs import write_json
+from v2hdm.report.page import pictures
+from v2hdm.report.page.document import Document, document
+from v2hdm.report.page.drive import drive_of
+from v2hdm.report.page.facts import read_facts
+from v2hdm.report.page.layers import ellipses
+from v2hdm.report.page.sightings import ground_residuals
+from v2hdm.report.page.write import write_page
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
+    return make_result(tmp_path_factory.mktemp("page"))
+
+
+@pytest.fixture(scope="module")
+def result(drive: Drive) -> Path:
+    return drive.root.parent / "result"
+
+
+@pytest.fixture(scope="module")
+def page(drive: Drive, result: Path) -> Document:
+    return document(read_facts(result, drive))
+
+
+def test_an_ellipse_has_the_half_axes_and_the_direction_of_its_covariance() -> None:
+    turned = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
+    one = turned @ np.diag([0.02**2, 0.01**2]) @ turned.T
+    half = ellipses(Marking(DIAMOND, DIAMOND_M, 3, np.kron(np.eye(4), one)))
+    assert half is not None
+    # 5.991 is the 95 % quantile of chi-square with two degrees of freedom.
+    assert half[:, :2] == pytest.approx(np.tile(np.sqrt(5.991) * np.array([0.02, 0.01]), (4, 1)), rel=1e-3)
+    assert np.tan(half[:, 2]) == pytest.approx(np.full(4, np.tan(0.4)))
+
+
+def test_the_stated_ellipses_hold_95_of_100_true_corners_of_right_covariances(
+    result: Path, drive: Drive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from dataclasses import replace
+
+    from v2hdm.records import HdMap, Truth
+    from v2hdm.report.page import tables
+
+    random = np.random.default_rng(3)
+    places = np.stack(np.meshgrid(np.arange(40), np.arange(25)), axis=-1).reshape(-1, 2) * 5.0
+    sigma_m = 0.01
+    true = [Marking(DIAMOND, DIAMOND_M + place, 3) for place in places]
+    mapped = [
+        replace(one, corners_map=one.corners_map + random.normal(0, sigma_m, (4, 2)),
+                covariance_m2=sigma_m**2 * np.eye(8))
+        for one in true
+    ]  # fmt: skip
+    facts = replace(
+        read_facts(result, drive),
+        hd_map=HdMap(tuple(mapped)),
+        truth=Truth(HdMap(tuple(true)), {}, np.empty((0, 4, 4)), np.empty((0, 1000)), (), {}),
+    )
+    table = tables.truth_table(facts)
+    assert table is not None
+    assert abs(int(table.rows[-1][-1]) - 95) <= 1
+
+
+def test_key_figures_and_tables_state_what_the_files_do(page: Document) -> None:
+    figures = {one.name: (one.value, one.unit) for one in page.figures}
+    assert figures["Markings"] == ("4", "")
+    assert figures["Between neighbours"] == ("1.0", "cm")  # 2.45 x 0.004 m
+    assert figures["In the map’s frame"] == ("2.4", "cm")  # 2.45 x 0.01 m
+    assert figures["In the images"] == ("0.36", "px")
+    mounting = {row[0]: row[1:] for row in page.cameras[0].mounting.rows}
+    assert mounting["centre up"][:2] == ("2.000 m", "2.0 mm")
+    assert mounting["centre forward"][2] == "+100 mm"
+    assert mounting["pitch, down"][:2] == ("14.324°", "0.006°")
+    assert mounting["clock, images later"][:2] == ("1.0 ms", "0.5 ms")
+    assert page.summary == "4 markings, 1 lane line and 1 symbol, mapped along 3 m with 1 camera (front)."
+    assert page.excluded_words == "1 of 5 candidates (20 %) are not in the map."
+    assert len(page.residuals) == 4
+
+
+def test_residuals_on_the_ground_lead_from_the_observation_to_the_map(result: Path, drive: Drive) -> None:
+    found = ground_residuals(read_facts(result, drive))
+    assert found is not None
+    assert found.residual_px == pytest.approx(np.tile(SHIFT_PX, (80, 1)), abs=1e-4)
+    # Straight ahead 0.3 px to the right are depth / 500 px times as many metres to the vehicle's right.
+    ahead = np.isin(found.marking, (1, 4)) & (found.corner % 2 == 0)
+    depth_m = np.cos(0.25) * found.range_m + np.sin(0.25) * 2.0
+    assert found.ground_m[ahead, 1] == pytest.approx(-0.3 * depth_m[ahead] / 500, rel=0.02)
+    assert (found.ground_m[ahead, 0] > 0).all()  # 0.2 px up is farther away
+    assert found.range_m.max() == pytest.approx(9.5, abs=0.1)
+
+
+def test_a_corner_is_where_its_marking_has_it_in_the_map(result: Path, drive: Drive) -> None:
+    residuals = read_residuals(result / "residuals.csv")
+    facts = read_facts(result, drive)
+    found = ground_residuals(facts)
+    assert found is not None
+    assert facts.hd_map is not None
+    first = (residuals.row_image == 0) & (residuals.marking == 1)
+    feet = found.range_m[first]
+    assert feet == pytest.approx(np.linalg.norm(DIAMOND_M + PLACES[0], axis=1), abs=0.05)
+
+
+def test_pictures_stay_within_their_budget_and_the_best_of_everything_comes_first(
+    result: Path, drive: Drive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    facts = read_facts(result, drive)
+    everything = pictures.pictures(facts)
+    assert {"m1", "m2", "m3", "m4", "s6", "x0"} <= everything.keys()
+    total = sum(len(one["src"]) for shots in everything.values() for one in shots)
+    monkeypatch.setattr(pictures, "BUDGET_BYTES", total // 2)
+    monkeypatch.setattr(pictures, "_USUAL_BYTES", 1)
+    fewer = pictures.pictures(facts)
+    assert sum(len(one["src"]) for shots in fewer.values() for one in shots) <= total // 2
+    assert all(shots[0] == everything[key][0] for key, shots in fewer.items())
+    assert len([key for key in fewer if key.startswith("m")]) == 4
+
+
+def test_names_end_no_script_and_become_no_markup(tmp_path: Path) -> None:
+    drive = make_result(tmp_path, kind=NASTY, status="WARN")
+    text = write_page(tmp_path / "result", drive).read_text()
+    assert "<img src=x" not in text
+    assert text.count("</script>") == text.count("<script")
+    embedded = re.search(r'id="map-data">(.*?)</script>', text, re.DOTALL)
+    assert embedded is not None
+    assert NASTY in json.loads(embedded.group(1))["kinds"]
+
+
+def test_the_page_asks_for_nothing_beyond_itself(result: Path, drive: Drive) -> None:
+    text = write_page(result, drive).read_text()
+    assert "default-src 'none'" in text
+    outside_scripts = re.sub(r"<script.*?</script>", "", text, flags=re.DOTALL)
+    assert not re.search(r"""(?:src|href)=["'](?!data:|#)""", outside_scripts)
+    assert "@import" not in outside_scripts
+    assert "sourceMappingURL" not in text
+
+
+def test_the_same_folder_gives_the_same_page_to_the_byte(result: Path, drive: Drive) -> None:
+    assert write_page(result, drive).read_bytes() == write_page(result, drive).read_bytes()
+
+
+def test_without_its_drive_the_page_says_what_it_lacks(result: Path) -> None:
+    page = document(read_facts(result, None))
+    assert page.pictures == {}
+    assert any("--drive" in one for one in page.missing)
+    assert page.map_data["route"]["recorded"] == []
+    assert len(page.map_data["markings"]) == 4
+
+
+def test_a_run_without_a_map_has_a_page_with_its_verdict(tmp_path: Path) -> None:
+    finding = {"check": "map", "status": "FAIL", "value": None, "limit": None, "unit": "",
+               "says": "no map came of this drive", "about": "map"}  # fmt: skip
+    verdict = {"status": "FAIL", "findings": [finding], "untold": [], "passed": []}
+    write_json(tmp_path / "metrics.json", {"name": "n", "verdict": verdict, "results": {}})
+    text = write_page(tmp_path, None).read_text()
+    assert "no map came of this drive" in text
+    assert 'id="map"' not in text
+
+
+def test_check_points_of_the_folder_are_told_in_centimetres_and_shown_on_the_map(tmp_path: Path) -> None:
+    drive = make_result(tmp_path)
+    rows = [
+        "id,x_map_m,y_map_m,marking,corner,dx_m,dy_m,distance_m,inside_95_percent,not_compared_because",
+        "P1,6.5,0.0,1,1,0.0123,-0.0040,0.0129,yes,",
+        "P2,30.0,0.0,,,,,,,nothing of the map is near",
+    ]
+    (tmp_path / "result" / "check_points.csv").write_text("\n".join(rows) + "\n")
+    page = document(read_facts(tmp_path / "result", drive))
+    assert page.check_points is not None
+    first = dict(zip(page.check_points.headings, page.check_points.rows[0], strict=True))
+    assert (first["point"], first["east (cm)"], first["north (cm)"]) == ("P1", "1.2", "−0.4")
+    assert [one["off"] for one in page.map_data["checks"]] == [[0.0123, -0.004], [None, None]]
+
+
+def test_a_mosaic_of_the_folder_is_a_layer_within_its_budget(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from v2hdm.report.page import ground
+
+    drive = make_result(tmp_path)
+    random = np.random.default_rng(0).integers(0, 255, (600, 800, 4), dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "result" / "mosaic.webp"), random)
+    cv2.imwrite(str(tmp_path / "result" / "mosaic_before_after.png"), random[..., :3])
+    sharpness = {
+        "edges": 9,
+        "edge_width_before_m": 0.06,
+        "edge_width_after_m": 0.02,
+        "after_over_before": 3.0,
+    }
+    told = {"image": "mosaic.webp", "bounds_m": [-1.0, -4.0, 15.0, 8.0], "sharpness": sharpness}
+    write_json(tmp_path / "result" / "mosaic.json", told)
+    monkeypatch.setattr(ground, "LARGEST_BYTES", 60_000)
+    page = document(read_facts(tmp_path / "result", drive))
+    layer = page.map_data["mosaic"]
+    assert layer["bounds"] == [-1.0, -4.0, 15.0, 8.0]
+    assert len(layer["src"]) <= 60_000
+    shown = cv2.imdecode(np.frombuffer(base64.b64decode(layer["src"]), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert shown.shape[1] / shown.shape[0] == pytest.approx(800 / 600, rel=0.02)
+    assert page.ground is not None
+    assert "6.0 cm wide before and 2.0 cm after: 3.0 times as sharp" in page.ground.caption
+    (tmp_path / "result" / "mosaic.webp").unlink()
+    with pytest.raises(MapFileError, match=r"mosaic\.webp: no picture"):
+        document(read_facts(tmp_path / "result", drive))
+
+
+def test_a_map_of_thousands_is_written_in_seconds(tmp_path: Path) -> None:
+    make_site(tmp_path / "site", 3000)
+    assert write_page(tmp_path / "site", None).stat().st_size < 4e6
+
+
+def test_the_door_finds_the_drive_and_names_what_is_wrong(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_result(tmp_path)
+    result = tmp_path / "result"
+    assert main([str(result)]) == 0
+    assert capsys.readouterr().out.startswith(f"{result / 'report.html'}: ")
+    pictures_of = re.compile(r'id="pictures">\{"m1"')
+    assert pictures_of.search((result / "report.html").read_text())
+    assert main([str(tmp_path)]) == 2
+    assert capsys.readouterr().err.startswith(f"error: {tmp_path}: no metrics.json in it")
+    lines = (result / "residuals.csv").read_text().splitlines()
+    (result / "residuals.csv").write_text("\n".join([*lines[:3], "front/0.png,front,x"]) + "\n")
+    assert main([str(result)]) == 2
+    assert "residuals.csv: line 4" in capsys.readouterr().err
+    (result / "residuals.csv").write_text("a,b\n")
+    assert main([str(result)]) == 2
+    assert ",".join(COLUMNS) in capsys.readouterr().err
+
+
+def test_another_drive_than_that_of_the_result_is_refused(tmp_path: Path) -> None:
+    make_result(tmp_path / "a", name="one")
+    make_result(tmp_path / "b", name="two")
+    metrics = json.loads((tmp_path / "a" / "result" / "metrics.json").read_text())
+    with pytest.raises(DriveError, match="drive two of 5 images"):
+        drive_of(metrics, tmp_path / "b" / "drive")
+    metrics["drive"]["path"] = str(tmp_path / "gone")
+    assert drive_of(metrics, None) is None
+    assert read_drive(tmp_path / "a" / "drive").cameras["front"].info.width == INFO.width

@@ -1,0 +1,56 @@
+"""What a run was made of: the drive, the date, the versions of what computed it."""
+
+from __future__ import annotations
+
+import platform
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from v2hdm import __version__
+from v2hdm.drive import ReadOptions
+from v2hdm.records import Drive
+
+_PACKAGES = ("torch", "kornia", "numpy", "scipy", "onnxruntime", "opencv-python-headless", "numba")
+"""Those that the figures of a run depend on."""
+
+
+def describe_run(name: str, drive: Drive, path: Path, options: ReadOptions) -> dict[str, Any]:
+    """What ``metrics.json`` begins with: name, version, date (UTC), the drive at ``path``, as it was read."""
+    return {
+        "name": name,
+        "version": __version__,
+        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
+        "drive": _drive(drive, path, options),
+        "versions": _versions(),
+    }
+
+
+def _drive(drive: Drive, path: Path, options: ReadOptions) -> dict[str, Any]:
+    stamp_s = [image.stamp_s for image in drive.images]
+    places = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
+    return {
+        "name": drive.name,
+        "path": str(path.resolve()),
+        "format": options.format,
+        "max_gap_s": options.max_gap_s,
+        "cameras": list(drive.cameras),
+        "images": len(drive.images),
+        "duration_s": round(float(np.ptp(stamp_s)), 3),
+        "length_m": round(float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum()), 2),
+        "position_sigma_m": drive.pose_noise.position_m,
+        "heading_sigma_deg": round(float(np.rad2deg(drive.pose_noise.heading_rad)), 4),
+    }
+
+
+def _versions() -> dict[str, str]:
+    found = {"v2hdm": __version__, "Python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found | {"system": f"{platform.system()} {platform.machine()}"}

@@ -1,0 +1,323 @@
+"""The report's charts as SVG, whose colours the page's style replaces by those of its light or dark theme."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
+
+from v2hdm.records import FloatArray, HdMap
+from v2hdm.report.page.facts import Route
+from v2hdm.report.page.sightings import GroundResiduals
+from v2hdm.report.style import OKABE_ITO
+
+INK, MUTED, GRID, PAPER = "#1b1e21", "#5c646b", "#dde1e5", "#fdfdfd"
+"""Colours of text, axes, grid and background: those that ``page.css`` replaces by its theme's."""
+
+_ORDER = ("blue", "vermillion", "green", "purple", "orange", "sky")
+_DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1.2, 1.2)), (0, (6, 1.5, 1.2, 1.5)), "-", "--")
+_MARKERS = ("o", "s", "^", "D", "v", "P")
+
+CELLS = (9, 16)
+"""Rows and columns that an image is divided into for the mean residual of each."""
+
+_LEAST_IN_CELL = 10
+"""Observations of a cell from which its mean is drawn: its error is a third of one observation's."""
+
+_RC: dict[Any, Any] = {
+    "svg.fonttype": "none",
+    "font.family": "sans-serif",
+    "font.size": 9.5,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": MUTED,
+    "axes.facecolor": "none",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.8,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.titlecolor": INK,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "grid.color": GRID,
+    "grid.linewidth": 0.8,
+    "legend.frameon": False,
+    "legend.labelcolor": INK,
+    "lines.linewidth": 1.6,
+    "patch.linewidth": 1.2,
+}
+
+
+@contextmanager
+def _chart(name: str, width_in: float, height_in: float) -> Iterator[tuple[Figure, list[str]]]:
+    """A figure, and the list that holds its SVG when the block has ended."""
+    out: list[str] = []
+    with mpl.rc_context({**_RC, "svg.hashsalt": name}):
+        figure = Figure(figsize=(width_in, height_in), layout="constrained")
+        FigureCanvasSVG(figure)
+        figure.patch.set_alpha(0.0)
+        yield figure, out
+        text = io.StringIO()
+        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        figure.savefig(text, format="svg", metadata=nothing, transparent=True)
+    svg = text.getvalue()
+    out.append(svg[svg.index("<svg") :])
+
+
+def _look(number: int) -> dict[str, Any]:
+    """Colour and dashes of series ``number``: told apart without colour, too."""
+    return {"color": OKABE_ITO[_ORDER[number % len(_ORDER)]], "linestyle": _DASHES[number % len(_DASHES)]}
+
+
+def site_chart(hd_map: HdMap, route: Route | None, excluded: FloatArray) -> str:
+    """The whole map from above, for paper: markings, lane lines, the route, what was left out (N, 2)."""
+    points = [m.corners_map for m in hd_map.markings] + [one.points_map for one in hd_map.lanes]
+    if route is not None:
+        points.append(route.map_from_vehicle[:, :2, 3])
+    spread = np.ptp(np.concatenate(points), axis=0) + 10.0
+    height_in = float(np.clip(6.4 * spread[1] / spread[0] + 0.8, 2.4, 6.2))
+    with _chart("site", 7.2, height_in) as (figure, out):
+        axes = figure.subplots()
+        if route is not None:
+            way = route.map_from_vehicle[:, :2, 3]
+            axes.plot(*way.T, color=MUTED, lw=1.0, ls=(0, (4, 2)), label="route of the vehicle")
+            axes.plot(*way[0], "o", color=MUTED, ms=4)
+        lanes = [one.points_map for one in hd_map.lanes]
+        axes.add_collection(
+            LineCollection(lanes, colors=OKABE_ITO["sky"], linewidths=0.9, label="lane lines")
+        )
+        shapes = [m.corners_map for m in hd_map.markings] + [one.outline_map for one in hd_map.symbols]
+        colour = OKABE_ITO["blue"]
+        axes.add_collection(
+            PolyCollection(shapes, facecolors=colour, edgecolors=colour, linewidths=0.8, label="markings")
+        )
+        if len(excluded):
+            axes.plot(
+                *excluded.T, "x", color=OKABE_ITO["vermillion"], ms=4, mew=1.0, label="left out, with reason"
+            )
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.autoscale_view()
+        axes.set_xlabel("east (m)")
+        axes.set_ylabel("north (m)")
+        figure.legend(loc="outside upper left", ncols=4, fontsize=8.5, handlelength=1.8, columnspacing=1.4)
+    return out[0]
+
+
+def histogram_chart(residuals: GroundResiduals) -> str:
+    """Residuals in px, and in standard deviations beside what they would be if the noise model were right."""
+    with _chart("histogram", 7.2, 2.5) as (figure, out):
+        left, right = figure.subplots(1, 2)
+        size_px = np.linalg.norm(residuals.residual_px[residuals.is_point], axis=1)
+        edges_px = np.linspace(0, max(float(np.percentile(size_px, 99)) if len(size_px) else 1.0, 0.1), 41)
+        edges_sigma = np.linspace(0, 5, 41)
+        for number, name in enumerate(residuals.cameras):
+            own = residuals.camera == number
+            point = own & residuals.is_point
+            lengths = np.linalg.norm(residuals.residual_px[point], axis=1)
+            _steps(left, lengths, edges_px, f"{name} ({np.count_nonzero(point)})", number)
+            _steps(right, residuals.distance_sigma[own], edges_sigma, name, number)
+        ideal = edges_sigma * np.exp(-0.5 * edges_sigma**2)
+        right.plot(edges_sigma, ideal, color=MUTED, lw=1.0, label="as the noise model says")
+        left.set_xlabel("distance, projected to observed (px)")
+        left.set_ylabel("share of corners per px")
+        right.set_xlabel("the same (standard deviations)")
+        for axes in (left, right):
+            axes.set_ylim(bottom=0)
+            axes.set_xlim(left=0)
+            axes.grid(axis="y")
+            axes.legend(loc="upper right", fontsize=8.5)
+    return out[0]
+
+
+def _steps(axes: Axes, values: FloatArray, edges: FloatArray, label: str, number: int) -> None:
+    if not len(values):
+        return
+    counts, _ = np.histogram(values, edges)
+    axes.stairs(counts / (len(values) * np.diff(edges)), edges, label=label, baseline=None, **_look(number))
+
+
+def field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]]) -> str:
+    """The mean residual over each camera's image, by ``sizes`` (width, height) in px."""
+    names = list(residuals.cameras)
+    width_px, height_px = sizes[names[0]]
+    columns = min(2, len(names))
+    rows = -(-len(names) // columns)
+    panel_in = 7.2 / columns
+    with _chart("field", 7.2, rows * (0.84 * panel_in * height_px / width_px + 0.75)) as (figure, out):
+        panels = np.atleast_1d(figure.subplots(rows, columns)).ravel()
+        for axes in panels[len(names) :]:
+            axes.set_axis_off()
+        fields = [_field(residuals, number, sizes[name]) for number, name in enumerate(names)]
+        longest = max(
+            (float(np.linalg.norm(mean, axis=1).max()) for _, mean in fields if len(mean)), default=0.1
+        )
+        key_px = _round_down(max(longest, 1e-3))
+        for number, (axes, name) in enumerate(zip(panels, names, strict=False)):
+            width_px, height_px = sizes[name]
+            places, mean = fields[number]
+            # The longest arrow spans one and a half cells.
+            scale = longest / (1.5 * width_px / CELLS[1])
+            arrows = axes.quiver(
+                *places.T, *mean.T, angles="xy", scale_units="xy", scale=scale,
+                color=OKABE_ITO[_ORDER[number % len(_ORDER)]], width=0.005, headwidth=3.6,
+            )  # fmt: skip
+            axes.quiverkey(
+                arrows, 0.88, 1.06, key_px, f"{key_px:g} px", labelpos="W", coordinates="axes",
+                labelcolor=INK, color=INK, fontproperties={"size": 8.5},
+            )  # fmt: skip
+            axes.set_xlim(0, width_px)
+            axes.set_ylim(height_px, 0)
+            axes.set_aspect("equal")
+            axes.set_xlabel("u (px)")
+            axes.set_ylabel("v (px)")
+            axes.set_title(name)
+            for side in ("top", "right"):
+                axes.spines[side].set_visible(True)
+    return out[0]
+
+
+def _field(residuals: GroundResiduals, camera: int, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+    """Centres (N, 2) of the cells of an image that saw enough, and the mean residual (N, 2) of each, px."""
+    own = (residuals.camera == camera) & residuals.is_point
+    place, off = residuals.observed_px[own], residuals.residual_px[own]
+    rows, columns = CELLS
+    column = np.floor(place[:, 0] / size[0] * columns).astype(np.int64)
+    row = np.floor(place[:, 1] / size[1] * rows).astype(np.int64)
+    inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    cell = (row * columns + column)[inside]
+    count = np.bincount(cell, minlength=rows * columns)
+    enough = np.flatnonzero(count >= _LEAST_IN_CELL)
+    mean = np.column_stack([np.bincount(cell, off[inside, a], rows * columns) for a in (0, 1)])
+    centres = np.column_stack(
+        [(enough % columns + 0.5) * size[0] / columns, (enough // columns + 0.5) * size[1] / rows]
+    )
+    return centres, mean[enough] / count[enough][:, None]
+
+
+def _round_down(value: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten up to ``value``."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(max(step for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)) * power)
+
+
+def range_chart(residuals: GroundResiduals) -> str:
+    """Residuals against the distance from the camera: in the image and on the ground."""
+    with _chart("range", 7.2, 2.5) as (figure, out):
+        left, right = figure.subplots(1, 2)
+        farthest = float(np.ceil(residuals.range_m.max(initial=1.0)))
+        edges = np.linspace(0, farthest, max(2, min(int(farthest), 24)) + 1)
+        ground = np.linalg.norm(residuals.ground_m, axis=1)
+        size_px = np.linalg.norm(residuals.residual_px, axis=1)
+        for number, name in enumerate(residuals.cameras):
+            own = (residuals.camera == number) & residuals.is_point & np.isfinite(ground)
+            look = {**_look(number), "marker": _MARKERS[number % len(_MARKERS)], "ms": 3.5}
+            for axes, values in ((left, size_px), (right, 100 * ground)):
+                middle, rms = _rms_by(residuals.range_m[own], values[own], edges)
+                axes.plot(middle, rms, label=name, **look)
+        left.set_ylabel("RMS distance (px)")
+        right.set_ylabel("RMS distance on the ground (cm)")
+        for axes in (left, right):
+            axes.set_xlabel("distance from the camera (m)")
+            axes.set_ylim(bottom=0)
+            axes.grid(axis="y")
+            axes.legend(loc="best", fontsize=8.5)
+    return out[0]
+
+
+def _rms_by(place: FloatArray, values: FloatArray, edges: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Middles of the bins that hold enough values, and the root mean square of each."""
+    bin_of = np.clip(np.searchsorted(edges, place, side="right") - 1, 0, len(edges) - 2)
+    count = np.bincount(bin_of, minlength=len(edges) - 1)
+    squared = np.bincount(bin_of, values**2, len(edges) - 1)
+    enough = count >= _LEAST_IN_CELL
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    return middle[enough], np.sqrt(squared[enough] / count[enough])
+
+
+def route_chart(route: Route, residuals: GroundResiduals | None) -> str:
+    """Along the way: the residuals, and what was taken off the recorded poses."""
+    panels = [name for name, there in (("fit", residuals), ("pose", route.recorded)) if there is not None]
+    with _chart("route", 7.2, 1.9 * len(panels) + 0.3) as (figure, out):
+        rows = dict(zip(panels, np.atleast_1d(figure.subplots(len(panels), 1, sharex=True)), strict=True))
+        way_m = route.way_m
+        if residuals is not None:
+            _fit_along(rows["fit"], residuals, route)
+        if route.recorded is not None:
+            moved = np.linalg.inv(route.recorded) @ route.map_from_vehicle
+            for number, (name, axis) in enumerate((("forward", 0), ("left", 1))):
+                axes, shift = rows["pose"], 100 * moved[:, axis, 3]
+                look = _look(number)
+                sigma = 100 * route.sigma[:, axis]
+                axes.fill_between(
+                    way_m, shift - 2.448 * sigma, shift + 2.448 * sigma, color=look["color"], alpha=0.15, lw=0
+                )
+                axes.plot(way_m, shift, label=name, lw=1.1, **look)
+            rows["pose"].axhline(0, color=MUTED, lw=0.6)
+            rows["pose"].set_ylabel("correction (cm)")
+            rows["pose"].legend(loc="upper right", ncols=2, fontsize=8.5)
+        for axes in rows.values():
+            axes.grid(axis="y")
+            axes.set_xlim(0, max(float(way_m[-1]), 1.0))
+        list(rows.values())[-1].set_xlabel("way driven (m)")
+    return out[0]
+
+
+def _fit_along(axes: Axes, residuals: GroundResiduals, route: Route) -> None:
+    total = max(float(route.way_m[-1]), 1.0)
+    edges = np.linspace(0, total, int(np.clip(total / 5, 4, 80)) + 1)
+    way = np.interp(residuals.taken_s, route.stamp_s, route.way_m)
+    for number, name in enumerate(residuals.cameras):
+        own = (residuals.camera == number) & residuals.is_point
+        middle, rms = _rms_by(way[own], np.linalg.norm(residuals.residual_px[own], axis=1), edges)
+        axes.plot(middle, rms, label=name, lw=1.1, **_look(number))
+    axes.set_ylabel("RMS residual (px)")
+    axes.set_ylim(bottom=0)
+    axes.legend(loc="upper right", ncols=max(1, len(residuals.cameras)), fontsize=8.5)
+
+
+def ellipse_chart(semi_axes_cm: Mapping[str, FloatArray]) -> str:
+    """How many corners are known how well: shares of corners by the 95 % ellipse's larger half axis."""
+    with _chart("ellipse", 7.2, 2.3) as (figure, out):
+        axes = figure.subplots()
+        top = max((float(values.max(initial=0.0)) for values in semi_axes_cm.values()), default=1.0)
+        for number, (name, values) in enumerate(semi_axes_cm.items()):
+            order = np.sort(values)
+            share = 100 * np.arange(1, len(order) + 1) / max(len(order), 1)
+            axes.step(
+                np.concatenate([[0], order, [top]]), np.concatenate([[0], share, [100]]), where="post",
+                label=name, **_look(number),
+            )  # fmt: skip
+        axes.set_xlabel("95 % of the error lies within (cm)")
+        axes.set_ylabel("share of corners (%)")
+        axes.set_ylim(0, 102)
+        axes.set_xlim(0, max(top, 1e-3))
+        axes.grid()
+        axes.legend(loc="lower right", fontsize=8.5)
+    return out[0]
+
+
+def bar_chart(name: str, counts: Sequence[tuple[str, int]]) -> str:
+    """Counts by name, the largest first, as horizontal bars with their numbers."""
+    with _chart(name, 7.2, 0.45 + 0.27 * len(counts)) as (figure, out):
+        axes = figure.subplots()
+        labels, values = [one for one, _ in counts], [count for _, count in counts]
+        bars = axes.barh(range(len(values)), values, color=OKABE_ITO["blue"], height=0.62)
+        axes.bar_label(bars, padding=4, color=INK, fontsize=9)
+        axes.set_yticks(range(len(values)), labels)
+        axes.tick_params(axis="y", length=0)
+        axes.invert_yaxis()
+        axes.set_xlabel("candidates")
+        axes.spines["left"].set_visible(False)
+        axes.margins(x=0.08)
+    return out[0]

@@ -1,0 +1,251 @@
+"""The whole page as one document: what the templates fill in, and nothing that they have to compute."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from v2hdm.report.page import charts, tables
+from v2hdm.report.page.cameras import CameraPage, camera_pages
+from v2hdm.report.page.cells import Figure, Table, in_words, pair_table
+from v2hdm.report.page.facts import Facts
+from v2hdm.report.page.ground import GroundPage, ground_page
+from v2hdm.report.page.layers import layers
+from v2hdm.report.page.pictures import overlays, pictures
+from v2hdm.report.page.sightings import GroundResiduals, ground_residuals
+
+_SAYS = {
+    "PASS": "Every check is within its limit. Map and calibrations can be relied on as stated below.",
+    "WARN": "The map holds, or was corrected for what is told below. Read the findings before you rely "
+    "on it.",
+    "FAIL": "The map is wrong or cannot be relied on, whatever the figures below say. Each finding names a "
+    "cause and a remedy.",
+}
+
+
+@dataclass(frozen=True)
+class Chart:
+    """An SVG, what it shows and what to see in it."""
+
+    title: str
+    caption: str
+    svg: str
+
+
+@dataclass(frozen=True)
+class VerdictPage:
+    """The verdict: its status, what that means, and the rows of its findings."""
+
+    status: str
+    says: str
+    raised: tuple[tuple[str, ...], ...]
+    untold: tuple[tuple[str, ...], ...]
+    passed: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True)
+class Document:
+    """What the page shows, in the order of its sections; what a run does not have is None or empty.
+
+    ``map_data`` and ``pictures`` are the JSON documents of the map in the page.
+    """
+
+    name: str
+    date: str
+    version: str
+    summary: str
+    verdict: VerdictPage
+    figures: tuple[Figure, ...]
+    site: Chart | None
+    accuracy: tuple[Table, ...]
+    accuracy_chart: Chart | None
+    check_points: Table | None
+    map_data: Mapping[str, Any]
+    pictures: Mapping[str, Any]
+    cameras: tuple[CameraPage, ...]
+    ground: GroundPage | None
+    residuals: tuple[Chart, ...]
+    excluded: Chart | None
+    excluded_words: str
+    contents: Table | None
+    methods: Table | None
+    about: tuple[Table, ...]
+    config: str
+    missing: tuple[str, ...]
+
+
+def document(facts: Facts) -> Document:
+    """Everything that is known of a run, as the page says it.
+
+    Raises:
+        DriveError: an image of the drive cannot be read.
+    """
+    metrics = facts.metrics
+    verdict = metrics.get("verdict") or {}
+    status = str(verdict.get("status", "FAIL"))
+    residuals = ground_residuals(facts)
+    accuracy = (tables.accuracy_table(facts), tables.truth_table(facts))
+    about = (
+        pair_table("The drive.", metrics.get("drive") or {}),
+        tables.timing_table(facts),
+        pair_table("Versions of what computed it.", metrics.get("versions") or {}),
+    )
+    return Document(
+        name=str(metrics.get("name", facts.folder.name)),
+        date=str(metrics.get("date", "")),
+        version=str(metrics.get("version", "")),
+        summary=_summary(facts),
+        verdict=VerdictPage(
+            status,
+            _SAYS.get(status, ""),
+            *(tables.finding_rows(verdict, which) for which in ("findings", "untold", "passed")),
+        ),
+        figures=tables.key_figures(facts),
+        site=_site(facts),
+        accuracy=tuple(one for one in accuracy if one is not None),
+        accuracy_chart=_accuracy_chart(facts),
+        check_points=tables.check_point_table(facts),
+        map_data=layers(facts, residuals),
+        pictures=pictures(facts),
+        cameras=camera_pages(facts, overlays(facts)),
+        ground=ground_page(facts.folder),
+        residuals=_residual_charts(facts, residuals),
+        excluded=_excluded(facts),
+        excluded_words=_excluded_words(facts),
+        contents=tables.content_table(facts),
+        methods=tables.method_table(facts),
+        about=tuple(one for one in about if one is not None),
+        config=facts.config.strip(),
+        missing=_missing(facts),
+    )
+
+
+def _summary(facts: Facts) -> str:
+    """What was mapped, in a sentence."""
+    if facts.hd_map is None:
+        return "No map came of this drive."
+    words = [
+        in_words(len(facts.hd_map.markings), "marking"),
+        in_words(len(facts.hd_map.lanes), "lane line"),
+    ]
+    if facts.hd_map.symbols:
+        words.append(in_words(len(facts.hd_map.symbols), "symbol"))
+    sentence = f"{', '.join(words[:-1])} and {words[-1]}"
+    if facts.route is not None:
+        sentence += f", mapped along {facts.route.way_m[-1]:.0f} m"
+    if facts.cameras:
+        sentence += f" with {in_words(len(facts.cameras), 'camera')} ({', '.join(facts.cameras)})"
+    return f"{sentence}."
+
+
+def _site(facts: Facts) -> Chart | None:
+    if facts.hd_map is None or not (facts.hd_map.markings or facts.hd_map.lanes):
+        return None
+    excluded = np.array([one.position_map for one in facts.excluded]).reshape(-1, 2)
+    return Chart(
+        "The map from above",
+        "Where markings stand close together along the whole route, the drive was seen throughout. "
+        "Crosses show "
+        "what was left out: they should be few and at the edges.",
+        charts.site_chart(facts.hd_map, facts.route, excluded),
+    )
+
+
+def _accuracy_chart(facts: Facts) -> Chart | None:
+    if facts.hd_map is None:
+        return None
+    relative = tables.relative_m(facts.hd_map.markings)
+    absolute = tables.half_axes_m(facts.hd_map.markings)
+    series = {
+        name: 100 * values
+        for name, values in (("relative to neighbours", relative), ("absolute", absolute))
+        if len(values)
+    }
+    if not series:
+        return None
+    return Chart(
+        "How many corners are how good",
+        "Read it upwards from the accuracy that you need: the lines say which share of the corners "
+        "reaches it. "
+        "The absolute accuracy rests on the receiver’s stated noise. An offset that a whole drive "
+        "shares, as of a "
+        "base station set up wrongly, shows in no drive: only surveyed check points tell it.",
+        charts.ellipse_chart(series),
+    )
+
+
+def _residual_charts(facts: Facts, residuals: GroundResiduals | None) -> tuple[Chart, ...]:
+    if residuals is None or facts.route is None:
+        return ()
+    sizes = {
+        name: (one.calibration.info.width, one.calibration.info.height) for name, one in facts.cameras.items()
+    }
+    return (
+        Chart(
+            "How far corners lie from where the map puts them",
+            "Left: in pixels. Right: in standard deviations of the detector’s own statement; lines to "
+            "the left "
+            "of the grey one mean that the corners are better than stated, a long tail that some are wrong.",
+            charts.histogram_chart(residuals),
+        ),
+        Chart(
+            "Over the image",
+            "Mean residual of each part of the image, drawn longer than it is (the key gives the scale). "
+            "Arrows "
+            "without a pattern are noise; a swirl or a fan would be a wrong lens or principal point.",
+            charts.field_chart(residuals, sizes),
+        ),
+        Chart(
+            "Over range",
+            "In the image near corners scatter more, for there a centimetre is more pixels; a rise at the "
+            "far end would be a wrong tilt or lens. On the ground residuals grow with range, since a far "
+            "pixel covers more of it. The map is made of many such sightings and is better than each.",
+            charts.range_chart(residuals),
+        ),
+        Chart(
+            "Along the route",
+            "Above: a stretch that stands out was seen badly or has wrong poses. Below: what was taken "
+            "off the "
+            "recorded poses, with the band of 95 %; it should wander within the receiver’s noise and "
+            "never jump.",
+            charts.route_chart(facts.route, residuals),
+        ),
+    )
+
+
+def _excluded(facts: Facts) -> Chart | None:
+    counts = tables.exclusion_counts(facts)
+    if not counts:
+        return None
+    return Chart(
+        "Why candidates were left out",
+        "Each of them is on the map above, with its reason and, where the drive is at hand, its pictures.",
+        charts.bar_chart("excluded", counts),
+    )
+
+
+def _excluded_words(facts: Facts) -> str:
+    if facts.hd_map is None:
+        return ""
+    out, kept = len(facts.excluded), len(facts.hd_map.markings)
+    if not out:
+        return "Nothing was left out."
+    return f"{out} of {out + kept} candidates ({100 * out / (out + kept):.0f} %) are not in the map."
+
+
+def _missing(facts: Facts) -> tuple[str, ...]:
+    """What the page lacks, and why."""
+    found = []
+    if facts.drive is None:
+        found.append(
+            "The drive was not at hand: no pictures of markings, no recorded route, no truth. "
+            "Make the report again with --drive."
+        )
+    if facts.residuals is None and facts.hd_map is not None:
+        found.append(
+            "The folder has no residuals.csv (an older run): no residuals, no pictures. Map it again."
+        )
+    return tuple(found)

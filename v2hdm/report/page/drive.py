@@ -1,0 +1,38 @@
+"""The drive of a result, found again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from v2hdm.drive import ReadOptions, read_drive
+from v2hdm.errors import DriveError
+from v2hdm.records import Drive
+
+
+def drive_of(metrics: Mapping[str, Any], path: Path | None) -> Drive | None:
+    """The drive at ``path``, else where ``metrics.json`` says it was; None where nothing is there any more.
+
+    Raises:
+        DriveError: it cannot be read, or is not the drive of this result.
+    """
+    told = metrics.get("drive")
+    told = told if isinstance(told, dict) else {}
+    if path is None:
+        if not told.get("path") or not Path(str(told["path"])).exists():
+            return None
+        path = Path(str(told["path"]))
+    options = ReadOptions(
+        format=str(told.get("format", "auto")),
+        cameras=[str(name) for name in told.get("cameras") or []],
+        max_gap_s=float(told.get("max_gap_s", ReadOptions.max_gap_s)),
+    )
+    drive = read_drive(path, options)
+    expected = (told.get("name", drive.name), told.get("images", len(drive.images)))
+    if expected != (drive.name, len(drive.images)):
+        raise DriveError(
+            f"{path}: drive {drive.name} of {len(drive.images)} images, but the result is of drive "
+            f"{expected[0]} of {expected[1]}; give that one with --drive"
+        )
+    return drive

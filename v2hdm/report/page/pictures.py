@@ -1,0 +1,218 @@
+"""Small pictures of what is in the map and what was left out, cut from the drive's images."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from v2hdm.detection.batch import read_image
+from v2hdm.geometry.ipm import project_ground
+from v2hdm.geometry.lens import distort_points
+from v2hdm.records import Drive, FloatArray, Image
+from v2hdm.report.page.coding import jpeg
+from v2hdm.report.page.facts import Facts
+from v2hdm.report.page.layers import excluded_key, marking_key, symbol_key
+from v2hdm.report.page.sightings import cams_from_map
+
+BUDGET_BYTES = 8_000_000
+"""Of all pictures together, as text in the page: a report stays below 15 MB."""
+
+PER_CAMERA = 2
+"""Pictures of a marking by one camera: the nearest one, and one from the middle of its sightings."""
+
+_USUAL_BYTES = 5_000
+"""Of one picture; no more are cut than could fit."""
+
+_LONGEST_PX = 320
+_LEAST_PX = 96
+_MARGIN = 0.45
+"""Share of a marking's size that is shown around it."""
+
+_QUALITY = 72
+
+_NEAR_M, _FAR_M = 3.0, 14.0
+"""Where something that is no marking is looked for in the images: in front of the camera, this far away."""
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """A piece of an image to be cut: of the feature ``key``, which has ``shape_map`` (N, 2).
+
+    ``seen_px`` (M, 2) are its corners as they were detected, recorded px; ``rank`` 0 is the best one of it.
+    """
+
+    key: str
+    rank: int
+    image: str
+    row: int
+    shape_map: FloatArray
+    seen_px: FloatArray
+
+
+def pictures(facts: Facts) -> dict[str, list[dict[str, Any]]]:
+    """By feature (see :mod:`v2hdm.report.page.layers`) its pictures, the best first; empty without the drive.
+
+    Each has ``src`` (JPEG as base64), ``size``, ``camera``, ``image``, ``t`` (s), the shape as the map puts
+    it there (``map``) and the corners as they were detected (``seen``), both in px of the picture.
+
+    Raises:
+        DriveError: an image of the drive cannot be read.
+    """
+    if facts.drive is None or facts.residuals is None or facts.route is None or facts.hd_map is None:
+        return {}
+    images = {_name(image, facts.drive): image for image in facts.drive.images}
+    calibrations = {name: one.calibration for name, one in facts.cameras.items()}
+    cam_from_map = cams_from_map(facts.residuals, facts.route, calibrations)
+    cuts = [cut for cut in _cuts(facts, cam_from_map) if cut.image in images]
+    cuts = sorted(cuts, key=lambda cut: cut.rank)[: BUDGET_BYTES // _USUAL_BYTES]
+    made: list[tuple[int, str, dict[str, Any]]] = []
+    by_image: dict[str, list[_Cut]] = {}
+    for cut in cuts:
+        by_image.setdefault(cut.image, []).append(cut)
+    for name, wanted in by_image.items():
+        image = images[name]
+        pixels = read_image(image, facts.drive.cameras[image.camera])
+        for cut in wanted:
+            picture = _cut_out(pixels, facts, image, cam_from_map[cut.row], cut)
+            if picture is not None:
+                made.append((cut.rank, cut.key, {**picture, "image": name}))
+    return _within_budget(made)
+
+
+def _within_budget(made: list[tuple[int, str, dict[str, Any]]]) -> dict[str, list[dict[str, Any]]]:
+    """The best picture of everything first, then the second best, until the budget is spent."""
+    out: dict[str, list[dict[str, Any]]] = {}
+    spent = 0
+    for _, key, picture in sorted(made, key=lambda one: one[0]):
+        spent += len(picture["src"])
+        if spent > BUDGET_BYTES:
+            break
+        out.setdefault(key, []).append(picture)
+    return out
+
+
+def _name(image: Image, drive: Drive) -> str:
+    """As ``residuals.csv`` names it."""
+    path = image.path
+    return path.relative_to(drive.root).as_posix() if path.is_relative_to(drive.root) else str(path)
+
+
+def _cuts(facts: Facts, cam_from_map: FloatArray) -> Iterable[_Cut]:
+    assert facts.hd_map is not None
+    yield from _of_markings(facts)
+    for symbol in facts.hd_map.symbols:
+        yield from _of_place(facts, cam_from_map, symbol_key(symbol.id), symbol.outline_map)
+    for number, one in enumerate(facts.excluded):
+        yield from _of_place(facts, cam_from_map, excluded_key(number), one.position_map[None])
+
+
+def _of_markings(facts: Facts) -> Iterable[_Cut]:
+    """Those by which a marking was mapped: nearest first, a camera at a time."""
+    residuals = facts.residuals
+    assert residuals is not None
+    assert facts.hd_map is not None
+    infos = {name: one.calibration.info for name, one in facts.cameras.items()}
+    corners = {one.id: one.corners_map for one in facts.hd_map.markings}
+    pairs = np.stack([residuals.marking, residuals.row_image], axis=1)
+    order = np.lexsort((pairs[:, 1], pairs[:, 0]))
+    starts = np.flatnonzero(np.r_[True, (np.diff(pairs[order], axis=0) != 0).any(axis=1)])
+    found: dict[int, dict[str, list[tuple[float, int, FloatArray]]]] = {}
+    for rows in np.split(order, starts[1:]):
+        marking, row = pairs[rows[0]].tolist()
+        camera = residuals.camera[row]
+        if marking not in corners or camera not in infos:
+            continue
+        points = residuals.observed_px[rows[residuals.is_point[rows]]]
+        if len(points) < 2:
+            continue
+        seen_px = distort_points(infos[camera], points)
+        size = float(np.ptp(seen_px, axis=0).prod()) * len(points)
+        found.setdefault(marking, {}).setdefault(camera, []).append((size, row, seen_px))
+    for marking, by_camera in found.items():
+        for number, sightings in enumerate(by_camera.values()):
+            ranked = sorted(sightings, key=lambda one: -one[0])
+            chosen = [ranked[0], ranked[len(ranked) // 2]][: min(PER_CAMERA, len(ranked))]
+            for step, (_, row, seen_px) in enumerate(chosen):
+                rank = step * len(by_camera) + number
+                yield _Cut(marking_key(marking), rank, residuals.image[row], row, corners[marking], seen_px)
+
+
+def _of_place(facts: Facts, cam_from_map: FloatArray, key: str, shape_map: FloatArray) -> Iterable[_Cut]:
+    """Those that look at a place from near, one of each camera; other things may stand in the way."""
+    residuals = facts.residuals
+    assert residuals is not None
+    centre = shape_map.mean(axis=0)
+    rank = 0
+    for name, one in facts.cameras.items():
+        rows = np.flatnonzero([camera == name for camera in residuals.camera])
+        info = one.calibration.info
+        px, depth_m = project_ground(
+            info.intrinsic[None].repeat(len(rows), 0),
+            cam_from_map[rows],
+            centre[None, None].repeat(len(rows), 0),
+        )
+        margin = 0.05 * np.array([info.width, info.height])
+        inside = ((px[:, 0] > margin) & (px[:, 0] < np.array([info.width, info.height]) - margin)).all(axis=1)
+        near = inside & (depth_m[:, 0] > _NEAR_M) & (depth_m[:, 0] < _FAR_M)
+        if near.any():
+            best = rows[near][np.argmin(depth_m[near, 0])]
+            yield _Cut(key, rank, residuals.image[best], int(best), shape_map, np.empty((0, 2)))
+            rank += 1
+
+
+def _cut_out(
+    pixels: np.ndarray, facts: Facts, image: Image, cam_from_map: FloatArray, cut: _Cut
+) -> dict[str, Any] | None:
+    """The piece of an image around a feature, no larger than it needs to be; None where it shows nothing."""
+    info = facts.cameras[image.camera].calibration.info
+    px, depth_m = project_ground(info.intrinsic, cam_from_map, cut.shape_map)
+    if not (depth_m > 0).all():
+        return None
+    shape_px = distort_points(info, px)
+    shown = np.concatenate([shape_px, cut.seen_px])
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    half = np.maximum((0.5 + _MARGIN) * (high - low), _LEAST_PX / 2)
+    # No flatter and no higher than 3 to 1, so that the pictures of a row look alike.
+    half = np.maximum(half, half[::-1] / 3)
+    middle = 0.5 * (low + high)
+    first = np.clip(np.floor(middle - half), 0, [info.width - 1, info.height - 1]).astype(int)
+    last = np.clip(np.ceil(middle + half), 1, [info.width, info.height]).astype(int)
+    if (last - first).min() < 16:
+        return None
+    piece = pixels[first[1] : last[1], first[0] : last[0]]
+    factor = min(1.0, _LONGEST_PX / max(piece.shape[:2]))
+    if factor < 1.0:
+        size = (max(1, round(piece.shape[1] * factor)), max(1, round(piece.shape[0] * factor)))
+        piece = cv2.resize(piece, size, interpolation=cv2.INTER_AREA)
+    return {
+        "src": jpeg(piece, _QUALITY),
+        "size": [piece.shape[1], piece.shape[0]],
+        "camera": image.camera,
+        "t": round(float(image.stamp_s), 3),
+        # The centre of a pixel is at its whole number; that of a drawing's first one at a half.
+        "map": _rounded((shape_px - first + 0.5) * factor),
+        "seen": _rounded((cut.seen_px - first + 0.5) * factor),
+    }
+
+
+def _rounded(points: FloatArray) -> list[list[float]]:
+    rounded: list[list[float]] = np.round(points, 1).tolist()
+    return rounded
+
+
+def overlays(facts: Facts) -> Mapping[str, str]:
+    """By camera the folder's ``overlay_<camera>.png`` as JPEG in base64, where there is one."""
+    found = {}
+    for name in facts.cameras:
+        path = facts.folder / f"overlay_{name}.png"
+        pixels = cv2.imread(str(path)) if path.is_file() else None
+        if pixels is None:
+            continue
+        factor = min(1.0, 1200 / pixels.shape[1])
+        size = (round(pixels.shape[1] * factor), round(pixels.shape[0] * factor))
+        found[name] = jpeg(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), 82)
+    return found

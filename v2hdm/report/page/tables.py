@@ -1,0 +1,270 @@
+"""The report's tables and figures of merit."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+
+from v2hdm.records import FloatArray, Lane, Marking, Symbol
+from v2hdm.report.metrics import corner_errors, match_markings
+from v2hdm.report.page.cells import Figure, Table, in_words, name_of, number, significant, table
+from v2hdm.report.page.facts import Facts
+from v2hdm.report.page.layers import SIGMAS_95, ellipses
+from v2hdm.report.table import METHODS
+
+_LEAST_FOR_SHARE = 20
+"""Corners from which a share of them is told."""
+
+
+_Mapped = TypeVar("_Mapped", Marking, Symbol, Lane)
+
+
+def half_axes_m(markings: Iterable[Marking]) -> FloatArray:
+    """The larger half axis (4 M,), m, of the 95 % ellipse of every corner that has one."""
+    found = [ellipses(one) for one in markings]
+    return np.concatenate([one[:, 0] for one in found if one is not None] or [np.empty(0)])
+
+
+def relative_m(markings: Iterable[Marking]) -> FloatArray:
+    """The 95 % radius (M,), m, of what a marking adds to the error of a distance to its neighbours."""
+    return np.array(
+        [SIGMAS_95 * one.relative_sigma_m for one in markings if one.relative_sigma_m is not None]
+    )
+
+
+def key_figures(facts: Facts) -> tuple[Figure, ...]:
+    """What stands at the top of the page."""
+    if facts.hd_map is None:
+        return ()
+    markings, best = facts.hd_map.markings, facts.best
+    lanes = best.get("lanes", {})
+    figures = [
+        Figure(
+            "Markings", str(len(markings)), "", f"{in_words(len(facts.hd_map.symbols), 'symbol')} besides"
+        ),
+        Figure(
+            "Lane lines", str(len(facts.hd_map.lanes)), "", f"{number(lanes.get('length_m'), 0)} m together"
+        ),
+    ]
+    for name, values, note in (
+        ("Between neighbours", relative_m(markings), "95 % of a corner’s error, relative"),
+        ("In the map’s frame", half_axes_m(markings), "95 % of a corner’s error, absolute"),
+    ):
+        if len(values):
+            figures.append(Figure(name, number(100 * float(np.median(values)), 1), "cm", note))
+    if "corner_rmse_m" in best:
+        note = "root mean square of all corners"
+        figures.append(Figure("Against the truth", number(best["corner_rmse_m"], 1, 100), "cm", note))
+    checked = facts.metrics.get("check_points") or {}
+    if "rmse_m" in checked:
+        note = f"RMSE of {checked.get('compared')} surveyed points that no estimate has seen"
+        figures.append(Figure("Check points", number(checked["rmse_m"], 1, 100), "cm", note))
+    if "reprojection_rmse_px" in best:
+        before = best.get("initial_reprojection_rmse_px")
+        note = "reprojection" + ("" if before is None else f"; {number(before, 2)} px before")
+        figures.append(Figure("In the images", number(best["reprojection_rmse_px"], 2), "px", note))
+    return tuple(figures)
+
+
+def accuracy_table(facts: Facts) -> Table | None:
+    """By class how well the corners are known: half of them within, 95 % of them within."""
+    if facts.hd_map is None:
+        return None
+    by_kind = _by_kind(facts.hd_map.markings)
+    if not len(half_axes_m(facts.hd_map.markings)):
+        return None
+    rows = []
+    for name, own in [*by_kind.items(), *([("all", facts.hd_map.markings)] if len(by_kind) > 1 else [])]:
+        relative, absolute = 100 * relative_m(own), 100 * half_axes_m(own)
+        rows.append([
+            name_of(name), str(len(own)), number(_median(relative), 1), number(_most(relative), 1),
+            number(_median(absolute), 1), number(_most(absolute), 1),
+        ])  # fmt: skip
+    return table(
+        "95 % error of a corner as the adjustment states it (cm). Relative: what a marking adds to the "
+        "error of "
+        "a distance to others about 10 m away (radius). Absolute: in the map’s frame, with the drift of the "
+        "poses (larger half axis). Each for the median corner and for the corner that 95 % are better than.",
+        ("class", "markings", "relative, median", "relative, 95th", "absolute, median", "absolute, 95th"),
+        rows,
+    )
+
+
+def truth_table(facts: Facts) -> Table | None:
+    """By class the errors against the ground truth, and how many lie inside their ellipses."""
+    if facts.truth is None or facts.hd_map is None:
+        return None
+    by_class = facts.best.get("by_class", {})
+    rows = []
+    for name, own in _by_kind(facts.hd_map.markings).items():
+        found = by_class.get(name, {})
+        rows.append([
+            name_of(name), str(len(own)), number(found.get("false_markings"), 0),
+            number(found.get("recall"), 1, 100), number(found.get("corner_rmse_m"), 2, 100),
+            number(found.get("corner_bias_m"), 2, 100), number(_inside(own, facts), 0, 100),
+        ])  # fmt: skip
+    rows.append([
+        "all", str(len(facts.hd_map.markings)), number(facts.best.get("false_markings"), 0), "–",
+        number(facts.best.get("corner_rmse_m"), 2, 100), number(facts.best.get("corner_bias_m"), 2, 100),
+        number(_inside(facts.hd_map.markings, facts), 0, 100),
+    ])  # fmt: skip
+    return table(
+        "The drive was rendered, so the truth is known; the mapper never sees it. Recall counts markings "
+        "that were driven past in full view. The last column tests the stated accuracy: 95 is exact, more "
+        "is cautious, less is too bold.",
+        ("class", "markings", "false", "recall (%)", "RMSE (cm)", "bias (cm)", "in their 95 % ellipse (%)"),
+        rows,
+    )
+
+
+def _inside(markings: Sequence[Marking], facts: Facts) -> float | None:
+    """Share of the corners whose true place lies inside their 95 % ellipse."""
+    assert facts.truth is not None
+    rows, columns = match_markings(markings, facts.truth.map.markings)
+    squared: list[float] = []
+    for row, column in zip(rows, columns, strict=True):
+        covariance = markings[row].covariance_m2
+        if covariance is None:
+            continue
+        off = corner_errors([markings[row]], [facts.truth.map.markings[column]])
+        blocks = covariance.reshape(4, 2, 4, 2)[range(4), :, range(4), :]
+        squared += np.einsum("ni,nij,nj->n", off, np.linalg.inv(blocks), off).tolist()
+    return None if len(squared) < _LEAST_FOR_SHARE else float(np.mean(np.array(squared) <= SIGMAS_95**2))
+
+
+_CHECK_COLUMNS: Mapping[str, tuple[str, float | None, int]] = {
+    "id": ("point", None, 0),
+    "description": ("description", None, 0),
+    "marking": ("marking", None, 0),
+    "class": ("class", None, 0),
+    "corner": ("corner", 1.0, 0),
+    "dx_m": ("east (cm)", 100.0, 1),
+    "dy_m": ("north (cm)", 100.0, 1),
+    "distance_m": ("distance (cm)", 100.0, 1),
+    "normalised_error": ("in σ", 1.0, 1),
+    "inside_95_percent": ("inside 95 %", None, 0),
+    "dz_m": ("up (cm)", 100.0, 1),
+    "not_compared_because": ("not compared because", None, 0),
+}
+"""Of the columns of ``check_points.csv`` heading, factor (None for words) and digits."""
+
+
+def check_point_table(facts: Facts) -> Table | None:
+    """Surveyed points that no estimate has seen, beside the map: what ``check_points.csv`` says of them."""
+    rows = facts.check_points
+    shown = [name for name in _CHECK_COLUMNS if any(row.get(name) for row in rows)]
+    if not shown:
+        return None
+    return Table(
+        "Surveyed corners that the adjustment was not told of: the map minus the survey.",
+        tuple(_CHECK_COLUMNS[name][0] for name in shown),
+        tuple(tuple(_check_cell(name, row.get(name, "")) for name in shown) for row in rows),
+        tuple(_CHECK_COLUMNS[name][1] is not None for name in shown),
+    )
+
+
+def _check_cell(name: str, text: str) -> str:
+    _, factor, digits = _CHECK_COLUMNS[name]
+    if factor is None:
+        return text
+    try:
+        return number(float(text), digits, factor)
+    except ValueError:
+        return "–"
+
+
+def exclusion_counts(facts: Facts) -> list[tuple[str, int]]:
+    """Why candidates are not in the map, the commonest reason first."""
+    return Counter(one.reason for one in facts.excluded).most_common()
+
+
+def content_table(facts: Facts) -> Table | None:
+    """What is in the map, by class: how many or how long, and how often seen."""
+    if facts.hd_map is None:
+        return None
+    rows = []
+    for name, own in _by_kind(facts.hd_map.markings).items():
+        rows.append([name_of(name), "marking", str(len(own)), "–", _sightings(own)])
+    for name, symbols in _by_kind(facts.hd_map.symbols).items():
+        rows.append([name_of(name), "symbol", str(len(symbols)), "–", _sightings(symbols)])
+    for name, lanes in _by_kind(facts.hd_map.lanes).items():
+        length_m = sum(float(np.linalg.norm(np.diff(one.points_map, axis=0), axis=1).sum()) for one in lanes)
+        rows.append([name_of(name), "lane line", str(len(lanes)), number(length_m, 1), _sightings(lanes)])
+    return table(
+        "What the map holds. Sightings: images that show one of them, the median.",
+        ("class", "as", "count", "length (m)", "sightings"),
+        rows,
+        words=2,
+    )
+
+
+def _sightings(own: Sequence[Any]) -> str:
+    return number(float(np.median([one.sightings for one in own])), 0)
+
+
+def method_table(facts: Facts) -> Table | None:
+    """The methods of the paper beside each other, for all cameras together."""
+    if not facts.results:
+        return None
+    has_truth = any("recall" in row for row in facts.results.values())
+    rows = []
+    for name in METHODS:
+        row = facts.results.get(name)
+        if row is None:
+            continue
+        figures = [str(row.get("markings", "–"))]
+        if has_truth:
+            figures += [number(row.get("recall"), 1, 100), number(row.get("false_markings"), 0)]
+            figures += [number(row.get(key), 1, 100) for key in ("corner_rmse_m", "corner_bias_m")]
+        else:
+            figures += [number(row.get("median_sigma_m"), 1, 100), number(row.get("reprojection_rmse_px"), 2)]
+        rows.append([name, METHODS[name], *figures])
+    truth = ("recall (%)", "false", "RMSE (cm)", "bias (cm)")
+    return table(
+        "The same drive by each method, all cameras together. Opt is the result of this report.",
+        ("", "method", "markings", *(truth if has_truth else ("sigma (cm)", "reprojection (px)"))),
+        rows,
+        words=2,
+    )
+
+
+def finding_rows(verdict: Mapping[str, Any], which: str) -> tuple[tuple[str, ...], ...]:
+    """Status, check, what it is about, measured, limit and sentence of the findings ``which``."""
+    rows = []
+    for one in verdict.get(which) or []:
+        unit = f" {one['unit']}" if one.get("unit") else ""
+        value, limit = (significant(one.get(key)) for key in ("value", "limit"))
+        outcome = "untold" if which == "untold" else str(one["status"])
+        measured = [text if text == "–" else f"{text}{unit}" for text in (value, limit)]
+        rows.append((outcome, str(one["check"]), str(one["about"]), *measured, str(one["says"])))
+    return tuple(rows)
+
+
+def timing_table(facts: Facts) -> Table | None:
+    """How long each step took."""
+    seconds = facts.metrics.get("seconds") or {}
+    if not seconds:
+        return None
+    total = sum(float(one) for one in seconds.values())
+    rows = [[name, number(float(value), 1)] for name, value in seconds.items()]
+    return table("Time of each step of the run (s).", ("step", "s"), [*rows, ["together", number(total, 1)]])
+
+
+def _by_kind(own: Sequence[_Mapped]) -> dict[str, list[_Mapped]]:
+    """By class, the most frequent one first."""
+    found: dict[str, list[_Mapped]] = {}
+    for one in own:
+        found.setdefault(one.kind, []).append(one)
+    return dict(sorted(found.items(), key=lambda pair: -len(pair[1])))
+
+
+def _median(values: FloatArray) -> float:
+    return float(np.median(values)) if len(values) else math.nan
+
+
+def _most(values: FloatArray) -> float:
+    return float(np.percentile(values, 95)) if len(values) else math.nan

@@ -1,0 +1,327 @@
+// The map of the report: Leaflet on a canvas, in local metres (CRS.Simple: latitude is north, longitude east).
+// Names of people's files only ever become text nodes.
+(() => {
+  "use strict";
+  const data = JSON.parse(document.getElementById("map-data").textContent);
+  const byId = (id) => document.getElementById(id);
+  const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+  const at = ([x, y]) => [y, x];
+  const words = (kind) => kind.replaceAll("_", " ");
+  const number = (value, digits) => value.toFixed(digits).replace("-", "\u2212");
+  const cm = (metres) => `${number(100 * metres, 1)} cm`;
+  const SERIES = ["blue", "green", "vermillion", "purple", "orange", "sky"];
+  const DASHES = [null, "7 4", "2 4", "8 3 2 3"];
+  const MOST_IN_DETAIL = 1200; // markings in view up to which ellipses and arrows are drawn
+  const LEAST_PX = 3; // half axis of an ellipse below which it would be a dot
+  const NEAR_PX = 6; // pixels of a metre from which ellipses and arrows are drawn
+
+  let pictures = null; // parsed when first needed: most of the page's size
+  const picturesOf = (key) => {
+    pictures ??= JSON.parse(byId("pictures").textContent);
+    return pictures[key] ?? [];
+  };
+
+  function element(tag, attributes = {}, ...children) {
+    const svg = ["svg", "image", "polygon", "path", "line", "circle"].includes(tag);
+    const made = svg ? document.createElementNS("http://www.w3.org/2000/svg", tag) : document.createElement(tag);
+    for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+    made.append(...children);
+    return made;
+  }
+
+  const map = L.map("map", {
+    crs: L.CRS.Simple, minZoom: -4, maxZoom: 10, zoomSnap: 0.25, zoomDelta: 1, wheelPxPerZoomLevel: 90,
+    attributionControl: false, renderer: L.canvas({ padding: 0.4 }), zoomControl: true,
+  });
+  L.control.scale({ imperial: false, maxWidth: 140 }).addTo(map);
+  // Only markings answer the pointer; what lies above them lets it through.
+  const pane = (name, zIndex) => {
+    const made = map.createPane(name);
+    made.style.zIndex = zIndex;
+    made.style.pointerEvents = "none";
+    return L.canvas({ pane: name, padding: 0.4 });
+  };
+  const below = pane("below", 350);
+  const above = pane("above", 450);
+
+  // ---- layers ----
+  const layers = {};
+  const small = { noClip: true, smoothFactor: 0 }; // four corners gain nothing by clipping and simplifying
+  const still = (renderer) => ({ renderer, interactive: false });
+  if (data.mosaic) {
+    const [west, south, east, north] = data.mosaic.bounds;
+    layers.mosaic = L.imageOverlay(`data:${data.mosaic.type};base64,${data.mosaic.src}`, [[south, west], [north, east]],
+      { pane: "tilePane", interactive: false });
+  }
+  if (data.truth) {
+    layers.truth = L.featureGroup([
+      ...data.truth.markings.map((corners) => L.polygon(corners.map(at), { ...still(below), ...small })),
+      ...data.truth.lanes.map((line) => L.polyline(line.map(at), still(below))),
+    ]);
+  }
+  layers.lanes = L.featureGroup(data.lanes.map((lane) =>
+    Object.assign(L.polyline(lane.p.map(at), still(below)), { kind: lane.k })));
+  if (data.route.recorded.length) layers.recorded = L.featureGroup([L.polyline(data.route.recorded.map(at), still(below))]);
+  if (data.route.adjusted.length) layers.adjusted = L.featureGroup([L.polyline(data.route.adjusted.map(at), still(below))]);
+  const things = [];
+  const feature = (shape, about) => {
+    Object.assign(shape, { about });
+    things.push(shape);
+    return shape;
+  };
+  layers.markings = L.featureGroup([
+    ...data.markings.map((one) => feature(L.polygon(one.c.map(at), small), { ...one, key: `m${one.id}`, what: "marking" })),
+    ...data.symbols.map((one) => feature(L.polygon(one.p.map(at), small), { ...one, key: `s${one.id}`, what: "symbol" })),
+  ]);
+  layers.excluded = L.featureGroup(data.excluded.map((one, n) =>
+    feature(L.circleMarker(at(one.p), { radius: 4 }), { ...one, key: `x${n}`, what: "excluded" })));
+  layers.checks = L.featureGroup(data.checks.map((one, n) =>
+    feature(L.circleMarker(at(one.p), { radius: 6 }), { ...one, key: `c${n}`, what: "check" })));
+  layers.ellipses = L.layerGroup();
+  layers.arrows = L.layerGroup();
+  const selection = L.layerGroup().addTo(map);
+
+  const worst = (one) => (one.e && Array.isArray(one.e) ? Math.max(...one.e.map((ellipse) => ellipse[0])) : one.e ?? NaN);
+  const SHADES = {
+    class: { name: "class" },
+    absolute: { name: "95 % error, absolute", of: worst, unit: "cm" },
+    relative: { name: "95 % error, relative", of: (one) => one.r ?? NaN, unit: "cm" },
+    truth: { name: "error against the truth", of: (one) => one.t ?? NaN, unit: "cm" },
+    sightings: { name: "sightings", of: (one) => one.n, unit: "" },
+  };
+  // Cividis, which is even in lightness and the same to colour-blind people.
+  const RAMP = ["#00224e", "#123570", "#3b496c", "#575d6d", "#707173", "#8a8779", "#a69d75", "#c4b56c", "#e4cf5b", "#fee838"];
+  const ramp = (share) => RAMP[Math.min(RAMP.length - 1, Math.max(0, Math.round(share * (RAMP.length - 1))))];
+  let shade = "class";
+  let range = [0, 1];
+
+  function fill(one) {
+    if (shade === "class") return colour(SERIES[one.k % SERIES.length]);
+    const value = SHADES[shade].of(one);
+    return Number.isFinite(value) ? ramp((value - range[0]) / (range[1] - range[0] || 1)) : colour("muted");
+  }
+
+  function paint() {
+    if (shade !== "class") {
+      const values = data.markings.map(SHADES[shade].of).filter(Number.isFinite).sort((a, b) => a - b);
+      range = values.length ? [values[0], values[Math.floor(0.98 * (values.length - 1))]] : [0, 1];
+    }
+    const [ink, muted] = [colour("ink"), colour("muted")];
+    layers.truth?.setStyle({ color: muted, weight: 1, dashArray: "3 3", fill: false });
+    layers.lanes.eachLayer((line) => line.setStyle({ color: colour("sky"), weight: 2, dashArray: data.kinds[line.kind] === "lane_dash" ? "10 8" : null }));
+    layers.recorded?.setStyle({ color: colour("vermillion"), weight: 1.2, dashArray: "2 5" });
+    layers.adjusted?.setStyle({ color: ink, weight: 1.2, dashArray: null });
+    layers.markings.eachLayer((shape) => shape.setStyle({ color: fill(shape.about), weight: 1.2, fillOpacity: 0.55, dashArray: shape.about.what === "symbol" ? "4 2" : null }));
+    layers.checks.setStyle({ color: ink, weight: 2, fillColor: colour("orange"), fillOpacity: 0.9 });
+    layers.excluded.setStyle({ color: colour("vermillion"), weight: 1.3, dashArray: "2 1.5", fill: true, fillOpacity: 0 });
+    legend();
+    detail();
+  }
+
+  // ---- what is drawn only for what is in view ----
+  function ring([x, y], [a, b, direction], times) {
+    const [c, s] = [Math.cos(direction), Math.sin(direction)];
+    return Array.from({ length: 24 }, (_, n) => {
+      const [u, v] = [times * a * Math.cos(n * Math.PI / 12), times * b * Math.sin(n * Math.PI / 12)];
+      return [y + s * u + c * v, x + c * u - s * v];
+    });
+  }
+
+  function inView() {
+    if (map.getZoomScale(map.getZoom(), 0) < NEAR_PX) return null;
+    const bounds = map.getBounds().pad(0.1);
+    const found = data.markings.filter((one) => bounds.contains(at(one.c[0])));
+    return found.length <= MOST_IN_DETAIL ? found : null;
+  }
+
+  function detail() {
+    layers.ellipses.clearLayers();
+    layers.arrows.clearLayers();
+    const [ellipses, arrows] = [map.hasLayer(layers.ellipses), map.hasLayer(layers.arrows)];
+    const shown = ellipses || arrows ? inView() : [];
+    byId("map").dataset.detail = shown ? "drawn" : "too many";
+    hints(shown === null);
+    if (!shown) return;
+    const times = Number(byId("enlarge").value);
+    const px = map.getZoomScale(map.getZoom(), 0);
+    for (const one of shown) {
+      if (ellipses && one.e) one.c.forEach((corner, n) => {
+        if (one.e[n][0] * times * px >= LEAST_PX) layers.ellipses.addLayer(
+          L.polygon(ring(corner, one.e[n], times), { ...still(above), color: colour("ink"), weight: 1, fill: false }));
+      });
+      if (arrows) for (const [camera, dx, dy] of one.a ?? []) layers.arrows.addLayer(arrow(one, camera, dx, dy, times, px));
+    }
+  }
+
+  function arrow(one, camera, dx, dy, times, px) {
+    const x = one.c.reduce((sum, corner) => sum + corner[0], 0) / 4;
+    const y = one.c.reduce((sum, corner) => sum + corner[1], 0) / 4;
+    const [ex, ey] = [x + times * dx, y + times * dy];
+    const head = Math.min(6 / px, 0.4 * Math.hypot(ex - x, ey - y));
+    const angle = Math.atan2(ey - y, ex - x);
+    const wing = (turn) => [ey + head * Math.sin(angle + turn), ex + head * Math.cos(angle + turn)];
+    return L.polyline([[[y, x], [ey, ex]], [wing(2.6), [ey, ex], wing(-2.6)]],
+      { ...still(above), color: colour(SERIES[(camera + 3) % SERIES.length]), weight: 1.8, dashArray: DASHES[camera % DASHES.length] });
+  }
+
+  // ---- the panel ----
+  const NAMES = {
+    markings: "markings and symbols", lanes: "lane lines", truth: "truth", checks: "check points", ellipses: "95 % ellipses", adjusted: "route, adjusted",
+    recorded: "route, recorded", excluded: "left out", arrows: "residual arrows", mosaic: "ground mosaic",
+  };
+  const ON = ["markings", "lanes", "adjusted", "excluded", "checks", "ellipses", "mosaic"];
+  const swatch = (stroke, dashes, shape = "line") => {
+    const made = element("svg", { viewBox: "0 0 26 14", "aria-hidden": "true" });
+    const look = { style: `stroke:${stroke};stroke-width:2;fill:none`, ...(dashes ? { "stroke-dasharray": dashes } : {}) };
+    if (shape === "box") made.append(element("polygon", { points: "13,1 24,7 13,13 2,7", ...look, style: `${look.style.replace("fill:none", `fill:${stroke}`)};fill-opacity:.55` }));
+    else if (shape === "ring") made.append(element("circle", { cx: 13, cy: 7, r: 5, ...look }));
+    else if (shape === "arrow") made.append(element("path", { d: "M3 7H22M17 3l6 4-6 4", ...look }));
+    else made.append(element("line", { x1: 1, y1: 7, x2: 25, y2: 7, ...look }));
+    return made;
+  };
+  const SWATCHES = {
+    markings: ["var(--blue)", null, "box"], lanes: ["var(--sky)"], truth: ["var(--muted)", "3 3"], checks: ["var(--orange)", null, "ring"], ellipses: ["var(--ink)", null, "ring"],
+    adjusted: ["var(--ink)"], recorded: ["var(--vermillion)", "2 4"], excluded: ["var(--vermillion)", "2 2", "ring"],
+    arrows: ["var(--purple)", null, "arrow"], mosaic: ["var(--line)"],
+  };
+  const COUNTS = { markings: data.markings.length + data.symbols.length, checks: data.checks.length, lanes: data.lanes.length, excluded: data.excluded.length, truth: data.truth?.markings.length };
+  for (const name of Object.keys(NAMES)) {
+    const empty = !layers[name] || (name === "arrows" && !data.markings.some((one) => one.a)) || COUNTS[name] === 0;
+    if (empty) continue;
+    const box = element("input", { type: "checkbox", id: `layer-${name}` });
+    box.checked = ON.includes(name);
+    box.addEventListener("change", () => { box.checked ? layers[name].addTo(map) : layers[name].remove(); detail(); });
+    const label = element("label", {}, box, swatch(...SWATCHES[name]), NAMES[name]);
+    if (COUNTS[name]) label.append(element("span", { class: "count" }, String(COUNTS[name])));
+    byId("layers").append(label);
+    if (box.checked) layers[name].addTo(map);
+  }
+  const hint = element("p", { class: "hint" }, "Zoom in for ellipses and arrows.");
+  hint.hidden = true;
+  byId("layers").append(hint);
+  const hints = (tooMany) => { hint.hidden = !tooMany; };
+
+  for (const [name, one] of Object.entries(SHADES)) {
+    if (!one.of || data.markings.some((marking) => Number.isFinite(one.of(marking)))) byId("colour").append(element("option", { value: name }, one.name));
+  }
+  byId("colour").addEventListener("change", (event) => { shade = event.target.value; paint(); });
+  byId("enlarge").addEventListener("change", detail);
+
+  function legend() {
+    const rows = [];
+    if (shade === "class") {
+      const used = new Set(things.filter((shape) => ["marking", "symbol"].includes(shape.about.what)).map((shape) => shape.about.k));
+      for (const k of [...used].sort((a, b) => a - b)) rows.push(element("div", {}, swatch(`var(--${SERIES[k % SERIES.length]})`, null, "box"), words(data.kinds[k])));
+    } else {
+      const { unit } = SHADES[shade];
+      const text = (value) => (unit === "cm" ? cm(value) : String(Math.round(value)));
+      rows.push(element("div", { class: "ramp", style: `background:linear-gradient(90deg,${RAMP.join(",")})` }));
+      rows.push(element("div", { class: "ends" }, element("span", {}, text(range[0])), element("span", {}, `${text(range[1])} and more`)));
+    }
+    if (layers.arrows && map.hasLayer(layers.arrows)) {
+      data.cameras.forEach((name, n) => rows.push(element("div", {}, swatch(`var(--${SERIES[(n + 3) % SERIES.length]})`, DASHES[n % DASHES.length], "arrow"), `${name}: mean of map minus seen`)));
+    }
+    byId("legend").replaceChildren(...rows);
+  }
+
+  // ---- pointing and selecting ----
+  const title = (about) => (about.what === "check" ? `Check point ${about.id}` : about.what === "excluded" ? `Left out: ${words(about.k)}` : `${about.what === "symbol" ? "Symbol" : "Marking"} ${about.id}, ${words(data.kinds[about.k])}`);
+  function facts(about) {
+    if (about.what === "check") return checked(about);
+    const rows = [];
+    if (about.what === "excluded") rows.push(["reason", about.why]);
+    rows.push(["sightings", `${about.n} ${about.n === 1 ? "image" : "images"}`]);
+    if (Number.isFinite(about.r)) rows.push(["95 %, relative", cm(about.r)]);
+    if (Number.isFinite(worst(about))) rows.push(["95 %, absolute", cm(worst(about))]);
+    if (Number.isFinite(about.t)) rows.push(["off the truth", `${cm(about.t)} RMS`]);
+    return rows;
+  }
+  function checked({ off: [dx, dy], inside }) {
+    if (dx === null || dy === null) return [["map minus survey", "not compared"]];
+    const rows = [["map minus survey", `${cm(dx)} east, ${cm(dy)} north`]];
+    if (inside) rows.push(["inside its 95 % ellipse", inside]);
+    return rows;
+  }
+  function tooltip(shape) {
+    const { about } = shape;
+    const box = element("div", { "data-key": about.key }, element("b", {}, title(about)));
+    for (const [name, value] of facts(about)) box.append(`${name}: ${value}`, element("br"));
+    if (about.c) about.c.forEach(([x, y], n) => box.append(`${n + 1}: ${number(x, 3)} E, ${number(y, 3)} N`, element("br")));
+    return box;
+  }
+  for (const name of ["markings", "excluded", "checks"]) {
+    layers[name].bindTooltip(tooltip, { sticky: true, direction: "auto", opacity: 1 });
+    layers[name].on("click", (event) => select(event.layer));
+  }
+
+  function shot(picture) {
+    const [width, height] = picture.size;
+    const points = (list) => list.map((point) => point.join(",")).join(" ");
+    const svg = element("svg", { viewBox: `0 0 ${width} ${height}`, role: "img" });
+    svg.append(element("image", { href: `data:image/jpeg;base64,${picture.src}`, width, height }));
+    if (picture.map.length > 1) svg.append(element("polygon", { class: "halo", points: points(picture.map) }), element("polygon", { class: "mapped", points: points(picture.map) }));
+    else picture.map.forEach(([u, v]) => svg.append(element("circle", { class: "halo", cx: u, cy: v, r: 9 }), element("circle", { class: "mapped", cx: u, cy: v, r: 9 })));
+    for (const [u, v] of picture.seen) svg.append(element("path", { class: "seen", d: `M${u - 4} ${v}H${u + 4}M${u} ${v - 4}V${v + 4}` }));
+    return element("figure", {}, svg, element("figcaption", {}, `${picture.camera}, ${picture.t.toFixed(2)} s, ${picture.image}`));
+  }
+
+  function select(shape) {
+    selection.clearLayers();
+    const { about } = shape;
+    const rows = element("dl");
+    for (const [name, value] of facts(about)) rows.append(element("dt", {}, name), element("dd", {}, value));
+    const text = element("div", {}, element("h3", {}, title(about)), rows);
+    if (about.c) {
+      selection.addLayer(L.polygon(about.c.map(at), { ...still(above), color: colour("ink"), weight: 3, fill: false }));
+      about.c.forEach((corner, n) => selection.addLayer(L.tooltip({ permanent: true, direction: "center", className: "corner", interactive: false }).setLatLng(at(corner)).setContent(String(n + 1))));
+      text.append(corners(about));
+    } else if (about.what === "symbol") selection.addLayer(L.polygon(about.p.map(at), { ...still(above), color: colour("ink"), weight: 3, fill: false }));
+    else selection.addLayer(L.circleMarker(at(about.p), { ...still(above), radius: 9, color: colour("ink"), weight: 3, fill: false }));
+    const shots = element("div", { class: "shots" }, ...picturesOf(about.key).map(shot));
+    const side = element("div");
+    if (shots.childElementCount) {
+      const what = about.what === "marking" ? "Outline: as the map puts it there. Crosses: corners as they were detected." : "Where the map puts it; something else may stand in front.";
+      side.append(element("p", { class: "hint" }, what), shots);
+    } else side.append(element("p", { class: "hint" }, "No picture of it in this report."));
+    byId("details").replaceChildren(element("div", { class: "card", "data-key": about.key }, text, side));
+  }
+
+  function corners(about) {
+    const head = ["corner", "east (m)", "north (m)", "95 % ellipse (cm)"].map((name, n) => element("th", { scope: "col", ...(n ? { class: "n" } : {}) }, name));
+    const rows = about.c.map(([x, y], n) => {
+      const ellipse = about.e ? `${(100 * about.e[n][0]).toFixed(1)} × ${(100 * about.e[n][1]).toFixed(1)}` : "–";
+      return element("tr", {}, element("th", { scope: "row" }, String(n + 1)), ...[number(x, 3), number(y, 3), ellipse].map((cell) => element("td", { class: "n" }, cell)));
+    });
+    return element("table", {}, element("thead", {}, element("tr", {}, ...head)), element("tbody", {}, ...rows));
+  }
+
+  byId("find").addEventListener("submit", (event) => {
+    event.preventDefault();
+    const wanted = Number(byId("find-id").value);
+    const found = things.find((shape) => shape.about.id === wanted && ["marking", "symbol"].includes(shape.about.what));
+    byId("find-id").setCustomValidity(found ? "" : "No marking of this number.");
+    byId("find-id").reportValidity();
+    if (!found) return;
+    map.fitBounds(found.getBounds().pad(3), { maxZoom: 7 });
+    select(found);
+  });
+  byId("find-id").addEventListener("input", () => byId("find-id").setCustomValidity(""));
+
+  const place = L.control({ position: "bottomright" });
+  place.onAdd = () => element("div", { id: "place" });
+  place.addTo(map);
+  map.on("mousemove", ({ latlng }) => { byId("place").textContent = `${number(latlng.lng, 2)} m E, ${number(latlng.lat, 2)} m N`; });
+
+  // ---- begin ----
+  const everything = L.latLngBounds([]);
+  for (const name of ["markings", "lanes", "adjusted"]) if (layers[name]?.getLayers().length) everything.extend(layers[name].getBounds());
+  map.fitBounds(everything.isValid() ? everything.pad(0.03) : [[-10, -10], [10, 10]]);
+  map.setMinZoom(Math.min(map.getZoom() - 1, 0));
+  map.setMaxBounds(everything.isValid() ? everything.pad(1) : null);
+  map.on("moveend", detail);
+  for (const name of ["ellipses", "arrows"]) layers[name].on("add remove", legend);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", paint);
+  paint();
+  byId("map").dataset.ready = String(Math.round(performance.now()));
+  window.v2hdmMap = { map, things }; // for tests, and for those who want more of it
+})();
