@@ -69,7 +69,7 @@ def run_methods(
     tell = progress or _silent
     tell("linking sightings")
     sightings = collect_sightings(drive, detections, cameras)
-    optimiser = Optimiser(sightings, views_of(drive, cameras), drive.cameras, drive.pose_noise, options)
+    optimiser = Optimiser(sightings, views_of(drive, cameras), drive.cameras, drive.noises, options)
     tracks = optimiser.initial_tracks()
     results: dict[str, MethodResult] = {}
     for name, ipm in _given_ipms(drive, cameras).items():

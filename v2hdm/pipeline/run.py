@@ -22,13 +22,13 @@ from v2hdm.detection.batch import detect_all
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import unknown_network
-from v2hdm.drive import ReadOptions, drive_name, read_drive
+from v2hdm.drive import ReadOptions, drive_name, join_drives, read_drive
 from v2hdm.errors import AdjustError, ConfigError, MappingError, V2hdmError
 from v2hdm.hdmap.formats import check_formats
 from v2hdm.mapping.methods import run_methods
-from v2hdm.mapping.options import MappingOptions, check_options
+from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
 from v2hdm.pipeline.evaluate import CameraSets, evaluate
-from v2hdm.pipeline.inspect import Inspection, inspect
+from v2hdm.pipeline.inspect import Inspection, inspect, join
 from v2hdm.pipeline.write import write_results
 from v2hdm.quality import Finding, Status, Verdict
 from v2hdm.quality.results.result import check_result
@@ -60,9 +60,29 @@ def silent(task: str, done: int, total: int) -> None:
 
 @dataclass(kw_only=True)
 class DriveConfig(ReadOptions):
-    """Where the drive is, and how to read it: ``path`` is its folder or bag, None where it is rendered."""
+    """Where the drive is, and how to read it: ``path`` is its folder or bag, None where it is rendered.
 
-    path: str | None = None
+    A list of paths are drives through one site, which are mapped together (docs/living-map.md).
+    """
+
+    path: Any = None
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """The paths, none where the drive is rendered.
+
+        Raises:
+            ConfigError: ``path`` is neither a path nor a list of them.
+        """
+        if not self.path:
+            return ()
+        listed = self.path if isinstance(self.path, list) else [self.path]
+        wrong = [one for one in listed if not isinstance(one, str | Path) or not str(one)]
+        if wrong:
+            raise ConfigError(
+                f"drive.path: {wrong[0]!r} is no path; give one, or a list as in [monday,friday]"
+            )
+        return tuple(Path(one) for one in listed)
 
 
 @dataclass(kw_only=True)
@@ -71,7 +91,7 @@ class RunConfig:
 
     Attributes:
         name: names the results, ``<output>/<name>/``; None takes the drive's own name.
-        drive: the drive to map.
+        drive: the drive to map, or several that are mapped together.
         simulate: renders the drive into the cache first, instead of reading ``drive.path``.
         detector: settings of the detector.
         mapping: settings of association, optimisation and lanes.
@@ -109,7 +129,7 @@ class RunResult:
 
 
 def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -> RunResult:
-    """Map one drive and write the results to ``<output>/<name>/``, whole or not at all.
+    """Map one drive, or several together, and write the results to ``<output>/<name>/``, whole or not at all.
 
     Args:
         config: what to do.
@@ -130,11 +150,14 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
         if unknown is not None:
             log.warning("%s", unknown)
         (folder / "config.yaml").write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
-        drive_folder = _drive_folder(config, seconds, progress)
-        drive = read_drive(drive_folder, config.drive)
-        log.info("drive %s: %d images of cameras %s", drive.name, len(drive.images), ", ".join(drive.cameras))
+        drives = [read_drive(path, config.drive) for path in _drive_folders(config, seconds, progress)]
+        for drive in drives:
+            count, names = len(drive.images), ", ".join(drive.cameras)
+            log.info("drive %s: %d images of cameras %s", drive.name, count, names)
+        if len(drives) > 1:
+            join_drives(drives)  # what cannot be joined is told before any long work
         with _timed(seconds, "check"):
-            inspection = inspect(drive, config.drive.max_gap_s, _workers(config), partial(progress, "check"))
+            inspection = join([_inspect(config, drive, len(drives), progress) for drive in drives])
         about = {"name": name, "version": __version__}
         try:
             result = _map_and_judge(config, inspection, folder, about, seconds, progress)
@@ -145,6 +168,11 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
         for line in result.verdict.lines:
             log.info("%s", line)
     return result
+
+
+def _inspect(config: RunConfig, drive: Drive, drives: int, progress: Progress) -> Inspection:
+    task = "check" if drives == 1 else f"check {drive.name}"
+    return inspect(drive, config.drive.max_gap_s, _workers(config), partial(progress, task))
 
 
 def _map_and_judge(
@@ -194,19 +222,20 @@ def camera_sets(drive: Drive) -> dict[str, tuple[str, ...]]:
     return sets
 
 
-def _drive_folder(config: RunConfig, seconds: dict[str, float], progress: Progress) -> Path:
+def _drive_folders(config: RunConfig, seconds: dict[str, float], progress: Progress) -> tuple[Path, ...]:
     if config.simulate is None:
-        if not config.drive.path:
+        if not config.drive.paths:
             raise ConfigError(_NO_DRIVE)
-        return Path(config.drive.path)
-    if config.drive.path:
+        return config.drive.paths
+    if config.drive.paths:
         raise ConfigError(
             "both simulate and drive.path are set: a run renders a drive or reads one, remove one of them"
         )
     with _timed(seconds, "render"):
-        return rendered_drive(
+        folder = rendered_drive(
             config.simulate, Path(config.cache), _workers(config), partial(progress, "render")
         )
+    return (folder,)
 
 
 def _detect(config: RunConfig, drive: Drive, progress: Progress) -> list[ImageDetections]:
@@ -255,6 +284,11 @@ def _check(config: RunConfig) -> str:
     detector = Detector.load(options=config.detector)
     check_options(config.mapping, detector.catalogue.cornered)
     check_formats(config.export, "export")
+    if len(config.drive.paths) > 1 and config.mapping.mode == INCREMENTAL:
+        raise ConfigError(
+            "mode=incremental maps one drive as the vehicle would; map several with mode=batch, or one by "
+            "one with map.base"
+        )
     _check_device(config.mapping.device)
     return name
 
@@ -265,9 +299,9 @@ def run_name(config: RunConfig) -> str:
         return config.name
     if config.simulate is not None:
         return config.simulate.name
-    if not config.drive.path:
+    if not config.drive.paths:
         raise ConfigError(_NO_DRIVE)
-    return drive_name(Path(config.drive.path))
+    return "+".join(drive_name(path) for path in config.drive.paths)
 
 
 def _check_device(device: str) -> None:
