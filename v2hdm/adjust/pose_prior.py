@@ -59,7 +59,8 @@ def state_prior(
 
     ``by_visit`` are the components of each visit, ``visit`` (J,) is that of each frame; no state outlasts
     its visit. A drift is a first-order Gauss-Markov process along the driven distance d: memory
-    m = exp(-d / over_m), innovation variance sigma^2 (1 - m^2) (Gelb, Applied Optimal Estimation, section 3.8).
+    m = exp(-d / over_m), innovation variance sigma^2 (1 - m^2) (Gelb, Applied Optimal Estimation, section
+    3.8).
     """
     poses, components = map_from_vehicle, by_visit[0]
     if not components:

@@ -191,11 +191,11 @@ def linearise(
                     for p in range(6):
                         rows[i, column + p] += coupling[j, p]
                         rows[i + 1, column + p] += coupling[j, 6 + p]
-                    for q in range(each - 6):
+                    for v in range(each - 6):
                         for p in range(6):
-                            by_clock = clock[layout.pair[k], p * (each - 6) + q]
-                            rows[i, column + 6 + q] += coupling[j, p] * by_clock
-                            rows[i + 1, column + 6 + q] += coupling[j, 6 + p] * by_clock
+                            by_clock = clock[layout.pair[k], p * (each - 6) + v]
+                            rows[i, column + 6 + v] += coupling[j, p] * by_clock
+                            rows[i + 1, column + 6 + v] += coupling[j, 6 + p] * by_clock
                 surveyed = layout.control_information[c]
                 block[i, i], block[i + 1, i], block[i + 1, i + 1] = xx + surveyed, yx, yy + surveyed
                 gradient[i], gradient[i + 1] = gx, gy
