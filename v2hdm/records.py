@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from enum import Enum
 from pathlib import Path
 
 import numpy as np
@@ -356,12 +357,79 @@ class Lane:
 
 @dataclass(frozen=True)
 class HdMap:
-    """Markings, lanes and symbols of a site in its map frame."""
+    """Markings, lanes and symbols of a site in its map frame.
+
+    ``drift_over_m`` is the distance over which the error that neighbouring markings share fades, None where
+    it is not known. ``largest_id`` is the largest id that was ever given, also to what is gone; 0 where it
+    is a feature's.
+    """
 
     markings: tuple[Marking, ...]
     lanes: tuple[Lane, ...] = ()
     origin: GeodeticOrigin | None = None
     symbols: tuple[Symbol, ...] = ()
+    drift_over_m: float | None = None
+    largest_id: int = 0
+
+
+class Fate(Enum):
+    """What became of a marking between an earlier map and a new drive."""
+
+    MOVED = "moved"
+    VANISHED = "vanished"
+    NEW = "new"
+    FIRST_SEEN = "first seen"
+    """It is in the map now and was not before, but the earlier drive may just have missed it."""
+    NOT_SEEN = "not seen"
+    """It is in the map still: no image looked at its place, or too few to miss it."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """One marking that is not what the earlier map says, and the evidence.
+
+    Attributes:
+        id: in the map; that of a vanished one is never given again.
+        kind: its class.
+        fate: what became of it.
+        before: corners (4, 2) in the earlier map's place for it, m; None if it had none.
+        after: corners (4, 2) now; None if it is gone.
+        shift_m: (2,) how far its centre moved beyond what the two maps are apart there; None if it did not.
+        shift_sigma_m: (2,) of that.
+        probability: of its fate.
+        views: images of the drive that had its place in easy view; of a new one, images of the earlier drive.
+        found: in how many of them it was found.
+        sightings: images that show it, of the map that has it.
+    """
+
+    id: int
+    kind: str
+    fate: Fate
+    before: FloatArray | None
+    after: FloatArray | None
+    shift_m: FloatArray | None
+    shift_sigma_m: FloatArray | None
+    probability: float
+    views: int
+    found: int
+    sightings: int
+
+
+@dataclass(frozen=True)
+class Changes:
+    """An earlier map against a new drive.
+
+    ``changes`` are the markings that are not the same any more, ``same`` counts those seen again in their
+    places. ``shift_m`` (2,) is how far the drive's own map lay from the earlier one, as a mean.
+    """
+
+    changes: tuple[Change, ...]
+    same: int
+    shift_m: FloatArray
+
+    def of(self, fate: Fate) -> tuple[Change, ...]:
+        """Those of one fate."""
+        return tuple(one for one in self.changes if one.fate is fate)
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,14 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from v2hdm.adjust import Status, observability
 from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.bundle import Bundle
+from v2hdm.mapping.changes.update import Base, update_map
+from v2hdm.mapping.changes.watched import Observer
 from v2hdm.mapping.growth import grow_map
 from v2hdm.mapping.lanes.fuse import map_lanes
 from v2hdm.mapping.lanes.points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
@@ -46,6 +50,7 @@ def run_methods(
     options: MappingOptions | None = None,
     progress: Progress | None = None,
     growth_steps: int = 0,
+    base: Base | None = None,
 ) -> dict[str, MethodResult]:
     """Map a drive with every method that its IPMs allow.
 
@@ -56,6 +61,7 @@ def run_methods(
         options: Settings of the mapping.
         progress: Called with the name of each step as it begins.
         growth_steps: At how many sizes of the growing map ``Opt`` is solved again; 0 for none.
+        base: An earlier map that ``Opt`` brings up to date; None where there is none.
 
     Returns:
         Results by method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``.
@@ -85,6 +91,9 @@ def run_methods(
     if growth_steps:
         tell("growth of the map")
         optimal = replace(optimal, growth=grow_map(optimiser, optimised, growth_steps))
+    if base is not None:
+        tell("the earlier map")
+        optimal = _brought_up_to_date(base, optimal, outcome, optimised)
     results["Opt"] = optimal
     tell("ONI")
     found = optimal.calibrations
@@ -157,7 +166,9 @@ def _optimised_result(
     return MethodResult(
         name="Opt",
         cameras=tuple(cameras),
-        hd_map=HdMap(optimised.markings, lanes, drive.origin, symbols),
+        hd_map=HdMap(
+            optimised.markings, lanes, drive.origin, symbols, drive.pose_noise.position_drift_over_m
+        ),
         calibrations=optimised.calibrations,
         excluded=optimised.excluded,
         reprojection_rmse_px=optimised.reprojection_rmse_px,
@@ -175,6 +186,27 @@ def _optimised_result(
         poses=adjusted_poses(outcome),
         clocks=clock_offsets(outcome),
     )
+
+
+def _brought_up_to_date(
+    base: Base, made: MethodResult, outcome: Outcome, optimised: Optimised
+) -> MethodResult:
+    drive, sightings, group = (
+        outcome.inputs.drive,
+        outcome.inputs.sightings,
+        optimised.bundle.association.group,
+    )
+    observer = Observer(
+        sightings,
+        views_of(drive, made.cameras),
+        tuple(drive.cameras[name] for name in made.cameras),
+        optimised.bundle.rig,
+        drive.pose_noise.roll_pitch_rad,
+    )
+    mapped = np.isin(group, optimised.groups)
+    over_m = drive.pose_noise.position_drift_over_m
+    hd_map, changes = update_map(base, made.hd_map, observer, mapped, over_m)
+    return replace(made, hd_map=hd_map, changes=changes)
 
 
 def _certainty(bundle: Bundle) -> dict[str, str]:

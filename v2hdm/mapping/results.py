@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.mapping.evidence import SolveEvidence
-from v2hdm.records import BoolArray, Calibration, FloatArray, HdMap, Image, IntArray, Marking
+from v2hdm.records import BoolArray, Calibration, Changes, FloatArray, HdMap, Image, IntArray, Marking
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,8 @@ class MethodResult:
     ``diagnostics`` are named figures for the log and the report; ``certainty`` says of each camera
     in a sentence what the drive determined and what rests on the survey; ``evidence`` is what the checks
     after the solve rest on, ``poses`` the vehicle's poses as the solve has adjusted them, ``clocks`` of
-    each visit the offsets of the cameras' clocks, corrections before the solve included.
+    each visit the offsets of the cameras' clocks, corrections before the solve included; ``changes`` what
+    became of an earlier map that was brought up to date.
     """
 
     name: str
@@ -94,3 +95,4 @@ class MethodResult:
     evidence: SolveEvidence | None = None
     poses: AdjustedPoses | None = None
     clocks: Sequence[Mapping[str, ClockOffset]] = ({},)
+    changes: Changes | None = None

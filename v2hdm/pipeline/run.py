@@ -23,13 +23,16 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import unknown_network
 from v2hdm.drive import ReadOptions, drive_name, join_drives, read_drive
+from v2hdm.drive.truth import has_truth
 from v2hdm.errors import AdjustError, ConfigError, MappingError, V2hdmError
 from v2hdm.hdmap.formats import check_formats
+from v2hdm.mapping.changes.update import Base
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
+from v2hdm.pipeline.base import changes_json, check_together, read_base
 from v2hdm.pipeline.evaluate import CameraSets, evaluate
 from v2hdm.pipeline.inspect import Inspection, inspect, join
-from v2hdm.pipeline.write import write_results
+from v2hdm.pipeline.write import BEST, write_results
 from v2hdm.quality import Finding, Status, Verdict
 from v2hdm.quality.results.result import check_result
 from v2hdm.records import Drive, ImageDetections
@@ -86,12 +89,20 @@ class DriveConfig(ReadOptions):
 
 
 @dataclass(kw_only=True)
+class MapConfig:
+    """The map that comes out: ``base`` is the map.geojson that the drive brings up to date, None for none."""
+
+    base: str | None = None
+
+
+@dataclass(kw_only=True)
 class RunConfig:
     """Everything about one run.
 
     Attributes:
         name: names the results, ``<output>/<name>/``; None takes the drive's own name.
         drive: the drive to map, or several that are mapped together.
+        map: an earlier map that the drive brings up to date, if there is one.
         simulate: renders the drive into the cache first, instead of reading ``drive.path``.
         detector: settings of the detector.
         mapping: settings of association, optimisation and lanes.
@@ -106,6 +117,7 @@ class RunConfig:
 
     name: str | None = None
     drive: DriveConfig = field(default_factory=DriveConfig)
+    map: MapConfig = field(default_factory=MapConfig)
     simulate: PortConfig | None = None
     detector: DetectorOptions = field(default_factory=DetectorOptions.for_mapping)
     mapping: MappingOptions = field(default_factory=MappingOptions)
@@ -141,6 +153,7 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
     """
     name = _check(config)
     seconds: dict[str, float] = {}
+    base = None if config.map.base is None else read_base(Path(config.map.base))
     with (
         result_folder(Path(config.output) / name) as folder,
         logging_to(_log_file(folder / "run.log")),
@@ -154,13 +167,15 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
         for drive in drives:
             count, names = len(drive.images), ", ".join(drive.cameras)
             log.info("drive %s: %d images of cameras %s", drive.name, count, names)
-        if len(drives) > 1:
-            join_drives(drives)  # what cannot be joined is told before any long work
+        # What does not belong together is told before any long work.
+        whole = join_drives(drives)
+        if base is not None:
+            check_together(base, whole, config.map.base or "")
         with _timed(seconds, "check"):
             inspection = join([_inspect(config, drive, len(drives), progress) for drive in drives])
         about = {"name": name, "version": __version__}
         try:
-            result = _map_and_judge(config, inspection, folder, about, seconds, progress)
+            result = _map_and_judge(config, inspection, base, folder, about, seconds, progress)
         except (MappingError, AdjustError) as failure:
             if not inspection.has_failed:
                 raise
@@ -178,6 +193,7 @@ def _inspect(config: RunConfig, drive: Drive, drives: int, progress: Progress) -
 def _map_and_judge(
     config: RunConfig,
     inspection: Inspection,
+    base: Base | None,
     folder: Path,
     about: Mapping[str, Any],
     seconds: dict[str, float],
@@ -188,14 +204,16 @@ def _map_and_judge(
     with _timed(seconds, "detect"):
         detections = _detect(config, drive, progress)
     with _timed(seconds, "map"):
-        methods = _map_camera_sets(config, drive, detections, progress)
+        methods = _map_camera_sets(config, drive, detections, base, progress)
     with _timed(seconds, "judge"):
         found = check_result(drive, methods, inspection.ground)
         verdict = Verdict.of([*inspection.findings, *found])
     with _timed(seconds, "evaluate"):
         described = inspection.drive_as_described
         judgement = evaluate(described, detections, methods, config.mapping, partial(progress, "evaluate"))
-    metrics = {**about, "verdict": verdict.as_json(), **judgement.metrics, "seconds": seconds}
+    changes = list(methods.values())[-1][BEST].changes
+    changed = {} if changes is None else {"changes": changes_json(changes)}
+    metrics = {**about, "verdict": verdict.as_json(), **judgement.metrics, **changed, "seconds": seconds}
     write_results(
         folder, described, detections, methods, judgement, metrics, verdict, config.all_maps, config.export
     )
@@ -249,16 +267,23 @@ def _detect(config: RunConfig, drive: Drive, progress: Progress) -> list[ImageDe
 
 
 def _map_camera_sets(
-    config: RunConfig, drive: Drive, detections: Sequence[ImageDetections], progress: Progress
+    config: RunConfig,
+    drive: Drive,
+    detections: Sequence[ImageDetections],
+    base: Base | None,
+    progress: Progress,
 ) -> CameraSets:
     sets = camera_sets(drive)
     found = {}
     for done, (name, cameras) in enumerate(sets.items()):
         progress("map", done, len(sets))
         # The picture of the growing map is drawn for the whole rig, which comes last, and needs truth.
-        growth_steps = GROWTH_STEPS if drive.truth_dir and done == len(sets) - 1 else 0
+        last = done == len(sets) - 1
+        growth_steps = GROWTH_STEPS if last and has_truth(drive) else 0
         tell, begin_s = partial(log.debug, "%s: %s", name), time.perf_counter()
-        found[name] = run_methods(drive, detections, cameras, config.mapping, tell, growth_steps)
+        found[name] = run_methods(
+            drive, detections, cameras, config.mapping, tell, growth_steps, base if last else None
+        )
         took_s = time.perf_counter() - begin_s
         log.info("mapped with %s: %d markings, %.1f s", name, len(found[name]["Opt"].hd_map.markings), took_s)
         for exclusion in found[name]["Opt"].excluded:
@@ -284,6 +309,8 @@ def _check(config: RunConfig) -> str:
     detector = Detector.load(options=config.detector)
     check_options(config.mapping, detector.catalogue.cornered)
     check_formats(config.export, "export")
+    if config.map.base is not None and config.mapping.mode == INCREMENTAL:
+        raise ConfigError("mode=incremental makes a map of one drive alone; update map.base with mode=batch")
     if len(config.drive.paths) > 1 and config.mapping.mode == INCREMENTAL:
         raise ConfigError(
             "mode=incremental maps one drive as the vehicle would; map several with mode=batch, or one by "

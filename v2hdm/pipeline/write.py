@@ -21,6 +21,7 @@ from v2hdm.hdmap.formats import write_map
 from v2hdm.hdmap.geojson import write_geojson
 from v2hdm.hdmap.heights import with_heights
 from v2hdm.mapping.results import MethodResult
+from v2hdm.pipeline.base import write_changes
 from v2hdm.pipeline.evaluate import CameraSets, Judgement
 from v2hdm.pipeline.trajectory import write_trajectories
 from v2hdm.quality import Verdict
@@ -70,6 +71,8 @@ def write_results(
         _write_calibration_forms(calibration, about, path)
     if best.poses is not None:
         write_trajectories(best.poses, drive, folder)
+    if best.changes is not None:
+        write_changes(best.changes, best.hd_map, folder, _route(drive))
     _write_exclusions(folder / "excluded.geojson", drive, sets)
     if all_maps:
         _write_maps(folder / "maps", drive, sets)

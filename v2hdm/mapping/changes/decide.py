@@ -1,16 +1,16 @@
 """Which marking of a new map is which of an old one: the likeliest of all that may have happened to them.
 
-Of a marking of the old map, the new drive may have seen it where it was, seen it elsewhere because it was painted
-anew there, or not seen it, because it is gone, because no image showed its place, or because it was missed. A
-marking of the new map that is none of the old one is new paint, or was missed before. Each has a likelihood; how
-often each happens is learned from the pair of maps (expectation maximisation with a Dirichlet prior), and one
-assignment makes all of it as likely as can be.
+Of a marking of the old map, the new drive may have seen it where it was, seen it elsewhere because it was
+painted anew there, or not seen it: because it is gone, because no image showed its place, or because it was
+missed. A marking of the new map that is none of the old one is new paint, or was missed before. Each has a
+likelihood; how often each happens is learned from the pair of maps (expectation maximisation with a Dirichlet
+prior), and one assignment makes all of it as likely as can be.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -72,7 +72,7 @@ class Watched:
 
 @dataclass(frozen=True)
 class Pair:
-    """An old and a new marking that are one: corner c of the old one is corner (c + ``turn``) mod 4 of the new.
+    """An old and a new marking that are one: the old one's corner c is the new one's (c + ``turn``) mod 4.
 
     ``moved`` is the probability that it was painted elsewhere.
     """
@@ -101,8 +101,8 @@ class Decision:
 class _Candidates:
     """P pairs of markings that may be one: their numbers, the new one's turn, and how its corners are off.
 
-    ``off`` (P, 8), m; ``noise`` (P, 8, 8), m^2, is that of both; ``basis`` (P, 8, 8) has rows for two shifts, the
-    turn and five deformations; ``arm_m`` (P,) is what a turn is multiplied by in it.
+    ``off`` (P, 8), m; ``noise`` (P, 8, 8), m^2, is that of both; ``basis`` (P, 8, 8) has rows for two shifts,
+    the turn and five deformations; ``arm_m`` (P,) is what a turn is multiplied by in it.
     """
 
     old: IntArray
@@ -119,13 +119,14 @@ class _Candidates:
 
 @dataclass(frozen=True)
 class _Rates:
-    """Log probabilities of an old marking's fate, and log density of new ones per m^2."""
+    """Log probabilities of an old marking's fate, and log densities per m^2 of new and of older paint."""
 
     stayed: float
     moved: float
     gone: float
     kept: float
     new_per_m2: float
+    older_per_m2: float
 
 
 def decide(
@@ -148,15 +149,16 @@ def decide(
     """
     candidates = _candidates(old, new, of_old, of_new)
     shift = _shift(of_old, of_new, candidates, np.zeros(0, dtype=np.int64))
-    rates = _rates(_PRIOR_COUNT, _PRIOR_NEW, len(new))
+    rates = _rates(_PRIOR_COUNT, _PRIOR_NEW)
     chosen, moved = np.zeros(0, dtype=np.int64), np.zeros(0)
     gone, fresh = np.zeros(len(old)), np.zeros(len(new))
     for _ in range(_PASSES):
         likelihood = _likelihoods(candidates, shift, chosen, rates)
         unseen = np.logaddexp(rates.gone + watched_now.bare, rates.kept + watched_now.there)
         gone = np.exp(rates.gone + watched_now.bare - unseen)
-        density = rates.new_per_m2 + np.logaddexp(watched_before.bare, _missed(rates) + watched_before.there)
-        fresh = np.exp(rates.new_per_m2 + watched_before.bare - density)
+        painted = rates.new_per_m2 + watched_before.bare
+        density = np.logaddexp(painted, rates.older_per_m2 + watched_before.there)
+        fresh = np.exp(painted - density)
         both = logsumexp(likelihood, axis=1)
         score = both - unseen[candidates.old] - _alone(candidates, density[candidates.new])
         chosen = _assign(candidates, score)
@@ -169,7 +171,6 @@ def decide(
         rates = _rates(
             _PRIOR_COUNT + counts,
             (_PRIOR_NEW[0] + fresh[alone_new].sum(), _PRIOR_NEW[1] + len(old)),
-            len(new),
         )
     numbers = zip(candidates.old[chosen], candidates.new[chosen], candidates.turn[chosen], strict=True)
     return Decision(
@@ -181,3 +182,124 @@ def decide(
         fresh={int(k): float(fresh[k]) for k in alone_new},
         shift=shift,
     )
+
+
+def _rates(counts: FloatArray, new: tuple[float, float]) -> _Rates:
+    """Rates by how often each fate was met, with ``new`` markings for so many old ones."""
+    stayed, moved, gone = np.log(counts / counts.sum())
+    # Of the paint within the reach of an old marking about one is older: that much ground counts for each.
+    older = -float(np.log(np.pi * _REACH_M**2))
+    return _Rates(stayed, moved, gone, float(np.log1p(-np.exp(gone))), older + np.log(new[0] / new[1]), older)
+
+
+def _candidates(
+    old: Sequence[Marking], new: Sequence[Marking], of_old: Errors, of_new: Errors
+) -> _Candidates:
+    """The pairs of one class within reach."""
+    near: list[list[int]] = [[] for _ in old]
+    if len(old) and len(new):
+        near = cKDTree(of_new.centres_map).query_ball_point(of_old.centres_map, _REACH_M).tolist()
+    pairs = [(a, b) for a, others in enumerate(near) for b in sorted(others) if old[a].kind == new[b].kind]
+    first, second = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    before = np.array([old[a].corners_map for a in first]).reshape(-1, 4, 2)
+    after = np.array([new[b].corners_map for b in second]).reshape(-1, 4, 2)
+    whole = np.ones(before.shape[:2], dtype=bool)
+    turn = align(before, whole, after, whole).shift
+    turned = np.take_along_axis(after, SHIFTS[turn][..., None], axis=1)
+    order = (2 * SHIFTS[turn][..., None] + np.arange(2)).reshape(-1, 8)
+    rows = np.arange(len(second))[:, None, None]
+    noise = of_old.own_m2[first] + of_new.own_m2[second][rows, order[:, :, None], order[:, None, :]]
+    basis, arm_m = _bases(before)
+    return _Candidates(first, second, turn, (turned - before).reshape(-1, 8), noise, basis, arm_m)
+
+
+def _bases(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Orthonormal rows (P, 8, 8): shifts along x and y, the turn about the centre, five deformations."""
+    arms = corners - corners.mean(axis=1, keepdims=True)
+    turning = np.stack([-arms[..., 1], arms[..., 0]], axis=-1).reshape(-1, 8)
+    arm_m = np.linalg.norm(turning, axis=1)
+    columns = np.concatenate(
+        [np.broadcast_to(SHIFT / 2, (len(corners), 8, 2)), (turning / arm_m[:, None])[..., None]], axis=2
+    )
+    rest = np.linalg.qr(columns, mode="complete")[0][:, :, 3:]
+    return np.swapaxes(np.concatenate([columns, rest], axis=2), 1, 2), arm_m
+
+
+def _shift(of_old: Errors, of_new: Errors, candidates: _Candidates, stayed: IntArray) -> Shift:
+    """How the maps lie to each other, by the candidates ``stayed``."""
+    information = np.linalg.inv(candidates.noise[stayed])
+    common = SHIFT.T @ information @ SHIFT
+    pulled = SHIFT.T @ information @ candidates.off[stayed][..., None]
+    spread = np.linalg.inv(common)
+    off = (spread @ pulled)[..., 0]
+    rows = candidates.old[stayed], candidates.new[stayed]
+    return Shift(of_old, of_new, *rows, off, np.asarray(spread, dtype=np.float64))
+
+
+def _likelihoods(candidates: _Candidates, shift: Shift, chosen: IntArray, rates: _Rates) -> FloatArray:
+    """Log likelihood (P, 2) of each candidate pair having stayed or moved, its prior included."""
+    of_pair = {(int(a), int(b)): k for k, (a, b) in enumerate(zip(shift.old, shift.new, strict=True))}
+    out = np.empty((len(candidates), 2))
+    for p in range(len(candidates)):
+        old, new = int(candidates.old[p]), int(candidates.new[p])
+        own = of_pair.get((old, new))
+        mean, spread = shift.at(old, new) if own is None else shift.without_itself(own)
+        off = candidates.basis[p] @ (candidates.off[p] - SHIFT @ mean)
+        noise = candidates.basis[p] @ (candidates.noise[p] + SHIFT @ spread @ SHIFT.T) @ candidates.basis[p].T
+        # In the basis a shift counts twice its length, a turn by its arm.
+        free = np.zeros(8)
+        free[:2], free[2] = (2 * MOVED_SIGMA_M) ** 2, (candidates.arm_m[p] * TURNED_SIGMA_RAD) ** 2
+        out[p, STAYED] = rates.stayed + _read(off, noise)
+        out[p, MOVED] = rates.moved + _read(off, noise + np.diag(free))
+    return out
+
+
+def _read(off: FloatArray, noise: FloatArray) -> float:
+    """Log likelihood of a deviation (8,), of which an end or corner may have been misread."""
+    plain = np.log1p(-_MISREAD_SHARE) + _normal(off, noise)
+    misread = noise + np.diag(np.repeat([0.0, _MISREAD_M**2], [3, 5]))
+    return float(np.logaddexp(plain, np.log(_MISREAD_SHARE) + _normal(off, misread)))
+
+
+def _normal(off: FloatArray, covariance: FloatArray) -> float:
+    root = np.linalg.cholesky(covariance)
+    whitened = np.linalg.solve(root, off)
+    count = len(off)
+    return float(-0.5 * (whitened @ whitened + count * np.log(2 * np.pi)) - np.log(np.diag(root)).sum())
+
+
+def _alone(candidates: _Candidates, density: FloatArray) -> FloatArray:
+    """Log density (P,) of each candidate's new marking, in its pair's basis, if it is none of the old ones.
+
+    It lies anywhere, ``density`` (P,) per m^2, turned by any angle of half a circle, and its shape is another
+    one of its class's.
+    """
+    off = (candidates.basis @ candidates.off[..., None])[..., 0]
+    noise = candidates.basis @ candidates.noise @ np.swapaxes(candidates.basis, 1, 2)
+    shape = [
+        _normal(one[3:], own[3:, 3:] + _OTHER_SHAPE_M**2 * np.eye(5))
+        for one, own in zip(off, noise, strict=True)
+    ]
+    return np.asarray(density - np.log(4) - np.log(np.pi * candidates.arm_m) + np.array(shape))
+
+
+def _assign(candidates: _Candidates, score: FloatArray) -> IntArray:
+    """The candidates that together have the largest score; each marking is in one of them at most."""
+    better = np.flatnonzero(score > 0)
+    if not len(better):
+        return better
+    olds, news = candidates.old[better], candidates.new[better]
+    count = int(olds.max()) + 1
+    size = count + int(news.max()) + 1
+    graph = coo_array((np.ones(len(better)), (olds, count + news)), shape=(size, size))
+    _, group = connected_components(graph, directed=False)
+    chosen: list[int] = []
+    for one in np.unique(group[olds]):
+        own = better[group[olds] == one]
+        a, rows = np.unique(candidates.old[own], return_inverse=True)
+        b, columns = np.unique(candidates.new[own], return_inverse=True)
+        gain = np.zeros((len(a), len(b)))
+        gain[rows, columns] = score[own]
+        taken = {(int(r), int(c)) for r, c in zip(*linear_sum_assignment(-gain), strict=True)}
+        chosen += [int(p) for p, r, c in zip(own, rows, columns, strict=True) if (int(r), int(c)) in taken]
+    return np.array(sorted(chosen), dtype=np.int64)

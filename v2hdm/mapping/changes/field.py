@@ -1,10 +1,10 @@
 r"""What the markings of a map have in common by their errors, and how two maps therefore lie to each other.
 
-A corner of a map is off by an error of its own and by one that it shares with its surroundings: the drift of the
-receiver, which fades along the route, and a survey's. The shared error is a Gaussian process over the ground
-with the covariance :math:`\sigma_a \sigma_b \exp(-d / l)` for two markings at the distance d. So the markings
-that two maps have in common tell how the maps are shifted against each other, everywhere near to them; and
-averaging many markings does not average away what they share.
+A corner of a map is off by an error of its own and by one that it shares with its surroundings: the drift of
+the receiver, which fades along the route, and a survey's. The shared error is a Gaussian process over the
+ground with the covariance :math:`\sigma_a \sigma_b \exp(-d / l)` for two markings at the distance d. So the
+markings that two maps have in common tell how the maps are shifted against each other, everywhere near to them;
+and averaging many markings does not average away what they share.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ SHIFT = np.tile(np.eye(2), (4, 1))
 class Errors:
     """The errors of M markings, taken apart.
 
-    ``centres_map`` (M, 2), m; ``own_m2`` (M, 8, 8) covariances of each marking's own errors; ``shared_m2`` (M,)
-    variances, a coordinate, of the shift that it shares with its surroundings, over about ``over_m``, m.
+    ``centres_map`` (M, 2), m; ``own_m2`` (M, 8, 8) covariances of each marking's own errors; ``shared_m2``
+    (M,) variances, a coordinate, of the shift that it shares with its surroundings, over about ``over_m``, m.
     """
 
     centres_map: FloatArray
@@ -89,7 +89,7 @@ def _positive(covariance: FloatArray) -> FloatArray:
 class Shift:
     """How a new map lies to an old one, by P pairs of markings that both have.
 
-    ``old`` and ``new`` (P,) are the pairs' markings; ``off_map`` (P, 2) how far the new one is from the old one,
+    ``old`` and ``new`` (P,) are the pairs' markings; ``off_map`` (P, 2) how far the new one is from the old,
     of the covariance ``noise_m2`` (P, 2, 2) by their own errors.
     """
 

@@ -62,7 +62,7 @@ _CLUTTER_FOUND = (0.5, 2.0)
 """Beta distribution of how often clutter, or part of a symbol, is found in an easy view: a fifth of them."""
 
 _BARE_FOUND = (0.05, 10.0)
-"""Beta distribution of how often bare ground is taken for a marking of a given place: one view in two hundred."""
+"""Beta distribution of how often bare ground is taken for a given marking: in one view of two hundred."""
 
 _CLUTTER_REPEATS = 0.7
 """Probability that clutter which some images have shown is shown by one more."""
@@ -179,11 +179,12 @@ def log_found(found: IntArray, easy_views: IntArray, rate: float) -> FloatArray:
     """
     usual = _rates(found, easy_views, _RATE_STRENGTH * rate, _RATE_STRENGTH * (1 - rate))
     neglected = _rates(found, easy_views, 1.0, 1.0)
-    return np.logaddexp(np.log1p(-_NEGLECTED_SHARE) + usual, np.log(_NEGLECTED_SHARE) + neglected)
+    both = np.log1p(-_NEGLECTED_SHARE) + usual, np.log(_NEGLECTED_SHARE) + neglected
+    return np.asarray(np.logaddexp(*both))
 
 
 def log_found_where_none_is(found: IntArray, easy_views: IntArray) -> FloatArray:
-    """Log likelihood (N,) that so many ``easy_views`` (N,) of bare ground show a marking there, ``found`` (N,)."""
+    """Log likelihood (N,) that bare ground is taken for markings ``found`` times in ``easy_views`` (N,)."""
     return _rates(found, easy_views, *_BARE_FOUND)
 
 
