@@ -397,7 +397,7 @@ class Change:
         shift_m: (2,) how far its centre moved beyond what the two maps are apart there; None if it did not.
         shift_sigma_m: (2,) of that.
         probability: of its fate.
-        views: images of the drive that had its place in easy view; of a new one, images of the earlier drive.
+        views: images of the drive that had its place in near view; of a new one, images of the earlier drive.
         found: in how many of them it was found.
         sightings: images that show it, of the map that has it.
     """

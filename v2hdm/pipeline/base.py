@@ -129,8 +129,7 @@ def _as_json(one: Change) -> dict[str, Any]:
 def write_changes(changes: Changes, hd_map: HdMap, folder: Path, route_map: FloatArray) -> None:
     """Write ``changes.geojson`` and ``changes.png`` into ``folder``.
 
-    A feature is a change: its outline now, or that which it had if it is gone, in the frame of the map as it is
-    now.
+    A feature is a change: its outline now, or that which it had if it is gone, where the map has it now.
     """
     features = []
     for one in changes.changes:

@@ -3,8 +3,8 @@ r"""What the markings of a map have in common by their errors, and how two maps 
 A corner of a map is off by an error of its own and by one that it shares with its surroundings: the drift of
 the receiver, which fades along the route, and a survey's. The shared error is a Gaussian process over the
 ground with the covariance :math:`\sigma_a \sigma_b \exp(-d / l)` for two markings at the distance d. So the
-markings that two maps have in common tell how the maps are shifted against each other, everywhere near to them;
-and averaging many markings does not average away what they share.
+markings that two maps have in common tell how the maps are shifted against each other, everywhere near to
+them; and averaging many markings does not average away what they share.
 """
 
 from __future__ import annotations

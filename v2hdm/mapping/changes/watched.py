@@ -20,13 +20,16 @@ from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
 _MOST_SQUARED = 25.0
 """Squared distance of a sighting's corners from a place, in sigmas, up to which it shows what is there."""
 
+_NEAR_M = 12.0
+"""Distance from the camera, m, within which markings are found at about one rate, as those of a map say."""
+
 _REACH_M = 2.0
 """How far the middle of a sighting may be from a place's centre, m: of a dash one may see an end only."""
 
 
 @dataclass(frozen=True)
 class Looks:
-    """Of N places, how many images had each in easy ``views`` (N,), and in how many it was ``found`` (N,)."""
+    """Of N places, how many images had each in near ``views`` (N,), and in how many it was ``found`` (N,)."""
 
     views: IntArray
     found: IntArray
@@ -55,8 +58,8 @@ class Observer:
     jitter_rad: float
 
     def easy_views(self, corners_map: FloatArray) -> tuple[IntArray, IntArray]:
-        """(place, image) in which each of the places (N, 4, 2) is in easy view."""
-        return easy_views(self.views, self.rig, list(self.cameras), corners_map)
+        """(place, image) in which each of the places (N, 4, 2) is wholly in view, and near."""
+        return easy_views(self.views, self.rig, list(self.cameras), corners_map, _NEAR_M)
 
     def looks(self, markings: Sequence[Marking], free: BoolArray) -> Looks:
         """How often it looked at ``markings``, and found one among the sightings that are ``free`` (S,)."""

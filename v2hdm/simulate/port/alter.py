@@ -16,7 +16,7 @@ _BESIDE_ROUTE_M = 4.5
 """Only paint this near to the route is altered: a vehicle sees it from everywhere."""
 
 _CLEAR_M = 2.6
-"""Distance of an altered marking from all other paint that is altered, m: what it was and is stays told apart."""
+"""Distance of an altered marking from all others that are, m: what each was and is can be told apart."""
 
 _FREE_M = 1.3
 """Distance of new paint's centre from other paint, m."""
@@ -38,8 +38,8 @@ def alter(
 ) -> tuple[Layout, list[Alteration]]:
     """Paint a port anew in places; fewer where there is no room for so many."""
     done: list[Alteration] = []
-    for _ in range(config.moved):
-        done += _moved(layout, config, route, done, rng)
+    for length_m in np.linspace(config.moved_by_m[0], config.moved_by_m[1], config.moved):
+        done += _moved(layout, float(length_m), config.turned_sigma_rad, route, done, rng)
     for _ in range(config.removed):
         done += _removed(layout, route, done, rng)
     for _ in range(config.added):
@@ -48,15 +48,19 @@ def alter(
 
 
 def _moved(
-    layout: Layout, config: AlteredConfig, route: Route, done: list[Alteration], rng: np.random.Generator
+    layout: Layout,
+    length_m: float,
+    turned_sigma_rad: float,
+    route: Route,
+    done: list[Alteration],
+    rng: np.random.Generator,
 ) -> list[Alteration]:
-    """A diamond, shifted by 0.1 to 1 m and turned a little."""
+    """A diamond, shifted by a distance and turned a little."""
     for _ in range(_TRIES):
         before = _any(layout, (DIAMOND,), route, done, rng)
         if before is None:
             continue
-        length_m = rng.uniform(*config.moved_by_m)
-        angle, turn = rng.uniform(0, 2 * np.pi), rng.normal(0.0, config.turned_sigma_rad)
+        angle, turn = rng.uniform(0, 2 * np.pi), rng.normal(0.0, turned_sigma_rad)
         centre = before.mean(axis=0)
         spin = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
         after = (before - centre) @ spin.T + centre + length_m * np.array([np.cos(angle), np.sin(angle)])

@@ -136,7 +136,8 @@ class PaintConfig:
 class AlteredConfig:
     """How many markings were painted anew since the port was laid out: moved, removed, added.
 
-    ``moved_by_m`` are the least and the largest distance; they are turned by ``turned_sigma_rad`` as well.
+    ``moved_by_m`` are the least and the largest distance, between which there are even steps; what is moved is
+    turned by ``turned_sigma_rad`` as well.
     """
 
     moved: int = 0
@@ -220,8 +221,8 @@ class PortConfig:
 
     ``initial_ipm`` is ``calibrated`` when the drive starts from this vehicle's own manual calibration,
     ``estimated`` when it starts from the other vehicle's. ``visit`` numbers drives through one port: the same
-    paint, other noise of poses and images, other traffic; ``altered`` paint was moved, removed or added since.
-    Equal values give equal files, byte for byte.
+    paint, other noise of poses and images, other traffic; ``altered`` paint was moved, removed or added
+    since. Equal values give equal files, byte for byte.
     """
 
     name: str = "port1"
