@@ -1,4 +1,4 @@
-"""Two visits of one street in one problem: their drifts and clocks are their own, cameras and corners common."""
+"""Two visits of one street in one problem: drifts and clocks are their own, cameras and corners common."""
 
 from __future__ import annotations
 

@@ -196,7 +196,7 @@ def test_the_drift_of_either_map_counts_once() -> None:
 
 
 def test_what_a_drive_did_not_pass_moves_with_what_it_did() -> None:
-    """The old map's drift is found out along half of the street; near its end the other half is better, too."""
+    """The old map's drift is found out along half of the street; nearby the other half is better, too."""
     before, after, stated = [], [], []
     for seed in range(40):
         rng = np.random.default_rng(100 + seed)
