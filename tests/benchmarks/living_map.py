@@ -1,12 +1,12 @@
-"""Whether a map lives: two drives together, and an earlier map brought up to date after paint was altered.
+"""Whether a map lives: two drives together, and an earlier map brought up to date once paint was altered.
 
-``python -m tests.benchmarks.living_map [--full] [--base FOLDER] [--cache FOLDER] [--workers N]`` renders port 2
-three times: a drive, another drive through it, and one after markings were moved by 10 cm to 1 m, removed and
-painted anew. It maps the first two alone and together, brings the map of the first up to date by the second and
-by the third, and prints corner errors against ground truth, how many ids stayed, and which alterations are
-listed. The route is short and four markings of each kind are altered, unless ``--full`` drives all of port 2,
-with twelve. ``--base`` takes the first drive's map from the results of ``v2hdm.map +run=port2`` and leaves out
-the second drive.
+``python -m tests.benchmarks.living_map [--full] [--base FOLDER] [--cache FOLDER] [--workers N]`` renders port
+2 three times: a drive, another drive through it, and one after markings were moved by 10 cm to 1 m, removed
+and painted anew. It maps the first two alone and together, brings the map of the first up to date by the
+second and by the third, and prints corner errors against ground truth, how many ids stayed, and what
+alterations are listed. The route is short and four markings of each kind are altered, unless ``--full`` drives
+all of port 2, with twelve. ``--base`` takes the first drive's map from the results of
+``v2hdm.map +run=port2`` and leaves the second drive out.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from v2hdm.hdmap.geojson import read_geojson, write_geojson
 from v2hdm.mapping.changes.update import Base
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.results import MethodResult
-from v2hdm.pipeline.base import read_base
+from v2hdm.pipeline.base import grey_reader, read_base
 from v2hdm.records import Change, Drive, Fate, FloatArray, HdMap, ImageDetections, Truth
 from v2hdm.report.metrics import corner_errors, driven_past, marking_metrics, match_markings
 from v2hdm.simulate import PortConfig, rendered_drive
@@ -70,7 +70,7 @@ def seen(config: PortConfig, cache: Path, workers: int) -> Seen:
 
 def mapped(one: Seen, base: Base | None = None) -> MethodResult:
     """The optimised map by all cameras."""
-    return run_methods(*one, tuple(one[0].cameras), base=base)["Opt"]
+    return run_methods(*one, tuple(one[0].cameras), base=base, grey=grey_reader(one[0]))["Opt"]
 
 
 def together(drives: Sequence[Seen]) -> Seen:

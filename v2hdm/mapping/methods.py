@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from v2hdm.adjust import Status, observability
 from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
@@ -33,7 +34,7 @@ from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.sightings.table import Sightings, camera_of, collect_sightings
 from v2hdm.mapping.sightings.views import views_of
 from v2hdm.mapping.survey import without_corner
-from v2hdm.records import Drive, FloatArray, HdMap, ImageDetections, Lane
+from v2hdm.records import Drive, FloatArray, HdMap, Image, ImageDetections, Lane
 
 Progress = Callable[[str], None]
 
@@ -51,6 +52,7 @@ def run_methods(
     progress: Progress | None = None,
     growth_steps: int = 0,
     base: Base | None = None,
+    grey: Callable[[Image], NDArray[np.float32]] | None = None,
 ) -> dict[str, MethodResult]:
     """Map a drive with every method that its IPMs allow.
 
@@ -62,6 +64,7 @@ def run_methods(
         progress: Called with the name of each step as it begins.
         growth_steps: At how many sizes of the growing map ``Opt`` is solved again; 0 for none.
         base: An earlier map that ``Opt`` brings up to date; None where there is none.
+        grey: Reads the grey values (H, W) of an image, to look where ``base`` has paint; None does without.
 
     Returns:
         Results by method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``.
@@ -93,7 +96,7 @@ def run_methods(
         optimal = replace(optimal, growth=grow_map(optimiser, optimised, growth_steps))
     if base is not None:
         tell("the earlier map")
-        optimal = _brought_up_to_date(base, optimal, outcome, optimised)
+        optimal = _brought_up_to_date(base, optimal, outcome, optimised, grey)
     results["Opt"] = optimal
     tell("ONI")
     found = optimal.calibrations
@@ -189,7 +192,11 @@ def _optimised_result(
 
 
 def _brought_up_to_date(
-    base: Base, made: MethodResult, outcome: Outcome, optimised: Optimised
+    base: Base,
+    made: MethodResult,
+    outcome: Outcome,
+    optimised: Optimised,
+    grey: Callable[[Image], NDArray[np.float32]] | None,
 ) -> MethodResult:
     drive, sightings, group = (
         outcome.inputs.drive,
@@ -202,6 +209,7 @@ def _brought_up_to_date(
         tuple(drive.cameras[name] for name in made.cameras),
         optimised.bundle.rig,
         drive.pose_noise.roll_pitch_rad,
+        None if grey is None else lambda image: grey(drive.images[image]),
     )
     mapped = np.isin(group, optimised.groups)
     over_m = drive.pose_noise.position_drift_over_m

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from v2hdm.detection.batch import read_image
 from v2hdm.drive.road import lay_flat
 from v2hdm.drive.tum import read_tum
 from v2hdm.errors import MapFileError
 from v2hdm.files import load_json, take_array
 from v2hdm.hdmap.geojson import geojson_feature, geojson_positions, read_geojson, read_verdict, write_features
 from v2hdm.mapping.changes.update import Base
-from v2hdm.records import Change, Changes, Drive, Fate, FloatArray, HdMap
+from v2hdm.records import Change, Changes, Drive, Fate, FloatArray, HdMap, Image
 from v2hdm.report.changes import save_changes
 
 _SITE_M = 40.0
@@ -72,6 +75,15 @@ def check_together(base: Base, drive: Drive, path: str) -> None:
             f"map.base: drive {drive.name} comes no nearer than {nearest_m:.0f} m to a marking of {path}: it "
             "is of another site; map the drive by itself"
         )
+
+
+def grey_reader(drive: Drive) -> Callable[[Image], NDArray[np.float32]]:
+    """Reads the grey values of a drive's images."""
+
+    def grey(image: Image) -> NDArray[np.float32]:
+        return np.asarray(read_image(image, drive.cameras[image.camera]).mean(axis=2, dtype=np.float32))
+
+    return grey
 
 
 def _poses(folder: Path) -> FloatArray:

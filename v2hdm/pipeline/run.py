@@ -29,7 +29,7 @@ from v2hdm.hdmap.formats import check_formats
 from v2hdm.mapping.changes.update import Base
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
-from v2hdm.pipeline.base import changes_json, check_together, read_base
+from v2hdm.pipeline.base import changes_json, check_together, grey_reader, read_base
 from v2hdm.pipeline.evaluate import CameraSets, evaluate
 from v2hdm.pipeline.inspect import Inspection, inspect, join
 from v2hdm.pipeline.write import BEST, write_results
@@ -282,7 +282,14 @@ def _map_camera_sets(
         growth_steps = GROWTH_STEPS if last and has_truth(drive) else 0
         tell, begin_s = partial(log.debug, "%s: %s", name), time.perf_counter()
         found[name] = run_methods(
-            drive, detections, cameras, config.mapping, tell, growth_steps, base if last else None
+            drive,
+            detections,
+            cameras,
+            config.mapping,
+            tell,
+            growth_steps,
+            base if last else None,
+            grey_reader(drive),
         )
         took_s = time.perf_counter() - begin_s
         log.info("mapped with %s: %d markings, %.1f s", name, len(found[name]["Opt"].hd_map.markings), took_s)

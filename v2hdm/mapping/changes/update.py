@@ -12,7 +12,7 @@ from v2hdm.mapping.changes.decide import Decision, Pair, Watched, decide
 from v2hdm.mapping.changes.field import Errors
 from v2hdm.mapping.changes.fuse import fused_markings
 from v2hdm.mapping.changes.lanes import updated_lanes, updated_symbols
-from v2hdm.mapping.changes.watched import Looks, Observer, find_rates
+from v2hdm.mapping.changes.watched import Looks, Observer, find_rates, with_paint
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.views import Views
 from v2hdm.records import BoolArray, Change, Changes, Fate, FloatArray, HdMap, Marking
@@ -69,7 +69,7 @@ def update_map(
         new,
         of_old,
         of_new,
-        now.watched(np.array([rates.get(one.kind, usual) for one in old])),
+        with_paint(now.watched(np.array([rates.get(one.kind, usual) for one in old])), observer, old, new),
         before.watched(np.array([rates[one.kind] for one in new]))
         if len(base.poses)
         else Watched.never(len(new)),

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from v2hdm.mapping.association.attach import squared_distances
 from v2hdm.mapping.changes.decide import Watched
+from v2hdm.mapping.changes.paint import Grey, Pictures, learn_paint
 from v2hdm.mapping.sightings.location import locate
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import Sightings
@@ -22,6 +23,9 @@ _MOST_SQUARED = 25.0
 
 _NEAR_M = 12.0
 """Distance from the camera, m, within which markings are found at about one rate, as those of a map say."""
+
+_SAME_PLACE_M = 0.05
+"""A marking that has one of its class nearer than this is there, m."""
 
 _REACH_M = 2.0
 """How far the middle of a sighting may be from a place's centre, m: of a dash one may see an end only."""
@@ -48,7 +52,8 @@ class Looks:
 class Observer:
     """What a drive has seen and from where: its ``sightings``, images and cameras, under a ``rig``.
 
-    ``jitter_rad`` is how far the attitude of a pose is off.
+    ``jitter_rad`` is how far the attitude of a pose is off. ``grey`` gives its images, None where they are
+    not to be had.
     """
 
     sightings: Sightings
@@ -56,6 +61,12 @@ class Observer:
     cameras: tuple[Camera, ...]
     rig: Rig
     jitter_rad: float
+    grey: Grey | None = None
+
+    @property
+    def pictures(self) -> Pictures | None:
+        """Its images, None where they are not to be had."""
+        return None if self.grey is None else Pictures(self.grey, self.views, self.cameras, self.rig)
 
     def easy_views(self, corners_map: FloatArray) -> tuple[IntArray, IntArray]:
         """(place, image) in which each of the places (N, 4, 2) is wholly in view, and near."""
@@ -108,3 +119,29 @@ def find_rates(observer: Observer, markings: Sequence[Marking]) -> Mapping[str, 
         str(kind): float((looks.found[kinds == kind].sum() + 1) / (looks.views[kinds == kind].sum() + 2))
         for kind in np.unique(kinds)
     }
+
+
+def with_paint(
+    watched: Watched, observer: Observer, old: Sequence[Marking], new: Sequence[Marking]
+) -> Watched:
+    """What was ``watched`` of ``old`` markings, and what images show where no ``new`` one of a class lies."""
+    pictures = observer.pictures
+    if pictures is None or not old or not new:
+        return watched
+    old_at, new_at = (np.array([one.corners_map.mean(axis=0) for one in some]) for some in (old, new))
+    paint_map = np.concatenate([one.corners_map for one in (*old, *new)] + [old_at, new_at])
+    paints = learn_paint(pictures, new, paint_map, observer.easy_views)
+    there, bare = watched.there.copy(), watched.bare.copy()
+    for kind, paint in paints.items():
+        alike = np.array([one.kind == kind for one in new])
+        near_m = cKDTree(new_at[alike]).query(old_at)[0]
+        doubtful = [k for k, one in enumerate(old) if one.kind == kind and near_m[k] > _SAME_PLACE_M]
+        if not doubtful:
+            continue
+        corners = np.stack([old[k].corners_map for k in doubtful])
+        contrast = pictures.contrasts(corners, *observer.easy_views(corners))
+        known = np.isfinite(contrast)
+        rows = np.array(doubtful)[known]
+        there[rows] += paint.log_there(contrast[known])
+        bare[rows] += paint.log_bare(contrast[known])
+    return Watched(there, bare)

@@ -136,8 +136,8 @@ class PaintConfig:
 class AlteredConfig:
     """How many markings were painted anew since the port was laid out: moved, removed, added.
 
-    ``moved_by_m`` are the least and the largest distance, with even steps between them; what is moved is turned
-    by ``turned_sigma_rad`` as well.
+    ``moved_by_m`` are the least and the largest distance, with even steps between them; what is moved is
+    turned by ``turned_sigma_rad`` as well.
     """
 
     moved: int = 0
