@@ -4,8 +4,8 @@
 2 three times: a drive, another drive through it, and one after markings were moved by 10 cm to 1 m, removed
 and painted anew. It maps the first two alone and together, brings the map of the first up to date by the
 second and by the third, and prints corner errors against ground truth, how many ids stayed, and what
-alterations are listed. The route is short and four markings of each kind are altered, unless ``--full`` drives
-all of port 2, with twelve. ``--base`` takes the first drive's map from the results of
+alterations are listed. The route is short and four markings of each kind are altered, unless ``--full``
+drives all of port 2, with twelve. ``--base`` takes the first drive's map from the results of
 ``v2hdm.map +run=port2`` and leaves the second drive out.
 """
 

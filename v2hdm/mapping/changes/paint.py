@@ -1,8 +1,8 @@
 """Whether images show paint, bare ground or something before it where a marking should be.
 
 A marking that was found in no image may be gone, or it may be worn, or a parked truck may hide it. The
-contrast of its outline's inside to the ground around it tells: bare ground has next to none. What contrast paint
-has in this light, and bare ground between the markings, the drive's own markings say.
+contrast of its outline's inside to the ground around it tells: bare ground has next to none. What contrast
+paint has in this light, and bare ground between the markings, the drive's own markings say.
 """
 
 from __future__ import annotations
