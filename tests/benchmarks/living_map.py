@@ -143,7 +143,7 @@ def tell_changes(changes: Sequence[Change], alterations: Sequence[Alteration], b
             + "; ".join(f"{c.id} {c.kind} p {c.probability:.2f} {c.found}/{c.views}" for c in others)
         )
         for one in own:
-            if one not in right:
+            if not any(one is other for other in right):
                 corners = one.before if one.after is None else one.after
                 assert corners is not None
                 near = [
