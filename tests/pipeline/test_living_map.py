@@ -47,7 +47,7 @@ def write_scene(scene: Scene, folder: Path) -> None:
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """``outputs`` after Monday's map, and after the document's two commands."""
     folder = tmp_path_factory.mktemp("living")
-    options = SceneOptions(length_m=60.0, cameras=("front",), seed=21)
+    options = SceneOptions(length_m=40.0, cameras=("front",), seed=21)
     scenes = {"monday": make_scene(options), "friday": make_scene(replace(options, seed=22), repainted)}
     for name, scene in scenes.items():
         write_scene(scene, folder / name)
