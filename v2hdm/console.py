@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from v2hdm import pipeline
 from v2hdm.pipeline.run import logging_to
 from v2hdm.quality import Status, Verdict
-from v2hdm.report.table import results_table
+from v2hdm.report.table import changes_table, results_table
 
 _EVERY_S = 10.0
 """Between two lines on one task."""
@@ -33,6 +33,8 @@ def run_on_terminal(config: pipeline.RunConfig, config_yaml: str) -> Verdict:
         console.print(line, highlight=False)
     if result.metrics["results"]:
         console.print(results_table(result.metrics["name"], result.metrics["results"]))
+    if "changes" in result.metrics:
+        console.print(changes_table(result.metrics["changes"]))
     style = _STYLES[result.verdict.status]
     for number, line in enumerate(result.verdict.lines):
         console.print(

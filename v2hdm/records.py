@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from enum import Enum
 from pathlib import Path
 
 import numpy as np
@@ -139,6 +140,12 @@ class PoseNoise:
         return replace(noise, **drifts)
 
 
+def largest_noise(noises: Sequence[PoseNoise]) -> PoseNoise:
+    """The largest of each standard deviation, and of each distance over which a drift fades."""
+    names = [one.name for one in fields(PoseNoise)]
+    return PoseNoise(**{name: max(getattr(noise, name) for noise in noises) for name in names})
+
+
 DRIFTS: Mapping[str, str] = {
     "position_m": "position_drift_m",
     "heading_rad": "heading_drift_rad",
@@ -179,7 +186,7 @@ class Image:
     """One image of a drive and the vehicle's pose (4 x 4) when it was taken.
 
     ``stamp_s`` is its recorded time; ``clock_offset_s`` is how much later it was taken, as far as that is
-    known.
+    known. ``visit`` is an index into ``Drive.visits``.
     """
 
     camera: str
@@ -187,6 +194,7 @@ class Image:
     path: Path
     map_from_vehicle: FloatArray
     clock_offset_s: float = 0.0
+    visit: int = 0
 
     @property
     def taken_s(self) -> float:
@@ -195,13 +203,31 @@ class Image:
 
 
 @dataclass(frozen=True)
+class Visit:
+    """One of the drives that a :class:`Drive` was joined of: what is its own, as :class:`Drive` has it.
+
+    ``cameras`` says what the joined drive calls each of its own cameras.
+    """
+
+    name: str
+    root: Path
+    pose_noise: PoseNoise
+    truth_dir: Path | None = None
+    trajectory: Trajectory | None = None
+    recorded: Trajectory | None = None
+    cameras: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Drive:
-    """Everything the mapper may know of a drive; images are sorted by time, then camera.
+    """Everything the mapper may know of a drive; images are sorted by visit, time, then camera.
 
     ``truth_dir`` only tells the report where ground truth lies, if there is any. ``trajectory`` holds the
     poses that those of the images were interpolated from, at the receiver's rate, with the road laid flat;
     ``recorded`` the same poses as they were recorded. ``road`` is the recorded ground, None where it was
     recorded as the plane z = 0. ``unposed`` counts, by camera, the images left out for want of a pose.
+    ``joined`` are the drives that it was made of (:func:`v2hdm.drive.join.join_drives`), empty for one that
+    was recorded in one piece; a joined drive has no trajectory of its own, and the largest of each noise.
     """
 
     name: str
@@ -215,6 +241,18 @@ class Drive:
     recorded: Trajectory | None = None
     road: Road | None = None
     unposed: Mapping[str, int] = field(default_factory=dict)
+    joined: tuple[Visit, ...] = ()
+
+    @property
+    def visits(self) -> tuple[Visit, ...]:
+        """The drives that it was joined of, or itself alone."""
+        own = (self.name, self.root, self.pose_noise, self.truth_dir, self.trajectory, self.recorded)
+        return self.joined or (Visit(*own, {name: name for name in self.cameras}),)
+
+    @property
+    def noises(self) -> tuple[PoseNoise, ...]:
+        """The noise of the recorded poses of each visit."""
+        return tuple(visit.pose_noise for visit in self.visits)
 
 
 @dataclass(frozen=True)
@@ -319,12 +357,79 @@ class Lane:
 
 @dataclass(frozen=True)
 class HdMap:
-    """Markings, lanes and symbols of a site in its map frame."""
+    """Markings, lanes and symbols of a site in its map frame.
+
+    ``drift_over_m`` is the distance over which the error that neighbouring markings share fades, None where
+    it is not known. ``largest_id`` is the largest id that was ever given, also to what is gone; 0 where it
+    is a feature's.
+    """
 
     markings: tuple[Marking, ...]
     lanes: tuple[Lane, ...] = ()
     origin: GeodeticOrigin | None = None
     symbols: tuple[Symbol, ...] = ()
+    drift_over_m: float | None = None
+    largest_id: int = 0
+
+
+class Fate(Enum):
+    """What became of a marking between an earlier map and a new drive."""
+
+    MOVED = "moved"
+    VANISHED = "vanished"
+    NEW = "new"
+    FIRST_SEEN = "first seen"
+    """It is in the map now and was not before, but the earlier drive may just have missed it."""
+    NOT_SEEN = "not seen"
+    """It is in the map still: no image looked at its place, or too few to miss it."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """One marking that is not what the earlier map says, and the evidence.
+
+    Attributes:
+        id: in the map; that of a vanished one is never given again.
+        kind: its class.
+        fate: what became of it.
+        before: corners (4, 2) in the earlier map's place for it, m; None if it had none.
+        after: corners (4, 2) now; None if it is gone.
+        shift_m: (2,) how far its centre moved beyond what the two maps are apart there; None if it did not.
+        shift_sigma_m: (2,) of that.
+        probability: of its fate.
+        views: images of the drive that had its place in near view; of a new one, images of the earlier drive.
+        found: in how many of them it was found.
+        sightings: images that show it, of the map that has it.
+    """
+
+    id: int
+    kind: str
+    fate: Fate
+    before: FloatArray | None
+    after: FloatArray | None
+    shift_m: FloatArray | None
+    shift_sigma_m: FloatArray | None
+    probability: float
+    views: int
+    found: int
+    sightings: int
+
+
+@dataclass(frozen=True)
+class Changes:
+    """An earlier map against a new drive.
+
+    ``changes`` are the markings that are not the same any more, ``same`` counts those seen again in their
+    places. ``shift_m`` (2,) is how far the drive's own map lay from the earlier one, as a mean.
+    """
+
+    changes: tuple[Change, ...]
+    same: int
+    shift_m: FloatArray
+
+    def of(self, fate: Fate) -> tuple[Change, ...]:
+        """Those of one fate."""
+        return tuple(one for one in self.changes if one.fate is fate)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ gets a :class:`v2hdm.records.Drive` and detections.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -84,11 +85,15 @@ MOUNTS = {
 }
 
 
-def make_scene(options: SceneOptions) -> Scene:
-    """Build the yard, drive through it and detect."""
+def make_scene(options: SceneOptions, repaint: Callable[[list[Marking]], list[Marking]] = list) -> Scene:
+    """Build the yard, drive through it and detect; equal options but for the seed are visits of one yard.
+
+    ``repaint`` takes the markings that the yard was laid out with to those that are there by now.
+    """
     rng = np.random.default_rng(options.seed)
     route = _route(options)
     markings, lanes = _paint(route, options)
+    markings = repaint(markings)
     truth = {name: extrinsic(*MOUNTS[name]) for name in options.cameras}
     cameras = {name: _camera(name, truth[name], options, rng) for name in options.cameras}
     true_poses, recorded = _poses(route, options, rng)

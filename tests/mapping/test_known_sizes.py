@@ -61,7 +61,7 @@ def test_a_joint_solve_keeps_to_the_sizes() -> None:
     bundle = optimiser.run(optimiser.initial_tracks()).bundle
     spread = []
     for sizes in (SizeOptions(), SizeOptions(by_class_m={DIAMOND: list(true)}, sigma_m=0.002)):
-        model = full_model(scene.drive.pose_noise, replace(options, known_sizes=sizes), "heave")
+        model = full_model([scene.drive.pose_noise], replace(options, known_sizes=sizes), "heave")
         usable = sightings.valid & (bundle.association.group >= 0)[:, None]
         solved = solve_bundle(
             sightings, bundle.association, usable, bundle.rig, scene.drive.cameras, model

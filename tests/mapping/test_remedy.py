@@ -99,7 +99,7 @@ def test_a_clock_60_ms_late_is_put_right(scene: Scene) -> None:
     )
     result = mapped(scene, late)
     assert faults(result) == [Fault.CLOCK]
-    assert result.clocks["front"].value_s == pytest.approx(0.06, abs=0.008)
+    assert result.clocks[0]["front"].value_s == pytest.approx(0.06, abs=0.008)
 
 
 def _before(trajectory: Trajectory, stamp_s: float) -> FloatArray:

@@ -9,7 +9,7 @@ import numpy as np
 from v2hdm.drive.tum import read_tum
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.mapping.results import AdjustedPoses
-from v2hdm.pipeline.trajectory import write_trajectory
+from v2hdm.pipeline.trajectory import write_trajectories
 from v2hdm.records import Drive, FloatArray, Trajectory
 
 
@@ -30,8 +30,9 @@ def test_poses_that_were_laid_flat_are_written_at_their_recorded_height(tmp_path
     drive = Drive("d", tmp_path, {}, (), recorded=recorded)
     sigma = np.tile([0.01, 0.02, 0.003, 1e-4, 2e-4, 3e-4], (3, 1))
     seen = np.array([True, False, True])
-    adjusted = AdjustedPoses(stamp_s, poses(), poses(forward_m=0.05), sigma, seen, {})
-    write_trajectory(adjusted, drive, tmp_path)
+    visit = np.zeros(len(stamp_s), dtype=np.int64)
+    adjusted = AdjustedPoses(stamp_s, poses(), poses(forward_m=0.05), sigma, seen, {}, visit)
+    write_trajectories(adjusted, drive, tmp_path)
     got = read_tum(tmp_path / "trajectory.tum")
     np.testing.assert_allclose(got.stamp_s, stamp_s)
     np.testing.assert_allclose(got.map_from_vehicle, poses(46.2, 0.02, 0.05), atol=1e-8)

@@ -91,8 +91,8 @@ class Arrays:
         centre, centre_information_root: (C, 3) prior on the camera centres, and 1 / sigma.
         state_transition: (J, S, S) what a frame's states are expected to be, given the frame's before.
         state_information_root: (J, S) 1 / sigma of what is new in it.
-        clock_twist: (J, 6, Q) how the vehicle moves with a camera's clock offset; Q is 1, or 0 where no
-            offset is estimated.
+        clock_twist: (J, 6, Q) how the vehicle moves with a camera's clock offsets; Q is the number of visits,
+            or 0 where no offset is estimated.
         clock_information_root: 1 / sigma of a clock offset.
         control, control_information: surveyed positions (N, 2) of the corners and 1 / sigma^2 (N, 2), 0 where
             there is no survey.
@@ -137,7 +137,7 @@ class Arrays:
 
     @property
     def camera_unknowns(self) -> int:
-        """6 + Q: a camera's extrinsic and, where it is estimated, its clock offset."""
+        """6 + Q: a camera's extrinsic and, where they are estimated, its clock offsets."""
         return 6 + self.clock_twist.shape[-1]
 
     @property

@@ -93,7 +93,7 @@ def _check_lengths(problem: Problem) -> None:
 
 def check_model(problem: Problem, options: SolveOptions) -> None:
     """Raise :class:`AdjustError` where ``options`` ask for more than ``problem`` says."""
-    prior, each = problem.camera_prior, 6 + int(options.clock_offset)
+    prior, each = problem.camera_prior, 6 + problem.visit_count * int(options.clock_offset)
     if prior is not None:
         size = len(problem.intrinsic) * each
         for name, values, shape in (
@@ -242,9 +242,23 @@ def _check_priors(problem: Problem) -> None:
         raise AdjustError(f"centre_sigma_m of camera {camera} must be above 0 (inf where nothing is known)")
     if not problem.clock_sigma_s > 0:
         raise AdjustError(f"clock_sigma_s is {problem.clock_sigma_s}: give a number of seconds above 0")
-    sigma = problem.pose_sigma.by_state()
-    if not (np.isfinite(sigma).all() and (sigma > 0).all()):
-        raise AdjustError(f"pose_sigma must be above 0 and finite: {problem.pose_sigma}")
-    for total, drift in zip(sigma, problem.pose_sigma.drift_by_state(), strict=True):
-        if not (0 <= drift.sigma <= total and drift.over_m > 0):
-            raise AdjustError(f"{drift} must be part of its pose_sigma {total:g} and fade over a distance")
+    _check_visits(problem)
+    for one in problem.pose_sigmas:
+        sigma = one.by_state()
+        if not (np.isfinite(sigma).all() and (sigma > 0).all()):
+            raise AdjustError(f"pose_sigma must be above 0 and finite: {one}")
+        for total, drift in zip(sigma, one.drift_by_state(), strict=True):
+            if not (0 <= drift.sigma <= total and drift.over_m > 0):
+                raise AdjustError(
+                    f"{drift} must be part of its pose_sigma {total:g} and fade over a distance"
+                )
+
+
+def _check_visits(problem: Problem) -> None:
+    visit = problem.visit_of_frame
+    if visit.shape != (len(problem.map_from_vehicle),) or (np.diff(visit, prepend=0) < 0).any():
+        raise AdjustError("visit must number each frame's visit, from 0 and rising along the frames")
+    if visit.max(initial=0) >= len(problem.pose_sigmas):
+        raise AdjustError(
+            f"visit {visit.max()} has no pose_sigma: give one for all visits, or one for each of them"
+        )

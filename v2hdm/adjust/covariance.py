@@ -49,11 +49,11 @@ class Covariance:
         return np.stack([joint[k : k + 6, k : k + 6].cpu().numpy() for k in starts])
 
     def clock_s2(self) -> FloatArray:
-        """Variance (C,) of each camera's clock offset, s^2; 0 where it is not estimated."""
+        """Variance (C, Q), s^2, of each camera's clock offset at each visit; Q is 0 where none is."""
         arrays = self.whitening.arrays
         joint = torch.cholesky_inverse(self.whitening.reduced_factor.tip)
         variance = joint.diagonal().reshape(arrays.camera_count, -1)[:, 6:]
-        return np.asarray(variance.sum(1).cpu().numpy())
+        return np.asarray(variance.cpu().numpy())
 
     def poses(self) -> FloatArray:
         """Variances (J, 6) of each frame's tangent, how well its pose is known; 0 without states."""

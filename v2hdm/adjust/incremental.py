@@ -264,7 +264,7 @@ class IncrementalMap:
         solution = _sound(solve(problem, options), "the map")
         information = solution.covariance.camera_information()
         at = np.zeros((len(cameras), len(information) // len(cameras)))
-        at[:, 6:] = solution.clock_offset_s[:, None]
+        at[:, 6:] = solution.clock_offset_s
         self._earlier = _Quadratic(cameras, solution.cam_from_vehicle, information, information @ at.ravel())
         self._adjusted_count = len(every)
         frames = np.unique(np.concatenate([one.observations.frame for one in every]))
@@ -331,6 +331,7 @@ class IncrementalMap:
             centre_vehicle=None if centre is None else centre[cameras],
             centre_sigma_m=None if sigma is None else sigma[cameras],
             pose_sigma=drive.pose_sigma,
+            visit=None if drive.visit is None else drive.visit[frames],
             twist_vehicle=None if twist is None else twist[frames],
             clock_sigma_s=drive.clock_sigma_s,
             control=_control(sighted, starts),

@@ -46,8 +46,8 @@ def make_arrays(
     rank[corner_order] = np.arange(len(corner_order))
     order, corner, pair = _sorted_observations(problem, rank)
     measured, root = _whitened(problem, order)
-    components = state_components(problem.pose_sigma, pose_states)
-    transition, information_root = state_prior(problem.map_from_vehicle, components)
+    components = state_components(problem.pose_sigmas, pose_states)
+    transition, information_root = state_prior(problem.map_from_vehicle, components, problem.visit_of_frame)
     centre, centre_root = _centre_prior(problem)
     control, control_information = _control(problem)
     return Arrays(
@@ -59,7 +59,7 @@ def make_arrays(
         measured=real(measured),
         root_information=real(root),
         vehicle_from_map=inverse(real(problem.map_from_vehicle)),
-        states=tuple(component.column for component in components),
+        states=tuple(component.column for component in components[0]),
         centre=real(centre),
         centre_information_root=real(centre_root),
         state_transition=real(transition),
@@ -199,10 +199,11 @@ def _lengths(problem: Problem, rank: IntArray, device: str) -> Lengths:
 
 
 def _clock_twist(problem: Problem, clock_offset: bool) -> FloatArray:
-    """(J, 6, Q), Q = 1 if clock offsets are estimated."""
+    """(J, 6, Q), Q visits if clock offsets are estimated: a frame moves with that of its own visit."""
     if not clock_offset or problem.twist_vehicle is None:
         return np.zeros((len(problem.map_from_vehicle), 6, 0))
-    return problem.twist_vehicle[:, :, None]
+    own = problem.visit_of_frame[:, None] == np.arange(problem.visit_count)
+    return np.asarray(problem.twist_vehicle[:, :, None] * own[:, None])
 
 
 def _centre_prior(problem: Problem) -> tuple[FloatArray, FloatArray]:

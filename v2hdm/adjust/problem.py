@@ -8,6 +8,9 @@ Unknown are, in the frames of :mod:`v2hdm.geometry`,
   roll, pitch, heading, as a tangent s in the vehicle frame, ``map_from_vehicle @ exp(s)``,
 - optionally, for every camera, a clock offset: its images were taken that much later than they say.
 
+Frames may be of several visits to the site. Each visit has its own noise of poses, whose drift begins anew,
+and its own clock offsets; cameras and corners are common to all.
+
 The cost, in units of half a squared standard deviation, is
 
 .. math:: f = \tfrac12 \sum_k \rho(\|\Sigma_k^{-1/2} (\pi(T_c\,e^{-s_j} P_j^{-1}\, l) - u_k)\|^2)
@@ -159,7 +162,8 @@ class Problem:
     is held near zero by ``clock_sigma_s``. ``control``, if given, ties corners to a survey: the only thing
     that can tell a shift of the whole map from the drift of the receiver. ``lengths``, if given, are known
     distances between corners. ``camera_prior``, if given, is what markings outside this problem say of the
-    cameras.
+    cameras. ``visit`` (J,), if given, numbers the visit that each frame is of, from 0 and rising; there is
+    then one ``pose_sigma`` for all visits or one for each.
     """
 
     intrinsic: FloatArray
@@ -169,13 +173,32 @@ class Problem:
     corner_count: int
     centre_vehicle: FloatArray | None = None
     centre_sigma_m: FloatArray | None = None
-    pose_sigma: PoseSigma = PoseSigma()
+    pose_sigma: PoseSigma | tuple[PoseSigma, ...] = PoseSigma()
     corners_start: FloatArray | None = None
     twist_vehicle: FloatArray | None = None
     clock_sigma_s: float = 0.02
     control: ControlPoints | None = None
     lengths: KnownLengths | None = None
     camera_prior: CameraPrior | None = None
+    visit: IntArray | None = None
+
+    @property
+    def visit_of_frame(self) -> IntArray:
+        """The visit (J,) that each frame is of."""
+        return np.zeros(len(self.map_from_vehicle), dtype=np.int64) if self.visit is None else self.visit
+
+    @property
+    def visit_count(self) -> int:
+        """How many visits there are."""
+        if not isinstance(self.pose_sigma, PoseSigma):
+            return len(self.pose_sigma)
+        return int(self.visit_of_frame.max(initial=0)) + 1
+
+    @property
+    def pose_sigmas(self) -> tuple[PoseSigma, ...]:
+        """How far the recorded poses of each visit are off."""
+        one = self.pose_sigma
+        return self.visit_count * (one,) if isinstance(one, PoseSigma) else one
 
 
 @dataclass(kw_only=True)
@@ -184,7 +207,7 @@ class SolveOptions:
 
     Attributes:
         pose_states: the states each frame is given, of :data:`POSE_STATES`; () is the paper's model.
-        clock_offset: whether each camera's clock offset is estimated.
+        clock_offset: whether each camera's clock offset, one a visit, is estimated.
         loss: robust loss on the whitened residual of an observation, of :data:`LOSSES`.
         loss_scale: residual, in standard deviations, from which the loss departs from least squares.
         gate_probability: share of sound observations that the verdict on outliers may cost.

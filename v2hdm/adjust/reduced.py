@@ -285,8 +285,8 @@ def coupling_by_camera(arrays: Arrays, spread: Spread, run: Run, coupling: Tenso
     """W' of a run by the unknowns of the cameras, (n, 2, C (6 + Q)), from that by observation (2, 6, k)."""
     each, cameras = arrays.camera_unknowns, arrays.camera_count
     if each > 6:
-        clock = of_each(spread.clock.reshape(arrays.pair_count, 6).T, run.pair)
-        coupling = torch.cat([coupling, (coupling * clock).sum(1, keepdim=True)], dim=1)
+        clock = of_each(spread.clock.reshape(arrays.pair_count, -1).T, run.pair).view(6, each - 6, -1)
+        coupling = torch.cat([coupling, (coupling[:, :, None] * clock).sum(1)], dim=1)
     place = run.corner * cameras + run.pair // arrays.frame_count
     rows = coupling.new_zeros(2 * each, run.corner_count * cameras)
     rows.index_add_(1, place, coupling.flatten(0, 1))

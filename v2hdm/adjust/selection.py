@@ -134,7 +134,8 @@ def predicted_squared(
     first = int(whole.observations.frame[~held_out].min())
     vehicle_from_map = np.linalg.inv(solution.map_from_vehicle)[frame - first]
     if fitted.twist_vehicle is not None:
-        moved = fitted.twist_vehicle[frame - first] * solution.clock_offset_s[camera, None]
+        late_s = solution.clock_offset_s[camera, fitted.visit_of_frame[frame - first]]
+        moved = fitted.twist_vehicle[frame - first] * late_s[:, None]
         vehicle_from_map = exp(torch.as_tensor(-moved)).numpy() @ vehicle_from_map
     cam_from_map = solution.cam_from_vehicle[camera] @ vehicle_from_map
     points_map = solution.corners_map[np.searchsorted(corners, seen.corner[held_out])]

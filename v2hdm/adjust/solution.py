@@ -62,8 +62,8 @@ class Solution:
             freedom where model and covariances are right (what was seen of a line is scaled to that).
         verdict: a :class:`v2hdm.adjust.Verdict` on each observation (K,).
         loss, loss_scale: the robust loss, as in :class:`v2hdm.adjust.SolveOptions`.
-        clock_offset_s: (C,) how much later than stated each camera's images were taken; 0 where that is
-            not estimated.
+        clock_offset_s: (C, V) how much later than stated each camera's images of each visit were taken; 0
+            where that is not estimated.
         cost_terms: the parts of the cost by name; they add up to :attr:`cost`.
         evaluations: of cost and gradient, all stages together.
         gap: predicted decrease still possible, as a fraction of the cost (the certificate).

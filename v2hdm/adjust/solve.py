@@ -137,7 +137,7 @@ def _report(
         verdict=judge(problem.observations, seen.mahalanobis2, seen.behind, options.gate_probability, scale),
         loss=options.loss,
         loss_scale=options.loss_scale,
-        clock_offset_s=_clock_offset_s(estimate),
+        clock_offset_s=_clock_offset_s(problem, estimate),
         cost_terms={name: float(value) for name, value in terms.items()},
         evaluations=descent.evaluations + spent,
         gap=descent.gap,
@@ -191,9 +191,11 @@ def _adjusted_poses(problem: Problem, arrays: Arrays, estimate: Estimate) -> Flo
     return np.asarray((recorded @ exp(frame_tangent(arrays, estimate.frame_state))).cpu().numpy())
 
 
-def _clock_offset_s(estimate: Estimate) -> FloatArray:
-    """Clock offsets (C,), zero where they are not estimated."""
-    return np.asarray(estimate.clock_s.sum(1).cpu().numpy())
+def _clock_offset_s(problem: Problem, estimate: Estimate) -> FloatArray:
+    """Clock offsets (C, V), zero where they are not estimated."""
+    if not estimate.clock_s.shape[1]:
+        return np.zeros((len(problem.intrinsic), problem.visit_count))
+    return np.asarray(estimate.clock_s.cpu().numpy())
 
 
 def _unsorted(values: Tensor, order: Tensor) -> FloatArray:

@@ -46,6 +46,7 @@ def restrict(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
         corner_count=len(corners),
         corners_start=None if start is None else start[corners],
         twist_vehicle=None if twist is None else twist[used],
+        visit=None if problem.visit is None else problem.visit[used],
         control=control,
         lengths=lengths,
     )

@@ -88,7 +88,7 @@ class Suspect:
         camera: of which camera of the problem; -1 for all together.
         axis: along which axis, 0 to 2: of the vehicle (survey, lever), of the map (slope, datum), of the
             image (principal).
-        item: which of the problem's control points or known lengths; -1 for none or all.
+        item: which of the problem's control points, known lengths or (clock) visits; -1 for none or all.
         value: by how much, true minus stated.
         sigma: how well the drive tells, inf where it cannot.
         gain: by how much twice the cost would fall: chi-square with one degree of freedom.
@@ -233,7 +233,10 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
     groups = [*([-1] if arrays.camera_count > 1 else []), *cameras]
     for camera in groups:
         if problem.twist_vehicle is not None:
-            yield _Hypothesis(Fault.CLOCK, _moving(_clock_motion(problem, camera)), camera)
+            visits = range(problem.visit_count) if problem.visit_count > 1 else [-1]
+            for visit in visits:
+                column = _moving(_clock_motion(problem, camera, visit))
+                yield _Hypothesis(Fault.CLOCK, column, camera, item=visit)
         yield _Hypothesis(Fault.FOCAL, _lens(camera, 0), camera)
         yield _Hypothesis(Fault.DISTORTION, _lens(camera, 1), camera)
         for axis in (0, 1):
@@ -333,8 +336,9 @@ def _moved(bench: _Bench, tangent: Tensor) -> Tensor:
     return out
 
 
-def _clock_motion(problem: Problem, camera: int) -> Callable[[Arrays], Tensor]:
-    twist = torch.as_tensor(np.asarray(problem.twist_vehicle))
+def _clock_motion(problem: Problem, camera: int, visit: int) -> Callable[[Arrays], Tensor]:
+    own = (problem.visit_of_frame == visit) | (visit < 0)
+    twist = torch.as_tensor(np.asarray(problem.twist_vehicle) * own[:, None])
 
     def motion(arrays: Arrays) -> Tensor:
         out = arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6)

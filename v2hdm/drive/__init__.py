@@ -16,6 +16,7 @@ from v2hdm.drive.folder import (
     read_folder_drive,
     write_drive,
 )
+from v2hdm.drive.join import join_drives
 from v2hdm.drive.kitti import is_kitti_drive, read_kitti_drive
 from v2hdm.drive.nuscenes import is_nuscenes_drive, read_nuscenes_drive
 from v2hdm.drive.options import KittiOptions, ReadOptions
@@ -29,6 +30,7 @@ __all__ = [
     "Reader",
     "Trajectory",
     "drive_name",
+    "join_drives",
     "read_drive",
     "with_clock_offsets",
     "write_drive",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,8 @@ def read_truth(drive: Drive) -> Truth:
         DriveError: when the drive has none or it is damaged.
         MapFileError: when its map is damaged.
     """
+    if drive.joined:
+        return _joined_truth(drive)
     folder = drive.truth_dir
     if folder is None:
         raise DriveError(f"{drive.root}: has no ground truth to compare with; drop the comparison")
@@ -38,6 +41,59 @@ def read_truth(drive: Drive) -> Truth:
         visibility=_read_sightings(folder / "sightings.csv", drive.images, len(hd_map.markings)),
         lane_visible=_read_lane_visible(folder / "lane_visible.csv", hd_map),
         disturbances=_read_disturbances(folder / "disturbances.yaml"),
+    )
+
+
+def has_truth(drive: Drive) -> bool:
+    """Whether there is a ground truth that holds for all of the drive.
+
+    That of joined drives has to be the same, in one frame: paint that was altered between them has none.
+    """
+    if not drive.joined:
+        return drive.truth_dir is not None
+    folders = [visit.truth_dir for visit in drive.visits]
+    known = [folder for folder in folders if folder is not None]
+    if len(known) < len(folders):
+        return False
+    first, *others = (read_geojson(folder / "map.geojson") for folder in known)
+    return all(
+        other.origin == first.origin
+        and len(other.markings) == len(first.markings)
+        and all(
+            np.array_equal(a.corners_map, b.corners_map)
+            for a, b in zip(first.markings, other.markings, strict=True)
+        )
+        for other in others
+    )
+
+
+def _joined_truth(drive: Drive) -> Truth:
+    """The truths of all visits as one, in the order of the joined drive's images."""
+    parts, rows = [], []
+    for number, visit in enumerate(drive.joined):
+        own_name = {joined: own for own, joined in visit.cameras.items()}
+        own = [i for i, image in enumerate(drive.images) if image.visit == number]
+        images = [replace(drive.images[i], camera=own_name[drive.images[i].camera]) for i in own]
+        cameras = {name: drive.cameras[joined] for name, joined in visit.cameras.items()}
+        rows.append(own)
+        parts.append(read_truth(Drive(visit.name, visit.root, cameras, images, truth_dir=visit.truth_dir)))
+    order = np.argsort(np.concatenate(rows), kind="stable")
+    cam_from_vehicle: dict[str, FloatArray] = {}
+    for visit, part in zip(drive.joined, parts, strict=True):
+        for name, matrix in part.cam_from_vehicle.items():
+            cam_from_vehicle.setdefault(visit.cameras[name], matrix)
+    lanes = zip(*(part.lane_visible for part in parts), strict=True)
+    return Truth(
+        map=parts[0].map,
+        cam_from_vehicle=cam_from_vehicle,
+        map_from_vehicle=np.concatenate([part.map_from_vehicle for part in parts])[order],
+        visibility=np.concatenate([part.visibility for part in parts])[order],
+        lane_visible=tuple(np.logical_or.reduce(flags) for flags in lanes),
+        disturbances={
+            f"{visit.name}: {key}": value
+            for visit, part in zip(drive.joined, parts, strict=True)
+            for key, value in part.disturbances.items()
+        },
     )
 
 

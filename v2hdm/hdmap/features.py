@@ -137,7 +137,7 @@ def features_of(hd_map: HdMap) -> list[Feature]:
         )
         for one in hd_map.symbols
     ]
-    ids = unique_ids([feature.id for feature in features])
+    ids = unique_ids([feature.id for feature in features], hd_map.largest_id)
     return [_with_id(feature, number) for feature, number in zip(features, ids, strict=True)]
 
 
@@ -168,9 +168,9 @@ def map_of(features: Iterable[Feature], origin: GeodeticOrigin | None) -> HdMap:
     return HdMap(tuple(markings), tuple(lanes), origin, tuple(symbols))
 
 
-def unique_ids(ids: Sequence[int]) -> list[int]:
-    """``ids`` with those below 1, and those taken already, replaced by numbers above the largest."""
-    following = max([0, *ids]) + 1
+def unique_ids(ids: Sequence[int], largest: int = 0) -> list[int]:
+    """``ids`` with those below 1, and those taken already, replaced by numbers above the ``largest`` ever."""
+    following = max([largest, *ids]) + 1
     taken: set[int] = set()
     out = []
     for number in ids:

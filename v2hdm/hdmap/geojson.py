@@ -13,16 +13,23 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from v2hdm.errors import MapFileError
-from v2hdm.fields import take_origin
+from v2hdm.fields import take_origin, take_whole
 from v2hdm.files import load_json, replace_text, take_array, take_mapping, take_number
-from v2hdm.hdmap.features import Feature, FeatureReader, Geometry, features_of, properties_of
+from v2hdm.hdmap.features import (
+    LARGEST_ID,
+    Feature,
+    FeatureReader,
+    Geometry,
+    features_of,
+    properties_of,
+)
 from v2hdm.hdmap.geodetic import geodetic_from_enu
 from v2hdm.records import FloatArray, GeodeticOrigin, HdMap
 
@@ -47,7 +54,12 @@ def write_geojson(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None =
     made the map, as JSON, stands in the foreign member ``v2hdm``.
     """
     features = [_feature(one, hd_map.origin) for one in features_of(hd_map)]
-    write_features(path, features, hd_map.origin, {} if verdict is None else {"verdict": dict(verdict)})
+    about: dict[str, Any] = {"largest_id": max([hd_map.largest_id, *(one["id"] for one in features)])}
+    if hd_map.drift_over_m is not None:
+        about["drift_over_m"] = hd_map.drift_over_m
+    if verdict is not None:
+        about["verdict"] = dict(verdict)
+    write_features(path, features, hd_map.origin, about)
 
 
 def write_features(
@@ -105,7 +117,14 @@ def read_geojson(path: Path) -> HdMap:
         entry = take_mapping(feature, where, MapFileError)
         properties = take_mapping(entry.get("properties"), where, MapFileError)
         reader.add(properties, _read_geometry(entry.get("geometry"), where), where)
-    return reader.map()
+    largest, over_m = about.get("largest_id"), about.get("drift_over_m")
+    return replace(
+        reader.map(),
+        largest_id=0
+        if largest is None
+        else take_whole(largest, 0, LARGEST_ID, f"{path}: largest_id", MapFileError),
+        drift_over_m=None if over_m is None else take_number(over_m, f"{path}: drift_over_m", MapFileError),
+    )
 
 
 def _feature(feature: Feature, origin: GeodeticOrigin | None) -> dict[str, Any]:

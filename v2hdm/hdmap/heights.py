@@ -16,12 +16,19 @@ _AT_ONCE = 1024
 
 
 def with_heights(hd_map: HdMap, road: Road | None) -> HdMap:
-    """``hd_map`` with the recorded height of every corner and vertex; as it is without a ``road``."""
+    """``hd_map`` with the recorded height of every corner and vertex; as it is without a ``road``.
+
+    What has heights already, of an earlier drive, keeps them.
+    """
     if road is None:
         return hd_map
-    markings = tuple(replace(m, heights_m=ground_height_m(road, m.corners_map)) for m in hd_map.markings)
-    lanes = tuple(replace(lane, heights_m=ground_height_m(road, lane.points_map)) for lane in hd_map.lanes)
-    symbols = tuple(replace(s, heights_m=ground_height_m(road, s.outline_map)) for s in hd_map.symbols)
+
+    def height_m(known: FloatArray | None, points_map: FloatArray) -> FloatArray:
+        return ground_height_m(road, points_map) if known is None else known
+
+    markings = tuple(replace(m, heights_m=height_m(m.heights_m, m.corners_map)) for m in hd_map.markings)
+    lanes = tuple(replace(one, heights_m=height_m(one.heights_m, one.points_map)) for one in hd_map.lanes)
+    symbols = tuple(replace(s, heights_m=height_m(s.heights_m, s.outline_map)) for s in hd_map.symbols)
     return replace(hd_map, markings=markings, lanes=lanes, symbols=symbols)
 
 

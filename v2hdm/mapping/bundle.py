@@ -58,9 +58,10 @@ class Model:
 
     ``floor_px`` is added to every corner in quadrature, px; the sum is multiplied by ``variance_factor``.
     ``sizes`` are those that the user knows, ``survey`` the corners; ``clock_sigma_s`` holds clock offsets.
+    ``pose_sigma`` is that of each visit.
     """
 
-    pose_sigma: PoseSigma
+    pose_sigma: tuple[PoseSigma, ...]
     floor_px: float
     solver: SolveOptions
     variance_factor: float = 1.0
@@ -105,12 +106,12 @@ class Bundle:
 
 
 def full_model(
-    pose_noise: PoseNoise, options: MappingOptions, poses: str, variance_factor: float = 1.0
+    pose_noise: Sequence[PoseNoise], options: MappingOptions, poses: str, variance_factor: float = 1.0
 ) -> Model:
     """Every frame has its own deviation from its recorded pose, in what the pose model ``poses`` says.
 
     Args:
-        pose_noise: How far the recorded poses are off.
+        pose_noise: How far the recorded poses of each visit are off.
         options: Loss and device.
         poses: One of :data:`v2hdm.adjust.MODELS`.
         variance_factor: How many times as large as stated the variances of corners are.
@@ -119,7 +120,7 @@ def full_model(
         loss=options.loss, loss_scale=options.loss_scale, coarse=False, device=options.device
     )
     solver = with_model(solver, MODELS[poses])
-    pose_sigma = pose_sigma_of(pose_noise)
+    pose_sigma = tuple(pose_sigma_of(one) for one in pose_noise)
     return Model(
         pose_sigma, options.model_floor_px, solver, variance_factor, options.known_sizes, options.survey
     )
@@ -138,18 +139,18 @@ def pose_sigma_of(pose_noise: PoseNoise) -> PoseSigma:
     )
 
 
-def coarse_model(rig: Rig, pose_noise: PoseNoise, options: MappingOptions) -> Model:
+def coarse_model(rig: Rig, pose_noise: Sequence[PoseNoise], options: MappingOptions) -> Model:
     """The recorded poses taken at their word, and their errors as so much noise in the image.
 
     Only the extrinsics and corners are left to estimate, which takes a fraction of the time and
     is amply exact for telling markings apart.
     """
     focal_px = float(np.mean(rig.intrinsic[:, 0, 0]))
-    jitter_px = focal_px * float(np.hypot(pose_noise.roll_pitch_rad, pose_noise.heading_rad))
+    jitter_px = focal_px * max(float(np.hypot(one.roll_pitch_rad, one.heading_rad)) for one in pose_noise)
     solver = SolveOptions(
         pose_states=(), loss=options.loss, loss_scale=options.loss_scale, device=options.device
     )
-    return Model(PoseSigma(), float(np.hypot(options.model_floor_px, jitter_px)), solver)
+    return Model(len(pose_noise) * (PoseSigma(),), float(np.hypot(options.model_floor_px, jitter_px)), solver)
 
 
 def solve_bundle(
@@ -244,9 +245,14 @@ def _problem(
         centre_vehicle=centre,
         centre_sigma_m=sigma,
         pose_sigma=model.pose_sigma,
-        twist_vehicle=vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s)[used.frames],
+        twist_vehicle=_twists(sightings)[used.frames],
+        visit=sightings.visit[used.frames],
         clock_sigma_s=model.clock_sigma_s,
     )
+
+
+def _twists(sightings: Sightings) -> FloatArray:
+    return vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s, sightings.visit)
 
 
 def drive_problem(sightings: Sightings, rig: Rig, cameras: Mapping[str, Camera], model: Model) -> Problem:
@@ -275,10 +281,12 @@ def _known(
     located = replace(located, valid=located.valid & usable, informs=located.informs & usable)
     fused = fuse_groups(association, located, jitter_rad=0.0)
     points_map = np.where(fused.valid[..., None], fused.corners_map, np.nan)
+    # Points of a survey are found under the least certain poses of all visits.
+    poses = max(model.pose_sigma, key=lambda one: one.position_m)
     kinds = group_kinds(association, sightings)
     return (
         known_lengths(model.sizes, [sightings.kinds[k] for k in kinds], points_map, corner_index),
-        control_points(model.survey, points_map, corner_index, model.pose_sigma),
+        control_points(model.survey, points_map, corner_index, poses),
     )
 
 

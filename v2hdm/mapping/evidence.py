@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from v2hdm.adjust import Fault
 from v2hdm.records import FloatArray
@@ -23,7 +23,8 @@ class Contradiction:
         fault: what would be wrong.
         cameras: of which cameras.
         axis: along which axis, 0 to 2, of the vehicle (survey, lever) or the map (slope, datum).
-        about: the class of a known size and its length, or a surveyed point; empty for others.
+        about: the class of a known size and its length, a surveyed point, or the visit of a clock; empty for
+            others.
         value: by how much, true minus stated: s, m, rad or a share.
         sigma: how well this drive tells, inf where it cannot.
         sigmas: the value in sigmas, by its chi-square: of one degree of freedom, of two for a surveyed point.
@@ -72,7 +73,7 @@ class SolveEvidence:
             most 1 where these are right.
         worst_pull: the largest of them all, in sigmas.
         worst_pull_s: when, s.
-        clock_s: by camera its estimated clock offset and sigma, where the pose model has one.
+        clock_s: of each visit, by camera its estimated clock offset and sigma, where the pose model has one.
     """
 
     suspects: tuple[Contradiction, ...]
@@ -86,7 +87,7 @@ class SolveEvidence:
     pose_pulls: Mapping[str, float]
     worst_pull: float
     worst_pull_s: float
-    clock_s: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    clock_s: Sequence[Mapping[str, tuple[float, float]]] = ({},)
 
     @property
     def held_out_loss(self) -> float | None:

@@ -10,7 +10,7 @@ from v2hdm.adjust import Fault, Suspect
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.evidence import CELLS, WINDOW_OBSERVATIONS, CameraFit, Contradiction
 from v2hdm.mapping.survey import name_of
-from v2hdm.records import FloatArray
+from v2hdm.records import FloatArray, IntArray
 
 MEDIAN_SQUARED = 2 * float(np.log(2))
 """Median of a squared residual in sigmas: chi-square with two degrees of freedom."""
@@ -19,15 +19,17 @@ CELL_OBSERVATIONS = 40
 """Observations of a cell from which its median residual counts."""
 
 
-def contradictions(bundle: Bundle, found: Sequence[Suspect]) -> tuple[Contradiction, ...]:
-    """``found`` in the bundle's problem, in the words of the user's inputs."""
+def contradictions(
+    bundle: Bundle, found: Sequence[Suspect], visits: Sequence[str] = ()
+) -> tuple[Contradiction, ...]:
+    """``found`` in the bundle's problem, in the words of the user's inputs; several ``visits`` are named."""
     names = tuple(bundle.camera_index)
     return tuple(
         Contradiction(
             one.fault,
             names if one.camera < 0 else (names[one.camera],),
             one.axis,
-            _about(bundle, one),
+            _about(bundle, one, visits),
             one.value,
             one.sigma,
             one.sigmas,
@@ -70,13 +72,19 @@ def camera_fits(bundle: Bundle) -> dict[str, CameraFit]:
     return fits
 
 
-def along_route(bundle: Bundle, stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Variance factors (W,) of windows along the route and when they begin, given the observations' times."""
-    order = np.argsort(stamp_s, kind="stable")
+def along_route(bundle: Bundle, frame: IntArray, stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Variance factors (W,) of windows along the route and when they begin, s.
+
+    Args:
+        bundle: a solve before anything was left out.
+        frame: (K,) that of each observation.
+        stamp_s: (F,) the frames' times.
+    """
+    order = np.argsort(frame, kind="stable")
     count = max(len(order) // WINDOW_OBSERVATIONS, 1)
     windows = np.array_split(order, count)
     factors = [_factor(bundle, bundle.solution.mahalanobis2[window]) for window in windows]
-    return np.array(factors), np.array([stamp_s[window[0]] for window in windows])
+    return np.array(factors), np.array([stamp_s[frame[window[0]]] for window in windows])
 
 
 def overall_factor(bundle: Bundle) -> float:
@@ -103,7 +111,9 @@ def _cell_bias(places_px: FloatArray, residual_px: FloatArray) -> float:
     return max(biases, default=0.0)
 
 
-def _about(bundle: Bundle, suspect: Suspect) -> str:
+def _about(bundle: Bundle, suspect: Suspect, visits: Sequence[str]) -> str:
+    if suspect.fault is Fault.CLOCK and suspect.item >= 0 and visits:
+        return f"in {visits[suspect.item]}"
     if suspect.fault is Fault.SIZE:
         length_m = length_of(bundle, suspect.item)
         return f"{', '.join(sizes_of(bundle, length_m))} {length_m:.2f} m"

@@ -11,10 +11,15 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from v2hdm.adjust import Status, observability
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.mapping.bundle import Bundle
+from v2hdm.mapping.changes.update import Base, update_map
+from v2hdm.mapping.changes.watched import Observer
 from v2hdm.mapping.growth import grow_map
 from v2hdm.mapping.lanes.fuse import map_lanes
 from v2hdm.mapping.lanes.points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
@@ -22,12 +27,13 @@ from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.naive import naive_markings
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.outlines import map_symbols
-from v2hdm.mapping.outputs import JointCorners, adjusted_poses, clock_offsets, residuals_of
+from v2hdm.mapping.outputs import JointCorners, StatedCorners, adjusted_poses, clock_offsets, residuals_of
 from v2hdm.mapping.remedy import Inputs, Outcome, optimise
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.sightings.table import camera_of
+from v2hdm.mapping.sightings.views import views_of
 from v2hdm.mapping.survey import without_corner
-from v2hdm.records import Drive, FloatArray, HdMap, ImageDetections, Lane
+from v2hdm.records import Drive, FloatArray, HdMap, Image, ImageDetections, Lane
 
 Progress = Callable[[str], None]
 
@@ -44,6 +50,8 @@ def run_methods(
     options: MappingOptions | None = None,
     progress: Progress | None = None,
     growth_steps: int = 0,
+    base: Base | None = None,
+    grey: Callable[[Image], NDArray[np.float32]] | None = None,
 ) -> dict[str, MethodResult]:
     """Map a drive with every method that its IPMs allow.
 
@@ -54,6 +62,8 @@ def run_methods(
         options: Settings of the mapping.
         progress: Called with the name of each step as it begins.
         growth_steps: At how many sizes of the growing map ``Opt`` is solved again; 0 for none.
+        base: An earlier map that ``Opt`` brings up to date; None where there is none.
+        grey: Reads the grey values (H, W) of an image, to look where ``base`` has paint; None does without.
 
     Returns:
         Results by method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``.
@@ -80,6 +90,9 @@ def run_methods(
         tell("growth of the map")
         growth = grow_map(outcome.inputs.optimiser, optimised, growth_steps)
         optimal = replace(optimal, growth=growth)
+    if base is not None:
+        tell("the earlier map")
+        optimal = _brought_up_to_date(base, optimal, outcome, optimised, grey)
     results["Opt"] = optimal
     tell("ONI")
     found = optimal.calibrations
@@ -144,7 +157,9 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
     return MethodResult(
         name="Opt",
         cameras=tuple(cameras),
-        hd_map=HdMap(optimised.markings, lanes, drive.origin, symbols),
+        hd_map=HdMap(
+            optimised.markings, lanes, drive.origin, symbols, drive.pose_noise.position_drift_over_m
+        ),
         calibrations=optimised.calibrations,
         excluded=optimised.excluded,
         reprojection_rmse_px=optimised.reprojection_rmse_px,
@@ -164,6 +179,29 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
         corners=JointCorners(optimised),
         residuals=residuals_of(outcome, optimised),
     )
+
+
+def _brought_up_to_date(
+    base: Base,
+    made: MethodResult,
+    outcome: Outcome,
+    optimised: Optimised,
+    grey: Callable[[Image], NDArray[np.float32]] | None,
+) -> MethodResult:
+    drive, group = outcome.inputs.drive, optimised.bundle.association.group
+    observer = Observer(
+        outcome.inputs.sightings,
+        views_of(drive, made.cameras),
+        tuple(drive.cameras[name] for name in made.cameras),
+        optimised.bundle.rig,
+        drive.pose_noise.roll_pitch_rad,
+        None if grey is None else lambda image: grey(drive.images[image]),
+    )
+    mapped = np.isin(group, optimised.groups)
+    over_m = drive.pose_noise.position_drift_over_m
+    hd_map, changes = update_map(base, made.hd_map, observer, mapped, over_m)
+    corners = StatedCorners(hd_map.markings)
+    return replace(made, hd_map=hd_map, changes=changes, corners=corners, residuals=None)
 
 
 def _certainty(bundle: Bundle) -> dict[str, str]:

@@ -9,7 +9,7 @@ is solved together, and again without the observations that contradict the rest.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -36,7 +36,7 @@ from v2hdm.mapping.sightings.location import Located, locate
 from v2hdm.mapping.sightings.rig import Rig, build_rig
 from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.mapping.sightings.views import Views
-from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, PoseNoise
+from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, PoseNoise, largest_noise
 
 _log = logging.getLogger(__name__)
 
@@ -58,13 +58,18 @@ class Optimiser:
         sightings: Sightings,
         views: Views,
         cameras: Mapping[str, Camera],
-        pose_noise: PoseNoise,
+        pose_noise: PoseNoise | Sequence[PoseNoise],
         options: MappingOptions,
     ) -> None:
+        """``pose_noise`` is that of all visits, or of each; gates take the largest of each kind."""
         self._sightings = sightings
         self._views = views
         self._cameras = {name: cameras[name] for name in sightings.cameras}
-        self._pose_noise = pose_noise
+        visits = int(sightings.visit.max(initial=0)) + 1
+        self._noise_of_visits = (
+            visits * (pose_noise,) if isinstance(pose_noise, PoseNoise) else tuple(pose_noise)
+        )
+        self._pose_noise = largest_noise(self._noise_of_visits)
         self._options = options
         self._pose_model = SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
         self._variance_factor = 1.0
@@ -116,15 +121,18 @@ class Optimiser:
             self._options.acceptance,
         )
 
-    def clock_offsets_s(self, bundle: Bundle) -> dict[str, float]:
-        """Each camera's clock offset by a solve that expects none in particular, from ``bundle``."""
-        model = full_model(self._pose_noise, self._options, "clock", bundle.model.variance_factor)
+    def clock_offsets_s(self, bundle: Bundle) -> list[dict[str, float]]:
+        """By visit each camera's clock offset by a solve that expects none in particular, from ``bundle``."""
+        model = full_model(self._noise_of_visits, self._options, "clock", bundle.model.variance_factor)
         model = replace(model, clock_sigma_s=LOOSE_CLOCK_SIGMA_S)
         usable = self._usable(bundle.association, bundle.rig)
         solved = solve_bundle(
             self._sightings, bundle.association, usable, bundle.rig, self._cameras, model
         ).solution
-        return {name: float(solved.clock_offset_s[c]) for name, c in bundle.camera_index.items()}
+        return [
+            {name: float(offset_s[c]) for name, c in bundle.camera_index.items()}
+            for offset_s in solved.clock_offset_s.T
+        ]
 
     def grow(self, progress: Callable[[str], None] | None = None) -> Bundle:
         """Map one track after the other, as the vehicle would, and solve for all that the map rests on.
@@ -151,7 +159,7 @@ class Optimiser:
             self._options,
             link,
             solve,
-            coarse_model(self.initial_rig, self._pose_noise, self._options),
+            coarse_model(self.initial_rig, self._noise_of_visits, self._options),
         )
         grown = mapper.run(progress or _silent)
         bundle = self._solve(grown.association, grown.usable, grown.rig)
@@ -216,9 +224,9 @@ class Optimiser:
             usable,
             rig,
             self._cameras,
-            coarse_model(rig, self._pose_noise, self._options)
+            coarse_model(rig, self._noise_of_visits, self._options)
             if coarse
-            else full_model(self._pose_noise, self._options, self._pose_model, self._variance_factor),
+            else full_model(self._noise_of_visits, self._options, self._pose_model, self._variance_factor),
         )
         status = bundle.solution.status
         if status is Status.UNDETERMINED or not np.isfinite(bundle.solution.corners_map).all():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,13 +14,13 @@ from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.remedy import Outcome
 from v2hdm.mapping.results import AdjustedPoses, ClockOffset
 from v2hdm.mapping.sightings.table import frames_of
-from v2hdm.records import FloatArray, IntArray
+from v2hdm.records import FloatArray, IntArray, Marking
 
 
 def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
     """The poses of all frames of the drive."""
     drive, sightings, bundle = outcome.inputs.drive, outcome.inputs.sightings, outcome.bundle
-    sigma = np.tile(bundle.model.pose_sigma.by_state(), (len(sightings.stamp_s), 1))
+    sigma = np.stack([one.by_state() for one in bundle.model.pose_sigma])[sightings.visit]
     used = np.unique(sightings.frame[bundle.row])
     if bundle.model.solver.pose_states:
         inflation = max(1.0, bundle.solution.chi2_per_dof)
@@ -34,22 +35,33 @@ def adjusted_poses(outcome: Outcome) -> AdjustedPoses:
         sigma=sigma,
         seen=seen,
         frame={image.path: int(frame) for image, frame in zip(drive.images, frames, strict=True)},
+        visit=sightings.visit,
     )
 
 
-def clock_offsets(outcome: Outcome) -> dict[str, ClockOffset]:
-    """Each camera's clock offset: what its images were posed anew by, and what the solve estimates beyond."""
-    evidence = outcome.evidence
-    applied_s = {image.camera: image.clock_offset_s for image in outcome.inputs.drive.images}
-    clocks = {}
-    for name in outcome.inputs.sightings.cameras:
-        beyond_s, sigma_s = evidence.clock_s.get(name, (0.0, 0.0))
-        if name not in evidence.clock_s:
-            # Of each camera, and of all of them together: a clock of its own may differ by both.
-            tested = [one for one in evidence.suspects if one.fault is Fault.CLOCK and name in one.cameras]
-            sigma_s = float(np.sqrt(sum(one.sigma**2 for one in tested))) if tested else float("inf")
-        clocks[name] = ClockOffset(applied_s.get(name, 0.0) + beyond_s, sigma_s)
-    return clocks
+def clock_offsets(outcome: Outcome) -> tuple[dict[str, ClockOffset], ...]:
+    """Of each visit each camera's clock offset: what its images were moved by, and the solve's beyond."""
+    evidence, drive = outcome.evidence, outcome.inputs.drive
+    applied_s = {(image.visit, image.camera): image.clock_offset_s for image in drive.images}
+    suspects = [one for one in evidence.suspects if one.fault is Fault.CLOCK]
+    out = []
+    for visit, (place, estimated) in enumerate(zip(drive.visits, evidence.clock_s, strict=True)):
+        clocks = {}
+        for name in outcome.inputs.sightings.cameras:
+            if (visit, name) not in applied_s:
+                continue
+            beyond_s, sigma_s = estimated.get(name, (0.0, 0.0))
+            if name not in estimated:
+                # Of each camera, and of all of them together: a clock of its own may differ by both.
+                tested = [
+                    one.sigma**2
+                    for one in suspects
+                    if name in one.cameras and one.about in ("", f"in {place.name}")
+                ]
+                sigma_s = float(np.sqrt(sum(tested))) if tested else float("inf")
+            clocks[name] = ClockOffset(applied_s[visit, name] + beyond_s, sigma_s)
+        out.append(clocks)
+    return tuple(out)
 
 
 @dataclass(frozen=True)
@@ -82,6 +94,24 @@ class JointCorners:
         # Put together from two sources, it may be negative along some direction, by a millimetre squared.
         values, vectors = np.linalg.eigh(out)
         return out if values[0] >= 0 else np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+@dataclass(frozen=True)
+class StatedCorners:
+    """The errors of the corners of markings from several maps, as far as each marking states them."""
+
+    markings: Sequence[Marking]
+
+    def covariance(self, marking: IntArray, corner: IntArray) -> FloatArray:
+        """As :meth:`JointCorners.covariance`, but that nothing is shared from one marking to another."""
+        out = np.zeros((2 * len(marking), 2 * len(marking)))
+        rows = 2 * corner[:, None] + np.arange(2)
+        for k, own in enumerate(marking.tolist()):
+            stated = self.markings[own].covariance_m2
+            assert stated is not None
+            for other in np.flatnonzero(marking == own):
+                out[2 * k : 2 * k + 2, 2 * other : 2 * other + 2] = stated[np.ix_(rows[k], rows[other])]
+        return out
 
 
 def residuals_of(outcome: Outcome, optimised: Optimised) -> Residuals:

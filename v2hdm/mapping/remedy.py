@@ -105,7 +105,7 @@ class Inputs:
         """Of these inputs, not yet run."""
         drive, options = self.drive, self.options
         views = views_of(drive, self.cameras)
-        return Optimiser(self.sightings, views, drive.cameras, drive.pose_noise, options)
+        return Optimiser(self.sightings, views, drive.cameras, drive.noises, options)
 
     @cached_property
     def tracks(self) -> Association:
@@ -147,7 +147,7 @@ def optimise(inputs: Inputs, tell: Callable[[str], None]) -> tuple[Outcome, Opti
             remedied = _remedied(inputs, worst, settled)
         if worst is None or remedied is None:
             break
-        told = contradictions(settled, (worst,))[0]
+        told = contradictions(settled, (worst,), visit_names(drive))[0]
         whose, about = " and ".join(told.cameras), f" {told.about}" if told.about else ""
         _log.warning(
             "%s: mapped again, for the drive contradicts the %s%s of %s by %.0f sigmas (%+.3g %s)",
@@ -158,10 +158,14 @@ def optimise(inputs: Inputs, tell: Callable[[str], None]) -> tuple[Outcome, Opti
         inputs = remedied
     optimised = optimiser.finish(settled, tell)
     corrected = [_as_solved(one, settled) for one in corrected if _is_of_the_map(one, survey, optimised)]
-    evidence = _evidence(
-        settled, contradictions(settled, found), corrected, optimiser, optimised.bundle, inputs.sightings
-    )
+    suspected = contradictions(settled, found, visit_names(drive))
+    evidence = _evidence(settled, suspected, corrected, optimiser, optimised.bundle, inputs.sightings)
     return Outcome(inputs, optimised.bundle, evidence), optimised
+
+
+def visit_names(drive: Drive) -> tuple[str, ...]:
+    """The names of a joined drive's visits, none of a single one."""
+    return tuple(visit.name for visit in drive.joined)
 
 
 def _suspects(bundle: Bundle, drive: Drive) -> tuple[Suspect, ...]:
@@ -211,10 +215,10 @@ def _evidence(
     final: Bundle,
     sightings: Sightings,
 ) -> SolveEvidence:
-    factors, window_s = along_route(settled, sightings.stamp_s[sightings.frame[settled.row]])
+    factors, window_s = along_route(settled, sightings.frame[settled.row], sightings.stamp_s)
     pulls = pose_pulls(settled.solution)
     largest = np.abs(pulls.pulls).max(axis=1, initial=0.0)
-    frames_s = np.unique(sightings.stamp_s[sightings.frame[settled.row]])
+    frames_s = sightings.stamp_s[np.unique(sightings.frame[settled.row])]
     return SolveEvidence(
         suspects=found,
         corrected=tuple(corrected),
@@ -238,6 +242,7 @@ def _is_ambiguous(worst: Suspect, found: Sequence[Suspect]) -> bool:
         for one in found
         if one.fault is worst.fault
         and one.axis == worst.axis
+        and one.item == worst.item
         and min(one.camera, worst.camera) >= 0
         and one.camera != worst.camera
     ]
@@ -250,14 +255,15 @@ def is_contradicted(one: Suspect | Contradiction) -> bool:
     return told and one.sigmas > CONTRADICTED_SIGMAS and abs(one.value) > LEAST_VALUE[one.fault]
 
 
-def _clocks(bundle: Bundle) -> dict[str, tuple[float, float]]:
+def _clocks(bundle: Bundle) -> tuple[dict[str, tuple[float, float]], ...]:
+    offset_s = bundle.solution.clock_offset_s
     if not bundle.model.solver.clock_offset:
-        return {}
+        return tuple({} for _ in offset_s.T)
     sigma = np.sqrt(bundle.solution.covariance.clock_s2())
-    return {
-        name: (float(bundle.solution.clock_offset_s[c]), float(sigma[c]))
-        for name, c in bundle.camera_index.items()
-    }
+    return tuple(
+        {name: (float(offset_s[c, v]), float(sigma[c, v])) for name, c in bundle.camera_index.items()}
+        for v in range(offset_s.shape[1])
+    )
 
 
 def _remedied(inputs: Inputs, worst: Suspect, settled: Bundle) -> Inputs | None:
@@ -287,14 +293,16 @@ def _remedied(inputs: Inputs, worst: Suspect, settled: Bundle) -> Inputs | None:
     return None
 
 
-def _with_clocks(inputs: Inputs, later_s: Mapping[str, float]) -> Inputs | None:
-    """The images of each camera posed for ``later_s`` after the times that they have by now."""
+def _with_clocks(inputs: Inputs, later_s: Sequence[Mapping[str, float]]) -> Inputs | None:
+    """The images of each visit and camera posed for ``later_s`` after the times that they have by now."""
     drive = inputs.drive
-    if drive.trajectory is None:
+    if any(visit.trajectory is None for visit in drive.visits):
         return None
-    so_far = {image.camera: image.clock_offset_s for image in drive.images}
-    offset_s = {name: so_far.get(name, 0.0) + later for name, later in later_s.items()}
-    moved = with_clock_offsets(drive, offset_s, max_gap_s=float("inf"))
+    so_far = {(image.visit, image.camera): image.clock_offset_s for image in drive.images}
+    moved = drive
+    for visit, later in enumerate(later_s):
+        own = {name: so_far[visit, name] + late for name, late in later.items() if (visit, name) in so_far}
+        moved = with_clock_offsets(moved, own, max_gap_s=float("inf"), visit=visit)
     number = {image.path: n for n, image in enumerate(moved.images)}
     detections = [
         replace(one, image=number[drive.images[one.image].path])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -11,7 +11,7 @@ import numpy as np
 
 from v2hdm.hdmap.residuals import Residuals
 from v2hdm.mapping.evidence import SolveEvidence
-from v2hdm.records import BoolArray, Calibration, FloatArray, HdMap, Image, IntArray, Marking
+from v2hdm.records import BoolArray, Calibration, Changes, FloatArray, HdMap, Image, IntArray, Marking
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,14 @@ class AdjustedPoses:
     """The vehicle's poses at the images' times, as a solve has adjusted them.
 
     Attributes:
-        stamp_s: (F,) when images were taken, on the clock of the poses, rising.
+        stamp_s: (F,) when images were taken, on the clock of the poses, rising within each visit.
         before: (F, 4, 4) ``map_from_vehicle`` as it went into the solve.
         map_from_vehicle: (F, 4, 4) adjusted; as before where no marking was seen.
         sigma: (F, 6) standard deviations along and about the vehicle's axes, m and rad; those stated by the
             drive where no marking was seen.
         seen: (F,) whether a marking was seen then.
         frame: which of them each image is of, by its path.
+        visit: (F,) of which visit each is.
     """
 
     stamp_s: FloatArray
@@ -52,6 +53,7 @@ class AdjustedPoses:
     sigma: FloatArray
     seen: BoolArray
     frame: Mapping[Path, int]
+    visit: IntArray
 
     def of_image(self, image: Image) -> FloatArray:
         """The adjusted pose (4, 4) of an image, that in its record where the solve knew nothing of it."""
@@ -84,10 +86,10 @@ class MethodResult:
     ``growth`` is how the result came about, marking by marking, where that was asked for;
     ``diagnostics`` are named figures for the log and the report; ``certainty`` says of each camera
     in a sentence what the drive determined and what rests on the survey; ``evidence`` is what the checks
-    after the solve rest on, ``poses`` the vehicle's poses as the solve has adjusted them, ``clocks`` the
-    offsets of the cameras' clocks, corrections before the solve included; ``corners`` how the errors of the
-    map's corners hang together, None where nothing tells; ``residuals`` are those of the corner observations
-    that it accepted.
+    after the solve rest on, ``poses`` the vehicle's poses as the solve has adjusted them, ``clocks`` of
+    each visit the offsets of the cameras' clocks, corrections before the solve included; ``corners`` how the
+    errors of the map's corners hang together, None where nothing tells; ``residuals`` are those of the corner
+    observations that it accepted; ``changes`` what became of an earlier map that was brought up to date.
     """
 
     name: str
@@ -102,6 +104,7 @@ class MethodResult:
     certainty: Mapping[str, str] = field(default_factory=dict)
     evidence: SolveEvidence | None = None
     poses: AdjustedPoses | None = None
-    clocks: Mapping[str, ClockOffset] = field(default_factory=dict)
+    clocks: Sequence[Mapping[str, ClockOffset]] = ({},)
     corners: Corners | None = None
     residuals: Residuals | None = None
+    changes: Changes | None = None

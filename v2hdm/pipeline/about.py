@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -18,23 +19,23 @@ _PACKAGES = ("torch", "kornia", "numpy", "scipy", "onnxruntime", "opencv-python-
 """Those that the figures of a run depend on."""
 
 
-def describe_run(name: str, drive: Drive, path: Path, options: ReadOptions) -> dict[str, Any]:
-    """What ``metrics.json`` begins with: name, version, date (UTC), the drive at ``path``, as it was read."""
+def describe_run(name: str, drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[str, Any]:
+    """What ``metrics.json`` begins with: name, version, date (UTC), the drive at ``paths`` as it was read."""
     return {
         "name": name,
         "version": __version__,
         "date": datetime.now(UTC).strftime("%Y-%m-%d"),
-        "drive": _drive(drive, path, options),
+        "drive": _drive(drive, paths, options),
         "versions": _versions(),
     }
 
 
-def _drive(drive: Drive, path: Path, options: ReadOptions) -> dict[str, Any]:
+def _drive(drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[str, Any]:
     stamp_s = [image.stamp_s for image in drive.images]
     places = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
     return {
         "name": drive.name,
-        "path": str(path.resolve()),
+        "paths": [str(path.resolve()) for path in paths],
         "format": options.format,
         "max_gap_s": options.max_gap_s,
         "cameras": list(drive.cameras),

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.drive.truth import read_truth
+from v2hdm.drive.truth import has_truth, read_truth
 from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.mapping.methods import run_naive
 from v2hdm.mapping.options import MappingOptions
@@ -45,7 +45,7 @@ def evaluate(
     progress: Callable[[int, int], None],
 ) -> Judgement:
     """Compare every method on every camera set with the truth, where the drive has one."""
-    truth = read_truth(drive) if drive.truth_dir is not None else None
+    truth = read_truth(drive) if has_truth(drive) else None
     results: dict[str, dict[str, Any]] = {}
     reference: dict[str, Any] = {}
     growth: dict[str, list[tuple[int, float]]] = {}
@@ -137,10 +137,7 @@ def _extrinsics(drive: Drive, methods: CameraSets, truth: Truth | None) -> dict[
                 truth.cam_from_vehicle[name] if truth else None,
             )
             found["certainty"] = optimised.certainty.get(name, "")
-            clock = optimised.clocks.get(name)
-            if clock is not None:
-                found["clock_offset_s"] = clock.value_s
-                found["clock_sigma_s"] = clock.sigma_s if np.isfinite(clock.sigma_s) else None
+            found |= _clocks(drive, optimised, name)
             if calibration.covariance is not None:
                 sigma = np.sqrt(np.diag(calibration.covariance))
                 found["translation_sigma_m"] = float(np.linalg.norm(sigma[:3]))
@@ -150,6 +147,19 @@ def _extrinsics(drive: Drive, methods: CameraSets, truth: Truth | None) -> dict[
             else:
                 figures[name] = found
     return figures
+
+
+def _clocks(drive: Drive, optimised: MethodResult, camera: str) -> dict[str, Any]:
+    """A camera's clock offset and its sigma; of joined drives one a drive, by its name."""
+    offsets: dict[str, dict[str, float | None]] = {"clock_offset_s": {}, "clock_sigma_s": {}}
+    for visit, clocks in zip(drive.visits, optimised.clocks, strict=True):
+        if camera in clocks:
+            offsets["clock_offset_s"][visit.name] = clocks[camera].value_s
+            sigma_s = clocks[camera].sigma_s
+            offsets["clock_sigma_s"][visit.name] = sigma_s if np.isfinite(sigma_s) else None
+    if drive.joined:
+        return dict(offsets)
+    return {key: value for key, by_name in offsets.items() for value in by_name.values()}
 
 
 def _disturbances(truth: Truth | None) -> list[str]:

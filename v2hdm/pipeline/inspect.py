@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from v2hdm.drive import with_clock_offsets
-from v2hdm.ground import GroundEstimate, better_start, estimate_cameras
+from v2hdm.drive import join_drives, with_clock_offsets
+from v2hdm.errors import MapFileError
+from v2hdm.ground import GroundEstimate, GroundStatus, better_start, estimate_cameras
+from v2hdm.ground.better import GROUND_IPM
 from v2hdm.quality import Finding, Status, check_drive, clock_corrections
+from v2hdm.quality.movement import movement
 from v2hdm.records import Camera, Drive
 
 log = logging.getLogger(__name__)
@@ -21,15 +24,13 @@ class Inspection:
     Attributes:
         drive: with the clocks that the ground contradicts corrected, and the ground's better start.
         given: cameras as the drive describes them.
-        ground: by camera, what the bare ground says.
-        clock_offset_s: by camera, how much later than stamped its images are taken to be, s.
+        ground: of each visit, by camera, what the bare ground says.
         findings: of all checks before the run.
     """
 
     drive: Drive
     given: Mapping[str, Camera]
-    ground: Mapping[str, GroundEstimate]
-    clock_offset_s: Mapping[str, float]
+    ground: tuple[Mapping[str, GroundEstimate], ...]
     findings: tuple[Finding, ...]
 
     @property
@@ -61,4 +62,54 @@ def inspect(drive: Drive, max_gap_s: float, workers: int, progress: Callable[[in
             log.info("%s", finding.line)
     offset_s = clock_corrections(ground)
     corrected = better_start(with_clock_offsets(drive, offset_s, max_gap_s), ground)
-    return Inspection(corrected, drive.cameras, ground, offset_s, findings)
+    return Inspection(corrected, drive.cameras, (ground,), findings)
+
+
+def join(inspections: Sequence[Inspection]) -> Inspection:
+    """Several drives, each inspected by itself, as one; findings name the drive that they are of.
+
+    A camera that the bare ground of two drives puts on two mountings is two cameras.
+
+    Raises:
+        DriveError: they are not of one frame or site.
+    """
+    if len(inspections) == 1:
+        return inspections[0]
+    moved = [
+        (number, name)
+        for number, one in enumerate(inspections)
+        for name in one.given
+        if any(_has_moved(name, before, one) for before in inspections[:number])
+    ]
+    given = join_drives([one.drive_as_described for one in inspections], moved)
+    drive = replace(given, cameras=_started(given, inspections))
+    ground, findings = [], []
+    for visit, one in zip(drive.joined, inspections, strict=True):
+        ground.append({visit.cameras[name]: estimate for name, estimate in one.ground[0].items()})
+        findings += [replace(finding, about=f"{finding.about} of {visit.name}") for finding in one.findings]
+    return Inspection(drive, given.cameras, tuple(ground), tuple(findings))
+
+
+def _started(drive: Drive, inspections: Sequence[Inspection]) -> dict[str, Camera]:
+    """Each camera with the start that the ground gave it on the first visit where it did."""
+    started = dict(drive.cameras)
+    for visit, one in reversed(list(zip(drive.joined, inspections, strict=True))):
+        for own, name in visit.cameras.items():
+            camera = one.drive.cameras[own]
+            if camera.initial_ipm == GROUND_IPM:
+                described = drive.cameras[name]
+                ipm = {**described.ipm, GROUND_IPM: camera.ipm[GROUND_IPM]}
+                started[name] = replace(described, ipm=ipm, initial_ipm=GROUND_IPM)
+    return started
+
+
+def _has_moved(camera: str, before: Inspection, after: Inspection) -> bool:
+    """Whether the ground of two drives says that a camera sits elsewhere, by the odds of the drift alarm."""
+    found = [one.ground[0].get(camera) for one in (before, after)]
+    calibrations = [one.calibration for one in found if one is not None and one.status is GroundStatus.FOUND]
+    if len(calibrations) < 2 or any(one is None or one.covariance is None for one in calibrations):
+        return False
+    try:
+        return movement(*(one for one in calibrations if one is not None)).moved
+    except MapFileError:  # the lenses differ, which the descriptions say as well
+        return False

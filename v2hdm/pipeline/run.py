@@ -22,15 +22,18 @@ from v2hdm.detection.batch import detect_all
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import unknown_network
-from v2hdm.drive import ReadOptions, drive_name, read_drive
+from v2hdm.drive import ReadOptions, drive_name, join_drives, read_drive
+from v2hdm.drive.truth import has_truth
 from v2hdm.errors import AdjustError, ConfigError, MappingError, V2hdmError
 from v2hdm.hdmap.formats import check_formats
+from v2hdm.mapping.changes.update import Base
 from v2hdm.mapping.methods import run_methods
-from v2hdm.mapping.options import MappingOptions, check_options
+from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
 from v2hdm.orthophoto.result import write_mosaic
 from v2hdm.pipeline.about import describe_run
+from v2hdm.pipeline.base import changes_json, check_together, grey_reader, read_base
 from v2hdm.pipeline.evaluate import CameraSets, evaluate
-from v2hdm.pipeline.inspect import Inspection, inspect
+from v2hdm.pipeline.inspect import Inspection, inspect, join
 from v2hdm.pipeline.survey import Survey, check_survey, table_of, take_survey
 from v2hdm.pipeline.write import BEST, write_results
 from v2hdm.quality import Finding, Status, Verdict
@@ -106,9 +109,36 @@ def silent(task: str, done: int, total: int) -> None:
 
 @dataclass(kw_only=True)
 class DriveConfig(ReadOptions):
-    """Where the drive is, and how to read it: ``path`` is its folder or bag, None where it is rendered."""
+    """Where the drive is, and how to read it: ``path`` is its folder or bag, None where it is rendered.
 
-    path: str | None = None
+    A list of paths are drives through one site, which are mapped together (docs/living-map.md).
+    """
+
+    path: Any = None
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """The paths, none where the drive is rendered.
+
+        Raises:
+            ConfigError: ``path`` is neither a path nor a list of them.
+        """
+        if not self.path:
+            return ()
+        listed = self.path if isinstance(self.path, list) else [self.path]
+        wrong = [one for one in listed if not isinstance(one, str | Path) or not str(one)]
+        if wrong:
+            raise ConfigError(
+                f"drive.path: {wrong[0]!r} is no path; give one, or a list as in [monday,friday]"
+            )
+        return tuple(Path(one) for one in listed)
+
+
+@dataclass(kw_only=True)
+class MapConfig:
+    """The map that comes out: ``base`` is the map.geojson that the drive brings up to date, None for none."""
+
+    base: str | None = None
 
 
 @dataclass(kw_only=True)
@@ -117,7 +147,8 @@ class RunConfig:
 
     Attributes:
         name: names the results, ``<output>/<name>/``; None takes the drive's own name.
-        drive: the drive to map.
+        drive: the drive to map, or several that are mapped together.
+        map: an earlier map that the drive brings up to date, if there is one.
         simulate: renders the drive into the cache first, instead of reading ``drive.path``.
         detector: settings of the detector.
         mapping: settings of association, optimisation and lanes.
@@ -133,6 +164,7 @@ class RunConfig:
 
     name: str | None = None
     drive: DriveConfig = field(default_factory=DriveConfig)
+    map: MapConfig = field(default_factory=MapConfig)
     simulate: PortConfig | None = None
     detector: DetectorOptions = field(default_factory=DetectorOptions.for_mapping)
     mapping: MappingOptions = field(default_factory=MappingOptions)
@@ -157,7 +189,7 @@ class RunResult:
 
 
 def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -> RunResult:
-    """Map one drive and write the results to ``<output>/<name>/``, whole or not at all.
+    """Map one drive, or several together, and write the results to ``<output>/<name>/``, whole or not at all.
 
     Args:
         config: what to do.
@@ -169,6 +201,7 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
     """
     name = _check(config)
     seconds: dict[str, float] = {}
+    base = None if config.map.base is None else read_base(Path(config.map.base))
     with (
         result_folder(Path(config.output) / name) as folder,
         logging_to(_log_file(folder / "run.log")),
@@ -178,16 +211,22 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
         if unknown is not None:
             log.warning("%s", unknown)
         (folder / "config.yaml").write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
-        drive_folder = _drive_folder(config, seconds, progress)
-        drive = read_drive(drive_folder, config.drive)
-        log.info("drive %s: %d images of cameras %s", drive.name, len(drive.images), ", ".join(drive.cameras))
-        survey = take_survey(drive, config.mapping)
+        paths = _drive_folders(config, seconds, progress)
+        drives = [read_drive(path, config.drive) for path in paths]
+        for drive in drives:
+            count, names = len(drive.images), ", ".join(drive.cameras)
+            log.info("drive %s: %d images of cameras %s", drive.name, count, names)
+        # What does not belong together is told before any long work.
+        whole = join_drives(drives)
+        if base is not None:
+            check_together(base, whole, config.map.base or "")
+        survey = take_survey(whole, config.mapping)
         config = replace(config, mapping=survey.mapping)
         with _timed(seconds, "check"):
-            inspection = inspect(drive, config.drive.max_gap_s, _workers(config), partial(progress, "check"))
-        about = describe_run(name, drive, drive_folder, config.drive)
+            inspection = join([_inspect(config, drive, len(drives), progress) for drive in drives])
+        about = describe_run(name, whole, paths, config.drive)
         try:
-            result = _map_and_judge(config, inspection, survey, folder, about, seconds, progress)
+            result = _map_and_judge(config, inspection, survey, base, folder, about, seconds, progress)
         except (MappingError, AdjustError) as failure:
             if not inspection.has_failed:
                 raise
@@ -197,10 +236,16 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
     return result
 
 
+def _inspect(config: RunConfig, drive: Drive, drives: int, progress: Progress) -> Inspection:
+    task = "check" if drives == 1 else f"check {drive.name}"
+    return inspect(drive, config.drive.max_gap_s, _workers(config), partial(progress, task))
+
+
 def _map_and_judge(
     config: RunConfig,
     inspection: Inspection,
     survey: Survey,
+    base: Base | None,
     folder: Path,
     about: Mapping[str, Any],
     seconds: dict[str, float],
@@ -211,7 +256,7 @@ def _map_and_judge(
     with _timed(seconds, "detect"):
         detections = _detect(config, drive, progress)
     with _timed(seconds, "map"):
-        methods = _map_camera_sets(config, drive, detections, progress)
+        methods = _map_camera_sets(config, drive, detections, base, progress)
     with _timed(seconds, "judge"):
         found = check_result(drive, methods, inspection.ground)
         checked, surveyed = check_survey(survey, drive, list(methods.values())[-1][BEST])
@@ -220,7 +265,9 @@ def _map_and_judge(
     with _timed(seconds, "evaluate"):
         described = inspection.drive_as_described
         judgement = evaluate(described, detections, methods, config.mapping, partial(progress, "evaluate"))
-    metrics = {**about, "verdict": verdict.as_json(), **judgement.metrics, "seconds": seconds}
+    changes = list(methods.values())[-1][BEST].changes
+    changed = {} if changes is None else {"changes": changes_json(changes)}
+    metrics = {**about, "verdict": verdict.as_json(), **judgement.metrics, **changed, "seconds": seconds}
     headlines = judgement.headlines
     if checked is not None:
         metrics["check_points"] = checked.figures()
@@ -259,19 +306,20 @@ def camera_sets(drive: Drive) -> dict[str, tuple[str, ...]]:
     return sets
 
 
-def _drive_folder(config: RunConfig, seconds: dict[str, float], progress: Progress) -> Path:
+def _drive_folders(config: RunConfig, seconds: dict[str, float], progress: Progress) -> tuple[Path, ...]:
     if config.simulate is None:
-        if not config.drive.path:
+        if not config.drive.paths:
             raise ConfigError(_NO_DRIVE)
-        return Path(config.drive.path)
-    if config.drive.path:
+        return config.drive.paths
+    if config.drive.paths:
         raise ConfigError(
             "both simulate and drive.path are set: a run renders a drive or reads one, remove one of them"
         )
     with _timed(seconds, "render"):
-        return rendered_drive(
+        folder = rendered_drive(
             config.simulate, Path(config.cache), _workers(config), partial(progress, "render")
         )
+    return (folder,)
 
 
 def _detect(config: RunConfig, drive: Drive, progress: Progress) -> list[ImageDetections]:
@@ -285,17 +333,31 @@ def _detect(config: RunConfig, drive: Drive, progress: Progress) -> list[ImageDe
 
 
 def _map_camera_sets(
-    config: RunConfig, drive: Drive, detections: Sequence[ImageDetections], progress: Progress
+    config: RunConfig,
+    drive: Drive,
+    detections: Sequence[ImageDetections],
+    base: Base | None,
+    progress: Progress,
 ) -> CameraSets:
     sets = camera_sets(drive)
     found = {}
     for done, (name, cameras) in enumerate(sets.items()):
         progress("map", done, len(sets))
         # The picture of the growing map is drawn for the whole rig, which comes last, and needs truth.
-        growth_steps = GROWTH_STEPS if drive.truth_dir and done == len(sets) - 1 else 0
+        last = done == len(sets) - 1
+        growth_steps = GROWTH_STEPS if last and has_truth(drive) else 0
         tell, begin_s = partial(log.debug, "%s: %s", name), time.perf_counter()
-        found[name] = run_methods(drive, detections, cameras, config.mapping, tell, growth_steps)
-        if done < len(sets) - 1:
+        found[name] = run_methods(
+            drive,
+            detections,
+            cameras,
+            config.mapping,
+            tell,
+            growth_steps,
+            base if last else None,
+            grey_reader(drive),
+        )
+        if not last:
             # The factors of the adjustment are large, and only the whole rig's map is checked.
             found[name]["Opt"] = replace(found[name]["Opt"], corners=None)
         took_s = time.perf_counter() - begin_s
@@ -325,6 +387,17 @@ def _check(config: RunConfig) -> str:
     check_options(config.mapping, detector.catalogue.cornered)
     table_of(config.mapping.survey)
     check_formats(config.export, "export")
+    if config.mosaic and len(config.drive.paths) > 1:
+        raise ConfigError(
+            "mosaic=true puts the images of one drive on the ground; map the drives one by one for it"
+        )
+    if config.map.base is not None and config.mapping.mode == INCREMENTAL:
+        raise ConfigError("mode=incremental makes a map of one drive alone; update map.base with mode=batch")
+    if len(config.drive.paths) > 1 and config.mapping.mode == INCREMENTAL:
+        raise ConfigError(
+            "mode=incremental maps one drive as the vehicle would; map several with mode=batch, or one by "
+            "one with map.base"
+        )
     check_device(config.mapping.device)
     return name
 
@@ -335,9 +408,9 @@ def run_name(config: RunConfig) -> str:
         return config.name
     if config.simulate is not None:
         return config.simulate.name
-    if not config.drive.path:
+    if not config.drive.paths:
         raise ConfigError(_NO_DRIVE)
-    return drive_name(Path(config.drive.path))
+    return "+".join(drive_name(path) for path in config.drive.paths)
 
 
 def check_device(device: str) -> None:

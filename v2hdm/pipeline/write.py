@@ -23,10 +23,11 @@ from v2hdm.hdmap.heights import with_heights
 from v2hdm.hdmap.residuals import FILE as RESIDUALS
 from v2hdm.hdmap.residuals import write_residuals
 from v2hdm.mapping.results import MethodResult
+from v2hdm.pipeline.base import write_changes
 from v2hdm.pipeline.evaluate import CameraSets, Judgement
-from v2hdm.pipeline.trajectory import write_trajectory
+from v2hdm.pipeline.trajectory import write_trajectories
 from v2hdm.quality import Verdict
-from v2hdm.records import Calibration, Drive, HdMap, Image, ImageDetections
+from v2hdm.records import Calibration, Drive, FloatArray, HdMap, Image, ImageDetections
 from v2hdm.report.figures import save_birdseye, save_growth, save_overlay
 from v2hdm.report.outputs import write_json
 
@@ -65,27 +66,37 @@ def write_results(
     write_map(_along_route(with_heights(best.hd_map, drive.road), drive), folder, "map", formats, told)
     about = Provenance.today(drive.name, told)
     for name, calibration in best.calibrations.items():
-        clock = best.clocks.get(name)
+        clock = None if drive.joined else best.clocks[0].get(name)
         clock_s = None if clock is None else (clock.value_s, clock.sigma_s)
         path = folder / f"calibration_{name}.yaml"
         write_calibration(calibration, path, clock_s=clock_s, verdict=told, about=about)
         _write_calibration_forms(calibration, about, path)
     if best.poses is not None:
-        write_trajectory(best.poses, drive, folder)
+        write_trajectories(best.poses, drive, folder)
     if best.residuals is not None:
         write_residuals(best.residuals, folder / RESIDUALS)
+    if best.changes is not None:
+        write_changes(best.changes, best.hd_map, folder, _route(drive))
     _write_exclusions(folder / "excluded.geojson", drive, sets)
     if all_maps:
         _write_maps(folder / "maps", drive, sets)
     write_json(folder / "metrics.json", metrics)
     maps = {name: result.hd_map for name, result in methods.items()}
-    route_map = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
+    route_map = _route(drive)
     save_birdseye(folder / "birdseye.png", maps, BEST, route_map, judgement.truth)
     if any(judgement.growth.values()):
         save_growth(folder / "growth.png", judgement.growth)
     for name in best.calibrations:
         image = _fullest_image(drive, name, detections)
         _save_overlay(folder / f"overlay_{name}.png", drive, image, best)
+
+
+def _route(drive: Drive) -> FloatArray:
+    """Positions (N, 2) of the vehicle, with a nan between one visit and the next."""
+    images = drive.images
+    places = np.array([image.map_from_vehicle[:2, 3] for image in images])
+    ends = np.flatnonzero(np.diff([image.visit for image in images])) + 1
+    return np.insert(places, ends, np.nan, axis=0)
 
 
 def _along_route(hd_map: HdMap, drive: Drive) -> HdMap:

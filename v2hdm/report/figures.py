@@ -44,10 +44,11 @@ def save_birdseye(
         path: where the PNG goes.
         maps: the map of each method, by its name.
         best: the method shown on the whole site; its markings are coloured by their corner error.
-        route_map: vehicle positions (N, 2), m.
+        route_map: vehicle positions (N, 2), m, with nan between two drives.
         truth: ground truth, or None on a real drive.
     """
-    extent_m = np.maximum(np.ptp(route_map, axis=0), 1.0) + 2 * _BESIDE_ROUTE_M
+    span_m = np.nanmax(route_map, axis=0) - np.nanmin(route_map, axis=0)
+    extent_m = np.maximum(span_m, 1.0) + 2 * _BESIDE_ROUTE_M
     site_width_in = _HEIGHT_IN * float(np.clip(extent_m[0] / extent_m[1], 0.5, 2.0)) + 1.6
     with style.figure(path, site_width_in + _HEIGHT_IN, _HEIGHT_IN) as fig:
         site, detail = fig.subplots(1, 2, width_ratios=[site_width_in, _HEIGHT_IN])

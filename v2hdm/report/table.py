@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 from rich.table import Table
 
@@ -65,3 +66,35 @@ def _times_100(value: float | None) -> float | None:
 
 def _number(value: float | None, digits: int) -> str:
     return "-" if value is None or math.isnan(value) else f"{value:.{digits}f}"
+
+
+def changes_table(changes: Mapping[str, Any]) -> Table:
+    """What became of an earlier map's markings: those that moved, are gone or are new, one a row."""
+    counts = ", ".join(f"{number} {fate}" for fate, number in changes["counts"].items() if number)
+    table = Table(title=f"changes: {counts}", title_justify="left", header_style="bold")
+    for heading, justify in (
+        ("id", "right"),
+        ("class", "left"),
+        ("fate", "left"),
+        ("by (cm)", "right"),
+        ("sigma (cm)", "right"),
+        ("odds", "right"),
+        ("seen / should be", "right"),
+        ("at (m)", "left"),
+    ):
+        table.add_column(heading, justify=justify)  # type: ignore[arg-type]
+    for one in changes["listed"]:
+        shift, sigma = one["shift_m"], one["shift_sigma_m"]
+        corners = one["after_map"] or one["before_map"]
+        x, y = (sum(corner[k] for corner in corners) / len(corners) for k in (0, 1))
+        table.add_row(
+            str(one["id"]),
+            one["class"],
+            one["fate"],
+            "" if shift is None else f"{100 * math.hypot(*shift):.0f}",
+            "" if sigma is None else f"{100 * math.hypot(*sigma) / math.sqrt(2):.1f}",
+            f"{one['probability']:.3f}",
+            f"{one['found']} / {one['views']}",
+            f"({x:.1f}, {y:.1f})",
+        )
+    return table

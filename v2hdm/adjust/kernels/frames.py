@@ -182,9 +182,9 @@ def subtract_frames(
                 for p in range(6):
                     rows[i, column + p] += w[0, p]
                     rows[i + 1, column + p] += w[0, 6 + p]
-                    if each > 6:
-                        rows[i, column + 6] += w[0, p] * clock[t, p]
-                        rows[i + 1, column + 6] += w[0, 6 + p] * clock[t, p]
+                    for v in range(each - 6):
+                        rows[i, column + 6 + v] += w[0, p] * clock[t, p * (each - 6) + v]
+                        rows[i + 1, column + 6 + v] += w[0, 6 + p] * clock[t, p * (each - 6) + v]
         for a in range(count):
             solve_unit_rows(
                 joined,

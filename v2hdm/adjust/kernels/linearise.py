@@ -191,10 +191,11 @@ def linearise(
                     for p in range(6):
                         rows[i, column + p] += coupling[j, p]
                         rows[i + 1, column + p] += coupling[j, 6 + p]
-                    if each > 6:
+                    for v in range(each - 6):
                         for p in range(6):
-                            rows[i, column + 6] += coupling[j, p] * clock[layout.pair[k], p]
-                            rows[i + 1, column + 6] += coupling[j, 6 + p] * clock[layout.pair[k], p]
+                            by_clock = clock[layout.pair[k], p * (each - 6) + v]
+                            rows[i, column + 6 + v] += coupling[j, p] * by_clock
+                            rows[i + 1, column + 6 + v] += coupling[j, 6 + p] * by_clock
                 block[i, i] = xx + layout.control_information[c, 0]
                 block[i + 1, i], block[i + 1, i + 1] = yx, yy + layout.control_information[c, 1]
                 gradient[i], gradient[i + 1] = gx, gy

@@ -57,7 +57,7 @@ def attach(
     group = whole[np.concatenate([np.asarray(groups, dtype=np.int64) for groups in near])]
     alike = group_kinds(association, sightings)[group] == sightings.kind[row]
     row, group = row[alike], group[alike]
-    squared = _squared(sightings, located, rig, row, fused.corners_map[group], jitter_rad)
+    squared = squared_distances(sightings, located, rig, row, fused.corners_map[group], jitter_rad)
     out_group, out_shift = association.group.copy(), association.shift.copy()
     shown = set(zip(association.group.tolist(), sightings.image.tolist(), strict=True))
     for one in np.unique(row):
@@ -72,7 +72,7 @@ def attach(
     return Association(out_group, out_shift, association.count)
 
 
-def _squared(
+def squared_distances(
     sightings: Sightings,
     located: Located,
     rig: Rig,

@@ -26,6 +26,9 @@ _REFUSED = 1e9
 _LEAST_TOLERANCE_M = 0.05
 """How far corners of one shape may deviate, m, however small the marking is."""
 
+_ANOTHER_VISIT_M = 1e6
+"""Way, m, from one visit to the next: beyond any gap that a track survives."""
+
 
 @dataclass(frozen=True)
 class Uncertainty:
@@ -108,6 +111,8 @@ class _Linker:
         self._options = options
         pose = rig.map_from_vehicle
         steps_m = np.linalg.norm(np.diff(pose[:, :2, 3], axis=0), axis=1)
+        # No track outlives its visit, wherever the next one begins.
+        steps_m[np.diff(sightings.visit) != 0] = _ANOTHER_VISIT_M
         self._odometer_m = np.concatenate([[0.0], np.cumsum(steps_m)])
         self._heading_rad = np.unwrap(heading_rad(pose))
         self._noise_m2 = _noise_covariances(located, uncertainty)

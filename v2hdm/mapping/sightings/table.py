@@ -28,6 +28,7 @@ class Sightings:
     images taken together share a frame. ``kind`` indexes ``kinds``, the names of the classes.
     ``corners_pinhole_px`` (S, 4, 2) have covariances ``covariance_px`` (S, 4, 2, 2), px^2; ``valid`` (S, 4)
     says which of them are points, small in every direction. ``symbols`` are those of the same images.
+    ``visit`` (F,) is the visit of each frame, as in ``Image.visit``; frames are sorted by it, then by time.
     """
 
     cameras: tuple[str, ...]
@@ -41,6 +42,7 @@ class Sightings:
     covariance_px: FloatArray
     valid: BoolArray
     kinds: tuple[str, ...]
+    visit: IntArray
     symbols: Symbols = NO_SYMBOLS
 
     def __len__(self) -> int:
@@ -73,30 +75,34 @@ class Sightings:
             covariance_px=self.covariance_px[rows],
             valid=self.valid[rows],
             kinds=self.kinds,
+            visit=self.visit,
             symbols=self.symbols,
         )
 
 
 @dataclass(frozen=True)
 class Frames:
-    """The distinct time stamps of a drive.
+    """The distinct time stamps of a drive, of each of its visits by itself.
 
-    ``frame_of_image`` (I,) indexes ``stamp_s`` (F,) and ``map_from_vehicle`` (F, 4, 4), the recorded poses.
+    ``frame_of_image`` (I,) indexes ``visit`` (F,), ``stamp_s`` (F,) and ``map_from_vehicle`` (F, 4, 4), the
+    recorded poses.
     """
 
     frame_of_image: IntArray
+    visit: IntArray
     stamp_s: FloatArray
     map_from_vehicle: FloatArray
 
 
 def frames_of(drive: Drive) -> Frames:
-    """Number the distinct times of ``drive``; images taken together share a frame."""
-    taken_s = np.array([image.taken_s for image in drive.images])
-    distinct_s, first, inverse = np.unique(taken_s, return_index=True, return_inverse=True)
+    """Number the distinct times of ``drive``; images of one visit that were taken together share a frame."""
+    taken = np.array([(image.visit, image.taken_s) for image in drive.images])
+    distinct, first, inverse = np.unique(taken, axis=0, return_index=True, return_inverse=True)
     poses = np.stack([drive.images[i].map_from_vehicle for i in first])
     return Frames(
-        frame_of_image=inverse.astype(np.int64),
-        stamp_s=distinct_s,
+        frame_of_image=inverse.ravel().astype(np.int64),
+        visit=distinct[:, 0].astype(np.int64),
+        stamp_s=distinct[:, 1],
         map_from_vehicle=poses.astype(np.float64),
     )
 
@@ -146,6 +152,7 @@ def collect_sightings(
         covariance_px=covariance,
         valid=valid,
         kinds=kinds,
+        visit=frames.visit,
         symbols=collect_symbols(drive, detections, camera_index, frames.frame_of_image),
     )
     sightings = sightings.subset(sightings.informs.sum(axis=1) >= 2)

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from v2hdm.geometry.ipm import apply_homography, flat_motion, project_ground
 from v2hdm.geometry.planar import inside_convex
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.table import frames_of
 from v2hdm.records import Camera, Drive, FloatArray, IntArray
@@ -39,7 +40,11 @@ def views_of(drive: Drive, cameras: Sequence[str]) -> Views:
 
 
 def easy_views(
-    views: Views, rig: Rig, cameras: Sequence[Camera], corners_map: FloatArray
+    views: Views,
+    rig: Rig,
+    cameras: Sequence[Camera],
+    corners_map: FloatArray,
+    within_m: float | None = None,
 ) -> tuple[IntArray, IntArray]:
     """Pairs (group, image) in which a whole marking lies inside the region of interest and the image.
 
@@ -48,6 +53,7 @@ def easy_views(
         rig: Extrinsics and poses.
         cameras: The rig's cameras, for image sizes and regions of interest.
         corners_map: Markings (G, 4, 2), m; those with nan corners are in no view.
+        within_m: Distance from the camera, m, that takes the place of the region of interest, if given.
     """
     whole = np.flatnonzero(np.isfinite(corners_map).all(axis=(1, 2)))
     groups, images = [], []
@@ -55,13 +61,16 @@ def easy_views(
         own = views.camera == c
         if not own.any() or not len(whole):
             continue
+        centre = camera_centre(rig.cam_from_vehicle[c])[:2]
         reach_m = float(np.max(np.linalg.norm(camera.roi_vehicle, axis=1)))
+        if within_m is not None:
+            reach_m = within_m + float(np.linalg.norm(centre))
         positions = rig.map_from_vehicle[views.frame[own]][:, :2, 3]
         near = cKDTree(positions).query_ball_point(corners_map[whole].mean(axis=1), reach_m)
         group = np.repeat(whole, [len(n) for n in near])
         view = np.flatnonzero(own)[np.concatenate([np.asarray(n, dtype=np.int64) for n in near])]
         vehicle_from_map = np.linalg.inv(rig.map_from_vehicle[views.frame[view]])
-        seen = _sees(camera, rig.cam_from_vehicle[c], vehicle_from_map, corners_map[group])
+        seen = _sees(camera, rig.cam_from_vehicle[c], vehicle_from_map, corners_map[group], within_m)
         groups.append(group[seen])
         images.append(views.image[view[seen]])
     empty = [np.zeros(0, dtype=np.int64)]
@@ -69,11 +78,19 @@ def easy_views(
 
 
 def _sees(
-    camera: Camera, cam_from_vehicle: FloatArray, vehicle_from_map: FloatArray, corners_map: FloatArray
+    camera: Camera,
+    cam_from_vehicle: FloatArray,
+    vehicle_from_map: FloatArray,
+    corners_map: FloatArray,
+    within_m: float | None,
 ) -> NDArray[np.bool_]:
     """Whether views (P, ...) hold the whole quadrilaterals (P, 4, 2), away from the image border."""
     corners_vehicle = apply_homography(flat_motion(vehicle_from_map), corners_map)
-    inside = inside_convex(camera.roi_vehicle, corners_vehicle).all(axis=1)
+    if within_m is None:
+        inside = inside_convex(camera.roi_vehicle, corners_vehicle).all(axis=1)
+    else:
+        away_m = np.linalg.norm(corners_vehicle - camera_centre(cam_from_vehicle)[:2], axis=2)
+        inside = np.asarray(away_m <= within_m).all(axis=1)
     pixel, depth = project_ground(camera.info.intrinsic, cam_from_vehicle @ vehicle_from_map, corners_map)
     limit = np.array([camera.info.width, camera.info.height]) - _BORDER_PX
     with np.errstate(invalid="ignore"):

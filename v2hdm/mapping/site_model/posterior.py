@@ -61,6 +61,9 @@ _NEGLECTED_SHARE = 0.1
 _CLUTTER_FOUND = (0.5, 2.0)
 """Beta distribution of how often clutter, or part of a symbol, is found in an easy view: a fifth of them."""
 
+_BARE_FOUND = (0.05, 10.0)
+"""Beta distribution of how often bare ground is taken for a given marking: in one view of two hundred."""
+
 _CLUTTER_REPEATS = 0.7
 """Probability that clutter which some images have shown is shown by one more."""
 
@@ -153,10 +156,9 @@ def _counted(counts: Counts, weight: FloatArray) -> FloatArray:
     stay = 1 - (weight.sum() + 1) / (weight @ images + 2)
     shown = np.stack([_geometric(images, stay), *2 * [_geometric(images, _CLUTTER_REPEATS)]], axis=1)
     rate = float((weight @ counts.found + 1) / (weight @ counts.easy_views + 2))
-    usual = _rates(counts, _RATE_STRENGTH * rate, _RATE_STRENGTH * (1 - rate))
-    neglected = _rates(counts, 1.0, 1.0)
-    own = np.logaddexp(np.log1p(-_NEGLECTED_SHARE) + usual, np.log(_NEGLECTED_SHARE) + neglected)
-    found = np.stack([own, *2 * [_rates(counts, *_CLUTTER_FOUND)]], axis=1)
+    own = log_found(counts.found, counts.easy_views, rate)
+    clutter = _rates(counts.found, counts.easy_views, *_CLUTTER_FOUND)
+    found = np.stack([own, clutter, clutter], axis=1)
     agree, differ = counts.agreeing, counts.observations - counts.agreeing
     right, wrong = (agree[:, None] * np.log(p) + differ[:, None] * np.log1p(-p) for p in _AGREEING)
     under, alone = counts.as_symbol, counts.images
@@ -170,10 +172,26 @@ def _geometric(images: IntArray, stay: float) -> FloatArray:
     return np.asarray(np.log1p(-stay) + (images - 1) * np.log(stay))
 
 
-def _rates(counts: Counts, found: float, missed: float) -> FloatArray:
+def log_found(found: IntArray, easy_views: IntArray, rate: float) -> FloatArray:
+    """Log likelihood (N,) that markings are ``found`` (N,) times in so many ``easy_views`` (N,).
+
+    ``rate`` is that of their class. Some are worn or hidden, and are found at any rate.
+    """
+    usual = _rates(found, easy_views, _RATE_STRENGTH * rate, _RATE_STRENGTH * (1 - rate))
+    neglected = _rates(found, easy_views, 1.0, 1.0)
+    both = np.log1p(-_NEGLECTED_SHARE) + usual, np.log(_NEGLECTED_SHARE) + neglected
+    return np.asarray(np.logaddexp(*both))
+
+
+def log_found_where_none_is(found: IntArray, easy_views: IntArray) -> FloatArray:
+    """Log likelihood (N,) that bare ground is taken for markings ``found`` times in ``easy_views`` (N,)."""
+    return _rates(found, easy_views, *_BARE_FOUND)
+
+
+def _rates(found: IntArray, easy_views: IntArray, hits: float, misses: float) -> FloatArray:
     """Log beta-binomial likelihood (N,) of the easy views."""
-    left = counts.easy_views - counts.found
-    return np.asarray(betaln(counts.found + found, left + missed) - betaln(found, missed))
+    left = easy_views - found
+    return np.asarray(betaln(found + hits, left + misses) - betaln(hits, misses))
 
 
 @dataclass(frozen=True)

@@ -58,8 +58,10 @@ def wrong_as(one: Contradiction) -> str:
     match one.fault:
         case Fault.CLOCK:
             late = "later" if one.value > 0 else "earlier"
+            where = f" {one.about}" if one.about else ""
             return (
-                f"the images of {whose} were taken {1e3 * off:.0f} ms {late} than stamped: their clock is off"
+                f"the images of {whose}{where} were taken {1e3 * off:.0f} ms {late} than stamped: their "
+                "clock is off"
             )
         case Fault.FOCAL:
             larger = "longer" if one.value > 0 else "shorter"

@@ -23,8 +23,8 @@ def check_known_sizes(sizes: SizeOptions, best: MethodResult) -> list[Finding]:
         if known_lengths(alone, [name] * len(markings), corners_map, numbers):
             continue
         says = (
-            f"none of the {len(markings)} markings of class {name} is about {size[0]:g} m by {size[1]:g} m, so "
-            "that the size was not used; mend or drop it"
+            f"none of the {len(markings)} markings of class {name} is about {size[0]:g} m by {size[1]:g} m, "
+            "so that the size was not used; mend or drop it"
         )
         about = f"mapping.known_sizes.by_class_m.{name}"
         found.append(Finding("known size", Status.WARN, 0.0, None, "", says, about))

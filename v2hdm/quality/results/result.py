@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from v2hdm.ground import GroundEstimate
 from v2hdm.mapping.results import MethodResult
@@ -15,14 +16,20 @@ from v2hdm.records import Drive
 def check_result(
     drive: Drive,
     methods: Mapping[str, Mapping[str, MethodResult]],
-    ground: Mapping[str, GroundEstimate] | None = None,
+    ground: Sequence[Mapping[str, GroundEstimate]] = (),
 ) -> list[Finding]:
     """The checks after the solve, and the mapper's mountings against those of bare ground.
 
     Args:
         drive: what was mapped.
         methods: results by camera set, the one of all cameras last, then by method.
-        ground: what bare ground says, by camera; None where it was not asked.
+        ground: of each visit, by camera, what bare ground says; empty where it was not asked.
     """
     best = list(methods.values())[-1][BEST]
-    return [*check_solution(drive, methods), *check_against_ground(best.calibrations, ground or {})]
+    findings = check_solution(drive, methods)
+    for visit, estimates in zip(drive.visits, ground, strict=False):
+        own = check_against_ground(best.calibrations, estimates)
+        if drive.joined:
+            own = [replace(finding, about=f"{finding.about} of {visit.name}") for finding in own]
+        findings += own
+    return findings

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from v2hdm.drive import ReadOptions, read_drive
+from v2hdm.drive import ReadOptions, join_drives, read_drive
 from v2hdm.errors import DriveError
 from v2hdm.records import Drive
 
@@ -19,20 +19,19 @@ def drive_of(metrics: Mapping[str, Any], path: Path | None) -> Drive | None:
     """
     told = metrics.get("drive")
     told = told if isinstance(told, dict) else {}
-    if path is None:
-        if not told.get("path") or not Path(str(told["path"])).exists():
-            return None
-        path = Path(str(told["path"]))
+    paths = [Path(str(one)) for one in told.get("paths") or []] if path is None else [path]
+    if not paths or not all(one.exists() for one in paths):
+        return None
     options = ReadOptions(
         format=str(told.get("format", "auto")),
         cameras=[str(name) for name in told.get("cameras") or []],
         max_gap_s=float(told.get("max_gap_s", ReadOptions.max_gap_s)),
     )
-    drive = read_drive(path, options)
+    drive = join_drives([read_drive(one, options) for one in paths])
     expected = (told.get("name", drive.name), told.get("images", len(drive.images)))
     if expected != (drive.name, len(drive.images)):
         raise DriveError(
-            f"{path}: drive {drive.name} of {len(drive.images)} images, but the result is of drive "
+            f"{paths[0]}: drive {drive.name} of {len(drive.images)} images, but the result is of drive "
             f"{expected[0]} of {expected[1]}; give that one with --drive"
         )
     return drive

@@ -13,6 +13,7 @@ from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import Camera, FloatArray, GeodeticOrigin, HdMap
+from v2hdm.simulate.port.alter import Alteration, alter
 from v2hdm.simulate.port.calibration import cam_from_vehicle, survey_camera
 from v2hdm.simulate.port.config import PortConfig
 from v2hdm.simulate.port.disturbance import DrivenPoses, drive_along
@@ -26,7 +27,7 @@ from v2hdm.simulate.render.scene import Box
 ORIGIN = GeodeticOrigin(latitude_deg=29.95, longitude_deg=122.05, altitude_m=12.0, epoch=2026.0)
 
 # Independent random streams of one seed, so that a change to one part leaves the others alone.
-_LAYOUT, _YARD, _TRUCKS, _POSES, _CALIBRATION, _IMAGES = range(6)
+_LAYOUT, _YARD, _TRUCKS, _POSES, _CALIBRATION, _IMAGES, _ALTERED = range(7)
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,7 @@ class Port:
     cameras: dict[str, Camera]
     cam_from_vehicle: dict[str, FloatArray]
     driven: DrivenPoses
+    alterations: tuple[Alteration, ...] = ()
 
     def cam_from_map(self, camera: str, frame: int) -> FloatArray:
         """Where a camera (4 x 4) truly was at an image."""
@@ -129,6 +131,7 @@ def build_port(config: PortConfig) -> Port:
             f"give {_SHORTEST_ROUTE_M:g} m or more"
         )
     layout = build_layout(config.paint, route, stream(_LAYOUT))
+    layout, alterations = alter(layout, config.altered, config.paint, route, stream(_ALTERED))
     scene = build_scene(config.surface, config.yard, route, stream(_YARD), config.seed)
     survey = stream(_CALIBRATION)
     cameras = {
@@ -146,6 +149,7 @@ def build_port(config: PortConfig) -> Port:
         cameras=cameras,
         cam_from_vehicle={name: cam_from_vehicle(config.cameras[name].mount) for name in cameras},
         driven=drive_along(route, config.route, config.disturbance, anew(_POSES)),
+        alterations=tuple(alterations),
     )
 
 
@@ -158,6 +162,11 @@ def _check(config: PortConfig) -> None:
             "initial_ipm: choose 'calibrated' or 'estimated'",
         ),
         (config.visit >= 0, "visit: must be 0 or more"),
+        (
+            min(config.altered.moved, config.altered.removed, config.altered.added) >= 0,
+            "altered: numbers must be 0 or more",
+        ),
+        (len(config.altered.moved_by_m) == 2, "altered.moved_by_m: give the least and the largest distance"),
         (config.route.pieces, "route.pieces: empty; give [length_m, turn_deg] pieces"),
         (
             all(len(p) == 2 and p[0] > 0 for p in config.route.pieces),

@@ -26,7 +26,7 @@ from v2hdm.geometry.rigid import ground_in_vehicle
 from v2hdm.pixels import read_header
 from v2hdm.records import Drive, Image, Truth
 from v2hdm.simulate.port.build import Port, build_port
-from v2hdm.simulate.port.config import PortConfig
+from v2hdm.simulate.port.config import AlteredConfig, PortConfig
 from v2hdm.simulate.port.disturbance import measured_disturbances, pose_noise
 from v2hdm.simulate.port.visibility import points_seen, quad_samples
 from v2hdm.simulate.render.renderer import RENDERER_VERSION
@@ -55,11 +55,13 @@ def rendered_drive(config: PortConfig, cache: Path, workers: int, progress: Prog
         WorkerError: when a process died; what it had rendered is kept.
     """
     content = asdict(config)
-    # Ports that were rendered before there were visits and stencils stay the same.
+    # Ports that were rendered before there were visits, stencils and alterations stay the same.
     if not config.visit:
         del content["visit"]
     if not config.paint.stencils:
         del content["paint"]["stencils"]
+    if config.altered == AlteredConfig():
+        del content["altered"]
     text = json.dumps([RENDERER_VERSION, content], sort_keys=True)
     folder = cache / f"{config.name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
     if not (folder / DRIVE_FILE).is_file() or _drop_damaged(folder):

@@ -1,0 +1,122 @@
+"""Two visits of one street in one problem: drifts and clocks are their own, cameras and corners common."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.adjust.scene import Scene, exp, make_scene, pose_errors, project, with_late_clocks
+from v2hdm.adjust import Drift, Observations, PoseSigma, Problem, SolveOptions, Status, kernels, solve
+from v2hdm.errors import AdjustError
+
+DRIFTING = PoseSigma(0.02, 0.001, 0.003, 0.01, position_drift=Drift(0.018, 30.0))
+SCATTERING = PoseSigma(0.03, 0.002, 0.003, 0.01)
+
+
+def joined(first: Problem, second: Problem) -> Problem:
+    """Two problems of the same cameras and corners as two visits of one problem."""
+    frames = [len(one.map_from_vehicle) for one in (first, second)]
+    parts = [first.observations, second.observations]
+    seen = Observations(
+        camera=np.concatenate([one.camera for one in parts]),
+        frame=np.concatenate([parts[0].frame, parts[1].frame + frames[0]]),
+        corner=np.concatenate([one.corner for one in parts]),
+        pinhole_px=np.concatenate([one.pinhole_px for one in parts]),
+        covariance_px=np.concatenate([one.covariance_px for one in parts]),
+    )
+    twists = [one.twist_vehicle for one in (first, second)]
+    return replace(
+        first,
+        map_from_vehicle=np.concatenate([first.map_from_vehicle, second.map_from_vehicle]),
+        observations=seen,
+        pose_sigma=(first.pose_sigma, second.pose_sigma),
+        twist_vehicle=None if twists[0] is None else np.concatenate(twists),
+        visit=np.repeat([0, 1], frames),
+    )
+
+
+def visited_again(scene: Scene, sigma: PoseSigma, seed: int) -> Scene:
+    """The same street with poses that are off by ``sigma``, and new noise of the pixels."""
+    rng, problem = np.random.default_rng(seed), scene.problem
+    poses = problem.map_from_vehicle @ exp(pose_errors(problem.map_from_vehicle, sigma, 0.5, rng))
+    seen = problem.observations
+    pixel = project(
+        scene.cam_from_vehicle[seen.camera] @ np.linalg.inv(poses)[seen.frame], scene.corners_map[seen.corner]
+    )
+    pixel += 0.7 * rng.standard_normal(pixel.shape)
+    problem = replace(problem, observations=replace(seen, pinhole_px=pixel), pose_sigma=sigma)
+    return replace(scene, problem=problem, map_from_vehicle=poses)
+
+
+@pytest.fixture(scope="module")
+def street() -> Scene:
+    return make_scene(3, frames=60)
+
+
+def test_two_visits_together_are_better_than_one_and_say_by_how_much() -> None:
+    street, errors, sigmas = make_scene(3, frames=40, prior_sigma_m=0.002), [], []
+    for seed in range(10):
+        visits = [visited_again(street, DRIFTING, 10 * seed + k) for k in (1, 2)]
+        problems = [visit.problem for visit in visits]
+        solutions = [solve(one) for one in (*problems, joined(*problems))]
+        assert all(one.status is Status.CONVERGED for one in solutions)
+        errors.append([np.square(one.corners_map - street.corners_map).sum() for one in solutions])
+        every = np.arange(len(street.corners_map))[:, None]
+        sigmas.append([one.corner_covariance(every).trace(axis1=1, axis2=2).sum() for one in solutions])
+    first, second, both = np.mean(errors, axis=0)
+    assert both < 0.75**2 * (first + second) / 2
+    stated = np.sqrt(np.mean(sigmas, axis=0))
+    assert stated[2] == pytest.approx(stated[0] / np.sqrt(2), rel=0.1)
+    assert np.sqrt(both) == pytest.approx(stated[2], rel=0.35)
+
+
+def test_the_order_of_the_visits_changes_nothing(street: Scene) -> None:
+    first = visited_again(street, DRIFTING, 1).problem
+    second = visited_again(street, SCATTERING, 2).problem
+    one, other = solve(joined(first, second)), solve(joined(second, first))
+    assert one.corners_map == pytest.approx(other.corners_map, abs=1e-6)
+    assert one.cost == pytest.approx(other.cost, rel=1e-9)
+
+
+def test_a_visit_without_drift_beside_one_with_it_is_as_by_itself(street: Scene) -> None:
+    """Far apart, and with cameras that are known, two visits have nothing to say of each other."""
+    known = replace(street.problem, centre_sigma_m=np.full((2, 3), 1e-5))
+    scene = replace(street, problem=known)
+    first, second = visited_again(scene, DRIFTING, 3).problem, visited_again(scene, SCATTERING, 4).problem
+    corners = first.corner_count
+    apart = replace(
+        joined(first, replace(second, observations=replace(
+            second.observations, corner=second.observations.corner + corners
+        ))),
+        corner_count=2 * corners,
+    )  # fmt: skip
+    cost = solve(apart).cost_terms["frame_states"]
+    alone = [solve(one).cost_terms["frame_states"] for one in (first, second)]
+    assert cost == pytest.approx(sum(alone), rel=0.1)
+
+
+@pytest.mark.parametrize("states", [(), ("roll", "pitch", "heading")])
+def test_every_visit_has_clocks_of_its_own(states: tuple[str, ...]) -> None:
+    offsets_s = np.array([[0.03, -0.02], [-0.01, 0.04]])
+    street = make_scene(14, frames=60, turn_deg_per_m=8.0, prior_sigma_m=0.01)
+    problems = [with_late_clocks(street, offsets_s[:, visit]).problem for visit in (0, 1)]
+    options = SolveOptions(pose_states=states, clock_offset=True)
+    found = solve(joined(*problems), options)
+    assert found.status is Status.CONVERGED
+    sigma_s = np.sqrt(found.covariance.clock_s2())
+    assert (sigma_s < 0.003).all()
+    assert (np.abs(found.clock_offset_s - offsets_s) < 4 * sigma_s).all()
+    with kernels.reference():
+        plain = solve(joined(*problems), options)
+    assert plain.clock_offset_s == pytest.approx(found.clock_offset_s, abs=1e-6)
+
+
+def test_visits_that_are_not_numbered_in_order_are_refused(street: Scene) -> None:
+    problem = joined(street.problem, street.problem)
+    assert problem.visit is not None
+    with pytest.raises(AdjustError, match="rising along the frames"):
+        solve(replace(problem, visit=problem.visit[::-1]))
+    with pytest.raises(AdjustError, match="visit 1 has no pose_sigma"):
+        solve(replace(problem, pose_sigma=(PoseSigma(),)))

@@ -1,0 +1,221 @@
+"""Whether a map lives: two drives together, and an earlier map brought up to date once paint was altered.
+
+``python -m tests.benchmarks.living_map [--full] [--base FOLDER] [--cache FOLDER] [--workers N]`` renders port
+2 three times: a drive, another drive through it, and one after markings were moved by 10 cm to 1 m, removed
+and painted anew. It maps the first two alone and together, brings the map of the first up to date by the
+second and by the third, and prints corner errors against ground truth, how many ids stayed, and what
+alterations are listed. The route is short and four markings of each kind are altered, unless ``--full``
+drives all of port 2, with twelve. ``--base`` takes the first drive's map from the results of
+``v2hdm.map +run=port2`` and leaves the second drive out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from omegaconf import OmegaConf
+
+from v2hdm.detection.batch import detect_all
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.drive import join_drives, read_drive
+from v2hdm.drive.truth import read_truth
+from v2hdm.hdmap.geojson import read_geojson, write_geojson
+from v2hdm.mapping.changes.update import Base
+from v2hdm.mapping.methods import run_methods
+from v2hdm.mapping.results import MethodResult
+from v2hdm.pipeline.base import grey_reader, read_base
+from v2hdm.records import Change, Drive, Fate, FloatArray, HdMap, ImageDetections, Truth
+from v2hdm.report.metrics import corner_errors, driven_past, marking_metrics, match_markings
+from v2hdm.simulate import PortConfig, rendered_drive
+from v2hdm.simulate.port.alter import Alteration
+from v2hdm.simulate.port.build import build_port
+from v2hdm.simulate.port.config import AlteredConfig, RouteConfig, YardConfig
+
+CACHE = Path("~/.cache/v2hdm/living").expanduser()
+
+SAME_M = 0.25
+"""A change is listed where it is if its centre lies nearer than this."""
+
+Seen = tuple[Drive, list[ImageDetections]]
+
+
+def port(full: bool, visit: int, altered: int = 0) -> PortConfig:
+    """Port 2, or a short way through its yard."""
+    run = OmegaConf.load(Path(__file__).parents[2] / "conf/run/port2.yaml").simulate
+    config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(PortConfig), run))
+    assert isinstance(config, PortConfig)
+    config = replace(
+        config, visit=visit, altered=AlteredConfig(moved=altered, removed=altered, added=altered)
+    )
+    if full:
+        return config
+    route = RouteConfig(pieces=[[30.0, 0.0], [23.0, -90.0], [25.0, 0.0]])
+    yard = replace(config.yard, parked_trucks=2, barriers=2, moving_trucks=1, shadow_strips=4)
+    assert isinstance(yard, YardConfig)
+    return replace(config, name="port2-short", route=route, yard=yard)
+
+
+def seen(config: PortConfig, cache: Path, workers: int) -> Seen:
+    """A drive and its detections."""
+    drive = read_drive(rendered_drive(config, cache, workers, lambda _, __: None))
+    drive = replace(drive, name=f"{drive.name} {config.visit}")
+    return drive, detect_all(drive, DetectorOptions.for_mapping(), workers, lambda _, __: None)
+
+
+def mapped(one: Seen, base: Base | None = None) -> MethodResult:
+    """The optimised map by all cameras."""
+    return run_methods(*one, tuple(one[0].cameras), base=base, grey=grey_reader(one[0]))["Opt"]
+
+
+def together(drives: Sequence[Seen]) -> Seen:
+    """Drives as visits of one."""
+    detections: list[ImageDetections] = []
+    for drive, found in drives:
+        before = sum(len(one.images) for one, _ in drives[: [d for d, _ in drives].index(drive)])
+        detections += [replace(one, image=one.image + before) for one in found]
+    return join_drives([drive for drive, _ in drives]), detections
+
+
+def told(name: str, hd_map: HdMap, truth: Truth, drive: Drive) -> float:
+    """Print how good a map is; returns its corner RMSE, m."""
+    figures = marking_metrics(hd_map, truth, driven_past(drive, truth, tuple(drive.cameras)))
+    print(
+        f"{name}: {figures.markings} markings, recall {figures.recall:.3f}, {figures.false_markings} false, "
+        f"corners {100 * figures.corner_rmse_m:.2f} cm off, bias {100 * figures.corner_bias_m:.2f} cm",
+        flush=True,
+    )
+    return figures.corner_rmse_m
+
+
+def base_of(result: MethodResult) -> Base:
+    """A result as an earlier map, by way of its file."""
+    with TemporaryDirectory() as folder:
+        write_geojson(result.hd_map, Path(folder) / "map.geojson")
+        hd_map = read_geojson(Path(folder) / "map.geojson")
+    assert result.poses is not None
+    left_out = tuple((one.kind, one.position_map, one.sightings) for one in result.excluded)
+    return Base(hd_map, result.poses.map_from_vehicle, left_out)
+
+
+def ids_kept(before: HdMap, after: HdMap, truth: Truth) -> str:
+    """Of the true markings that both maps have, how many have one id in both."""
+    ids = []
+    for hd_map in (before, after):
+        rows, columns = match_markings(hd_map.markings, truth.map.markings)
+        ids.append({column: hd_map.markings[row].id for row, column in zip(rows, columns, strict=True)})
+    common = ids[0].keys() & ids[1].keys()
+    return f"{sum(ids[0][k] == ids[1][k] for k in common)} of {len(common)} ids stayed"
+
+
+def at(corners: FloatArray | None, other: FloatArray | None) -> bool:
+    """Whether two outlines, or two absences, are one."""
+    if corners is None or other is None:
+        return corners is None and other is None
+    return bool(np.linalg.norm(corners.mean(axis=0) - other.mean(axis=0)) < SAME_M)
+
+
+def tell_changes(changes: Sequence[Change], alterations: Sequence[Alteration], base: HdMap) -> None:
+    """Print which alterations are listed, and what else is."""
+    known = [one.corners_map for one in base.markings]
+    for fate, is_one in (
+        (Fate.MOVED, lambda one: one.before is not None and one.after is not None),
+        (Fate.VANISHED, lambda one: one.after is None),
+        (Fate.NEW, lambda one: one.before is None),
+    ):
+        own = [one for one in alterations if is_one(one)]
+        listed = [change for change in changes if change.fate is fate]
+        right = [
+            one for one in own if any(at(one.before, c.before) and at(one.after, c.after) for c in listed)
+        ]
+        others = [
+            c for c in listed if not any(at(one.before, c.before) and at(one.after, c.after) for one in own)
+        ]
+        unknown = [one for one in own if one.before is not None and not any(at(one.before, k) for k in known)]
+        print(
+            f"{fate.value}: {len(right)} of {len(own)} listed ({len(unknown)} were not in the earlier map), "
+            f"{len(others)} others: "
+            + "; ".join(f"{c.id} {c.kind} p {c.probability:.2f} {c.found}/{c.views}" for c in others)
+        )
+        for one in own:
+            if not any(one is other for other in right):
+                corners = one.before if one.after is None else one.after
+                assert corners is not None
+                near = [
+                    c for c in changes if any(at(x, corners) for x in (c.before, c.after) if x is not None)
+                ]
+                fates = ", ".join(f"{c.fate.value} p {c.probability:.2f} {c.found}/{c.views}" for c in near)
+                x, y = corners.mean(axis=0)
+                print(f"   missed at ({x:.1f}, {y:.1f}): {fates or 'nothing listed'}")
+
+
+def common_rmse_m(hd_map: HdMap, others: Sequence[HdMap], truth: Truth) -> float:
+    """Corner RMSE, m, over the true markings that all of the maps have."""
+    columns = [set(match_markings(one.markings, truth.map.markings)[1]) for one in (hd_map, *others)]
+    shared = set.intersection(*columns)
+    pairs = [
+        (row, column)
+        for row, column in zip(*match_markings(hd_map.markings, truth.map.markings), strict=True)
+        if column in shared
+    ]
+    errors = corner_errors([hd_map.markings[r] for r, _ in pairs], [truth.map.markings[c] for _, c in pairs])
+    return float(np.sqrt((errors**2).sum(axis=1).mean()))
+
+
+def two_drives(arguments: argparse.Namespace) -> Base:
+    """Map two drives alone and together; returns the map of the first."""
+    first = seen(port(arguments.full, 0), arguments.cache, arguments.workers)
+    truth = read_truth(first[0])
+    one = mapped(first)
+    told("first drive", one.hd_map, truth, first[0])
+    base = base_of(one)
+    second = seen(port(arguments.full, 1), arguments.cache, arguments.workers)
+    other, both = mapped(second), mapped(together([first, second]))
+    updated = mapped(second, base)
+    maps = {
+        "second drive": other.hd_map,
+        "both in one adjustment": both.hd_map,
+        "first map brought up to date by the second drive": updated.hd_map,
+    }
+    for name, hd_map in maps.items():
+        told(name, hd_map, truth, first[0])
+    every = [one.hd_map, *maps.values()]
+    rmse_m = [common_rmse_m(hd_map, every, truth) for hd_map in every]
+    better = min(rmse_m[:2])
+    print(
+        "over the markings that all have: "
+        + ", ".join(f"{100 * rmse:.2f} cm" for rmse in rmse_m)
+        + f"; of the better drive alone {rmse_m[2] / better:.2f} (both), {rmse_m[3] / better:.2f} (update)"
+    )
+    assert updated.changes is not None
+    print(ids_kept(base.hd_map, updated.hd_map, truth))
+    tell_changes(updated.changes.changes, (), base.hd_map)
+    return base
+
+
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--full", action="store_true")
+    parser.add_argument("--base", type=Path)
+    parser.add_argument("--cache", type=Path, default=CACHE)
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    arguments = parser.parse_args()
+    count = 12 if arguments.full else 4
+    base = two_drives(arguments) if arguments.base is None else read_base(arguments.base)
+    config = port(full=arguments.full, visit=1 if arguments.full else 2, altered=count)
+    third = seen(config, arguments.cache, arguments.workers)
+    renewed = mapped(third, base)
+    assert renewed.changes is not None
+    told("first map after the paint was altered", renewed.hd_map, read_truth(third[0]), third[0])
+    print(ids_kept(base.hd_map, renewed.hd_map, read_truth(third[0])))
+    tell_changes(renewed.changes.changes, build_port(config).alterations, base.hd_map)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""Several drives as one: frames brought together, cameras shared where they are one, the rest told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.drive.example import make_drive
+from v2hdm.drive import join_drives, read_drive, with_clock_offsets
+from v2hdm.errors import DriveError
+from v2hdm.geometry.rigid import heading_rad
+from v2hdm.hdmap.geodetic import enu_from_geodetic, geodetic_from_enu
+from v2hdm.mapping.sightings.table import frames_of
+from v2hdm.records import Drive, GeodeticOrigin, PoseNoise
+
+ORIGIN = GeodeticOrigin(50.0, 8.0, 120.0)
+
+
+@pytest.fixture
+def drives(tmp_path: Path) -> list[Drive]:
+    """One drive, recorded twice."""
+    out = []
+    for name in ("monday", "friday"):
+        (tmp_path / name).mkdir()
+        make_drive(tmp_path / name)
+        out.append(replace(read_drive(tmp_path / name), name=name, origin=ORIGIN))
+    return out
+
+
+def test_a_drive_alone_stays_as_it_is(drives: list[Drive]) -> None:
+    assert join_drives(drives[:1]) is drives[0]
+
+
+def test_drives_of_one_rig_share_its_cameras_and_no_frame(drives: list[Drive]) -> None:
+    drives[1] = replace(drives[1], pose_noise=PoseNoise(0.05, 1e-4, 0.004))
+    joined = join_drives(drives)
+    assert list(joined.cameras) == list(drives[0].cameras)
+    assert joined.name == "monday+friday"
+    frames = frames_of(joined)
+    alone = len(frames_of(drives[0]).stamp_s)
+    assert frames.visit.tolist() == [0] * alone + [1] * alone
+    assert [image.visit for image in joined.images] == sorted(image.visit for image in joined.images)
+    assert joined.noises == (drives[0].pose_noise, drives[1].pose_noise)
+    assert joined.pose_noise.position_m == 0.05
+    assert joined.pose_noise.heading_rad == max(drives[0].pose_noise.heading_rad, 1e-4)
+
+
+def test_a_frame_of_another_origin_is_moved_to_its_place_on_the_earth(drives: list[Drive]) -> None:
+    there = GeodeticOrigin(50.002, 8.003, 121.0)
+    here_from_there = enu_from_geodetic(ORIGIN, np.array([[50.002, 8.003, 121.0]]))[0]
+    image = drives[1].images[0].map_from_vehicle
+    # The same place, written in the other frame.
+    geodetic = geodetic_from_enu(ORIGIN, image[:3, 3][None])
+    local = enu_from_geodetic(there, geodetic)[0]
+    moved = [
+        replace(one, map_from_vehicle=_shifted(one.map_from_vehicle, local[:2] - image[:2, 3]))
+        for one in drives[1].images
+    ]
+    joined = join_drives([drives[0], replace(drives[1], origin=there, images=moved)])
+    back = next(one for one in joined.images if one.visit == 1).map_from_vehicle
+    assert back[:2, 3] == pytest.approx(image[:2, 3], abs=2e-3)
+    # The meridians converge by the difference of longitude times the sine of the latitude.
+    convergence = np.radians(0.003) * np.sin(np.radians(50.0))
+    turned = heading_rad(back[None])[0] - heading_rad(image[None])[0]
+    assert turned == pytest.approx(convergence, rel=0.01)
+    assert np.linalg.norm(here_from_there[:2]) > 200
+
+
+def _shifted(pose: np.ndarray, by_m: np.ndarray) -> np.ndarray:
+    out = pose.copy()
+    out[:2, 3] += by_m
+    return out
+
+
+def test_a_camera_with_another_lens_or_mounting_is_another_camera(
+    drives: list[Drive], caplog: pytest.LogCaptureFixture
+) -> None:
+    name, camera = next(iter(drives[1].cameras.items()))
+    intrinsic = camera.info.intrinsic * np.array([[1.01, 1, 1], [1, 1.01, 1], [1, 1, 1]])
+    zoomed = replace(camera, info=replace(camera.info, intrinsic=intrinsic))
+    joined = join_drives([drives[0], replace(drives[1], cameras={**drives[1].cameras, name: zoomed})])
+    assert f"{name}@friday" in joined.cameras
+    assert joined.cameras[f"{name}@friday"].info.name == f"{name}@friday"
+    assert {image.camera for image in joined.images if image.visit == 1} >= {f"{name}@friday"}
+    assert f"calibrated by itself, as {name}@friday" in caplog.text
+    apart = join_drives(drives, [(1, name)])
+    assert f"{name}@friday" in apart.cameras
+
+
+def test_drives_that_have_nothing_in_common_are_refused(drives: list[Drive]) -> None:
+    with pytest.raises(DriveError, match="given twice"):
+        join_drives([drives[0], drives[0]])
+    with pytest.raises(DriveError, match="friday: has no origin, but other drives have"):
+        join_drives([drives[0], replace(drives[1], origin=None)])
+    with pytest.raises(DriveError, match="several datums"):
+        join_drives([drives[0], replace(drives[1], origin=replace(ORIGIN, datum="ETRS89"))])
+    with pytest.raises(DriveError, match=r"comes no nearer than .* m to the other"):
+        join_drives([drives[0], replace(drives[1], origin=replace(ORIGIN, latitude_deg=50.1))])
+
+
+def test_drives_without_origins_are_taken_to_share_a_frame(
+    drives: list[Drive], caplog: pytest.LogCaptureFixture
+) -> None:
+    join_drives([replace(drive, origin=None) for drive in drives])
+    assert "taken to be of one frame" in caplog.text
+
+
+def test_each_visit_has_clocks_of_its_own(drives: list[Drive]) -> None:
+    joined = join_drives(drives)
+    name = next(iter(joined.cameras))
+    moved = with_clock_offsets(joined, {name: 0.05}, max_gap_s=1.0, visit=1)
+    offsets = {(one.visit, one.camera): one.clock_offset_s for one in moved.images}
+    assert offsets[0, name] == 0.0
+    assert offsets[1, name] == 0.05

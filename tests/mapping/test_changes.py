@@ -1,0 +1,253 @@
+"""A yard that was painted anew in places, seen by a second drive: what stayed, moved, vanished and is new."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.mapping.scene import Scene, SceneOptions, make_scene
+from tests.mapping.test_methods import match
+from v2hdm.errors import MappingError
+from v2hdm.hdmap.geojson import read_geojson, write_geojson
+from v2hdm.mapping.changes.decide import Decision, Watched, decide
+from v2hdm.mapping.changes.field import Errors
+from v2hdm.mapping.changes.fuse import fused_markings
+from v2hdm.mapping.changes.lanes import updated_lanes
+from v2hdm.mapping.changes.update import Base
+from v2hdm.mapping.methods import run_methods
+from v2hdm.mapping.results import MethodResult
+from v2hdm.records import Changes, Fate, Lane, Marking
+
+MOVED = {3: (0.1, 0.02), 7: (-0.25, 0.1), 12: (0.4, 0.5), 16: (0.0, -0.9)}
+REMOVED = (5, 10, 14, 21)
+ADDED = ((14.0, 3.0), (30.0, 9.5), (22.0, 6.0))
+DIAMOND = np.array([[0.6, 0.0], [0.0, 0.3], [-0.6, 0.0], [0.0, -0.3]])
+
+
+def repainted(markings: list[Marking]) -> list[Marking]:
+    """Some diamonds moved, some removed, some added."""
+    out = [
+        replace(one, corners_map=one.corners_map + MOVED.get(k, (0.0, 0.0)))
+        for k, one in enumerate(markings)
+        if k not in REMOVED
+    ]
+    return out + [Marking("diamond", DIAMOND + place, 0) for place in ADDED]
+
+
+def base_of(result: MethodResult, folder: Path) -> Base:
+    """A result as the base of the next one, by way of its file."""
+    write_geojson(result.hd_map, folder / "map.geojson")
+    assert result.poses is not None
+    left_out = tuple((one.kind, one.position_map, one.sightings) for one in result.excluded)
+    return Base(read_geojson(folder / "map.geojson"), result.poses.map_from_vehicle, left_out)
+
+
+@pytest.fixture(scope="module")
+def before() -> Scene:
+    return make_scene(SceneOptions(length_m=70.0, seed=21))
+
+
+@pytest.fixture(scope="module")
+def base(before: Scene, tmp_path_factory: pytest.TempPathFactory) -> Base:
+    found = run_methods(before.drive, before.detections, ("front", "rear"))["Opt"]
+    return base_of(found, tmp_path_factory.mktemp("base"))
+
+
+@pytest.fixture(scope="module")
+def updated(base: Base) -> tuple[Scene, MethodResult]:
+    now = make_scene(SceneOptions(length_m=70.0, seed=22), repainted)
+    return now, run_methods(now.drive, now.detections, ("front", "rear"), base=base)["Opt"]
+
+
+def changes_of(result: MethodResult) -> Changes:
+    assert result.changes is not None
+    return result.changes
+
+
+def near(corners: np.ndarray | None, centre: np.ndarray) -> bool:
+    return corners is not None and bool(np.linalg.norm(corners.mean(axis=0) - centre) < 0.1)
+
+
+def test_what_moved_is_listed_with_its_way_and_nothing_else(
+    before: Scene, updated: tuple[Scene, MethodResult]
+) -> None:
+    moved = changes_of(updated[1]).of(Fate.MOVED)
+    assert len(moved) == len(MOVED)
+    for number, shift in MOVED.items():
+        centre = before.markings[number].corners_map.mean(axis=0)
+        (one,) = [change for change in moved if near(change.before, centre)]
+        assert one.shift_m == pytest.approx(np.array(shift), abs=0.03)
+        assert one.shift_sigma_m is not None
+        assert (one.shift_sigma_m < 0.02).all()
+        assert near(one.after, centre + shift)
+        assert one.probability > 0.99
+
+
+def test_what_vanished_left_the_map_and_stays_in_the_list(
+    before: Scene, updated: tuple[Scene, MethodResult]
+) -> None:
+    now, result = updated
+    gone = changes_of(result).of(Fate.VANISHED)
+    centres = [before.markings[k].corners_map.mean(axis=0) for k in REMOVED]
+    assert all(any(near(one.before, centre) for one in gone) for centre in centres)
+    assert len(gone) == len(REMOVED)
+    assert all(one.views >= 5 and one.found == 0 and one.after is None for one in gone)
+    assert not {one.id for one in gone} & {one.id for one in result.hd_map.markings}
+    pairs, _ = match(result.hd_map, now.markings, 0.3)
+    assert len(pairs) == len(result.hd_map.markings)
+
+
+def test_new_paint_has_an_id_that_no_other_ever_had(base: Base, updated: tuple[Scene, MethodResult]) -> None:
+    result = updated[1]
+    new = changes_of(result).of(Fate.NEW)
+    assert len(new) == len(ADDED)
+    assert all(any(near(one.after, np.array(place)) for one in new) for place in ADDED)
+    given = [one.id or 0 for one in (*base.hd_map.markings, *base.hd_map.lanes)]
+    assert min(one.id for one in new) > max(given)
+
+
+def test_ids_stay(base: Base, updated: tuple[Scene, MethodResult]) -> None:
+    vanished = {one.id for one in changes_of(updated[1]).of(Fate.VANISHED)}
+    moved = {one.id for one in changes_of(updated[1]).of(Fate.MOVED)}
+    now = {one.id: one for one in updated[1].hd_map.markings}
+    for one in base.hd_map.markings:
+        if one.id not in vanished | moved:
+            assert now[one.id].corners_map == pytest.approx(one.corners_map, abs=0.05)
+    assert {one.id for one in base.hd_map.markings} - vanished <= set(now)
+    ids = [one.id for one in (*updated[1].hd_map.markings, *updated[1].hd_map.lanes)]
+    assert len(set(ids)) == len(ids)
+    assert {one.id for one in base.hd_map.lanes} <= set(ids)
+
+
+def test_two_drives_together_are_better_than_either(
+    before: Scene, base: Base, updated: tuple[Scene, MethodResult]
+) -> None:
+    now = updated[0]
+    alone = run_methods(now.drive, now.detections, ("front", "rear"))["Opt"].hd_map
+    errors = [match(one, now.markings, 0.3)[1] for one in (alone, updated[1].hd_map)]
+    assert errors[1] < errors[0]
+
+
+def test_an_id_that_is_gone_is_never_given_again(tmp_path: Path, updated: tuple[Scene, MethodResult]) -> None:
+    hd_map = updated[1].hd_map
+    last = max(one.id or 0 for one in hd_map.markings)
+    without = replace(hd_map, markings=tuple(one for one in hd_map.markings if one.id != last))
+    fresh = replace(hd_map.markings[0], id=None)
+    write_geojson(replace(without, markings=(*without.markings, fresh)), tmp_path / "map.geojson")
+    again = read_geojson(tmp_path / "map.geojson")
+    assert again.markings[-1].id == hd_map.largest_id + 1
+    assert again.largest_id == hd_map.largest_id + 1
+
+
+def test_a_map_of_another_place_is_refused(base: Base, updated: tuple[Scene, MethodResult]) -> None:
+    elsewhere = [replace(one, corners_map=one.corners_map + 2.4) for one in base.hd_map.markings]
+    wrong = replace(base, hd_map=replace(base.hd_map, markings=tuple(elsewhere)))
+    with pytest.raises(MappingError, match="is the map of this site and frame"):
+        run_methods(updated[0].drive, updated[0].detections, ("front", "rear"), base=wrong)
+
+
+# Two maps made up from their errors: what is shared, and what is each marking's own.
+
+SHARED_M, OWN_M = 0.015, 0.004
+
+
+def street(count: int) -> np.ndarray:
+    """Corners (count, 4, 2) of diamonds 4 m apart."""
+    places = np.column_stack([4.0 * np.arange(count), np.where(np.arange(count) % 2, 3.0, -3.0)])
+    return DIAMOND + places[:, None]
+
+
+def mapped(corners: np.ndarray, rng: np.random.Generator, over_m: float = 30.0) -> list[Marking]:
+    """A map of the street: a drift that all share, and errors of each corner."""
+    centres = corners.mean(axis=1)
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    root = np.linalg.cholesky(SHARED_M**2 * np.exp(-apart / over_m) + 1e-12 * np.eye(len(corners)))
+    drift = root @ rng.standard_normal((len(corners), 2))
+    whole = OWN_M**2 * np.eye(8) + SHARED_M**2 * np.kron(np.ones((4, 4)), np.eye(2))
+    noisy = corners + drift[:, None] + OWN_M * rng.standard_normal(corners.shape)
+    return [Marking("diamond", one, 10, whole, OWN_M / 2, id=k + 1) for k, one in enumerate(noisy)]
+
+
+def decided(old: list[Marking], new: list[Marking], looks: int = 8) -> Decision:
+    def watched(markings: list[Marking]) -> Watched:
+        return Watched(np.full(len(markings), -np.log(10.0 * (looks + 1))), np.full(len(markings), -0.05))
+
+    errors = [Errors.of(markings, 30.0) for markings in (old, new)]
+    return decide(old, new, *errors, watched(old), watched(new))
+
+
+def test_the_drift_of_either_map_counts_once() -> None:
+    squared, stated = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        corners = street(40)
+        old, new = mapped(corners, rng), mapped(corners, rng)
+        by_old, by_new = fused_markings(old, new, decided(old, new))
+        assert not by_new
+        off = np.stack([by_old[k].corners_map for k in range(40)]) - corners
+        squared.append(np.mean(off**2))
+        stated.append(np.mean([np.trace(one.covariance_m2) / 8 for one in by_old.values()]))
+    expected = (SHARED_M**2 + OWN_M**2) / 2
+    assert np.mean(stated) == pytest.approx(expected, rel=0.1)
+    assert np.mean(squared) == pytest.approx(expected, rel=0.35)
+
+
+def test_what_a_drive_did_not_pass_moves_with_what_it_did() -> None:
+    """The old map's drift is found out along half of the street; nearby the other half is better, too."""
+    before, after, stated = [], [], []
+    for seed in range(40):
+        rng = np.random.default_rng(100 + seed)
+        corners = street(40)
+        old, new = mapped(corners, rng), mapped(corners, rng)[:20]
+        decision = decided(old, new)
+        by_old, _ = fused_markings(old, new, decision)
+        before.append(old[20].corners_map - corners[20])
+        after.append(by_old[20].corners_map - corners[20])
+        stated.append(np.trace(by_old[20].covariance_m2) / 8)
+    assert np.mean(np.square(after)) < 0.8 * np.mean(np.square(before))
+    assert np.mean(np.square(after)) == pytest.approx(np.mean(stated), rel=0.4)
+
+
+@pytest.mark.parametrize("shift_m", [0.1, 0.3, 1.0])
+def test_a_move_is_told_from_the_drift_of_two_maps(shift_m: float) -> None:
+    rng = np.random.default_rng(5)
+    corners = street(40)
+    now = corners.copy()
+    now[17] += (shift_m, 0.0)
+    decision = decided(mapped(corners, rng), mapped(now, rng))
+    assert [pair.old for pair in decision.pairs if pair.moved > 0.5] == [17]
+    assert not decision.gone
+    assert not decision.fresh
+
+
+def test_what_no_image_looked_at_is_not_gone() -> None:
+    rng = np.random.default_rng(6)
+    corners = street(30)
+    old, new = mapped(corners, rng), [one for k, one in enumerate(mapped(corners, rng)) if k not in (4, 9)]
+    errors = [Errors.of(markings, 30.0) for markings in (old, new)]
+    there, bare = np.zeros(30), np.zeros(30)
+    there[4] = -9.0
+    decision = decide(old, new, *errors, Watched(there, bare), Watched.never(28))
+    assert decision.gone[4] > 0.95
+    assert decision.gone[9] < 0.1
+
+
+def test_a_lane_keeps_its_id_and_its_course_where_the_drive_has_none() -> None:
+    along = np.arange(0.0, 60.0, 0.5)
+    old = [Lane("lane_line", np.column_stack([along, 0.0 * along]), 5, id=3)]
+    part = along[(along > 20) & (along < 40)]
+    new = [
+        Lane("lane_line", np.column_stack([part, 0.0 * part + 0.1])[::-1], 4),
+        Lane("lane_line", np.column_stack([along, 0.0 * along + 3.5]), 4),
+    ]
+    nothing = decided([], [])
+    kept, added = updated_lanes(old, new, nothing.shift, iter([8]).__next__)
+    assert (kept.id, kept.sightings, added.id) == (3, 9, 8)
+    assert (np.diff(kept.points_map[:, 0]) > 0).all()
+    inside = (kept.points_map[:, 0] > 20.1) & (kept.points_map[:, 0] < 39.4)
+    assert kept.points_map[inside, 1] == pytest.approx(0.1)
+    assert kept.points_map[~inside, 1] == pytest.approx(0.0, abs=0.11)
+    assert (kept.points_map[0, 0], kept.points_map[-1, 0]) == (0.0, 59.5)

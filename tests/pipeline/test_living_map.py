@@ -1,0 +1,128 @@
+"""docs/living-map.md does what it says: its commands run on two drives through a made-up yard."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.mapping.scene import Scene, SceneOptions, make_scene
+from tests.mapping.test_changes import repainted
+from v2hdm import map as door
+from v2hdm.drive import ReadOptions, read_drive, write_drive
+from v2hdm.errors import MapFileError
+from v2hdm.hdmap.geojson import read_geojson, write_geojson
+from v2hdm.pipeline.base import check_together, read_base
+from v2hdm.records import Drive, Fate, GeodeticOrigin, ImageDetections, PoseNoise, Trajectory
+
+TEXT = (Path(__file__).parents[2] / "docs/living-map.md").read_text()
+BOTH, LATER = re.findall(r"^    python -m v2hdm.map (.*)$", TEXT, re.MULTILINE)
+
+
+def write_scene(scene: Scene, folder: Path) -> None:
+    """The drive of a scene as a folder, all of whose images are grey."""
+    _, grey = cv2.imencode(".jpg", np.full((720, 1280, 3), 90, dtype=np.uint8))
+    images = []
+    for image in scene.drive.images:
+        path = folder / image.camera / "images" / image.path.name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(grey.tobytes())
+        images.append(replace(image, path=path))
+    stamp_s = np.array([image.stamp_s for image in images])
+    poses = np.stack([image.map_from_vehicle for image in images])
+    noise = PoseNoise(**{key: float(value) for key, value in asdict(scene.drive.pose_noise).items()})
+    drive = replace(scene.drive, name=folder.name, root=folder, images=images, pose_noise=noise)
+    write_drive(folder, drive, Trajectory(stamp_s, poses))
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``outputs`` after Monday's map, and after the document's two commands."""
+    folder = tmp_path_factory.mktemp("living")
+    options = SceneOptions(length_m=40.0, cameras=("front",), seed=21)
+    scenes = {"monday": make_scene(options), "friday": make_scene(replace(options, seed=22), repainted)}
+    for name, scene in scenes.items():
+        write_scene(scene, folder / name)
+
+    def detected(drive: Drive, *_: Any) -> list[ImageDetections]:
+        out: list[ImageDetections] = []
+        for visit in drive.visits:
+            found = scenes[visit.root.name].detections
+            out += [replace(one, image=one.image + len(out)) for one in found]
+        return out
+
+    with pytest.MonkeyPatch.context() as patch:
+        # Grey images say nothing: neither to the detector nor to the checks of images and ground.
+        patch.setattr(sys.modules["v2hdm.pipeline.run"], "detect_all", detected)
+        patch.setattr(sys.modules["v2hdm.pipeline.inspect"], "check_drive", lambda *_: [])
+        patch.setattr(sys.modules["v2hdm.pipeline.inspect"], "estimate_cameras", lambda *_: {})
+        patch.chdir(folder)
+        for arguments in ("drive.path=monday name=monday", BOTH, LATER):
+            patch.setattr(sys, "argv", ["v2hdm.map", *shlex.split(arguments), "workers=1"])
+            assert door.main() == 0
+    return folder / "outputs"
+
+
+def test_drives_are_mapped_together_each_with_its_trajectory(results: Path) -> None:
+    metrics = json.loads((results / "both" / "metrics.json").read_text())
+    assert (results / "both" / "trajectory_monday.tum").is_file()
+    assert (results / "both" / "trajectory_friday.tum").is_file()
+    clocks = metrics["extrinsics"]["front"]["clock_offset_s"]
+    assert set(clocks) == {"monday", "friday"}
+    alone = json.loads((results / "monday" / "metrics.json").read_text())
+    sigma = [one["results"]["front"]["Opt"]["median_sigma_m"] for one in (metrics, alone)]
+    assert sigma[0] < sigma[1]
+
+
+def test_a_later_drive_lists_what_changed(results: Path) -> None:
+    changes = json.loads((results / "friday" / "metrics.json").read_text())["changes"]
+    fates = [one["fate"] for one in changes["listed"]]
+    assert {Fate.MOVED.value, Fate.VANISHED.value} <= set(fates)
+    features = json.loads((results / "friday" / "changes.geojson").read_text())["features"]
+    assert {one["properties"]["fate"] for one in features} >= set(fates)
+    assert (results / "friday" / "changes.png").stat().st_size > 10_000
+    before, after = (read_geojson(results / name / "map.geojson") for name in ("monday", "friday"))
+    gone = {one["id"] for one in changes["listed"] if one["fate"] == "vanished"}
+    assert {one.id for one in before.markings} - gone <= {one.id for one in after.markings}
+    assert after.largest_id >= before.largest_id
+
+
+def test_the_document_names_every_fate() -> None:
+    for fate in Fate:
+        assert f"| `{fate.value}` |" in TEXT
+
+
+def test_a_base_that_nothing_can_be_built_on_is_refused(results: Path, tmp_path: Path) -> None:
+    with pytest.raises(MapFileError, match=r"nowhere\.geojson"):
+        read_base(tmp_path / "nowhere.geojson")
+    hd_map = read_geojson(results / "monday" / "map.geojson")
+    naive = tuple(replace(one, covariance_m2=None) for one in hd_map.markings)
+    for changed, verdict, told in (
+        (hd_map, {"status": "FAIL"}, "the verdict on its drive is FAIL"),
+        (replace(hd_map, markings=naive), None, "does not say how sure its markings are"),
+        (replace(hd_map, markings=()), None, "has no markings"),
+    ):
+        write_geojson(changed, tmp_path / "map.geojson", verdict)
+        with pytest.raises(MapFileError, match=told):
+            read_base(tmp_path)
+
+
+def test_a_base_of_another_frame_or_site_is_refused(results: Path) -> None:
+    base = read_base(results / "monday")
+    drive = read_drive(results.parent / "friday", ReadOptions())
+    check_together(base, drive, "monday")
+    with pytest.raises(MapFileError, match="their coordinates differ"):
+        check_together(base, replace(drive, origin=GeodeticOrigin(50.0, 8.0, 100.0)), "monday")
+    far = [replace(one, map_from_vehicle=one.map_from_vehicle.copy()) for one in drive.images]
+    for image in far:
+        image.map_from_vehicle[0, 3] += 500.0
+    with pytest.raises(MapFileError, match="it is of another site"):
+        check_together(base, replace(drive, images=far), "monday")

@@ -1,0 +1,153 @@
+"""An earlier map at the door: read and held against the drive; and what became of it, as files."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from v2hdm.detection.batch import read_image
+from v2hdm.drive.road import lay_flat
+from v2hdm.drive.tum import read_tum
+from v2hdm.errors import MapFileError
+from v2hdm.files import load_json, take_array
+from v2hdm.hdmap.geojson import geojson_feature, geojson_positions, read_geojson, read_verdict, write_features
+from v2hdm.mapping.changes.update import Base
+from v2hdm.records import Change, Changes, Drive, Fate, FloatArray, HdMap, Image
+from v2hdm.report.changes import save_changes
+
+_SITE_M = 40.0
+"""A marking farther from all of a drive's route is not seen from it, m: twice what a camera reaches."""
+
+_POSITION_SIGMA_M = 0.02
+"""Sigma of a written pose's height by which its road is laid flat, m."""
+
+LISTED = (Fate.MOVED, Fate.VANISHED, Fate.NEW)
+"""Fates that are changes of the site, and no want of images."""
+
+
+def read_base(path: Path) -> Base:
+    """Read an earlier map, and beside it the poses and left-out candidates of its run, where there are any.
+
+    Raises:
+        MapFileError: It is missing, damaged, of an older version or another method, or its verdict is FAIL.
+    """
+    if path.is_dir():
+        path = path / "map.geojson"
+    hd_map = read_geojson(path)
+    if not hd_map.markings:
+        raise MapFileError(f"map.base: {path}: has no markings to bring up to date; map the drive by itself")
+    verdict = read_verdict(path)
+    if verdict is not None and verdict.get("status") == "FAIL":
+        raise MapFileError(
+            f"map.base: {path}: the verdict on its drive is FAIL, so that nothing can be built on it; mend "
+            "that drive first (docs/verdict.md)"
+        )
+    if all(one.covariance_m2 is None or one.relative_sigma_m is None for one in hd_map.markings):
+        raise MapFileError(
+            f"map.base: {path}: does not say how sure its markings are, as maps of older versions and "
+            "naive methods; map its drive anew"
+        )
+    return Base(hd_map, _poses(path.parent), _left_out(path.parent / "excluded.geojson"))
+
+
+def check_together(base: Base, drive: Drive, path: str) -> None:
+    """Refuse a map that is not of the drive's frame or site.
+
+    Raises:
+        MapFileError: The message names both.
+    """
+    if base.hd_map.origin != drive.origin:
+        raise MapFileError(
+            f"map.base: the origin of {path} is {base.hd_map.origin} and that of drive {drive.name} "
+            f"{drive.origin}: their coordinates differ; bring the drive's poses into the map's frame"
+        )
+    route = cKDTree([image.map_from_vehicle[:2, 3] for image in drive.images])
+    centres = np.array([one.corners_map.mean(axis=0) for one in base.hd_map.markings])
+    nearest_m = float(route.query(centres)[0].min())
+    if nearest_m > _SITE_M:
+        raise MapFileError(
+            f"map.base: drive {drive.name} comes no nearer than {nearest_m:.0f} m to a marking of {path}: it "
+            "is of another site; map the drive by itself"
+        )
+
+
+def grey_reader(drive: Drive) -> Callable[[Image], NDArray[np.float32]]:
+    """Reads the grey values of a drive's images."""
+
+    def grey(image: Image) -> NDArray[np.float32]:
+        return np.asarray(read_image(image, drive.cameras[image.camera]).mean(axis=2, dtype=np.float32))
+
+    return grey
+
+
+def _poses(folder: Path) -> FloatArray:
+    """The vehicle's poses (F, 4, 4) at the images of an earlier map, its road laid flat."""
+    poses = [np.zeros((0, 4, 4))]
+    for path in sorted(folder.glob("trajectory*.tum")):
+        trajectory = read_tum(path)
+        poses.append(lay_flat(trajectory, _POSITION_SIGMA_M).trajectory.map_from_vehicle)
+    return np.concatenate(poses)
+
+
+def _left_out(path: Path) -> tuple[tuple[str, FloatArray, int], ...]:
+    """Class, place (2,) and sightings of the candidates that an earlier map left out."""
+    if not path.is_file():
+        return ()
+    out = []
+    for feature in load_json(path, MapFileError).get("features", []):
+        properties = feature.get("properties", {})
+        if "position_map" in properties:
+            place = take_array(properties["position_map"], (2,), f"{path}: position_map", MapFileError)
+            out.append((str(properties.get("class")), place, int(properties.get("sightings", 0))))
+    return tuple(out)
+
+
+def changes_json(changes: Changes) -> dict[str, Any]:
+    """What ``metrics.json`` says of an earlier map: counts, and each change with its evidence."""
+    counted = Counter(one.fate for one in changes.changes)
+    return {
+        "counts": {"same": changes.same, **{fate.value: counted[fate] for fate in Fate}},
+        "shift_m": changes.shift_m.tolist(),
+        "listed": [_as_json(one) for fate in LISTED for one in changes.of(fate)],
+        "unsure": [_as_json(one) for one in changes.changes if one.fate not in LISTED],
+    }
+
+
+def _as_json(one: Change) -> dict[str, Any]:
+    def plain(values: FloatArray | None) -> list[Any] | None:
+        return None if values is None else values.tolist()
+
+    return {
+        "id": one.id,
+        "class": one.kind,
+        "fate": one.fate.value,
+        "before_map": plain(one.before),
+        "after_map": plain(one.after),
+        "shift_m": plain(one.shift_m),
+        "shift_sigma_m": plain(one.shift_sigma_m),
+        "probability": one.probability,
+        "views": one.views,
+        "found": one.found,
+        "sightings": one.sightings,
+    }
+
+
+def write_changes(changes: Changes, hd_map: HdMap, folder: Path, route_map: FloatArray) -> None:
+    """Write ``changes.geojson`` and ``changes.png`` into ``folder``.
+
+    A feature is a change: its outline now, or that which it had if it is gone, where the map has it now.
+    """
+    features = []
+    for one in changes.changes:
+        corners = one.before if one.after is None else one.after
+        assert corners is not None
+        ring = geojson_positions(corners, None, hd_map.origin)
+        features.append(geojson_feature(f"changes/{one.id}", "Polygon", [[*ring, ring[0]]], _as_json(one)))
+    write_features(folder / "changes.geojson", features, hd_map.origin, {"same": changes.same})
+    save_changes(folder / "changes.png", changes, hd_map, route_map)
