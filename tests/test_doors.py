@@ -43,6 +43,7 @@ def run_door(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
         (("export", "checkpoint=a", "output=b"), "onnx"),
         (("v2hdm.detect", "images"), "cv2"),
         (("v2hdm.check", "drive"), "cv2"),
+        (("v2hdm.experiment",), "torch"),
         (("v2hdm.export", "map.geojson", "--format", "csv"), "cv2"),
     ],
 )
@@ -61,6 +62,7 @@ def test_an_interruption_while_libraries_are_loaded_is_one_line(
     [
         (("v2hdm.map", "+run=port2"), "torch", "map"),
         (("v2hdm.map", "+run=port2"), "kornia", "map"),
+        (("v2hdm.experiment",), "matplotlib", "map"),
         (("v2hdm.check", "drive"), "matplotlib", "map"),
         (("train",), "tensorboard", "train"),
         (("train.ship", "runs/gpu"), "onnx", "train"),

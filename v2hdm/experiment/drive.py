@@ -50,7 +50,7 @@ DETECTIONS_FILE = "detections.json.gz"
 GROWTH_STEPS = 8
 """Sizes of the growing map at which its error is told."""
 
-_LAYOUT = 1
+_LAYOUT = 2
 """Raised whenever what a record holds changes."""
 
 

@@ -89,9 +89,8 @@ def by_port(measured: Sequence[Measured]) -> dict[str, list[Measured]]:
 
 def markdown(heads: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     """A table in Markdown; columns of figures are aligned to the right."""
-    rule = [
-        ":--" if head in ("port", "method", "cameras", "camera", "extrinsic of") else "--:" for head in heads
-    ]
+    left = ("port", "method", "cameras", "camera", "extrinsic of", "claim", "where")
+    rule = [":--" if head in left else "--:" for head in heads]
     return "".join(f"| {' | '.join(line)} |\n" for line in [heads, rule, *lines])
 
 

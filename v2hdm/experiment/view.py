@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from v2hdm.experiment.measures import Measured
 from v2hdm.experiment.plan import ExperimentConfig
 from v2hdm.experiment.run import Tell, run_experiment
-from v2hdm.experiment.tables import results_table
+from v2hdm.experiment.tables import by_port, results_table
 from v2hdm.experiment.words import claims
+
+_SHOWN = ("method", "cameras", "markings", "RMSE (cm)", "RMSE of shared (cm)")
+"""Columns of the main table that the terminal shows."""
 
 _EVERY_S = 30.0
 """How often a stage that goes on has a line where there is no terminal."""
@@ -24,15 +28,8 @@ def experiment_on_terminal(config: ExperimentConfig, config_yaml: str) -> None:
     console = Console()
     with _view(console) as tell:
         folder, measured = run_experiment(config, config_yaml, tell)
-    heads, lines = results_table(measured)
-    table = Table(title=config.name, title_justify="left", header_style="bold")
-    for number, head in enumerate(heads):
-        table.add_column(head, justify="left" if number < 3 else "right")
-    for number, line in enumerate(lines):
-        if number and line[:2] != lines[number - 1][:2]:
-            table.add_section()
-        table.add_row(*line)
-    console.print(table)
+    for port, drives in by_port(measured).items():
+        console.print(_table(port, drives))
     tested = claims(measured)
     for claim in tested:
         if not claim.holds:
@@ -43,6 +40,21 @@ def experiment_on_terminal(config: ExperimentConfig, config_yaml: str) -> None:
     console.print(
         f"results in {folder}: begin with experiment.md and figures.md", highlight=False, soft_wrap=True
     )
+
+
+def _table(port: str, drives: Sequence[Measured]) -> Table:
+    """What fits a terminal of the main table: method by camera set."""
+    seeds = f", {len(drives)} seeds" if len(drives) > 1 else ""
+    table = Table(title=f"{port}{seeds}", title_justify="left", header_style="bold")
+    heads, lines = results_table(drives)
+    shown = [heads.index(name) for name in _SHOWN]
+    for name in _SHOWN:
+        table.add_column(name, justify="left" if name in ("method", "cameras") else "right")
+    for number, line in enumerate(lines):
+        if number and line[1] != lines[number - 1][1]:
+            table.add_section()
+        table.add_row(*(line[column] for column in shown))
+    return table
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,6 +38,7 @@ class Claim:
     """One claim held against the figures of one port and set of cameras.
 
     ``values`` are those of the seeds, ``limit`` says what their mean is to keep; ``holds`` whether it does.
+    ``shared`` are the same ratios over the markings that every method has mapped.
     """
 
     text: str
@@ -45,15 +46,12 @@ class Claim:
     limit: str
     values: tuple[float, ...]
     holds: bool
+    shared: tuple[float, ...] = ()
 
     @property
     def figure(self) -> str:
         """The mean over the seeds and, where there are several, the range that they span."""
-        known = [value for value in self.values if not math.isnan(value)]
-        if not known:
-            return "-"
-        mean = f"{np.mean(known):.2f}"
-        return f"{mean} ({min(known):.2f} to {max(known):.2f})" if len(known) > 1 else mean
+        return _with_range(self.values)
 
 
 def claims(measured: Sequence[Measured]) -> list[Claim]:
@@ -62,18 +60,14 @@ def claims(measured: Sequence[Measured]) -> list[Claim]:
     for port, drives in by_port(measured).items():
         started = drives[0].started_from
         for cameras in drives[0].rows:
-            where = f"{port}, {cameras}"
             if started == "calibrated":
-                ratios = _ratios(drives, cameras, "Opt", "CNI")
                 text = "the optimisation is as good as a manual calibration: Opt / CNI"
-                found.append(_claim(text, where, ratios, most=OPT_TO_CNI))
+                found.append(_claim(text, port, drives, cameras, ("Opt", "CNI"), most=OPT_TO_CNI))
             elif started == "estimated":
-                ratios = _ratios(drives, cameras, "ENI", "Opt")
                 text = "it repairs a borrowed calibration: ENI / Opt"
-                found.append(_claim(text, where, ratios, least=ENI_TO_OPT))
-            ratios = _ratios(drives, cameras, "ONI", "CNI")
+                found.append(_claim(text, port, drives, cameras, ("ENI", "Opt"), least=ENI_TO_OPT))
             text = "its IPM serves as well as the manual one: ONI / CNI"
-            found.append(_claim(text, where, ratios, most=ONI_TO_CNI))
+            found.append(_claim(text, port, drives, cameras, ("ONI", "CNI"), most=ONI_TO_CNI))
         found += _more_with_more(port, drives)
     return [claim for claim in found if claim.values]
 
@@ -90,8 +84,11 @@ def write_words(
 def words(measured: Sequence[Measured], config: ExperimentConfig) -> str:
     """The text in Markdown."""
     tested = claims(measured)
-    heads = ["claim", "where", "asked", "measured", "holds"]
-    lines = [[c.text, c.where, c.limit, c.figure, "yes" if c.holds else "**no**"] for c in tested]
+    heads = ["claim", "where", "asked", "measured", "on shared markings", "holds"]
+    lines = [
+        [c.text, c.where, c.limit, c.figure, _with_range(c.shared), "yes" if c.holds else "**no**"]
+        for c in tested
+    ]
     drives = ", ".join(one.title for one in measured)
     recipes = "".join(f"- {name}: {what}\n" for name, what in RECIPES.items() if name in config.recipes)
     return (
@@ -156,23 +153,38 @@ def _more_with_more(port: str, drives: Sequence[Measured]) -> list[Claim]:
         if len(counts) == len(sets) and max(counts[:-1]):
             values.append(counts[-1] / max(counts[:-1]))
     text = f"{sets[-1]} cameras map more markings than one: Opt, {sets[-1]} / the best one alone"
-    return [Claim(text, f"{port}, {sets[-1]}", "> 1", tuple(values), bool(values) and np.mean(values) > 1)]
+    return [Claim(text, f"{port}, {sets[-1]}", "> 1", tuple(values), bool(values and np.mean(values) > 1))]
 
 
 def _claim(
-    text: str, where: str, values: Sequence[float], least: float | None = None, most: float | None = None
+    text: str,
+    port: str,
+    drives: Sequence[Measured],
+    cameras: str,
+    methods: tuple[str, str],
+    least: float | None = None,
+    most: float | None = None,
 ) -> Claim:
-    known = [value for value in values if not math.isnan(value)]
-    mean = float(np.mean(known)) if known else float("nan")
-    if most is not None:
-        return Claim(text, where, f"<= {most:g}", tuple(known), mean <= most)
-    assert least is not None
-    return Claim(text, where, f">= {least:g}", tuple(known), mean >= least)
+    """The ratio of two methods' corner RMSE, which is to be at least or at most some value."""
+    rows = _common(drives, cameras, methods)
+    pairs = [(row[methods[0]], row[methods[1]]) for row in rows]
+    values = _known(above.rmse_m / below.rmse_m for above, below in pairs)
+    shared = _known(above.shared_rmse_m / below.shared_rmse_m for above, below in pairs)
+    mean = float(np.mean(values)) if values else float("nan")
+    holds = mean <= most if most is not None else least is not None and mean >= least
+    limit = f"<= {most:g}" if most is not None else f">= {least:g}"
+    return Claim(text, f"{port}, {cameras}", limit, values, holds, shared)
 
 
-def _ratios(drives: Sequence[Measured], cameras: str, above: str, below: str) -> list[float]:
-    rows = _common(drives, cameras, (above, below))
-    return [row[above].rmse_m / row[below].rmse_m for row in rows]
+def _known(values: Iterable[float]) -> tuple[float, ...]:
+    return tuple(value for value in values if not math.isnan(value))
+
+
+def _with_range(values: Sequence[float]) -> str:
+    if not values:
+        return "-"
+    mean = f"{np.mean(values):.2f}"
+    return f"{mean} ({min(values):.2f} to {max(values):.2f})" if len(values) > 1 else mean
 
 
 def _common(drives: Sequence[Measured], cameras: str, methods: Sequence[str]) -> list[Mapping[str, Row]]:
@@ -181,6 +193,6 @@ def _common(drives: Sequence[Measured], cameras: str, methods: Sequence[str]) ->
     return [rows for rows in found if all(method in rows for method in methods)]
 
 
-def _cm(values_m: object) -> str:
-    known = [value for value in values_m if not math.isnan(value)]  # type: ignore[attr-defined]
+def _cm(values_m: Iterable[float]) -> str:
+    known = _known(values_m)
     return f"{100 * np.mean(known):.1f}" if known else "-"

@@ -88,26 +88,29 @@ def _draw_ground(axes: Axes, camera: Mapping[str, Any]) -> None:
 
 
 def save_fields(path: Path, record: Mapping[str, Any]) -> str | None:
-    """Draw the mean residuals over the image, before and after; returns the caption."""
+    """Draw the median residuals over the image, before and after; returns the caption."""
     cameras = record.get("residuals")
     if not cameras:
         return None
+    told = []
     with style.figure(path, 13.0, 4.2 * len(cameras)) as fig:
         panels = fig.subplots(len(cameras), 2, squeeze=False)
         for row, (name, found) in enumerate(cameras.items()):
+            field, lengths = found["field"], []
             for column, when in enumerate(("before", "after")):
-                _draw_field(panels[row, column], found["field"][when], found["field"]["size_px"])
-                rms = found["field"][when]["rms_px"]
-                told = "" if rms is None else f", {rms:.2f} px RMS"
-                panels[row, column].set_title(f"{drive_of(record)}, {name}: {when}{told}")
+                _draw_field(panels[row, column], field[when], field["size_px"])
+                length = field[when]["length_px"]
+                lengths.append("-" if length is None else f"{length:.2f} px")
+                panels[row, column].set_title(f"{drive_of(record)}, {name}: {when}, {lengths[-1]}")
+            told.append(f"{name} from {lengths[0]} to {lengths[1]}")
     return (
-        "Mean residual of detected corners against the optimised map by cell of the image, "
+        "Median residual of detected corners against the optimised map by cell of the image, "
         f"{drive_of(record)}: before, under the IPM that the mapping started from and the recorded poses; "
         "after, under the optimised extrinsic and the adjusted poses. Axes in px of the image without "
-        "distortion; the arrow above each panel gives its scale, which differs between panels, and the "
-        "RMS in the title is over single corners. See that before all arrows run one way, as under a "
-        "turned camera, and that after they are a hundredth as long and agree no more: cells without "
-        "arrows hold too few corners."
+        "distortion. The arrow above each panel gives its scale, which differs between panels; cells "
+        "without an arrow hold too few corners. The median length of all residuals falls: "
+        f"{', '.join(told)}. See that before the arrows run along with each other, as under a turned "
+        "camera, and look for any such order that is left after."
     )
 
 
@@ -115,7 +118,7 @@ def _draw_field(axes: Axes, field: Mapping[str, Any], size_px: tuple[int, int]) 
     width, height = size_px
     cell = np.array([width / CELLS[0], height / CELLS[1]])
     places, arrows = [], []
-    for index, mean in enumerate(field["mean_px"]):
+    for index, mean in enumerate(field["median_px"]):
         if mean is not None:
             places.append((np.array([index % CELLS[0], index // CELLS[0]]) + 0.5) * cell)
             arrows.append(mean)

@@ -40,13 +40,15 @@ def save_boxes(path: Path, firsts: Sequence[Measured]) -> str | None:
                     continue
                 beyond += _draw_boxes(panels[row, column], found)
                 panels[row, column].set_title(f"{one.title}: Opt, {cameras}, {len(found.true)} markings")
-        panels[0, 0].legend(loc="upper right", frameon=True, edgecolor="none", ncols=2)
+        drawn = next((axes for axes in panels.flat if axes.axison), None)
+        if drawn is not None:
+            fig.legend(handles=drawn.get_legend_handles_labels()[0], loc="outside lower center", ncols=3)
     return (
         "Errors of the four corners of each marking (Opt; cm), in the order in which the vehicle passed "
         "them: box from the lower to the upper quartile, whiskers from the least to the largest of the "
-        "four. The dark line is the running mean over all corners so far. See that it settles within the "
-        "first tens of markings and does not climb along the route, and that both cameras give more "
-        f"markings than either. {beyond} of all corners lie above the top of their panel."
+        "four. The dark line is the running mean over all corners so far, its last value written beside "
+        "it. See how soon it settles, and whether errors run together along the route: those drift with "
+        f"the receiver. {beyond} of all corners lie above the top of their panel."
     )
 
 
@@ -89,17 +91,16 @@ def save_growth(path: Path, records: Sequence[Mapping[str, Any]]) -> str | None:
                 if record["port"] == port:
                     _draw_growth(axes, record["growth"])
             _logarithmic(axes, "y")
-            axes.set_xscale("log")
-            axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+            _logarithmic(axes, "x")
             axes.set_xlabel("markings mapped so far")
             axes.set_ylabel("corner RMSE (cm)")
             axes.set_title(f"{port}: the error while the map grows")
         fig.legend(handles=_growth_legend(records), loc="outside lower center", ncols=5)
     return (
         "Corner RMSE (cm) over the first markings of a drive, all cameras, a line per seed. Opt is solved "
-        "anew at each size with what the drive has shown of the first markings; 'incremental' is the same "
-        "of the map that was grown marking by marking. CNI and ENI keep a marking as it was when it was "
-        "passed. See at which size Opt falls below CNI, and that ENI never gets better."
+        "anew at each size, from what the drive has shown of the first markings; 'incremental' is the "
+        "same for the map that was grown marking by marking. CNI and ENI keep a marking as it was when it "
+        "was passed. See at which size Opt falls below CNI."
     )
 
 
@@ -156,10 +157,10 @@ def save_ranges(path: Path, records: Sequence[Mapping[str, Any]]) -> str | None:
         fig.legend(handles=handles, loc="outside lower center", ncols=4)
     return (
         "How far a corner of a single sighting, laid on the ground, is from the true one (cm), by its "
-        "distance from the camera (m): medians, with the quartiles as a band; means over the seeds of "
-        "both. CNI, ENI and ONI lay it by their IPM and the recorded pose, Opt by its extrinsic and the "
-        "adjusted pose. See that a borrowed calibration (ENI) is off at any range, that the others differ "
-        "little near the vehicle, and that pitch and heading errors let all but Opt grow with range."
+        "distance from the camera (m): median, with the quartiles as a band; each the mean of the seeds'. "
+        "CNI, ENI and ONI lay it by their IPM and the recorded pose, Opt by its extrinsic and the "
+        "adjusted pose. See that the naive methods grow with range even under a right calibration, since "
+        "pitch and heading of the recorded poses err, and that the adjusted poses take most of that away."
     )
 
 
@@ -213,8 +214,8 @@ def save_balance(path: Path, measured: Sequence[Measured]) -> str | None:
     return (
         "Bias against spread of the corner errors (cm), a sign per seed: colour is the method, shape the "
         "cameras, hollow the paper's recipe; dotted lines join points of equal RMSE. Bias moves the whole "
-        "map, as a wrong calibration or the receiver's drift do; spread is what is left. See that the "
-        "optimisation moves the points to the left and down, and that most of what remains is spread."
+        "map, as a wrong calibration or the receiver's drift do; spread is what is left. See how far the "
+        "optimisation moves the points to the left and down, and which of the two is what remains."
     )
 
 
