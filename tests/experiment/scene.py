@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.experiment.plan import DriveConfig, ExperimentConfig, Site
+from v2hdm.experiment.drive import SETTING_FILE, recipe_file, recipe_key, setting_key
+from v2hdm.experiment.plan import DriveConfig, ExperimentConfig, Job, Site
+from v2hdm.experiment.stored import store
 from v2hdm.records import DIAMOND
 
 DIAMOND_CORNERS = np.array([[0.5, 0.0], [0.0, 0.25], [-0.5, 0.0], [0.0, -0.25]])
@@ -55,7 +57,6 @@ def record(port: str, seed: int | None, started_from: str, opt_m: float = 0.01) 
             "front": {"field": {"size_px": [640, 480], "before": field, "after": field}, "range": bins}
         },
         "failures": [],
-        "seconds": 1.0,
     }
 
 
@@ -92,3 +93,18 @@ def experiment(output: str, **changes: Any) -> ExperimentConfig:
     """An experiment on two recorded drives that are nowhere."""
     ports = {name: Site(drive=DriveConfig(path=f"absent/{name}")) for name in ("port1", "port2")}
     return ExperimentConfig(**{"ports": ports, "output": output, "workers": 1, **changes})
+
+
+def keep(job: Job, plain: dict[str, Any]) -> None:
+    """Store a record as the files of a finished drive."""
+    own = ("maps", "growth", "extrinsics", "failures", "lanes", "residuals")
+    store(job.folder / SETTING_FILE, setting_key(job), {k: v for k, v in plain.items() if k not in own})
+    for recipe in job.options:
+        maps = {
+            name: {row: one for row, one in rows.items() if (row.split(", ")[1:] or ["ours"]) == [recipe]}
+            for name, rows in plain["maps"].items()
+        }
+        found = {"maps": maps, "growth": plain["growth"].get(recipe, {}), "failures": []}
+        found |= {"extrinsics": plain["extrinsics"].get(recipe, {}), "lanes": plain["lanes"]}
+        found["residuals"] = plain["residuals"]
+        store(job.folder / recipe_file(recipe), recipe_key(job, recipe), found)

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.experiment.scene import CALIBRATED, ESTIMATED, experiment, record
+from tests.experiment.scene import CALIBRATED, ESTIMATED, experiment, keep, record
 from tests.mapping.scene import SceneOptions, make_scene
 from v2hdm.errors import DriveError
-from v2hdm.experiment.drive import RECORD_FILE, record_key
+from v2hdm.experiment.drive import drive_record, recipe_file
 from v2hdm.experiment.plan import ExperimentConfig, jobs
 from v2hdm.experiment.residuals import residuals
 from v2hdm.experiment.run import run_experiment
@@ -25,7 +25,7 @@ def finished(output: Path) -> ExperimentConfig:
     """An experiment whose drives are finished, and nowhere to be read again."""
     config = experiment(str(output))
     for job, start in zip(jobs(config), (CALIBRATED, ESTIMATED), strict=True):
-        store(job.folder / RECORD_FILE, record_key(job), record(job.port, job.seed, start))
+        keep(job, record(job.port, job.seed, start))
         cv2.imwrite(str(job.folder / "front.jpg"), np.full((480, 640, 3), 90, np.uint8))
     return config
 
@@ -50,6 +50,25 @@ def test_another_setting_takes_nothing_from_an_earlier_run(tmp_path: Path) -> No
     config.mapping.max_range_m = 12.0
     with pytest.raises(DriveError, match="absent"):
         run_experiment(config, "", lambda *_: None)
+
+
+def test_the_files_of_a_drive_make_up_its_record(tmp_path: Path) -> None:
+    job, expected = jobs(finished(tmp_path))[0], record("port1", None, CALIBRATED)
+    found = drive_record(job, 1, lambda *_: None)
+    assert {key: found[key] for key in expected if key != "extrinsics"} == {
+        key: expected[key] for key in expected if key != "extrinsics"
+    }
+    assert {recipe: one for recipe, one in found["extrinsics"].items() if one} == expected["extrinsics"]
+
+
+def test_only_the_recipe_that_is_missing_is_mapped_anew(tmp_path: Path) -> None:
+    config = finished(tmp_path)
+    (jobs(config)[0].folder / recipe_file("incremental")).unlink()
+    config.recipes = ["paper"]
+    assert drive_record(jobs(config)[0], 1, lambda *_: None)["port"] == "port1"
+    config.recipes = ["paper", "incremental"]
+    with pytest.raises(DriveError, match="absent"):
+        drive_record(jobs(config)[0], 1, lambda *_: None)
 
 
 def test_detections_come_back_exactly(tmp_path: Path) -> None:

@@ -1,13 +1,12 @@
 """One drive of an experiment: read or rendered, detected, mapped by every recipe, held against the truth.
 
-Everything that tables, figures and words need of it comes back as plain content, so that a finished drive is
-never opened again.
+Everything that tables, figures and words need of it is kept as plain content, a file for each recipe, so
+that a finished drive is never opened again.
 """
 
 from __future__ import annotations
 
 import shutil
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -33,7 +32,6 @@ from v2hdm.experiment.stored import (
 )
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.mapping.methods import NAIVE_IPMS, run_methods
-from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.inspect import Inspection, inspect
 from v2hdm.pipeline.run import camera_sets
@@ -45,23 +43,32 @@ from v2hdm.simulate import rendered_drive, surveyed_cameras
 Tell = Callable[[str, int, int], None]
 """Told a stage, and how many of its steps are done, of how many."""
 
-RECORD_FILE = "record.json.gz"
+SETTING_FILE = "drive.json.gz"
 DETECTIONS_FILE = "detections.json.gz"
 GROWTH_STEPS = 8
 """Sizes of the growing map at which its error is told."""
 
-_LAYOUT = 2
-"""Raised whenever what a record holds changes."""
+_LAYOUT = 3
+"""Raised whenever what the files hold changes."""
 
 
-def record_key(job: Job) -> str:
-    """The key of all that a drive's record is made from."""
-    options = {name: asdict(one) for name, one in job.options.items()}
-    return key_of(_LAYOUT, __version__, job.site, job.detector, network_key(job.detector), options)
+def setting_key(job: Job) -> str:
+    """The key of what a drive is before it is mapped."""
+    return key_of(_LAYOUT, __version__, job.site)
+
+
+def recipe_key(job: Job, recipe: str) -> str:
+    """The key of all that a drive's maps under a recipe are made from."""
+    return key_of(setting_key(job), job.detector, network_key(job.detector), job.options[recipe])
+
+
+def recipe_file(recipe: str) -> str:
+    """Name of the file with a drive's maps under a recipe."""
+    return f"{recipe}.json.gz"
 
 
 def drive_record(job: Job, workers: int, tell: Tell) -> dict[str, Any]:
-    """What is known of a drive, from disk or found now and kept there.
+    """What is known of a drive and of its maps, from disk or found now and kept there.
 
     Args:
         job: the drive.
@@ -71,30 +78,56 @@ def drive_record(job: Job, workers: int, tell: Tell) -> dict[str, Any]:
     Raises:
         V2hdmError: the drive cannot be rendered, read or looked at, or has no truth.
     """
-    key = record_key(job)
-    record = stored(job.folder / RECORD_FILE, key)
-    if record is None:
-        record = _found(job, workers, tell)
-        store(job.folder / RECORD_FILE, key, record)
-        record = stored(job.folder / RECORD_FILE, key)
-        assert record is not None
+    if _setting_and_maps(job) is None:
+        _find(job, workers, tell)
+    known = _setting_and_maps(job)
+    assert known is not None
     tell("finished", 1, 1)
-    return record
+    return _together(*known)
 
 
-def _found(job: Job, workers: int, tell: Tell) -> dict[str, Any]:
-    begin_s = time.perf_counter()
+def _setting_and_maps(job: Job) -> tuple[dict[str, Any], dict[str, dict[str, Any]]] | None:
+    """What is on disk: the drive, and its maps by recipe; None where something is missing."""
+    setting = stored(job.folder / SETTING_FILE, setting_key(job))
+    maps = {
+        recipe: found
+        for recipe in job.options
+        if (found := stored(job.folder / recipe_file(recipe), recipe_key(job, recipe))) is not None
+    }
+    return None if setting is None or len(maps) < len(job.options) else (setting, maps)
+
+
+def _together(setting: Mapping[str, Any], maps: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """One record of a drive and its maps under all recipes."""
+    return {
+        **setting,
+        "maps": {
+            name: {row: one for found in maps.values() for row, one in found["maps"].get(name, {}).items()}
+            for name in setting["expected"]
+        },
+        "growth": {recipe: found["growth"] for recipe, found in maps.items() if found["growth"]},
+        "extrinsics": {recipe: found["extrinsics"] for recipe, found in maps.items()},
+        "failures": [[recipe, *one] for recipe, found in maps.items() for one in found["failures"]],
+        "lanes": maps[OURS]["lanes"],
+        "residuals": maps[OURS]["residuals"],
+    }
+
+
+def _find(job: Job, workers: int, tell: Tell) -> None:
+    """Open the drive, and map it by those recipes whose maps are missing."""
     if job.site.simulate is not None:
         folder = rendered_drive(job.site.simulate, job.cache, workers, partial(tell, "render"))
     else:
         folder = Path(job.site.drive.path or "")
     drive = read_drive(folder, job.site.drive)
     truth = read_truth(drive)
+    store(job.folder / SETTING_FILE, setting_key(job), _setting(job, drive, truth))
     inspection = inspect(drive, job.site.drive.max_gap_s, workers, partial(tell, "check"))
     detections = _detections(job, inspection.drive, workers, tell)
-    record = _setting(job, drive, truth)
-    record |= _mapped(job, inspection, detections, truth, tell)
-    return record | {"seconds": time.perf_counter() - begin_s}
+    for recipe in job.options:
+        path, key = job.folder / recipe_file(recipe), recipe_key(job, recipe)
+        if stored(path, key) is None:
+            store(path, key, _mapped(job, recipe, inspection, detections, truth, tell))
 
 
 def _detections(job: Job, drive: Drive, workers: int, tell: Tell) -> list[ImageDetections]:
@@ -144,40 +177,36 @@ def _setting(job: Job, drive: Drive, truth: Truth) -> dict[str, Any]:
 
 def _mapped(
     job: Job,
+    recipe: str,
     inspection: Inspection,
     detections: Sequence[ImageDetections],
     truth: Truth,
     tell: Tell,
 ) -> dict[str, Any]:
-    """Maps, growth, extrinsics and residuals, by recipe or by row of the tables."""
+    """Maps, growth and extrinsics of a drive under a recipe; under ours residuals, too."""
     drive = inspection.drive
     sets = camera_sets(drive)
-    maps: dict[str, dict[str, Any]] = {name: {} for name in sets}
-    lanes: dict[str, Any] = {}
-    out: dict[str, Any] = {"maps": maps, "lanes": lanes, "growth": {}, "extrinsics": {}, "failures": []}
-    total, done = len(sets) * len(job.options), 0
-    for recipe, options in job.options.items():
-        for name, members in sets.items():
-            tell("map", done, total)
-            done += 1
-            last = name == list(sets)[-1]
-            try:
-                methods = _run(drive, detections, members, options, recipe, last)
-            except (MappingError, AdjustError) as failure:
-                out["failures"].append([recipe, name, str(failure)])
-                continue
-            for method, result in methods.items():
-                row = row_of(method, recipe)
-                if row is not None:
-                    maps[name][row] = _plain_map(result.hd_map.markings)
-            out["extrinsics"].setdefault(recipe, {})[name] = _extrinsics(drive, methods, truth)
-            if last and methods["Opt"].growth:
-                out["growth"][recipe] = _growth(methods, truth)
-            if last and recipe == OURS:
-                lanes["Opt"] = [lane.points_map for lane in methods["Opt"].hd_map.lanes]
-                described = inspection.drive_as_described
-                out["residuals"] = residuals(described, detections, methods, truth)
-    tell("map", total, total)
+    out: dict[str, Any] = {
+        "maps": {}, "growth": {}, "extrinsics": {}, "failures": [], "lanes": {}, "residuals": {},
+    }  # fmt: skip
+    for done, (name, members) in enumerate(sets.items()):
+        tell(f"map, {recipe}", done, len(sets))
+        last = name == list(sets)[-1]
+        steps = GROWTH_STEPS if last and recipe != PAPER else 0
+        try:
+            methods = run_methods(drive, detections, members, job.options[recipe], growth_steps=steps)
+        except (MappingError, AdjustError) as failure:
+            out["failures"].append([name, str(failure)])
+            continue
+        rows = {row_of(method, recipe): result for method, result in methods.items()}
+        out["maps"][name] = {row: _plain_map(one.hd_map.markings) for row, one in rows.items() if row}
+        out["extrinsics"][name] = _extrinsics(drive, methods, truth)
+        if last and methods["Opt"].growth:
+            out["growth"] = _growth(methods, truth)
+        if last and recipe == OURS:
+            out["lanes"] = {"Opt": [lane.points_map for lane in methods["Opt"].hd_map.lanes]}
+            out["residuals"] = residuals(inspection.drive_as_described, detections, methods, truth)
+    tell(f"map, {recipe}", len(sets), len(sets))
     return out
 
 
@@ -186,18 +215,6 @@ def row_of(method: str, recipe: str) -> str | None:
     if recipe == OURS:
         return method
     return None if method in NAIVE_IPMS else f"{method}, {recipe}"
-
-
-def _run(
-    drive: Drive,
-    detections: Sequence[ImageDetections],
-    cameras: Sequence[str],
-    options: MappingOptions,
-    recipe: str,
-    last: bool,
-) -> dict[str, MethodResult]:
-    steps = GROWTH_STEPS if last and recipe != PAPER else 0
-    return run_methods(drive, detections, cameras, options, growth_steps=steps)
 
 
 def _plain_map(markings: Sequence[Marking]) -> dict[str, Any]:

@@ -118,7 +118,8 @@ def _passed(true: tuple[Marking, ...], route_map: FloatArray) -> IntArray:
     if not true:
         return np.empty(0, dtype=np.int64)
     centres = np.array([marking.corners_map.mean(axis=0) for marking in true])
-    return np.linalg.norm(centres[:, None] - route_map[None], axis=2).argmin(axis=1).astype(np.int64)
+    away_m = np.linalg.norm(centres[:, None] - route_map[None], axis=2)
+    return np.asarray(away_m.argmin(axis=1), dtype=np.int64)
 
 
 def _matched(hd_map: HdMap, true: tuple[Marking, ...], passed: IntArray) -> Matched:

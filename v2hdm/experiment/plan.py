@@ -94,7 +94,7 @@ def jobs(config: ExperimentConfig) -> list[Job]:
     _check(config)
     options = {name: _options(config.mapping, name) for name in dict.fromkeys([OURS, *config.recipes])}
     folder = Path(config.output) / config.name / "drives"
-    found = []
+    found: list[tuple[str, int | None, Site]] = []
     for seed in config.seeds:
         for port, site in config.ports.items():
             if site.simulate is not None:

@@ -73,8 +73,8 @@ def calibrations_table(measured: Sequence[Measured]) -> tuple[list[str], list[li
         for one in drives:
             for camera, origin, errors in _extrinsics(one):
                 found.setdefault((camera, origin), []).append(errors)
-        for (camera, origin), errors in found.items():
-            degrees, centres = zip(*errors, strict=True)
+        for (camera, origin), pairs in found.items():
+            degrees, centres = ([pair[n] for pair in pairs] for n in range(2))
             lines.append([port, camera, origin, _mean(degrees, 3), _mean(centres, 1)])
     return ["port", "camera", "extrinsic of", *_EXTRINSICS], lines
 

@@ -65,7 +65,7 @@ def _view(console: Console) -> Iterator[Tell]:
         return
     columns = (
         TextColumn("{task.description:<18}"),
-        TextColumn("{task.fields[stage]:<9}"),
+        TextColumn("{task.fields[stage]:<16}"),
         BarColumn(30),
         MofNCompleteColumn(),
         TimeElapsedColumn(),

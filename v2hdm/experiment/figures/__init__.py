@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,24 +38,19 @@ def save_figures(
     first: dict[str, int] = {}
     for number, one in enumerate(measured):
         first.setdefault(one.port, number)
-    work: list[tuple[str, Callable[[Path], str | None]]] = []
+    work: dict[str, Callable[[Path], str | None]] = {}
     for port, n in first.items():
         record, one, pictures = records[n], measured[n], todo[n].folder
-        work += [
-            (f"map_{port}.png", lambda path, r=record, m=one: save_map(path, r, m)),
-            (f"eni_oni_{port}.png", lambda path, r=record, m=one: save_shift(path, r, m)),
-            (f"calibration_{port}.png", lambda path, r=record, p=pictures: save_calibration(path, r, p)),
-            (f"reprojection_{port}.png", lambda path, r=record: save_fields(path, r)),
-        ]
-    firsts = [measured[n] for n in first.values()]
-    work += [
-        ("corners.png", lambda path: save_boxes(path, firsts)),
-        ("growth.png", lambda path: save_growth(path, records)),
-        ("range.png", lambda path: save_ranges(path, records)),
-        ("bias_spread.png", lambda path: save_balance(path, measured)),
-    ]
+        work[f"map_{port}.png"] = partial(save_map, record=record, measured=one)
+        work[f"eni_oni_{port}.png"] = partial(save_shift, record=record, measured=one)
+        work[f"calibration_{port}.png"] = partial(save_calibration, record=record, pictures=pictures)
+        work[f"reprojection_{port}.png"] = partial(save_fields, record=record)
+    work["corners.png"] = partial(save_boxes, firsts=[measured[n] for n in first.values()])
+    work["growth.png"] = partial(save_growth, records=records)
+    work["range.png"] = partial(save_ranges, records=records)
+    work["bias_spread.png"] = partial(save_balance, measured=measured)
     captions = {}
-    for done, (name, draw) in enumerate(work):
+    for done, (name, draw) in enumerate(work.items()):
         tell(done, len(work))
         caption = draw(folder / name)
         if caption is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -124,8 +124,12 @@ def _growth_legend(records: Sequence[Mapping[str, Any]]) -> list[Line2D]:
         Line2D([], [], color=colour(name), marker=SIGN[name], ls=LINE[name], label=name) for name in methods
     ]
     if any(INCREMENTAL in record["growth"] for record in records):
-        look = {"color": colour("Opt"), "marker": SIGN["Opt"], "mfc": "white", "ls": (0, (2, 1))}
-        handles.append(Line2D([], [], label="Opt, incremental", **look))
+        handles.append(
+            Line2D(
+                [], [], color=colour("Opt"), marker=SIGN["Opt"], mfc="white", ls=(0, (2, 1)),
+                label="Opt, incremental",
+            )
+        )  # fmt: skip
     return handles
 
 
@@ -237,7 +241,7 @@ def _equal_errors(panels: Sequence[Axes]) -> None:
         axes.set_ylim(bottom, top)
 
 
-def _logarithmic(axes: Axes, which: str) -> None:
+def _logarithmic(axes: Axes, which: Literal["x", "y"]) -> None:
     """A logarithmic axis whose 1, 2 and 5 have labels."""
     axis = axes.xaxis if which == "x" else axes.yaxis
     (axes.set_xscale if which == "x" else axes.set_yscale)("log")

@@ -57,7 +57,7 @@ def save_map(path: Path, record: Mapping[str, Any], measured: Measured) -> str |
             inside = axes is not site
             axes.add_collection(
                 PolyCollection(
-                    mapped, facecolors="none" if inside else _OPT, edgecolors=_OPT, lw=1.4, zorder=3
+                    list(mapped), facecolors="none" if inside else _OPT, edgecolors=_OPT, lw=1.4, zorder=3
                 )
             )
         for letter, axes, (centre, half_m, text) in zip("abc", others, insets, strict=True):
@@ -103,7 +103,9 @@ def save_shift(path: Path, record: Mapping[str, Any], measured: Measured) -> str
             _draw_truth(axes, record)
             width = 0.7 if axes is site else 1.5
             for corners, colour in ((eni, _ENI), (oni, style.METHOD["ONI"])):
-                outlines = PolyCollection(corners, facecolors="none", edgecolors=colour, lw=width, zorder=3)
+                outlines = PolyCollection(
+                    list(corners), facecolors="none", edgecolors=colour, lw=width, zorder=3
+                )
                 axes.add_collection(outlines)
             axes.add_collection(LineCollection(links, colors=LINK, lw=width, ls=(0, (3, 2)), zorder=4))
         for letter, axes, (centre, half_m, text) in zip("ab", others, insets, strict=True):
@@ -187,7 +189,9 @@ def _lines(plain: Sequence[Any]) -> list[FloatArray]:
 
 def _draw_truth(axes: Axes, record: Mapping[str, Any]) -> None:
     corners = _true_corners(record)
-    axes.add_collection(PolyCollection(corners, facecolors=PAINT, edgecolors=style.TRUTH, lw=0.4, zorder=1))
+    axes.add_collection(
+        PolyCollection(list(corners), facecolors=PAINT, edgecolors=style.TRUTH, lw=0.4, zorder=1)
+    )
     axes.add_collection(LineCollection(_lines(record["true_lanes"]), colors=PAINT, lw=2.2, zorder=0.5))
 
 
