@@ -53,6 +53,7 @@ def run_door(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
         (("v2hdm.detect", "images"), "cv2"),
         (("v2hdm.check", "drive"), "cv2"),
         (("v2hdm.report", "results"), "cv2"),
+        (("v2hdm.experiment",), "torch"),
         (("v2hdm.export", "map.geojson", "--format", "csv"), "cv2"),
         (("v2hdm.calibrate", "points.csv", "--intrinsics", "a.yaml"), "torch"),
     ],
@@ -72,6 +73,7 @@ def test_an_interruption_while_libraries_are_loaded_is_one_line(
     [
         (("v2hdm.map", "+run=port2"), "torch", "map"),
         (("v2hdm.map", "+run=port2"), "kornia", "map"),
+        (("v2hdm.experiment",), "matplotlib", "map"),
         (("v2hdm.check", "drive"), "matplotlib", "map"),
         (("v2hdm.calibrate", "points.csv", "--intrinsics", "a.yaml"), "kornia", "map"),
         (("v2hdm.mosaic", "outputs/port2"), "kornia", "map"),

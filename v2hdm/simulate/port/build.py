@@ -14,7 +14,7 @@ from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import Camera, FloatArray, GeodeticOrigin, HdMap
 from v2hdm.simulate.port.alter import Alteration, alter
-from v2hdm.simulate.port.calibration import cam_from_vehicle, survey_camera
+from v2hdm.simulate.port.calibration import ManualCalibration, cam_from_vehicle, survey_camera
 from v2hdm.simulate.port.config import PortConfig
 from v2hdm.simulate.port.disturbance import DrivenPoses, drive_along
 from v2hdm.simulate.port.layout import build_layout
@@ -110,6 +110,19 @@ def _visit_seed(config: PortConfig, part: int) -> list[int]:
     return [config.seed, part, *([-1 % 2**32, config.visit] if config.visit else [])]
 
 
+def surveyed_cameras(config: PortConfig) -> dict[str, tuple[Camera, ManualCalibration]]:
+    """The cameras of a port as the mapper gets to know them, and the manual calibration of each.
+
+    Raises:
+        ConfigError: the points of the calibration cannot be used.
+    """
+    rng = np.random.default_rng([config.seed, _CALIBRATION])
+    return {
+        name: survey_camera(name, config.cameras[name], config.calibration, config.initial_ipm, rng)
+        for name in sorted(config.cameras)
+    }
+
+
 def build_port(config: PortConfig) -> Port:
     """Build a port; equal configurations give equal ports.
 
@@ -133,11 +146,7 @@ def build_port(config: PortConfig) -> Port:
     layout = build_layout(config.paint, route, stream(_LAYOUT))
     layout, alterations = alter(layout, config.altered, config.paint, route, stream(_ALTERED))
     scene = build_scene(config.surface, config.yard, route, stream(_YARD), config.seed)
-    survey = stream(_CALIBRATION)
-    cameras = {
-        name: survey_camera(name, config.cameras[name], config.calibration, config.initial_ipm, survey)
-        for name in sorted(config.cameras)
-    }
+    cameras = {name: camera for name, (camera, _) in surveyed_cameras(config).items()}
     return Port(
         config=config,
         route=route,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
@@ -55,14 +57,27 @@ def ground_points(mount: MountConfig, config: CalibrationConfig) -> FloatArray:
     )
 
 
+@dataclass(frozen=True)
+class ManualCalibration:
+    """What a manual calibration rests on, and what comes of it.
+
+    Attributes:
+        surveyed_vehicle: (N, 2) m, the points on the ground as they were measured.
+        clicked_px: (N, 2) px, the same points as they were clicked in the recorded image.
+        ipm: ``vehicle_from_pinhole_px`` (3 x 3).
+        roi_vehicle: (M, 2) m, the region that it was made for, the convex hull of the surveyed points.
+    """
+
+    surveyed_vehicle: FloatArray
+    clicked_px: FloatArray
+    ipm: FloatArray
+    roi_vehicle: FloatArray
+
+
 def calibrate(
     info: CameraInfo, mount: MountConfig, config: CalibrationConfig, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
+) -> ManualCalibration:
     """Calibrate a camera by hand: survey points on the ground, click them in the image, solve.
-
-    Returns:
-        The IPM ``vehicle_from_pinhole_px`` (3 x 3) and the region (N, 2) in the vehicle frame that it was
-        made for, the convex hull of the surveyed points.
 
     Raises:
         ConfigError: when a point lies outside the image, or the points do not determine a homography.
@@ -84,7 +99,9 @@ def calibrate(
     if pinhole_from_vehicle is None:
         raise ConfigError("calibration.points_ahead_m: these points do not fix a homography; spread them out")
     ipm = np.linalg.inv(pinhole_from_vehicle)
-    return np.asarray(ipm / np.linalg.norm(ipm)), convex_hull(surveyed)
+    return ManualCalibration(
+        surveyed, clicked_px, np.asarray(ipm / np.linalg.norm(ipm)), convex_hull(surveyed)
+    )
 
 
 def survey_camera(
@@ -93,17 +110,21 @@ def survey_camera(
     calibration: CalibrationConfig,
     initial_ipm: str,
     rng: np.random.Generator,
-) -> Camera:
-    """What the mapper gets to know of a camera: two IPMs, a region, a surveyed centre."""
+) -> tuple[Camera, ManualCalibration]:
+    """What the mapper gets to know of a camera: two IPMs, a region, a surveyed centre.
+
+    Beside it the vehicle's own manual calibration, of which the mapper knows no more than the IPM.
+    """
     info = camera_info(name, config)
-    own, own_roi = calibrate(info, config.mount, calibration, rng)
-    borrowed, borrowed_roi = calibrate(info, config.borrowed_mount, calibration, rng)
+    own = calibrate(info, config.mount, calibration, rng)
+    borrowed = calibrate(info, config.borrowed_mount, calibration, rng)
     centre = np.array([config.mount.x_m, config.mount.y_m, config.mount.z_m])
     sigma = np.full(3, calibration.centre_sigma_m)
-    return Camera(
+    camera = Camera(
         info=info,
-        ipm={"calibrated": own, "estimated": borrowed},
+        ipm={"calibrated": own.ipm, "estimated": borrowed.ipm},
         initial_ipm=initial_ipm,
-        roi_vehicle=own_roi if initial_ipm == "calibrated" else borrowed_roi,
+        roi_vehicle=own.roi_vehicle if initial_ipm == "calibrated" else borrowed.roi_vehicle,
         centre_prior=CentrePrior(centre + rng.normal(0.0, sigma), sigma),
     )
+    return camera, own

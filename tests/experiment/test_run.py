@@ -1,0 +1,111 @@
+"""An experiment that was stopped goes on; one that is finished draws everything from what it has kept."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.experiment.scene import CALIBRATED, ESTIMATED, experiment, keep, record
+from tests.mapping.scene import SceneOptions, make_scene
+from v2hdm.errors import DriveError
+from v2hdm.experiment.drive import drive_record, recipe_file
+from v2hdm.experiment.plan import ExperimentConfig, jobs
+from v2hdm.experiment.residuals import residuals
+from v2hdm.experiment.run import run_experiment
+from v2hdm.experiment.stored import detections_of, key_of, plain_detections, store, stored
+from v2hdm.mapping.methods import run_methods
+from v2hdm.records import HdMap, Truth
+
+
+def finished(output: Path) -> ExperimentConfig:
+    """An experiment whose drives are finished, and nowhere to be read again."""
+    config = experiment(str(output))
+    for job, start in zip(jobs(config), (CALIBRATED, ESTIMATED), strict=True):
+        keep(job, record(job.port, job.seed, start))
+        cv2.imwrite(str(job.folder / "front.jpg"), np.full((480, 640, 3), 90, np.uint8))
+    return config
+
+
+def test_finished_drives_are_never_opened_again(tmp_path: Path) -> None:
+    folder, measured = run_experiment(finished(tmp_path), "name: x\n", lambda *_: None)
+    assert [one.title for one in measured] == ["port1", "port2"]
+    captions = (folder / "figures.md").read_text()
+    pictures = sorted(path.name for path in folder.glob("*.png"))
+    of_ports = ("map", "eni_oni", "calibration", "reprojection")
+    expected = {f"{kind}_{port}.png" for kind in of_ports for port in ("port1", "port2")}
+    assert set(pictures) == expected | {"corners.png", "growth.png", "range.png", "bias_spread.png"}
+    for name in pictures:
+        assert f"![{name}]({name})" in captions
+        image = cv2.imread(str(folder / name))
+        assert len(np.unique(image.reshape(-1, 3), axis=0)) > 10
+    assert "All 14 figures agree" in (folder / "experiment.md").read_text()
+
+
+def test_another_setting_takes_nothing_from_an_earlier_run(tmp_path: Path) -> None:
+    config = finished(tmp_path)
+    config.mapping.max_range_m = 12.0
+    with pytest.raises(DriveError, match="absent"):
+        run_experiment(config, "", lambda *_: None)
+
+
+def test_the_files_of_a_drive_make_up_its_record(tmp_path: Path) -> None:
+    job, expected = jobs(finished(tmp_path))[0], record("port1", None, CALIBRATED)
+    found = drive_record(job, 1, lambda *_: None)
+    assert {key: found[key] for key in expected if key != "extrinsics"} == {
+        key: expected[key] for key in expected if key != "extrinsics"
+    }
+    assert {recipe: one for recipe, one in found["extrinsics"].items() if one} == expected["extrinsics"]
+
+
+def test_only_the_recipe_that_is_missing_is_mapped_anew(tmp_path: Path) -> None:
+    config = finished(tmp_path)
+    (jobs(config)[0].folder / recipe_file("incremental")).unlink()
+    config.recipes = ["paper"]
+    assert drive_record(jobs(config)[0], 1, lambda *_: None)["port"] == "port1"
+    config.recipes = ["paper", "incremental"]
+    with pytest.raises(DriveError, match="absent"):
+        drive_record(jobs(config)[0], 1, lambda *_: None)
+
+
+def test_detections_come_back_exactly(tmp_path: Path) -> None:
+    found = make_scene(SceneOptions(length_m=20.0)).detections
+    store(tmp_path / "found.json.gz", "key", plain_detections(found))
+    content = stored(tmp_path / "found.json.gz", "key")
+    assert content is not None
+    for one, other in zip(found, detections_of(content), strict=True):
+        assert one.image == other.image
+        for a, b in zip(one.markings, other.markings, strict=True):
+            assert (a.kind, a.score) == (b.kind, b.score)
+            for name in ("corners_px", "covariance_px", "corner_valid", "outline_px"):
+                np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+        for c, d in zip(one.lanes, other.lanes, strict=True):
+            np.testing.assert_array_equal(c.points_px, d.points_px)
+
+
+@pytest.mark.parametrize("damage", ["cut", "text", "other"])
+def test_a_damaged_file_or_one_of_another_key_counts_as_absent(damage: str, tmp_path: Path) -> None:
+    path = tmp_path / "found.json.gz"
+    store(path, key_of(1), {"a": 1})
+    assert stored(path, key_of(1)) == {"a": 1}
+    if damage == "cut":
+        path.write_bytes(path.read_bytes()[:-9])
+    elif damage == "text":
+        path.write_bytes(gzip.compress(b"[1]"))
+    assert stored(path, key_of(2) if damage == "other" else key_of(1)) is None
+
+
+def test_residuals_and_errors_fall_to_the_noise_under_the_optimised_calibration() -> None:
+    """0.25 px of noise in the corners, 1.5 degrees and 0.3 m in the first IPMs."""
+    scene = make_scene(SceneOptions(length_m=60.0, jitter_deg=0.02, heading_deg=0.01, rtk_m=0.002))
+    methods = run_methods(scene.drive, scene.detections, ("front", "rear"))
+    poses = np.array([image.map_from_vehicle for image in scene.drive.images])
+    truth = Truth(HdMap(tuple(scene.markings)), scene.cam_from_vehicle, poses, np.empty((0, 0)), (), {})
+    for found in residuals(scene.drive, scene.detections, methods, truth).values():
+        assert found["field"]["before"]["length_px"] > 5.0
+        assert found["field"]["after"]["length_px"] < 1.0
+        medians_m = np.array([bin_[2] for bin_ in found["range"]["Opt"]])
+        assert np.median(medians_m) < 0.03

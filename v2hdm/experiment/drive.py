@@ -1,0 +1,249 @@
+"""One drive of an experiment: read or rendered, detected, mapped by every recipe, held against the truth.
+
+Everything that tables, figures and words need of it is kept as plain content, a file for each recipe, so
+that a finished drive is never opened again.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from v2hdm import __version__
+from v2hdm.detection.batch import detect_all
+from v2hdm.drive import read_drive
+from v2hdm.drive.truth import read_truth
+from v2hdm.errors import AdjustError, MappingError
+from v2hdm.experiment.plan import OURS, PAPER, Job
+from v2hdm.experiment.residuals import residuals
+from v2hdm.experiment.stored import (
+    detections_of,
+    key_of,
+    network_key,
+    plain_detections,
+    store,
+    stored,
+)
+from v2hdm.geometry.ipm import extrinsic_from_ipm
+from v2hdm.mapping.methods import NAIVE_IPMS, run_methods
+from v2hdm.mapping.results import MethodResult
+from v2hdm.pipeline.inspect import Inspection, inspect
+from v2hdm.pipeline.run import camera_sets
+from v2hdm.records import Drive, HdMap, ImageDetections, Marking, Truth
+from v2hdm.report.evaluation import growth_figures
+from v2hdm.report.metrics import driven_past, extrinsic_metrics
+from v2hdm.simulate import rendered_drive, surveyed_cameras
+
+Tell = Callable[[str, int, int], None]
+"""Told a stage, and how many of its steps are done, of how many."""
+
+SETTING_FILE = "drive.json.gz"
+DETECTIONS_FILE = "detections.json.gz"
+GROWTH_STEPS = 8
+"""Sizes of the growing map at which its error is told."""
+
+_LAYOUT = 3
+"""Raised whenever what the files hold changes."""
+
+
+def setting_key(job: Job) -> str:
+    """The key of what a drive is before it is mapped."""
+    return key_of(_LAYOUT, __version__, job.site)
+
+
+def recipe_key(job: Job, recipe: str) -> str:
+    """The key of all that a drive's maps under a recipe are made from."""
+    return key_of(setting_key(job), job.detector, network_key(job.detector), job.options[recipe])
+
+
+def recipe_file(recipe: str) -> str:
+    """Name of the file with a drive's maps under a recipe."""
+    return f"{recipe}.json.gz"
+
+
+def drive_record(job: Job, workers: int, tell: Tell) -> dict[str, Any]:
+    """What is known of a drive and of its maps, from disk or found now and kept there.
+
+    Args:
+        job: the drive.
+        workers: processes to render and detect in; 1 stays in this one.
+        tell: told how far each stage is.
+
+    Raises:
+        V2hdmError: the drive cannot be rendered, read or looked at, or has no truth.
+    """
+    if _setting_and_maps(job) is None:
+        _find(job, workers, tell)
+    known = _setting_and_maps(job)
+    assert known is not None
+    tell("finished", 1, 1)
+    return _together(*known)
+
+
+def _setting_and_maps(job: Job) -> tuple[dict[str, Any], dict[str, dict[str, Any]]] | None:
+    """What is on disk: the drive, and its maps by recipe; None where something is missing."""
+    setting = stored(job.folder / SETTING_FILE, setting_key(job))
+    maps = {
+        recipe: found
+        for recipe in job.options
+        if (found := stored(job.folder / recipe_file(recipe), recipe_key(job, recipe))) is not None
+    }
+    return None if setting is None or len(maps) < len(job.options) else (setting, maps)
+
+
+def _together(setting: Mapping[str, Any], maps: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """One record of a drive and its maps under all recipes."""
+    return {
+        **setting,
+        "maps": {
+            name: {row: one for found in maps.values() for row, one in found["maps"].get(name, {}).items()}
+            for name in setting["expected"]
+        },
+        "growth": {recipe: found["growth"] for recipe, found in maps.items() if found["growth"]},
+        "extrinsics": {recipe: found["extrinsics"] for recipe, found in maps.items()},
+        "failures": [[recipe, *one] for recipe, found in maps.items() for one in found["failures"]],
+        "lanes": maps[OURS]["lanes"],
+        "residuals": maps[OURS]["residuals"],
+    }
+
+
+def _find(job: Job, workers: int, tell: Tell) -> None:
+    """Open the drive, and map it by those recipes whose maps are missing."""
+    if job.site.simulate is not None:
+        folder = rendered_drive(job.site.simulate, job.cache, workers, partial(tell, "render"))
+    else:
+        folder = Path(job.site.drive.path or "")
+    drive = read_drive(folder, job.site.drive)
+    truth = read_truth(drive)
+    store(job.folder / SETTING_FILE, setting_key(job), _setting(job, drive, truth))
+    inspection = inspect(drive, job.site.drive.max_gap_s, workers, partial(tell, "check"))
+    detections = _detections(job, inspection.drive, workers, tell)
+    for recipe in job.options:
+        path, key = job.folder / recipe_file(recipe), recipe_key(job, recipe)
+        if stored(path, key) is None:
+            store(path, key, _mapped(job, recipe, inspection, detections, truth, tell))
+
+
+def _detections(job: Job, drive: Drive, workers: int, tell: Tell) -> list[ImageDetections]:
+    key = key_of(__version__, job.detector, network_key(job.detector), str(drive.root.resolve()))
+    path = job.folder / DETECTIONS_FILE
+    content = stored(path, key)
+    if content is None:
+        found = detect_all(drive, job.detector, workers, partial(tell, "detect"))
+        store(path, key, plain_detections(found))
+        return found
+    return detections_of(content)
+
+
+def _setting(job: Job, drive: Drive, truth: Truth) -> dict[str, Any]:
+    """The drive itself: truth, route, cameras, and one image of each."""
+    job.folder.mkdir(parents=True, exist_ok=True)
+    sets = camera_sets(drive)
+    manual = {} if job.site.simulate is None else surveyed_cameras(job.site.simulate)
+    cameras = {}
+    for name, camera in drive.cameras.items():
+        images = [image for image in drive.images if image.camera == name]
+        if not images:
+            continue
+        picture = f"{name}{images[len(images) // 2].path.suffix}"
+        shutil.copyfile(images[len(images) // 2].path, job.folder / picture)
+        clicks = manual[name][1] if name in manual else None
+        cameras[name] = {
+            "picture": picture,
+            "info": asdict(camera.info),
+            "roi_vehicle": camera.roi_vehicle,
+            "initial_ipm": camera.initial_ipm,
+            "ipm": dict(camera.ipm),
+            "true_cam_from_vehicle": truth.cam_from_vehicle[name],
+            "clicked_px": None if clicks is None else clicks.clicked_px,
+            "surveyed_vehicle": None if clicks is None else clicks.surveyed_vehicle,
+        }
+    return {
+        "port": job.port,
+        "seed": job.seed,
+        "cameras": cameras,
+        "truth": _plain_map(truth.map.markings),
+        "true_lanes": [lane.points_map for lane in truth.map.lanes],
+        "route": np.array([image.map_from_vehicle[:2, 3] for image in drive.images]),
+        "expected": {name: driven_past(drive, truth, members) for name, members in sets.items()},
+    }
+
+
+def _mapped(
+    job: Job,
+    recipe: str,
+    inspection: Inspection,
+    detections: Sequence[ImageDetections],
+    truth: Truth,
+    tell: Tell,
+) -> dict[str, Any]:
+    """Maps, growth and extrinsics of a drive under a recipe; under ours residuals, too."""
+    drive = inspection.drive
+    sets = camera_sets(drive)
+    out: dict[str, Any] = {
+        "maps": {}, "growth": {}, "extrinsics": {}, "failures": [], "lanes": {}, "residuals": {},
+    }  # fmt: skip
+    for done, (name, members) in enumerate(sets.items()):
+        tell(f"map, {recipe}", done, len(sets))
+        last = name == list(sets)[-1]
+        steps = GROWTH_STEPS if last and recipe != PAPER else 0
+        try:
+            methods = run_methods(drive, detections, members, job.options[recipe], growth_steps=steps)
+        except (MappingError, AdjustError) as failure:
+            out["failures"].append([name, str(failure)])
+            continue
+        rows = {row_of(method, recipe): result for method, result in methods.items()}
+        out["maps"][name] = {row: _plain_map(one.hd_map.markings) for row, one in rows.items() if row}
+        out["extrinsics"][name] = _extrinsics(drive, methods, truth)
+        if last and methods["Opt"].growth:
+            out["growth"] = _growth(methods, truth)
+        if last and recipe == OURS:
+            out["lanes"] = {"Opt": [lane.points_map for lane in methods["Opt"].hd_map.lanes]}
+            out["residuals"] = residuals(inspection.drive_as_described, detections, methods, truth)
+    tell(f"map, {recipe}", len(sets), len(sets))
+    return out
+
+
+def row_of(method: str, recipe: str) -> str | None:
+    """The row of the tables that a method's result under a recipe belongs to, None where it repeats one."""
+    if recipe == OURS:
+        return method
+    return None if method in NAIVE_IPMS else f"{method}, {recipe}"
+
+
+def _plain_map(markings: Sequence[Marking]) -> dict[str, Any]:
+    return {
+        "kinds": [marking.kind for marking in markings],
+        "corners": [marking.corners_map for marking in markings],
+        "sightings": [marking.sightings for marking in markings],
+    }
+
+
+def _growth(methods: Mapping[str, MethodResult], truth: Truth) -> dict[str, Any]:
+    """Number of markings and corner RMSE (m) while the map grows, by method."""
+    steps = methods["Opt"].growth
+    growth = {"Opt": growth_figures([HdMap(step.markings) for step in steps], truth)}
+    for name in NAIVE_IPMS:
+        if name in methods:
+            markings = methods[name].hd_map.markings
+            growth[name] = growth_figures([HdMap(markings[: len(step.markings)]) for step in steps], truth)
+    return growth
+
+
+def _extrinsics(drive: Drive, methods: Mapping[str, MethodResult], truth: Truth) -> dict[str, Any]:
+    """By camera and method, how far the extrinsic is from the truth: deg and m."""
+    out: dict[str, Any] = {}
+    for name, found in methods["Opt"].calibrations.items():
+        camera, true = drive.cameras[name], truth.cam_from_vehicle[name]
+        poses = {"Opt": found.cam_from_vehicle}
+        for method, ipm in NAIVE_IPMS.items():
+            if ipm in camera.ipm:
+                poses[method] = extrinsic_from_ipm(camera.info, camera.ipm[ipm])
+        out[name] = {method: asdict(extrinsic_metrics(pose, true)) for method, pose in poses.items()}
+    return out

@@ -1,0 +1,253 @@
+"""Errors as curves: marking by marking, while the map grows, over range, and bias against spread."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.lines import Line2D
+
+from v2hdm.experiment.figures.look import LINE, SIGN, colour
+from v2hdm.experiment.measures import Matched, Measured
+from v2hdm.experiment.plan import OURS, PAPER
+from v2hdm.experiment.tables import by_port
+from v2hdm.mapping.options import INCREMENTAL
+from v2hdm.report import style
+
+_GRID = "#e6eaed"
+_BOX = "#7fb8b4"
+_TOP_PERCENTILE = 99.5
+"""Percentile of the corner errors at which a panel of boxes ends: one bad corner would flatten the rest."""
+
+_EQUAL_CM = (0.5, 1, 2, 5, 10, 20, 50, 100)
+
+
+def save_boxes(path: Path, firsts: Sequence[Measured]) -> str | None:
+    """Draw the four corner errors of each marking and their running mean; returns the caption."""
+    sets = list(dict.fromkeys(cameras for one in firsts for cameras in one.matched))
+    beyond = 0
+    with style.figure(path, 8.0 * len(firsts), 3.1 * len(sets)) as fig:
+        panels = fig.subplots(len(sets), len(firsts), squeeze=False)
+        for column, one in enumerate(firsts):
+            for row, cameras in enumerate(sets):
+                found = one.matched.get(cameras, {}).get("Opt")
+                if found is None or not len(found.true):
+                    panels[row, column].set_axis_off()
+                    continue
+                beyond += _draw_boxes(panels[row, column], found)
+                panels[row, column].set_title(f"{one.title}: Opt, {cameras}, {len(found.true)} markings")
+        drawn = next((axes for axes in panels.flat if axes.axison), None)
+        if drawn is not None:
+            fig.legend(handles=drawn.get_legend_handles_labels()[0], loc="outside lower center", ncols=3)
+    return (
+        "Errors of the four corners of each marking (Opt; cm), in the order in which the vehicle passed "
+        "them: box from the lower to the upper quartile, whiskers from the least to the largest of the "
+        "four. The dark line is the running mean over all corners so far, its last value written beside "
+        "it. See how soon it settles, and whether errors run together along the route: those drift with "
+        f"the receiver. {beyond} of all corners lie above the top of their panel."
+    )
+
+
+def _draw_boxes(axes: Axes, found: Matched) -> int:
+    """One panel; returns how many corners lie above it."""
+    error_cm = 100 * np.linalg.norm(found.errors_m, axis=2)
+    low, lower, upper, high = np.percentile(error_cm, [0, 25, 75, 100], axis=1)
+    number = np.arange(1, len(error_cm) + 1)
+    for bottom, top, width, tint, name in (
+        (low, high, 0.7, _BOX, "least to largest"),
+        (lower, upper, 2.6, _BOX, "quartiles"),
+    ):
+        lines = np.stack([np.column_stack([number, bottom]), np.column_stack([number, top])], axis=1)
+        axes.add_collection(LineCollection(list(lines), colors=tint, lw=width))
+        axes.plot([], [], color=tint, lw=width, label=name)
+    mean = error_cm.mean(axis=1).cumsum() / number
+    axes.plot(number, mean, color="#14302e", lw=1.8, label="running mean")
+    axes.annotate(
+        f"{mean[-1]:.1f} cm", (number[-1], mean[-1]), xytext=(4, 0), textcoords="offset points", va="center"
+    )
+    top = float(np.percentile(error_cm, _TOP_PERCENTILE))
+    axes.set_xlim(0, len(number) + 1)
+    axes.set_ylim(0, 1.05 * top)
+    axes.grid(axis="y", color=_GRID)
+    axes.set_axisbelow(True)
+    axes.set_xlabel("marking, in the order of the route")
+    axes.set_ylabel("corner error (cm)")
+    return int((error_cm > 1.05 * top).sum())
+
+
+def save_growth(path: Path, records: Sequence[Mapping[str, Any]]) -> str | None:
+    """Draw the error against the size of the growing map, batch and incremental; returns the caption."""
+    ports = list(dict.fromkeys(record["port"] for record in records))
+    if not any(record["growth"] for record in records):
+        return None
+    with style.figure(path, 6.4 * len(ports), 4.6) as fig:
+        panels = fig.subplots(1, len(ports), squeeze=False, sharey=True)[0]
+        for axes, port in zip(panels, ports, strict=True):
+            for record in records:
+                if record["port"] == port:
+                    _draw_growth(axes, record["growth"])
+            _logarithmic(axes, "y")
+            _logarithmic(axes, "x")
+            axes.set_xlabel("markings mapped so far")
+            axes.set_ylabel("corner RMSE (cm)")
+            axes.set_title(f"{port}: the error while the map grows")
+        fig.legend(handles=_growth_legend(records), loc="outside lower center", ncols=5)
+    return (
+        "Corner RMSE (cm) over the first markings of a drive, all cameras, a line per seed. Opt is solved "
+        "anew at each size, from what the drive has shown of the first markings; 'incremental' is the "
+        "same for the map that was grown marking by marking. CNI and ENI keep a marking as it was when it "
+        "was passed. See at which size Opt falls below CNI."
+    )
+
+
+def _draw_growth(axes: Axes, growth: Mapping[str, Any]) -> None:
+    for recipe, by_method in growth.items():
+        for method, points in by_method.items():
+            if not points or (recipe != OURS and method != "Opt"):
+                continue
+            counts, errors = np.array(points, dtype=np.float64).T
+            incremental = recipe == INCREMENTAL
+            axes.plot(
+                counts, 100 * errors, marker=SIGN[method], ms=5, lw=1.3, color=colour(method),
+                ls=(0, (2, 1)) if incremental else LINE[method],
+                mfc="white" if incremental else colour(method),
+            )  # fmt: skip
+
+
+def _growth_legend(records: Sequence[Mapping[str, Any]]) -> list[Line2D]:
+    methods = dict.fromkeys(name for record in records for name in record["growth"].get(OURS, {}))
+    handles = [
+        Line2D([], [], color=colour(name), marker=SIGN[name], ls=LINE[name], label=name) for name in methods
+    ]
+    if any(INCREMENTAL in record["growth"] for record in records):
+        handles.append(
+            Line2D(
+                [], [], color=colour("Opt"), marker=SIGN["Opt"], mfc="white", ls=(0, (2, 1)),
+                label="Opt, incremental",
+            )
+        )  # fmt: skip
+    return handles
+
+
+def save_ranges(path: Path, records: Sequence[Mapping[str, Any]]) -> str | None:
+    """Draw the error of single sightings against their range; returns the caption."""
+    known = [record for record in records if record.get("residuals")]
+    if not known:
+        return None
+    ports = list(dict.fromkeys(record["port"] for record in known))
+    cameras = list(dict.fromkeys(name for record in known for name in record["residuals"]))
+    with style.figure(path, 5.6 * len(cameras), 4.0 * len(ports)) as fig:
+        panels = fig.subplots(len(ports), len(cameras), squeeze=False, sharex=True, sharey=True)
+        for row, port in enumerate(ports):
+            for column, camera in enumerate(cameras):
+                axes = panels[row, column]
+                found = [
+                    r["residuals"][camera]["range"]
+                    for r in known
+                    if r["port"] == port and camera in r["residuals"]
+                ]
+                _draw_ranges(axes, found)
+                _logarithmic(axes, "y")
+                axes.set_xlabel("distance of the corner from the camera (m)")
+                axes.set_ylabel("error on the ground (cm)")
+                axes.set_title(f"{port}, {camera}")
+        handles = [
+            Line2D([], [], color=colour(name), marker=SIGN[name], ls=LINE[name], label=name) for name in SIGN
+        ]
+        fig.legend(handles=handles, loc="outside lower center", ncols=4)
+    return (
+        "How far a corner of a single sighting, laid on the ground, is from the true one (cm), by its "
+        "distance from the camera (m): median, with the quartiles as a band; each the mean of the seeds'. "
+        "CNI, ENI and ONI lay it by their IPM and the recorded pose, Opt by its extrinsic and the "
+        "adjusted pose. See that the naive methods grow with range even under a right calibration, since "
+        "pitch and heading of the recorded poses err, and that the adjusted poses take most of that away."
+    )
+
+
+def _draw_ranges(axes: Axes, found: Sequence[Mapping[str, Any]]) -> None:
+    for method in SIGN:
+        bins: dict[float, list[list[float]]] = {}
+        for one in found:
+            for middle, *quartiles, _ in one.get(method, []):
+                bins.setdefault(middle, []).append(quartiles)
+        if not bins:
+            continue
+        middle = np.array(sorted(bins))
+        lower, median, upper = 100 * np.array([np.mean(bins[m], axis=0) for m in middle]).T
+        axes.plot(middle, median, marker=SIGN[method], ms=4, color=colour(method), ls=LINE[method])
+        axes.fill_between(middle, lower, upper, color=colour(method), alpha=0.13, lw=0)
+
+
+def save_balance(path: Path, measured: Sequence[Measured]) -> str | None:
+    """Draw bias against spread of every map; returns the caption."""
+    ports = by_port(measured)
+    sets = list(dict.fromkeys(cameras for one in measured for cameras in one.rows))
+    signs = dict(zip(sets, ("<", ">", "o", "s", "D", "^"), strict=False))
+    shown = ("CNI", "ENI", "Opt", "ONI", f"Opt, {PAPER}")
+    with style.figure(path, 6.2 * len(ports), 6.2) as fig:
+        panels = fig.subplots(1, len(ports), squeeze=False, sharex=True, sharey=True)[0]
+        for axes, (port, drives) in zip(panels, ports.items(), strict=True):
+            for one in drives:
+                for cameras, rows in one.rows.items():
+                    for name in shown:
+                        if name in rows and rows[name].spread_m > 0:
+                            axes.plot(
+                                100 * rows[name].spread_m, 100 * rows[name].bias_m, signs.get(cameras, "o"),
+                                color=colour(name), ms=7, mfc="white" if PAPER in name else colour(name),
+                            )  # fmt: skip
+            _logarithmic(axes, "x")
+            _logarithmic(axes, "y")
+            axes.set_xlabel("spread of the corner errors (cm)")
+            axes.set_ylabel("bias: length of the mean error (cm)")
+            axes.set_title(f"{port}: bias against spread")
+        _equal_errors(panels)
+        handles = [
+            Line2D([], [], color=colour(name), lw=0, marker="o", label=name,
+                   mfc="white" if PAPER in name else colour(name))
+            for name in shown if any(name in rows for one in measured for rows in one.rows.values())
+        ]  # fmt: skip
+        handles += [
+            Line2D([], [], color="k", lw=0, marker=signs[name], mfc="none", label=name) for name in signs
+        ]
+        handles.append(Line2D([], [], color=style.TRUTH, ls=":", label="equal RMSE"))
+        fig.legend(handles=handles, loc="outside lower center", ncols=5)
+    return (
+        "Bias against spread of the corner errors (cm), a sign per seed: colour is the method, shape the "
+        "cameras, hollow the paper's recipe; dotted lines join points of equal RMSE. Bias moves the whole "
+        "map, as a wrong calibration or the receiver's drift do; spread is what is left. See how far the "
+        "optimisation moves the points to the left and down, and which of the two is what remains."
+    )
+
+
+def _equal_errors(panels: Sequence[Axes]) -> None:
+    """Dotted lines of equal RMSE within the limits that the points have set."""
+    for axes in panels:
+        (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+        for value in _EQUAL_CM:
+            spread = np.geomspace(left, min(value * 0.99999, right), 200) if left < value else np.empty(0)
+            bias = np.sqrt(value**2 - spread**2)
+            inside = (bias >= bottom) & (bias <= top)
+            if inside.sum() > 1:
+                axes.plot(spread[inside], bias[inside], ":", color=style.TRUTH, lw=1, zorder=0)
+                axes.annotate(
+                    f"{value:g}", (spread[inside][0], bias[inside][0]), color=style.TRUTH, fontsize=8,
+                    xytext=(2, -9), textcoords="offset points",
+                )  # fmt: skip
+        axes.set_xlim(left, right)
+        axes.set_ylim(bottom, top)
+
+
+def _logarithmic(axes: Axes, which: Literal["x", "y"]) -> None:
+    """A logarithmic axis whose 1, 2 and 5 have labels."""
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    (axes.set_xscale if which == "x" else axes.set_yscale)("log")
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.set_minor_formatter(
+        lambda value, _: f"{value:g}" if f"{value:g}".lstrip("0.")[:1] in ("2", "5") else ""
+    )
+    axes.grid(axis=which, which="both", color=_GRID)
+    axes.set_axisbelow(True)

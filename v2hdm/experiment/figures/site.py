@@ -1,0 +1,213 @@
+"""The site from above: the map over the truth with insets, and ENI against ONI corner by corner."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
+
+from v2hdm.experiment.figures.look import LINK, PAINT, drive_of
+from v2hdm.experiment.measures import Matched, Measured
+from v2hdm.records import FloatArray
+from v2hdm.report import style
+
+_SITE_IN = 9.0
+"""Longer side of the site."""
+
+_INSET_IN = 3.4
+_BESIDE_M = 12.0
+_OPT, _LANE = style.METHOD["Opt"], style.METHOD["ONI"]
+
+_NEAR_M, _FAR_M = 1.0, 6.0
+"""Half the width of an inset: of one that shows a corner's error, and of one that shows a neighbourhood."""
+
+_LETTERS = {"a": (2, (3, 1)), "b": (0, (-9, -9)), "c": (3, (-9, 1))}
+"""Of each inset the corner of its square that its letter stands at, and how far from it (pt)."""
+
+_ENI = "#3a3f44"
+"""ENI's outlines, where its own red is that of the correspondences."""
+
+
+def save_map(path: Path, record: Mapping[str, Any], measured: Measured) -> str | None:
+    """Draw the optimised map over the truth, with three insets; returns the caption."""
+    cameras = list(measured.matched)[-1]
+    found = measured.matched[cameras].get("Opt")
+    if found is None or not len(found.true):
+        return None
+    mapped = _corners(record, found)[1]
+    error_cm = 100 * np.linalg.norm(found.errors_m, axis=2)
+    mean_cm = error_cm.mean(axis=1)
+    median, (worst, corner) = int(np.argsort(mean_cm)[len(mean_cm) // 2]), divmod(int(error_cm.argmax()), 4)
+    insets = [
+        (_crowd(mapped.mean(axis=1), _FAR_M), _FAR_M, "most markings together"),
+        (mapped[median].mean(axis=0), _NEAR_M, f"a usual one, {mean_cm[median]:.1f} cm off"),
+        (mapped[worst, corner], _NEAR_M, f"the worst corner, {error_cm.max():.1f} cm off"),
+    ]
+    lanes = _lines(record["lanes"].get("Opt", []))
+    with style.figure(path, *_size_in(record, len(insets))) as fig:
+        site, others = _axes(fig, record, len(insets))
+        for axes in (site, *others):
+            _draw_truth(axes, record)
+            axes.add_collection(LineCollection(lanes, colors=_LANE, lw=1.0, zorder=2))
+            inside = axes is not site
+            axes.add_collection(
+                PolyCollection(
+                    list(mapped), facecolors="none" if inside else _OPT, edgecolors=_OPT, lw=1.4, zorder=3
+                )
+            )
+        for letter, axes, (centre, half_m, text) in zip("abc", others, insets, strict=True):
+            _frame(site, axes, centre, half_m, letter)
+            axes.set_title(f"{letter}: {text}", fontsize=10)
+        site.set_title(f"{drive_of(record)}: Opt, {cameras}, {len(mapped)} markings over the truth")
+        site.plot([], [], color=style.ROUTE, lw=5, label="route")
+        site.fill([], [], facecolor=PAINT, edgecolor=style.TRUTH, label="truth")
+        site.fill([], [], facecolor=_OPT, edgecolor=_OPT, label="mapped marking")
+        site.plot([], [], color=_LANE, lw=1.0, label="mapped lane line")
+        fig.legend(handles=site.get_legend_handles_labels()[0], loc="outside lower center", ncols=4)
+    return (
+        f"The map of {drive_of(record)} (Opt, cameras: {cameras}) in teal over the true paint in grey; "
+        "lanes in blue; east and north in m. The insets are the places marked on the map: a shows the "
+        f"most markings together, b, 2 m wide, one of the median error ({mean_cm[median]:.1f} cm on "
+        f"average over its corners), c, as wide, the worst corner of all ({error_cm.max():.1f} cm). See "
+        "that in b the outline runs along the edge of the paint, and how far it leaves it in c. True "
+        "markings without an outline were not mapped."
+    )
+
+
+def save_shift(path: Path, record: Mapping[str, Any], measured: Measured) -> str | None:
+    """Draw ENI against ONI with corner correspondences; returns the caption."""
+    cameras = list(measured.matched)[-1]
+    before, after = (measured.matched[cameras].get(name) for name in ("ENI", "ONI"))
+    if before is None or after is None:
+        return None
+    common, rows, columns = np.intersect1d(before.true, after.true, return_indices=True)
+    if not len(common):
+        return None
+    eni, oni = _corners(record, before)[1][rows], _corners(record, after)[1][columns]
+    true = _true_corners(record)[common]
+    error_cm = [100 * np.sqrt(((corners - true) ** 2).sum(axis=2).mean()) for corners in (eni, oni)]
+    links = list(np.stack([eni.reshape(-1, 2), oni.reshape(-1, 2)], axis=1))
+    moved = np.linalg.norm(eni - oni, axis=2).mean(axis=1)
+    insets = [
+        (_crowd(true.mean(axis=1), _FAR_M), _FAR_M, "most markings together"),
+        (true[moved.argmax()].mean(axis=0), _FAR_M / 2, f"moved the most, by {100 * moved.max():.0f} cm"),
+    ]
+    with style.figure(path, *_size_in(record, len(insets))) as fig:
+        site, others = _axes(fig, record, len(insets))
+        for axes in (site, *others):
+            _draw_truth(axes, record)
+            width = 0.7 if axes is site else 1.5
+            for corners, colour in ((eni, _ENI), (oni, style.METHOD["ONI"])):
+                outlines = PolyCollection(
+                    list(corners), facecolors="none", edgecolors=colour, lw=width, zorder=3
+                )
+                axes.add_collection(outlines)
+            axes.add_collection(LineCollection(links, colors=LINK, lw=width, ls=(0, (3, 2)), zorder=4))
+        for letter, axes, (centre, half_m, text) in zip("ab", others, insets, strict=True):
+            _frame(site, axes, centre, half_m, letter)
+            axes.set_title(f"{letter}: {text}", fontsize=10)
+        site.set_title(f"{drive_of(record)}: ENI against ONI, {cameras}")
+        site.plot([], [], color=_ENI, label="ENI")
+        site.plot([], [], color=style.METHOD["ONI"], label="ONI")
+        site.plot([], [], color=LINK, ls=(0, (3, 2)), label="the same corner")
+        site.fill([], [], facecolor=PAINT, edgecolor=style.TRUTH, label="truth")
+        fig.legend(handles=site.get_legend_handles_labels()[0], loc="outside lower center", ncols=4)
+    return (
+        f"The naive map of {drive_of(record)} (cameras: {cameras}) under the borrowed IPM (ENI, black) and "
+        f"under the IPM that the optimisation found (ONI, blue), for the {len(common)} markings that both "
+        "have; a red dashed line joins the two places of each corner. East and north in m; the insets are "
+        f"the squares on the map. ENI is {error_cm[0]:.1f} cm off (RMSE), ONI {error_cm[1]:.1f} cm. See "
+        "that the lines of neighbours run alike and turn with the vehicle: the error is one of the "
+        "calibration, not of single sightings."
+    )
+
+
+def _true_corners(record: Mapping[str, Any]) -> FloatArray:
+    return np.array(record["truth"]["corners"]).reshape(-1, 4, 2)
+
+
+def _corners(record: Mapping[str, Any], found: Matched) -> tuple[FloatArray, FloatArray]:
+    """True and mapped corners (M, 4, 2) of matched markings, in the same order."""
+    true = _true_corners(record)[found.true]
+    return true, true + found.errors_m
+
+
+def _crowd(centres: FloatArray, half_m: float) -> FloatArray:
+    """The centre (2,) with the most others within a square about it."""
+    near = (np.abs(centres[:, None] - centres[None]).max(axis=2) < half_m).sum(axis=1)
+    return np.asarray(centres[int(near.argmax())])
+
+
+def _extent_m(record: Mapping[str, Any]) -> FloatArray:
+    return np.asarray(np.ptp(np.array(record["route"]), axis=0) + 2 * _BESIDE_M)
+
+
+def _is_wide(record: Mapping[str, Any]) -> bool:
+    extent = _extent_m(record)
+    return bool(extent[0] > 1.6 * extent[1])
+
+
+def _size_in(record: Mapping[str, Any], insets: int) -> tuple[float, float]:
+    """Width and height: the insets stand to the right of a site, below one that is much wider than high."""
+    extent = _extent_m(record)
+    width, height = _SITE_IN * extent / extent.max()
+    if _is_wide(record):
+        return max(width, insets * _INSET_IN) + 0.6, height + _INSET_IN + 1.4
+    return width + _INSET_IN + 1.4, max(height, insets * (_INSET_IN + 0.5)) + 0.8
+
+
+def _axes(fig: Figure, record: Mapping[str, Any], insets: int) -> tuple[Axes, list[Axes]]:
+    """The site with its route, and the axes of the insets."""
+    extent = _extent_m(record)
+    width, height = _SITE_IN * extent / extent.max()
+    if _is_wide(record):
+        grid = fig.add_gridspec(2, insets, height_ratios=[height, _INSET_IN])
+        site, others = fig.add_subplot(grid[0, :]), [fig.add_subplot(grid[1, n]) for n in range(insets)]
+    else:
+        grid = fig.add_gridspec(insets, 2, width_ratios=[width, _INSET_IN])
+        site, others = fig.add_subplot(grid[:, 0]), [fig.add_subplot(grid[n, 1]) for n in range(insets)]
+    route = np.array(record["route"])
+    site.plot(*route.T, color=style.ROUTE, lw=5, zorder=0, solid_capstyle="round")
+    low, high = route.min(axis=0) - _BESIDE_M, route.max(axis=0) + _BESIDE_M
+    site.set_xlim(low[0], high[0])
+    site.set_ylim(low[1], high[1])
+    for axes in (site, *others):
+        axes.set_aspect("equal")
+        axes.set_xlabel("east (m)")
+        axes.set_ylabel("north (m)")
+    return site, others
+
+
+def _lines(plain: Sequence[Any]) -> list[FloatArray]:
+    return [np.array(line) for line in plain]
+
+
+def _draw_truth(axes: Axes, record: Mapping[str, Any]) -> None:
+    corners = _true_corners(record)
+    axes.add_collection(
+        PolyCollection(list(corners), facecolors=PAINT, edgecolors=style.TRUTH, lw=0.4, zorder=1)
+    )
+    axes.add_collection(LineCollection(_lines(record["true_lanes"]), colors=PAINT, lw=2.2, zorder=0.5))
+
+
+def _frame(site: Axes, inset: Axes, centre: FloatArray, half_m: float, letter: str) -> None:
+    """Cut an inset to a square, and mark that square on the site."""
+    square = centre + half_m * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+    site.plot(*square.T, color="k", lw=1.0, zorder=5)
+    corner, offset = _LETTERS[letter]
+    site.annotate(
+        letter,
+        square[corner],
+        xytext=offset,
+        textcoords="offset points",
+        weight="bold",
+        zorder=6,
+        fontsize=12,
+    )
+    inset.set_xlim(centre[0] - half_m, centre[0] + half_m)
+    inset.set_ylim(centre[1] - half_m, centre[1] + half_m)

@@ -1,0 +1,153 @@
+"""The figures of one drive: every method's map against the truth, on all markings and on shared ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from v2hdm.experiment.plan import OURS, RECIPES
+from v2hdm.records import DIAMOND, FloatArray, HdMap, IntArray, Marking, Truth
+from v2hdm.report.metrics import corner_errors, marking_metrics, match_markings
+from v2hdm.report.table import METHODS
+
+ROWS: tuple[str, ...] = (
+    *METHODS,
+    *(f"{method}, {recipe}" for recipe in RECIPES if recipe != OURS for method in ("Opt", "ONI")),
+)
+"""Rows of the tables: the paper's four methods, then ours under other recipes."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method on one set of cameras of one drive; lengths in m, nan where nothing matched.
+
+    Attributes:
+        markings: mapped.
+        recall: share of the diamonds driven past that were mapped; of all markings where there are none.
+        false_markings: mapped without a true counterpart.
+        rmse_m: root mean square distance of corners from the true ones.
+        bias_m: length of their mean error vector.
+        spread_m: root mean square distance of the error vectors from their mean.
+        shared: markings that every method of this camera set has mapped.
+        shared_rmse_m: ``rmse_m`` of those alone.
+    """
+
+    markings: int
+    recall: float
+    false_markings: int
+    rmse_m: float
+    bias_m: float
+    spread_m: float
+    shared: int
+    shared_rmse_m: float
+
+
+@dataclass(frozen=True)
+class Matched:
+    """Markings of a map with a true counterpart: ``true`` (M,) indexes it, ``mapped`` (M,) the map.
+
+    ``errors_m`` (M, 4, 2) are the error vectors of their corners, in the order in which the vehicle passed
+    them.
+    """
+
+    true: IntArray
+    mapped: IntArray
+    errors_m: FloatArray
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The figures of one drive: by camera set, then by row."""
+
+    port: str
+    seed: int | None
+    started_from: str
+    rows: Mapping[str, Mapping[str, Row]]
+    matched: Mapping[str, Mapping[str, Matched]]
+    extrinsics: Mapping[str, Any]
+    failures: tuple[tuple[str, str, str], ...]
+
+    @property
+    def title(self) -> str:
+        """The drive in words."""
+        return self.port if self.seed is None else f"{self.port} seed {self.seed}"
+
+
+def markings_of(plain: Mapping[str, Any]) -> tuple[Marking, ...]:
+    """The markings of a map in a drive's record."""
+    corners = np.array(plain["corners"], dtype=np.float64).reshape(-1, 4, 2)
+    return tuple(
+        Marking(kind, own, sightings)
+        for kind, own, sightings in zip(plain["kinds"], corners, plain["sightings"], strict=True)
+    )
+
+
+def measure(record: Mapping[str, Any]) -> Measured:
+    """The figures of a drive's record."""
+    true = markings_of(record["truth"])
+    truth = Truth(HdMap(true), {}, np.empty((0, 4, 4)), np.empty((0, len(true))), (), {})
+    passed = _passed(true, np.array(record["route"], dtype=np.float64))
+    rows: dict[str, dict[str, Row]] = {}
+    matched: dict[str, dict[str, Matched]] = {}
+    for cameras, plain_maps in record["maps"].items():
+        maps = {row: HdMap(markings_of(plain_maps[row])) for row in ROWS if row in plain_maps}
+        found = {row: _matched(hd_map, true, passed) for row, hd_map in maps.items()}
+        shared = set(range(len(true)))
+        for one in found.values():
+            shared &= set(one.true.tolist())
+        expected = np.array(record["expected"][cameras], dtype=np.bool_)
+        rows[cameras] = {row: _row(maps[row], truth, expected, found[row], shared) for row in maps}
+        matched[cameras] = found
+    started = sorted({camera["initial_ipm"] for camera in record["cameras"].values()})
+    return Measured(
+        port=record["port"],
+        seed=record["seed"],
+        started_from=" and ".join(started),
+        rows=rows,
+        matched=matched,
+        extrinsics=record["extrinsics"],
+        failures=tuple((recipe, cameras, text) for recipe, cameras, text in record["failures"]),
+    )
+
+
+def _passed(true: tuple[Marking, ...], route_map: FloatArray) -> IntArray:
+    """For every true marking the point of the route nearest to it, the first where there are several."""
+    if not true:
+        return np.empty(0, dtype=np.int64)
+    centres = np.array([marking.corners_map.mean(axis=0) for marking in true])
+    away_m = np.linalg.norm(centres[:, None] - route_map[None], axis=2)
+    return np.asarray(away_m.argmin(axis=1), dtype=np.int64)
+
+
+def _matched(hd_map: HdMap, true: tuple[Marking, ...], passed: IntArray) -> Matched:
+    mapped, other = (np.array(i, dtype=np.int64) for i in match_markings(hd_map.markings, true))
+    order = np.argsort(passed[other], kind="stable")
+    mapped, other = mapped[order], other[order]
+    errors = corner_errors([hd_map.markings[m] for m in mapped], [true[t] for t in other])
+    return Matched(other, mapped, errors.reshape(-1, 4, 2))
+
+
+def _row(
+    hd_map: HdMap, truth: Truth, expected: np.ndarray, matched: Matched, shared: set[int]
+) -> Row:  # fmt: skip
+    overall = marking_metrics(hd_map, truth, expected)
+    diamonds = marking_metrics(hd_map, truth, expected, DIAMOND)
+    errors = matched.errors_m.reshape(-1, 2)
+    of_shared = matched.errors_m[np.isin(matched.true, list(shared))].reshape(-1, 2)
+    return Row(
+        markings=overall.markings,
+        recall=diamonds.recall if diamonds.expected else overall.recall,
+        false_markings=overall.false_markings,
+        rmse_m=overall.corner_rmse_m,
+        bias_m=overall.corner_bias_m,
+        spread_m=_rms(errors - errors.mean(axis=0)) if len(errors) else float("nan"),
+        shared=len(shared),
+        shared_rmse_m=_rms(of_shared),
+    )
+
+
+def _rms(errors_m: FloatArray) -> float:
+    return float(np.sqrt((errors_m**2).sum(axis=1).mean())) if len(errors_m) else float("nan")

@@ -1,0 +1,141 @@
+"""What an experiment maps: its ports, its seeds, and how each drive is mapped."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.errors import ConfigError
+from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
+from v2hdm.pipeline import DriveConfig
+from v2hdm.simulate import PortConfig
+
+OURS = "ours"
+PAPER = "paper"
+RECIPES: Mapping[str, str] = {
+    OURS: "the settings as configured",
+    PAPER: "mapping.pose_model=paper mapping.loss=none: poses at their word, plain least squares",
+    INCREMENTAL: "mode=incremental: marking by marking, as on the vehicle",
+}
+"""Ways to map a drive, by name; the first is always run."""
+
+
+@dataclass(kw_only=True)
+class Site:
+    """One port of the experiment, as ``conf/run/port1.yaml`` describes it.
+
+    ``simulate`` is rendered once with every seed. Without it ``drive`` is read, and mapped once.
+    """
+
+    name: str | None = None
+    simulate: PortConfig | None = None
+    drive: DriveConfig = field(default_factory=DriveConfig)
+
+
+@dataclass(kw_only=True)
+class ExperimentConfig:
+    """Everything about one experiment.
+
+    Attributes:
+        ports: what is driven through, by name.
+        seeds: of the rendered ports; each seed is another port, another drive and another calibration.
+        recipes: beside ``ours``: ``paper`` and ``incremental`` (:data:`RECIPES`).
+        detector: settings of the detector.
+        mapping: settings of the mapping.
+        name: names the results, ``<output>/<name>/``.
+        output: folder that takes the results.
+        cache: folder that keeps rendered drives.
+        workers: processes, each of which takes one drive at a time; 0 takes one per core.
+    """
+
+    ports: dict[str, Site] = field(default_factory=dict)
+    seeds: list[int] = field(default_factory=lambda: [1, 2, 3, 4, 5])
+    recipes: list[str] = field(default_factory=lambda: [OURS, PAPER, INCREMENTAL])
+    detector: DetectorOptions = field(default_factory=DetectorOptions.for_mapping)
+    mapping: MappingOptions = field(default_factory=MappingOptions)
+    name: str = "experiment"
+    output: str = "outputs"
+    cache: str = "cache"
+    workers: int = 0
+
+
+@dataclass(frozen=True)
+class Job:
+    """One drive of the experiment: a port under one seed, None where the drive is read.
+
+    ``options`` are the settings of the mapping by recipe, ``folder`` takes what is found.
+    """
+
+    port: str
+    seed: int | None
+    site: Site
+    detector: DetectorOptions
+    options: Mapping[str, MappingOptions]
+    cache: Path
+    folder: Path
+
+    @property
+    def title(self) -> str:
+        """The drive in words."""
+        return self.port if self.seed is None else f"{self.port} seed {self.seed}"
+
+
+def jobs(config: ExperimentConfig) -> list[Job]:
+    """The drives of an experiment, seed by seed, so that what is finished first compares all ports.
+
+    Raises:
+        ConfigError: a setting cannot work; the message names the key.
+        DetectorError: ``detector.model`` cannot be used.
+    """
+    _check(config)
+    options = {name: _options(config.mapping, name) for name in dict.fromkeys([OURS, *config.recipes])}
+    folder = Path(config.output) / config.name / "drives"
+    found: list[tuple[str, int | None, Site]] = []
+    for seed in config.seeds:
+        for port, site in config.ports.items():
+            if site.simulate is not None:
+                found.append((port, seed, replace(site, simulate=replace(site.simulate, seed=seed))))
+            elif seed == config.seeds[0]:
+                found.append((port, None, site))
+    return [
+        Job(
+            port,
+            seed,
+            site,
+            config.detector,
+            options,
+            Path(config.cache),
+            folder / (port if seed is None else f"{port}-{seed}"),
+        )
+        for port, seed, site in found
+    ]
+
+
+def _options(given: MappingOptions, recipe: str) -> MappingOptions:
+    options = deepcopy(given)
+    if recipe == PAPER:
+        return replace(options, pose_model="paper", loss="none")
+    return replace(options, mode=INCREMENTAL) if recipe == INCREMENTAL else options
+
+
+def _check(config: ExperimentConfig) -> None:
+    for key in (config.name, *config.ports):
+        if not key.strip(".") or "/" in key:
+            raise ConfigError(f"name is {key!r}: give the name of a folder, without '/'")
+    if not config.ports:
+        raise ConfigError("ports is empty: name one, as in +run@ports.port1=port1")
+    if not config.seeds or len(set(config.seeds)) < len(config.seeds) or min(config.seeds) < 0:
+        raise ConfigError(f"seeds is {config.seeds}: give different whole numbers, zero or greater")
+    if config.workers < 0:
+        raise ConfigError(f"workers is {config.workers}: set 0 for one per core, or a positive number")
+    for recipe in config.recipes:
+        if recipe not in RECIPES:
+            raise ConfigError(f"recipes: there is no {recipe!r}; choose from {', '.join(RECIPES)}")
+    for port, site in config.ports.items():
+        if (site.simulate is None) == (site.drive.path is None):
+            raise ConfigError(f"ports.{port}: set either simulate or drive.path")
+    check_options(config.mapping, Detector.load(options=config.detector).catalogue.cornered)
