@@ -125,7 +125,8 @@ def test_every_console_script_is_a_door_and_resolves_to_a_callable() -> None:
     assert {"v2hdm-map", "v2hdm-detect", "v2hdm-check", "v2hdm-export"} <= set(SCRIPTS)
     for name, target in SCRIPTS.items():
         assert callable(EntryPoint(name, target, "console_scripts").load()), name
-        assert (ROOT / "v2hdm" / f"{name.removeprefix('v2hdm-')}.py").is_file(), name
+        door = ROOT / "v2hdm" / name.removeprefix("v2hdm-")
+        assert door.with_suffix(".py").is_file() or (door / "__main__.py").is_file(), name
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
@@ -163,4 +164,5 @@ def test_every_file_that_states_the_version_states_the_same() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert project["version"] == citation["version"] == __version__
-    assert citation["license"] == project["license"]
+    # The wheel holds a library of another licence; what one cites is ours.
+    assert citation["license"] == project["license"].split(" AND ")[0]

@@ -49,7 +49,7 @@ def residuals(scene: Scene, x: np.ndarray) -> np.ndarray:
     centre = np.linalg.inv(cam_from_vehicle)[:, :3, 3] / problem.centre_sigma_m
     parts = [pixel.ravel(), centre.ravel()]
     if problem.control is not None:
-        parts.append((corners[problem.control.corner] / problem.control.sigma_m[:, None]).ravel())
+        parts.append((corners[problem.control.corner] / problem.control.sigma_m).ravel())
     return np.concatenate(parts)
 
 

@@ -265,7 +265,9 @@ def texts() -> Iterator[Case]:
     """Broken YAML, JSON and tables."""
     for name, (text, says) in YAML_TEXTS.items():
         for file in ("drive.yaml", "front/camera_info.yaml"):
-            yield Case(f"{file}: {name}", CHECK, CHECKED, drive(write(file, text)), says)
+            # Of intrinsics any tool's file will do.
+            either = f"{says}|no intrinsics of a known format" if file.startswith("front") else says
+            yield Case(f"{file}: {name}", CHECK, CHECKED, drive(write(file, text)), either)
         yield Case(
             f"calibration: {name}", "v2hdm.calibration", ("a.yaml", "a.yaml"), write("a.yaml", text), says
         )  # fmt: skip

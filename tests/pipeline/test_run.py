@@ -245,8 +245,8 @@ def test_a_drive_past_nothing_fails_and_says_that_no_marking_was_found(
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"name": "../elsewhere"}, "name is '../elsewhere'"),
-        ({"name": ".."}, "name is '..'"),
+        ({"name": "../elsewhere"}, "the name '../elsewhere' has a separator"),
+        ({"name": ".."}, "the name '..' begins with a dot"),
         ({"workers": -1}, "workers is -1"),
         ({"mapping": MappingOptions(mode="both")}, "mapping.mode is 'both'"),
         ({"mapping": MappingOptions(max_range_m=float("nan"))}, "mapping.max_range_m is nan"),

@@ -232,7 +232,7 @@ def test_u_and_v_exchanged_are_told_within_the_image_too(tmp_path, capsys) -> No
         (["--pixel-sigma", "0", "--survey-sigma", "0"], "are both 0"),
         (["--name", "a/b"], "no file name; give another --name"),
         (["--image", "half.png"], "the image is 640 x 360, but the intrinsics of 'front' are for 1280 x 720"),
-        (["--image", "none.png"], "none.png: cannot read this image"),
+        (["--image", "none.png"], "none.png: image listed but missing"),
     ],
 )
 def test_options_that_cannot_be_are_one_line(

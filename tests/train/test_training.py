@@ -202,7 +202,7 @@ def test_an_output_that_is_a_file_is_one_line_and_stays(
     (tmp_path / "taken").write_text("kept", encoding="utf-8")
     monkeypatch.setattr(sys, "argv", ["train", f"output={tmp_path / 'taken'}"])
     assert door.main() == 2
-    assert "taken: no folder can be made there (File exists); set another output=" in capsys.readouterr().err
+    assert "taken is a file; give another output=" in capsys.readouterr().err
     assert (tmp_path / "taken").read_text(encoding="utf-8") == "kept"
 
 

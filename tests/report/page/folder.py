@@ -29,12 +29,14 @@ from v2hdm.records import (
     Marking,
     Symbol,
 )
-from v2hdm.report.outputs import write_json
+from v2hdm.report.outputs import result_folder, write_json
 
 INFO = CameraInfo("front", 640, 480, np.array([[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]]))
 DIAMOND_M = np.array([[0.5, 0.0], [0.0, 0.35], [-0.5, 0.0], [0.0, -0.35]])
 PLACES = np.array([[6.0, 0.0], [7.5, 1.2], [7.5, -1.2], [9.0, 0.0]])
 NASTY = "</script><img src=x onerror=alert(1)>&\"'"
+NASTY_NAME = NASTY.replace("/", "")
+"""What of it a name may be."""
 SHIFT_PX = np.array([0.3, -0.2])
 
 
@@ -77,28 +79,31 @@ def make_result(folder: Path, name: str = "small", kind: str = DIAMOND, status: 
     poses = np.tile(np.eye(4), (5, 1, 1))
     poses[:, 0, 3] = 0.8 * np.arange(5)
     drive = _write_drive(folder / "drive", name, hd_map, poses, cam_from_vehicle)
-    result = folder / "result"
-    result.mkdir(parents=True)
-    write_geojson(hd_map, result / "map.geojson", verdict(status))
-    excluded = [ExcludedMarking(kind, np.array([8.0, 2.0]), 2, f"its place is unsure {NASTY}", "front")]
-    write_exclusions(excluded, result / "excluded.geojson", None, None)
-    calibration = Calibration(INFO, cam_from_vehicle, np.diag([4e-6] * 3 + [1e-8] * 3))
-    write_calibration(calibration, result / "calibration_front.yaml", clock_s=(0.001, 0.0005))
-    stamp_s = np.array([image.stamp_s for image in drive.images])
-    write_tum(Trajectory(stamp_s, poses), result / "trajectory.tum")
-    rows = [f"{stamp:.9f},1,0.01,0.01,0.002,0.0002,0.0002,0.0003" for stamp in stamp_s]
-    heading = "stamp_s,seen,forward_m,left_m,up_m,roll_rad,pitch_rad,heading_rad"
-    (result / "trajectory_sigma.csv").write_text("\n".join([heading, *rows]) + "\n")
-    write_residuals(_residuals(drive, hd_map, poses, cam_from_vehicle), result / "residuals.csv")
-    (result / "config.yaml").write_text(f"name: {name}\n")
-    figures = {"markings": len(hd_map.markings), "reprojection_rmse_px": 0.36, "lanes": {"length_m": 12.0}}
-    metrics = {
-        "name": name, "version": "0.1.0", "date": "2026-11-23", "verdict": verdict(status),
-        "drive": {"name": name, "path": str(drive.root), "cameras": ["front"], "images": 5},
-        "results": {"front": {"Opt": figures}}, "seconds": {"detect": 1.5},
-        "extrinsics": {"front": {"certainty": "front: the drive fixes both", "x_change_m": 0.1}},
-    }  # fmt: skip
-    write_json(result / "metrics.json", metrics)
+    with result_folder(folder / "result") as result:
+        write_geojson(hd_map, result / "map.geojson", verdict(status))
+        excluded = [ExcludedMarking(kind, np.array([8.0, 2.0]), 2, f"its place is unsure {NASTY}", "front")]
+        write_exclusions(excluded, result / "excluded.geojson", None, None)
+        calibration = Calibration(INFO, cam_from_vehicle, np.diag([4e-6] * 3 + [1e-8] * 3))
+        write_calibration(calibration, result / "calibration_front.yaml", clock_s=(0.001, 0.0005))
+        stamp_s = np.array([image.stamp_s for image in drive.images])
+        write_tum(Trajectory(stamp_s, poses), result / "trajectory.tum")
+        rows = [f"{stamp:.9f},1,0.01,0.01,0.002,0.0002,0.0002,0.0003" for stamp in stamp_s]
+        heading = "stamp_s,seen,forward_m,left_m,up_m,roll_rad,pitch_rad,heading_rad"
+        (result / "trajectory_sigma.csv").write_text("\n".join([heading, *rows]) + "\n")
+        write_residuals(_residuals(drive, hd_map, poses, cam_from_vehicle), result / "residuals.csv")
+        (result / "config.yaml").write_text(f"name: {name}\n")
+        figures = {
+            "markings": len(hd_map.markings),
+            "reprojection_rmse_px": 0.36,
+            "lanes": {"length_m": 12.0},
+        }
+        metrics = {
+            "name": name, "version": "0.1.0", "date": "2026-11-23", "verdict": verdict(status),
+            "drive": {"name": name, "paths": [str(drive.root)], "cameras": ["front"], "images": 5},
+            "results": {"front": {"Opt": figures}}, "seconds": {"detect": 1.5},
+            "extrinsics": {"front": {"certainty": "front: the drive fixes both", "x_change_m": 0.1}},
+        }  # fmt: skip
+        write_json(result / "metrics.json", metrics)
     return drive
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.report.page.browser import Watched, browser_path, opened
-from tests.report.page.folder import NASTY, PLACES, make_result
+from tests.report.page.folder import NASTY, NASTY_NAME, PLACES, make_result
 from v2hdm.report.page.write import write_page
 
 WINDOWS = [(1280, 800, "light"), (1280, 800, "dark"), (390, 844, "light"), (390, 844, "dark")]
@@ -161,16 +161,16 @@ def test_what_was_left_out_tells_its_reason_and_a_number_finds_its_marking(
 
 
 def test_names_of_people_are_text_and_never_markup(browser: Any, tmp_path: Path) -> None:
-    drive = make_result(tmp_path, name=NASTY.replace("/", ""), kind=NASTY, status="FAIL")
+    drive = make_result(tmp_path, name=NASTY_NAME, kind=NASTY_NAME, status="FAIL")
     path = write_page(tmp_path / "result", drive)
     with opened(browser, path) as watched:
         page = watched.page
-        assert page.locator("h1").inner_text() == NASTY.replace("/", "")
+        assert page.locator("h1").inner_text() == NASTY_NAME
         assert NASTY in page.locator(".findings").first.inner_text()
         page.locator("#map").scroll_into_view_if_needed()
         page.mouse.move(*page.evaluate(ON_SCREEN, PLACES[1].tolist()))
         page.wait_for_timeout(100)
-        assert NASTY in page.locator(".leaflet-tooltip:not(.corner)").inner_text()
+        assert NASTY_NAME in page.locator(".leaflet-tooltip:not(.corner)").inner_text()
         assert page.locator("img[onerror]").count() == 0
         is_quiet(watched)
 

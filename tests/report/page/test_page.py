@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.report.page.folder import DIAMOND_M, INFO, NASTY, PLACES, SHIFT_PX, make_result, make_site
+from tests.report.page.folder import DIAMOND_M, INFO, NASTY_NAME, PLACES, SHIFT_PX, make_result, make_site
 from v2hdm.drive import read_drive
 from v2hdm.errors import DriveError, MapFileError
 from v2hdm.hdmap.residuals import COLUMNS, read_residuals
@@ -134,13 +134,13 @@ def test_pictures_stay_within_their_budget_and_the_best_of_everything_comes_firs
 
 
 def test_names_end_no_script_and_become_no_markup(tmp_path: Path) -> None:
-    drive = make_result(tmp_path, kind=NASTY, status="WARN")
+    drive = make_result(tmp_path, kind=NASTY_NAME, status="WARN")
     text = write_page(tmp_path / "result", drive).read_text()
     assert "<img src=x" not in text
     assert text.count("</script>") == text.count("<script")
     embedded = re.search(r'id="map-data">(.*?)</script>', text, re.DOTALL)
     assert embedded is not None
-    assert NASTY in json.loads(embedded.group(1))["kinds"]
+    assert NASTY_NAME in json.loads(embedded.group(1))["kinds"]
 
 
 def test_the_page_asks_for_nothing_beyond_itself(result: Path, drive: Drive) -> None:
@@ -251,6 +251,6 @@ def test_another_drive_than_that_of_the_result_is_refused(tmp_path: Path) -> Non
     metrics = json.loads((tmp_path / "a" / "result" / "metrics.json").read_text())
     with pytest.raises(DriveError, match="drive two of 5 images"):
         drive_of(metrics, tmp_path / "b" / "drive")
-    metrics["drive"]["path"] = str(tmp_path / "gone")
+    metrics["drive"]["paths"] = [str(tmp_path / "gone")]
     assert drive_of(metrics, None) is None
     assert read_drive(tmp_path / "a" / "drive").cameras["front"].info.width == INFO.width

@@ -21,6 +21,9 @@ class Document:
     entries: dict[str, Any]
 
 
+_XML = re.compile(r"<[?!\w]")
+"""How XML begins; YAML may begin with ``<<``."""
+
 _END_OF_MESSAGE = re.compile(r"\n---\s*$")
 """What ``ros2 topic echo`` writes ends with a second, empty document."""
 
@@ -35,7 +38,7 @@ def read_document(path: Path) -> Document:
         raise DriveError(f"{path}: is a folder; name the calibration file in it")
     text = read_text(path, DriveError)
     start = text.lstrip("\ufeff \t\r\n")
-    if start.startswith("<"):
+    if _XML.match(start):
         return Document(path, text, _of_xml(path, start))
     if start.startswith("{"):
         return Document(path, text, _of_json(path, start))

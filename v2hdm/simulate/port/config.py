@@ -188,10 +188,14 @@ class PaintConfig:
 
 @dataclass(kw_only=True)
 class AlteredConfig:
-    """How many markings were painted anew since the port was laid out: moved, removed, added.
+    """What was painted anew since the port was laid out.
 
-    ``moved_by_m`` are the least and the largest distance, with even steps between them; what is moved is
-    turned by ``turned_sigma_rad`` as well.
+    Attributes:
+        moved: how many markings were moved.
+        removed: how many were removed.
+        added: how many were added.
+        moved_by_m: the least and the largest distance, with even steps between them.
+        turned_sigma_rad: by how much what is moved is turned as well.
     """
 
     moved: int = 0
