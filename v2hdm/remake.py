@@ -42,11 +42,13 @@ def drive_of_result(folder: Path, path: Path | None = None) -> Drive:
         raise MapFileError(
             f"{folder / 'config.yaml'} is no configuration of v2hdm.map; give its result folder"
         )
+    if len(config.drive.paths) > 1:
+        raise MapFileError(f"{folder} is of several drives; a mosaic shows one: map them one by one for it")
     if path is None and config.simulate is not None:
         workers = config.workers or os.cpu_count() or 1
         path = rendered_drive(config.simulate, Path(config.cache), workers, lambda done, total: None)
-    elif path is None and config.drive.path:
-        path = Path(config.drive.path)
+    elif path is None and config.drive.paths:
+        path = config.drive.paths[0]
     if path is None:
         raise ConfigError(f"{folder / 'config.yaml'} names no drive; give its folder with --drive")
     return read_drive(path, config.drive)

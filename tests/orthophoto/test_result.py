@@ -103,6 +103,10 @@ def test_a_picture_is_reduced_until_it_can_be_drawn_and_keeps_its_colours() -> N
             "no configuration of v2hdm.map",
         ),
         (lambda folder: (folder / "config.yaml").write_text("name: plane\n"), "give its folder with --drive"),
+        (
+            lambda folder: (folder / "config.yaml").write_text("name: two\ndrive: {path: [a, b]}\n"),
+            "is of several drives",
+        ),
         (lambda folder: (folder / "calibration_front.yaml").unlink(), "no calibration_"),
         (lambda folder: (folder / "trajectory.tum").write_text("900 0 0 0 0 0 0 1\n"), "share no time"),
         (shutil.rmtree, "no such folder"),
