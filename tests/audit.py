@@ -1,4 +1,4 @@
-"""Known weaknesses of the installed packages: ``python -m tests.audit``, part of ``make audit`` and ``.ci/run``.
+"""Known weaknesses of the installed packages: ``python -m tests.audit``, which ``make audit`` runs.
 
 ``pip-audit`` asks PyPI for advisories. Where these cannot be reached (offline, or a mirror that serves files
 only) the audit is skipped, and says why; a weakness found is exit code 1.
