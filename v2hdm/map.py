@@ -30,8 +30,6 @@ _settle = partial(open_door, "v2hdm.map", "map", _INTERRUPTED)
 
 
 def _map() -> int:
-    import torch  # noqa: F401  # its absence is told before that of what is built on it
-
     from v2hdm.config import work_on
     from v2hdm.pipeline import RunConfig
 

@@ -33,8 +33,8 @@ from v2hdm.experiment.stored import (
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.mapping.methods import NAIVE_IPMS, run_methods
 from v2hdm.mapping.results import MethodResult
+from v2hdm.pipeline.camera_sets import camera_sets
 from v2hdm.pipeline.inspect import Inspection, inspect
-from v2hdm.pipeline.run import camera_sets
 from v2hdm.records import Drive, HdMap, ImageDetections, Marking, Truth
 from v2hdm.report.evaluation import growth_figures
 from v2hdm.report.metrics import driven_past, extrinsic_metrics
