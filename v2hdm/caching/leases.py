@@ -1,51 +1,83 @@
-"""Who uses a store now: a file that each process holds locked while it runs.
+"""Who uses a cache now: a file that each process holds locked while it does.
 
-A run touches every entry that it uses, so that what was last used before the oldest run in progress began is
-used by none of them.
+A run touches all that it uses, so that what was last used before the oldest run in progress began is used by
+none of them.
 """
 
 from __future__ import annotations
 
+import atexit
 import os
 import secrets
 import time
+from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import IO
 
 from v2hdm.locks import take_lock
 
+STAGES = "stages"
+"""Folder within a cache of what runs keep, and of their leases."""
+
 _FOLDER = "in_use"
 _ENDING = ".lease"
+_TRIES = 9
+_held: Counter[Path] = Counter()
 
 
 @contextmanager
-def lease(folder: Path) -> Iterator[None]:
-    """Tell others, within, that the store in ``folder`` is in use, if anything can be written there."""
-    path = folder / _FOLDER / f"{os.getpid()}-{secrets.token_hex(4)}{_ENDING}"
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        stream = path.open("x", encoding="utf-8")
-    except OSError:
+def lease(cache: Path) -> Iterator[None]:
+    """Tell others, within, that a cache is in use, if anything can be written there."""
+    path = cache / STAGES / _FOLDER / f"{os.getpid()}-{secrets.token_hex(4)}{_ENDING}"
+    stream = _opened(path)
+    if stream is None:
         yield
         return
+    here = cache.resolve()
+    _held[here] += 1
     try:
-        with suppress(OSError):
-            take_lock(stream)
+        take_lock(stream)
         yield
     finally:
+        _held[here] -= 1
         stream.close()
         with suppress(OSError):
             path.unlink(missing_ok=True)
+            for folder in (path.parent, path.parent.parent, cache):  # as many as are empty
+                folder.rmdir()
 
 
-def unused_before(folder: Path) -> float:
+def _opened(path: Path) -> IO[str] | None:
+    """A new file, open; None where none can be made. Whoever leaves may remove its folder meanwhile."""
+    for _ in range(_TRIES):
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            return path.open("x", encoding="utf-8")
+        except FileNotFoundError:
+            continue
+        except OSError:
+            return None
+    return None
+
+
+def hold_lease(cache: Path) -> None:
+    """Tell others, until this process ends, that a cache is in use, unless it tells them already."""
+    if _held[cache.resolve()]:
+        return
+    held = ExitStack()
+    held.enter_context(lease(cache))
+    atexit.register(held.close)
+
+
+def unused_before(cache: Path) -> float:
     """What was last used before this time, s since 1970, is used by no run in progress.
 
     Leases of processes that have died are removed.
     """
     earliest = time.time()
-    for path in sorted((folder / _FOLDER).glob(f"*{_ENDING}")):
+    for path in sorted((cache / STAGES / _FOLDER).glob(f"*{_ENDING}")):
         try:
             began = path.stat().st_mtime
             with path.open("a", encoding="utf-8") as stream:

@@ -13,12 +13,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from v2hdm.caching.leases import lease
+from v2hdm.caching.leases import STAGES, lease
 
 _log = logging.getLogger(__name__)
-
-STAGES = "stages"
-"""Folder of the entries within a cache."""
 
 ENDING = ".v2hdm"
 """Of an entry's name, after its key."""
@@ -31,13 +28,13 @@ class Store:
     """The entries of one cache."""
 
     def __init__(self, cache: Path) -> None:
-        self.folder = cache / STAGES
+        self.cache, self.folder = cache, cache / STAGES
         self._can_write = True
 
     @contextmanager
     def in_use(self) -> Iterator[None]:
         """Within, nothing that is read or written is pruned."""
-        with lease(self.folder):
+        with lease(self.cache):
             yield
 
     def path(self, stage: str, key: str) -> Path:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from v2hdm.caching.folders import note_use
 from v2hdm.caching.keys import code_key, key_of
 from v2hdm.caching.room import Room
 from v2hdm.caching.store import Store
@@ -60,6 +61,7 @@ def finished(config: RunConfig, store: Store) -> RunResult | None:
             return None
         if config.simulate is not None:
             paths: tuple[Path, ...] = (folder_of_port(config.simulate, Path(config.cache)),)
+            note_use(paths[0])
         else:
             paths = config.drive.paths
         drives = read_drives(config, paths)

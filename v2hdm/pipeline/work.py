@@ -13,6 +13,7 @@ from typing import Any
 import torch  # noqa: F401  # its absence is told before that of what is built on it
 
 from v2hdm import __version__
+from v2hdm.caching.pruning import make_room
 from v2hdm.caching.room import Room
 from v2hdm.caching.store import Store
 from v2hdm.detection.weights import unknown_network
@@ -64,46 +65,53 @@ class _Task:
 def map_drives(config: RunConfig, store: Store, config_yaml: str, progress: Progress) -> RunResult:
     """Do what :func:`v2hdm.pipeline.run.run` says, with what ``store`` keeps."""
     name = admit(config)
-    seconds: dict[str, float] = {}
     base = None if config.map.base is None else read_base(Path(config.map.base))
-    room = Room(store, config.resume)
-    with (
-        result_folder(Path(config.output) / name) as folder,
-        logging_to(log_file(folder / "run.log")),
-        store.in_use(),
-    ):
-        log.info("v2hdm %s, run %s", __version__, name)
-        unknown = unknown_network(config.detector.model) if config.detector.model is not None else None
-        if unknown is not None:
-            log.warning("%s", unknown)
-        (folder / "config.yaml").write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
-        paths = _drive_folders(config, seconds, progress)
-        with timed(seconds, "read"):
-            drives = read_drives(config, paths)
-        for drive in drives:
-            count, names = len(drive.images), ", ".join(drive.cameras)
-            log.info("drive %s: %d images of cameras %s", drive.name, count, names)
-        # What does not belong together is told before any long work.
-        whole = join_drives(drives)
-        if base is not None:
-            check_together(base, whole, config.map.base or "")
-        survey = take_survey(whole, config.mapping)
-        contents = Contents.of(drives)
-        key = result_key(config, drives, contents, room.key())
-        about = describe_run(name, whole, paths, config.drive)
-        task = _Task(replace(config, mapping=survey.mapping), room, folder, about, seconds, progress)
-        with timed(seconds, "check"):
-            inspection = join([_inspect(task, drive, contents, len(drives)) for drive in drives])
-        try:
-            result = _map_and_judge(task, inspection, contents, survey, base)
-        except (MappingError, AdjustError) as failure:
-            if not inspection.has_failed:
-                raise
-            result = _without_map(task, inspection, failure)
-        for line in result.verdict.lines:
-            log.info("%s", line)
-    note_finished(result, key, store)
+    with store.in_use():
+        with (
+            result_folder(Path(config.output) / name) as folder,
+            logging_to(log_file(folder / "run.log")),
+        ):
+            log.info("v2hdm %s, run %s", __version__, name)
+            (folder / "config.yaml").write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
+            result, key = _write(config, name, base, Room(store, config.resume), folder, progress)
+            for line in result.verdict.lines:
+                log.info("%s", line)
+        note_finished(result, key, store)
+        make_room(store.cache, config.cache_gb)
     return result
+
+
+def _write(
+    config: RunConfig, name: str, base: Base | None, room: Room, folder: Path, progress: Progress
+) -> tuple[RunResult, str]:
+    """Write a run's result into ``folder``; returns the key of what it was made of, too."""
+    unknown = unknown_network(config.detector.model) if config.detector.model is not None else None
+    if unknown is not None:
+        log.warning("%s", unknown)
+    seconds: dict[str, float] = {}
+    paths = _drive_folders(config, seconds, progress)
+    with timed(seconds, "read"):
+        drives = read_drives(config, paths)
+        contents = Contents.of(drives)
+    for drive in drives:
+        count, names = len(drive.images), ", ".join(drive.cameras)
+        log.info("drive %s: %d images of cameras %s", drive.name, count, names)
+    # What does not belong together is told before any long work.
+    whole = join_drives(drives)
+    if base is not None:
+        check_together(base, whole, config.map.base or "")
+    survey = take_survey(whole, config.mapping)
+    key = result_key(config, drives, contents, room.key())
+    about = describe_run(name, whole, paths, config.drive)
+    task = _Task(replace(config, mapping=survey.mapping), room, folder, about, seconds, progress)
+    with timed(seconds, "check"):
+        inspection = join([_inspect(task, drive, contents, len(drives)) for drive in drives])
+    try:
+        return _map_and_judge(task, inspection, contents, survey, base), key
+    except (MappingError, AdjustError) as failure:
+        if not inspection.has_failed:
+            raise
+        return _without_map(task, inspection, failure), key
 
 
 def _inspect(task: _Task, drive: Drive, contents: Contents, drives: int) -> Inspection:

@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from v2hdm.caching.folders import note_use
 from v2hdm.drive import write_drive
 from v2hdm.drive.folder import DRIVE_FILE, TRUTH_FOLDER
 from v2hdm.drive.truth import write_truth
@@ -57,6 +58,7 @@ def rendered_drive(config: PortConfig, cache: Path, workers: int, progress: Prog
     folder = folder_of_port(config, cache)
     if not (folder / DRIVE_FILE).is_file() or _drop_damaged(folder):
         render_drive(config, folder, workers, progress)
+    note_use(folder)
     return folder
 
 
