@@ -29,7 +29,7 @@ from v2hdm.pipeline.config import NO_DRIVE, RunConfig
 from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.evaluate import evaluate
 from v2hdm.pipeline.finished import RunResult, note_finished
-from v2hdm.pipeline.inspect import Inspection, inspect, join
+from v2hdm.pipeline.inspect import Inspection, inspect_once, join
 from v2hdm.pipeline.keys import Contents, read_drives, result_key
 from v2hdm.pipeline.survey import Survey, check_survey, take_survey
 from v2hdm.pipeline.telling import Progress, log_file, logging_to, timed
@@ -115,15 +115,9 @@ def _write(
 
 
 def _inspect(task: _Task, drive: Drive, contents: Contents, drives: int) -> Inspection:
-    named = "check" if drives == 1 else f"check {drive.name}"
-    max_gap_s = task.config.drive.max_gap_s
-    tell = partial(task.progress, named)
-    return task.room.made(
-        "check",
-        task.room.key(contents.key(drive), max_gap_s),
-        Inspection,
-        lambda: inspect(drive, max_gap_s, _workers(task.config), tell),
-    )
+    tell = partial(task.progress, "check" if drives == 1 else f"check {drive.name}")
+    max_gap_s, workers = task.config.drive.max_gap_s, _workers(task.config)
+    return inspect_once(drive, contents, max_gap_s, task.room, workers, tell)
 
 
 def _map_and_judge(
