@@ -1,6 +1,6 @@
 """A run that is killed at any instant goes on, and ends in the byte-identical map.
 
-``python -m tests.benchmarks.kills [--kills 50] [--images 32] [--scratch FOLDER] [--seed 1]`` renders a small
+``python -m tests.benchmarks.kills [--kills 50] [--images 16] [--scratch FOLDER] [--seed 1]`` renders a small
 drive and maps it in one go. Then, again and again: a run of the same with an empty cache, ``kill -9`` at an
 instant drawn evenly over the time that a whole run takes, and a run that goes on. It must end in the same
 ``map.geojson``, and leave nothing half done behind. Runs are forked from a process that has loaded everything
@@ -96,7 +96,7 @@ def timed(start: Start, drive: Path, folder: Path, images: int) -> float:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--kills", type=int, default=50)
-    parser.add_argument("--images", type=int, default=32, help="of each of the two cameras")
+    parser.add_argument("--images", type=int, default=16, help="of each of the two cameras")
     parser.add_argument("--scratch", type=Path, default=Path("cache/kills"))
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--door", action="store_true", help="start each run as a process of its own")

@@ -57,11 +57,6 @@ def refused(*_: object, **__: object) -> Any:
     raise AssertionError("this was to be taken from the cache")
 
 
-def test_a_run_without_the_cache_makes_the_same_map(site: Path) -> None:
-    anew = run(config(site, "anew", cache=str(site / "empty"), resume=False))
-    assert_same(anew.folder, site / "first" / "short")
-
-
 def test_another_mapping_setting_needs_no_image_again(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(inspection, "inspect", refused)
     monkeypatch.setattr(detections, "detect_images", refused)
@@ -171,13 +166,16 @@ def test_a_killed_run_goes_on_in_the_middle_of_detection(site: Path, monkeypatch
     assert_same(resumed.folder, site / "first" / "short")
 
 
-def test_the_limit_of_the_cache_is_kept(site: Path, tmp_path: Path) -> None:
-    other = tmp_path / "cache"
-    run(config(site, "small", cache=str(other)))
-    for item in items_of(other):
+def test_the_limit_of_the_cache_is_kept(site: Path) -> None:
+    for item in items_of(site / "cache"):
         os.utime(item.path, (1000, 1000))
-    run(config(site, "first", cache=str(other), cache_gb=0.0, resume=False))
-    assert all(item.used_s > 1000 for item in items_of(other))
+    before = len(items_of(site / "cache"))
+    limited = run(config(site, "limited", cache_gb=0.0))
+    left = items_of(site / "cache")
+    assert {item.kind for item in left} == {"check", "own_vehicle", "detect", "map", "finished"}
+    assert all(item.used_s > 1000 for item in left)
+    assert len(left) < before
+    assert_same(limited.folder, site / "first" / "short")
 
 
 def test_part_of_a_drive_can_be_tried(site: Path) -> None:
