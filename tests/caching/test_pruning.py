@@ -82,6 +82,14 @@ def test_a_run_in_another_process_protects_its_entries_until_it_is_killed(cache:
     assert not list((cache / "stages").glob("in_use/*"))
 
 
+def test_a_lease_that_cannot_be_looked_at_counts_as_held(cache: Path) -> None:
+    held = cache / "stages" / "in_use" / "1-00000000.lease"
+    held.parent.mkdir()
+    held.mkdir()  # opened, it is an error that is not its absence
+    os.utime(held, (1001, 1001))
+    assert [item.path.stem for item in prune(cache, 0)] == KEYS[:1]
+
+
 def test_what_killed_runs_have_left_goes(cache: Path) -> None:
     partial = cache / "stages" / "detect" / f".{'a' * 16}.{'b' * 8}.part"
     partial.write_bytes(b"half")

@@ -49,6 +49,14 @@ def test_an_entry_that_was_cut_is_made_anew(kept: int, tmp_path: Path) -> None:
     assert made(Room(store), [7]) == [7]
 
 
+def test_a_pipe_in_an_entrys_place_is_not_waited_for(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.path("stage", KEY).parent.mkdir(parents=True)
+    os.mkfifo(store.path("stage", KEY))
+    assert made(Room(store), [7]) == [7]
+    assert made(Room(store), [8]) == [7]
+
+
 def test_an_entry_of_another_type_is_made_anew(tmp_path: Path) -> None:
     Room(Store(tmp_path)).keep("stage", KEY, str, "text")
     assert made(Room(Store(tmp_path)), [7]) == [7]

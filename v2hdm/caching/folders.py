@@ -12,6 +12,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from v2hdm.caching.leases import hold_lease
+from v2hdm.errors import ConfigError
+from v2hdm.texts import read_json
 
 LIST = ".v2hdm-cache.json"
 """Name of the list in a folder."""
@@ -39,12 +41,15 @@ def note_use(folder: Path) -> None:
 def our_files(folder: Path) -> list[Path] | None:
     """Those files of a folder that are ours and there; None where it is none of our folders."""
     try:
-        content = json.loads((folder / LIST).read_text(encoding="utf-8"))
-        if content["about"] != _ABOUT:
-            return None
-        listed = [folder / str(name) for name in content["files"]]
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        content = read_json(folder / LIST, ConfigError)
+    except ConfigError:
         return None
+    if not isinstance(content, dict) or content.get("about") != _ABOUT:
+        return None
+    names = content.get("files")
+    if not isinstance(names, list):
+        return None
+    listed = [folder / name for name in names if isinstance(name, str) and "\0" not in name]
     here = folder.resolve()
     # The list may lie: nothing outside of the folder is ours, whatever way leads there.
     within = [path for path in listed if path.parent.resolve().is_relative_to(here)]

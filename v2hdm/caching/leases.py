@@ -79,13 +79,23 @@ def unused_before(cache: Path) -> float:
     earliest = time.time()
     for path in sorted((cache / STAGES / _FOLDER).glob(f"*{_ENDING}")):
         try:
-            began = path.stat().st_mtime
-            with path.open("a", encoding="utf-8") as stream:
-                is_left = take_lock(stream)
-            if is_left:
-                path.unlink(missing_ok=True)
-            else:
-                earliest = min(earliest, began)
-        except OSError:
+            began_s = path.stat().st_mtime
+        except OSError:  # given up meanwhile
             continue
+        if _is_left(path):
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+        else:
+            earliest = min(earliest, began_s)
     return earliest
+
+
+def _is_left(path: Path) -> bool:
+    """Whether the process that held a lease has ended; a lease that cannot be looked at counts as held."""
+    try:
+        with path.open(encoding="utf-8") as stream:
+            return take_lock(stream)
+    except FileNotFoundError:
+        return True
+    except OSError:
+        return False

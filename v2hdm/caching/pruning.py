@@ -53,7 +53,7 @@ def items_of(cache: Path) -> list[Item]:
     found = []
     for path in (cache / STAGES).glob("*/*"):
         kind = path.parent.name if _ENTRY.fullmatch(path.name) else LEFT
-        if kind == LEFT and not _PARTIAL.fullmatch(path.name):
+        if (kind == LEFT and not _PARTIAL.fullmatch(path.name)) or not path.is_file():
             continue
         with suppress(OSError):  # another process has removed it
             about = path.stat()

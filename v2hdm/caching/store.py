@@ -45,6 +45,8 @@ class Store:
         """What is kept under a key; None where there is nothing whole, of which a damaged file is removed."""
         path = self.path(stage, key)
         try:
+            if not path.is_file():  # a pipe would be waited for
+                return None
             data = path.read_bytes()
         except FileNotFoundError:
             return None
