@@ -10,6 +10,7 @@ import json
 import os
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from v2hdm.caching.leases import hold_lease
 from v2hdm.errors import ConfigError
@@ -32,28 +33,40 @@ def note_use(folder: Path) -> None:
         if path.is_file():
             os.utime(path)
             return
-        names = sorted(one.relative_to(folder).as_posix() for one in folder.rglob("*") if one.is_file())
+        files = sorted(one for one in folder.rglob("*") if one.is_file())
+        names = [one.relative_to(folder).as_posix() for one in files]
+        size = sum(one.stat().st_size for one in files)
+        content = {"about": _ABOUT, "bytes": size, "files": names}
         partial = folder / f".{os.getpid()}.part"
-        partial.write_text(json.dumps({"about": _ABOUT, "files": names}) + "\n", encoding="utf-8")
+        partial.write_text(json.dumps(content) + "\n", encoding="utf-8")
         partial.replace(path)
 
 
-def our_files(folder: Path) -> list[Path] | None:
-    """Those files of a folder that are ours and there; None where it is none of our folders."""
+def size_of(folder: Path) -> int | None:
+    """Bytes of our files in a folder, as its list says; None where it is none of our folders."""
+    content = _listed(folder)
+    size = None if content is None else content.get("bytes")
+    return size if isinstance(size, int) and size >= 0 else None
+
+
+def our_files(folder: Path) -> list[Path]:
+    """Those files of a folder that are ours and there."""
+    names = (_listed(folder) or {}).get("files")
+    if not isinstance(names, list):
+        return []
+    listed = [folder / name for name in names if isinstance(name, str) and "\0" not in name]
+    # The list may lie: nothing outside of the folder is ours, whatever way leads there.
+    here = folder.resolve()
+    within = {parent for parent in {path.parent for path in listed} if parent.resolve().is_relative_to(here)}
+    return [path for path in listed if path.parent in within and path.is_file() and not path.is_symlink()]
+
+
+def _listed(folder: Path) -> dict[str, Any] | None:
     try:
         content = read_json(folder / LIST, ConfigError)
     except ConfigError:
         return None
-    if not isinstance(content, dict) or content.get("about") != _ABOUT:
-        return None
-    names = content.get("files")
-    if not isinstance(names, list):
-        return None
-    listed = [folder / name for name in names if isinstance(name, str) and "\0" not in name]
-    here = folder.resolve()
-    # The list may lie: nothing outside of the folder is ours, whatever way leads there.
-    within = [path for path in listed if path.parent.resolve().is_relative_to(here)]
-    return [path for path in within if path.is_file() and not path.is_symlink()]
+    return content if isinstance(content, dict) and content.get("about") == _ABOUT else None
 
 
 def remove_ours(folder: Path) -> None:
@@ -64,10 +77,7 @@ def remove_ours(folder: Path) -> None:
     Raises:
         OSError: a file cannot be removed.
     """
-    files = our_files(folder)
-    if files is None:
-        return
-    for path in sorted(files, key=lambda path: (len(path.parts), path)):
+    for path in sorted(our_files(folder), key=lambda path: (len(path.parts), path)):
         path.unlink(missing_ok=True)
     (folder / LIST).unlink(missing_ok=True)
     below = sorted((one for one in folder.rglob("*") if one.is_dir()), key=lambda one: -len(one.parts))

@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from v2hdm.caching.folders import LIST, our_files, remove_ours
+from v2hdm.caching.folders import LIST, remove_ours, size_of
 from v2hdm.caching.leases import STAGES, unused_before
 from v2hdm.caching.store import ENDING, checked
 
@@ -59,11 +59,10 @@ def items_of(cache: Path) -> list[Item]:
             about = path.stat()
             found.append(Item(kind, path, about.st_size, about.st_mtime))
     for listing in cache.glob(f"*/{LIST}"):
-        files = our_files(listing.parent)
-        if files is None:
+        size = size_of(listing.parent)
+        if size is None:
             continue
         with suppress(OSError):
-            size = sum(path.stat().st_size for path in files)
             found.append(Item(DRIVES, listing.parent, size, listing.stat().st_mtime))
     return sorted(found, key=lambda item: (item.used_s, item.path))
 
