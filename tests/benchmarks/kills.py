@@ -2,11 +2,11 @@
 
 ``python -m tests.benchmarks.kills [--kills 50] [--images 16] [--one-camera] [--scratch FOLDER]`` renders a
 small drive and maps it in one go. Then, again and again: a run of the same with an empty cache, ``kill -9``
-at an instant drawn evenly over the processor time of a whole run, so that a busy machine moves no instant, and a
-run that goes on. It must end in the same ``map.geojson``, and leave nothing half done beside it. Runs are
-forked from a process that has loaded everything already, so that the kills fall into the work and not into
-imports; with ``--door`` each is a process of its own, ``python -m v2hdm.map``. The exit code is 1 if any map
-differs.
+at an instant drawn evenly over the processor time of a whole run, so that a busy machine moves no instant,
+and a run that goes on. It must end in the same ``map.geojson``, and leave nothing half done beside it. Runs
+are forked from a process that has loaded everything already, so that the kills fall into the work and not
+into imports; with ``--door`` each is a process of its own, ``python -m v2hdm.map``. The exit code is 1 if any
+map differs.
 """
 
 from __future__ import annotations
