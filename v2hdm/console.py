@@ -12,7 +12,7 @@ from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from v2hdm import pipeline
-from v2hdm.pipeline.run import logging_to
+from v2hdm.pipeline.telling import logging_to
 from v2hdm.quality import Status, Verdict
 from v2hdm.report.table import changes_table, results_table
 

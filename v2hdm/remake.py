@@ -16,7 +16,8 @@ from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.files import load_yaml
 from v2hdm.orthophoto.result import MOSAIC_FILES, RESOLUTION_M, write_mosaic
 from v2hdm.outputs import added_to
-from v2hdm.pipeline.run import RunConfig, check_device
+from v2hdm.pipeline.admit import check_device
+from v2hdm.pipeline.config import RunConfig
 from v2hdm.records import Drive
 from v2hdm.simulate import rendered_drive
 

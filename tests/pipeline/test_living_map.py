@@ -20,6 +20,7 @@ from v2hdm import map as door
 from v2hdm.drive import ReadOptions, read_drive, write_drive
 from v2hdm.errors import MapFileError
 from v2hdm.hdmap.geojson import read_geojson, write_geojson
+from v2hdm.pipeline import work
 from v2hdm.pipeline.base import check_together, read_base
 from v2hdm.records import Drive, Fate, GeodeticOrigin, ImageDetections, PoseNoise, Trajectory
 
@@ -61,7 +62,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     with pytest.MonkeyPatch.context() as patch:
         # Grey images say nothing: neither to the detector nor to the checks of images and ground.
-        patch.setattr(sys.modules["v2hdm.pipeline.run"], "detect_all", detected)
+        patch.setattr(work, "detect_in_pieces", detected)
         patch.setattr(sys.modules["v2hdm.pipeline.inspect"], "check_drive", lambda *_: [])
         patch.setattr(sys.modules["v2hdm.pipeline.inspect"], "estimate_cameras", lambda *_: {})
         patch.chdir(folder)
