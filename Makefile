@@ -2,6 +2,7 @@
 #   make map     drive through a rendered port and map it
 #   make test    run the tests
 #   make check   format, lint, types, import contracts
+#   make docs    build the documentation's site into site/
 # Further arguments: make map ARGS="+run=port1"
 
 PYTHON ?= python3
@@ -13,7 +14,7 @@ INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c co
 MAP_INSTALLED := $(VENV)/.installed-map
 DEV_INSTALLED := $(VENV)/.installed-dev
 
-.PHONY: map test check clean
+.PHONY: map test check docs clean
 
 map: $(MAP_INSTALLED)
 	$(BIN)/python -m v2hdm.map $(ARGS)
@@ -29,8 +30,11 @@ check: $(DEV_INSTALLED)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+docs: $(DEV_INSTALLED)
+	$(BIN)/mkdocs build --strict --quiet
+
 clean:
-	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf $(VENV) build dist site .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.12 ...")'
