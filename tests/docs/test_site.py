@@ -93,5 +93,5 @@ def test_a_link_to_nowhere_stops_the_build() -> None:
     file = File("check.md", str(ROOT / "docs"), "site", use_directory_urls=False)
     page, files = SimpleNamespace(file=file), Files([file])
     assert hook.on_page_markdown("[a](check.md#x) [b](../pyproject.toml)", page, files) == "[a](check.md#x) b"
-    with pytest.raises(PluginError, match="check.md: links to gone.md"):
+    with pytest.raises(PluginError, match=r"check\.md: links to gone\.md"):
         hook.on_page_markdown("[a](gone.md)", page, files)
