@@ -84,7 +84,6 @@ def _work(asked: socket.socket) -> None:
         os.dup2(fd, number)
         os.close(fd)
     arguments, folder, environment = json.loads(b"".join(iter(lambda: asked.recv(65536), b"")))
-    T0=time.process_time()
     os.chdir(folder)
     os.environ.clear()
     os.environ.update(environment)
@@ -103,7 +102,6 @@ def _work(asked: socket.socket) -> None:
         for stream in (sys.stdout, sys.stderr):
             with contextlib.suppress(OSError):
                 stream.flush()
-        open("/tmp/lab/cpu.log","a").write(f"{time.process_time()-T0:.1f} {arguments}\n")
         asked.sendall(str(code).encode())
         os._exit(0)
 
@@ -111,10 +109,12 @@ def _work(asked: socket.socket) -> None:
 def _run(arguments: list[str]) -> None:
     from tests.docs.smaller import smaller
 
-    option, module, *rest = smaller(arguments)
-    assert option == "-m", arguments
-    sys.argv = [module, *rest]
-    runpy.run_module(module, run_name="__main__", alter_sys=True)
+    if arguments[0] != "-m":
+        sys.argv = arguments
+        runpy.run_path(arguments[0], run_name="__main__")
+        return
+    sys.argv = smaller(arguments)[1:]
+    runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
 
 
 if __name__ == "__main__":

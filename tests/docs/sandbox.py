@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -15,10 +14,8 @@ from v2hdm.drive.truth import read_truth
 from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.hdmap import read_geojson
-from v2hdm.hdmap.geodetic import geodetic_from_enu
 from v2hdm.hdmap.geopackage import write_geopackage
 from v2hdm.records import Drive, Truth
-from v2hdm.report.metrics import driven_past
 
 _COPIES = ("mysite", "monday", "friday", "port2_again")
 _PLACES = [
@@ -27,9 +24,8 @@ _PLACES = [
 ]  # fmt: skip
 
 
-def furnish(folder: Path, do: Callable[[str], object]) -> None:
-    """Fill ``folder`` with drives, results, a recording, tables and images; ``do`` runs a command."""
-    do("python -m v2hdm.map +run=port2")
+def furnish(folder: Path) -> None:
+    """Add drives, results, a recording, tables and images to the cache and result of ``+run=port2``."""
     (rendered,) = (folder / "cache").iterdir()
     for name in _COPIES:
         copy = folder / "drives" / name
@@ -43,7 +39,6 @@ def furnish(folder: Path, do: Callable[[str], object]) -> None:
     truth = read_truth(drive)
     _lay_out_recording(folder, rendered)
     _survey_camera(folder, drive, truth)
-    _survey_site(folder / "survey.csv", drive, truth)
     shutil.copy(result / "map.geojson", folder)
     write_geopackage(read_geojson(result / "map.geojson"), folder / "map.gpkg")
     shutil.copy(result / "calibration_front.yaml", folder)
@@ -76,15 +71,3 @@ def _survey_camera(folder: Path, drive: Drive, truth: Truth) -> None:
         f"P{n},{u:.2f},{v:.2f},{x:.3f},{y:.3f}" for n, (u, v, x, y) in enumerate(np.hstack([px, measured]), 1)
     ]
     (folder / "points.csv").write_text("\n".join(["name,u,v,x,y", *rows]) + "\n")
-
-
-def _survey_site(path: Path, drive: Drive, truth: Truth) -> None:
-    """Corners of markings that the drive passed, control and check points in turn."""
-    assert drive.origin is not None
-    passed = driven_past(drive, truth, ("front",))
-    corners = [m.corners_map[0] for m, own in zip(truth.map.markings, passed, strict=True) if own][:12]
-    placed = geodetic_from_enu(drive.origin, np.column_stack([np.array(corners), np.zeros(len(corners))]))
-    rows = ["id,latitude_deg,longitude_deg,sigma_m,role"]
-    for k, (lat, lon, _) in enumerate(placed):
-        rows.append(f"P{k},{lat:.10f},{lon:.10f},0.005,{'check' if k % 2 else 'control'}")
-    path.write_text("\n".join(rows) + "\n")

@@ -21,9 +21,18 @@ from tests.docs.blocks import ROOT, Block, blocks, document, documents
 from tests.docs.processes import python_in
 from tests.docs.sandbox import furnish
 from v2hdm import __version__
+from v2hdm.hdmap import read_geojson
+
+RUN_BY = {
+    "docs/calibrate.md": "tests/precalibration/test_door.py",
+    "docs/living-map.md": "tests/pipeline/test_living_map.py",
+    "docs/survey.md": "tests/pipeline/test_survey.py",
+}
+"""Documents whose commands other tests run, on data made for them, to see what comes of them."""
 
 SHELL = [block for name in documents() for block in blocks(name, "sh")]
-RUN = [block for block in SHELL if block.not_run_because is None]
+RUN = [block for block in SHELL if block.not_run_because is None and block.document not in RUN_BY]
+PYTHON = [block for name in documents() for block in blocks(name, "python")]
 NOT_RUN = [block for block in SHELL if block.not_run_because is not None]
 COMPOSED = ("v2hdm.map", "v2hdm.experiment", "train", "export")
 """Doors whose arguments are checked by composing their configuration."""
@@ -75,8 +84,10 @@ def shell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shell]:
 
 @pytest.fixture(scope="module")
 def furnished(shell: Shell, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The README's first block makes the drive and the result that all other commands work on."""
     folder = tmp_path_factory.mktemp("furnished")
-    furnish(folder, lambda command: shell(command, folder))
+    shell(RUN[0].text, folder)
+    furnish(folder)
     return folder
 
 
@@ -99,9 +110,30 @@ def folder_of(furnished: Path, tmp_path_factory: pytest.TempPathFactory) -> Call
     return folder
 
 
-@pytest.mark.parametrize("block", RUN, ids=named)
+def test_the_first_block_of_the_readme_makes_a_map_and_a_report(furnished: Path) -> None:
+    assert "make map" in RUN[0].text
+    assert (furnished / "outputs/port2/report.html").stat().st_size > 100_000
+    assert len(read_geojson(furnished / "outputs/port2/map.geojson").markings) > 5
+
+
+@pytest.mark.parametrize("block", RUN[1:], ids=named)
 def test_a_documented_block_runs(block: Block, shell: Shell, folder_of: Callable[[str], Path]) -> None:
-    shell(block.text, folder_of(block.document))
+    folder = folder_of(block.document)
+    for line in shell(block.text, folder).splitlines():
+        if re.fullmatch(r"[\w./-]+/[\w.-]+", line):  # a door that tells what it has written
+            assert (folder / line).exists(), line
+
+
+@pytest.mark.parametrize("block", PYTHON, ids=named)
+def test_a_documented_program_runs(block: Block, shell: Shell, folder_of: Callable[[str], Path]) -> None:
+    folder = folder_of(block.document)
+    (folder / "program.py").write_text(block.text)
+    shell("python program.py", folder)
+
+
+@pytest.mark.parametrize("name", RUN_BY)
+def test_the_commands_that_other_tests_run_are_taken_from_the_document(name: str) -> None:
+    assert f'blocks("{name}", "sh"' in (ROOT / RUN_BY[name]).read_text()
 
 
 @pytest.mark.parametrize("block", NOT_RUN, ids=named)
@@ -115,7 +147,9 @@ def test_what_is_not_run_names_doors_and_settings_that_are_there(
         assert importlib.util.find_spec(module) is not None, line
         if module in COMPOSED:
             own = ROOT / "docs" / "own-class"
-            arguments = [one.replace("docs/own-class", str(own)) for one in arguments]
+            # One configuration is composed: a sweep's values stand for themselves.
+            given = [one for one in arguments if one != "--multirun"]
+            arguments = [one.replace("docs/own-class", str(own)) for one in given]
             assert shell(shlex.join(["python", "-m", module, *arguments, "--cfg=job"]), tmp_path)
         else:
             source = "".join(path.read_text() for path in _sources(module))
