@@ -142,6 +142,9 @@ def test_what_is_not_run_names_doors_and_settings_that_are_there(
 ) -> None:
     for line in block.lines:
         words = shlex.split(line)
+        if words[0] == "rerun":
+            assert (ROOT / "v2hdm/viewer/recording.py").read_text().count(words[1].rpartition("/")[2]), line
+            continue
         assert words[0] in ("python", "torchrun"), line
         module, arguments = words[words.index("-m") + 1], words[words.index("-m") + 2 :]
         assert importlib.util.find_spec(module) is not None, line

@@ -35,6 +35,7 @@ from v2hdm.pipeline.base import changes_json, check_together, grey_reader, read_
 from v2hdm.pipeline.evaluate import CameraSets, evaluate
 from v2hdm.pipeline.inspect import Inspection, inspect, join
 from v2hdm.pipeline.survey import Survey, check_survey, table_of, take_survey
+from v2hdm.pipeline.viewer import Unwatched, Viewer
 from v2hdm.pipeline.write import BEST, write_results
 from v2hdm.quality import Finding, Status, Verdict
 from v2hdm.quality.results.known_sizes import check_known_sizes
@@ -159,6 +160,7 @@ class RunConfig:
         all_maps: whether the map of every method and camera set is written, into ``maps/``.
         mode: what it hands on as ``mapping.mode``, ``batch`` or ``incremental``.
         mosaic: whether the ground is shown from above, too (docs/mosaic.md).
+        viewer: ``rerun`` shows and records the run while it goes on (docs/live-view.md), ``none`` does not.
         export: formats of the map: ``geojson``, ``csv``, ``gpkg``, ``lanelet2``, ``dxf`` (docs/exports.md).
     """
 
@@ -175,6 +177,7 @@ class RunConfig:
     mode: str = "batch"
     all_maps: bool = False
     mosaic: bool = False
+    viewer: str = "none"
     export: list[str] = field(default_factory=lambda: ["geojson"])
 
 
@@ -188,13 +191,16 @@ class RunResult:
     verdict: Verdict
 
 
-def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -> RunResult:
+def run(
+    config: RunConfig, config_yaml: str = "", progress: Progress = silent, viewer: Viewer | None = None
+) -> RunResult:
     """Map one drive, or several together, and write the results to ``<output>/<name>/``, whole or not at all.
 
     Args:
         config: what to do.
         config_yaml: the configuration as text, kept beside the results.
         progress: told how far the long steps are.
+        viewer: shown images, detections and maps as they come.
 
     Raises:
         V2hdmError: The configuration, the drive or the detector is at fault, or no map can be made.
@@ -202,6 +208,7 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
     name = _check(config)
     seconds: dict[str, float] = {}
     base = None if config.map.base is None else read_base(Path(config.map.base))
+    viewer = viewer or Unwatched()
     with (
         result_folder(Path(config.output) / name) as folder,
         logging_to(_log_file(folder / "run.log")),
@@ -226,7 +233,9 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
             inspection = join([_inspect(config, drive, len(drives), progress) for drive in drives])
         about = describe_run(name, whole, paths, config.drive)
         try:
-            result = _map_and_judge(config, inspection, survey, base, folder, about, seconds, progress)
+            result = _map_and_judge(
+                config, inspection, survey, base, folder, about, seconds, progress, viewer
+            )
         except (MappingError, AdjustError) as failure:
             if not inspection.has_failed:
                 raise
@@ -250,13 +259,16 @@ def _map_and_judge(
     about: Mapping[str, Any],
     seconds: dict[str, float],
     progress: Progress,
+    viewer: Viewer,
 ) -> RunResult:
     """Detect, map, check and write."""
     drive = inspection.drive
     with _timed(seconds, "detect"):
         detections = _detect(config, drive, progress)
+    viewer.detected(folder, drive, detections)
     with _timed(seconds, "map"):
-        methods = _map_camera_sets(config, drive, detections, base, progress)
+        methods = _map_camera_sets(config, drive, detections, base, progress, viewer)
+    viewer.close()
     with _timed(seconds, "judge"):
         found = check_result(drive, methods, inspection.ground)
         checked, surveyed = check_survey(survey, drive, list(methods.values())[-1][BEST])
@@ -338,6 +350,7 @@ def _map_camera_sets(
     detections: Sequence[ImageDetections],
     base: Base | None,
     progress: Progress,
+    viewer: Viewer,
 ) -> CameraSets:
     sets = camera_sets(drive)
     found = {}
@@ -361,6 +374,7 @@ def _map_camera_sets(
             # The factors of the adjustment are large, and only the whole rig's map is checked.
             found[name]["Opt"] = replace(found[name]["Opt"], corners=None)
         took_s = time.perf_counter() - begin_s
+        viewer.mapped(name, found[name])
         log.info("mapped with %s: %d markings, %.1f s", name, len(found[name]["Opt"].hd_map.markings), took_s)
         for exclusion in found[name]["Opt"].excluded:
             where = ", ".join(f"{value:.2f}" for value in exclusion.position_map)
