@@ -3,6 +3,7 @@
 #   make test    run the tests
 #   make check   format, lint, types, import contracts
 #   make docs    build the documentation's site into site/
+#   make audit   known weaknesses of the installed packages
 # Further arguments: make map ARGS="+run=port1"
 
 PYTHON ?= python3
@@ -14,7 +15,7 @@ INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c co
 MAP_INSTALLED := $(VENV)/.installed-map
 DEV_INSTALLED := $(VENV)/.installed-dev
 
-.PHONY: map test check docs clean
+.PHONY: map test check docs audit clean
 
 map: $(MAP_INSTALLED)
 	$(BIN)/python -m v2hdm.map $(ARGS)
@@ -32,6 +33,9 @@ check: $(DEV_INSTALLED)
 
 docs: $(DEV_INSTALLED)
 	$(BIN)/mkdocs build --strict --quiet
+
+audit: $(DEV_INSTALLED)
+	$(BIN)/python -m tests.audit
 
 clean:
 	rm -rf $(VENV) build dist site .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
