@@ -36,7 +36,12 @@ def drive_of_result(folder: Path, path: Path | None = None) -> Drive:
     """
     content = load_yaml(folder / "config.yaml", MapFileError)
     try:
-        config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(RunConfig), content))
+        merged = OmegaConf.merge(OmegaConf.structured(RunConfig), content)
+        if merged.simulate is not None and content["simulate"].get("cameras"):
+            # The schema brings its own cameras: those that the run had left out would come back.
+            for name in set(merged.simulate.cameras) - set(content["simulate"]["cameras"]):
+                del merged.simulate.cameras[name]
+        config = OmegaConf.to_object(merged)
     except OmegaConfBaseException:
         config = None
     if not isinstance(config, RunConfig):

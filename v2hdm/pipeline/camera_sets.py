@@ -16,6 +16,7 @@ from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.base import grey_reader
 from v2hdm.pipeline.survey import Survey, compare_survey
 from v2hdm.pipeline.telling import Progress
+from v2hdm.pipeline.viewer import Viewer
 from v2hdm.pipeline.write import BEST
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.check_points import CheckTable
@@ -52,6 +53,7 @@ def map_camera_sets(
     base: Base | None,
     room: Room,
     progress: Progress,
+    viewer: Viewer,
 ) -> dict[str, MappedSet]:
     """Map a drive with each set of cameras, where that is not known yet.
 
@@ -63,6 +65,7 @@ def map_camera_sets(
         base: an earlier map that is brought up to date with all cameras.
         room: keeps the results.
         progress: told how many sets are done.
+        viewer: shown the results of each set.
 
     Raises:
         MappingError: no map can be made.
@@ -81,6 +84,7 @@ def map_camera_sets(
             _map_set, drive, detections, name, cameras, survey, steps, base if last else None, last
         )
         found[name] = room.made(STAGE, room.key(begun, name, cameras, steps, of_last), MappedSet, make)
+        viewer.mapped(name, found[name].methods)
     progress("map", len(sets), len(sets))
     return found
 

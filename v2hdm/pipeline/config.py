@@ -74,6 +74,7 @@ class RunConfig:
         all_maps: whether the map of every method and camera set is written, into ``maps/``.
         mode: what it hands on as ``mapping.mode``, ``batch`` or ``incremental``.
         mosaic: whether the ground is shown from above, too (docs/mosaic.md).
+        viewer: ``rerun`` shows and records the run while it goes on (docs/live-view.md), ``none`` does not.
         export: formats of the map: ``geojson``, ``csv``, ``gpkg``, ``lanelet2``, ``dxf`` (docs/exports.md).
     """
 
@@ -92,6 +93,7 @@ class RunConfig:
     mode: str = "batch"
     all_maps: bool = False
     mosaic: bool = False
+    viewer: str = "none"
     export: list[str] = field(default_factory=lambda: ["geojson"])
 
 

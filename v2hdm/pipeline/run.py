@@ -12,15 +12,19 @@ from v2hdm.caching.store import Store
 from v2hdm.pipeline.config import RunConfig
 from v2hdm.pipeline.finished import RunResult, finished
 from v2hdm.pipeline.telling import Progress, silent
+from v2hdm.pipeline.viewer import Viewer
 
 
-def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -> RunResult:
+def run(
+    config: RunConfig, config_yaml: str = "", progress: Progress = silent, viewer: Viewer | None = None
+) -> RunResult:
     """Map one drive, or several together, and write the results to ``<output>/<name>/``, whole or not at all.
 
     Args:
         config: what to do.
         config_yaml: the configuration as text, kept beside the results.
         progress: told how far the long steps are.
+        viewer: shown images, detections and maps as they come.
 
     Raises:
         V2hdmError: The configuration, the drive or the detector is at fault, or no map can be made.
@@ -32,4 +36,4 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
     # Loads torch and much else, which takes seconds.
     from v2hdm.pipeline.work import map_drives
 
-    return map_drives(config, store, config_yaml, progress)
+    return map_drives(config, store, config_yaml, progress, viewer)

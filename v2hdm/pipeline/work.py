@@ -33,6 +33,7 @@ from v2hdm.pipeline.inspect import Inspection, inspect_once, join
 from v2hdm.pipeline.keys import Contents, read_drives, result_key
 from v2hdm.pipeline.survey import Survey, check_survey, take_survey
 from v2hdm.pipeline.telling import Progress, log_file, logging_to, timed
+from v2hdm.pipeline.viewer import Unwatched, Viewer
 from v2hdm.pipeline.write import BEST, write_results
 from v2hdm.quality import Finding, Status, Verdict
 from v2hdm.quality.results.known_sizes import check_known_sizes
@@ -56,13 +57,16 @@ class _Task:
     about: Mapping[str, Any]
     seconds: dict[str, float]
     progress: Progress
+    viewer: Viewer
 
     def result(self, metrics: Mapping[str, Any], headlines: Sequence[str], verdict: Verdict) -> RunResult:
         """What the run hands back."""
         return RunResult(Path(self.config.output) / self.about["name"], metrics, headlines, verdict)
 
 
-def map_drives(config: RunConfig, store: Store, config_yaml: str, progress: Progress) -> RunResult:
+def map_drives(
+    config: RunConfig, store: Store, config_yaml: str, progress: Progress, viewer: Viewer | None = None
+) -> RunResult:
     """Do what :func:`v2hdm.pipeline.run.run` says, with what ``store`` keeps."""
     name = admit(config)
     base = None if config.map.base is None else read_base(Path(config.map.base))
@@ -73,7 +77,8 @@ def map_drives(config: RunConfig, store: Store, config_yaml: str, progress: Prog
         ):
             log.info("v2hdm %s, run %s", __version__, name)
             (folder / "config.yaml").write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
-            result, key = _write(config, name, base, Room(store, config.resume), folder, progress)
+            room = Room(store, config.resume)
+            result, key = _write(config, name, base, room, folder, progress, viewer or Unwatched())
             for line in result.verdict.lines:
                 log.info("%s", line)
         note_finished(result, key, store)
@@ -82,7 +87,13 @@ def map_drives(config: RunConfig, store: Store, config_yaml: str, progress: Prog
 
 
 def _write(
-    config: RunConfig, name: str, base: Base | None, room: Room, folder: Path, progress: Progress
+    config: RunConfig,
+    name: str,
+    base: Base | None,
+    room: Room,
+    folder: Path,
+    progress: Progress,
+    viewer: Viewer,
 ) -> tuple[RunResult, str]:
     """Write a run's result into ``folder``; returns the key of what it was made of, too."""
     unknown = unknown_network(config.detector.model) if config.detector.model is not None else None
@@ -103,7 +114,8 @@ def _write(
     survey = take_survey(whole, config.mapping)
     key = result_key(config, drives, contents, room.key())
     about = describe_run(name, whole, paths, config.drive)
-    task = _Task(replace(config, mapping=survey.mapping), room, folder, about, seconds, progress)
+    mapped = replace(config, mapping=survey.mapping)
+    task = _Task(mapped, room, folder, about, seconds, progress, viewer)
     with timed(seconds, "check"):
         inspection = join([_inspect(task, drive, contents, len(drives)) for drive in drives])
     try:
@@ -127,8 +139,12 @@ def _map_and_judge(
     config, drive, seconds, progress = task.config, inspection.drive, task.seconds, task.progress
     with timed(seconds, "detect"):
         detections = _detect(task, drive, contents)
+    task.viewer.detected(task.folder, drive, detections)
     with timed(seconds, "map"):
-        sets = map_camera_sets(drive, contents.key(drive), detections, survey, base, task.room, progress)
+        sets = map_camera_sets(
+            drive, contents.key(drive), detections, survey, base, task.room, progress, task.viewer
+        )
+    task.viewer.close()
     methods = {name: one.methods for name, one in sets.items()}
     best, checked = list(methods.values())[-1][BEST], list(sets.values())[-1].checked
     with timed(seconds, "judge"):
