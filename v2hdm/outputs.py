@@ -108,6 +108,15 @@ def added_to(folder: Path, names: Sequence[str], option: str) -> Iterator[Path]:
                         stream.write(json.dumps(entry) + "\n")
 
 
+def is_whole(folder: Path) -> bool:
+    """Whether a folder is a finished result of ours, all of whose files are as we wrote them."""
+    try:
+        listed = _ours(folder, folder, "output=")
+    except (ConfigError, OSError):
+        return False
+    return listed is not None and all((folder / name).is_file() for name in listed)
+
+
 class GrowingFolder:
     """A folder whose files are written one by one, each at once."""
 

@@ -73,7 +73,7 @@ def detect_all(
 
     if workers <= 1 or total < _FEW_IMAGES:
         for index in range(total):
-            collect(_detect_image(detector, drive, index))
+            collect(detect_image(detector, drive, index))
         return results
     share_out(_work, range(total), workers, _start_worker, (drive, options), collect)
     return results
@@ -101,10 +101,15 @@ def _start_worker(drive: Drive, options: DetectorOptions) -> None:
 def _work(index: int) -> ImageDetections:
     if _worker is None:
         raise RuntimeError("worker was not started")
-    return _detect_image(*_worker, index)
+    return detect_image(*_worker, index)
 
 
-def _detect_image(detector: Detector, drive: Drive, index: int) -> ImageDetections:
+def detect_image(detector: Detector, drive: Drive, index: int) -> ImageDetections:
+    """What a detector finds in image ``index`` of a drive, see :func:`with_own_vehicle`.
+
+    Raises:
+        DriveError: the image is missing, damaged or of the wrong size.
+    """
     image = drive.images[index]
     camera = drive.cameras[image.camera]
     return ImageDetections(index, *detector.detect(read_image(image, camera), camera))

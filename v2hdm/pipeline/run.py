@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -188,13 +188,29 @@ class RunResult:
     verdict: Verdict
 
 
-def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -> RunResult:
+class Detect(Protocol):
+    """Finds what is in the images of a drive, as :func:`~v2hdm.detection.batch.detect_all` does."""
+
+    def __call__(
+        self,
+        drive: Drive,
+        options: DetectorOptions,
+        workers: int,
+        progress: Callable[[int, int], None],
+    ) -> list[ImageDetections]:
+        """``progress`` is told how many images are done, and of how many."""
+
+
+def run(
+    config: RunConfig, config_yaml: str = "", progress: Progress = silent, detect: Detect = detect_all
+) -> RunResult:
     """Map one drive, or several together, and write the results to ``<output>/<name>/``, whole or not at all.
 
     Args:
         config: what to do.
         config_yaml: the configuration as text, kept beside the results.
         progress: told how far the long steps are.
+        detect: takes the place of detection in processes of this machine.
 
     Raises:
         V2hdmError: The configuration, the drive or the detector is at fault, or no map can be made.
@@ -226,7 +242,9 @@ def run(config: RunConfig, config_yaml: str = "", progress: Progress = silent) -
             inspection = join([_inspect(config, drive, len(drives), progress) for drive in drives])
         about = describe_run(name, whole, paths, config.drive)
         try:
-            result = _map_and_judge(config, inspection, survey, base, folder, about, seconds, progress)
+            result = _map_and_judge(
+                config, inspection, survey, base, folder, about, seconds, progress, detect
+            )
         except (MappingError, AdjustError) as failure:
             if not inspection.has_failed:
                 raise
@@ -250,11 +268,12 @@ def _map_and_judge(
     about: Mapping[str, Any],
     seconds: dict[str, float],
     progress: Progress,
+    detect: Detect,
 ) -> RunResult:
     """Detect, map, check and write."""
     drive = inspection.drive
     with _timed(seconds, "detect"):
-        detections = _detect(config, drive, progress)
+        detections = _detect(config, drive, progress, detect)
     with _timed(seconds, "map"):
         methods = _map_camera_sets(config, drive, detections, base, progress)
     with _timed(seconds, "judge"):
@@ -322,8 +341,8 @@ def _drive_folders(config: RunConfig, seconds: dict[str, float], progress: Progr
     return (folder,)
 
 
-def _detect(config: RunConfig, drive: Drive, progress: Progress) -> list[ImageDetections]:
-    detections = detect_all(drive, config.detector, _workers(config), partial(progress, "detect"))
+def _detect(config: RunConfig, drive: Drive, progress: Progress, detect: Detect) -> list[ImageDetections]:
+    detections = detect(drive, config.detector, _workers(config), partial(progress, "detect"))
     markings = sum(len(found.markings) for found in detections)
     lanes = sum(len(found.lanes) for found in detections)
     log.info(
