@@ -1,4 +1,4 @@
-"""A synthetic site: one street driven by many drives, each of which has a stretch of it and shares its ends."""
+"""A synthetic site: a street of which each drive has a stretch, and shares its ends."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ def site(drives: int, frames: int, overlap: int, *, every_m: float = 2.0, seed: 
     sigmas = [(DRIFTING, SCATTERING)[number % 2] for number in range(drives)]
     parts = []
     for number, sigma in enumerate(sigmas):
-        rng, own = np.random.default_rng(seed + 100 * number), slice(number * stride, number * stride + frames)
+        rng, own = (
+            np.random.default_rng(seed + 100 * number),
+            slice(number * stride, number * stride + frames),
+        )
         true = poses[own] @ exp(pose_errors(poses[own], sigma, 0.5, rng))
         mine = np.flatnonzero((seen.frame >= own.start) & (seen.frame < own.stop))
         frame = seen.frame[mine] - own.start

@@ -16,7 +16,15 @@ from v2hdm.adjust.arrays import Arrays, Run
 from v2hdm.adjust.corner_factor import CornerFactor
 from v2hdm.adjust.linear import PAIR_BLOCK
 from v2hdm.adjust.residuals import Estimate, earlier_markings, of_each
-from v2hdm.adjust.tiles import TIP, Pattern, TiledCholesky, TiledMatrix, factorise_above_tip, factorise_tiles, find_pattern
+from v2hdm.adjust.tiles import (
+    TIP,
+    Pattern,
+    TiledCholesky,
+    TiledMatrix,
+    factorise_above_tip,
+    factorise_tiles,
+    find_pattern,
+)
 
 # Rows of a tile, about: large enough for fast products, small against a corner's span of frames.
 _TILE_ROWS = 96

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -22,8 +23,12 @@ class Keeper:
 
     def __init__(self) -> None:
         torch.set_num_threads(1)
-        self._workers: dict[int, Worker] = {}
+        self._workers: dict[int, tuple[str, Worker]] = {}
         self._bases: dict[int, tuple[str, Base]] = {}
+
+    def process(self) -> int:
+        """Its process's number."""
+        return os.getpid()
 
     def corners(self, parts: Sequence[tuple[int, Any]]) -> list[tuple[Tensor, Tensor]]:
         """The :attr:`Worker.corners` of parts, given by number and reference."""
@@ -42,9 +47,10 @@ class Keeper:
         return bases if len(bases) > 1 else bases[0]
 
     def _worker(self, number: int, part: Any) -> Worker:
-        if number not in self._workers:
-            self._workers[number] = Worker(ray.get(part))
-        return self._workers[number]
+        key = part.hex()
+        if number not in self._workers or self._workers[number][0] != key:
+            self._workers[number] = key, Worker(ray.get(part))
+        return self._workers[number][1]
 
     def _base(self, number: int, base: Any) -> Base:
         key = base.hex()
@@ -83,9 +89,7 @@ class RayTeam:
 
     def ask(self, question: str, bases: Sequence[Any], *arguments: Sequence[Any]) -> list[Any]:
         """Ask all actors at once."""
-        told = [
-            actor.ask.remote(question, tasks) for actor, tasks in self._tasks(bases, arguments) if tasks
-        ]
+        told = [actor.ask.remote(question, tasks) for actor, tasks in self._tasks(bases, arguments) if tasks]
         return self._in_order(ray.get(told))
 
     def move(self, bases: Sequence[Any], *arguments: Sequence[Any]) -> list[Any]:
@@ -109,6 +113,8 @@ class RayTeam:
     def _in_order(self, told: Sequence[Sequence[Any]]) -> list[Any]:
         """What the actors say of their parts, in the order of the parts."""
         out: dict[int, Any] = {}
-        for mine, answers in zip([one for one in self._mine if one], [one for one in told if one], strict=True):
+        for mine, answers in zip(
+            [one for one in self._mine if one], [one for one in told if one], strict=True
+        ):
             out.update(zip(mine, answers, strict=True))
         return [out[number] for number in range(len(out))]

@@ -99,7 +99,9 @@ class _Table:
 
 def _map_all(ray: Any, todo: Sequence[Job], table: _Table, tell: Tell) -> None:
     """Map the drives, as many at a time as there are cores."""
-    from v2hdm.fleet.work import Board, Eyes, map_drive
+    from v2hdm.fleet.board import Board
+    from v2hdm.fleet.eyes import Eyes
+    from v2hdm.fleet.work import map_drive
 
     cores = max(int(ray.cluster_resources().get("CPU", 1)), 1)
     here = str(Path.cwd())

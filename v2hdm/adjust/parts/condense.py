@@ -300,10 +300,12 @@ class Condensed:
 
 def _nothing(arrays: Arrays) -> Elimination:
     """Of a part without corners of its own."""
-    zero, wrench = arrays.centre.new_zeros(()), arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6)
+    zero, wrench = (
+        arrays.centre.new_zeros(()),
+        arrays.centre.new_zeros(arrays.camera_count, arrays.frame_count, 6),
+    )
     none = arrays.centre.new_zeros(0, 2)
     by_state = wrench.new_zeros(arrays.frame_count, len(arrays.states))
     by_camera = wrench.new_zeros(arrays.camera_count, arrays.camera_unknowns)
     factor = CornerFactor(none.new_zeros(3, 0), ())
     return Elimination(Sums(zero, zero, zero, wrench, none), Coupled(by_state, by_camera), none, factor, None)
-

@@ -30,6 +30,7 @@ from v2hdm.adjust.solve import report, start_at
 from v2hdm.adjust.whitening import JITTER_STEPS, SINGULAR_PIVOT
 from v2hdm.errors import AdjustError
 
+
 def solve_in_parts(problem: Problem, options: SolveOptions, team: Team) -> Solution:
     """Adjust a problem of several visits, each visit by a worker of its own; as :func:`v2hdm.adjust.solve`.
 
@@ -193,7 +194,9 @@ class _InParts:
             terms = {name: value + one.cost[name] for name, value in terms.items()}
         return terms, gradient
 
-    def step_from(self, joined: Joined, whitened: Tensor, numbers: Sequence[int]) -> tuple[Tensor, list[Step]]:
+    def step_from(
+        self, joined: Joined, whitened: Tensor, numbers: Sequence[int]
+    ) -> tuple[Tensor, list[Step]]:
         """What whitened variables move the shared unknowns by (6 C + 2 M,), and what each part is told."""
         shared = torch.linalg.solve_triangular(
             joined.factor.mT, whitened[joined.bounds[-1] :, None], upper=True
@@ -257,7 +260,9 @@ class _Objective:
 def _factor(information: Tensor, known: Tensor) -> tuple[Tensor, float]:
     """The lower factor of S, and what had to be added to its diagonal, relative to ``known``."""
     for jitter in JITTER_STEPS:
-        factor, failed = torch.linalg.cholesky_ex(information + jitter * torch.diag(known))
+        if jitter:
+            information.diagonal().add_(known, alpha=jitter)
+        factor, failed = torch.linalg.cholesky_ex(information)
         if not int(failed):
             return factor, jitter
     raise AdjustError(

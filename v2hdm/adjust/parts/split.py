@@ -35,9 +35,7 @@ class Part:
     clock_offset: bool
 
 
-def split(
-    problem: Problem, pose_states: tuple[str, ...], clock_offset: bool
-) -> tuple[list[Part], IntArray]:
+def split(problem: Problem, pose_states: tuple[str, ...], clock_offset: bool) -> tuple[list[Part], IntArray]:
     """The visits of a problem as parts, and its corners (M,) that they share, ascending.
 
     Corners that known lengths join to a shared one are shared, too.
