@@ -144,7 +144,9 @@ def compose_run_file(path: Path, name: str, schema: type[Any], overrides: Sequen
             with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
                 return hydra.compose(name, chosen)
         except Exception as error:  # as in work_on
-            line = _OF_COPY.sub("", str(explain(error, schema, list(overrides))))
+            # What the line does not name is the file's.
+            named = [one for one in overrides if one.lstrip("+~").split("=")[0] in str(error)]
+            line = _OF_COPY.sub("", str(explain(error, schema, named)))
             raise ConfigError(f"{path}: {line}") from error
 
 

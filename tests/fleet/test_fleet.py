@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +18,14 @@ import pytest
 
 pytest.importorskip("ray", reason="ray, the extra 'fleet', is not installed")
 
+from v2hdm import pipeline
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.drive import read_drive
 from v2hdm.errors import DriveError, WorkerError
 from v2hdm.fleet.eyes import Eyes, detect_by
+from v2hdm.fleet.finished import finished_metrics
+from v2hdm.fleet.plan import plan
 from v2hdm.fleet.rows import Row, exit_code
 from v2hdm.fleet.run import FleetOptions, run_fleet
 from v2hdm.fleet.work import map_drive
@@ -92,69 +97,54 @@ def written(folder: Path, name: str, drive: object) -> Path:
     return path
 
 
-def test_a_fleet_keeps_what_is_finished_and_goes_on_past_what_fails(
+def test_a_fleet_outlives_its_workers_keeps_what_is_finished_and_goes_on_past_what_fails(
     ray: Any, drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     @contextmanager
     def here(address: str, workers: int) -> Iterator[Any]:
         yield ray
 
+    def dies_once(*arguments: Any) -> Any:
+        if not (tmp_path / "died").exists():
+            (tmp_path / "died").touch()
+            threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGKILL)).start()
+        return map_drive(*arguments)
+
     monkeypatch.setattr("v2hdm.fleet.run.cluster", here)
-    files = [
-        written(tmp_path, "good", drive),
-        written(tmp_path, "nowhere", tmp_path / "absent"),
-        written(tmp_path, "typo", drive),
-    ]
-    files[2].write_text(files[2].read_text() + "mapping: {max_rang_m: 3}\n")
+    monkeypatch.setattr("v2hdm.fleet.work.map_drive", dies_once)
+    good, nowhere = written(tmp_path, "good", drive), written(tmp_path, "nowhere", tmp_path / "absent")
+    typo = written(tmp_path, "typo", drive)
+    typo.write_text(typo.read_text() + "mapping: {max_rang_m: 3}\n")
     overrides = [f"output={tmp_path / 'out'}", f"cache={tmp_path / 'cache'}"]
     told: list[tuple[str, str, int, int]] = []
 
-    def fleet(*more: str, again: bool = False) -> list[Row]:
-        options = FleetOptions(tmp_path / "table", again=again)
-        return run_fleet(files, [*overrides, *more], options, lambda *message: told.append(message))
+    def fleet(*files: Path) -> list[Row]:
+        options = FleetOptions(tmp_path / "table")
+        return run_fleet(files, overrides, options, lambda *message: told.append(message))
 
-    first = fleet()
-    assert [row.status for row in first][1:] == ["ERROR", "ERROR"]
-    assert first[0].status in ("PASS", "WARN", "FAIL")
-    assert first[0].images == 11
-    assert not first[0].kept
-    assert "no such drive folder" in first[1].says
-    assert "did you mean mapping.max_range_m" in first[2].says
-    assert exit_code(first) == 2
-    assert ("good", "detect", 11, 11) in told
-    table = list(csv.DictReader((tmp_path / "table" / "fleet.csv").open()))
-    assert [row["drive"] for row in table] == ["good", "nowhere", "typo"]
-    assert json.loads((tmp_path / "table" / "fleet.json").read_text())["drives"][0]["kept"] is False
-    map_file = tmp_path / "out" / "good" / "map.geojson"
-    before = map_file.read_bytes()
-
-    def dies_once(*arguments: Any) -> Any:
-        died = tmp_path / "died"
-        if not died.exists():
-            died.touch()
-            threading.Timer(1.5, os.kill, (os.getpid(), signal.SIGKILL)).start()
-        return map_drive(*arguments)
-
-    assert fleet()[0].kept
-    monkeypatch.setattr("v2hdm.fleet.work.map_drive", dies_once)
-    again = fleet(again=True)
+    rows = fleet(good, nowhere, typo)
     assert (tmp_path / "died").exists()
-    assert not again[0].kept
-    assert again[0].status == first[0].status
-    assert map_file.read_bytes() == before
+    images = len(read_drive(drive).images)
+    assert [row.status for row in rows] == ["PASS", "ERROR", "ERROR"]
+    assert (rows[0].images, rows[0].kept) == (images, False)
+    assert "no such drive folder" in rows[1].says
+    assert re.search("did you mean .*mapping.max_range_m", rows[2].says)
+    assert ("good", "detect", images, images) in told
+    table = list(csv.DictReader(StringIO((tmp_path / "table" / "fleet.csv").read_text())))
+    assert [row["drive"] for row in table] == ["good", "nowhere", "typo"]
+    assert json.loads((tmp_path / "table" / "fleet.json").read_text())["drives"][0]["status"] == "PASS"
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["good"]
-    image = next(drive.rglob("*.jpg"), None) or next(drive.rglob("*.png"))
-    os.utime(image)  # an input that was touched is another input
-    from v2hdm.fleet.finished import finished_metrics
-    from v2hdm.fleet.plan import plan
+    (job,), _ = plan([good], [f"output={tmp_path / 'alone'}", "workers=1"])
+    alone = pipeline.run(job.config, job.config_yaml).folder
+    for name in ("map.geojson", "calibration_front.yaml", "residuals.csv", "trajectory.tum"):
+        assert (tmp_path / "out" / "good" / name).read_bytes() == (alone / name).read_bytes(), name
 
-    assert finished_metrics(plan(files[:1], overrides)[0][0]) is None
-    assert plan(files[:1], [*overrides, "workers=1"])[0][0].key == plan(files[:1], overrides)[0][0].key
+    assert fleet(good)[0].kept
+    os.utime(read_drive(drive).images[0].path)  # an input that was touched is another input
+    assert finished_metrics(plan([good], overrides)[0][0]) is None
 
 
 def test_two_run_files_never_write_one_folder(tmp_path: Path, drive: Path) -> None:
-    from v2hdm.fleet.plan import plan
-
     files = [written(tmp_path, "one", drive), tmp_path / "other.yaml"]
     files[1].write_text(files[0].read_text())
     jobs, refused = plan(files, [])

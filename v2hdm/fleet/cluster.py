@@ -65,7 +65,7 @@ def cluster(address: str, workers: int) -> Iterator[Any]:
             ray.init(
                 address=address,
                 log_to_driver=False,
-                logging_level=logging.ERROR,
+                configure_logging=False,
                 runtime_env=None if local else {"env_vars": dict.fromkeys(_ONE_THREAD, "1")},
                 **(own if local else {}),
             )
