@@ -65,7 +65,7 @@ class RayTeam:
     def __init__(self, actors: int, cores_each: float = 1.0) -> None:
         """Start actors that take so many cores each."""
         options = {"num_cpus": cores_each, "max_restarts": -1, "max_task_retries": -1}
-        self.actors = [ray.remote(Keeper).options(**options).remote() for _ in range(actors)]
+        self.actors: list[Any] = [ray.remote(Keeper).options(**options).remote() for _ in range(actors)]
 
     def start(self, parts: Sequence[Part]) -> list[tuple[Tensor, Tensor]]:
         """Share the parts out, the large ones first, each to the actor that has least to do."""

@@ -245,7 +245,8 @@ class Condensed:
         across = matrix[self._clocks][:, self._shared_rows]
         self._of_clock = torch.linalg.solve_triangular(self._clock_factor, across, upper=False)
         rest = matrix[self._shared_rows][:, self._shared_rows]
-        return rest - self._of_clock.mT @ self._of_clock
+        left: Tensor = rest - self._of_clock.mT @ self._of_clock
+        return left
 
     def _with_priors(
         self, estimate: Estimate, shared_map: Tensor, sums: Sums

@@ -149,7 +149,7 @@ class _InParts:
         """The loss's scale by the median of all parts' residuals, exactly; few of them travel."""
         cut = self.team.ask("quantiles", estimate.bases)
         wanted = (sum(count for count, _ in cut) - 1) // 2
-        marks = torch.cat([values for _, values in cut]).unique()
+        marks = torch.cat([values for _, values in cut]).sort().values
         low, high = _bracket(cut, marks, wanted)
         found = self.team.ask("between", estimate.bases, self._of_each(low), self._of_each(high))
         inside = torch.cat([values for _, values in found]).sort().values
@@ -272,7 +272,8 @@ def _factor(information: Tensor, known: Tensor) -> tuple[Tensor, float]:
 
 
 def _solved(factor: Tensor, gradient: Tensor) -> Tensor:
-    return torch.linalg.solve_triangular(factor, gradient[:, None], upper=False)[:, 0]
+    solved: Tensor = torch.linalg.solve_triangular(factor, gradient[:, None], upper=False)
+    return solved[:, 0]
 
 
 def _bracket(cut: Sequence[tuple[int, Tensor]], marks: Tensor, wanted: int) -> tuple[float, float]:
