@@ -2,6 +2,7 @@
 #   make map     drive through a rendered port and map it
 #   make test    run the tests
 #   make check   format, lint, types, import contracts
+#   make audit   known weaknesses of the installed packages
 # Further arguments: make map ARGS="+run=port1"
 
 PYTHON ?= python3
@@ -13,7 +14,7 @@ INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c co
 MAP_INSTALLED := $(VENV)/.installed-map
 DEV_INSTALLED := $(VENV)/.installed-dev
 
-.PHONY: map test check clean
+.PHONY: map test check audit clean
 
 map: $(MAP_INSTALLED)
 	$(BIN)/python -m v2hdm.map $(ARGS)
@@ -28,6 +29,9 @@ check: $(DEV_INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+audit: $(DEV_INSTALLED)
+	$(BIN)/python -m tests.audit
 
 clean:
 	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

@@ -19,6 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import BinaryIO
 
 import cv2
 import numpy as np
@@ -35,7 +36,7 @@ LEAST_SIDE_PX = 16
 """Narrower images show no marking, and not one cell of the network."""
 
 _MOST_BYTES = 1 << 30
-_HEAD_BYTES, _TAIL_BYTES = 1 << 18, 4096
+_TAIL_BYTES = 4096
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
 _TIFF = (b"II*\0", b"MM\0*")
@@ -67,7 +68,8 @@ def read_header(path: Path) -> Header:
     Raises:
         DriveError: the file is missing, no image of these, truncated, or of a size that cannot be worked on.
     """
-    return _checked(_read(path, _HEAD_BYTES), path)
+    with _opened(path) as data:
+        return _checked(data, path)
 
 
 def read_pixels(path: Path, flags: int) -> np.ndarray:
@@ -76,8 +78,10 @@ def read_pixels(path: Path, flags: int) -> np.ndarray:
     Raises:
         DriveError: as :func:`read_header`, or the file is damaged inside.
     """
-    data = _read(path, _MOST_BYTES)
+    with _opened(path) as stored:
+        data = stored[:]
     header = _checked(data, path)
+    _check_sums(data, path)
     if header.orientation != _UPRIGHT and not flags & cv2.IMREAD_IGNORE_ORIENTATION:
         _tell_turned(path.parent, header.orientation)
     with _complaints() as told:
@@ -100,8 +104,26 @@ def _tell_turned(folder: Path, orientation: int) -> None:
     )  # fmt: skip
 
 
-def _read(path: Path, most: int) -> bytes:
-    """The bytes of a file; of one that has more than ``most`` its beginning and its end."""
+class _Stored:
+    """The bytes of an open file, read where they are asked for: a header may lie at its end (TIFF)."""
+
+    def __init__(self, stream: BinaryIO, size: int) -> None:
+        self._stream, self._size = stream, size
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, part: slice) -> bytes:
+        begin, end, _ = part.indices(self._size)
+        self._stream.seek(begin)
+        return self._stream.read(max(end - begin, 0))
+
+
+_Data = bytes | _Stored
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[_Stored]:
     try:
         about = path.stat()
         if not stat.S_ISREG(about.st_mode):
@@ -110,11 +132,7 @@ def _read(path: Path, most: int) -> bytes:
             raise DriveError(f"{path}: image of {about.st_size / 1e6:.0f} MB; check what it is")
         note_input(path)
         with path.open("rb") as stream:
-            data = stream.read(most)
-            if about.st_size > most:
-                stream.seek(-_TAIL_BYTES, os.SEEK_END)
-                data += stream.read()
-        return data
+            yield _Stored(stream, about.st_size)
     except (FileNotFoundError, NotADirectoryError):
         raise DriveError(f"{path}: image listed but missing; restore it or drop it from the list") from None
     except (OSError, ValueError) as failure:
@@ -122,8 +140,8 @@ def _read(path: Path, most: int) -> bytes:
         raise DriveError(f"{path}: cannot read this image ({reason}); check its permissions") from None
 
 
-def _checked(data: bytes, path: Path) -> Header:
-    if not data:
+def _checked(data: _Data, path: Path) -> Header:
+    if not len(data):
         raise DriveError(f"{path}: image file is empty; restore it or drop it from the list")
     if not _known(data):
         raise DriveError(f"{path}: not a PNG, JPEG, TIFF, BMP or WebP image; convert it, or drop it")
@@ -141,51 +159,58 @@ def _checked(data: bytes, path: Path) -> Header:
     return header
 
 
-def _known(data: bytes) -> bool:
-    is_webp = data[:4] == b"RIFF" and data[8:12] == b"WEBP"
-    return data.startswith((_PNG, _JPEG, b"BM", *_TIFF)) or is_webp
+def _known(data: _Data) -> bool:
+    begin = data[:12]
+    is_webp = begin[:4] == b"RIFF" and begin[8:] == b"WEBP"
+    return begin.startswith((_PNG, _JPEG, b"BM", *_TIFF)) or is_webp
 
 
-def _is_whole(data: bytes) -> bool:
+def _is_whole(data: _Data) -> bool:
     """Whether a file has its end."""
-    tail = data[-_TAIL_BYTES:]
-    if data.startswith(_JPEG):
+    begin, tail = data[:8], data[-_TAIL_BYTES:]
+    if begin.startswith(_JPEG):
         return b"\xff\xd9" in tail
-    if data.startswith(_PNG):
+    if begin == _PNG:
         return b"IEND" in tail
     return True
 
 
-def _header(data: bytes) -> Header | None:
-    if data.startswith(_PNG):
-        width, height = struct.unpack_from(">II", data, 16)
+def _header(data: _Data) -> Header | None:
+    begin = data[:8]
+    if begin == _PNG:
+        width, height = _unpack(">II", data, 16)
         return Header(width, height, _png_orientation(data))
-    if data.startswith(_JPEG):
+    if begin.startswith(_JPEG):
         return _jpeg_header(data)
-    if data.startswith(_TIFF):
+    if begin.startswith(_TIFF):
         tags = _tiff_tags(data)
         return Header(tags[_WIDTH_TAG], tags[_HEIGHT_TAG], tags.get(_ORIENTATION_TAG, _UPRIGHT))
-    if data.startswith(b"BM"):
-        if struct.unpack_from("<I", data, 14)[0] < 40:  # OS/2's header
-            return Header(*struct.unpack_from("<HH", data, 18))
-        width, height = struct.unpack_from("<ii", data, 18)
+    if begin.startswith(b"BM"):
+        if _unpack("<I", data, 14)[0] < 40:  # OS/2's header
+            return Header(*_unpack("<HH", data, 18))
+        width, height = _unpack("<ii", data, 18)
         return Header(width, abs(height))
-    return _webp_header(data)
+    return _webp_header(data[:32])
 
 
-def _jpeg_header(data: bytes) -> Header | None:
+def _unpack(form: str, data: _Data, at: int) -> tuple[int, ...]:
+    """Whole numbers of a ``struct`` form that stand at a place in the file."""
+    return struct.unpack(form, data[at : at + struct.calcsize(form)])
+
+
+def _jpeg_header(data: _Data) -> Header | None:
     """Walk the segments up to the start of frame (ITU-T T.81, B.2)."""
     orientation, at = _UPRIGHT, 2
     while at < len(data):
-        marker = data[at]
+        marker = data[at : at + 1][0]
         at += 1
         if marker == 0xFF or marker in _JPEG_WITHOUT_LENGTH:
             continue
         if marker == _START_OF_SCAN:
             return None
-        (length,) = struct.unpack_from(">H", data, at)
+        (length,) = _unpack(">H", data, at)
         if marker in _JPEG_FRAMES:
-            height, width = struct.unpack_from(">HH", data, at + 3)
+            height, width = _unpack(">HH", data, at + 3)
             return Header(width, height, orientation)
         if marker == _APP1 and data[at + 2 : at + 8] == b"Exif\0\0":
             orientation = _orientation(data[at + 8 : at + length])
@@ -193,19 +218,38 @@ def _jpeg_header(data: bytes) -> Header | None:
     return None
 
 
-def _png_orientation(data: bytes) -> int:
+def _png_orientation(data: _Data) -> int:
+    """Of the EXIF chunk, where there is one before the pixels."""
+    for kind, at, length in _png_chunks(data):
+        if kind == b"eXIf":
+            return _orientation(data[at : at + length])
+        if kind == b"IDAT":
+            break
+    return _UPRIGHT
+
+
+def _png_chunks(data: _Data) -> Iterator[tuple[bytes, int, int]]:
+    """Kind, begin and length of the body of each whole chunk (PNG, third edition, section 5.3)."""
     at = len(_PNG)
     while at + 12 <= len(data):
-        (length,) = struct.unpack_from(">I", data, at)
-        kind, body = data[at + 4 : at + 8], data[at + 8 : at + 8 + length]
+        (length,) = _unpack(">I", data, at)
         if at + 12 + length > len(data):
             break
-        if zlib.crc32(kind + body) != struct.unpack_from(">I", data, at + 8 + length)[0]:
-            raise ValueError("check sum")
-        if kind == b"eXIf":
-            return _orientation(body)
+        yield data[at + 4 : at + 8], at + 8, length
         at += 12 + length
-    return _UPRIGHT
+
+
+def _check_sums(data: bytes, path: Path) -> None:
+    """Hold every chunk of a PNG against its check sum, which decoders only warn of.
+
+    Raises:
+        DriveError: one is damaged.
+    """
+    if not data.startswith(_PNG):
+        return
+    for kind, at, length in _png_chunks(data):
+        if zlib.crc32(data[at : at + length], zlib.crc32(kind)) != _unpack(">I", data, at + length)[0]:
+            raise DriveError(f"{path}: the image is damaged; copy it again or drop it from the list")
 
 
 def _webp_header(data: bytes) -> Header:
@@ -230,18 +274,16 @@ def _orientation(exif: bytes) -> int:
     return told if 1 <= told <= 8 else _UPRIGHT
 
 
-def _tiff_tags(data: bytes) -> dict[int, int]:
+def _tiff_tags(data: _Data) -> dict[int, int]:
     """Whole numbers of the first directory of a TIFF by their tags."""
     order = "<" if data[:2] == b"II" else ">"
-    (at,) = struct.unpack_from(f"{order}I", data, 4)
-    (count,) = struct.unpack_from(f"{order}H", data, at)
+    (at,) = _unpack(f"{order}I", data, 4)
+    (count,) = _unpack(f"{order}H", data, at)
     tags = {}
     for number in range(count):
-        tag, kind, length = struct.unpack_from(f"{order}HHI", data, at + 2 + 12 * number)
+        tag, kind, length = _unpack(f"{order}HHI", data, at + 2 + 12 * number)
         if length == 1 and kind in (3, 4):
-            tags[tag] = struct.unpack_from(
-                f"{order}{'H' if kind == 3 else 'I'}", data, at + 10 + 12 * number
-            )[0]
+            tags[tag] = _unpack(f"{order}{'H' if kind == 3 else 'I'}", data, at + 10 + 12 * number)[0]
     if _WIDTH_TAG in tags and _HEIGHT_TAG not in tags:
         raise ValueError("no height")
     return tags

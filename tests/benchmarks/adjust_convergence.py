@@ -6,15 +6,16 @@ with six states a frame and a Cauchy loss, and prints
 
 - how many starts end in the optimum, which is where the same solver ends that starts at the true
   extrinsics: within a millionth of its cost and a millimetre of its corners;
-- how much the cost of its optimum exceeds that of ours, as a share (pycolmap's prior on a pose is ours but
-  for terms of second order);
+- how much the cost of its optimum exceeds that of ours, as a share;
 - the median number of iterations (ours: evaluations of cost and gradient, all stages; Ceres: steps
   taken or tried) and the CPU time of the solve, Ceres' without its set-up.
 
+Ceres is the program of :mod:`tests.benchmarks.adjust_native`: our own cost, derivatives analytic.
+
 Corners start at the back-projection of their rays, each weighted by how well it fixes its point: a plain
 mean is worse for all. Ceres is shown a second time from the extrinsics of our coarse stage, which is what
-leads home from far away; ours a second time without it. Observations of points behind the camera
-cost nothing in pycolmap's functions, which is no optimum: an end is told by the corners too.
+leads home from far away; ours a second time without it. An end is told by the corners, too: where points
+lie behind a camera a low cost is no optimum.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ import torch
 
 from tests.adjust.scene import Scene, make_scene
 from tests.benchmarks.adjust_accuracy import PAPER, ROBUST, WHITE, street
-from tests.benchmarks.adjust_ceres import ABSENT, CeresOptions, solve_ceres
+from tests.benchmarks.adjust_native import NativeOptions, build, solve_native
 from v2hdm.adjust import Problem, SolveOptions, solve
 from v2hdm.adjust.coarse import coarse_extrinsics
 from v2hdm.adjust.layout import make_arrays
@@ -67,7 +68,7 @@ def by_us(problem: Problem, options: SolveOptions) -> End:
     return End(found.cost, found.corners_map, found.evaluations, time.process_time() - began)
 
 
-def by_ceres(problem: Problem, options: CeresOptions, coarse: bool = False) -> End:
+def by_ceres(problem: Problem, options: NativeOptions, coarse: bool = False) -> End:
     """Ceres from the weighted back-projection, after our coarse stage if wanted, its time not counted."""
     extrinsics = torch.as_tensor(problem.cam_from_vehicle)
     arrays = make_arrays(problem, (), "cpu")
@@ -79,7 +80,7 @@ def by_ceres(problem: Problem, options: CeresOptions, coarse: bool = False) -> E
     start = np.empty((problem.corner_count, 2))
     start[arrays.corner_order.numpy()] = corners.numpy()
     problem = replace(problem, cam_from_vehicle=extrinsics.numpy(), corners_start=start)
-    found = solve_ceres(problem, options)
+    found = solve_native(problem, options)
     return End(found.cost, found.corners_map, found.steps, found.cpu_s)
 
 
@@ -90,9 +91,12 @@ def solvers(options: SolveOptions) -> dict[str, Solver]:
         "ours, without its coarse stage": replace(options, coarse=False),
     }
     rows: dict[str, Solver] = {name: partial(by_us, options=each) for name, each in ours.items()}
-    if not ABSENT:
+    if build()[0] is not None:
         scale = 0.0 if options.loss == "none" else options.loss_scale
-        theirs = CeresOptions(bool(options.pose_states), scale, tolerance=1e-12, max_steps=500)
+        solver = "sparse_schur" if options.pose_states else "dense_schur"
+        theirs = NativeOptions(
+            bool(options.pose_states), scale, linear_solver=solver, tolerance=1e-12, max_steps=500
+        )
         rows["ceres"] = partial(by_ceres, options=theirs)
         rows["ceres, after our coarse stage"] = partial(by_ceres, options=theirs, coarse=True)
     return rows
@@ -140,8 +144,8 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     solve(make_scene(0, frames=30).problem)
-    if ABSENT:
-        print(ABSENT)
+    if build()[0] is None:
+        print(build()[1])
     scenes = [street(seed, WHITE, start_error_deg=arguments.degrees) for seed in range(arguments.drives)]
     print_model("extrinsics and corners, least squares", PAPER, scenes)
     print_model("six states a frame, Cauchy loss", ROBUST, scenes)

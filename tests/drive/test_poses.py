@@ -17,6 +17,7 @@ from tests.drive.bags import Messages, write_ros2
 from tests.drive.example import ORIGIN, make_drive
 from v2hdm.drive import ReadOptions, read_drive
 from v2hdm.drive.poses import Recorded, read_poses
+from v2hdm.drive.poses.table import read_table
 from v2hdm.errors import DriveError
 from v2hdm.quality import check_drive
 from v2hdm.records import FloatArray, GeodeticOrigin
@@ -281,6 +282,12 @@ def test_a_damaged_table_is_refused_in_one_line(text: str, message: str, tmp_pat
     with pytest.raises(DriveError, match=message) as caught:
         read({"csv": "route.csv"}, tmp_path)
     assert "\n" not in str(caught.value)
+
+
+def test_a_pose_whose_quality_is_left_blank_has_no_fix(tmp_path: Path) -> None:
+    path = tmp_path / "route.csv"
+    path.write_text("stamp_s,x_m,y_m,yaw_deg,quality\n1,2,3,0,4\n2,3,3,0,\n3,4,3,0,inf\n")
+    assert read_table(path, {}, tmp_path, "here").sigma_m.tolist() == [0.02, np.inf, np.inf]
 
 
 @pytest.mark.parametrize("axes", ["vehicle", "camera"])

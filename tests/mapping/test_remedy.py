@@ -12,6 +12,7 @@ from v2hdm.adjust import Fault
 from v2hdm.drive.trajectory import interpolate
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions, SizeOptions, SurveyOptions
+from v2hdm.mapping.remedy import Inputs
 from v2hdm.mapping.results import MethodResult
 from v2hdm.records import DIAMOND, Drive, FloatArray, Trajectory
 
@@ -104,3 +105,13 @@ def test_a_clock_60_ms_late_is_put_right(scene: Scene) -> None:
 
 def _before(trajectory: Trajectory, stamp_s: float) -> FloatArray:
     return np.asarray(interpolate(trajectory, np.array([max(stamp_s, 0.0)]), 1.0)[0][0])
+
+
+def test_inputs_are_tested_with_the_poses_estimated_even_where_the_first_groups_hold() -> None:
+    clear = SceneOptions(
+        seed=3, length_m=30.0, turns=False, wild_rate=0.0, false_rate=0.0, hidden_corner_rate=0.0,
+        detection_rate=1.0, ipm_error_deg=0.0, ipm_error_m=0.0, pixel_sigma=0.1,
+    )  # fmt: skip
+    scene = make_scene(clear)
+    inputs = Inputs(scene.drive, scene.detections, ("front",), OPTIONS)
+    assert "roll" in inputs.optimiser.settle(inputs.tracks).model.solver.pose_states

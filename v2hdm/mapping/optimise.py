@@ -99,7 +99,8 @@ class Optimiser:
         for number in range(1, self._options.rounds + 1):
             tell(f"joint solve {number}")
             association = self._associate(bundle.rig)
-            if same_groups(association, bundle.association):
+            # The coarse solve takes the poses at their word, which no test of the inputs may rest on.
+            if number > 1 and same_groups(association, bundle.association):
                 break
             bundle = self._solve(association, self._usable(association, bundle.rig), bundle.rig)
             self._reweigh(bundle)

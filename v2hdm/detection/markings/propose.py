@@ -152,5 +152,7 @@ def _tightest(outline_pinhole_px: FloatArray) -> tuple[FloatArray, float] | None
 
 def symbol_share(proposal: Proposal, catalogue: Catalogue) -> float:
     """Share of symbols and other paint, by the network alone: they have no size of their own."""
-    names = catalogue.of_family(SYMBOL, OTHER)
-    return sum(proposal.blob.class_score.get(name, 0.0) for name in names) / max(proposal.certainty, 1e-9)
+    known = catalogue.classes
+    scores = ((name, score) for name, score in proposal.blob.class_score.items() if name in known)
+    share = sum(score for name, score in scores if known[name].family in (SYMBOL, OTHER))
+    return share / max(proposal.certainty, 1e-9)

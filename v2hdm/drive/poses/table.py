@@ -62,7 +62,7 @@ def read_table(path: Path, entry: dict[str, Any], root: Path, where: str) -> Rea
     points = np.column_stack([columns.get(name, np.zeros(count)) for name in names])
     sigma_m = columns.get("sigma_m", np.full(count, np.nan))
     if "quality" in columns:
-        stated = np.array([SIGMA_OF_QUALITY_M.get(int(value), np.inf) for value in columns["quality"]])
+        stated = np.array([SIGMA_OF_QUALITY_M.get(value, np.inf) for value in columns["quality"]])
         sigma_m = np.where(np.isfinite(sigma_m) & np.isfinite(stated), sigma_m, stated)
     heading_sigma = np.radians(columns.get("heading_sigma_deg", np.full(count, np.nan)))
     rotation = _rotation(columns, path)
