@@ -70,9 +70,10 @@ def cluster(address: str, workers: int) -> Iterator[Any]:
                 **(own if local else {}),
             )
         except (ConnectionError, ValueError, RuntimeError) as error:
+            why = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise ConfigError(
-                f"--address {address}: no Ray answers there ({error}); start it with `ray start`, or leave "
-                "--address out"
+                f"--address {address}: no Ray answers there ({why}); start it with `ray start`, with the "
+                "same RAY_AUTH_TOKEN, or leave --address out"
             ) from error
         yield ray
     finally:
