@@ -2,6 +2,7 @@
 #   make map     drive through a rendered port and map it
 #   make test    run the tests
 #   make check   format, lint, types, import contracts
+#   make docs    build the documentation's site into site/
 #   make audit   known weaknesses of the installed packages
 # Further arguments: make map ARGS="+run=port1"
 
@@ -14,7 +15,7 @@ INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c co
 MAP_INSTALLED := $(VENV)/.installed-map
 DEV_INSTALLED := $(VENV)/.installed-dev
 
-.PHONY: map test check audit clean
+.PHONY: map test check docs audit clean
 
 map: $(MAP_INSTALLED)
 	$(BIN)/python -m v2hdm.map $(ARGS)
@@ -30,11 +31,14 @@ check: $(DEV_INSTALLED)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+docs: $(DEV_INSTALLED)
+	$(BIN)/mkdocs build --strict --quiet
+
 audit: $(DEV_INSTALLED)
 	$(BIN)/python -m tests.audit
 
 clean:
-	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf $(VENV) build dist site .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.12 ...")'

@@ -203,7 +203,7 @@ class _Task:
 _LABEL_LETTERS = 100
 
 _WITH_VALUE = {
-    "--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn", "--package", "-p",
+    "--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn", "--package", "-p", "--cfg", "-c",
     "--experimental-rerun",
 }  # fmt: skip
 """Options of Hydra that are followed by a value."""

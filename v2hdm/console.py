@@ -12,9 +12,11 @@ from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from v2hdm import pipeline
-from v2hdm.pipeline.run import logging_to
+from v2hdm.pipeline.config import run_name
+from v2hdm.pipeline.telling import logging_to
 from v2hdm.quality import Status, Verdict
 from v2hdm.report.table import changes_table, results_table
+from v2hdm.viewer import RerunViewer, check_viewer
 
 _EVERY_S = 10.0
 """Between two lines on one task."""
@@ -26,8 +28,9 @@ def run_on_terminal(config: pipeline.RunConfig, config_yaml: str) -> Verdict:
     """Run the pipeline, show what it does and found, and return the verdict on it."""
     console = Console()
     handler = RichHandler(logging.INFO, console, show_path=False, show_level=False, log_time_format="%X")
+    viewer = RerunViewer(run_name(config)) if check_viewer(config.viewer) else None
     with logging_to(handler), _bars(console) as progress:
-        result = pipeline.run(config, config_yaml, progress)
+        result = pipeline.run(config, config_yaml, progress, viewer)
     console.print()
     for line in result.headlines:
         console.print(line, highlight=False)

@@ -11,7 +11,7 @@ from v2hdm.door import EXIT_FAILED_VERDICT, answer_signals, open_door, version_l
 if TYPE_CHECKING:
     from v2hdm.config import Job
 
-_INTERRUPTED = "interrupted; finished renderings are kept in the cache, no result was written"
+_INTERRUPTED = "interrupted; what was found so far is kept in the cache, no result was written"
 _RUNS = "choose a run (+run=port1, +run=port2, +run=kitti drive.path=...) or set it on the command line"
 
 
@@ -30,8 +30,6 @@ _settle = partial(open_door, "v2hdm.map", "map", _INTERRUPTED)
 
 
 def _map() -> int:
-    import torch  # noqa: F401  # its absence is told before that of what is built on it
-
     from v2hdm.config import work_on
     from v2hdm.pipeline import RunConfig
 

@@ -13,14 +13,13 @@ import json
 import logging
 import os
 import shutil
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import IO
 
 from v2hdm.errors import ConfigError
 from v2hdm.files import whole_file
+from v2hdm.locks import take_lock
 
 _log = logging.getLogger(__name__)
 
@@ -108,15 +107,6 @@ def added_to(folder: Path, names: Sequence[str], option: str) -> Iterator[Path]:
                         stream.write(json.dumps(entry) + "\n")
 
 
-def is_whole(folder: Path) -> bool:
-    """Whether a folder is a finished result of ours, all of whose files are as we wrote them."""
-    try:
-        listed = _ours(folder, folder, "output=")
-    except (ConfigError, OSError):
-        return False
-    return listed is not None and all((folder / name).is_file() for name in listed)
-
-
 class GrowingFolder:
     """A folder whose files are written one by one, each at once."""
 
@@ -185,6 +175,22 @@ def locked_folder(folder: Path, option: str = "output=") -> Iterator[None]:
             stack.enter_context(_parents(target))
             stack.enter_context(_locked(target, folder, option))
         yield
+
+
+def files_of_result(folder: Path) -> dict[str, str]:
+    """SHA-256 of our files in a result folder by their names; none where it is no result.
+
+    Raises:
+        ConfigError: its list is damaged.
+    """
+    return _ours(folder, folder, "output=", unchanged=False) or {}
+
+
+def is_whole(folder: Path, files: Mapping[str, str]) -> bool:
+    """Whether a result folder holds these files of ours, unchanged, and none is missing."""
+    return bool(files) and all(
+        (folder / name).is_file() and _digest(folder / name) == digest for name, digest in files.items()
+    )
 
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
@@ -324,7 +330,7 @@ def _locked(target: Path, shown: Path, option: str) -> Iterator[None]:
     path = _hidden(target, "lock")
     while True:
         stream = path.open("a+", encoding="utf-8")
-        if not _take(stream):
+        if not take_lock(stream):
             stream.seek(0)
             holder = stream.read(200).strip()
             stream.close()
@@ -349,23 +355,3 @@ def _locked(target: Path, shown: Path, option: str) -> Iterator[None]:
         path.unlink(missing_ok=True)
         with suppress(OSError):
             stream.close()
-
-
-def _take(stream: IO[str]) -> bool:
-    """Lock an open file without waiting; whether it was free."""
-    try:
-        if sys.platform == "win32":
-            import msvcrt
-
-            msvcrt.locking(stream.fileno(), msvcrt.LK_NBLCK, 1)
-        else:
-            import fcntl
-
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except (BlockingIOError, PermissionError):
-        return False
-    except OSError as failure:
-        _log.warning(
-            "%s: no lock can be held here (%s); do not write it twice at a time", stream.name, failure
-        )
-    return True

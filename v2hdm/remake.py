@@ -16,7 +16,8 @@ from v2hdm.errors import ConfigError, MapFileError
 from v2hdm.files import load_yaml
 from v2hdm.orthophoto.result import MOSAIC_FILES, RESOLUTION_M, write_mosaic
 from v2hdm.outputs import added_to
-from v2hdm.pipeline.run import RunConfig, check_device
+from v2hdm.pipeline.admit import check_device
+from v2hdm.pipeline.config import RunConfig
 from v2hdm.records import Drive
 from v2hdm.simulate import rendered_drive
 
@@ -35,7 +36,12 @@ def drive_of_result(folder: Path, path: Path | None = None) -> Drive:
     """
     content = load_yaml(folder / "config.yaml", MapFileError)
     try:
-        config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(RunConfig), content))
+        merged = OmegaConf.merge(OmegaConf.structured(RunConfig), content)
+        if merged.simulate is not None and content["simulate"].get("cameras"):
+            # The schema brings its own cameras: those that the run had left out would come back.
+            for name in set(merged.simulate.cameras) - set(content["simulate"]["cameras"]):
+                del merged.simulate.cameras[name]
+        config = OmegaConf.to_object(merged)
     except OmegaConfBaseException:
         config = None
     if not isinstance(config, RunConfig):

@@ -31,6 +31,8 @@ from tests.adjust.site import site
 from v2hdm.adjust import Problem, Solution, SolveOptions, solve
 from v2hdm.adjust.parts import Local, solve_in_parts
 from v2hdm.adjust.parts.split import split
+from v2hdm.detection.batch import with_own_vehicle
+from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.drive import ReadOptions, read_drive
 from v2hdm.fleet.cluster import LOCAL, cluster
@@ -106,7 +108,8 @@ def timed_detection(ray: Any, drive: Any, options: DetectorOptions, actors: int)
     ray.get([one.detect.remote([ray.put(drive)], options, [0]) for one in eyes])
     processes = ray.get([one.process.remote() for one in eyes])
     before, began = [cpu_s(one) for one in processes], time.perf_counter()
-    found = detect_by(eyes, drive, options, 1, lambda done, total: None)
+    found: list[Any] = []
+    detect_by(eyes, drive, options, range(len(drive.images)), 1, found.append)
     took = time.perf_counter() - began
     spent = max(cpu_s(one) - past for one, past in zip(processes, before, strict=True))
     for one in eyes:
@@ -116,8 +119,8 @@ def timed_detection(ray: Any, drive: Any, options: DetectorOptions, actors: int)
 
 def detection(ray: Any, folder: Path, repeats: int) -> None:
     """Print the row of detection."""
-    drive = read_drive(folder, ReadOptions())
     options = DetectorOptions.for_mapping()
+    drive = with_own_vehicle(read_drive(folder, ReadOptions()), Detector.load(options=options))
     wall, spent, found = {1: [], 2: []}, {1: [], 2: []}, {}
     for _ in range(repeats):
         for actors in (1, 2):

@@ -18,7 +18,7 @@ from onnx import numpy_helper
 from tests.detection.pictures import HEIGHT, WIDTH, brightness_model, diamond, extrinsic, make_camera, picture
 from v2hdm import watch
 from v2hdm.detect import main
-from v2hdm.detection import frames, network
+from v2hdm.detection import frames
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.draw import draw_detections
 from v2hdm.detection.road import RoadDetector
@@ -351,17 +351,6 @@ def test_the_class_for_a_robots_loop_gives_what_the_door_writes(bench, capsys):
     for marking, written in zip(found.markings, record["markings"], strict=True):
         np.testing.assert_allclose(marking.corners_vehicle, written["corners_vehicle"], atol=1e-4)
         np.testing.assert_allclose(marking.covariance_m2, written["covariance_m2"], rtol=1e-3)
-
-
-def test_the_snippet_of_the_documentation_runs(bench, tmp_path, monkeypatch, capsys):
-    text = (Path(__file__).parents[2] / "docs" / "detect.md").read_text()
-    (snippet,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    (tmp_path / "calibration_front.yaml").write_bytes(bench.calibration.read_bytes())
-    (tmp_path / "image.jpg").write_bytes((bench.folder / "0.png").read_bytes())
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(network, "DEFAULT_MODEL", bench.model)
-    exec(snippet, {})
-    assert capsys.readouterr().out.count("diamond") == 8
 
 
 def test_arrows_and_whole_lines_are_written_and_drawn_without_corners(bench, monkeypatch, capsys, tmp_path):

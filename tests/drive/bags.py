@@ -157,7 +157,12 @@ class Messages:
         return self.make("tf2_msgs/msg/TFMessage", transforms=made)
 
 
-def messages_of(folder: Path, ros1: bool = False, fixed_frames: bool = True) -> Messages:
+def messages_of(
+    folder: Path,
+    ros1: bool = False,
+    fixed_frames: bool = True,
+    mounted: Mapping[str, FloatArray] | None = None,
+) -> Messages:
     """The drive in ``folder``: raw images of ``front``, those of ``rear`` as they are, odometry, frames."""
     drive = read_drive(folder)
     made = Messages(ros1)
@@ -180,7 +185,8 @@ def messages_of(folder: Path, ros1: bool = False, fixed_frames: bool = True) -> 
         made.add(stamp_s, "/odom", made.odometry(stamp_s, pose, np.zeros(36), "base_link"))
     if fixed_frames:
         edges = {
-            ("base_link", f"{name}_optical"): inverse(np.array(guess)) for name, guess in mountings().items()
+            ("base_link", f"{name}_optical"): inverse(np.array(guess))
+            for name, guess in (mounted or mountings()).items()
         }
         made.add(
             drive.trajectory.stamp_s[0], "/tf_static", made.transforms(drive.trajectory.stamp_s[0], edges)

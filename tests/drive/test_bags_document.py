@@ -1,18 +1,16 @@
-"""docs/bags.md does what it says."""
+"""docs/bags.md does what it says; its commands run in tests/docs."""
 
 from __future__ import annotations
 
 import re
-import shlex
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
+from tests.docs.blocks import blocks, document
 from tests.drive.bags import messages_of, write_ros2
 from tests.drive.example import make_drive
 from v2hdm import check
@@ -22,8 +20,7 @@ from v2hdm.drive.poses.settings import COMMON_KEYS
 from v2hdm.drive.poses.table import NAMES
 from v2hdm.drive.sources import IMAGE_SOURCES
 
-TEXT = (Path(__file__).parents[2] / "docs/bags.md").read_text()
-COMMANDS = re.findall(r"^python -m (.*)$", TEXT, re.MULTILINE)
+TEXT = document("docs/bags.md")
 
 
 @pytest.fixture
@@ -38,32 +35,16 @@ def test_the_documented_listing_ends_in_a_description_that_is_read(
     site: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(site.parent)
-    door, *arguments = shlex.split(COMMANDS[0])
-    assert door == "v2hdm.check"
-    assert check.main(arguments) == 0
+    assert check.main(["site", "--list-topics"]) == 0
     printed = capsys.readouterr().out
     assert re.search(r"/odom +21  nav_msgs/msg/Odometry", printed)
     Path("drive.yaml").write_text(printed.split("# drive.yaml\n")[1])
     assert len(read_drive(site.parent).images) == 6
 
 
-def test_the_documented_check_and_map_take_a_bag(site: Path) -> None:
-    """The example is too short to be mapped; a bag is read and judged like its folder."""
-    assert COMMANDS[2] == "v2hdm.map drive.path=site"
-    for folder in ("folder", "site"):
-        arguments = shlex.split(COMMANDS[1].replace("site", folder))
-        done = subprocess.run(
-            [sys.executable, "-m", *arguments, "--no-ground", "--output", f"{folder}-check"],
-            cwd=site.parent, env={"PYTHONPATH": str(Path(__file__).parents[2]), "PATH": "/usr/bin:/bin"},
-            capture_output=True, text=True, timeout=120,
-        )  # fmt: skip
-        assert done.returncode in (0, 3), done.stderr
-        assert (site.parent / f"{folder}-check" / "front_1.jpg").is_file()
-
-
 def test_the_documented_description_reads(site: Path) -> None:
-    (block,) = re.findall(r"```yaml\n(.*?)```", TEXT, re.DOTALL)
-    (site.parent / "drive.yaml").write_text(block)
+    (block,) = blocks("docs/bags.md", "yaml")
+    (site.parent / "drive.yaml").write_text(block.text)
     shutil.rmtree(site.parent / "folder")
     drive = read_drive(site.parent, ReadOptions(cache=str(site.parent / "cache")))
     assert [image.camera for image in drive.images] == ["front"] * 3

@@ -1,18 +1,16 @@
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from tests.docs.blocks import blocks
 from tests.drive.example import make_drive
 from v2hdm.drive import read_drive
 from v2hdm.drive.camera_info import read_camera_info
 
-BLOCKS = re.findall(
-    r"```yaml\n(.*?)```", (Path(__file__).parents[2] / "docs/drive-format.md").read_text(), re.DOTALL
-)
+BLOCKS = [block.text for block in blocks("docs/drive-format.md", "yaml")]
 
 
 def test_the_documented_drive_reads_and_its_cameras_look_at_their_rois(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from v2hdm.experiment.drive import drive_record, recipe_file
 from v2hdm.experiment.plan import ExperimentConfig, jobs
 from v2hdm.experiment.residuals import residuals
 from v2hdm.experiment.run import run_experiment
-from v2hdm.experiment.stored import detections_of, key_of, plain_detections, store, stored
+from v2hdm.experiment.stored import key_of, store, stored
 from v2hdm.mapping.methods import run_methods
 from v2hdm.records import HdMap, Truth
 
@@ -69,21 +69,6 @@ def test_only_the_recipe_that_is_missing_is_mapped_anew(tmp_path: Path) -> None:
     config.recipes = ["paper", "incremental"]
     with pytest.raises(DriveError, match="absent"):
         drive_record(jobs(config)[0], 1, lambda *_: None)
-
-
-def test_detections_come_back_exactly(tmp_path: Path) -> None:
-    found = make_scene(SceneOptions(length_m=20.0)).detections
-    store(tmp_path / "found.json.gz", "key", plain_detections(found))
-    content = stored(tmp_path / "found.json.gz", "key")
-    assert content is not None
-    for one, other in zip(found, detections_of(content), strict=True):
-        assert one.image == other.image
-        for a, b in zip(one.markings, other.markings, strict=True):
-            assert (a.kind, a.score) == (b.kind, b.score)
-            for name in ("corners_px", "covariance_px", "corner_valid", "outline_px"):
-                np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
-        for c, d in zip(one.lanes, other.lanes, strict=True):
-            np.testing.assert_array_equal(c.points_px, d.points_px)
 
 
 @pytest.mark.parametrize("damage", ["cut", "text", "other"])

@@ -189,6 +189,11 @@ def damaged_map(origin: object = None, **properties: object) -> str:
             "corners_map: holds a number that is not finite",
         ),
         (damaged_map(covariance_m2=(-np.eye(8)).tolist()), "covariance_m2: not symmetric or negative"),
+        (
+            '{"v2hdm": {}, "features": [{"geometry": {"type": "Polygon", "coordinates": [[[0, 0, 0]]]}, '
+            '"properties": {}}]}',
+            "feature 0: its ring has fewer than three corners",
+        ),
     ],
 )
 def test_a_damaged_map_is_refused(tmp_path: Path, text: str, message: str) -> None:

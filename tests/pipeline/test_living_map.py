@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shlex
 import sys
 from dataclasses import asdict, replace
@@ -14,17 +13,18 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.docs.blocks import blocks, document
 from tests.mapping.scene import Scene, SceneOptions, make_scene
 from tests.mapping.test_changes import repainted
 from v2hdm import map as door
 from v2hdm.drive import ReadOptions, read_drive, write_drive
 from v2hdm.errors import MapFileError
 from v2hdm.hdmap.geojson import read_geojson, write_geojson
+from v2hdm.pipeline import work
 from v2hdm.pipeline.base import check_together, read_base
 from v2hdm.records import Drive, Fate, GeodeticOrigin, ImageDetections, PoseNoise, Trajectory
 
-TEXT = (Path(__file__).parents[2] / "docs/living-map.md").read_text()
-BOTH, LATER = re.findall(r"^    python -m v2hdm.map (.*)$", TEXT, re.MULTILINE)
+BOTH, LATER = (" ".join(block.lines) for block in blocks("docs/living-map.md", "sh"))
 
 
 def write_scene(scene: Scene, folder: Path) -> None:
@@ -50,7 +50,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     options = SceneOptions(length_m=40.0, cameras=("front",), seed=21)
     scenes = {"monday": make_scene(options), "friday": make_scene(replace(options, seed=22), repainted)}
     for name, scene in scenes.items():
-        write_scene(scene, folder / name)
+        write_scene(scene, folder / "drives" / name)
 
     def detected(drive: Drive, *_: Any) -> list[ImageDetections]:
         out: list[ImageDetections] = []
@@ -61,12 +61,12 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     with pytest.MonkeyPatch.context() as patch:
         # Grey images say nothing: neither to the detector nor to the checks of images and ground.
-        patch.setattr(sys.modules["v2hdm.pipeline.run"], "detect_all", detected)
+        patch.setattr(work, "detect_in_pieces", detected)
         patch.setattr(sys.modules["v2hdm.pipeline.inspect"], "check_drive", lambda *_: [])
         patch.setattr(sys.modules["v2hdm.pipeline.inspect"], "estimate_cameras", lambda *_: {})
         patch.chdir(folder)
-        for arguments in ("drive.path=monday name=monday", BOTH, LATER):
-            patch.setattr(sys, "argv", ["v2hdm.map", *shlex.split(arguments), "workers=1"])
+        for command in ("python -m v2hdm.map drive.path=drives/monday name=monday", BOTH, LATER):
+            patch.setattr(sys, "argv", [*shlex.split(command)[2:], "workers=1"])
             assert door.main() == 0
     return folder / "outputs"
 
@@ -97,7 +97,7 @@ def test_a_later_drive_lists_what_changed(results: Path) -> None:
 
 def test_the_document_names_every_fate() -> None:
     for fate in Fate:
-        assert f"| `{fate.value}` |" in TEXT
+        assert f"| `{fate.value}` |" in document("docs/living-map.md")
 
 
 def test_a_base_that_nothing_can_be_built_on_is_refused(results: Path, tmp_path: Path) -> None:
@@ -117,7 +117,7 @@ def test_a_base_that_nothing_can_be_built_on_is_refused(results: Path, tmp_path:
 
 def test_a_base_of_another_frame_or_site_is_refused(results: Path) -> None:
     base = read_base(results / "monday")
-    drive = read_drive(results.parent / "friday", ReadOptions())
+    drive = read_drive(results.parent / "drives" / "friday", ReadOptions())
     check_together(base, drive, "monday")
     with pytest.raises(MapFileError, match="their coordinates differ"):
         check_together(base, replace(drive, origin=GeodeticOrigin(50.0, 8.0, 100.0)), "monday")

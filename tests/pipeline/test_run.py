@@ -24,7 +24,8 @@ from v2hdm.hdmap.geojson import read_geojson
 from v2hdm.hdmap.residuals import read_residuals
 from v2hdm.mapping.options import AcceptanceOptions, LaneOptions, MappingOptions
 from v2hdm.pipeline import DriveConfig, RunConfig, run
-from v2hdm.pipeline.run import camera_sets, run_name
+from v2hdm.pipeline.camera_sets import camera_sets
+from v2hdm.pipeline.config import run_name
 from v2hdm.quality import Status
 from v2hdm.records import Trajectory
 from v2hdm.simulate import PortConfig, render_drive
@@ -50,9 +51,8 @@ def drive_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run_config(drive: Path, output: Path, **changes: object) -> RunConfig:
     drive_config = DriveConfig(path=str(drive))
-    return RunConfig(
-        **{"name": "short", "drive": drive_config, "output": str(output), "workers": 1, **changes}
-    )
+    given = {"name": "short", "drive": drive_config, "output": str(output), "workers": 1}
+    return RunConfig(**{**given, "cache": f"{output}.cache", **changes})
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.docs.blocks import blocks
 from tests.pipeline.test_run import run_config, short_port
 from v2hdm.drive import read_drive
 from v2hdm.drive.truth import read_truth
@@ -28,9 +29,7 @@ from v2hdm.records import FloatArray, Trajectory
 from v2hdm.report.metrics import driven_past
 from v2hdm.simulate import render_drive
 
-COMMANDS = re.findall(
-    r"^python -m (.*)$", (Path(__file__).parents[2] / "docs/survey.md").read_text(), re.MULTILINE
-)
+(DOCUMENTED,) = blocks("docs/survey.md", "sh")
 DRIFT_M = np.array([0.06, -0.05])
 SIGMA_M = 0.005
 
@@ -97,10 +96,10 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
 @pytest.fixture(scope="module")
 def documented(site: Site) -> tuple[Path, str]:
     """The result of the documented command, with one camera and every map, and what it printed."""
-    (command,) = COMMANDS
+    (command,) = DOCUMENTED.lines
     settings = ["drive.cameras=[front]", "all_maps=true", "workers=1", "output=outputs", "name=short"]
     done = subprocess.run(
-        [sys.executable, "-m", *shlex.split(command), *settings],
+        [sys.executable, *shlex.split(command)[1:], *settings],
         cwd=site.folder,
         capture_output=True,
         text=True,

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.docs.blocks import blocks, document
 from tests.drive.example import make_drive
 from tests.precalibration.site import CENTRE, INFO, MATRIX, PLACES, clicked, mounting, project, write_table
 from v2hdm import calibration
@@ -25,8 +26,6 @@ from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.hdmap.calibration import read_calibration, read_provenance
 from v2hdm.records import FloatArray
-
-DOCUMENT = Path(__file__).parents[2] / "docs/calibrate.md"
 
 
 @pytest.fixture
@@ -247,13 +246,12 @@ def test_options_that_cannot_be_are_one_line(
 
 
 def test_the_documented_command_does_what_the_page_says(tmp_path, intrinsics, capsys, monkeypatch) -> None:
-    text = DOCUMENT.read_text()
-    (command,) = re.findall(r"^    python -m (v2hdm\.calibrate points\.csv .*)$", text, re.MULTILINE)
-    (table,) = re.findall(r"```csv\n(.*?)```", text, re.DOTALL)
+    text = document("docs/calibrate.md")
+    command, table = blocks("docs/calibrate.md", "sh", "csv")
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "points.csv").write_text(table)
+    (tmp_path / "points.csv").write_text(table.text)
     cv2.imwrite("yard.png", np.zeros((720, 1280, 3), np.uint8))
-    assert main(shlex.split(command)[1:]) == 0
+    assert main(shlex.split(command.text)[3:]) == 0
     shown = capsys.readouterr().out
     quoted = [line.strip() for line in re.findall(r"^    ((?:front:|  ).*)$", text, re.MULTILINE)]
     assert quoted

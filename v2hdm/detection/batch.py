@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from v2hdm.detection.image_file import read_bgr
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.own_vehicle import learn_own_vehicle
 from v2hdm.errors import DriveError
-from v2hdm.records import Camera, Drive, Image, ImageDetections
+from v2hdm.records import BoolArray, Camera, Drive, Image, ImageDetections
 from v2hdm.workers import share_out
 
 _log = logging.getLogger(__name__)
@@ -61,35 +62,81 @@ def detect_all(
         WorkerError: a process died.
     """
     options = replace(options) if options else DetectorOptions()
-    detector = Detector.load(options=options)  # a bad model is refused here, once, not in every worker
-    drive = with_own_vehicle(drive, detector)
-    total = len(drive.images)
+    drive = with_own_vehicle(drive, Detector.load(options=options))  # a bad model is refused here, once
     results: list[ImageDetections] = []
 
     def collect(detections: ImageDetections) -> None:
         results.append(detections)
         if progress:
-            progress(len(results), total)
+            progress(len(results), len(drive.images))
 
-    if workers <= 1 or total < _FEW_IMAGES:
-        for index in range(total):
-            collect(detect_image(detector, drive, index))
-        return results
-    share_out(_work, range(total), workers, _start_worker, (drive, options), collect)
+    detect_images(drive, options, range(len(drive.images)), workers, collect)
     return results
 
 
-def with_own_vehicle(drive: Drive, detector: Detector) -> Drive:
-    """The drive with masks of the vehicle itself, learnt for the cameras that have none."""
-    cameras = dict(drive.cameras)
+class Detect(Protocol):
+    """Does what :func:`detect_images` does."""
+
+    def __call__(
+        self,
+        drive: Drive,
+        options: DetectorOptions,
+        images: Sequence[int],
+        workers: int,
+        take: Callable[[ImageDetections], None],
+    ) -> None:
+        """``take`` is called in the order of ``images``."""
+
+
+def detect_images(
+    drive: Drive,
+    options: DetectorOptions,
+    images: Sequence[int],
+    workers: int,
+    take: Callable[[ImageDetections], None],
+) -> None:
+    """Detect in some images of a drive whose cameras know their own vehicle.
+
+    Args:
+        drive: what to look at.
+        options: detector settings.
+        images: which images, as indices.
+        workers: processes, one thread each; 1 stays in this process.
+        take: called with what was found in each image, in the order of ``images``.
+
+    Raises:
+        V2hdmError: as :func:`detect_all`.
+    """
+    if workers <= 1 or len(images) < _FEW_IMAGES:
+        detector = Detector.load(options=options)
+        for index in images:
+            take(detect_image(detector, drive, index))
+        return
+    share_out(_work, images, workers, _start_worker, (drive, options), take)
+
+
+def own_vehicles(drive: Drive, detector: Detector) -> dict[str, BoolArray]:
+    """Masks (height, width) of the vehicle itself, learnt for those cameras that have none and show it."""
+    masks = {}
     for name, camera in drive.cameras.items():
         if camera.own_vehicle is not None:
             continue
         mask = learn_own_vehicle(detector, [image for image in drive.images if image.camera == name], camera)
         if mask is not None:
-            cameras[name] = replace(camera, own_vehicle=mask)
+            masks[name] = mask
             _log.info("camera %s: %.1f %% of the image is the vehicle itself", name, 100 * mask.mean())
-    return replace(drive, cameras=cameras)
+    return masks
+
+
+def with_own_vehicle(drive: Drive, detector: Detector) -> Drive:
+    """The drive with masks of the vehicle itself, learnt for the cameras that have none."""
+    return with_masks(drive, own_vehicles(drive, detector))
+
+
+def with_masks(drive: Drive, masks: Mapping[str, BoolArray]) -> Drive:
+    """The drive with these masks of the vehicle itself, by camera, beside those that it has."""
+    learnt = {name: replace(drive.cameras[name], own_vehicle=mask) for name, mask in masks.items()}
+    return replace(drive, cameras={**drive.cameras, **learnt})
 
 
 def _start_worker(drive: Drive, options: DetectorOptions) -> None:
@@ -105,7 +152,7 @@ def _work(index: int) -> ImageDetections:
 
 
 def detect_image(detector: Detector, drive: Drive, index: int) -> ImageDetections:
-    """What a detector finds in image ``index`` of a drive, see :func:`with_own_vehicle`.
+    """What a detector finds in image ``index`` of a drive whose cameras know their own vehicle.
 
     Raises:
         DriveError: the image is missing, damaged or of the wrong size.

@@ -20,6 +20,7 @@ from v2hdm.drive.join import join_drives
 from v2hdm.drive.kitti import is_kitti_drive, read_kitti_drive
 from v2hdm.drive.nuscenes import is_nuscenes_drive, read_nuscenes_drive
 from v2hdm.drive.options import KittiOptions, ReadOptions
+from v2hdm.drive.part import part_of
 from v2hdm.errors import DriveError
 from v2hdm.records import Drive, Trajectory
 
@@ -63,7 +64,8 @@ def read_drive(path: Path, options: ReadOptions | None = None) -> Drive:
 
     Every image gets the vehicle's pose at its time: position linear, rotation slerp, never
     extrapolated, not across a gap longer than ``options.max_gap_s``; images without a pose are
-    dropped with a logged count. All image files are checked for presence, completeness and size.
+    dropped with a logged count. All image files are checked for presence, completeness and size. Then
+    those are taken that ``options.start_s``, ``end_s`` and ``limit`` ask for.
 
     Raises:
         DriveError: naming what is wrong, where, and what to do about it.
@@ -78,10 +80,10 @@ def read_drive(path: Path, options: ReadOptions | None = None) -> Drive:
             raise DriveError(
                 f"unknown drive format '{options.format}'; choose from: auto, {', '.join(READERS)}"
             )
-        return READERS[options.format].read(path, options)
+        return part_of(READERS[options.format].read(path, options), options)
     for reader in READERS.values():
         if reader.accepts(path):
-            return reader.read(path, options)
+            return part_of(reader.read(path, options), options)
     raise DriveError(
         f"{path}: not a drive in any known format ({', '.join(READERS)}); see docs/drive-format.md"
     )

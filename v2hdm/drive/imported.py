@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from v2hdm.caching.folders import note_use
 from v2hdm.errors import DriveError
 
 _VERSION = 1
@@ -36,7 +37,10 @@ def entry_folder(cache: Path, files: Sequence[Path], label: str, settings: Any) 
     source = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
     text = json.dumps([_VERSION, source, label, settings], sort_keys=True)
     words = "".join(letter if letter.isalnum() else "_" for letter in f"{files[0].stem}-{label}").strip("_")
-    return cache / f"{words[:60]}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+    folder = cache / f"{words[:60]}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+    if is_whole(folder):
+        note_use(folder)
+    return folder
 
 
 def is_whole(folder: Path) -> bool:
@@ -77,6 +81,7 @@ def finish_entry(folder: Path) -> None:
             shutil.rmtree(partial)
         else:
             partial.replace(folder)
+        note_use(folder)
     except OSError as failure:
         raise cannot_write(folder, failure) from None
 

@@ -33,6 +33,9 @@ class ReadOptions:
         cameras: names of the cameras to read; empty for all.
         max_gap_s: poses further apart than this are not interpolated across; images that fall into
             such a gap are dropped.
+        limit: images of each camera to take at most, the first ones, for trying things; None takes all.
+        start_s: seconds of the drive to leave out at its beginning, by the stamps of its images.
+        end_s: seconds after its first image at which the drive ends; None for its own end.
         cache: folder that keeps what is imported from bags and videos.
         kitti: only used by the ``kitti`` reader.
     """
@@ -40,5 +43,8 @@ class ReadOptions:
     format: str = "auto"
     cameras: list[str] = field(default_factory=list)
     max_gap_s: float = 0.5
+    limit: int | None = None
+    start_s: float = 0.0
+    end_s: float | None = None
     cache: str = "cache"
     kitti: KittiOptions = field(default_factory=KittiOptions)

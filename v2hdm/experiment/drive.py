@@ -16,25 +16,21 @@ from typing import Any
 import numpy as np
 
 from v2hdm import __version__
-from v2hdm.detection.batch import detect_all
+from v2hdm.caching.room import Room
+from v2hdm.caching.store import Store
 from v2hdm.drive import read_drive
 from v2hdm.drive.truth import read_truth
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.experiment.plan import OURS, PAPER, Job
 from v2hdm.experiment.residuals import residuals
-from v2hdm.experiment.stored import (
-    detections_of,
-    key_of,
-    network_key,
-    plain_detections,
-    store,
-    stored,
-)
+from v2hdm.experiment.stored import key_of, network_key, store, stored
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.mapping.methods import NAIVE_IPMS, run_methods
 from v2hdm.mapping.results import MethodResult
-from v2hdm.pipeline.inspect import Inspection, inspect
-from v2hdm.pipeline.run import camera_sets
+from v2hdm.pipeline.camera_sets import camera_sets
+from v2hdm.pipeline.detections import detect_in_pieces
+from v2hdm.pipeline.inspect import Inspection, inspect_once
+from v2hdm.pipeline.keys import Contents
 from v2hdm.records import Drive, HdMap, ImageDetections, Marking, Truth
 from v2hdm.report.evaluation import growth_figures
 from v2hdm.report.metrics import driven_past, extrinsic_metrics
@@ -44,7 +40,6 @@ Tell = Callable[[str, int, int], None]
 """Told a stage, and how many of its steps are done, of how many."""
 
 SETTING_FILE = "drive.json.gz"
-DETECTIONS_FILE = "detections.json.gz"
 GROWTH_STEPS = 8
 """Sizes of the growing map at which its error is told."""
 
@@ -122,23 +117,17 @@ def _find(job: Job, workers: int, tell: Tell) -> None:
     drive = read_drive(folder, job.site.drive)
     truth = read_truth(drive)
     store(job.folder / SETTING_FILE, setting_key(job), _setting(job, drive, truth))
-    inspection = inspect(drive, job.site.drive.max_gap_s, workers, partial(tell, "check"))
-    detections = _detections(job, inspection.drive, workers, tell)
+    cache, contents = Store(job.cache), Contents.of([drive])
+    room, max_gap_s = Room(cache), job.site.drive.max_gap_s
+    with cache.in_use():
+        inspection = inspect_once(drive, contents, max_gap_s, room, workers, partial(tell, "check"))
+        detections = detect_in_pieces(
+            inspection.drive, contents, job.detector, room, workers, partial(tell, "detect")
+        )
     for recipe in job.options:
         path, key = job.folder / recipe_file(recipe), recipe_key(job, recipe)
         if stored(path, key) is None:
             store(path, key, _mapped(job, recipe, inspection, detections, truth, tell))
-
-
-def _detections(job: Job, drive: Drive, workers: int, tell: Tell) -> list[ImageDetections]:
-    key = key_of(__version__, job.detector, network_key(job.detector), str(drive.root.resolve()))
-    path = job.folder / DETECTIONS_FILE
-    content = stored(path, key)
-    if content is None:
-        found = detect_all(drive, job.detector, workers, partial(tell, "detect"))
-        store(path, key, plain_detections(found))
-        return found
-    return detections_of(content)
 
 
 def _setting(job: Job, drive: Drive, truth: Truth) -> dict[str, Any]:

@@ -48,7 +48,7 @@ class ExperimentConfig:
         mapping: settings of the mapping.
         name: names the results, ``<output>/<name>/``.
         output: folder that takes the results.
-        cache: folder that keeps rendered drives.
+        cache: folder that keeps rendered drives, and what was detected in them.
         workers: processes, each of which takes one drive at a time; 0 takes one per core.
     """
 

@@ -10,7 +10,7 @@ import gzip
 import hashlib
 import json
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,6 @@ import numpy as np
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import NETWORK_FILE, digest
 from v2hdm.files import whole_file
-from v2hdm.records import ImageDetections, LaneDetection, MarkingDetection
 
 _FASTEST = 1
 """Level of gzip: a fifth of the size already, at a tenth of the time of the default."""
@@ -52,45 +51,6 @@ def stored(path: Path, key: str) -> dict[str, Any] | None:
     except (OSError, EOFError, zlib.error, ValueError, KeyError, TypeError):
         return None
     return content
-
-
-def plain_detections(detections: Sequence[ImageDetections]) -> dict[str, Any]:
-    """Detections as plain content."""
-    return {"images": [asdict(found) for found in detections]}
-
-
-def detections_of(content: Mapping[str, Any]) -> list[ImageDetections]:
-    """The detections of :func:`plain_detections`."""
-    return [
-        ImageDetections(
-            found["image"],
-            tuple(_marking(one) for one in found["markings"]),
-            tuple(_lane(one) for one in found["lanes"]),
-        )
-        for found in content["images"]
-    ]
-
-
-def _marking(one: Mapping[str, Any]) -> MarkingDetection:
-    return MarkingDetection(
-        kind=one["kind"],
-        score=one["score"],
-        corners_px=np.array(one["corners_px"], dtype=np.float64).reshape(-1, 2),
-        covariance_px=np.array(one["covariance_px"], dtype=np.float64),
-        corner_valid=np.array(one["corner_valid"], dtype=np.bool_),
-        outline_px=np.array(one["outline_px"], dtype=np.float64).reshape(-1, 2),
-    )
-
-
-def _lane(one: Mapping[str, Any]) -> LaneDetection:
-    sigma = one["sigma_px"]
-    return LaneDetection(
-        kind=one["kind"],
-        score=one["score"],
-        points_px=np.array(one["points_px"], dtype=np.float64).reshape(-1, 2),
-        identity=one["identity"],
-        sigma_px=None if sigma is None else np.array(sigma, dtype=np.float64),
-    )
 
 
 def _plain(value: object) -> object:

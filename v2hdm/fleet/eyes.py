@@ -10,7 +10,7 @@ import cv2
 import ray
 from ray.exceptions import RayActorError, RayTaskError
 
-from v2hdm.detection.batch import detect_image, with_own_vehicle
+from v2hdm.detection.batch import detect_image
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import WorkerError
@@ -59,34 +59,35 @@ def detect_by(
     eyes: Sequence[Any],
     drive: Drive,
     options: DetectorOptions,
+    images: Sequence[int],
     workers: int,
-    progress: Callable[[int, int], None],
-) -> list[ImageDetections]:
-    """:func:`v2hdm.detection.batch.detect_all` by actors; the result is the same.
+    take: Callable[[ImageDetections], None],
+) -> None:
+    """:func:`v2hdm.detection.batch.detect_images` by actors; what is found is the same.
 
     Raises:
         V2hdmError: as there.
         WorkerError: an actor died again and again.
     """
-    drive = with_own_vehicle(drive, Detector.load(options=options))
-    total, reference = len(drive.images), ray.put(drive)
-    batches = [range(begin, min(begin + IMAGES_A_BATCH, total)) for begin in range(0, total, IMAGES_A_BATCH)]
+    reference = ray.put(drive)
+    batches = [images[begin : begin + IMAGES_A_BATCH] for begin in range(0, len(images), IMAGES_A_BATCH)]
     found: dict[int, list[ImageDetections]] = {}
     waiting: dict[Any, tuple[int, Any]] = {}
     free = _BATCHES_AHEAD * list(eyes)
-    left, seen = list(enumerate(batches))[::-1], 0
+    left, taken = list(enumerate(batches))[::-1], 0
     while left or waiting:
         while left and free:
-            number, images = left.pop()
+            number, batch = left.pop()
             actor = free.pop(0)
-            waiting[actor.detect.remote([reference], options, images)] = number, actor
+            waiting[actor.detect.remote([reference], options, batch)] = number, actor
         (done,), _ = ray.wait(list(waiting), num_returns=1)
         number, actor = waiting.pop(done)
         found[number] = _result(done)
         free.append(actor)
-        seen += len(found[number])
-        progress(seen, total)
-    return [one for number in range(len(batches)) for one in found[number]]
+        while taken in found:
+            for one in found.pop(taken):
+                take(one)
+            taken += 1
 
 
 def _result(reference: Any) -> list[ImageDetections]:

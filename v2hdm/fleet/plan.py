@@ -1,25 +1,17 @@
-"""What a fleet maps: run files composed, each drive with the folder and the key of its result."""
+"""What a fleet maps: run files composed, each drive with the folder of its result."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from v2hdm import __version__
 from v2hdm.config import compose_run_file, to_dataclass, to_yaml
-from v2hdm.detection.weights import NETWORK_FILE, digest
 from v2hdm.errors import ConfigError, V2hdmError
 from v2hdm.fleet.rows import Row
 from v2hdm.pipeline import RunConfig
-from v2hdm.pipeline.run import run_name
+from v2hdm.pipeline.config import run_name
 from v2hdm.texts import take_name
-
-_OF_PLACE = ("output", "cache", "workers")
-"""Settings that say where and how something is done, and change nothing of what comes out."""
 
 
 @dataclass(frozen=True)
@@ -30,14 +22,12 @@ class Job:
         name: of the run.
         source: its run file.
         config, config_yaml: what to do, and as text to be kept beside the results.
-        key: of all that the result is made of.
     """
 
     name: str
     source: Path
     config: RunConfig
     config_yaml: str
-    key: str
 
     @property
     def folder(self) -> Path:
@@ -76,30 +66,4 @@ def _job(file: Path, overrides: Sequence[str]) -> Job:
     config = to_dataclass(composed, RunConfig, f"set it in {file}")
     name = run_name(config)
     take_name(name, "name", ConfigError)
-    return Job(name, file, config, to_yaml(composed), _key(config))
-
-
-def _key(config: RunConfig) -> str:
-    settings: dict[str, Any] = asdict(config)
-    for name in _OF_PLACE:
-        del settings[name]
-    del settings["drive"]["cache"]
-    model = NETWORK_FILE if config.detector.model is None else Path(config.detector.model)
-    made_of = {
-        "version": __version__,
-        "settings": settings,
-        "network": digest(model) if model.is_file() else None,
-        "inputs": list(_inputs(config)),
-    }
-    return hashlib.sha256(json.dumps(made_of, sort_keys=True, default=str).encode()).hexdigest()
-
-
-def _inputs(config: RunConfig) -> Iterator[tuple[str, int, int]]:
-    """The files that a run reads: name, size and time of the last change."""
-    named = [*config.drive.paths, config.map.base, config.mapping.survey.file]
-    for path in [Path(one) for one in named if one is not None]:
-        files = sorted(path.rglob("*")) if path.is_dir() else [path]
-        for file in files:
-            if file.is_file():
-                state = file.stat()
-                yield str(file), state.st_size, state.st_mtime_ns
+    return Job(name, file, config, to_yaml(composed))

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from v2hdm.fleet.cluster import LOCAL, cluster
-from v2hdm.fleet.finished import finished_metrics
 from v2hdm.fleet.plan import Job, plan
 from v2hdm.fleet.rows import Row, as_csv, as_json
 from v2hdm.outputs import GrowingFolder, growing_folder
@@ -56,21 +55,14 @@ def run_fleet(
     Raises:
         V2hdmError: the table cannot be written, or there is no Ray.
     """
-    jobs, refused = plan(files, overrides)
+    jobs, refused = plan(files, [*overrides, "resume=false"] if options.again else overrides)
     with growing_folder(options.folder, "--table") as folder:
         table = _Table(folder, files, tell)
         for row in refused:
             table.add(row)
-        todo = []
-        for job in jobs:
-            metrics = None if options.again else finished_metrics(job)
-            if metrics is None:
-                todo.append(job)
-            else:
-                table.add(Row.of_result(job.name, job.source, job.folder, metrics, kept=True))
-        if todo:
+        if jobs:
             with cluster(options.address, options.workers) as ray:
-                _map_all(ray, todo, table, tell)
+                _map_all(ray, jobs, table, tell)
         return table.rows
 
 

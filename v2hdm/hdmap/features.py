@@ -28,6 +28,9 @@ LARGEST_ID = 1_000_000_000
 
 _MOST_SIGHTINGS = 1_000_000_000
 
+_LEAST_OF_A_RING = 3
+"""Corners of a polygon, the repeated first one aside (RFC 7946, section 3.1.6)."""
+
 _NAMED = 9
 """Edited features that the log names."""
 
@@ -234,6 +237,8 @@ class FeatureReader:
             raise MapFileError(
                 f"{where}: has neither a geometry nor '{CORNERS}', '{POINTS}' or '{OUTLINE}'; drop it"
             )
+        if geometry is not None and geometry.closed and len(geometry.positions) < _LEAST_OF_A_RING:
+            raise MapFileError(f"{where}: its ring has fewer than three corners; mend it, or drop it")
         if geometry is not None and self.origin is not None and (np.abs(geometry.positions[:, 1]) > 90).any():
             raise MapFileError(f"{where}: its geometry is not in degrees of longitude and latitude; mend it")
         closed = POINTS not in properties if geometry is None else geometry.closed

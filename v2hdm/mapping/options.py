@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, is_dataclass, replace
 
-from v2hdm.adjust.problem import LOSSES
 from v2hdm.errors import ConfigError
 
 BATCH = "batch"
@@ -205,6 +204,8 @@ def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -
         raise ConfigError(
             f"mapping.pose_model is '{options.pose_model}'; choose from {', '.join(POSE_MODELS)}."
         )
+    from v2hdm.adjust.problem import LOSSES  # brings torch, which settings as such do without
+
     if options.loss not in LOSSES:
         raise ConfigError(f"mapping.loss is '{options.loss}'; choose from {', '.join(LOSSES)}.")
     for key, value in positive.items():

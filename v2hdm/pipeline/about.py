@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from v2hdm import __version__
+from v2hdm.caching.keys import library_versions
 from v2hdm.drive import ReadOptions
 from v2hdm.records import Drive
-
-_PACKAGES = ("torch", "kornia", "numpy", "scipy", "onnxruntime", "opencv-python-headless", "numba")
-"""Those that the figures of a run depend on."""
 
 
 def describe_run(name: str, drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[str, Any]:
@@ -26,7 +22,7 @@ def describe_run(name: str, drive: Drive, paths: Sequence[Path], options: ReadOp
         "version": __version__,
         "date": datetime.now(UTC).strftime("%Y-%m-%d"),
         "drive": _drive(drive, paths, options),
-        "versions": _versions(),
+        "versions": {"v2hdm": __version__, **library_versions()},
     }
 
 
@@ -38,6 +34,9 @@ def _drive(drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[st
         "paths": [str(path.resolve()) for path in paths],
         "format": options.format,
         "max_gap_s": options.max_gap_s,
+        "limit": options.limit,
+        "start_s": options.start_s,
+        "end_s": options.end_s,
         "cameras": list(drive.cameras),
         "images": len(drive.images),
         "duration_s": round(float(np.ptp(stamp_s)), 3),
@@ -45,13 +44,3 @@ def _drive(drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[st
         "position_sigma_m": drive.pose_noise.position_m,
         "heading_sigma_deg": round(float(np.rad2deg(drive.pose_noise.heading_rad)), 4),
     }
-
-
-def _versions() -> dict[str, str]:
-    found = {"v2hdm": __version__, "Python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return found | {"system": f"{platform.system()} {platform.machine()}"}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from v2hdm.errors import MapFileError
 from v2hdm.files import load_json, take_array
 from v2hdm.hdmap.geojson import geojson_feature, geojson_positions, read_geojson, read_verdict, write_features
 from v2hdm.mapping.changes.update import Base
+from v2hdm.pipeline.keys import base_files
 from v2hdm.records import Change, Changes, Drive, Fate, FloatArray, HdMap, Image
 from v2hdm.report.changes import save_changes
 
@@ -37,8 +38,7 @@ def read_base(path: Path) -> Base:
     Raises:
         MapFileError: It is missing, damaged, of an older version or another method, or its verdict is FAIL.
     """
-    if path.is_dir():
-        path = path / "map.geojson"
+    path, trajectories, excluded = base_files(path)
     hd_map = read_geojson(path)
     if not hd_map.markings:
         raise MapFileError(f"map.base: {path}: has no markings to bring up to date; map the drive by itself")
@@ -53,7 +53,7 @@ def read_base(path: Path) -> Base:
             f"map.base: {path}: does not say how sure its markings are, as maps of older versions and "
             "naive methods; map its drive anew"
         )
-    return Base(hd_map, _poses(path.parent), _left_out(path.parent / "excluded.geojson"))
+    return Base(hd_map, _poses(trajectories), _left_out(excluded))
 
 
 def check_together(base: Base, drive: Drive, path: str) -> None:
@@ -86,10 +86,10 @@ def grey_reader(drive: Drive) -> Callable[[Image], NDArray[np.float32]]:
     return grey
 
 
-def _poses(folder: Path) -> FloatArray:
+def _poses(paths: Sequence[Path]) -> FloatArray:
     """The vehicle's poses (F, 4, 4) at the images of an earlier map, its road laid flat."""
     poses = [np.zeros((0, 4, 4))]
-    for path in sorted(folder.glob("trajectory*.tum")):
+    for path in paths:
         trajectory = read_tum(path)
         poses.append(lay_flat(trajectory, _POSITION_SIGMA_M).trajectory.map_from_vehicle)
     return np.concatenate(poses)

@@ -6,10 +6,12 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from v2hdm.caching.room import Room
 from v2hdm.drive import join_drives, with_clock_offsets
 from v2hdm.errors import MapFileError
 from v2hdm.ground import GroundEstimate, GroundStatus, better_start, estimate_cameras
 from v2hdm.ground.better import GROUND_IPM
+from v2hdm.pipeline.keys import Contents
 from v2hdm.quality import Finding, Status, check_drive, clock_corrections
 from v2hdm.quality.movement import movement
 from v2hdm.records import Camera, Drive
@@ -63,6 +65,28 @@ def inspect(drive: Drive, max_gap_s: float, workers: int, progress: Callable[[in
     offset_s = clock_corrections(ground)
     corrected = better_start(with_clock_offsets(drive, offset_s, max_gap_s), ground)
     return Inspection(corrected, drive.cameras, (ground,), findings)
+
+
+def inspect_once(
+    drive: Drive,
+    contents: Contents,
+    max_gap_s: float,
+    room: Room,
+    workers: int,
+    progress: Callable[[int, int], None],
+) -> Inspection:
+    """As :func:`inspect`, or what it found before of the same drive, with the same lines in the log.
+
+    Args:
+        drive: as it was read.
+        contents: of its images.
+        max_gap_s: as there.
+        room: keeps what is found.
+        workers: as there.
+        progress: as there.
+    """
+    key = room.key(contents.key(drive), max_gap_s)
+    return room.made("check", key, Inspection, lambda: inspect(drive, max_gap_s, workers, progress))
 
 
 def join(inspections: Sequence[Inspection]) -> Inspection:

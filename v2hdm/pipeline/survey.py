@@ -84,15 +84,19 @@ def take_survey(drive: Drive, options: MappingOptions) -> Survey:
     return Survey(replace(options, survey=survey), check, points, elsewhere)
 
 
-def check_survey(survey: Survey, drive: Drive, best: MethodResult) -> tuple[CheckTable | None, list[Finding]]:
-    """The check points against the map of ``best``, None where there are none; and what follows."""
-    findings = check_frame(survey.found(best)) if survey.points else []
+def compare_survey(survey: Survey, drive: Drive, best: MethodResult) -> CheckTable | None:
+    """The check points against the finished map of ``best``; None where there are none."""
     if not survey.check:
-        return None, findings
+        return None
     assert best.corners is not None
     hd_map, reach_m = with_heights(best.hd_map, drive.road), survey.mapping.survey.reach_m
-    table = compare(hd_map, survey.check, reach_m, best.corners.covariance, route_of(drive))
-    return table, [check_points(table), *findings]
+    return compare(hd_map, survey.check, reach_m, best.corners.covariance, route_of(drive))
+
+
+def check_survey(survey: Survey, best: MethodResult, compared: CheckTable | None) -> list[Finding]:
+    """What follows from a survey, and from its check points where they were compared."""
+    findings = check_frame(survey.found(best)) if survey.points else []
+    return findings if compared is None else [check_points(compared), *findings]
 
 
 def route_of(drive: Drive) -> FloatArray:

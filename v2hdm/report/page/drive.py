@@ -26,6 +26,9 @@ def drive_of(metrics: Mapping[str, Any], path: Path | None) -> Drive | None:
         format=str(told.get("format", "auto")),
         cameras=[str(name) for name in told.get("cameras") or []],
         max_gap_s=float(told.get("max_gap_s", ReadOptions.max_gap_s)),
+        limit=None if told.get("limit") is None else int(told["limit"]),
+        start_s=float(told.get("start_s") or 0.0),
+        end_s=None if told.get("end_s") is None else float(told["end_s"]),
     )
     drive = join_drives([read_drive(one, options) for one in paths])
     expected = (told.get("name", drive.name), told.get("images", len(drive.images)))

@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from v2hdm.caching.folders import note_use
 from v2hdm.drive import write_drive
 from v2hdm.drive.folder import DRIVE_FILE, TRUTH_FOLDER
 from v2hdm.drive.truth import write_truth
@@ -54,6 +55,15 @@ def rendered_drive(config: PortConfig, cache: Path, workers: int, progress: Prog
         DriveError: when the cache cannot be written.
         WorkerError: when a process died; what it had rendered is kept.
     """
+    folder = folder_of_port(config, cache)
+    if not (folder / DRIVE_FILE).is_file() or _drop_damaged(folder):
+        render_drive(config, folder, workers, progress)
+    note_use(folder)
+    return folder
+
+
+def folder_of_port(config: PortConfig, cache: Path) -> Path:
+    """Where a port's drive belongs in a cache: named by the port and a hash of what it is rendered from."""
     content = asdict(config)
     # Ports that were rendered before there were visits, stencils and alterations stay the same.
     if not config.visit:
@@ -63,10 +73,7 @@ def rendered_drive(config: PortConfig, cache: Path, workers: int, progress: Prog
     if config.altered == AlteredConfig():
         del content["altered"]
     text = json.dumps([RENDERER_VERSION, content], sort_keys=True)
-    folder = cache / f"{config.name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
-    if not (folder / DRIVE_FILE).is_file() or _drop_damaged(folder):
-        render_drive(config, folder, workers, progress)
-    return folder
+    return cache / f"{config.name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
 
 
 def _drop_damaged(folder: Path) -> bool:

@@ -1,0 +1,121 @@
+"""``python`` for shell blocks without its slow start: a process with the libraries forks for every command.
+
+Run as a program it is that process: ``python processes.py SOCKET``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import runpy
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+LOADED = (
+    "torch", "kornia", "scipy.optimize", "hydra", "matplotlib.pyplot", "rasterio", "pyogrio", "ezdxf",
+    "v2hdm.config", "v2hdm.console", "v2hdm.checkup", "v2hdm.watch", "v2hdm.remake", "v2hdm.localization",
+    "v2hdm.precalibration", "v2hdm.adjust.kernels", "rosbags.highlevel",
+)  # fmt: skip
+
+CLIENT = """#!{python} -IS
+import json, os, socket, sys
+asked = socket.socket(socket.AF_UNIX)
+asked.connect({address!r})
+socket.send_fds(asked, [b"3"], [0, 1, 2])
+asked.sendall(json.dumps([sys.argv[1:], os.getcwd(), dict(os.environ)]).encode())
+asked.shutdown(socket.SHUT_WR)
+told = asked.recv(8)
+sys.exit(int(told) if told else 70)
+"""
+
+
+@contextlib.contextmanager
+def python_in(folder: Path) -> Iterator[Path]:
+    """A folder for ``PATH`` with the quick ``python``, as long as the context lasts."""
+    address = str(folder / "socket")
+    client = folder / "python"
+    client.write_text(CLIENT.format(python=sys.executable, address=address))
+    client.chmod(0o755)
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "MPLBACKEND": "agg"}
+    server = subprocess.Popen([sys.executable, __file__, address], env=environment, cwd=folder)
+    try:
+        for _ in range(600):
+            if Path(address).exists() or server.poll() is not None:
+                break
+            time.sleep(0.1)
+        yield folder
+    finally:
+        server.terminate()
+        server.wait()
+
+
+def serve(address: str) -> None:
+    """Fork for every command that is asked for, until SIGTERM."""
+    sys.path[0] = str(ROOT)
+    for name in LOADED:
+        with contextlib.suppress(ModuleNotFoundError):
+            __import__(name)
+    listening = socket.socket(socket.AF_UNIX)
+    listening.bind(address + ".new")
+    listening.listen()
+    Path(address + ".new").rename(address)
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+    while True:
+        asked, _ = listening.accept()
+        if os.fork() == 0:
+            listening.close()
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            _work(asked)
+        asked.close()
+
+
+def _work(asked: socket.socket) -> None:
+    """Be ``python ARGUMENTS`` on the asker's terminal, and end."""
+    _, passed, _, _ = socket.recv_fds(asked, 1, 3)
+    for number, fd in enumerate(passed):
+        os.dup2(fd, number)
+        os.close(fd)
+    arguments, folder, environment = json.loads(b"".join(iter(lambda: asked.recv(65536), b"")))
+    os.chdir(folder)
+    os.environ.clear()
+    os.environ.update(environment)
+    code = 70
+    try:
+        _run(arguments)
+        code = 0
+    except SystemExit as left:
+        code = left.code if isinstance(left.code, int) else int(left.code is not None)
+    except BaseException:
+        import traceback
+
+        traceback.print_exc()
+        code = 1
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError):
+                stream.flush()
+        asked.sendall(str(code).encode())
+        os._exit(0)
+
+
+def _run(arguments: list[str]) -> None:
+    from tests.docs.smaller import smaller
+
+    if arguments[0] != "-m":
+        sys.argv = arguments
+        runpy.run_path(arguments[0], run_name="__main__")
+        return
+    sys.argv = smaller(arguments)[1:]
+    runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    serve(sys.argv[1])

@@ -1,0 +1,179 @@
+"""Every command in the README and in ``docs/`` does what it says, on one small rendered drive.
+
+The blocks of a document run in their order, in a folder of that document's own. What cannot be run here says
+so to its readers, with the reason; then the door that it names must exist and take its arguments.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shlex
+import shutil
+import subprocess
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.docs.blocks import ROOT, Block, blocks, document, documents
+from tests.docs.processes import python_in
+from tests.docs.sandbox import furnish
+from v2hdm import __version__
+from v2hdm.hdmap import read_geojson
+
+RUN_BY = {
+    "docs/calibrate.md": "tests/precalibration/test_door.py",
+    "docs/living-map.md": "tests/pipeline/test_living_map.py",
+    "docs/survey.md": "tests/pipeline/test_survey.py",
+}
+"""Documents whose commands other tests run, on data made for them, to see what comes of them."""
+
+SHELL = [block for name in documents() for block in blocks(name, "sh")]
+RUN = [block for block in SHELL if block.not_run_because is None and block.document not in RUN_BY]
+PYTHON = [block for name in documents() for block in blocks(name, "python")]
+NOT_RUN = [block for block in SHELL if block.not_run_because is not None]
+COMPOSED = ("v2hdm.map", "v2hdm.experiment", "train", "export")
+"""Doors whose arguments are checked by composing their configuration."""
+
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+
+
+def named(block: Block) -> str:
+    return f"{block.document}:{block.line}"
+
+
+class Shell:
+    """Runs blocks of shell, with ``python`` at hand quickly and runs of ports small."""
+
+    def __init__(self, programs: Path) -> None:
+        self.programs = programs
+
+    def __call__(self, text: str, folder: Path) -> str:
+        """What the commands print."""
+        ran = subprocess.run(
+            ["bash", "-c", f"set -eo pipefail\n{text}"],
+            cwd=folder, capture_output=True, text=True, timeout=300, stdin=subprocess.DEVNULL,
+            env={"PATH": f"{self.programs}:/usr/bin:/bin", "HOME": str(folder), "COLUMNS": "200"},
+        )  # fmt: skip
+        assert ran.returncode == 0, f"{text}\n{ran.stdout[-3000:]}{ran.stderr[-3000:]}"
+        return ran.stdout + ran.stderr
+
+
+MAKE = """#!/bin/bash
+set -e
+told=$({make} --no-print-directory -n -C {root} "$@")
+if [ "$1" = map ]; then eval "python ${{told##*bin/python }}"; fi
+"""
+"""``make``: its target must be there; that of a run is run, and the others are what runs these tests."""
+
+
+@pytest.fixture(scope="module")
+def shell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shell]:
+    make = shutil.which("make")
+    if make is None:
+        pytest.skip("no make: install it")
+    folder = tmp_path_factory.mktemp("programs")
+    for name, text in (("make", MAKE.format(make=make, root=ROOT)), ("pip", "#!/bin/sh\n")):
+        (folder / name).write_text(text)
+        (folder / name).chmod(0o755)
+    with python_in(folder) as programs:
+        yield Shell(programs)
+
+
+@pytest.fixture(scope="module")
+def furnished(shell: Shell, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The README's first block makes the drive and the result that all other commands work on."""
+    folder = tmp_path_factory.mktemp("furnished")
+    shell(RUN[0].text, folder)
+    furnish(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder_of(furnished: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """The folder of a document, furnished when it is first asked for."""
+    folders: dict[str, Path] = {}
+
+    def folder(name: str) -> Path:
+        if name not in folders:
+            folders[name] = tmp_path_factory.mktemp(Path(name).stem) / "here"
+            shutil.copytree(furnished, folders[name])
+            for block in blocks(name):
+                if block.title:
+                    path = folders[name] / block.title
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    path.write_text(block.text)
+        return folders[name]
+
+    return folder
+
+
+def test_the_first_block_of_the_readme_makes_a_map_and_a_report(furnished: Path) -> None:
+    assert "make map" in RUN[0].text
+    assert (furnished / "outputs/port2/report.html").stat().st_size > 100_000
+    assert len(read_geojson(furnished / "outputs/port2/map.geojson").markings) > 5
+
+
+@pytest.mark.parametrize("block", RUN[1:], ids=named)
+def test_a_documented_block_runs(block: Block, shell: Shell, folder_of: Callable[[str], Path]) -> None:
+    folder = folder_of(block.document)
+    for line in shell(block.text, folder).splitlines():
+        if re.fullmatch(r"[\w./-]+/[\w.-]+", line):  # a door that tells what it has written
+            assert (folder / line).exists(), line
+
+
+@pytest.mark.parametrize("block", PYTHON, ids=named)
+def test_a_documented_program_runs(block: Block, shell: Shell, folder_of: Callable[[str], Path]) -> None:
+    folder = folder_of(block.document)
+    (folder / "program.py").write_text(block.text)
+    shell("python program.py", folder)
+
+
+@pytest.mark.parametrize("name", RUN_BY)
+def test_the_commands_that_other_tests_run_are_taken_from_the_document(name: str) -> None:
+    assert f'blocks("{name}", "sh"' in (ROOT / RUN_BY[name]).read_text()
+
+
+@pytest.mark.parametrize("block", NOT_RUN, ids=named)
+def test_what_is_not_run_names_doors_and_settings_that_are_there(
+    block: Block, shell: Shell, tmp_path: Path
+) -> None:
+    for line in block.lines:
+        words = shlex.split(line)
+        if words[0] == "rerun":
+            assert (ROOT / "v2hdm/viewer/recording.py").read_text().count(words[1].rpartition("/")[2]), line
+            continue
+        assert words[0] in ("python", "torchrun"), line
+        module, arguments = words[words.index("-m") + 1], words[words.index("-m") + 2 :]
+        assert importlib.util.find_spec(module) is not None, line
+        if module in COMPOSED:
+            own = ROOT / "docs" / "own-class"
+            if "--multirun" in arguments:  # one configuration is composed: the first of a sweep
+                arguments.remove("--multirun")
+                arguments = [re.sub(r"=([^\[{,]+),.*", r"=\1", one) for one in arguments]
+            arguments = [one.replace("docs/own-class", str(own)) for one in arguments]
+            assert shell(shlex.join(["python", "-m", module, *arguments, "--cfg=job"]), tmp_path)
+        else:
+            source = "".join(path.read_text() for path in _sources(module))
+            options = [one for one in arguments if one.startswith("--")]
+            assert all(f'"{one}"' in source for one in options), line
+
+
+def _sources(module: str) -> list[Path]:
+    path = ROOT / module.replace(".", "/")
+    return [path.with_suffix(".py")] if path.with_suffix(".py").is_file() else list(path.glob("*.py"))
+
+
+@pytest.mark.parametrize("name", documents())
+def test_a_document_names_only_modules_extras_and_targets_that_are_there(name: str) -> None:
+    text = document(name)
+    for module in re.findall(r"python -m ([a-z][a-z_0-9.]*[a-z_0-9])\\b", text):
+        assert importlib.util.find_spec(module) is not None, module
+    for listed in re.findall(r"(?:\.|v2hdm|\.whl)\[([a-z, ]+)\]'", text):
+        assert {one.strip() for one in listed.split(",")} <= set(EXTRAS), listed
+    targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert set(re.findall(r"`make ([a-z]+)", text)) <= set(targets)
+    for version in re.findall(r"v2hdm-([\d.]+)-py3", text):
+        assert version == __version__

@@ -1,0 +1,97 @@
+"""The documentation's site builds without a warning, and asks no other machine for anything."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import pytest
+import yaml
+
+from tests.docs.blocks import ROOT, module_at
+from tests.report.page.browser import browser_path, opened
+
+_LOADED = re.compile(r"""<(?:script|link|img|iframe|source|video)\b[^>]*\b(?:src|href)=["']?(https?:|//)""")
+_IMPORTED = re.compile(r"""(?:url\(|@import)\s*["']?(?:https?:|//)""")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("material", reason="no mkdocs-material: pip install 'v2hdm[docs]'")
+    folder = tmp_path_factory.mktemp("site")
+    built = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)],
+        cwd=ROOT, capture_output=True, text=True, timeout=120, env={"NO_MKDOCS_2_WARNING": "1", "PATH": ""},
+    )  # fmt: skip
+    assert built.returncode == 0, built.stderr
+    assert "WARNING" not in built.stderr
+    return folder
+
+
+def test_every_page_is_built_and_in_the_navigation(site: Path) -> None:
+    listed = set(re.findall(r"[\w-]+\.md", (ROOT / "mkdocs.yml").read_text()))
+    pages = {path.name for path in (ROOT / "docs").glob("*.md")}
+    assert pages <= listed
+    for page in listed:
+        assert (site / page).with_suffix(".html").stat().st_size > 5000, page
+
+
+def test_no_page_loads_anything_from_another_machine(site: Path) -> None:
+    for path in [*site.rglob("*.html"), *site.rglob("*.css"), *site.rglob("*.svg")]:
+        text = path.read_text(encoding="utf-8")
+        assert not _LOADED.search(text), path
+        assert not _IMPORTED.search(text), path
+    # The theme's script fetches these for what no page of ours may hold.
+    for page in site.rglob("*.html"):
+        assert 'class="mermaid"' not in page.read_text(encoding="utf-8"), page
+    settings = yaml.safe_load((ROOT / "mkdocs.yml").read_text())
+    assert not {"repo_url", "extra_javascript", "extra_css"} & set(settings)
+
+
+def test_pages_of_the_repository_lead_to_each_other(site: Path) -> None:
+    assert 'href="contributing.html"' in (site / "design.html").read_text()
+    assert 'href="your-drive.html"' in (site / "index.html").read_text()
+    assert not list(site.rglob("*.py"))
+
+
+def test_a_browser_draws_the_site_and_asks_for_nothing_outside(site: Path) -> None:
+    path = browser_path()
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        launched = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        for page in ("index.html", "design.html"):
+            with opened(launched, site / page) as watched:
+                assert all(url.startswith(("file:", "data:", "blob:")) for url in watched.requests)
+                assert watched.page.locator("h1").count() == 1
+        launched.close()
+
+
+@pytest.fixture(scope="module")
+def floors() -> ModuleType:
+    return module_at(ROOT / "docs" / "tools" / "floors.py")
+
+
+def test_the_drawn_floors_are_those_of_the_contracts(floors: ModuleType) -> None:
+    assert (ROOT / "docs" / "floors.svg").read_text() == floors.draw(), (
+        "the contracts have changed: python docs/tools/floors.py"
+    )
+    drawn = re.findall(r"<text[^>]*>([^<]+)</text>", floors.draw())
+    parts = {path.stem for path in (ROOT / "v2hdm").iterdir() if path.suffix == ".py" or path.is_dir()}
+    assert parts - {"__init__", "__pycache__", "conf"} <= {*drawn, "catalogue"}
+
+
+def test_a_link_to_nowhere_stops_the_build() -> None:
+    pytest.importorskip("mkdocs", reason="no mkdocs-material: pip install 'v2hdm[docs]'")
+    from mkdocs.exceptions import PluginError
+    from mkdocs.structure.files import File, Files
+
+    hook = module_at(ROOT / "docs" / "tools" / "repository_pages.py")
+    file = File("check.md", str(ROOT / "docs"), "site", use_directory_urls=False)
+    page, files = SimpleNamespace(file=file), Files([file])
+    assert hook.on_page_markdown("[a](check.md#x) [b](../pyproject.toml)", page, files) == "[a](check.md#x) b"
+    with pytest.raises(PluginError, match=r"check\.md: links to gone\.md"):
+        hook.on_page_markdown("[a](gone.md)", page, files)

@@ -1,0 +1,196 @@
+"""A run goes on from what earlier ones have found, and ends in the bytes that one in one go makes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from v2hdm.caching.pruning import items_of
+from v2hdm.drive import ReadOptions, read_drive
+from v2hdm.errors import DriveError
+from v2hdm.mapping.options import MappingOptions
+from v2hdm.pipeline import DriveConfig, RunConfig, RunResult, detections, run, work
+from v2hdm.pipeline import inspect as inspection
+from v2hdm.simulate import PortConfig, render_drive
+from v2hdm.simulate.port.config import RouteConfig, YardConfig
+
+SAME = ("map.geojson", "trajectory.tum", "excluded.geojson", "residuals.csv")
+
+
+def smallest_port() -> PortConfig:
+    route = RouteConfig(pieces=[[16.0, 0.0], [10.0, 40.0]], image_spacing_m=1.0)
+    yard = YardConfig(parked_trucks=0, barriers=0, lamp_posts=0, moving_trucks=0, shadow_strips=0)
+    port = PortConfig(name="smallest", seed=11, initial_ipm="estimated", route=route, yard=yard)
+    return replace(port, cameras={"front": port.cameras["front"]})
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a drive, what a first run has made of it, and its cache."""
+    folder = tmp_path_factory.mktemp("site")
+    render_drive(smallest_port(), folder / "drive", 1, lambda done, total: None)
+    run(config(folder, "first"))
+    return folder
+
+
+def config(folder: Path, output: str, **changes: Any) -> RunConfig:
+    drive = DriveConfig(path=str(folder / "drive"))
+    given = {"name": "short", "drive": drive, "output": str(folder / output), "workers": 1}
+    return RunConfig(**{**given, "cache": str(folder / "cache"), **changes})
+
+
+def assert_same(folder: Path, other: Path) -> None:
+    for name in SAME:
+        assert (folder / name).read_bytes() == (other / name).read_bytes(), name
+
+
+def refused(*_: object, **__: object) -> Any:
+    raise AssertionError("this was to be taken from the cache")
+
+
+def test_another_mapping_setting_needs_no_image_again(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inspection, "inspect", refused)
+    monkeypatch.setattr(detections, "detect_images", refused)
+    monkeypatch.setattr(detections, "own_vehicles", refused)
+    nearer = run(config(site, "nearer", mapping=MappingOptions(max_range_m=9.0)))
+    before, after = ((one / "map.geojson").read_bytes() for one in (site / "first" / "short", nearer.folder))
+    assert before != after
+
+
+def test_with_nothing_changed_the_result_is_taken_as_it_lies(
+    site: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(work, "map_drives", refused)
+    again = run(config(site, "first", workers=2))
+    metrics = json.loads((site / "first" / "short" / "metrics.json").read_text())
+    assert again.metrics["results"].keys() == metrics["results"].keys()
+    assert again.verdict.as_json() == metrics["verdict"]
+    assert again.headlines
+
+
+def test_a_finished_result_is_known_without_torch(site: Path) -> None:
+    code = (
+        "import sys; from v2hdm.pipeline import DriveConfig, RunConfig, run\n"
+        f"run(RunConfig(name='short', drive=DriveConfig(path={str(site / 'drive')!r}), workers=1,"
+        f" output={str(site / 'first')!r}, cache={str(site / 'cache')!r}))\n"
+        "print('torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.stdout.strip() == "False", done.stderr
+
+
+def remove_a_file(folder: Path) -> None:
+    (folder / "map.geojson").unlink()
+
+
+def cut_the_entries(folder: Path) -> None:
+    for item in items_of(folder.parent.parent / "cache"):
+        if item.path.is_file():
+            item.path.write_bytes(item.path.read_bytes()[: item.size // 2])
+
+
+@pytest.mark.parametrize("harm", [remove_a_file, cut_the_entries])
+def test_what_is_missing_or_damaged_is_made_anew(
+    site: Path, harm: Callable[[Path], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[RunResult] = []
+    before = (site / "first" / "short" / "map.geojson").read_bytes()
+    harm(site / "first" / "short")
+    original = work.map_drives
+    monkeypatch.setattr(work, "map_drives", lambda *given: made.append(original(*given)) or made[-1])
+    run(config(site, "first"))
+    assert made
+    assert (site / "first" / "short" / "map.geojson").read_bytes() == before
+
+
+def test_an_image_that_changed_is_looked_at_again_and_no_other_piece(
+    site: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked: list[int] = []
+    original = detections.detect_images
+
+    def detect(drive: Any, options: Any, images: Any, *rest: Any) -> None:
+        looked.extend(images)
+        original(drive, options, images, *rest)
+
+    monkeypatch.setattr(detections, "detect_images", detect)
+    image = sorted((site / "drive").rglob("*.jpg"))[-1]
+    before = image.read_bytes()
+    try:
+        image.write_bytes(before + b"\0")  # a decoder does not mind what follows the end
+        run(config(site, "changed"))
+    finally:
+        image.write_bytes(before)
+    total = len(read_drive(site / "drive").images)
+    assert looked == list(range(total - total % detections.PIECE, total))
+
+
+KILLED = """
+import os, signal, sys
+from v2hdm.pipeline import DriveConfig, RunConfig, detections, run
+original, kept = detections.Room.keep, []
+def keep(room, stage, *rest):
+    found = original(room, stage, *rest)
+    kept.append(stage)
+    if kept.count("detect") == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return found
+detections.Room.keep = keep
+drive = DriveConfig(path=sys.argv[1])
+run(RunConfig(name="short", drive=drive, output=sys.argv[2], cache=sys.argv[3], workers=1))
+"""
+
+
+def test_a_killed_run_goes_on_in_the_middle_of_detection(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cache, output = site / "killed_cache", site / "killed"
+    arguments = [str(site / "drive"), str(output), str(cache)]
+    done = subprocess.run([sys.executable, "-c", KILLED, *arguments], capture_output=True, timeout=300)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    looked: list[int] = []
+    original = detections.detect_images
+    monkeypatch.setattr(
+        detections, "detect_images", lambda *given: (looked.extend(given[2]), original(*given))[1]
+    )
+    resumed = run(config(site, "killed", cache=str(cache)))
+    assert looked
+    assert looked[0] == detections.PIECE
+    assert_same(resumed.folder, site / "first" / "short")
+
+
+def test_the_limit_of_the_cache_is_kept(site: Path) -> None:
+    for item in items_of(site / "cache"):
+        os.utime(item.path, (1000, 1000))
+    before = len(items_of(site / "cache"))
+    limited = run(config(site, "limited", cache_gb=0.0))
+    left = items_of(site / "cache")
+    assert {item.kind for item in left} == {"check", "own_vehicle", "detect", "map", "finished"}
+    assert all(item.used_s > 1000 for item in left)
+    assert len(left) < before
+    assert_same(limited.folder, site / "first" / "short")
+
+
+def test_part_of_a_drive_can_be_tried(site: Path) -> None:
+    whole = read_drive(site / "drive")
+    first_s = whole.images[0].stamp_s
+    few = read_drive(site / "drive", ReadOptions(limit=3))
+    assert [image.path for image in few.images] == [image.path for image in whole.images[:3]]
+    middle = read_drive(site / "drive", ReadOptions(start_s=0.5, end_s=2.0))
+    assert {image.path for image in middle.images} == {
+        image.path for image in whole.images if 0.5 <= image.stamp_s - first_s <= 2.0
+    }
+    assert middle.trajectory is not None
+    assert whole.trajectory is not None
+    assert len(middle.trajectory.stamp_s) == len(whole.trajectory.stamp_s)
+    with pytest.raises(DriveError, match=r"no image of camera 'front' is left from 1000 to inf s"):
+        read_drive(site / "drive", ReadOptions(start_s=1000.0))
+    with pytest.raises(DriveError, match=r"drive\.limit is 0"):
+        read_drive(site / "drive", ReadOptions(limit=0))

@@ -1,0 +1,141 @@
+"""``viewer=rerun``: a run is recorded, and the recording holds what happened."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from v2hdm.drive import read_drive
+from v2hdm.errors import ConfigError
+from v2hdm.hdmap import read_geojson
+from v2hdm.hdmap.calibration import read_calibration
+from v2hdm.pipeline import DriveConfig, RunConfig, run
+from v2hdm.simulate import PortConfig, render_drive
+from v2hdm.simulate.port.config import RouteConfig, YardConfig
+from v2hdm.viewer import FILE, RerunViewer, check_viewer
+
+ROOT = Path(__file__).parents[2]
+Columns = Mapping[str, list[Any]]
+
+
+def small_port() -> PortConfig:
+    """One camera of half the pixels on 46 m."""
+    route = RouteConfig(pieces=[[20.0, 0.0], [16.0, 70.0], [10.0, 0.0]], image_spacing_m=2.0)
+    yard = YardConfig(parked_trucks=0, barriers=0, lamp_posts=0, moving_trucks=0, shadow_strips=1)
+    front = replace(PortConfig().cameras["front"], width=640, height=360, focal_px=450.0)
+    return PortConfig(
+        name="small", seed=11, initial_ipm="estimated", route=route, yard=yard, cameras={"front": front}
+    )
+
+
+@pytest.fixture(scope="module")
+def drive_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("drive") / "small"
+    render_drive(small_port(), folder, 1, lambda done, total: None)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(drive_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("rerun", reason="no rerun: pip install 'v2hdm[viewer]'")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("DISPLAY", raising=False)
+        patch.delenv("WAYLAND_DISPLAY", raising=False)
+        output = tmp_path_factory.mktemp("outputs")
+        config = RunConfig(
+            name="small", drive=DriveConfig(path=str(drive_folder)), output=str(output), workers=1
+        )
+        return run(config, viewer=RerunViewer("small")).folder
+
+
+@pytest.fixture(scope="module")
+def recorded(result: Path) -> Mapping[str, Columns]:
+    """Columns of the recording by entity, read by Rerun's own reader."""
+    from rerun.chunk import RrdReader
+
+    columns: dict[str, dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
+    for chunk in RrdReader(result / FILE).stream().to_chunks():
+        batch = chunk.to_record_batch()
+        for name in (one for one in batch.schema.names if one == "image" or ":" in one):
+            columns[chunk.entity_path][name] += batch.column(name).to_pylist()
+    return columns
+
+
+def only(columns: Columns, ending: str) -> list[Any]:
+    (found,) = [values for name, values in columns.items() if name.endswith(ending)]
+    return found
+
+
+def test_every_image_is_in_the_recording_byte_for_byte(
+    recorded: Mapping[str, Columns], drive_folder: Path
+) -> None:
+    drive = read_drive(drive_folder)
+    columns = recorded["/map/vehicle/front/image"]
+    blobs = [bytes(one[0]) for one in only(columns, "EncodedImage:blob") if one]
+    assert sorted(blobs) == sorted(image.path.read_bytes() for image in drive.images)
+    frames = [n for n, one in zip(columns["image"], only(columns, "EncodedImage:blob"), strict=True) if one]
+    assert sorted(frames) == list(range(len(drive.images)))
+
+
+def test_detections_lie_in_the_images(recorded: Mapping[str, Columns], drive_folder: Path) -> None:
+    columns = recorded["/map/vehicle/front/image/markings"]
+    strips = [strip for one in only(columns, "LineStrips2D:strips") for strip in one or ()]
+    assert len(strips) > 20
+    inside = [((np.array(strip) > -50) & (np.array(strip) < [690, 410])).all() for strip in strips]
+    assert np.mean(inside) > 0.9
+    labels = [label for one in only(columns, "LineStrips2D:labels") for label in one or ()]
+    assert any(label.startswith("diamond 0.") for label in labels)
+
+
+def test_the_recorded_map_is_the_written_one(recorded: Mapping[str, Columns], result: Path) -> None:
+    (strips,) = only(recorded["/map/front/markings"], "LineStrips3D:strips")
+    written = read_geojson(result / "map.geojson").markings
+    assert len(strips) == len(written) > 5
+    got = sorted(np.array(strip)[:4, :2].mean(axis=0).tolist() for strip in strips)
+    expected = sorted(marking.corners_map.mean(axis=0).tolist() for marking in written)
+    np.testing.assert_allclose(got, expected, atol=1e-3)
+    assert recorded["/map/front/lanes"]
+
+
+def test_the_camera_ends_where_the_calibration_has_it(recorded: Mapping[str, Columns], result: Path) -> None:
+    columns = recorded["/map/vehicle/front"]
+    found = read_calibration(result / "calibration_front.yaml").cam_from_vehicle
+    centre = -found[:3, :3].T @ found[:3, 3]
+    np.testing.assert_allclose(only(columns, "Transform3D:translation")[-1][0], centre, atol=1e-4)
+    assert only(recorded["/map/vehicle/front/image"], "Pinhole:resolution")[0]
+
+
+def test_the_recording_belongs_to_the_result_and_the_log_says_how_to_replay_it(result: Path) -> None:
+    listed = [json.loads(line) for line in (result / ".v2hdm-results.jsonl").read_text().splitlines()]
+    assert any(FILE in one.values() for one in listed)
+    assert f"replay the run with: rerun {FILE}" in (result / "run.log").read_text()
+
+
+def test_an_unknown_viewer_is_refused() -> None:
+    assert not check_viewer("none")
+    with pytest.raises(ConfigError, match="viewer is 'foxglove': choose none or rerun"):
+        check_viewer("foxglove")
+
+
+def test_without_its_package_the_viewer_is_one_line_before_any_work(tmp_path: Path) -> None:
+    (tmp_path / "rerun.py").write_text('raise ModuleNotFoundError("not installed", name="rerun")')
+    done = subprocess.run(
+        [sys.executable, "-m", "v2hdm.map", "drive.path=nowhere", "viewer=rerun"],
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"},
+        capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert done.stderr == (
+        "error: viewer=rerun needs rerun: install the viewer extra, pip install 'v2hdm[viewer]'\n"
+    )
+    assert not (tmp_path / "outputs").exists()

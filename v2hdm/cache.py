@@ -1,0 +1,83 @@
+"""The cache door: ``python -m v2hdm.cache list`` says what is kept; ``prune`` and ``verify`` mend it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from v2hdm.door import ShowVersion, answer_signals, open_door
+
+if TYPE_CHECKING:
+    from v2hdm.caching.pruning import Item
+
+_INTERRUPTED = "interrupted; what was removed so far is made anew when it is needed"
+_GB = 1e9
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the door; the exit code is 0, or 2 where a user must mend something."""
+    parsed = _parser().parse_args(arguments)
+    return open_door("v2hdm.cache", None, _INTERRUPTED, lambda: _work(parsed))
+
+
+def _work(parsed: argparse.Namespace) -> None:
+    from v2hdm.caching.pruning import items_of, prune, remove_damaged
+    from v2hdm.errors import ConfigError
+
+    cache: Path = parsed.cache
+    if not cache.is_dir():
+        raise ConfigError(f"{cache}: no such folder; give the cache of your runs with --cache")
+    if parsed.what == "list":
+        _show(items_of(cache))
+    elif parsed.what == "prune":
+        if not parsed.gb >= 0:
+            raise ConfigError(f"--gb {parsed.gb:g}: give 0 or more")
+        removed = prune(cache, parsed.gb * _GB)
+        freed, left = sum(item.size for item in removed), sum(item.size for item in items_of(cache))
+        print(f"removed {len(removed)} entries of {_size(freed)}; {_size(left)} are left")
+    else:
+        items = items_of(cache)
+        damaged = remove_damaged(items)
+        for item in damaged:
+            print(f"{item.path}: is damaged and was removed; the next run makes it anew")
+        print(f"read {len(items)} entries, {len(damaged)} of them damaged")
+
+
+def _show(items: Sequence[Item]) -> None:
+    kinds = sorted({item.kind for item in items})
+    print(f"{'what':<20}{'entries':>8}{'size':>12}  last used")
+    for kind in kinds:
+        own = [item for item in items if item.kind == kind]
+        used = time.strftime("%Y-%m-%d %H:%M", time.localtime(max(item.used_s for item in own)))
+        print(f"{kind:<20}{len(own):>8}{_size(sum(item.size for item in own)):>12}  {used}")
+    print(f"{'all':<20}{len(items):>8}{_size(sum(item.size for item in items)):>12}")
+
+
+def _size(size: int) -> str:
+    return f"{size / _GB:.2f} GB" if size >= _GB else f"{size / 1e6:.1f} MB"
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m v2hdm.cache", description="What the cache of runs keeps (docs/cache.md)."
+    )
+    parser.add_argument("--version", action=ShowVersion)
+    actions = parser.add_subparsers(dest="what", required=True)
+    shown = actions.add_parser("list", help="say what is kept, how large it is, and when it was last used")
+    pruned = actions.add_parser(
+        "prune", help="remove what was not used for longest, and what killed runs left"
+    )
+    pruned.add_argument("--gb", type=float, required=True, help="what may stay, GB; 0 empties the cache")
+    verified = actions.add_parser("verify", help="read every entry and remove those that are damaged")
+    for action in (shown, pruned, verified):
+        action.add_argument("--cache", type=Path, default=Path("cache"), help="the folder (default: cache)")
+    return parser
+
+
+if __name__ == "__main__":
+    answer_signals()
+    sys.exit(main())

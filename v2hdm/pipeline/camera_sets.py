@@ -1,0 +1,115 @@
+"""The stage of mapping: every method on every set of cameras, each set kept by itself."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+from v2hdm.caching.room import Room
+from v2hdm.drive.truth import has_truth
+from v2hdm.mapping.changes.update import Base
+from v2hdm.mapping.methods import run_methods
+from v2hdm.mapping.results import MethodResult
+from v2hdm.pipeline.base import grey_reader
+from v2hdm.pipeline.survey import Survey, compare_survey
+from v2hdm.pipeline.telling import Progress
+from v2hdm.pipeline.viewer import Viewer
+from v2hdm.pipeline.write import BEST
+from v2hdm.records import Drive, ImageDetections
+from v2hdm.report.check_points import CheckTable
+
+_log = logging.getLogger(__name__)
+
+STAGE = "map"
+GROWTH_STEPS = 8
+"""Sizes of the growing map at which its error is drawn."""
+
+
+@dataclass(frozen=True)
+class MappedSet:
+    """One set of cameras: results by method, and of the last set the check points of a survey, if any."""
+
+    methods: dict[str, MethodResult]
+    checked: CheckTable | None = None
+
+
+def camera_sets(drive: Drive) -> dict[str, tuple[str, ...]]:
+    """Each camera alone and all together: named ``both`` for two cameras, ``all`` for more."""
+    names = tuple(drive.cameras)
+    sets: dict[str, tuple[str, ...]] = {name: (name,) for name in names}
+    if len(names) > 1:
+        sets["both" if len(names) == 2 else "all"] = names
+    return sets
+
+
+def map_camera_sets(
+    drive: Drive,
+    drive_key: str,
+    detections: Sequence[ImageDetections],
+    survey: Survey,
+    base: Base | None,
+    room: Room,
+    progress: Progress,
+    viewer: Viewer,
+) -> dict[str, MappedSet]:
+    """Map a drive with each set of cameras, where that is not known yet.
+
+    Args:
+        drive: what to map.
+        drive_key: of the drive and of what its images show.
+        detections: what was found in its images.
+        survey: control points for the mapping; check points, held against the finished map of all cameras.
+        base: an earlier map that is brought up to date with all cameras.
+        room: keeps the results.
+        progress: told how many sets are done.
+        viewer: shown the results of each set.
+
+    Raises:
+        MappingError: no map can be made.
+        AdjustError: the adjustment fails.
+    """
+    sets = camera_sets(drive)
+    begun = room.key(drive_key, list(detections), survey.mapping)
+    found = {}
+    for done, (name, cameras) in enumerate(sets.items()):
+        progress("map", done, len(sets))
+        last = done == len(sets) - 1
+        # The picture of the growing map is drawn for the whole rig, which comes last, and needs truth.
+        steps = GROWTH_STEPS if last and has_truth(drive) else 0
+        of_last = (base, survey.check) if last else None
+        make = partial(
+            _map_set, drive, detections, name, cameras, survey, steps, base if last else None, last
+        )
+        found[name] = room.made(STAGE, room.key(begun, name, cameras, steps, of_last), MappedSet, make)
+        viewer.mapped(name, found[name].methods)
+    progress("map", len(sets), len(sets))
+    return found
+
+
+def _map_set(
+    drive: Drive,
+    detections: Sequence[ImageDetections],
+    name: str,
+    cameras: Sequence[str],
+    survey: Survey,
+    growth_steps: int,
+    base: Base | None,
+    last: bool,
+) -> MappedSet:
+    tell, begin_s = partial(_log.debug, "%s: %s", name), time.perf_counter()
+    methods = run_methods(
+        drive, detections, cameras, survey.mapping, tell, growth_steps, base, grey_reader(drive)
+    )
+    best = methods[BEST]
+    checked = compare_survey(survey, drive, best) if last else None
+    # The factors of the adjustment are large; whoever needs more of them than this asks while they are here.
+    methods[BEST] = replace(best, corners=None)
+    took_s = time.perf_counter() - begin_s
+    _log.info("mapped with %s: %d markings, %.1f s", name, len(best.hd_map.markings), took_s)
+    for exclusion in best.excluded:
+        where = ", ".join(f"{value:.2f}" for value in exclusion.position_map)
+        _log.debug("%s: left out a %s at (%s): %s", name, exclusion.kind, where, exclusion.reason)
+    return MappedSet(methods, checked)

@@ -1,0 +1,94 @@
+"""The stage of detection, kept piece by piece, so that a run that was stopped goes on in the middle.
+
+A piece rests on the pixels of its images and on what is known of their cameras, not on where or of which
+drive they are.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v2hdm.caching.keys import key_of
+from v2hdm.caching.room import Room
+from v2hdm.detection.batch import Detect, detect_images, own_vehicles, with_masks
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.pipeline.keys import Contents, model_key
+from v2hdm.records import Drive, ImageDetections
+
+_log = logging.getLogger(__name__)
+
+STAGE = "detect"
+PIECE = 16
+"""Images of a piece: a second or two of work."""
+
+_Masks = dict[str, NDArray[np.bool_]]
+_Piece = list[ImageDetections]
+
+
+def detect_in_pieces(
+    drive: Drive,
+    contents: Contents,
+    options: DetectorOptions,
+    room: Room,
+    workers: int,
+    progress: Callable[[int, int], None],
+    detect: Detect = detect_images,
+) -> list[ImageDetections]:
+    """Detect in every image of a drive, in the drive's order, where that is not known yet.
+
+    Args:
+        drive: what to look at.
+        contents: of its images.
+        options: detector settings.
+        room: keeps what was found.
+        workers: processes, one thread each.
+        progress: called as ``progress(done, total)`` with numbers of images.
+        detect: takes the place of processes of this machine.
+
+    Raises:
+        V2hdmError: as :func:`v2hdm.detection.batch.detect_all`.
+    """
+    detector_key = room.key(options, model_key(options))
+    masks = room.made(
+        "own_vehicle",
+        key_of(detector_key, contents.key(drive)),
+        _Masks,
+        lambda: own_vehicles(drive, Detector.load(options=options)),
+    )
+    drive = with_masks(drive, masks)
+    cameras = {name: key_of(camera) for name, camera in drive.cameras.items()}
+    starts = range(0, len(drive.images), PIECE)
+    keys = {}
+    for start in starts:
+        images = drive.images[start : start + PIECE]
+        known = [cameras[image.camera] for image in images]
+        keys[start] = key_of(detector_key, known, contents.of_images(images))
+    pieces = {start: room.take(STAGE, keys[start], _Piece) for start in starts}
+    missing = [start for start in starts if pieces[start] is None]
+    total = len(drive.images)
+    todo = [i for start in missing for i in range(start, min(start + PIECE, total))]
+    if len(todo) < total:
+        _log.info("detections in %d of %d images were kept by an earlier run", total - len(todo), total)
+    progress(total - len(todo), total)
+    begun: _Piece = []
+    done = 0
+
+    def take(found: ImageDetections) -> None:
+        nonlocal done
+        done += 1
+        start = found.image - found.image % PIECE
+        begun.append(replace(found, image=found.image - start))
+        if len(begun) == min(PIECE, total - start):
+            pieces[start] = room.keep(STAGE, keys[start], _Piece, begun)
+            begun.clear()
+        progress(total - len(todo) + done, total)
+
+    if todo:
+        detect(drive, options, todo, workers, take)
+    return [replace(found, image=start + found.image) for start in starts for found in pieces[start] or ()]

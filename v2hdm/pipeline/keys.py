@@ -1,0 +1,90 @@
+"""What a run is made of, as digests: its drives by the content of their images, its files by theirs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from v2hdm.caching.keys import file_digest, key_of
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.drive import read_drive
+from v2hdm.errors import DriveError
+from v2hdm.pipeline.config import RunConfig, run_name
+from v2hdm.records import Drive, Image
+
+
+@dataclass(frozen=True)
+class Contents:
+    """SHA-256 of image files, by path."""
+
+    digests: Mapping[Path, str]
+
+    @classmethod
+    def of(cls, drives: Iterable[Drive]) -> Contents:
+        """Those of all images of some drives.
+
+        Raises:
+            DriveError: an image cannot be read.
+        """
+        try:
+            return cls({image.path: file_digest(image.path) for drive in drives for image in drive.images})
+        except OSError as failure:
+            raise DriveError(f"{failure.filename}: cannot be read ({failure.strerror})") from None
+
+    def of_images(self, images: Iterable[Image]) -> list[str]:
+        """Those of some images, in their order."""
+        return [self.digests[image.path] for image in images]
+
+    def key(self, drive: Drive) -> str:
+        """The key of a drive: its records and what its images show."""
+        return key_of(drive, self.of_images(drive.images))
+
+
+def model_key(options: DetectorOptions) -> str | None:
+    """SHA-256 of the network that a detector is told to use, None for the shipped one, which is code."""
+    return None if options.model is None else file_digest(Path(options.model))
+
+
+def base_files(path: Path) -> tuple[Path, tuple[Path, ...], Path]:
+    """Of an earlier map, a folder or its ``map.geojson``: the map, trajectories, and what it left out."""
+    hd_map = path / "map.geojson" if path.is_dir() else path
+    return hd_map, tuple(sorted(hd_map.parent.glob("trajectory*.tum"))), hd_map.parent / "excluded.geojson"
+
+
+def result_key(config: RunConfig, drives: Sequence[Drive], contents: Contents, code: str) -> str:
+    """The key of a run's whole result: all that it depends on, and nothing else.
+
+    Args:
+        config: of the run.
+        drives: as they were read.
+        contents: of their images.
+        code: key of the code.
+    """
+    asked = replace(
+        config, name=run_name(config), output="", cache="", cache_gb=0.0, resume=True, workers=0,
+        drive=replace(config.drive, path=None, cache=""),
+    )  # fmt: skip
+    files: list[Path] = []
+    if config.map.base is not None:
+        hd_map, trajectories, excluded = base_files(Path(config.map.base))
+        files += [hd_map, *trajectories, excluded]
+    if config.mapping.survey.file is not None:
+        files.append(Path(config.mapping.survey.file))
+    for drive in drives:
+        if drive.truth_dir is not None:
+            files += sorted(drive.truth_dir.rglob("*"))
+    read = [(str(path), file_digest(path)) for path in files if path.is_file()]
+    paths = [drive.root.resolve() for drive in drives]
+    return key_of(
+        code, asked, model_key(config.detector), paths, [contents.key(drive) for drive in drives], read
+    )
+
+
+def read_drives(config: RunConfig, paths: Sequence[Path]) -> list[Drive]:
+    """The drives of a run.
+
+    Raises:
+        DriveError: one cannot be read.
+    """
+    return [read_drive(path, config.drive) for path in paths]

@@ -1,0 +1,178 @@
+"""A run in the Rerun viewer, and in a recording that it replays: images, detections, map and cameras.
+
+In the viewer's tree the site is ``map``: below it the recorded and the adjusted route, the map of each set of
+cameras, and the vehicle with its cameras, which moves along the time lines ``image`` and ``drive``.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from v2hdm.errors import ConfigError
+from v2hdm.extras import need
+from v2hdm.geometry.ipm import extrinsic_from_ipm
+from v2hdm.geometry.rigid import inverse
+from v2hdm.mapping.results import AdjustedPoses, MethodResult
+from v2hdm.records import Camera, Drive, FloatArray, HdMap, ImageDetections
+from v2hdm.report.style import METHOD, OKABE_ITO, ROUTE
+
+_log = logging.getLogger(__name__)
+
+FILE = "recording.rrd"
+"""The recording's name in a result folder."""
+
+_RESULT = "Opt"
+_ROUTE, _MARKING, _LANE, _SYMBOL = (
+    [int(colour[at : at + 2], 16) for at in (1, 3, 5)]
+    for colour in (ROUTE, METHOD[_RESULT], OKABE_ITO["orange"], OKABE_ITO["purple"])
+)
+_FRUSTUM_M = 1.5
+_PNG = b"\x89PNG"
+
+
+class RerunViewer:
+    """Shows a run in Rerun where there is a display, and always records it.
+
+    Raises:
+        ConfigError: rerun is not installed; the line names the extra that brings it.
+    """
+
+    def __init__(self, name: str = "v2hdm") -> None:
+        self._rr: Any = need("rerun", "viewer", "viewer=rerun", ConfigError)
+        self._blueprint: Any = need("rerun.blueprint", "viewer", "viewer=rerun", ConfigError)
+        self._name = name
+        self._stream: Any = None
+        self._drive: Drive | None = None
+
+    def detected(self, folder: Path, drive: Drive, detections: Sequence[ImageDetections]) -> None:
+        """Begin the recording in ``folder`` with all images and what was found in them."""
+        rr, self._drive = self._rr, drive
+        self._stream = rr.RecordingStream("v2hdm", recording_id=None)
+        sinks = [rr.FileSink(str(folder / FILE))]
+        if has_display():
+            rr.spawn(connect=False)
+            sinks.append(rr.GrpcSink())
+        else:
+            _log.info("viewer: no display here; replay the run with: rerun %s, in the result's folder", FILE)
+        self._stream.set_sinks(*sinks, default_blueprint=self._layout(drive))
+        self._stream.send_recording_name(self._name)
+        self._log("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        route = [np.array([image.map_from_vehicle[:3, 3] for image in drive.images])]
+        self._log("map/route_recorded", rr.LineStrips3D(route, colors=[_ROUTE]))
+        for name, camera in drive.cameras.items():
+            self._log_camera(name, camera, _guess(camera))
+        for found in detections:
+            self._show_image(drive, found)
+
+    def mapped(self, cameras: str, methods: Mapping[str, MethodResult]) -> None:
+        """Add the map of a set of cameras; the vehicle and its cameras move to where it has them."""
+        if self._stream is None or self._drive is None:
+            return
+        best = methods[_RESULT]
+        self._show_map(f"map/{cameras}", best.hd_map)
+        for name, calibration in best.calibrations.items():
+            self._log_camera(name, self._drive.cameras[name], calibration.cam_from_vehicle)
+        if best.poses is not None:
+            self._show_poses(cameras, self._drive, best.poses)
+        self._stream.flush()
+
+    def close(self) -> None:
+        """End the recording; the file is whole then."""
+        if self._stream is not None:
+            self._stream.flush()
+            self._stream.disconnect()
+            self._stream = None
+
+    def _log(self, path: str, *what: Any) -> None:
+        """Log what holds for the whole run."""
+        self._stream.log(path, *what, static=True)
+
+    def _layout(self, drive: Drive) -> Any:
+        """The site on the left, the cameras' images on the right."""
+        made = self._blueprint
+        images = [made.Spatial2DView(origin=f"map/vehicle/{name}/image", name=name) for name in drive.cameras]
+        site = made.Spatial3DView(origin="map", name="map")
+        return made.Blueprint(made.Horizontal(site, made.Vertical(*images), column_shares=[3, 2]))
+
+    def _log_camera(self, name: str, camera: Camera, cam_from_vehicle: FloatArray) -> None:
+        rr, info = self._rr, camera.info
+        self._log(f"map/vehicle/{name}", self._pose(inverse(cam_from_vehicle)))
+        lens = rr.Pinhole(
+            image_from_camera=info.intrinsic,
+            resolution=[info.width, info.height],
+            image_plane_distance=_FRUSTUM_M,
+        )
+        self._log(f"map/vehicle/{name}/image", lens)
+
+    def _show_image(self, drive: Drive, found: ImageDetections) -> None:
+        rr, image = self._rr, drive.images[found.image]
+        self._at(drive, found.image)
+        self._stream.log("map/vehicle", self._pose(image.map_from_vehicle))
+        path = f"map/vehicle/{image.camera}/image"
+        coded = image.path.read_bytes()
+        kind = "image/png" if coded.startswith(_PNG) else "image/jpeg"  # a drive has no others
+        self._stream.log(path, rr.EncodedImage(contents=coded, media_type=kind))
+        outlines = [one.outline_px if len(one.outline_px) else one.corners_px for one in found.markings]
+        kinds = [f"{one.kind} {one.score:.2f}" for one in found.markings]
+        self._stream.log(
+            f"{path}/markings",
+            rr.LineStrips2D(_closed(outlines), labels=kinds, colors=[_MARKING] * len(kinds)),
+        )
+        lines = [one.points_px for one in found.lanes]
+        self._stream.log(f"{path}/lanes", rr.LineStrips2D(lines, colors=[_LANE] * len(lines)))
+
+    def _show_map(self, path: str, hd_map: HdMap) -> None:
+        rr = self._rr
+        markings = [_ground(one) for one in _closed(marking.corners_map for marking in hd_map.markings)]
+        kinds = [marking.kind for marking in hd_map.markings]
+        lanes = [_ground(lane.points_map) for lane in hd_map.lanes]
+        symbols = [_ground(one) for one in _closed(symbol.outline_map for symbol in hd_map.symbols)]
+        for name, strips, colour, labels in (
+            ("markings", markings, _MARKING, kinds),
+            ("lanes", lanes, _LANE, None),
+            ("symbols", symbols, _SYMBOL, None),
+        ):
+            colours = [colour] * len(strips)
+            drawn = rr.LineStrips3D(strips, colors=colours, labels=labels, show_labels=False)
+            self._log(f"{path}/{name}", drawn)
+
+    def _show_poses(self, cameras: str, drive: Drive, poses: AdjustedPoses) -> None:
+        adjusted = [poses.of_image(image) for image in drive.images]
+        for index, pose in enumerate(adjusted):
+            self._at(drive, index)
+            self._stream.log("map/vehicle", self._pose(pose))
+        route = [np.array([pose[:3, 3] for pose in adjusted])]
+        self._log(f"map/{cameras}/route", self._rr.LineStrips3D(route, colors=[_MARKING]))
+
+    def _at(self, drive: Drive, index: int) -> None:
+        self._stream.set_time("image", sequence=index)
+        self._stream.set_time("drive", duration=drive.images[index].taken_s - drive.images[0].taken_s)
+
+    def _pose(self, dst_from_src: FloatArray) -> Any:
+        return self._rr.Transform3D(translation=dst_from_src[:3, 3], mat3x3=dst_from_src[:3, :3])
+
+
+def has_display() -> bool:
+    """Whether a window can be opened here."""
+    if sys.platform.startswith(("win", "darwin")):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _guess(camera: Camera) -> FloatArray:
+    return extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm])
+
+
+def _closed(outlines: Iterable[FloatArray]) -> list[FloatArray]:
+    return [np.vstack([one, one[:1]]) for one in outlines]
+
+
+def _ground(points_map: FloatArray) -> FloatArray:
+    return np.column_stack([points_map, np.zeros(len(points_map))])
