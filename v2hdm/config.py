@@ -10,7 +10,9 @@ import difflib
 import itertools
 import os
 import re
+import shutil
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
@@ -18,6 +20,7 @@ from typing import Any, TypeVar, get_args, get_type_hints
 
 import hydra
 from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -112,6 +115,44 @@ def work_on(
     return task.codes[0] if task.codes else 0
 
 
+def compose_run_file(path: Path, name: str, schema: type[Any], overrides: Sequence[str] = ()) -> DictConfig:
+    """Compose ``conf/<name>.yaml`` with a run file, as ``--config-dir`` and ``+run=`` do, and overrides.
+
+    What the run file names in a ``defaults`` list of its own is looked for beside it, where its folder is
+    called ``run``, and among the shipped ones.
+
+    Raises:
+        ConfigError: the file is missing or damaged, or a key or value is wrong.
+    """
+    text = read_yaml(path, ConfigError)  # OmegaConf would expand whatever aliases repeat
+    if not isinstance(text, dict):
+        raise ConfigError(f"{path}: expected 'key: value' entries; write it as conf/run/*.yaml are")
+    _refuse_headless(path)
+    register(name, schema)
+    searched = [path.resolve().parent.parent] if path.resolve().parent.name == "run" else []
+    with tempfile.TemporaryDirectory(prefix="v2hdm-") as folder:
+        # Under a name of ours: Hydra takes no others than those of identifiers.
+        run = Path(folder) / "run" / "chosen_run_file.yaml"
+        run.parent.mkdir()
+        shutil.copyfile(path, run)
+        places = ",".join(
+            "'file://" + str(one).replace("'", "\\'") + "'" for one in [Path(folder), *searched]
+        )
+        chosen = [f"hydra.searchpath=[{places}]", f"+run={run.stem}", *overrides]
+        GlobalHydra.instance().clear()
+        try:
+            with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+                return hydra.compose(name, chosen)
+        except Exception as error:  # as in work_on
+            # What the line does not name is the file's.
+            named = [one for one in overrides if one.lstrip("+~").split("=")[0] in str(error)]
+            line = _OF_COPY.sub("", str(explain(error, schema, named)))
+            raise ConfigError(f"{path}: {line}") from error
+
+
+_OF_COPY = re.compile(r"In 'run/chosen_run_file': \w+ raised while composing config:;? ")
+
+
 class _JobFailed(Exception):  # noqa: N818  # told already: it only carries a code between processes
     """A job of a sweep did not end well."""
 
@@ -189,9 +230,14 @@ def _composition_error(error: Exception, schema: type[Any], arguments: list[str]
             f"{error.filename}: no folder can be made there ({error.strerror}); set another output="
         )
     for path in _own_files(arguments):
-        if path.parent.name == "run" and not _GLOBAL.search(path.read_text(encoding="utf-8-sig")):
-            return ConfigError(f"{path}: its first line must be '# @package _global_'; add it")
+        if path.parent.name == "run":
+            _refuse_headless(path)
     return explain(error, schema, arguments)
+
+
+def _refuse_headless(path: Path) -> None:
+    if not _GLOBAL.search(path.read_text(encoding="utf-8-sig")):
+        raise ConfigError(f"{path}: its first line must be '# @package _global_'; add it")
 
 
 _GLOBAL = re.compile(r"^#\s*@package\s+_global_\s*$", re.MULTILINE)
@@ -249,7 +295,7 @@ def explain(error: Exception, schema: type[Any], overrides: list[str]) -> Config
         )
     # Of a long command line only what the message is about: the override that has the key it names.
     about = [one for one in overrides if one.lstrip("+~").split("=")[0] in message + place]
-    where = f" (in {' '.join(about or overrides)})" if len(about or overrides) <= _FEW_OVERRIDES else ""
+    where = f" (in {' '.join(about or overrides)})" if 0 < len(about or overrides) <= _FEW_OVERRIDES else ""
     return ConfigError(f"configuration{where}: {message}{place}; {_advice(message, schema)}")
 
 

@@ -55,6 +55,12 @@ def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[],
         return 0
     except V2hdmError as error:
         return _fail(str(error))
+    except (MemoryError, OSError) as error:
+        line = told(error)
+        if line is None:
+            raise
+        _forget_full_stdout()
+        return _fail(line)
     except ModuleNotFoundError as error:
         if extra is None or error.name is None or error.name.split(".")[0] in _OURS:
             raise
@@ -63,15 +69,19 @@ def open_door(name: str, extra: str | None, interrupted: str, work: Callable[[],
         )
     except KeyboardInterrupt:
         return _fail(interrupted)
-    except MemoryError:
-        return _fail("the memory is not enough for this; give less at once, or fewer workers")
-    except OSError as error:
-        # Disks that are full, gone or read-only can fail any call.
-        if isinstance(error, ConnectionError):
-            raise
-        _forget_full_stdout()
+
+
+def told(error: BaseException) -> str | None:
+    """What a user is told of an error in one line; None for what is a bug of ours."""
+    if isinstance(error, V2hdmError):
+        return str(error)
+    if isinstance(error, MemoryError):
+        return "the memory is not enough for this; give less at once, or fewer workers"
+    # Disks that are full, gone or read-only can fail any call.
+    if isinstance(error, OSError) and not isinstance(error, ConnectionError):
         where = f"{error.filename}: " if error.filename else ""
-        return _fail(f"{where}{error.strerror or error}; free space or check the disk, then start again")
+        return f"{where}{error.strerror or error}; free space or check the disk, then start again"
+    return None
 
 
 def _to_the_end(work: Callable[[], int | None]) -> int:
@@ -96,10 +106,13 @@ def _forget_full_stdout() -> None:
 
 
 def _fail(message: str) -> int:
-    # Names and values in it come from files of strangers: none may end the line or move the cursor.
-    line = " ".join(message.split())
-    print(f"error: {''.join(c if c.isprintable() else '?' for c in line)}", file=sys.stderr)
+    print(f"error: {one_line(message)}", file=sys.stderr)
     return EXIT_USER_ERROR
+
+
+def one_line(message: str) -> str:
+    """A message whose words come from files of strangers: none ends the line or moves the cursor."""
+    return "".join(c if c.isprintable() else "?" for c in " ".join(message.split()))
 
 
 def answer_signals() -> None:

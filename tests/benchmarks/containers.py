@@ -31,7 +31,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from tests.drive.bags import messages_of, write_ros1, write_ros2
 from v2hdm.hdmap.geojson import read_geojson
-from v2hdm.pipeline.run import DriveConfig, RunConfig, run
+from v2hdm.pipeline import DriveConfig, RunConfig, run
 from v2hdm.records import Marking
 
 SAME_M = 0.5

@@ -12,7 +12,7 @@ from torch import Tensor
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.descent import Descent
 from v2hdm.adjust.linear import coupling, jacobians
-from v2hdm.adjust.reduced import coupling_by_camera, to_tiles
+from v2hdm.adjust.reduced import reduced_coupling, to_tiles
 from v2hdm.adjust.residuals import observe
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.records import FloatArray
@@ -162,15 +162,10 @@ def _corner_inverse(whitening: Whitening, corners: Tensor) -> Tensor:
 
 def _reduced_root(whitening: Whitening, corners: Tensor) -> Tensor:
     """L_S^-1 W (D, 2 n) for n corners, ascending."""
-    arrays, spread, states = whitening.arrays, whitening.spread, len(whitening.arrays.states)
+    arrays = whitening.arrays
     run = arrays.gather(corners)
     view = observe(run, whitening.table, whitening.estimate.corners_map[corners])
     root = whitening.weight(view).sqrt()
     by_pair = coupling(*(rows * root for rows in jacobians(run, view)))
-    by_state = by_pair.permute(2, 0, 1) @ spread.state.reshape(arrays.pair_count, 6, states)[run.pair]
-    by_frame = by_pair.new_zeros(arrays.frame_count, states, len(corners), 2)
-    place = (run.pair % arrays.frame_count, run.corner)
-    by_frame.permute(0, 2, 1, 3).index_put_(place, by_state.mT, accumulate=True)
-    by_camera = coupling_by_camera(arrays, spread, run, by_pair)
-    right = [to_tiles(whitening.plan, by_frame.flatten(2)), by_camera.permute(2, 0, 1).flatten(1)]
-    return whitening.reduced_factor.solve(torch.cat(right))
+    right = reduced_coupling(arrays, whitening.plan, whitening.spread, run, by_pair)
+    return whitening.reduced_factor.solve(right)

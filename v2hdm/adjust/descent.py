@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -35,8 +35,8 @@ _ANNEALING_TOLERANCE = 1e-3
 _ANNEALING_STEP = 3.0
 _ITERATIONS_PER_WHITENING = 12
 # Evaluations that a whitening takes as long as.
-_RENEWAL = 2.0
-_RENEWAL_WITH_STATES = 10.0
+RENEWAL = 2.0
+RENEWAL_WITH_STATES = 10.0
 _MAX_LM_DAMPING = 1e8
 _MIN_LM_DAMPING = 1e-5
 
@@ -110,12 +110,8 @@ class Objective:
         self.evaluations += 1
         whitening, arrays = self.whitening, self.whitening.arrays
         step, tangents = whitening.reduced_step(whitened)
-        estimate, jacobian = _moved(arrays, whitening.estimate, step)
-        own = whitening.corner_part(whitened)
-        if arrays.passes is not None and whitening.base is not None:
-            done = arrays.passes.evaluate(whitening, estimate, step, tangents, own)
-        else:
-            done = evaluate(whitening, estimate, tangents, own)
+        estimate, jacobian = moved(arrays, whitening.estimate, step)
+        done = evaluate(whitening, estimate, step, tangents, whitening.corner_part(whitened))
         estimate = replace(estimate, corners_map=done.corners_map)
         terms, gradient = with_priors(arrays, estimate, done.sums)
         by_tangent = (jacobian.mT @ gradient.extrinsic[..., None])[..., 0]
@@ -130,8 +126,26 @@ class Objective:
         return total(terms), by_whitened
 
 
-def evaluate(whitening: Whitening, estimate: Estimate, tangents: Tensor, own: Tensor) -> Evaluated:
+def evaluate(
+    whitening: Whitening, estimate: Estimate, step: Gradient, tangents: Tensor, own: Tensor
+) -> Evaluated:
     """Evaluate where the reduced unknowns are those of ``estimate``, and its corners move with them.
+
+    Args:
+        whitening: the problem, whitened.
+        estimate: moved by ``step`` but for its corners, see :func:`moved`.
+        step: of the reduced unknowns.
+        tangents: (C, J, 6) how the pairs move with them.
+        own: (N, 2) whitened variables of the corners.
+    """
+    passes = whitening.arrays.passes
+    if passes is not None and whitening.base is not None:
+        return passes.evaluate(whitening, estimate, step, tangents, own)
+    return _evaluate(whitening, estimate, tangents, own)
+
+
+def _evaluate(whitening: Whitening, estimate: Estimate, tangents: Tensor, own: Tensor) -> Evaluated:
+    """As :func:`evaluate`, by torch.
 
     Run by run: a run's corners are moved, x_c = L^-T (y_c - B x_r), and seen, and their gradient is carried
     back, while all of it is in the processor's cache.
@@ -151,7 +165,7 @@ def evaluate(whitening: Whitening, estimate: Estimate, tangents: Tensor, own: Te
     return Evaluated(sums, back.coupled(whitening.spread), back.corners, estimate.corners_map)
 
 
-def _moved(arrays: Arrays, base: Estimate, step: Gradient) -> tuple[Estimate, Tensor]:
+def moved(arrays: Arrays, base: Estimate, step: Gradient) -> tuple[Estimate, Tensor]:
     """``base`` moved by a step x but for its corners, and the left Jacobians (C, 6, 6) of the extrinsics'."""
     if arrays.passes is not None:
         cam_from_vehicle, jacobian = arrays.passes.move(step.extrinsic, base.cam_from_vehicle)
@@ -165,6 +179,83 @@ def _moved(arrays: Arrays, base: Estimate, step: Gradient) -> tuple[Estimate, Te
 def total(terms: dict[str, Tensor]) -> Tensor:
     """The cost: the sum of its terms."""
     return torch.stack(list(terms.values())).sum()
+
+
+class Linearised(Protocol):
+    """A problem whitened at one estimate, under one loss."""
+
+    @property
+    def robust(self) -> Loss:
+        """The loss."""
+
+    @property
+    def is_singular(self) -> bool:
+        """Whether a direction of the reduced unknowns is free."""
+
+
+class Measured(Protocol):
+    """Cost and gradient by whitened variables, as :class:`Objective`."""
+
+    evaluations: int
+
+    def at_base(self) -> tuple[Tensor, Tensor]:
+        """Cost and gradient at 0."""
+
+    def __call__(self, whitened: Tensor) -> tuple[Tensor, Tensor]:
+        """Cost and gradient at whitened variables."""
+
+    def point(self, whitened: Tensor) -> Any:
+        """What whitened variables stand for, as :class:`Point`."""
+
+
+class System(Protocol):
+    """What a descent goes down: a problem in this process, or in parts in several."""
+
+    @property
+    def renewal(self) -> float:
+        """Evaluations that a whitening takes as long as."""
+
+    def factorise(self, estimate: Any, robust: Loss, damping: float) -> Any:
+        """The problem whitened at an estimate, :class:`Linearised`."""
+
+    def annealed(self, estimate: Any, scale: float) -> float:
+        """:func:`~v2hdm.adjust.robust.annealed_scale` of the residuals at an estimate."""
+
+    def objective(self, linearised: Any) -> Measured:
+        """Cost and gradient around where it was whitened."""
+
+
+@dataclass(frozen=True)
+class _InOneProcess:
+    """The whole problem here."""
+
+    arrays: Arrays
+    plan: Plan
+
+    @property
+    def renewal(self) -> float:
+        return RENEWAL_WITH_STATES if self.arrays.states else RENEWAL
+
+    def factorise(self, estimate: Estimate, robust: Loss, damping: float) -> Whitening:
+        return factorise(self.arrays, self.plan, estimate, robust, damping)
+
+    def annealed(self, estimate: Estimate, scale: float) -> float:
+        return annealed_scale(squared_residuals(self.arrays, estimate), scale)
+
+    def objective(self, linearised: Whitening) -> Objective:
+        return Objective(linearised)
+
+
+class Ended(NamedTuple):
+    """Where :func:`go_down` ended, named as in :class:`Descent`; ``made`` is the problem whitened there."""
+
+    point: Any
+    robust: Loss
+    gap: float
+    evaluations: int
+    progressing: bool
+    is_singular: bool
+    made: Any
 
 
 def descend(
@@ -181,13 +272,43 @@ def descend(
 
     ``opening`` is what :func:`open_descent` makes of ``estimate``, if that was needed before.
     """
+    opening = opening or open_descent(arrays, estimate, robust)
+    system = _InOneProcess(arrays, opening.plan)
+    end = go_down(system, [opening], robust, solver, tolerance, max_refreshes, max_evaluations)
+    return Descent(
+        arrays,
+        system.plan,
+        end.point.estimate,
+        end.robust,
+        end.point.terms,
+        end.gap,
+        end.evaluations,
+        end.progressing,
+        end.is_singular,
+        end.made,
+    )
+
+
+def go_down(
+    system: System,
+    opening: list[Any],
+    robust: Loss,
+    solver: str,
+    tolerance: float,
+    max_refreshes: int,
+    max_evaluations: int,
+) -> Ended:
+    """Minimise the cost of a system, narrowing the robust loss on the way.
+
+    ``opening`` holds it whitened at the start, and is emptied, so that it goes when the next one comes.
+    """
     evaluations, refreshes, damping, progressing, slow = 0, 0, 0.0, True, False
-    whitening = opening or open_descent(arrays, estimate, robust)
-    plan, renewal = whitening.plan, _RENEWAL_WITH_STATES if arrays.states else _RENEWAL
+    whitening = opening.pop()
+    renewal = system.renewal
     while True:
         scale = whitening.robust.scale
         final = scale <= robust.scale
-        objective = Objective(whitening)
+        objective = system.objective(whitening)
         cost, gradient = objective.at_base()
         gap = predicted_gap(cost, gradient)
         refreshes += 1
@@ -216,17 +337,15 @@ def descend(
         evaluations += objective.evaluations
         singular = whitening.is_singular
         if ended:
-            return Descent(
-                arrays, plan, point.estimate, used, point.terms, gap, evaluations, progressing, singular, made
-            )
+            return Ended(point, used, gap, evaluations, progressing, singular, made)
         estimate = point.estimate
         progressing = float(reached) < float(cost) or not final or 0 < damping < _MAX_LM_DAMPING
         # The old factor and what led away from it go before the new one comes.
         del whitening, objective, whitened, gradient, point
         if not final:
-            narrowed = annealed_scale(squared_residuals(arrays, estimate), robust.scale)
+            narrowed = system.annealed(estimate, robust.scale)
             scale = max(robust.scale, min(narrowed, scale / _ANNEALING_STEP))
-        whitening = factorise(arrays, plan, estimate, Loss(robust.name, scale), damping)
+        whitening = system.factorise(estimate, Loss(robust.name, scale), damping)
 
 
 def open_descent(arrays: Arrays, estimate: Estimate, robust: Loss) -> Whitening:
@@ -238,7 +357,7 @@ def open_descent(arrays: Arrays, estimate: Estimate, robust: Loss) -> Whitening:
 
 
 def _newton_step(
-    objective: Objective, cost: Tensor, gradient: Tensor, damping: float
+    objective: Measured, cost: Tensor, gradient: Tensor, damping: float
 ) -> tuple[Tensor, Tensor, float]:
     """One damped Gauss-Newton step of Levenberg-Marquardt; a rejected one raises the damping."""
     reached, _ = objective(-gradient)

@@ -16,7 +16,15 @@ from v2hdm.adjust.arrays import Arrays, Run
 from v2hdm.adjust.corner_factor import CornerFactor
 from v2hdm.adjust.linear import PAIR_BLOCK
 from v2hdm.adjust.residuals import Estimate, earlier_markings, of_each
-from v2hdm.adjust.tiles import TIP, Pattern, TiledCholesky, TiledMatrix, factorise_tiles, find_pattern
+from v2hdm.adjust.tiles import (
+    TIP,
+    Pattern,
+    TiledCholesky,
+    TiledMatrix,
+    factorise_above_tip,
+    factorise_tiles,
+    find_pattern,
+)
 
 # Rows of a tile, about: large enough for fast products, small against a corner's span of frames.
 _TILE_ROWS = 96
@@ -220,7 +228,7 @@ class ReducedSystem:
         ``damping`` is added to U's diagonal, relative to it. Returns the factor and the smallest pivot as a
         share of U's diagonal; None where S cannot be factorised.
         """
-        diagonal = [*self._add_frames(), self._add_cameras(estimate)]
+        diagonal = self._add_own(estimate)
         keys = [*((k, k) for k in range(self.plan.tile_count)), (TIP, TIP)]
         for key, values in zip(keys, diagonal, strict=True):
             self._tiles[key].diagonal().add_(values, alpha=damping)
@@ -228,6 +236,20 @@ class ReducedSystem:
         if factor is None:
             return None
         return factor, float((factor.pivots() / (1 + damping) / torch.cat(diagonal)).min())
+
+    def eliminate_frames(self, estimate: Estimate) -> tuple[TiledCholesky, Tensor] | None:
+        """Put it together and eliminate the frames; the factor's tip is what they leave of the cameras.
+
+        Returns the factor and the diagonal of what was known of the cameras before; None where a frame's own
+        part cannot be factorised.
+        """
+        own = self._add_own(estimate)[-1].clone()
+        factor = factorise_above_tip(self.matrix)
+        return None if factor is None else (factor, own)
+
+    def _add_own(self, estimate: Estimate) -> list[Tensor]:
+        """Add U and the priors; returns their diagonal, by tile and of the tip."""
+        return [*self._add_frames(), self._add_cameras(estimate)]
 
     def _add_cameras(self, estimate: Estimate) -> Tensor:
         """Add the cameras' own information and priors; returns its diagonal."""
@@ -292,6 +314,17 @@ def coupling_by_camera(arrays: Arrays, spread: Spread, run: Run, coupling: Tenso
     rows.index_add_(1, place, coupling.flatten(0, 1))
     by_camera = rows.view(2, each, run.corner_count, cameras).permute(2, 0, 3, 1)
     return by_camera.reshape(run.corner_count, 2, -1)
+
+
+def reduced_coupling(arrays: Arrays, plan: Plan, spread: Spread, run: Run, coupling: Tensor) -> Tensor:
+    """W (D, 2 n) of a run's n corners by all reduced unknowns, from W' by observation (2, 6, k)."""
+    states = len(arrays.states)
+    by_state = coupling.permute(2, 0, 1) @ spread.state.reshape(arrays.pair_count, 6, states)[run.pair]
+    by_frame = coupling.new_zeros(arrays.frame_count, states, run.corner_count, 2)
+    place = (run.pair % arrays.frame_count, run.corner)
+    by_frame.permute(0, 2, 1, 3).index_put_(place, by_state.mT, accumulate=True)
+    by_camera = coupling_by_camera(arrays, spread, run, coupling)
+    return torch.cat([to_tiles(plan, by_frame.flatten(2)), by_camera.permute(2, 0, 1).flatten(1)])
 
 
 def _symmetric(entries: Tensor) -> Tensor:

@@ -69,7 +69,7 @@ def _solve(problem: Problem, options: SolveOptions, began: float) -> Solution:
         opening,
     )
     del opening
-    return _report(problem, origin_map, options, descent, spent, began)
+    return report(problem, origin_map, options, descent, spent, began)
 
 
 def _start(
@@ -89,13 +89,22 @@ def _start(
     spent = 0
     if options.coarse:
         cam_from_vehicle, spent = coarse_extrinsics(arrays, cam_from_vehicle)
+    return start_at(problem, arrays, cam_from_vehicle), None, spent
+
+
+def start_at(problem: Problem, arrays: Arrays, cam_from_vehicle: Tensor) -> Estimate:
+    """The start under some extrinsics.
+
+    Raises:
+        AdjustError: none of its rays fixes a corner.
+    """
     estimate, corner = _estimate(problem, arrays, cam_from_vehicle)
     if corner is not None:
         raise AdjustError(
             f"no ray of corner {corner} meets the ground under the starting extrinsics: its observations "
             "lie above the horizon; leave it out or give corners_start"
         )
-    return estimate, None, spent
+    return estimate
 
 
 def _estimate(problem: Problem, arrays: Arrays, cam_from_vehicle: Tensor) -> tuple[Estimate, int | None]:
@@ -109,7 +118,7 @@ def _estimate(problem: Problem, arrays: Arrays, cam_from_vehicle: Tensor) -> tup
     return Estimate(cam_from_vehicle, state, corners, arrays.no_clock()), loose
 
 
-def _report(
+def report(
     problem: Problem,
     origin_map: FloatArray,
     options: SolveOptions,

@@ -128,6 +128,13 @@ class TiledCholesky:
 
     def solve(self, right: Tensor) -> Tensor:
         """L^-1 b for b (size, n)."""
+        out = self.solve_above_tip(right)
+        begin = len(out) - len(self.tip)
+        out[begin:] = torch.linalg.solve_triangular(self.tip, out[begin:], upper=False)
+        return out
+
+    def solve_above_tip(self, right: Tensor) -> Tensor:
+        """As :meth:`solve`, but of the tip's rows only what stands above it is taken off."""
         out, begin = right.clone(), 0
         # Above the first row that is not zero there is nothing to solve for.
         first = int(right.any(dim=1).to(torch.uint8).argmax())
@@ -139,13 +146,17 @@ class TiledCholesky:
             part.copy_(torch.linalg.solve_triangular(tile, part, upper=False))
             out.index_add_(0, rows, panel @ part, alpha=-1)
             begin += len(tile)
-        out[begin:] = torch.linalg.solve_triangular(self.tip, out[begin:], upper=False)
         return out
 
     def solve_transposed(self, right: Tensor) -> Tensor:
         """L^-T b for b (size, n)."""
         out, end = right.clone(), self.size - len(self.tip)
         out[end:] = torch.linalg.solve_triangular(self.tip.mT, out[end:], upper=True)
+        return self.solve_transposed_above_tip(out)
+
+    def solve_transposed_above_tip(self, right: Tensor) -> Tensor:
+        """As :meth:`solve_transposed`, of b whose tip's rows are solved for already."""
+        out, end = right.clone(), self.size - len(self.tip)
         for tile, panel, rows in zip(
             reversed(self.diagonal), reversed(self.panels), reversed(self.rows), strict=True
         ):
@@ -157,7 +168,13 @@ class TiledCholesky:
 
 
 def factorise_tiles(matrix: TiledMatrix) -> TiledCholesky | None:
-    """Factorise, overwriting the matrix; None where it is not positive definite.
+    """Factorise, overwriting the matrix; None where it is not positive definite."""
+    factor = factorise_above_tip(matrix)
+    return factor if factor is not None and _factorise_tile(matrix.tip) else None
+
+
+def factorise_above_tip(matrix: TiledMatrix) -> TiledCholesky | None:
+    """As :func:`factorise_tiles`, but the tip stays what eliminating all above has left of it.
 
     Right-looking: each column, once factorised, is subtracted from those it couples to.
     """
@@ -173,8 +190,6 @@ def factorise_tiles(matrix: TiledMatrix) -> TiledCholesky | None:
                 left, right = matrix.tiles[second, column], matrix.tiles[first, column]
                 matrix.tiles[second, first].addmm_(left, right.mT, alpha=-1)
         rows.append(_row_index(below, len(own), len(matrix.diagonal), len(matrix.tip), panel))
-    if not _factorise_tile(matrix.tip):
-        return None
     return TiledCholesky(matrix.diagonal, matrix.panels, tuple(rows), matrix.tip)
 
 

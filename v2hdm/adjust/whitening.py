@@ -55,10 +55,10 @@ WEIGHT_FLOOR = 1e-6
 """Keeps a corner factorable whose sightings a robust loss has all but switched off."""
 
 # Below this a pivot is what rounding left of zero.
-_SINGULAR_PIVOT = 1e-13
+SINGULAR_PIVOT = 1e-13
 # What is added to a diagonal, relative to it, until it can be factorised; only a singular problem needs any.
 # A pivot is what elimination has left of it, and where that is rounding it says nothing of the size needed.
-_JITTER_STEPS = (0.0, 1e-12, 1e-9, 1e-6, 1e-3)
+JITTER_STEPS = (0.0, 1e-12, 1e-9, 1e-6, 1e-3)
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class Whitening:
     @property
     def is_singular(self) -> bool:
         """Whether the observations and priors leave a direction of the reduced unknowns free."""
-        return self.jitter > 0 or self.smallest_pivot < _SINGULAR_PIVOT
+        return self.jitter > 0 or self.smallest_pivot < SINGULAR_PIVOT
 
     @property
     def size(self) -> int:
@@ -212,7 +212,7 @@ def factorise(
 
     ``damping`` is added to the diagonal of the Hessian, relative to it (Levenberg-Marquardt).
     """
-    for jitter in _JITTER_STEPS:
+    for jitter in JITTER_STEPS:
         whitening = _try_factorise(arrays, plan, estimate, robust, damping, jitter)
         if whitening is not None:
             return whitening
@@ -228,10 +228,7 @@ def _try_factorise(
     """The whitening, if the diagonal of the reduced part with ``jitter`` added to it can be factorised."""
     spread = Spread(pair_from_state(arrays, estimate), pair_from_clock(arrays, estimate))
     system = ReducedSystem(arrays, plan, spread)
-    if arrays.passes is not None:
-        done = arrays.passes.eliminate(system, estimate, robust, damping)
-    else:
-        done = _eliminate(system, estimate, robust, damping)
+    done = eliminate(system, estimate, robust, damping)
     factorised = system.factorise(estimate, damping + jitter)
     if factorised is None:
         return None
@@ -251,6 +248,13 @@ def _try_factorise(
         jitter=jitter,
         base=done.base,
     )
+
+
+def eliminate(system: ReducedSystem, estimate: Estimate, robust: Loss, damping: float) -> Elimination:
+    """Linearise, and take the eliminated corners off the reduced system."""
+    if system.arrays.passes is not None:
+        return system.arrays.passes.eliminate(system, estimate, robust, damping)
+    return _eliminate(system, estimate, robust, damping)
 
 
 def _eliminate(system: ReducedSystem, estimate: Estimate, robust: Loss, damping: float) -> Elimination:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -73,6 +74,20 @@ def detect_all(
     return results
 
 
+class Detect(Protocol):
+    """Does what :func:`detect_images` does."""
+
+    def __call__(
+        self,
+        drive: Drive,
+        options: DetectorOptions,
+        images: Sequence[int],
+        workers: int,
+        take: Callable[[ImageDetections], None],
+    ) -> None:
+        """``take`` is called in the order of ``images``."""
+
+
 def detect_images(
     drive: Drive,
     options: DetectorOptions,
@@ -95,7 +110,7 @@ def detect_images(
     if workers <= 1 or len(images) < _FEW_IMAGES:
         detector = Detector.load(options=options)
         for index in images:
-            take(_detect_image(detector, drive, index))
+            take(detect_image(detector, drive, index))
         return
     share_out(_work, images, workers, _start_worker, (drive, options), take)
 
@@ -133,10 +148,15 @@ def _start_worker(drive: Drive, options: DetectorOptions) -> None:
 def _work(index: int) -> ImageDetections:
     if _worker is None:
         raise RuntimeError("worker was not started")
-    return _detect_image(*_worker, index)
+    return detect_image(*_worker, index)
 
 
-def _detect_image(detector: Detector, drive: Drive, index: int) -> ImageDetections:
+def detect_image(detector: Detector, drive: Drive, index: int) -> ImageDetections:
+    """What a detector finds in image ``index`` of a drive whose cameras know their own vehicle.
+
+    Raises:
+        DriveError: the image is missing, damaged or of the wrong size.
+    """
     image = drive.images[index]
     camera = drive.cameras[image.camera]
     return ImageDetections(index, *detector.detect(read_image(image, camera), camera))

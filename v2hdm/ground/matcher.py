@@ -103,4 +103,5 @@ def read_grey(path: str) -> ImageArray:
     Raises:
         DriveError: it cannot be read.
     """
-    return read_pixels(Path(path), cv2.IMREAD_GRAYSCALE)
+    # A JPEG decoded as grey is its luma, a level or two off the grey of the same pixels stored as PNG.
+    return np.asarray(cv2.cvtColor(read_pixels(Path(path), cv2.IMREAD_COLOR), cv2.COLOR_BGR2GRAY))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from v2hdm.caching.keys import key_of
 from v2hdm.caching.room import Room
-from v2hdm.detection.batch import detect_images, own_vehicles, with_masks
+from v2hdm.detection.batch import Detect, detect_images, own_vehicles, with_masks
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.pipeline.keys import Contents, model_key
@@ -38,6 +38,7 @@ def detect_in_pieces(
     room: Room,
     workers: int,
     progress: Callable[[int, int], None],
+    detect: Detect = detect_images,
 ) -> list[ImageDetections]:
     """Detect in every image of a drive, in the drive's order, where that is not known yet.
 
@@ -48,6 +49,7 @@ def detect_in_pieces(
         room: keeps what was found.
         workers: processes, one thread each.
         progress: called as ``progress(done, total)`` with numbers of images.
+        detect: takes the place of processes of this machine.
 
     Raises:
         V2hdmError: as :func:`v2hdm.detection.batch.detect_all`.
@@ -88,5 +90,5 @@ def detect_in_pieces(
         progress(total - len(todo) + done, total)
 
     if todo:
-        detect_images(drive, options, todo, workers, take)
+        detect(drive, options, todo, workers, take)
     return [replace(found, image=start + found.image) for start in starts for found in pieces[start] or ()]

@@ -16,6 +16,7 @@ from v2hdm import __version__
 from v2hdm.caching.pruning import make_room
 from v2hdm.caching.room import Room
 from v2hdm.caching.store import Store
+from v2hdm.detection.batch import Detect, detect_images
 from v2hdm.detection.weights import unknown_network
 from v2hdm.drive import join_drives
 from v2hdm.errors import AdjustError, ConfigError, MappingError, V2hdmError
@@ -58,6 +59,7 @@ class _Task:
     seconds: dict[str, float]
     progress: Progress
     viewer: Viewer
+    detect: Detect
 
     def result(self, metrics: Mapping[str, Any], headlines: Sequence[str], verdict: Verdict) -> RunResult:
         """What the run hands back."""
@@ -65,9 +67,17 @@ class _Task:
 
 
 def map_drives(
-    config: RunConfig, store: Store, config_yaml: str, progress: Progress, viewer: Viewer | None = None
+    config: RunConfig,
+    store: Store,
+    config_yaml: str,
+    progress: Progress,
+    viewer: Viewer | None = None,
+    detect: Detect = detect_images,
 ) -> RunResult:
-    """Do what :func:`v2hdm.pipeline.run.run` says, with what ``store`` keeps."""
+    """Do what :func:`v2hdm.pipeline.run.run` says, with what ``store`` keeps.
+
+    ``detect`` takes the place of detection in processes of this machine.
+    """
     name = admit(config)
     base = None if config.map.base is None else read_base(Path(config.map.base))
     with store.in_use():
@@ -78,7 +88,7 @@ def map_drives(
             log.info("v2hdm %s, run %s", __version__, name)
             (folder / "config.yaml").write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
             room = Room(store, config.resume)
-            result, key = _write(config, name, base, room, folder, progress, viewer or Unwatched())
+            result, key = _write(config, name, base, room, folder, progress, viewer or Unwatched(), detect)
             for line in result.verdict.lines:
                 log.info("%s", line)
         note_finished(result, key, store)
@@ -94,6 +104,7 @@ def _write(
     folder: Path,
     progress: Progress,
     viewer: Viewer,
+    detect: Detect,
 ) -> tuple[RunResult, str]:
     """Write a run's result into ``folder``; returns the key of what it was made of, too."""
     unknown = unknown_network(config.detector.model) if config.detector.model is not None else None
@@ -115,7 +126,7 @@ def _write(
     key = result_key(config, drives, contents, room.key())
     about = describe_run(name, whole, paths, config.drive)
     mapped = replace(config, mapping=survey.mapping)
-    task = _Task(mapped, room, folder, about, seconds, progress, viewer)
+    task = _Task(mapped, room, folder, about, seconds, progress, viewer, detect)
     with timed(seconds, "check"):
         inspection = join([_inspect(task, drive, contents, len(drives)) for drive in drives])
     try:
@@ -202,7 +213,9 @@ def _drive_folders(config: RunConfig, seconds: dict[str, float], progress: Progr
 def _detect(task: _Task, drive: Drive, contents: Contents) -> list[ImageDetections]:
     tell = partial(task.progress, "detect")
     workers = _workers(task.config)
-    detections = detect_in_pieces(drive, contents, task.config.detector, task.room, workers, tell)
+    detections = detect_in_pieces(
+        drive, contents, task.config.detector, task.room, workers, tell, task.detect
+    )
     markings = sum(len(found.markings) for found in detections)
     lanes = sum(len(found.lanes) for found in detections)
     log.info(

@@ -1,0 +1,162 @@
+"""A fleet maps each drive as the mapping door does; what fails is a row, what is finished is kept."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("ray", reason="ray, the extra 'fleet', is not installed")
+
+from v2hdm import pipeline
+from v2hdm.detection.batch import detect_all, with_own_vehicle
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.drive import read_drive
+from v2hdm.errors import DriveError, WorkerError
+from v2hdm.fleet.eyes import Eyes, detect_by
+from v2hdm.fleet.plan import plan
+from v2hdm.fleet.rows import Row, exit_code
+from v2hdm.fleet.run import FleetOptions, run_fleet
+from v2hdm.fleet.work import map_drive
+from v2hdm.simulate import PortConfig, render_drive
+from v2hdm.simulate.port.config import RouteConfig, YardConfig
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    route = RouteConfig(pieces=[[26.0, 0.0]], image_spacing_m=2.6)
+    yard = YardConfig(parked_trucks=0, barriers=0, lamp_posts=0, moving_trucks=0, shadow_strips=0)
+    port = PortConfig(name="tiny", seed=3, initial_ipm="calibrated", route=route, yard=yard)
+    port.cameras = {"front": port.cameras["front"]}
+    folder = tmp_path_factory.mktemp("drives") / "tiny"
+    render_drive(port, folder, 1, lambda done, total: None)
+    return folder
+
+
+def eyes_of(ray: Any, count: int, **options: Any) -> list[Any]:
+    return [ray.remote(Eyes).options(num_cpus=0.1, **options).remote(str(Path.cwd())) for _ in range(count)]
+
+
+def found_by(eyes: list[Any], drive: Path, **settings: Any) -> str:
+    options, found = DetectorOptions(**settings), []
+    whole = with_own_vehicle(read_drive(drive), Detector.load(options=options))
+    detect_by(eyes, whole, options, range(len(whole.images)), 1, found.append)
+    return repr(found)
+
+
+def test_actors_find_what_processes_find_also_when_one_is_killed(
+    ray: Any, drive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("v2hdm.fleet.eyes.IMAGES_A_BATCH", 2)
+    eyes = eyes_of(ray, 2, max_restarts=-1, max_task_retries=3)
+    killed = ray.get(eyes[0].process.remote())
+    expected = repr(detect_all(read_drive(drive), DetectorOptions()))
+    threading.Timer(0.3, os.kill, (killed, signal.SIGKILL)).start()
+    assert found_by(eyes, drive) == expected
+    assert ray.get(eyes[0].process.remote()) != killed
+    for one in eyes:
+        ray.kill(one)
+
+
+def test_what_is_wrong_with_an_image_is_told_as_by_the_mapping_door(ray: Any, drive: Path) -> None:
+    whole = read_drive(drive)
+    eyes = eyes_of(ray, 1)
+    image = whole.images[2].path
+    content = image.read_bytes()
+    try:
+        image.write_bytes(content[: len(content) // 2])
+        with pytest.raises(DriveError, match=image.name):
+            detect_by(eyes, whole, DetectorOptions(), range(len(whole.images)), 1, print)
+    finally:
+        image.write_bytes(content)
+        ray.kill(eyes[0])
+
+
+def test_an_actor_that_dies_again_and_again_is_told(ray: Any, drive: Path) -> None:
+    class Blind(Eyes):
+        def detect(self, *_: object) -> list[Any]:
+            os.kill(os.getpid(), signal.SIGKILL)
+            return []
+
+    eyes = [ray.remote(Blind).options(num_cpus=0.1).remote(str(Path.cwd()))]
+    with pytest.raises(WorkerError, match="died again and again"):
+        found_by(eyes, drive)
+
+
+def written(folder: Path, name: str, drive: object) -> Path:
+    path = folder / f"{name}.yaml"
+    path.write_text(f"# @package _global_\nname: {name}\ndrive:\n  path: {drive}\n")
+    return path
+
+
+def test_a_fleet_outlives_its_workers_keeps_what_is_finished_and_goes_on_past_what_fails(
+    ray: Any, drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @contextmanager
+    def here(address: str, workers: int) -> Iterator[Any]:
+        yield ray
+
+    def dies_once(*arguments: Any) -> Any:
+        if not (tmp_path / "died").exists():
+            (tmp_path / "died").touch()
+            threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGKILL)).start()
+        return map_drive(*arguments)
+
+    monkeypatch.setattr("v2hdm.fleet.run.cluster", here)
+    monkeypatch.setattr("v2hdm.fleet.work.map_drive", dies_once)
+    good, nowhere = written(tmp_path, "good", drive), written(tmp_path, "nowhere", tmp_path / "absent")
+    typo = written(tmp_path, "typo", drive)
+    typo.write_text(typo.read_text() + "mapping: {max_rang_m: 3}\n")
+    overrides = [f"output={tmp_path / 'out'}", f"cache={tmp_path / 'cache'}"]
+    told: list[tuple[str, str, int, int]] = []
+
+    def fleet(*files: Path) -> list[Row]:
+        options = FleetOptions(tmp_path / "table")
+        return run_fleet(files, overrides, options, lambda *message: told.append(message))
+
+    rows = fleet(good, nowhere, typo)
+    assert (tmp_path / "died").exists()
+    images = len(read_drive(drive).images)
+    assert [row.status for row in rows] == ["PASS", "ERROR", "ERROR"]
+    assert (rows[0].images, rows[0].kept) == (images, False)
+    assert "no such drive folder" in rows[1].says
+    assert re.search("did you mean .*mapping.max_range_m", rows[2].says)
+    assert ("good", "detect", images, images) in told
+    table = list(csv.DictReader(StringIO((tmp_path / "table" / "fleet.csv").read_text())))
+    assert [row["drive"] for row in table] == ["good", "nowhere", "typo"]
+    assert json.loads((tmp_path / "table" / "fleet.json").read_text())["drives"][0]["status"] == "PASS"
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["good"]
+    (job,), _ = plan([good], [f"output={tmp_path / 'alone'}", f"cache={tmp_path / 'other'}", "workers=1"])
+    alone = pipeline.run(job.config, job.config_yaml).folder
+    for name in ("map.geojson", "calibration_front.yaml", "residuals.csv", "trajectory.tum"):
+        assert (tmp_path / "out" / "good" / name).read_bytes() == (alone / name).read_bytes(), name
+
+    assert fleet(good)[0].kept
+
+
+def test_two_run_files_never_write_one_folder(tmp_path: Path, drive: Path) -> None:
+    files = [written(tmp_path, "one", drive), tmp_path / "other.yaml"]
+    files[1].write_text(files[0].read_text())
+    jobs, refused = plan(files, [])
+    assert [job.name for job in jobs] == ["one"]
+    assert "give one of them another name" in refused[0].says
+
+
+def test_the_table_has_a_code_for_the_worst_of_its_rows() -> None:
+    def row(status: str) -> Row:
+        return Row("a", status, "", 1, 1, 1.0, False, "", status)
+
+    assert exit_code([row("PASS"), row("WARN")]) == 0
+    assert exit_code([row("FAIL"), row("PASS")]) == 3
+    assert exit_code([row("FAIL"), row("ERROR")]) == 2

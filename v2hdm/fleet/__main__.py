@@ -1,0 +1,69 @@
+"""The fleet door: ``python -m v2hdm.fleet drives/*.yaml`` maps many drives, each described by a run file.
+
+Detection and mapping are spread over this machine's cores, or a cluster's, by Ray. A drive whose result is
+finished and was made of the same is not done again; one that fails is a row of the table that says why, and
+the others go on. docs/fleet.md describes it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from v2hdm.door import ShowVersion, answer_signals, open_door
+
+_INTERRUPTED = "interrupted; finished drives are kept, the same command goes on from there"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the door; 0, 2 where a drive gave no result, or 3 where a verdict is FAIL."""
+    parsed = _parser().parse_intermixed_args(arguments)
+    return open_door("v2hdm.fleet", "fleet", _INTERRUPTED, lambda: _fleet(parsed))
+
+
+def _fleet(parsed: argparse.Namespace) -> int:
+    import ray  # noqa: F401  # its absence is told before that of what is built on it
+
+    from v2hdm.errors import ConfigError
+    from v2hdm.fleet.rows import exit_code
+    from v2hdm.fleet.run import FleetOptions
+    from v2hdm.fleet.view import fleet_on_terminal
+    from v2hdm.settings import check_workers
+
+    check_workers(parsed.workers)
+    overrides = [one for one in parsed.drives if "=" in one and not Path(one).exists()]
+    files = [Path(one) for one in dict.fromkeys(parsed.drives) if one not in overrides]
+    if not files:
+        raise ConfigError("no drive is named: give run files, as in python -m v2hdm.fleet drives/*.yaml")
+    options = FleetOptions(parsed.table, parsed.workers, parsed.address, parsed.again)
+    return exit_code(fleet_on_terminal(files, overrides, options))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m v2hdm.fleet", description=__doc__)
+    parser.add_argument(
+        "drives", nargs="+", help="run files, as for python -m v2hdm.map; or key=value, for all of them"
+    )
+    parser.add_argument(
+        "--workers", type=int, default=0, help="cores of this machine to use; 0, the default, takes all"
+    )
+    parser.add_argument(
+        "--address", default="local", help="of a running Ray cluster, or auto; without it one is started here"
+    )
+    parser.add_argument(
+        "--table",
+        type=Path,
+        default=Path("outputs/fleet"),
+        metavar="FOLDER",
+        help="takes the table of verdicts, fleet.csv and fleet.json (outputs/fleet)",
+    )
+    parser.add_argument("--again", action="store_true", help="do what is finished again")
+    parser.add_argument("--version", action=ShowVersion)
+    return parser
+
+
+if __name__ == "__main__":
+    answer_signals()
+    sys.exit(main())

@@ -1,0 +1,103 @@
+"""Detection on Ray: batches of images by actors whose model stays loaded."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import cv2
+import ray
+from ray.exceptions import RayActorError, RayTaskError
+
+from v2hdm.detection.batch import detect_image
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.errors import WorkerError
+from v2hdm.records import Drive, ImageDetections
+
+IMAGES_A_BATCH = 8
+"""Images that an actor looks at in one call: seconds of work against a millisecond of Ray's."""
+
+_BATCHES_AHEAD = 2
+"""Calls that wait at each actor, so that it is never idle between them."""
+
+_DRIVES_KEPT = 4
+
+
+class Eyes:
+    """An actor that detects: its model stays loaded, and so do the drives that it has seen last."""
+
+    def __init__(self, folder: str) -> None:
+        """``folder`` is where relative paths begin."""
+        os.chdir(folder)
+        cv2.setNumThreads(1)
+        self._detectors: dict[str, Detector] = {}
+        self._drives: dict[str, Drive] = {}
+
+    def process(self) -> int:
+        """Its process's number."""
+        return os.getpid()
+
+    def detect(
+        self, drive: Sequence[Any], options: DetectorOptions, images: Sequence[int]
+    ) -> list[ImageDetections]:
+        """What is in some ``images`` of a drive, given by a reference within a list: it is fetched once."""
+        (reference,) = drive
+        key = reference.hex()
+        if key not in self._drives:
+            while len(self._drives) >= _DRIVES_KEPT:
+                self._drives.pop(next(iter(self._drives)))
+            self._drives[key] = ray.get(reference)
+        known = repr(options)
+        if known not in self._detectors:
+            self._detectors = {known: Detector.load(options=options)}
+        return [detect_image(self._detectors[known], self._drives[key], index) for index in images]
+
+
+def detect_by(
+    eyes: Sequence[Any],
+    drive: Drive,
+    options: DetectorOptions,
+    images: Sequence[int],
+    workers: int,
+    take: Callable[[ImageDetections], None],
+) -> None:
+    """:func:`v2hdm.detection.batch.detect_images` by actors; what is found is the same.
+
+    Raises:
+        V2hdmError: as there.
+        WorkerError: an actor died again and again.
+    """
+    reference = ray.put(drive)
+    batches = [images[begin : begin + IMAGES_A_BATCH] for begin in range(0, len(images), IMAGES_A_BATCH)]
+    found: dict[int, list[ImageDetections]] = {}
+    waiting: dict[Any, tuple[int, Any]] = {}
+    free = _BATCHES_AHEAD * list(eyes)
+    left, taken = list(enumerate(batches))[::-1], 0
+    while left or waiting:
+        while left and free:
+            number, batch = left.pop()
+            actor = free.pop(0)
+            waiting[actor.detect.remote([reference], options, batch)] = number, actor
+        (done,), _ = ray.wait(list(waiting), num_returns=1)
+        number, actor = waiting.pop(done)
+        found[number] = _result(done)
+        free.append(actor)
+        while taken in found:
+            for one in found.pop(taken):
+                take(one)
+            taken += 1
+
+
+def _result(reference: Any) -> list[ImageDetections]:
+    try:
+        result: list[ImageDetections] = ray.get(reference)
+    except RayTaskError as failure:
+        raise failure.cause from None
+    except RayActorError:
+        raise WorkerError(
+            "a detection worker died again and again over the same images, perhaps for want of memory; set "
+            "fewer --workers, or look at the images"
+        ) from None
+    return result

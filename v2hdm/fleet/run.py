@@ -1,0 +1,137 @@
+"""A fleet from its run files to its table: drives side by side, each retried when its worker dies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from v2hdm.fleet.cluster import LOCAL, cluster
+from v2hdm.fleet.plan import Job, plan
+from v2hdm.fleet.rows import Row, as_csv, as_json
+from v2hdm.outputs import GrowingFolder, growing_folder
+
+Tell = Callable[[str, str, int, int], None]
+"""Told a drive, its stage, and how many of the stage's steps are done, of how many."""
+
+ALL = "fleet"
+"""In place of a drive's name, for what is told of the fleet."""
+
+_RETRIES = 3
+"""How often work is begun anew whose worker died."""
+
+_LOOK_EVERY_S = 0.3
+
+
+@dataclass(frozen=True)
+class FleetOptions:
+    """What a user chooses beside the drives.
+
+    ``workers`` are the cores that are used on this machine, 0 for all; ``address`` is that of a cluster.
+    ``folder`` takes the table; ``again`` does what is finished again.
+    """
+
+    folder: Path
+    workers: int = 0
+    address: str = LOCAL
+    again: bool = False
+
+
+def run_fleet(
+    files: Sequence[Path], overrides: Sequence[str], options: FleetOptions, tell: Tell
+) -> list[Row]:
+    """Map the drives of run files; the table is written anew whenever one is done.
+
+    Args:
+        files: run files.
+        overrides: ``key=value`` for all of them.
+        options: how.
+        tell: told how far it is.
+
+    Returns:
+        A row for each file, in their order.
+
+    Raises:
+        V2hdmError: the table cannot be written, or there is no Ray.
+    """
+    jobs, refused = plan(files, [*overrides, "resume=false"] if options.again else overrides)
+    with growing_folder(options.folder, "--table") as folder:
+        table = _Table(folder, files, tell)
+        for row in refused:
+            table.add(row)
+        if jobs:
+            with cluster(options.address, options.workers) as ray:
+                _map_all(ray, jobs, table, tell)
+        return table.rows
+
+
+class _Table:
+    """The rows so far, on disk as well."""
+
+    def __init__(self, folder: GrowingFolder, files: Sequence[Path], tell: Tell) -> None:
+        self._folder, self._files, self._tell = folder, [str(file) for file in files], tell
+        self._rows: dict[str, Row] = {}
+
+    @property
+    def rows(self) -> list[Row]:
+        """In the order of the files."""
+        return [self._rows[file] for file in self._files if file in self._rows]
+
+    def add(self, row: Row, trace: str = "") -> None:
+        """Take the row of a drive, and the traceback of a bug where there is one."""
+        self._rows[row.source] = row
+        if trace:
+            self._folder.write(f"{row.drive}.traceback.txt", trace.encode())
+        self._folder.write("fleet.csv", as_csv(self.rows))
+        self._folder.write("fleet.json", as_json(self.rows))
+        self._tell(row.drive, row.status, 1, 1)
+        self._tell(ALL, "drives", len(self._rows), len(self._files))
+
+
+def _map_all(ray: Any, todo: Sequence[Job], table: _Table, tell: Tell) -> None:
+    """Map the drives, as many at a time as there are cores."""
+    from v2hdm.fleet.board import Board
+    from v2hdm.fleet.eyes import Eyes
+    from v2hdm.fleet.work import map_drive
+
+    cores = max(int(ray.cluster_resources().get("CPU", 1)), 1)
+    here = str(Path.cwd())
+    # A core has one actor that detects and one drive that is mapped: the one waits for the other by turns.
+    half = {"num_cpus": 0.5, "max_restarts": -1, "max_task_retries": _RETRIES}
+    eyes = [ray.remote(Eyes).options(**half).remote(here) for _ in range(cores)]
+    board = ray.remote(Board).options(num_cpus=0, max_restarts=-1).remote()
+    left = list(todo)[::-1]
+    doing: dict[Any, Job] = {}
+    while left or doing:
+        while left and len(doing) < cores:
+            job = left.pop()
+            gpus = 1 if job.config.device == "cuda" else 0
+            mapping = ray.remote(map_drive).options(num_cpus=0.5, num_gpus=gpus, max_retries=_RETRIES)
+            doing[mapping.remote(job, eyes, board, here)] = job
+        done, _ = ray.wait(list(doing), num_returns=1, timeout=_LOOK_EVERY_S)
+        for message in _told(ray, board):
+            tell(*message)
+        for reference in done:
+            table.add(*_outcome(ray, reference, doing.pop(reference)))
+
+
+def _told(ray: Any, board: Any) -> list[tuple[str, str, int, int]]:
+    try:
+        messages: list[tuple[str, str, int, int]] = ray.get(board.take.remote())
+    except ray.exceptions.RayError:  # it died, and is being restarted
+        return []
+    return messages
+
+
+def _outcome(ray: Any, reference: Any, job: Job) -> tuple[Row, str]:
+    try:
+        outcome: tuple[Row, str] = ray.get(reference)
+    except ray.exceptions.RayError as error:
+        # What map_drive raises is a row already: this is its process, again and again.
+        line = (
+            f"its worker process died {_RETRIES + 1} times ({type(error).__name__}), perhaps for want of "
+            "memory; set fewer --workers"
+        )
+        return Row.of_error(job.name, job.source, line), str(error)
+    return outcome

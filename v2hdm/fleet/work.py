@@ -1,0 +1,49 @@
+"""What a worker does for one drive: all but detection."""
+
+from __future__ import annotations
+
+import os
+import traceback
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from v2hdm.caching.store import Store
+from v2hdm.door import told
+from v2hdm.fleet.board import Telling
+from v2hdm.fleet.eyes import detect_by
+from v2hdm.fleet.plan import Job
+from v2hdm.fleet.rows import Row
+from v2hdm.pipeline.finished import RunResult, finished
+
+
+def map_drive(job: Job, eyes: Sequence[Any], board: Any, folder: str) -> tuple[Row, str]:
+    """Map one drive and write its results; its row, and the traceback where it met a bug of ours.
+
+    Args:
+        job: what to map.
+        eyes: the actors that detect.
+        board: the actor that is told of the progress.
+        folder: where relative paths begin.
+    """
+    os.chdir(folder)
+    job.config.workers = 1
+    try:
+        store = Store(Path(job.config.cache))
+        there = finished(job.config, store) if job.config.resume else None
+        result = there or _mapped(job, store, eyes, board)
+    except Exception as error:  # a drive that fails is a row, and the others go on
+        line = told(error)
+        if line is not None:
+            return Row.of_error(job.name, job.source, line), ""
+        line = f"a bug of ours, {type(error).__name__}: {error}; its traceback is in the fleet's folder"
+        return Row.of_error(job.name, job.source, line), traceback.format_exc()
+    return Row.of_result(job.name, job.source, result.folder, result.metrics, there is not None), ""
+
+
+def _mapped(job: Job, store: Store, eyes: Sequence[Any], board: Any) -> RunResult:
+    from v2hdm.pipeline.work import map_drives  # loads torch, which a finished result does not need
+
+    telling = Telling(board, job.name)
+    return map_drives(job.config, store, job.config_yaml, telling, detect=partial(detect_by, eyes))
