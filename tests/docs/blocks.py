@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[2]
 
 _FENCE = re.compile(r"^```(\w+)([^\n]*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 _TITLE = re.compile(r'title="([^"]+)"')
-_NOT_RUN = re.compile(r"\A# not run by the tests: (\S.*)\n")
+_NOT_RUN = re.compile(r"\A(?:#!.*\n)?# not run by the tests: (\S.*)\n")
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Block:
         """Its commands, a line each: comments and continuations are gone."""
         joined = re.sub(r"\\\n\s*", "", self.text)
         stripped = [re.sub(r"(^|\s)#\s.*$", "", line).strip() for line in joined.splitlines()]
-        return [line for line in stripped if line]
+        return [line for line in stripped if line and not line.startswith("#")]
 
 
 def document(name: str) -> str:

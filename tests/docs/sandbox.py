@@ -26,7 +26,7 @@ _PLACES = [
 
 def furnish(folder: Path) -> None:
     """Add drives, results, a recording, tables and images to the cache and result of ``+run=port2``."""
-    (rendered,) = (folder / "cache").iterdir()
+    (rendered,) = (folder / "cache").glob("port2-*")
     for name in _COPIES:
         copy = folder / "drives" / name
         shutil.copytree(rendered, copy)

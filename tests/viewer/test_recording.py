@@ -45,6 +45,16 @@ def drive_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def configured(drive: Path, output: Path) -> RunConfig:
+    return RunConfig(
+        name="small",
+        drive=DriveConfig(path=str(drive)),
+        output=str(output),
+        cache=str(output / "cache"),
+        workers=1,
+    )
+
+
 @pytest.fixture(scope="module")
 def result(drive_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("rerun", reason="no rerun: pip install 'v2hdm[viewer]'")
@@ -52,10 +62,7 @@ def result(drive_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
         patch.delenv("DISPLAY", raising=False)
         patch.delenv("WAYLAND_DISPLAY", raising=False)
         output = tmp_path_factory.mktemp("outputs")
-        config = RunConfig(
-            name="small", drive=DriveConfig(path=str(drive_folder)), output=str(output), workers=1
-        )
-        return run(config, viewer=RerunViewer("small")).folder
+        return run(configured(drive_folder, output), viewer=RerunViewer("small")).folder
 
 
 @pytest.fixture(scope="module")
@@ -139,3 +146,22 @@ def test_without_its_package_the_viewer_is_one_line_before_any_work(tmp_path: Pa
         "error: viewer=rerun needs rerun: install the viewer extra, pip install 'v2hdm[viewer]'\n"
     )
     assert not (tmp_path / "outputs").exists()
+
+
+def test_a_run_that_nothing_has_changed_for_is_shown_all_the_same(result: Path, drive_folder: Path) -> None:
+    class Seen:
+        def __init__(self) -> None:
+            self.calls: list[str] = []
+
+        def detected(self, *_: object) -> None:
+            self.calls.append("detected")
+
+        def mapped(self, cameras: str, *_: object) -> None:
+            self.calls.append(cameras)
+
+        def close(self) -> None:
+            self.calls.append("closed")
+
+    seen = Seen()
+    run(configured(drive_folder, result.parent), viewer=seen)
+    assert seen.calls == ["detected", "front", "closed"]

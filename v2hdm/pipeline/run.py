@@ -24,13 +24,13 @@ def run(
         config: what to do.
         config_yaml: the configuration as text, kept beside the results.
         progress: told how far the long steps are.
-        viewer: shown images, detections and maps as they come.
+        viewer: shown images, detections and maps as they come, also where nothing has changed since.
 
     Raises:
         V2hdmError: The configuration, the drive or the detector is at fault, or no map can be made.
     """
     store = Store(Path(config.cache))
-    there = finished(config, store) if config.resume else None
+    there = finished(config, store) if config.resume and viewer is None else None
     if there is not None:
         return there
     # Loads torch and much else, which takes seconds.
