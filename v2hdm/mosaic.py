@@ -36,7 +36,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action=ShowVersion)
     parser.add_argument("result", type=Path, help="result folder of v2hdm.map")
     parser.add_argument(
-        "--drive", type=Path, help="the drive's folder (default: the one that the result's config.yaml names)"
+        "--drive", type=Path, help="the drive's folder (default: where it was when it was mapped)"
     )
     parser.add_argument(
         "--resolution", type=float, metavar="M", help="side of a pixel on the ground (default: 0.02 m)"

@@ -1,25 +1,18 @@
-"""From a finished result back to its drive, for doors that work on results."""
+"""The mosaic of a finished result, for its door."""
 
 from __future__ import annotations
 
 import argparse
 import logging
-import os
 import sys
 from pathlib import Path
 
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-
-from v2hdm.drive import read_drive
-from v2hdm.errors import ConfigError, MapFileError
-from v2hdm.files import load_yaml
+from v2hdm.drive.of_result import drive_of
+from v2hdm.errors import DriveError, MapFileError
 from v2hdm.orthophoto.result import MOSAIC_FILES, RESOLUTION_M, write_mosaic
 from v2hdm.outputs import added_to
 from v2hdm.pipeline.admit import check_device
-from v2hdm.pipeline.config import RunConfig
 from v2hdm.records import Drive
-from v2hdm.simulate import rendered_drive
 
 
 def drive_of_result(folder: Path, path: Path | None = None) -> Drive:
@@ -27,37 +20,20 @@ def drive_of_result(folder: Path, path: Path | None = None) -> Drive:
 
     Args:
         folder: of the result.
-        path: of the drive, where it has moved; None for the one that ``config.yaml`` names.
+        path: of the drive, where it has moved; None for where it was.
 
     Raises:
-        MapFileError: the folder is no result of a run.
-        ConfigError: its configuration names no drive.
-        DriveError: the drive cannot be read.
+        MapFileError: the folder is no result of a run, or of one of several drives.
+        DriveError: the drive is not there any more, cannot be read, or is another one.
     """
-    content = load_yaml(folder / "config.yaml", MapFileError)
-    try:
-        merged = OmegaConf.merge(OmegaConf.structured(RunConfig), content)
-        if merged.simulate is not None and content["simulate"].get("cameras"):
-            # The schema brings its own cameras: those that the run had left out would come back.
-            for name in set(merged.simulate.cameras) - set(content["simulate"]["cameras"]):
-                del merged.simulate.cameras[name]
-        config = OmegaConf.to_object(merged)
-    except OmegaConfBaseException:
-        config = None
-    if not isinstance(config, RunConfig):
-        raise MapFileError(
-            f"{folder / 'config.yaml'} is no configuration of v2hdm.map; give its result folder"
+    drive = drive_of(folder, path)
+    if drive is None:
+        raise DriveError(
+            f"{folder}: its drive is not where it was; give its folder with --drive, or map it anew"
         )
-    if len(config.drive.paths) > 1:
+    if drive.joined:
         raise MapFileError(f"{folder} is of several drives; a mosaic shows one: map them one by one for it")
-    if path is None and config.simulate is not None:
-        workers = config.workers or os.cpu_count() or 1
-        path = rendered_drive(config.simulate, Path(config.cache), workers, lambda done, total: None)
-    elif path is None and config.drive.paths:
-        path = config.drive.paths[0]
-    if path is None:
-        raise ConfigError(f"{folder / 'config.yaml'} names no drive; give its folder with --drive")
-    return read_drive(path, config.drive)
+    return drive
 
 
 def mosaic_of_result(parsed: argparse.Namespace) -> list[str]:

@@ -11,9 +11,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from v2hdm.drive import write_drive
+from v2hdm.drive import ReadOptions, write_drive
+from v2hdm.drive.of_result import METRICS, told_of
 from v2hdm.drive.tum import write_tum
-from v2hdm.files import dump_yaml
 from v2hdm.geometry.ipm import apply_homography, ground_from_pinhole_px, ipm_from_extrinsic
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import exp, inverse
@@ -32,6 +32,7 @@ from v2hdm.records import (
     Marking,
     Trajectory,
 )
+from v2hdm.report.outputs import write_json
 
 INFO = CameraInfo(
     "front",
@@ -124,5 +125,5 @@ def result_of(folder: Path, drive: Drive) -> Path:
         )
         hd_map = HdMap(tuple(Marking("diamond", s, 7) for s in SQUARES), origin=ORIGIN)
         write_geojson(hd_map, out / "map.geojson")
-        (out / "config.yaml").write_text(dump_yaml({"name": "plane", "drive": {"path": str(drive.root)}}))
+        write_json(out / METRICS, {"drive": told_of(drive, [drive.root], ReadOptions())})
     return folder / "result"

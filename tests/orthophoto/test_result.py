@@ -15,6 +15,7 @@ import rasterio
 
 from tests.orthophoto import scene
 from v2hdm import mosaic
+from v2hdm.drive.of_result import METRICS
 from v2hdm.hdmap.geodetic import geodetic_from_enu
 from v2hdm.orthophoto.blend import Sheet
 from v2hdm.orthophoto.canvas import Canvas
@@ -94,19 +95,21 @@ def test_a_picture_is_reduced_until_it_can_be_drawn_and_keeps_its_colours() -> N
     assert not picture._rgba[:, :1024].any()
 
 
+def said_of_drive(folder: Path, **values: object) -> None:
+    """Change what a result says of its drive."""
+    content = json.loads((folder / METRICS).read_text())
+    content["drive"] |= values
+    (folder / METRICS).write_text(json.dumps(content))
+
+
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (lambda folder: (folder / "config.yaml").unlink(), "config.yaml: no such file"),
-        (
-            lambda folder: (folder / "config.yaml").write_text("nonsense: 3\n"),
-            "no configuration of v2hdm.map",
-        ),
-        (lambda folder: (folder / "config.yaml").write_text("name: plane\n"), "give its folder with --drive"),
-        (
-            lambda folder: (folder / "config.yaml").write_text("name: two\ndrive: {path: [a, b]}\n"),
-            "is of several drives",
-        ),
+        (lambda folder: (folder / METRICS).unlink(), "no metrics.json in it"),
+        (lambda folder: (folder / METRICS).write_text("[]"), "metrics.json"),
+        (lambda folder: said_of_drive(folder, limit="x"), "is damaged"),
+        (lambda folder: said_of_drive(folder, paths=["gone"]), "give its folder with --drive"),
+        (lambda folder: said_of_drive(folder, name="other"), "the result is of drive other"),
         (lambda folder: (folder / "calibration_front.yaml").unlink(), "no calibration_"),
         (lambda folder: (folder / "trajectory.tum").write_text("900 0 0 0 0 0 0 1\n"), "share no time"),
         (shutil.rmtree, "no such folder"),

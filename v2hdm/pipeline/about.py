@@ -12,6 +12,7 @@ import numpy as np
 from v2hdm import __version__
 from v2hdm.caching.keys import library_versions
 from v2hdm.drive import ReadOptions
+from v2hdm.drive.of_result import told_of
 from v2hdm.records import Drive
 
 
@@ -30,15 +31,7 @@ def _drive(drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[st
     stamp_s = [image.stamp_s for image in drive.images]
     places = np.array([image.map_from_vehicle[:2, 3] for image in drive.images])
     return {
-        "name": drive.name,
-        "paths": [str(path.resolve()) for path in paths],
-        "format": options.format,
-        "max_gap_s": options.max_gap_s,
-        "limit": options.limit,
-        "start_s": options.start_s,
-        "end_s": options.end_s,
-        "cameras": list(drive.cameras),
-        "images": len(drive.images),
+        **told_of(drive, paths, options),
         "duration_s": round(float(np.ptp(stamp_s)), 3),
         "length_m": round(float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum()), 2),
         "position_sigma_m": drive.pose_noise.position_m,

@@ -21,16 +21,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _report(parsed: argparse.Namespace) -> None:
-    from v2hdm.errors import MapFileError
-    from v2hdm.files import load_json
+    from v2hdm.drive.of_result import drive_of
     from v2hdm.outputs import added_to
-    from v2hdm.report.page.drive import drive_of
     from v2hdm.report.page.write import FILE, write_page
 
-    metrics = parsed.folder / "metrics.json"
-    if not metrics.is_file():
-        raise MapFileError(f"{parsed.folder}: no metrics.json in it; give the result folder of v2hdm.map")
-    drive = drive_of(load_json(metrics, MapFileError), parsed.drive)
+    drive = drive_of(parsed.folder, parsed.drive)
     with added_to(parsed.folder, [FILE], "folder") as folder:
         path = write_page(folder, drive)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB" + ("" if drive else ", without the drive's images"))

@@ -13,6 +13,7 @@ import pytest
 
 from tests.report.page.folder import DIAMOND_M, INFO, NASTY_NAME, PLACES, SHIFT_PX, make_result, make_site
 from v2hdm.drive import read_drive
+from v2hdm.drive.of_result import drive_of
 from v2hdm.errors import DriveError, MapFileError
 from v2hdm.hdmap.residuals import COLUMNS, read_residuals
 from v2hdm.records import DIAMOND, Drive, Marking
@@ -20,7 +21,6 @@ from v2hdm.report.__main__ import main
 from v2hdm.report.outputs import write_json
 from v2hdm.report.page import pictures
 from v2hdm.report.page.document import Document, document
-from v2hdm.report.page.drive import drive_of
 from v2hdm.report.page.facts import read_facts
 from v2hdm.report.page.layers import ellipses
 from v2hdm.report.page.sightings import ground_residuals
@@ -248,9 +248,15 @@ def test_the_door_finds_the_drive_and_names_what_is_wrong(
 def test_another_drive_than_that_of_the_result_is_refused(tmp_path: Path) -> None:
     make_result(tmp_path / "a", name="one")
     make_result(tmp_path / "b", name="two")
-    metrics = json.loads((tmp_path / "a" / "result" / "metrics.json").read_text())
+    result = tmp_path / "a" / "result"
     with pytest.raises(DriveError, match="drive two of 5 images"):
-        drive_of(metrics, tmp_path / "b" / "drive")
-    metrics["drive"]["paths"] = [str(tmp_path / "gone")]
-    assert drive_of(metrics, None) is None
+        drive_of(result, tmp_path / "b" / "drive")
+    metrics = json.loads((result / "metrics.json").read_text())
+    for paths, limit in (([str(tmp_path / "gone")], None), ([], "x")):
+        metrics["drive"] |= {"paths": paths, "limit": limit}
+        (result / "metrics.json").write_text(json.dumps(metrics))
+        if limit is None:
+            assert drive_of(result, None) is None
+    with pytest.raises(MapFileError, match=r"metrics\.json: what it says of the drive is damaged"):
+        drive_of(result, None)
     assert read_drive(tmp_path / "a" / "drive").cameras["front"].info.width == INFO.width
