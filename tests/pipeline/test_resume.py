@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from v2hdm.caching.pruning import items_of
+from v2hdm.detection import batch
 from v2hdm.drive import ReadOptions, read_drive
 from v2hdm.errors import DriveError
 from v2hdm.mapping.options import MappingOptions
@@ -57,9 +58,22 @@ def refused(*_: object, **__: object) -> Any:
     raise AssertionError("this was to be taken from the cache")
 
 
+def seen_images(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The images that are detected in from now on, as indices."""
+    looked: list[int] = []
+    original = batch.detect_image
+
+    def detect(detector: Any, drive: Any, index: int) -> Any:
+        looked.append(index)
+        return original(detector, drive, index)
+
+    monkeypatch.setattr(batch, "detect_image", detect)
+    return looked
+
+
 def test_another_mapping_setting_needs_no_image_again(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(inspection, "inspect", refused)
-    monkeypatch.setattr(detections, "detect_images", refused)
+    monkeypatch.setattr(batch, "detect_image", refused)
     monkeypatch.setattr(detections, "own_vehicles", refused)
     nearer = run(config(site, "nearer", mapping=MappingOptions(max_range_m=9.0)))
     before, after = ((one / "map.geojson").read_bytes() for one in (site / "first" / "short", nearer.folder))
@@ -115,14 +129,7 @@ def test_what_is_missing_or_damaged_is_made_anew(
 def test_an_image_that_changed_is_looked_at_again_and_no_other_piece(
     site: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    looked: list[int] = []
-    original = detections.detect_images
-
-    def detect(drive: Any, options: Any, images: Any, *rest: Any) -> None:
-        looked.extend(images)
-        original(drive, options, images, *rest)
-
-    monkeypatch.setattr(detections, "detect_images", detect)
+    looked = seen_images(monkeypatch)
     image = sorted((site / "drive").rglob("*.jpg"))[-1]
     before = image.read_bytes()
     try:
@@ -155,11 +162,7 @@ def test_a_killed_run_goes_on_in_the_middle_of_detection(site: Path, monkeypatch
     arguments = [str(site / "drive"), str(output), str(cache)]
     done = subprocess.run([sys.executable, "-c", KILLED, *arguments], capture_output=True, timeout=300)
     assert done.returncode == -signal.SIGKILL, done.stderr
-    looked: list[int] = []
-    original = detections.detect_images
-    monkeypatch.setattr(
-        detections, "detect_images", lambda *given: (looked.extend(given[2]), original(*given))[1]
-    )
+    looked = seen_images(monkeypatch)
     resumed = run(config(site, "killed", cache=str(cache)))
     assert looked
     assert looked[0] == detections.PIECE
