@@ -10,7 +10,7 @@ import pytest
 from tests.ground.scene import CENTRE, INFO, extrinsic, make_drive, with_guess, with_trajectory
 from v2hdm.geometry.mounting import mounting_angles
 from v2hdm.geometry.rigid import rotation_from_euler
-from v2hdm.ground import GroundOptions, GroundStatus, Reading, better_start, estimate_ground
+from v2hdm.ground import GroundOptions, GroundStatus, Reading, better_start, estimate, estimate_ground
 from v2hdm.records import Drive, FloatArray, Trajectory
 
 TRUE = extrinsic(roll_deg=0.5, pitch_deg=20.0, yaw_deg=-1.0)
@@ -54,6 +54,19 @@ def test_a_straight_route_at_constant_speed_cannot_tell_its_clock(straight):
     clock = estimate_ground(straight, "front", replace(FEW, free=("clock_s",))).parameters["clock_s"]
     assert not clock.told
     assert "drive a turn" in clock.why_not
+
+
+def test_a_clock_that_is_freed_where_hardly_anything_tells_it_stays_near_its_stamps(straight, monkeypatch):
+    monkeypatch.setattr(estimate, "clock_shows", lambda motion: True)
+    rng = np.random.default_rng(4)
+    poses = straight.trajectory.map_from_vehicle.copy()
+    poses[:, :2, 3] += rng.normal(0.0, 0.01, (len(poses), 2))
+    rough = with_trajectory(straight, replace(straight.trajectory, map_from_vehicle=poses))
+    guessed = with_guess(rough, extrinsic(roll_deg=-0.5, pitch_deg=21.0, yaw_deg=0.5))
+    found = estimate_ground(guessed, "front", replace(FEW, free=("clock_s",)))
+    assert found.status is GroundStatus.FOUND
+    assert abs(found.parameters["clock_s"].value) < 0.4
+    assert np.abs(angles_off_deg(found.calibration.cam_from_vehicle))[2] < 0.3
 
 
 def test_poses_that_rise_over_the_ground_are_told(straight):

@@ -47,6 +47,9 @@ _STAGES = (
 _CLOCK_APART_M = (0.8, 4.0)
 """Distance between the images of a pair that shows the clock: motion changes within it."""
 
+_CLOCK_LOOSENED = 2.0
+"""Factor on the stated noise of headings up to which a clock is told apart from them."""
+
 _LEAST_MATCHES = 60
 """Ten for each of the six quantities of a mounting."""
 
@@ -106,11 +109,13 @@ def _solve(matcher: Matcher, beliefs: Beliefs, mount: Mount, options: GroundOpti
         if len(matched.correlation) < _LEAST_MATCHES:
             return None
         used, believed, rows = beliefs.about(matched.observations, stage.loosened)
-        adjusted = adjust(used, believed, mount, free, max(stage.loosened / 2, 1.0))
+        # Where headings may be far off, so may the clock: nothing would hold the camera's yaw.
+        freed = free if stage.loosened <= _CLOCK_LOOSENED else None
+        adjusted = adjust(used, believed, mount, freed, max(stage.loosened / 2, 1.0))
         if np.count_nonzero(adjusted.weight) < _LEAST_MATCHES:  # rays that miss the ground fix nothing
             return None
         mount = adjusted.mount
-        if free is not None:
+        if freed is not None:
             beliefs = beliefs.at_clock(beliefs.clock_s + adjusted.extra)
         poses = beliefs.poses()
         poses[rows] = adjusted.poses
