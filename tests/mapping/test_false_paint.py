@@ -75,7 +75,7 @@ def on_a_truck(scene: Scene, ahead_m: float, gains_m: float) -> list[ImageDetect
 
     def more(seen: ImageDetections) -> list[MarkingDetection]:
         image = scene.drive.images[seen.image]
-        vehicle = [*_DIAMOND_M, ahead_m + gains_m * image.stamp_s, 0.4, 0.0]
+        vehicle = _DIAMOND_M + np.array([ahead_m + gains_m * image.stamp_s, 0.4, 0.0])
         matrix = image.map_from_vehicle
         on_map = vehicle @ matrix[:3, :3].T + matrix[:3, 3]
         cam_from_map = scene.cam_from_vehicle[image.camera] @ np.linalg.inv(matrix)
