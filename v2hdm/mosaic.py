@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _mosaic(parsed: argparse.Namespace) -> None:
     import torch  # noqa: F401  # its absence is told before that of what is built on it
 
-    from v2hdm.remake import mosaic_of_result
+    from v2hdm.mosaicking import mosaic_of_result
 
     for line in mosaic_of_result(parsed):
         print(line)

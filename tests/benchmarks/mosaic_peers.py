@@ -26,7 +26,7 @@ from v2hdm.orthophoto.canvas import Canvas
 from v2hdm.orthophoto.files import MULTIPLE_PX
 from v2hdm.orthophoto.result import RESOLUTION_M, ground_of
 from v2hdm.orthophoto.shots import Lens, Shot
-from v2hdm.remake import drive_of_result
+from v2hdm.mosaicking import drive_of_result
 
 Undistort = Callable[[str, np.ndarray], np.ndarray]
 
