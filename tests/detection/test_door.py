@@ -370,6 +370,17 @@ def test_arrows_and_whole_lines_are_written_and_drawn_without_corners(bench, mon
     assert not image.any()
 
 
+def test_a_process_that_runs_for_days_keeps_the_times_of_its_last_images_only(monkeypatch) -> None:
+    monkeypatch.setattr("v2hdm.detection.stopwatch.KEPT", 3)
+    stopwatch = Stopwatch()
+    for number in range(5):
+        with stopwatch.image():
+            stopwatch.add("fit", float(number))
+    assert stopwatch.images == 5
+    assert stopwatch.times_s("fit").tolist() == [2.0, 3.0, 4.0]
+    assert len(stopwatch.total_s()) == 3
+
+
 def test_the_stopwatch_adds_up_laps_of_an_image_and_forgets_failed_ones():
     stopwatch = Stopwatch()
     for stages in (["net"], ["net", "lanes", "lanes"]):

@@ -7,6 +7,7 @@ Code that works marks its stages with :func:`lap`; that costs nothing to speak o
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -16,12 +17,17 @@ import numpy as np
 _running: ContextVar[Stopwatch | None] = ContextVar("stopwatch", default=None)
 
 
+KEPT = 10_000
+"""Images whose times are kept, the last ones: a vehicle's process runs for days."""
+
+
 class Stopwatch:
-    """Collects the time of each stage, image by image."""
+    """Collects the time of each stage, image by image; of the last :data:`KEPT` images."""
 
     def __init__(self) -> None:
-        self._images: list[dict[str, float]] = []
-        self._total_s: list[float] = []
+        self._images: deque[dict[str, float]] = deque(maxlen=KEPT)
+        self._total_s: deque[float] = deque(maxlen=KEPT)
+        self._count = 0
         self._now: dict[str, float] | None = None
 
     @contextmanager
@@ -35,6 +41,7 @@ class Stopwatch:
             if self._now is not None:
                 self._images.append(self._now)
                 self._total_s.append(time.perf_counter() - start)
+                self._count += 1
         finally:
             _running.reset(token)
 
@@ -45,7 +52,7 @@ class Stopwatch:
     @property
     def images(self) -> int:
         """How many images were timed."""
-        return len(self._images)
+        return self._count
 
     @property
     def stages(self) -> tuple[str, ...]:
