@@ -30,10 +30,6 @@ against a pixel, but thousands of matches share it."""
 _BENDS = 6
 """Terms of a smooth error of each pixel coordinate: a polynomial of the second degree."""
 
-_CLOCK_SIGMA_S = 0.2
-"""Offset of a clock before anything is seen: recorders without synchronisation are off by a tenth or two. On
-a short drive with one bend the ground alone would take a wrong turn of the camera for seconds."""
-
 _LARGEST_TURN_RAD = 0.05
 _LARGEST_SHIFT_M = 0.2
 """A step larger than these leaves what the equations are linear in."""
@@ -81,7 +77,6 @@ class Believed:
         climb_m: (I,) what a grade of 1 has lifted the poses by, m.
         centre_vehicle: (3,) surveyed camera centre.
         centre_sigma_m: (3,) of it.
-        clock_s: how much later than stamped the images were taken, as the poses have it already.
     """
 
     poses: FloatArray
@@ -90,7 +85,6 @@ class Believed:
     climb_m: FloatArray
     centre_vehicle: FloatArray
     centre_sigma_m: FloatArray
-    clock_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -151,11 +145,8 @@ def adjust(
         system, gradient = _normal(
             observations, believed, mount, errors, bends, residual, jacobian, root * unit, weight
         )
-        known = len(gradient) - errors.size
-        if free == "clock_s":
-            system[known - 1, known - 1] += 1 / _CLOCK_SIGMA_S**2
-            gradient[known - 1] += (believed.clock_s + extra) / _CLOCK_SIGMA_S**2
         step = _short(np.asarray(np.linalg.solve(system, -gradient)))
+        known = len(step) - errors.size
         mount = mount.moved(step[TURN], step[CENTRE])
         bends = bends + step[6 : 6 + 2 * _BENDS]
         if free is not None:

@@ -78,6 +78,5 @@ class Beliefs:
             climb_m=path_m - path_m.mean(),
             centre_vehicle=self.guess.centre_vehicle if prior is None else prior.centre_vehicle,
             centre_sigma_m=sigma_m,
-            clock_s=self.clock_s,
         )
         return replace(observations, first=place[:count], second=place[count:]), believed, rows
