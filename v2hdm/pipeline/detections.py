@@ -62,15 +62,9 @@ def detect_in_pieces(
         lambda: own_vehicles(drive, Detector.load(options=options)),
     )
     drive = with_masks(drive, masks)
-    cameras = {name: key_of(camera) for name, camera in drive.cameras.items()}
-    starts = range(0, len(drive.images), PIECE)
-    keys = {}
-    for start in starts:
-        images = drive.images[start : start + PIECE]
-        known = [cameras[image.camera] for image in images]
-        keys[start] = key_of(detector_key, known, contents.of_images(images))
-    pieces = {start: room.take(STAGE, keys[start], _Piece) for start in starts}
-    missing = [start for start in starts if pieces[start] is None]
+    keys = _keys(drive, contents, detector_key)
+    pieces = {start: room.take(STAGE, key, _Piece) for start, key in keys.items()}
+    missing = [start for start, piece in pieces.items() if piece is None]
     total = len(drive.images)
     todo = [i for start in missing for i in range(start, min(start + PIECE, total))]
     if len(todo) < total:
@@ -91,4 +85,17 @@ def detect_in_pieces(
 
     if todo:
         detect(drive, options, todo, workers, take)
-    return [replace(found, image=start + found.image) for start in starts for found in pieces[start] or ()]
+    return [
+        replace(found, image=start + found.image) for start, piece in pieces.items() for found in piece or ()
+    ]
+
+
+def _keys(drive: Drive, contents: Contents, detector_key: str) -> dict[int, str]:
+    """The key of each piece, by its first image."""
+    cameras = {name: key_of(camera) for name, camera in drive.cameras.items()}
+    keys = {}
+    for start in range(0, len(drive.images), PIECE):
+        images = drive.images[start : start + PIECE]
+        known = [cameras[image.camera] for image in images]
+        keys[start] = key_of(detector_key, known, contents.of_images(images))
+    return keys
