@@ -39,7 +39,7 @@ class CeresOptions:
 
 
 @dataclass(frozen=True)
-class CeresResult:
+class PeerResult:
     """What came of it; times in s, ``cpu_s`` that of the solve; ``steps`` taken or tried."""
 
     setup_s: float
@@ -63,7 +63,7 @@ class _Blocks:
     intrinsic: np.ndarray
 
 
-def solve_ceres(problem: Problem, options: CeresOptions) -> CeresResult:
+def solve_ceres(problem: Problem, options: CeresOptions) -> PeerResult:
     """Levenberg-Marquardt from ``problem``'s extrinsics and its ``corners_start``.
 
     The cameras' Schur complement is dense; where frames have poses too, it is sparse.
@@ -83,7 +83,7 @@ def solve_ceres(problem: Problem, options: CeresOptions) -> CeresResult:
     ready, cpu = time.perf_counter(), time.process_time()
     pyceres.solve(settings, built, summary)
     took, cpu = time.perf_counter() - ready, time.process_time() - cpu
-    return CeresResult(
+    return PeerResult(
         setup_s=ready - began,
         solve_s=took,
         cpu_s=cpu,

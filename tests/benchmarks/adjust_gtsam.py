@@ -8,11 +8,11 @@ model. Levenberg-Marquardt eliminates in GTSAM's own order.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from tests.benchmarks.adjust_ceres import PeerResult
 from v2hdm.adjust import Problem
 
 try:
@@ -30,20 +30,7 @@ _HELD = 1e-5
 """Sigma of what is held, m and rad: tight constraints leave GTSAM's elimination ill-conditioned."""
 
 
-@dataclass(frozen=True)
-class GtsamResult:
-    """What came of it; times in s, but for ``setup_s`` those of the optimiser."""
-
-    setup_s: float
-    solve_s: float
-    cpu_s: float
-    cost: float
-    steps: int
-    cam_from_vehicle: np.ndarray
-    corners_map: np.ndarray
-
-
-def solve_gtsam(problem: Problem, tolerance: float = 1e-12, max_steps: int = 100) -> GtsamResult:
+def solve_gtsam(problem: Problem, tolerance: float = 1e-12, max_steps: int = 100) -> PeerResult:
     """Levenberg-Marquardt from ``problem``'s extrinsics and its ``corners_start``."""
     assert not ABSENT, ABSENT
     began = time.perf_counter()
@@ -58,7 +45,7 @@ def solve_gtsam(problem: Problem, tolerance: float = 1e-12, max_steps: int = 100
     found = optimiser.optimize()
     took, cpu = time.perf_counter() - ready, time.process_time() - cpu
     cameras = range(len(problem.intrinsic))
-    return GtsamResult(
+    return PeerResult(
         setup_s=ready - began,
         solve_s=took,
         cpu_s=cpu,
