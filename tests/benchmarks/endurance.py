@@ -1,0 +1,149 @@
+"""Whether memory and time an image stay flat over a long life.
+
+``python -m tests.benchmarks.endurance detect DRIVE [--images 20000]`` gives the on-vehicle door a folder in
+which the images of a drive repeat, and watches its process. ``... map DRIVE [--images 800000] [--cameras
+front]`` detects once and then maps, judges, evaluates and writes the drive again and again in one process, as
+a service would. Both print a line now and then: images so far, resident memory, processor time an image. The
+last line has the growth after the first tenth. Time is the processor's, so that a busy machine moves no
+figure.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import itertools
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from v2hdm.caching.room import Room
+from v2hdm.caching.store import Store
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.drive import read_drive
+from v2hdm.mapping.options import MappingOptions
+from v2hdm.pipeline.camera_sets import map_camera_sets
+from v2hdm.pipeline.config import DriveConfig
+from v2hdm.pipeline.detections import detect_in_pieces
+from v2hdm.pipeline.evaluate import evaluate
+from v2hdm.pipeline.inspect import inspect
+from v2hdm.pipeline.keys import Contents
+from v2hdm.pipeline.survey import take_survey
+from v2hdm.pipeline.telling import silent
+from v2hdm.pipeline.viewer import Unwatched
+from v2hdm.pipeline.write import write_results
+from v2hdm.quality import Verdict
+from v2hdm.quality.results.result import check_result
+
+_FIRST = 0.1
+"""Share of the whole after which memory must not grow."""
+
+Sample = tuple[int, float, float]
+"""Images so far, resident memory in MB, processor time in s."""
+
+
+def resident_mb(process: int) -> float:
+    """Resident memory of a process."""
+    for line in Path(f"/proc/{process}/status").read_text().splitlines():
+        if line.startswith("VmRSS:"):
+            return int(line.split()[1]) / 1024
+    raise SystemExit(f"process {process} has ended")
+
+
+def processor_s(process: int) -> float:
+    """Processor time that a process has used."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(") ")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def detecting(drive: Path, images: int, every: int) -> Iterator[Sample]:
+    """Samples of the door's process while it looks at the images of one camera again and again."""
+    files = sorted(next(path.parent for path in drive.rglob("*.jpg")).glob("*.jpg"))
+    with TemporaryDirectory(prefix="endurance-") as scratch:
+        folder = Path(scratch)
+        for i, file in zip(range(images), itertools.cycle(files), strict=False):
+            (folder / f"{i:07}.jpg").symlink_to(file.resolve())
+        command = [sys.executable, "-m", "v2hdm.detect", str(folder)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as door:
+            assert door.stdout is not None
+            for done, _ in enumerate(door.stdout, 1):
+                if done % every == 0 and done < images:
+                    yield done, resident_mb(door.pid), processor_s(door.pid)
+        if door.returncode != 0:
+            raise SystemExit(f"the door ended with {door.returncode}")
+
+
+def mapping(drive: Path, images: int, cameras: tuple[str, ...]) -> Iterator[Sample]:
+    """Samples of this process while it maps one drive again and again, after each round."""
+    read = read_drive(drive, DriveConfig(cameras=cameras))
+    contents, options = Contents.of([read]), MappingOptions()
+    tell = partial(silent, "detect")
+    with TemporaryDirectory(prefix="endurance-") as scratch:
+        kept = Room(Store(Path(scratch) / "cache"))
+        found = detect_in_pieces(read, contents, DetectorOptions(), kept, os.cpu_count() or 1, tell)
+        inspection = inspect(read, 0.5, 1, tell)
+        drive_read, survey = inspection.drive, take_survey(read, options)
+        for done in itertools.count(len(read.images), len(read.images)):
+            sets = map_camera_sets(
+                drive_read, contents.key(drive_read), found, survey, None, Room(None), silent, Unwatched()
+            )
+            methods = {name: one.methods for name, one in sets.items()}
+            verdict = Verdict.of(check_result(drive_read, methods, inspection.ground))
+            judged = evaluate(inspection.drive_as_described, found, methods, options, tell)
+            metrics = {**judged.metrics, "verdict": verdict.as_json()}
+            folder = Path(scratch) / "result"
+            folder.mkdir(exist_ok=True)
+            write_results(folder, inspection.drive_as_described, found, methods, judged, metrics, verdict)
+            del sets, methods, judged
+            gc.collect()
+            yield done, resident_mb(os.getpid()), time.process_time()
+            if done >= images:
+                return
+
+
+def main() -> int:
+    """Run one of the two; 1 where memory has grown by more than a twentieth."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("what", choices=("detect", "map"))
+    parser.add_argument("drive", type=Path)
+    parser.add_argument("--images", type=int)
+    parser.add_argument("--cameras", nargs="*", default=())
+    parsed = parser.parse_args()
+    images = parsed.images or {"detect": 20_000, "map": 800_000}[parsed.what]
+    began = time.perf_counter()
+    seen: list[Sample] = []
+    if parsed.what == "detect":
+        samples = detecting(parsed.drive, images, max(images // 100, 1))
+    else:
+        samples = mapping(parsed.drive, images, tuple(parsed.cameras))
+    for sample in samples:
+        seen.append(sample)
+        done, resident, used_s = sample
+        last = seen[-2] if len(seen) > 1 else (0, 0.0, 0.0)
+        each_ms = 1000 * (used_s - last[2]) / (done - last[0])
+        print(
+            f"{time.perf_counter() - began:8.0f} s  {done:8d} images  {resident:8.1f} MB  "
+            f"{each_ms:6.2f} ms an image",
+            flush=True,
+        )
+    counts, resident_all, used = np.array(seen).T
+    first = int(np.searchsorted(counts, _FIRST * images))
+    growth = resident_all[first:].max() / resident_all[: first + 1].max() - 1
+    rate = np.diff(used) / np.diff(counts)
+    halves = [1000 * float(np.median(half)) for half in np.array_split(rate, 2)]
+    print(
+        f"memory after the first tenth: {100 * growth:+.1f} %; ms an image in the first and the second half: "
+        f"{halves[0]:.2f}, {halves[1]:.2f}"
+    )
+    return int(growth > 0.05)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
