@@ -82,7 +82,7 @@ def detecting(drive: Path, images: int, every: int) -> Iterator[Sample]:
 
 def mapping(drive: Path, images: int, cameras: tuple[str, ...]) -> Iterator[Sample]:
     """Samples of this process while it maps one drive again and again, after each round."""
-    read = read_drive(drive, DriveConfig(cameras=cameras))
+    read = read_drive(drive, DriveConfig(cameras=list(cameras)))
     contents, options = Contents.of([read]), MappingOptions()
     tell = partial(silent, "detect")
     with TemporaryDirectory(prefix="endurance-") as scratch:
