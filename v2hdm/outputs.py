@@ -19,12 +19,10 @@ from pathlib import Path
 
 from v2hdm.errors import ConfigError
 from v2hdm.files import told_of_files, whole_file
+from v2hdm.listing import LIST as MARKER
 from v2hdm.locks import take_lock
 
 _log = logging.getLogger(__name__)
-
-MARKER = ".v2hdm-results.jsonl"
-"""Names our files in a folder: a line of JSON each, after one that says what the list is."""
 
 _HEAD = {"about": "files that v2hdm wrote here; a rerun replaces these and no others"}
 

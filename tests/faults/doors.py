@@ -8,7 +8,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from tests.faults.judge import Case, Outcome, judge
+from tests.faults.forked import Forked
+from tests.faults.judge import Case, Outcome, Prepare, judge
 from tests.pipeline.test_run import short_port
 from tests.precalibration.site import INFO, clicked, write_table
 from v2hdm.caching.leases import STAGES
@@ -92,7 +93,7 @@ class Doors:
             folder = self._made.with_name("making")
             shutil.rmtree(folder, ignore_errors=True)
             case = Case("map", "v2hdm.map", map_arguments(self.drive), lambda root: None, "")
-            outcome = judge(case, folder)
+            outcome = judge(case, folder, Forked(folder))
             assert outcome.code in (0, 3), outcome.error
             (folder / HERE).replace(self._made)
         return self._made
@@ -101,36 +102,37 @@ class Doors:
         """Every door that writes."""
         return [*self._maps(), *self._of_drives(), *self._of_results(), *self._of_files()]
 
-    def _given(self, *names: str) -> _Given:
+    def given(self, *names: str) -> Prepare:
+        """Copies folders of :meth:`mapped`."""
         return _Given(self.mapped(), names)
 
     def _maps(self) -> Iterator[Situation]:
-        done = self._given("cache", "out/run")
+        done = self.given("cache", "out/run")
         arguments = map_arguments(self.drive, "all_maps=true", f"export=[{_FORMATS}]")
         yield Situation(Case("map again, all files", "v2hdm.map", arguments, done, ""))
         yield Situation(
             Case("map with a mosaic", "v2hdm.map", (*map_arguments(self.drive), "mosaic=true"), done, "")
         )
-        yield Situation(Case("map", "v2hdm.map", map_arguments(self.drive), self._given(), ""))
+        yield Situation(Case("map", "v2hdm.map", map_arguments(self.drive), self.given(), ""))
         update = (*map_arguments(self.drive), "map.base=base/out/run", "name=update")
         given = _Given(self.mapped(), ("cache", "out/run"), ("out/run", "base/out/run"))
         yield Situation(Case("update", "v2hdm.map", update, given, ""))
 
     def _of_drives(self) -> Iterator[Situation]:
         common = (str(self.drive), "--workers", "1", "--output", "out")
-        yield Situation(Case("check", "v2hdm.check", common, self._given(), ""))
-        yield Situation(Case("extrinsic", "v2hdm.extrinsic", common, self._given(), ""))
+        yield Situation(Case("check", "v2hdm.check", common, self.given(), ""))
+        yield Situation(Case("extrinsic", "v2hdm.extrinsic", common, self.given(), ""))
         localised = ("out/run", str(self.drive), "--workers", "1", "--output", "where")
-        yield Situation(Case("localize", "v2hdm.localize", localised, self._given("out/run"), ""))
+        yield Situation(Case("localize", "v2hdm.localize", localised, self.given("out/run"), ""))
         port = f"+ports={{small: {{drive: {{path: {self.drive}}}}}}}"
         only = ("~run@ports.port1", "~run@ports.port2", "recipes=[ours]")
         experiment = (port, *only, "workers=1", "output=out", "cache=cache")
         yield Situation(
-            Case("experiment", "v2hdm.experiment.__main__", experiment, self._given("cache"), ""), grows=True
+            Case("experiment", "v2hdm.experiment.__main__", experiment, self.given("cache"), ""), grows=True
         )
 
     def _of_results(self) -> Iterator[Situation]:
-        done = self._given("out/run")
+        done = self.given("out/run")
         yield Situation(Case("mosaic", "v2hdm.mosaic", ("out/run",), done, ""), grows=True)
         yield Situation(Case("report", "v2hdm.report.__main__", ("out/run",), done, ""), grows=True)
         formats = [word for name in _FORMATS.split(",") for word in ("--format", name)]
@@ -143,7 +145,7 @@ class Doors:
 
     def _of_files(self) -> Iterator[Situation]:
         detect = ("images", "--limit", "3", "--output", "found.jsonl", "--draw", "drawn")
-        yield Situation(Case("detect", "v2hdm.detect", detect, self._images, ""), grows=True)
+        yield Situation(Case("detect", "v2hdm.detect", detect, self.images, ""), grows=True)
         calibrate = ("points.csv", "--intrinsics", "camera_info.yaml", "--output", "out")
         yield Situation(Case("calibrate", "v2hdm.calibrate", calibrate, _points, ""))
         tiny = ("net.widths=[16,16,16,16]", "net.dilations=[1]", "net.separable=true", "net.wide_kinds=false")
@@ -159,7 +161,8 @@ class Doors:
         train = (*tiny, *(f"data.{one}" for one in data), *rest)
         yield Situation(Case("train", "train.__main__", train, lambda root: None, ""), grows=True)
 
-    def _images(self, root: Path) -> None:
+    def images(self, root: Path) -> None:
+        """Makes a folder of three images."""
         (root / "images").mkdir()
         for path in sorted(self.drive.rglob("*.jpg"))[:3]:
             shutil.copy(path, root / "images")
@@ -196,7 +199,7 @@ class Expected:
     def of(cls, situation: Situation, first: Outcome, second: Outcome) -> Expected:
         """As two runs show."""
         assert first.code in (0, 3), (situation.name, first.code, first.error)
-        assert first.code == second.code, situation.name
+        assert first.code == second.code, (situation.name, second.code, second.error)
         files = _without(situation, first.after)
         loose = {name for name, digest in files.items() if second.after.get(name) != digest}
         return cls(first.code, files, frozenset(loose))
@@ -253,7 +256,7 @@ def cache_defects(cache: Path) -> list[str]:
 
 
 def _without(situation: Situation, state: dict[str, str]) -> dict[str, str]:
-    """A state without the cache; where files come one by one without their list, too, which is any order's."""
+    """A state without the cache; where files come one by one without their list, too."""
     cache = f"{HERE}{situation.cache}"
     return {
         name: one
