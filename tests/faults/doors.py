@@ -12,6 +12,7 @@ from tests.faults.forked import Forked
 from tests.faults.judge import Case, Outcome, Prepare, judge
 from tests.pipeline.test_run import short_port
 from tests.precalibration.site import INFO, clicked, write_table
+from v2hdm.caching.keys import code_key
 from v2hdm.caching.leases import STAGES
 from v2hdm.caching.pruning import LEFT, items_of, remove_damaged
 from v2hdm.drive.camera_info import write_camera_info
@@ -83,7 +84,8 @@ class Doors:
 
     def __init__(self, scratch: Path) -> None:
         self.drive = small_drive(scratch)
-        self._made = scratch / "made"
+        # Of other code, nothing in its cache would be taken.
+        self._made = scratch / f"made-{code_key()[:12]}"
 
     def mapped(self) -> Path:
         """A folder with the result of the mapping door, ``out/run``, and its cache."""

@@ -65,6 +65,7 @@ def main() -> int:
             counted[row.end] += 1
             if row.end == "DEFECT" or parsed.verbose:
                 print(f"{row.end:6} {row.name}\n       {row.said}", flush=True)
+        print(f"{kind}: {dict(counted)}, {time.perf_counter() - begun_s:.0f} s so far", flush=True)
     print(f"\n{'kind':10} {'cases':>6} {'right':>6} {'told':>6} {'defects':>8}")
     for kind, counted in counts.items():
         print(f"{kind:10} {counted.total():6} {counted['right']:6} {counted['told']:6} {counted['DEFECT']:8}")
