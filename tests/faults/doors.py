@@ -78,12 +78,15 @@ def map_arguments(drive: Path | str, *more: str) -> tuple[str, ...]:
 class Doors:
     """The situations.
 
+    ``drive`` is what most of them are given, ``whole_drive`` has all images of both cameras.
+
     Args:
         scratch: folder that keeps the drive and what was made of it.
     """
 
     def __init__(self, scratch: Path) -> None:
         self.drive = small_drive(scratch)
+        self.whole_drive = scratch / "rendered"
         # Of other code, nothing in its cache would be taken.
         self._made = scratch / f"made-{code_key()[:12]}"
 
@@ -148,8 +151,7 @@ class Doors:
     def _of_files(self) -> Iterator[Situation]:
         detect = ("images", "--limit", "3", "--output", "found.jsonl", "--draw", "drawn")
         yield Situation(Case("detect", "v2hdm.detect", detect, self.images, ""), grows=True)
-        calibrate = ("points.csv", "--intrinsics", "camera_info.yaml", "--output", "out")
-        yield Situation(Case("calibrate", "v2hdm.calibrate", calibrate, _points, ""))
+        yield calibrating()
         tiny = ("net.widths=[16,16,16,16]", "net.dilations=[1]", "net.separable=true", "net.wide_kinds=false")
         data = (
             "width=64",
@@ -182,6 +184,12 @@ class _Given:
         pairs = [(name, name) for name in self.names] + ([self.moved] if self.moved else [])
         for source, target in pairs:
             shutil.copytree(self.made / source, root / target)
+
+
+def calibrating() -> Situation:
+    """The door to a pre-calibration."""
+    words = ("points.csv", "--intrinsics", "camera_info.yaml", "--output", "out")
+    return Situation(Case("calibrate", "v2hdm.calibrate", words, _points, ""))
 
 
 def _points(root: Path) -> None:

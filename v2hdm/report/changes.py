@@ -42,7 +42,9 @@ def save_changes(path: Path, changes: Changes, hd_map: HdMap, route_map: FloatAr
             whole, close = np.asarray(fig.subfigures(1, 2, width_ratios=[site_in, detail_in])).tolist()
             rows = -(-len(moved) // columns)
             axes = close.subplots(rows, columns, squeeze=False).ravel()
-            close.suptitle("The largest moves by id: dashed before, solid now; east and north (m)", fontsize=9)
+            close.suptitle(
+                "The largest moves by id: dashed before, solid now; east and north (m)", fontsize=9
+            )
             for place, one in zip(axes, moved, strict=False):
                 _close_up(place, one, changes, hd_map)
             for place in axes[len(moved) :]:

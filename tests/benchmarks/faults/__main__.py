@@ -4,11 +4,15 @@
 
 - ``calls``: every call of a door that writes fails once, with ENOSPC from then on or EIO that once;
 - ``full``: disks of just so many bytes, from nothing to more than enough; ``readonly``: disks that may only
-  be read, all of them or that of the cache alone (both need root, for a disk in memory).
+  be read, all of them or that of the cache alone (both need root, for a disk in memory);
+- ``texts``, ``images``, ``networks``, ``caches``, ``results``: files of a drive, the detector's network,
+  entries of the cache and earlier results, of which a bit was flipped, the end cut off or a sector zeroed;
+- ``frames``: images frozen, exchanged, dropped, doubled or mixed up, and drop-outs of RTK.
 
-A door must end in what it makes where nothing fails, or in one line of error with nothing half written and no
-file touched that is not its own; afterwards, on a good disk, it must work. The exit code is 1 if any did not.
-Doors are forked from a process that has loaded everything.
+On a bad disk a door must end in what it makes on a good one, or in one line of error with nothing half
+written and no file touched that is not its own; afterwards, on a good disk, it must work. Of damaged files
+and frames it must make a map that is as good as that of whole ones, or tell. The exit code is 1 if any did
+not. Doors are forked from a process that has loaded everything.
 """
 
 from __future__ import annotations
@@ -28,6 +32,7 @@ from tests.benchmarks.faults.files import (
     damaged_networks,
     damaged_results,
     damaged_texts,
+    faulty_frames,
 )
 from tests.benchmarks.faults.running import Kind, Order
 from tests.faults.doors import Doors
@@ -41,6 +46,7 @@ KINDS: dict[str, Kind] = {
     "networks": damaged_networks,
     "caches": damaged_caches,
     "results": damaged_results,
+    "frames": faulty_frames,
 }
 
 

@@ -10,7 +10,9 @@ from pathlib import Path
 
 from tests.benchmarks.faults.disks import expected_of
 from tests.benchmarks.faults.running import Order, Row, folder_in, in_fork, row_of
+from tests.benchmarks.wrong.cameras import camera_faults
 from tests.benchmarks.wrong.fault import Fault, copy_of
+from tests.benchmarks.wrong.frames import frame_faults
 from tests.benchmarks.wrong_inputs import Outcome as Mapped
 from tests.benchmarks.wrong_inputs import judge as judge_map
 from tests.benchmarks.wrong_inputs import map_drive
@@ -47,22 +49,36 @@ def damaged_images(order: Order) -> Iterator[Row]:
         yield from _maps(order, "image of a drive", spoil)
 
 
+def faulty_frames(order: Order) -> Iterator[Row]:
+    """Images that are frozen, exchanged, dropped, doubled or mixed up, and drop-outs of RTK."""
+    good = order.doors.whole_drive
+    clean = _mapped(order, good, lambda folder: None)
+    known = [one for one in camera_faults() if re.search("frozen|swapped|twice|off by one|missing", one.name)]
+    for fault in [*known, *frame_faults()]:
+        if re.search(order.only, fault.name):
+            yield _row(fault.name, _mapped(order, good, fault.spoil), clean)
+
+
 def _maps(order: Order, name: str, spoil: Callable[[Path], str]) -> Iterator[Row]:
-    clean = _mapped(order, lambda folder: None)
+    good = order.doors.drive
+    clean = _mapped(order, good, lambda folder: None)
     for _ in range(order.each):
         how: list[str] = []
-        found = _mapped(order, lambda folder, how=how: how.append(spoil(folder)))
-        row = judge_map(name, Fault(name, None), found, clean)
-        crashed = found.status == "CRASHED"
-        end = "DEFECT" if row.silently_wrong or crashed else "right" if row.right else "told"
-        first = found.message or "; ".join(f"{one['check']}: {one['says']}" for one in found.findings[:1])
-        error = f"{100 * found.rmse_m:.1f} cm, {found.false} false of {found.markings}, {found.status}"
-        yield Row(f"{name}: {how[0]}", end, f"{error}: {first}"[:300])
+        found = _mapped(order, good, lambda folder, how=how: how.append(spoil(folder)))
+        yield _row(f"{name}: {how[0]}", found, clean)
 
 
-def _mapped(order: Order, spoil: Callable[[Path], object]) -> Mapped:
-    """The drive spoilt and mapped in a fork of this process."""
-    good = order.doors.drive
+def _row(name: str, found: Mapped, clean: Mapped) -> Row:
+    row = judge_map(name, Fault(name, None), found, clean)
+    crashed = found.status == "CRASHED"
+    end = "DEFECT" if row.silently_wrong or crashed else "right" if row.right else "told"
+    first = found.message or "; ".join(f"{one['check']}: {one['says']}" for one in found.findings[:1])
+    error = f"{100 * found.rmse_m:.1f} cm, {found.false} false of {found.markings}, {found.status}"
+    return Row(name, end, f"{error}: {first}"[:300])
+
+
+def _mapped(order: Order, good: Path, spoil: Callable[[Path], object]) -> Mapped:
+    """A drive spoilt and mapped in a fork of this process."""
     with folder_in(order.scratch) as folder:
         drive = copy_of(good, folder / "drive")
         spoil(drive)

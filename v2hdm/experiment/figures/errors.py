@@ -205,7 +205,7 @@ def save_balance(path: Path, measured: Sequence[Measured]) -> str | None:
             axes.set_ylabel("bias (cm)")
         for axes in panels[-1]:
             axes.set_xlabel("spread of the corner errors (cm)")
-        _equal_errors(panels.ravel())
+        _equal_errors(list(panels.flat))
         handles = [
             Line2D([], [], label=name, **_sign(name))
             for name in shown if any(name in rows for one in measured for rows in one.rows.values())

@@ -117,9 +117,9 @@ def _names(
 ) -> Names:
     names = Names(np.zeros(count, dtype=np.int64), np.tile(np.arange(4), (count, 1)))
     for k, one in fresh.items():
-        names.id[k] = one.id
+        names.id[k] = one.id or 0
     for pair in decision.pairs:
-        names.id[pair.new] = by_old[pair.old].id
+        names.id[pair.new] = by_old[pair.old].id or 0
         names.corner[pair.new] = np.argsort(SHIFTS[pair.turn])
     return names
 
