@@ -70,7 +70,9 @@ def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> I
         middle, size_m = ground.mean(axis=0), float(np.ptp(ground, axis=0).max())
         polygon = (ground - middle).astype(np.float32)
         for group in known[np.linalg.norm(centre[known] - middle, axis=1) < size_m]:
-            inside = [cv2.pointPolygonTest(polygon, at, False) >= 0 for at in (points[group] - middle).tolist()]
+            inside = [
+                cv2.pointPolygonTest(polygon, at, False) >= 0 for at in (points[group] - middle).tolist()
+            ]
             count[group] += 2 * sum(inside) > len(inside)
     return count
 
