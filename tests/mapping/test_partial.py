@@ -204,7 +204,7 @@ def with_a_stop_line(markings: list[Marking]) -> list[Marking]:
 
 
 def crossed(seen: MarkingDetection, is_left: bool) -> MarkingDetection:
-    """The half of a stop line that lies on one side of an arrow, which all images see end where that begins."""
+    """The half of a stop line that lies on one side of an arrow, which ends where that begins."""
     corners = seen.corners_px.astype(np.float32)
     # Seen anticlockwise from above, whichever corner comes first; only the nearer or farther end is left.
     sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)

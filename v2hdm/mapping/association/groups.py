@@ -88,7 +88,8 @@ def known_elsewhere(association: Association, point: BoolArray, informs: BoolArr
 
     Args:
         association: the groups.
-        point, informs: corners (S, 4), in the sightings' own order, that are points, or that say anything.
+        point: corners (S, 4), in the sightings' own order, that are points.
+        informs: those that say anything.
     """
     grouped = (association.group >= 0)[:, None]
     number = 4 * association.group[:, None] + np.arange(4)
