@@ -25,7 +25,6 @@ from omegaconf import OmegaConf
 
 from tests.benchmarks.wrong.cameras import camera_faults
 from tests.benchmarks.wrong.fault import Fault, copy_of
-from tests.benchmarks.wrong.frames import frame_faults
 from tests.benchmarks.wrong.poses import poses_faults
 from v2hdm import config as hydra_config
 from v2hdm.errors import V2hdmError
@@ -171,7 +170,7 @@ def _start_worker() -> None:
 
 
 def _faults() -> list[Fault]:
-    return [clean_fault(), *poses_faults(), *camera_faults(), *frame_faults()]
+    return [clean_fault(), *poses_faults(), *camera_faults()]
 
 
 def _work(job: _Job) -> Outcome:
