@@ -51,21 +51,23 @@ class Situation:
         return self.case.name
 
 
-def small_drive(scratch: Path) -> Path:
-    """A drive with one camera and few images, rendered where it is not there yet."""
-    rendered, folder = scratch / "rendered", scratch / "drive"
+def small_drive(scratch: Path, cameras: Sequence[str] = ("front",), images: int = IMAGES) -> Path:
+    """A drive with so many images of each camera, rendered where it is not there yet."""
+    rendered, folder = scratch / "rendered", scratch / f"drive-{'-'.join(cameras)}-{images}"
     if not (rendered / "drive.yaml").is_file():
         render_drive(short_port(), rendered, 1, lambda done, total: None)
     if not (folder / "drive.yaml").is_file():
         shutil.rmtree(folder, ignore_errors=True)
-        shutil.copytree(rendered, folder, ignore=shutil.ignore_patterns("rear", "drive.yaml"))
-        stamp_s, names = read_image_list(folder / "front" / "images.txt")
-        write_image_list(stamp_s[:IMAGES], names[:IMAGES], folder / "front" / "images.txt")
-        for name in names[IMAGES:]:
-            (folder / "front" / "images" / name).unlink(missing_ok=True)
-            (folder / "front" / name).unlink(missing_ok=True)
+        shutil.copytree(rendered, folder, ignore=shutil.ignore_patterns("front", "rear", "drive.yaml"))
+        for camera in cameras:
+            (folder / camera / "images").mkdir(parents=True)
+            shutil.copy(rendered / camera / "camera_info.yaml", folder / camera)
+            stamp_s, names = read_image_list(rendered / camera / "images.txt")
+            write_image_list(stamp_s[:images], names[:images], folder / camera / "images.txt")
+            for path in sorted((rendered / camera / "images").iterdir())[:images]:
+                shutil.copy(path, folder / camera / "images")
         content = load_yaml(rendered / "drive.yaml", DriveError)
-        del content["cameras"]["rear"]
+        content["cameras"] = {name: content["cameras"][name] for name in cameras}
         replace_text(folder / "drive.yaml", dump_yaml(content))
     return folder
 
@@ -79,7 +81,7 @@ def map_arguments(drive: Path | str, *more: str) -> tuple[str, ...]:
 class Doors:
     """The situations.
 
-    ``drive`` is what most of them are given, ``whole_drive`` has all images of both cameras.
+    ``drive`` is what most of them are given, ``longer_drive`` has two cameras.
 
     Args:
         scratch: folder that keeps the drive and what was made of it.
@@ -87,7 +89,7 @@ class Doors:
 
     def __init__(self, scratch: Path) -> None:
         self.drive = small_drive(scratch)
-        self.whole_drive = scratch / "rendered"
+        self.longer_drive = small_drive(scratch, ("front", "rear"), 30)
         # Of other code, nothing in its cache would be taken.
         self._made = scratch / f"made-{code_key()[:12]}"
 

@@ -51,7 +51,7 @@ def damaged_images(order: Order) -> Iterator[Row]:
 
 def faulty_frames(order: Order) -> Iterator[Row]:
     """Images that are frozen, exchanged, dropped, doubled or mixed up, and drop-outs of RTK."""
-    good = order.doors.whole_drive
+    good = order.doors.longer_drive
     clean = _mapped(order, good, lambda folder: None)
     known = [one for one in camera_faults() if re.search("frozen|swapped|twice|off by one|missing", one.name)]
     for fault in [*known, *frame_faults()]:
@@ -90,7 +90,8 @@ def _mapped(order: Order, good: Path, spoil: Callable[[Path], object]) -> Mapped
         return in_fork(work) or Mapped("CRASHED", "the process died, or did not end")
 
 
-_LONGEST_S = 120
+_LONGEST_S = 600
+"""Numba may have to compile within it."""
 
 
 def damaged_networks(order: Order) -> Iterator[Row]:
