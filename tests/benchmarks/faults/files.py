@@ -6,6 +6,7 @@ import re
 import shutil
 import signal
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from tests.benchmarks.faults.disks import expected_of
@@ -17,7 +18,7 @@ from tests.benchmarks.wrong_inputs import Outcome as Mapped
 from tests.benchmarks.wrong_inputs import judge as judge_map
 from tests.benchmarks.wrong_inputs import map_drive
 from tests.faults.damage import damage
-from tests.faults.doors import HERE, Situation, cache_defects, map_arguments
+from tests.faults.doors import HERE, Expected, Situation, cache_defects, map_arguments
 from tests.faults.forked import Forked
 from tests.faults.judge import Case, Outcome, judge
 from v2hdm.detection.weights import NETWORK_FILE
@@ -142,20 +143,22 @@ def _told(order: Order, situation: Situation, files: str) -> Iterator[Row]:
         def prepare(root: Path, how: list[str] = how) -> None:
             situation.case.prepare(root)
             path = _any(order, sorted(path for path in root.glob(files) if path.is_file()))
-            how.append(f"{path.relative_to(root)}: {damage(path, order.rng)}")
+            how[:] = [path.relative_to(root).as_posix(), damage(path, order.rng)]
 
         with folder_in(order.scratch) as folder:
             case = situation.case
             spoilt = Case(case.name, case.door, case.arguments, prepare, "")
             outcome = judge(spoilt, folder, Forked(folder))
             defects = cache_defects(folder / HERE / situation.cache)
-        defects += _defects(situation, expected, outcome)
-        row = row_of(f"{situation.name}: {how[0]}", outcome, defects)
+        # What was damaged and is not read is damaged afterwards, too.
+        spoilt_too = replace(expected, loose=expected.loose | {HERE + how[0]})
+        defects += _defects(situation, spoilt_too, outcome)
+        row = row_of(f"{situation.name}: {': '.join(how)}", outcome, defects)
         is_told = row.end == "right" and re.search(_TELLS, f"{outcome.error}\n{outcome.output}", re.MULTILINE)
         yield Row(row.name, "told" if is_told else row.end, row.said)
 
 
-def _defects(situation: Situation, expected, outcome: Outcome) -> list[str]:  # type: ignore[no-untyped-def]
+def _defects(situation: Situation, expected: Expected, outcome: Outcome) -> list[str]:
     says = re.search(_TELLS, f"{outcome.error}\n{outcome.output}", re.MULTILINE)
     if outcome.code == 2 or not says or "Traceback" in outcome.error:
         return expected.defects(situation, outcome)
