@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from v2hdm.fleet.cluster import LOCAL, cluster
-from v2hdm.fleet.plan import Job, plan
+from v2hdm.fleet.plan import Job, plan, plan_site
 from v2hdm.fleet.rows import Row, as_csv, as_json
 from v2hdm.outputs import GrowingFolder, growing_folder
 
@@ -29,13 +29,15 @@ class FleetOptions:
     """What a user chooses beside the drives.
 
     ``workers`` are the cores that are used on this machine, 0 for all; ``address`` is that of a cluster.
-    ``folder`` takes the table; ``again`` does what is finished again.
+    ``folder`` takes the table; ``again`` does what is finished again. ``site`` names the one that all drives
+    are of; without a name each is mapped by itself.
     """
 
     folder: Path
     workers: int = 0
     address: str = LOCAL
     again: bool = False
+    site: str | None = None
 
 
 def run_fleet(
@@ -50,33 +52,34 @@ def run_fleet(
         tell: told how far it is.
 
     Returns:
-        A row for each file, in their order.
+        A row for each file, in their order; one for a site.
 
     Raises:
         V2hdmError: the table cannot be written, or there is no Ray.
     """
-    jobs, refused = plan(files, [*overrides, "resume=false"] if options.again else overrides)
+    told = [*overrides, "resume=false"] if options.again else overrides
+    todo = plan(files, told) if options.site is None else plan_site(files, told, options.site)
     with growing_folder(options.folder, "--table") as folder:
-        table = _Table(folder, files, tell)
-        for row in refused:
+        table = _Table(folder, todo.sources, tell)
+        for row in todo.refused:
             table.add(row)
-        if jobs:
+        if todo.jobs:
             with cluster(options.address, options.workers) as ray:
-                _map_all(ray, jobs, table, tell)
+                _map_all(ray, todo.jobs, table, tell)
         return table.rows
 
 
 class _Table:
     """The rows so far, on disk as well."""
 
-    def __init__(self, folder: GrowingFolder, files: Sequence[Path], tell: Tell) -> None:
-        self._folder, self._files, self._tell = folder, [str(file) for file in files], tell
+    def __init__(self, folder: GrowingFolder, sources: Sequence[str], tell: Tell) -> None:
+        self._folder, self._sources, self._tell = folder, sources, tell
         self._rows: dict[str, Row] = {}
 
     @property
     def rows(self) -> list[Row]:
-        """In the order of the files."""
-        return [self._rows[file] for file in self._files if file in self._rows]
+        """In the order of the sources."""
+        return [self._rows[one] for one in self._sources if one in self._rows]
 
     def add(self, row: Row, trace: str = "") -> None:
         """Take the row of a drive, and the traceback of a bug where there is one."""
@@ -86,7 +89,7 @@ class _Table:
         self._folder.write("fleet.csv", as_csv(self.rows))
         self._folder.write("fleet.json", as_json(self.rows))
         self._tell(row.drive, row.status, 1, 1)
-        self._tell(ALL, "drives", len(self._rows), len(self._files))
+        self._tell(ALL, "drives", len(self._rows), len(self._sources))
 
 
 def _map_all(ray: Any, todo: Sequence[Job], table: _Table, tell: Tell) -> None:
