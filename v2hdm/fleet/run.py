@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from v2hdm.fleet.cluster import LOCAL, cluster
+from v2hdm.fleet.cluster import LOCAL, RETRIES, cluster
 from v2hdm.fleet.plan import Job, plan, plan_site
 from v2hdm.fleet.rows import Row, as_csv, as_json
 from v2hdm.outputs import GrowingFolder, growing_folder
@@ -17,9 +17,6 @@ Tell = Callable[[str, str, int, int], None]
 
 ALL = "fleet"
 """In place of a drive's name, for what is told of the fleet."""
-
-_RETRIES = 3
-"""How often work is begun anew whose worker died."""
 
 _LOOK_EVERY_S = 0.3
 
@@ -101,7 +98,7 @@ def _map_all(ray: Any, todo: Sequence[Job], table: _Table, tell: Tell) -> None:
     cores = max(int(ray.cluster_resources().get("CPU", 1)), 1)
     here = str(Path.cwd())
     # A core has one actor that detects and one drive that is mapped: the one waits for the other by turns.
-    half = {"num_cpus": 0.5, "max_restarts": -1, "max_task_retries": _RETRIES}
+    half = {"num_cpus": 0.5, "max_restarts": -1, "max_task_retries": RETRIES}
     eyes = [ray.remote(Eyes).options(**half).remote(here) for _ in range(cores)]
     board = ray.remote(Board).options(num_cpus=0, max_restarts=-1).remote()
     left = list(todo)[::-1]
@@ -110,7 +107,7 @@ def _map_all(ray: Any, todo: Sequence[Job], table: _Table, tell: Tell) -> None:
         while left and len(doing) < cores:
             job = left.pop()
             gpus = 1 if job.config.device == "cuda" else 0
-            mapping = ray.remote(map_drive).options(num_cpus=0.5, num_gpus=gpus, max_retries=_RETRIES)
+            mapping = ray.remote(map_drive).options(num_cpus=0.5, num_gpus=gpus, max_retries=RETRIES)
             doing[mapping.remote(job, eyes, board, here)] = job
         done, _ = ray.wait(list(doing), num_returns=1, timeout=_LOOK_EVERY_S)
         for message in _told(ray, board):
@@ -133,7 +130,7 @@ def _outcome(ray: Any, reference: Any, job: Job) -> tuple[Row, str]:
     except ray.exceptions.RayError as error:
         # What map_drive raises is a row already: this is its process, again and again.
         line = (
-            f"its worker process died {_RETRIES + 1} times ({type(error).__name__}), perhaps for want of "
+            f"its worker process died {RETRIES + 1} times ({type(error).__name__}), perhaps for want of "
             "memory; set fewer --workers"
         )
         return Row.of_error(job.name, job.source, line), str(error)
