@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -43,16 +44,19 @@ class ByPost(Alone):
         return Local()
 
 
-@pytest.fixture(scope="module")
-def visits(tmp_path_factory: pytest.TempPathFactory) -> tuple[Drive, list[ImageDetections]]:
-    """Two drives through one yard, joined."""
+def two_visits(root: Path) -> tuple[Drive, list[ImageDetections]]:
+    """Two drives through one yard, joined; ``root`` is where they would lie."""
     options = SceneOptions(length_m=50.0, cameras=("front",), seed=21)
     scenes = [make_scene(options), make_scene(replace(options, seed=22))]
-    root = tmp_path_factory.mktemp("visits")
     drives = [replace(one.drive, name=str(n), root=root / str(n)) for n, one in enumerate(scenes)]
     count = len(drives[0].images)
     later = [replace(one, image=one.image + count) for one in scenes[1].detections]
     return join_drives(drives), [*scenes[0].detections, *later]
+
+
+@pytest.fixture(scope="module")
+def visits(tmp_path_factory: pytest.TempPathFactory) -> tuple[Drive, list[ImageDetections]]:
+    return two_visits(tmp_path_factory.mktemp("visits"))
 
 
 def mapped(visits: tuple[Drive, list[ImageDetections]], how: str, **given: Any) -> dict[str, MethodResult]:

@@ -62,8 +62,7 @@ def _result(reference: Any) -> Any:
         raise failure.cause from failure
     except WorkerCrashedError:
         raise WorkerError(
-            f"a worker process of the site died {RETRIES + 1} times, perhaps for want of memory; set fewer "
-            "--workers"
+            "a worker process of a site died again and again, perhaps for want of memory; set fewer --workers"
         ) from None
     log_again(lines)
     return result

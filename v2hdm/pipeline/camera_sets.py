@@ -85,7 +85,9 @@ def map_camera_sets(
         work = partial(
             _map_set, drive, detections, name, cameras, survey, steps, base if last else None, last, crew
         )
-        jobs.append((room.key(begun, name, cameras, steps, of_last), partial(crew.begin, work)))
+        # A single set is mapped here, where all that it needs is.
+        begin = partial(crew.begin if len(sets) > 1 else ALONE.begin, work)
+        jobs.append((room.key(begun, name, cameras, steps, of_last), begin))
     progress("map", 0, len(sets))
     found = {}
     for name, mapped in zip(sets, room.each_made(STAGE, MappedSet, jobs), strict=True):
