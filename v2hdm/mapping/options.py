@@ -156,8 +156,8 @@ class MappingOptions:
     ``mode`` is ``batch``, or ``incremental``: the drive as the vehicle would map it, marking by marking,
     and in the end solved as ``batch`` does.
     ``adjustment`` is ``together``, or ``parts``: those of the joint solves of several drives are solved each
-    by itself and joined in what they share, which comes to the same map to rounding; ``auto`` takes what is
-    less work.
+    by itself and joined in what they share, which comes to the same map to rounding; ``auto`` takes them
+    where that is clearly less work.
     ``rounds`` counts association under the optimised extrinsic followed by a joint solve.
     ``device`` is the torch device that the joint solves run on, ``cpu`` or ``cuda``.
     """

@@ -85,8 +85,9 @@ def map_camera_sets(
         work = partial(
             _map_set, drive, detections, name, cameras, survey, steps, base if last else None, last, crew
         )
-        # A single set is mapped here, where all that it needs is.
-        begin = partial(crew.begin if len(sets) > 1 else ALONE.begin, work)
+        # A single set is mapped here, where all that it needs is; others, too, where a GPU is.
+        shared_out = len(sets) > 1 and survey.mapping.device == "cpu"
+        begin = partial(crew.begin if shared_out else ALONE.begin, work)
         jobs.append((room.key(begun, name, cameras, steps, of_last), begin))
     progress("map", 0, len(sets))
     found = {}

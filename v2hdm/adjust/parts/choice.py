@@ -1,4 +1,4 @@
-"""In one piece or in parts, whichever takes fewer multiplications.
+"""In one piece, or in parts where that takes clearly fewer multiplications.
 
 In one piece corners are eliminated first, which couples all frames that saw one: where many visits drive the
 same way, tiles of all of them fill up, and cost grows with the cube of their number. In parts shared corners
@@ -25,6 +25,9 @@ from v2hdm.adjust.solve import solve
 
 _log = logging.getLogger(__name__)
 
+_CLEARLY_LESS = 0.5
+"""Share of the multiplications from which parts pay; they are not all that takes time."""
+
 
 def adjust(problem: Problem, options: SolveOptions, how: str, team: Callable[[int], Team]) -> Solution:
     """Solve in one piece or in parts.
@@ -45,7 +48,7 @@ def adjust(problem: Problem, options: SolveOptions, how: str, team: Callable[[in
     if how == "auto":
         parts, together = cost_in_parts(problem, options), cost_together(problem, options)
         _log.debug("multiplications of a whitening: %.1e in parts, %.1e together", parts, together)
-        if together <= parts:
+        if parts > _CLEARLY_LESS * together:
             return solve(problem, options)
     return solve_in_parts(problem, options, team(visits))
 
