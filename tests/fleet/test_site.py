@@ -17,7 +17,6 @@ pytest.importorskip("ray", reason="ray, the extra 'fleet', is not installed")
 from tests.fleet.test_fleet import written
 from tests.mapping.test_crew import two_visits
 from v2hdm import pipeline
-from v2hdm.adjust.parts import Team
 from v2hdm.errors import DriveError, WorkerError
 from v2hdm.fleet.crew import RayCrew
 from v2hdm.fleet.parts import RayTeam
@@ -25,7 +24,7 @@ from v2hdm.fleet.plan import plan_site
 from v2hdm.fleet.rows import Row
 from v2hdm.fleet.run import FleetOptions, run_fleet
 from v2hdm.fleet.work import map_drive
-from v2hdm.mapping.crew import Alone
+from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.simulate import PortConfig, render_drive
@@ -113,7 +112,9 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def test_the_visits_adjusted_by_actors_one_of_which_dies_make_the_same_map(ray: Any, tmp_path: Path) -> None:
+def test_the_visits_adjusted_by_actors_one_of_which_dies_make_the_same_map(
+    ray: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     killed: list[int] = []
 
     class Mortal(RayTeam):
@@ -123,17 +124,14 @@ def test_the_visits_adjusted_by_actors_one_of_which_dies_make_the_same_map(ray: 
                 os.kill(killed[0], signal.SIGKILL)
             return super().ask(question, bases, *arguments)
 
-    class Crew(Alone):
-        def team(self, parts: int) -> Team:
-            return Mortal(parts, 0.0)
-
+    monkeypatch.setattr("v2hdm.fleet.crew.RayTeam", Mortal)
     drive, detections = two_visits(tmp_path)
 
-    def mapped(how: str, crew: Alone) -> Any:
-        options = MappingOptions(adjustment=how, pose_model="heave")
+    def mapped(how: str, crew: Crew) -> Any:
+        options = MappingOptions(adjustment=how, pose_model="heave", rounds=1)
         return run_methods(drive, detections, ("front",), options, crew=crew)["Opt"].hd_map.markings
 
-    parted, whole = mapped("parts", Crew()), mapped("together", Alone())
+    parted, whole = mapped("parts", RayCrew(2, str(Path.cwd()))), mapped("together", ALONE)
     assert killed
     assert [one.kind for one in parted] == [one.kind for one in whole]
     for one, other in zip(parted, whole, strict=True):

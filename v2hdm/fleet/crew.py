@@ -28,6 +28,11 @@ class RayCrew:
     def __init__(self, cores: int, folder: str) -> None:
         """``cores`` are those of the cluster; ``folder`` is where relative paths begin."""
         self._cores, self._folder = cores, folder
+        self._team: RayTeam | None = None
+
+    def __reduce__(self) -> tuple[type[RayCrew], tuple[int, str]]:
+        """A task that it is handed to has a team of its own."""
+        return RayCrew, (self._cores, self._folder)
 
     @property
     def workers(self) -> int:
@@ -42,8 +47,11 @@ class RayCrew:
         return lambda: _result(reference)
 
     def team(self, parts: int) -> Team:
-        """Actors, one a core or a part, that end with whoever has them."""
-        return RayTeam(min(parts, self._cores), 0.0)
+        """Actors, one a core or a part, that work on one problem after the other and end with the crew."""
+        actors = min(parts, self._cores)
+        if self._team is None or len(self._team.actors) < actors:
+            self._team = RayTeam(actors, 0.0)
+        return self._team
 
 
 def _done(work: Callable[[], _Result], level: int, folder: str) -> tuple[_Result, list[Line]]:
