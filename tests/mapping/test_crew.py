@@ -95,7 +95,7 @@ def test_the_visits_adjusted_in_parts_make_the_same_map(
     assert one == pytest.approx(other, abs=SAME_M)
 
 
-def test_a_problem_is_parted_where_that_is_less_work() -> None:
+def test_a_problem_is_parted_where_that_is_less_work(monkeypatch: pytest.MonkeyPatch) -> None:
     options = SolveOptions(coarse=False)
     asked: list[int] = []
 
@@ -115,6 +115,10 @@ def test_a_problem_is_parted_where_that_is_less_work() -> None:
     assert choice.cost_in_parts(chain, options) > choice.cost_together(chain, options)
     choice.adjust(chain, options, "auto", team)
     assert asked == []
+    monkeypatch.setattr(choice, "_WORTH_WORKERS", 2 * choice.cost_in_parts(crowd, options))
+    choice.adjust(crowd, options, "auto", team)
+    assert asked == []
+    monkeypatch.setattr(choice, "_WORTH_WORKERS", 0.0)
     found = choice.adjust(crowd, options, "auto", team)
     assert asked == [6]
     assert found.corners_map == pytest.approx(solve(crowd, options).corners_map, abs=SAME_M)

@@ -16,7 +16,7 @@ import numpy as np
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.parts.solve import solve_in_parts
 from v2hdm.adjust.parts.split import is_shared
-from v2hdm.adjust.parts.team import Team
+from v2hdm.adjust.parts.team import Local, Team
 from v2hdm.adjust.pose_prior import state_components
 from v2hdm.adjust.problem import Problem, SolveOptions
 from v2hdm.adjust.reduced import make_plan
@@ -28,6 +28,9 @@ _log = logging.getLogger(__name__)
 _CLEARLY_LESS = 0.5
 """Share of the multiplications from which parts pay; they are not all that takes time."""
 
+_WORTH_WORKERS = 2e9
+"""Multiplications of a whitening in parts below which this process is done before others have started."""
+
 
 def adjust(problem: Problem, options: SolveOptions, how: str, team: Callable[[int], Team]) -> Solution:
     """Solve in one piece or in parts.
@@ -37,7 +40,7 @@ def adjust(problem: Problem, options: SolveOptions, how: str, team: Callable[[in
         options: how to solve.
         how: ``together``; ``parts``, where there are any; or ``auto``, which looks at the problem alone, so
             that a map does not depend on who made it.
-        team: those who adjust so many parts.
+        team: those who adjust so many parts; under ``auto`` small ones are left to this process.
 
     Raises:
         AdjustError: as :func:`v2hdm.adjust.solve`.
@@ -50,6 +53,8 @@ def adjust(problem: Problem, options: SolveOptions, how: str, team: Callable[[in
         _log.debug("multiplications of a whitening: %.1e in parts, %.1e together", parts, together)
         if parts > _CLEARLY_LESS * together:
             return solve(problem, options)
+        if parts < _WORTH_WORKERS:
+            return solve_in_parts(problem, options, Local())
     return solve_in_parts(problem, options, team(visits))
 
 
