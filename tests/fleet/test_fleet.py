@@ -23,9 +23,9 @@ from v2hdm.detection.batch import detect_all, with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.drive import read_drive
-from v2hdm.errors import DriveError, WorkerError
+from v2hdm.errors import ConfigError, DriveError, WorkerError
 from v2hdm.fleet.eyes import Eyes, detect_by
-from v2hdm.fleet.plan import plan
+from v2hdm.fleet.plan import plan, plan_site
 from v2hdm.fleet.rows import Row, exit_code
 from v2hdm.fleet.run import FleetOptions, run_fleet
 from v2hdm.fleet.work import map_drive
@@ -137,7 +137,7 @@ def test_a_fleet_outlives_its_workers_keeps_what_is_finished_and_goes_on_past_wh
     assert [row["drive"] for row in table] == ["good", "nowhere", "typo"]
     assert json.loads((tmp_path / "table" / "fleet.json").read_text())["drives"][0]["status"] == "PASS"
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["good"]
-    (job,), _ = plan([good], [f"output={tmp_path / 'alone'}", f"cache={tmp_path / 'other'}", "workers=1"])
+    (job,) = plan([good], [f"output={tmp_path / 'alone'}", f"cache={tmp_path / 'other'}", "workers=1"]).jobs
     alone = pipeline.run(job.config, job.config_yaml).folder
     for name in ("map.geojson", "calibration_front.yaml", "residuals.csv", "trajectory.tum"):
         assert (tmp_path / "out" / "good" / name).read_bytes() == (alone / name).read_bytes(), name
@@ -148,9 +148,36 @@ def test_a_fleet_outlives_its_workers_keeps_what_is_finished_and_goes_on_past_wh
 def test_two_run_files_never_write_one_folder(tmp_path: Path, drive: Path) -> None:
     files = [written(tmp_path, "one", drive), tmp_path / "other.yaml"]
     files[1].write_text(files[0].read_text())
-    jobs, refused = plan(files, [])
-    assert [job.name for job in jobs] == ["one"]
-    assert "give one of them another name" in refused[0].says
+    planned = plan(files, [])
+    assert [job.name for job in planned.jobs] == ["one"]
+    assert "give one of them another name" in planned.refused[0].says
+
+
+def test_the_drives_of_run_files_become_one_site(tmp_path: Path) -> None:
+    monday = written(tmp_path, "monday", "drives/monday")
+    week = written(tmp_path, "week", "[drives/tuesday, drives/friday]")
+    planned = plan_site([monday, week], ["output=maps", "mapping.rounds=3"], "port")
+    (job,) = planned.jobs
+    assert job.config.drive.path == ["drives/monday", "drives/tuesday", "drives/friday"]
+    assert (job.name, job.folder, job.config.mapping.rounds) == ("port", Path("maps/port"), 3)
+    assert planned.sources == [f"{monday}, {week}"] == [job.source]
+
+
+def test_files_that_make_no_site_are_one_row_that_says_why(tmp_path: Path) -> None:
+    monday, tuesday = (written(tmp_path, name, name) for name in ("monday", "tuesday"))
+    tuesday.write_text(tuesday.read_text() + "mapping: {max_range_m: 9.0}\n")
+    (row,) = plan_site([monday, tuesday], [], "port").refused
+    assert (row.drive, row.status) == ("port", "ERROR")
+    assert "tuesday.yaml: mapping.max_range_m is 9.0, and 16.0 in" in row.says
+    assert plan_site([monday, tuesday], ["mapping.max_range_m=9.0"], "port").jobs
+    rendered = tmp_path / "rendered.yaml"
+    rendered.write_text("# @package _global_\nname: rendered\nsimulate: {}\n")
+    (row,) = plan_site([rendered, monday], [], "port").refused
+    assert "set drive.path" in row.says
+    (row,) = plan_site([monday, tmp_path / "absent.yaml"], [], "port").refused
+    assert "absent.yaml" in row.says
+    with pytest.raises(ConfigError, match="--site"):
+        plan_site([monday], [], "../port")
 
 
 def test_the_table_has_a_code_for_the_worst_of_its_rows() -> None:

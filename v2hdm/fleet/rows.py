@@ -27,7 +27,7 @@ class Row:
         images, markings, minutes: how large it was, what is on its map, and how long it took.
         kept: whether an earlier result was found that was made of the same.
         folder: of the result, empty without one.
-        source: the run file.
+        source: the run file, or those of a site.
     """
 
     drive: str
@@ -41,12 +41,12 @@ class Row:
     source: str
 
     @classmethod
-    def of_error(cls, drive: str, source: Path, message: str) -> Row:
+    def of_error(cls, drive: str, source: str, message: str) -> Row:
         """The row of a drive that gave no result."""
-        return cls(drive, ERROR, one_line(message), None, None, None, False, "", str(source))
+        return cls(drive, ERROR, one_line(message), None, None, None, False, "", source)
 
     @classmethod
-    def of_result(cls, drive: str, source: Path, folder: Path, metrics: Mapping[str, Any], kept: bool) -> Row:
+    def of_result(cls, drive: str, source: str, folder: Path, metrics: Mapping[str, Any], kept: bool) -> Row:
         """The row of a finished run, from its ``metrics.json``."""
         verdict = metrics["verdict"]
         raised = verdict["findings"]
@@ -56,7 +56,7 @@ class Row:
         minutes = round(sum(metrics.get("seconds", {}).values()) / 60, 3)
         images = int(metrics["drive"]["images"])
         status = str(verdict["status"])
-        where = (str(folder), str(source))
+        where = (str(folder), source)
         return cls(drive, status, one_line(says), images, markings, minutes, kept, *where)
 
 

@@ -43,7 +43,14 @@ def map_drive(job: Job, eyes: Sequence[Any], board: Any, folder: str) -> tuple[R
 
 
 def _mapped(job: Job, store: Store, eyes: Sequence[Any], board: Any) -> RunResult:
-    from v2hdm.pipeline.work import map_drives  # loads torch, which a finished result does not need
+    # They load torch, which a finished result does not need.
+    from v2hdm.fleet.crew import RayCrew
+    from v2hdm.mapping.crew import ALONE, Crew
+    from v2hdm.pipeline.work import map_drives
 
     telling = Telling(board, job.name)
-    return map_drives(job.config, store, job.config_yaml, telling, detect=partial(detect_by, eyes))
+    crew: Crew = ALONE
+    if len(job.config.drive.paths) > 1:
+        crew = RayCrew(len(eyes), str(Path.cwd()))
+    detect = partial(detect_by, eyes)
+    return map_drives(job.config, store, job.config_yaml, telling, detect=detect, crew=crew)
