@@ -20,11 +20,9 @@ from pathlib import Path
 from v2hdm.errors import ConfigError
 from v2hdm.files import whole_file
 from v2hdm.locks import take_lock
+from v2hdm.objects.results import LIST as MARKER
 
 _log = logging.getLogger(__name__)
-
-MARKER = ".v2hdm-results.jsonl"
-"""Names our files in a folder: a line of JSON each, after one that says what the list is."""
 
 _HEAD = {"about": "files that v2hdm wrote here; a rerun replaces these and no others"}
 
@@ -191,6 +189,16 @@ def is_whole(folder: Path, files: Mapping[str, str]) -> bool:
     return bool(files) and all(
         (folder / name).is_file() and _digest(folder / name) == digest for name, digest in files.items()
     )
+
+
+def drop_result(folder: Path) -> None:
+    """Remove our files from a result folder, and the folders that are empty then."""
+    with suppress(OSError, ConfigError):
+        for name in [*files_of_result(folder), MARKER]:
+            (folder / name).unlink(missing_ok=True)
+        below = sorted((one for one in folder.rglob("*") if one.is_dir()), key=lambda one: -len(one.parts))
+        for one in [*below, folder, folder.parent, folder.parent.parent]:
+            one.rmdir()
 
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
