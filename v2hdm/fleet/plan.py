@@ -9,6 +9,7 @@ from pathlib import Path
 from v2hdm.config import compose_run_file, to_dataclass, to_yaml
 from v2hdm.errors import ConfigError, V2hdmError
 from v2hdm.fleet.rows import Row
+from v2hdm.objects.bucket import place_of
 from v2hdm.pipeline import RunConfig
 from v2hdm.pipeline.config import run_name
 from v2hdm.texts import take_name
@@ -30,9 +31,10 @@ class Job:
     config_yaml: str
 
     @property
-    def folder(self) -> Path:
-        """The folder that takes the results."""
-        return Path(self.config.output) / self.name
+    def place(self) -> str:
+        """What takes the results: a folder, or the URL of one."""
+        there = place_of(self.config.output, "output=")
+        return str((there / self.name).resolve() if isinstance(there, Path) else there.below(self.name))
 
 
 def plan(files: Sequence[Path], overrides: Sequence[str]) -> tuple[list[Job], list[Row]]:
@@ -44,14 +46,14 @@ def plan(files: Sequence[Path], overrides: Sequence[str]) -> tuple[list[Job], li
     """
     jobs: list[Job] = []
     refused: list[Row] = []
-    taken: dict[Path, Path] = {}
+    taken: dict[str, Path] = {}
     for file in files:
         try:
             job = _job(file, overrides)
-            place = job.folder.resolve()
+            place = job.place
             if place in taken:
                 raise ConfigError(
-                    f"{file}: its results go to {job.folder}, as those of {taken[place]} do; give one of "
+                    f"{file}: its results go to {place}, as those of {taken[place]} do; give one of "
                     "them another name"
                 )
             taken[place] = file

@@ -14,7 +14,7 @@ import os
 import secrets
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 from v2hdm.errors import ConfigError
@@ -82,8 +82,13 @@ class Lease:
 
 
 @contextmanager
-def held(beside: Bucket, name: str) -> Iterator[Lease]:
+def held(beside: Bucket, name: str, tell: Callable[[int, int], None]) -> Iterator[Lease]:
     """Hold the lease of what is called ``name`` in ``beside``.
+
+    Args:
+        beside: where the leases of several places are.
+        name: of the place.
+        tell: called as ``tell(passed, of)`` with seconds while it listens whether a holder lives.
 
     Raises:
         ConfigError: another process holds it and is alive; the message names it.
@@ -91,7 +96,7 @@ def held(beside: Bucket, name: str) -> Iterator[Lease]:
     shown, objects = f"{beside}/{name}", beside.below(f"{LEASES}/{name}")
     for _ in range(_TRIES):
         numbers = _numbers(objects)
-        if numbers and _is_alive(objects, max(numbers), shown):
+        if numbers and _is_alive(objects, max(numbers), shown, tell):
             continue  # it was given up meanwhile
         number, secret = max(numbers, default=0) + 1, secrets.token_hex(8)
         if not objects.create(str(number), _holder(secret)):
@@ -109,7 +114,7 @@ def held(beside: Bucket, name: str) -> Iterator[Lease]:
     raise ConfigError(f"{shown}: other processes are about to write there; wait for them")
 
 
-def _is_alive(objects: Bucket, number: int, shown: str) -> bool:
+def _is_alive(objects: Bucket, number: int, shown: str, tell: Callable[[int, int], None]) -> bool:
     """False where the holder of a lease has been silent for long, True where it gave the lease up.
 
     Raises:
@@ -118,15 +123,13 @@ def _is_alive(objects: Bucket, number: int, shown: str) -> bool:
     secret, holder = _told(objects, number)
     first = objects.read(_beat_of(secret))
     began_s = time.monotonic()
-    told = False
-    while time.monotonic() - began_s < SILENT_S:
+    _log.info("%s: %s was writing it; listening for %g s whether it lives", shown, holder, SILENT_S)
+    while (passed_s := time.monotonic() - began_s) < SILENT_S:
         if objects.read(str(number)) is None:
             return True
         if objects.read(_beat_of(secret)) != first:
             raise ConfigError(f"{shown} is being written by {holder}; wait for it, or give another place")
-        if not told:
-            told = True
-            _log.info("%s: %s was writing it; listening for %g s whether it lives", shown, holder, SILENT_S)
+        tell(int(passed_s), int(SILENT_S))
         time.sleep(BEAT_S / 5)
     return False
 

@@ -16,10 +16,11 @@ from pathlib import Path
 
 from v2hdm.errors import ConfigError
 from v2hdm.objects.bucket import Bucket, Thing
-from v2hdm.objects.lease import Lease, held
+from v2hdm.objects.lease import LEASES, Lease, held
 
 LIST = ".v2hdm-results.jsonl"
 UNFINISHED = ".v2hdm-unfinished.jsonl"
+_ITSELF = "here"
 _ABOUT = {"about": "objects that v2hdm wrote here; a rerun replaces these and no others"}
 
 
@@ -163,16 +164,15 @@ class GrowingObjects:
 
 
 @contextmanager
-def growing_objects(beside: Bucket, name: str) -> Iterator[GrowingObjects]:
-    """The place ``name`` in ``beside`` to write single objects to.
+def growing_objects(objects: Bucket, tell: Callable[[int, int], None]) -> Iterator[GrowingObjects]:
+    """A place to write single objects to; ``tell`` is that of :func:`v2hdm.objects.lease.held`.
 
     Raises:
         ConfigError: it holds something that is not ours, another process is writing it, or the store failed.
     """
-    objects = beside.below(name)
-    with held(beside, name) as lease:
+    with held(objects, _ITSELF, tell) as lease:
         listing = objects.read(LIST)
-        if listing is None and objects.listed():
+        if listing is None and any(not name.startswith(LEASES) for name in objects.listed()):
             raise ConfigError(f"{objects} holds objects that are no results of ours: give another place")
         known: dict[str, list[str]] = {}
         for one in ResultObjects(objects)._entries(LIST, listing or b""):

@@ -99,7 +99,7 @@ def _put(
     if there is not None:
         _log.info(NOTHING_CHANGED, url)
         return replace(there, url=url), True
-    with held(output, name) as lease:
+    with held(output, name, partial(progress, "listen")) as lease:
         result.ours()  # what is not ours is told before any work
         place = Path(config.cache) / _UPLOADS / key_of(output.url)[:16]
         local = replace(config, output=str(place))

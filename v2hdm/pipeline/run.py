@@ -31,7 +31,10 @@ def run(
 
     def work(config: RunConfig, store: Store) -> RunResult:
         # Loads torch and much else, which takes seconds.
+        from v2hdm.detection.network import check_device
         from v2hdm.pipeline.work import map_drives
+
+        check_device(config.detector.device)
 
         return map_drives(config, store, config_yaml, progress, viewer)
 
