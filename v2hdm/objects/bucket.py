@@ -183,7 +183,7 @@ class Bucket:
     def remove(self, name: str) -> None:
         """Remove an object, if it is there."""
         try:
-            self._call(name, lambda: self._files.rm_file(f"{self._root}/{name}"))
+            self._call(name, lambda: self._rm(f"{self._root}/{name}"))
         except FileNotFoundError:
             return
 
@@ -193,6 +193,12 @@ class Bucket:
             self._files.pipe_file(path, content, mode=mode)
         else:
             self._files.put_file(str(content), path, mode=mode)
+
+    def _rm(self, path: str) -> None:
+        try:
+            self._files.rm_file(path)
+        except KeyError:  # of the store in memory
+            raise FileNotFoundError(path) from None
 
     def _find(self) -> dict[str, Any]:
         self._files.invalidate_cache()

@@ -1,6 +1,6 @@
 """One writer at a time at a place of a store, which has no locks that a death releases.
 
-Who writes holds a lease: an object that can be created once, ``<number>`` below the place's own prefix, and
+Who writes holds a lease: an object that can be created once, called by a number, and
 beside it a beat that it changes every few seconds. Who finds a lease watches its beat: where it changes, the
 holder is alive and the place is refused; where it has been silent for long, by the watcher's own clock, the
 next number is created, which only one can. The highest number holds.
@@ -23,7 +23,7 @@ from v2hdm.objects.bucket import Bucket
 _log = logging.getLogger(__name__)
 
 LEASES = ".v2hdm-leases"
-"""Prefix of the leases beside the places that they are of."""
+"""Prefix of leases."""
 
 BEAT_S = 10.0
 """Between two beats."""
@@ -82,18 +82,18 @@ class Lease:
 
 
 @contextmanager
-def held(beside: Bucket, name: str, tell: Callable[[int, int], None]) -> Iterator[Lease]:
-    """Hold the lease of what is called ``name`` in ``beside``.
+def held(place: Bucket, objects: Bucket, tell: Callable[[int, int], None]) -> Iterator[Lease]:
+    """Hold the lease of a place.
 
     Args:
-        beside: where the leases of several places are.
-        name: of the place.
+        place: which nobody else writes meanwhile.
+        objects: those of its lease.
         tell: called as ``tell(passed, of)`` with seconds while it listens whether a holder lives.
 
     Raises:
         ConfigError: another process holds it and is alive; the message names it.
     """
-    shown, objects = f"{beside}/{name}", beside.below(f"{LEASES}/{name}")
+    shown = str(place)
     for _ in range(_TRIES):
         numbers = _numbers(objects)
         if numbers and _is_alive(objects, max(numbers), shown, tell):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -20,7 +20,6 @@ from v2hdm.objects.lease import LEASES, Lease, held
 
 LIST = ".v2hdm-results.jsonl"
 UNFINISHED = ".v2hdm-unfinished.jsonl"
-_ITSELF = "here"
 _ABOUT = {"about": "objects that v2hdm wrote here; a rerun replaces these and no others"}
 
 
@@ -47,6 +46,11 @@ class ResultObjects:
 
     def __init__(self, objects: Bucket) -> None:
         self.objects = objects
+
+    def leased(self, beside: Bucket, tell: Callable[[int, int], None]) -> AbstractContextManager[Lease]:
+        """The lease of the result, which is kept ``beside`` it; ``tell`` as for :func:`held`."""
+        name = self.objects.url.rsplit("/", 1)[-1]
+        return held(self.objects, beside.below(f"{LEASES}/{name}"), tell)
 
     def is_whole(self) -> bool:
         """Whether there is a finished result whose objects are all there as they were put."""
@@ -170,7 +174,7 @@ def growing_objects(objects: Bucket, tell: Callable[[int, int], None]) -> Iterat
     Raises:
         ConfigError: it holds something that is not ours, another process is writing it, or the store failed.
     """
-    with held(objects, _ITSELF, tell) as lease:
+    with held(objects, objects.below(LEASES), tell) as lease:
         listing = objects.read(LIST)
         if listing is None and any(not name.startswith(LEASES) for name in objects.listed()):
             raise ConfigError(f"{objects} holds objects that are no results of ours: give another place")

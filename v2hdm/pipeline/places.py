@@ -18,7 +18,6 @@ from v2hdm.caching.store import Store
 from v2hdm.drive.mirror import mirrored
 from v2hdm.errors import ConfigError, V2hdmError
 from v2hdm.objects.bucket import Bucket, is_url, place_of
-from v2hdm.objects.lease import held
 from v2hdm.objects.results import LIST, ResultObjects, contents_of
 from v2hdm.outputs import drop_result
 from v2hdm.pipeline.config import RunConfig, run_name
@@ -99,7 +98,7 @@ def _put(
     if there is not None:
         _log.info(NOTHING_CHANGED, url)
         return replace(there, url=url), True
-    with held(output, name, partial(progress, "listen")) as lease:
+    with result.leased(output, partial(progress, "listen")) as lease:
         result.ours()  # what is not ours is told before any work
         place = Path(config.cache) / _UPLOADS / key_of(output.url)[:16]
         local = replace(config, output=str(place))
