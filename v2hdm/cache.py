@@ -38,7 +38,7 @@ def _work(parsed: argparse.Namespace) -> None:
     if isinstance(cache, Path) and not cache.is_dir():
         raise ConfigError(f"{cache}: no such folder; give the cache of your runs with --cache")
     if parsed.what == "list":
-        _show(kept())
+        _show(kept(), "last used" if isinstance(cache, Path) else "last written")
     elif parsed.what == "prune":
         if not parsed.gb >= 0:
             raise ConfigError(f"--gb {parsed.gb:g}: give 0 or more")
@@ -54,9 +54,9 @@ def _work(parsed: argparse.Namespace) -> None:
         print(f"read {len(items)} entries, {len(damaged)} of them damaged")
 
 
-def _show(items: Sequence[Kept]) -> None:
+def _show(items: Sequence[Kept], when: str) -> None:
     kinds = sorted({item.kind for item in items})
-    print(f"{'what':<20}{'entries':>8}{'size':>12}  last used")
+    print(f"{'what':<20}{'entries':>8}{'size':>12}  {when}")
     for kind in kinds:
         own = [item for item in items if item.kind == kind]
         used = time.strftime("%Y-%m-%d %H:%M", time.localtime(max(item.used_s for item in own)))

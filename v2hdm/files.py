@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 import sys
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -29,6 +30,7 @@ __all__ = [
     "load_json",
     "load_yaml",
     "read_text",
+    "refuse_url",
     "replace_text",
     "take_array",
     "take_choice",
@@ -38,6 +40,7 @@ __all__ = [
     "whole_file",
 ]
 
+_URL = re.compile(r"[a-z][a-z0-9+.-]+:/")
 _LARGEST = sys.float_info.max
 
 
@@ -52,6 +55,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         ConfigError: ``path`` is an input of this door, or no plain file.
         OSError: it cannot be written there.
     """
+    refuse_url(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     refuse_input(path)
     if path.exists() and not path.is_file():
@@ -63,6 +67,19 @@ def whole_file(path: Path) -> Iterator[Path]:
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def refuse_url(path: Path) -> None:
+    """Refuse a URL that was taken for a path: it would be a folder called ``s3:``.
+
+    Raises:
+        ConfigError: it is one.
+    """
+    if _URL.match(str(path)):
+        raise ConfigError(
+            f"{path}: no URL is written to here, only as output=, cache= and --table of v2hdm.map and "
+            "v2hdm.fleet; give a path on this machine"
+        )
 
 
 def replace_text(path: Path, text: str) -> None:

@@ -18,7 +18,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from v2hdm.errors import ConfigError
-from v2hdm.files import whole_file
+from v2hdm.files import refuse_url, whole_file
 from v2hdm.locks import take_lock
 from v2hdm.objects.results import LIST as MARKER
 
@@ -222,6 +222,7 @@ def _cannot_write(folder: Path, failure: OSError, option: str) -> ConfigError:
 
 def _resolved(folder: Path, option: str) -> Path:
     """Where ``folder`` leads; a folder that cannot be put aside is refused before any work."""
+    refuse_url(folder)
     try:
         target = folder.resolve()
     except (OSError, RuntimeError, ValueError):

@@ -6,9 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from omegaconf import OmegaConf
 
+from v2hdm.config import Job
 from v2hdm.errors import ConfigError
+from v2hdm.files import whole_file
 from v2hdm.objects.bucket import Bucket, place_of
+from v2hdm.outputs import result_folder
 
 
 def test_what_was_put_is_read_listed_and_removed(memory: Bucket, tmp_path: Path) -> None:
@@ -137,3 +141,19 @@ def test_a_bucket_that_is_not_there_is_told(s3: Any) -> None:
     for work in (nowhere.check, lambda: nowhere.write("a", b"x"), lambda: nowhere.create("a", b"x")):
         with pytest.raises(ConfigError, match="no such bucket or container"):
             work()
+
+
+def test_a_url_where_only_paths_are_written_is_told_and_not_made_a_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for write in (result_folder, whole_file):
+        with (
+            pytest.raises(ConfigError, match="no URL is written to here"),
+            write(Path("s3://bucket/results")),
+        ):
+            pass
+    job = Job(OmegaConf.create(), "0-a=b")
+    with pytest.raises(ConfigError, match="a sweep writes to folders of this machine"):
+        job.folder("s3://bucket/results")
+    assert not list(tmp_path.iterdir())

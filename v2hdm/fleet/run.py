@@ -76,6 +76,7 @@ def _growing(place: Path | str, tell: Tell) -> AbstractContextManager[GrowingFol
     there = place_of(str(place), "--table")
     if isinstance(there, Path):
         return growing_folder(there, "--table")
+    there.check()
     return growing_objects(there, partial(tell, ALL, "listen"))
 
 

@@ -117,7 +117,10 @@ class Bucket:
         Raises:
             ConfigError: there is no such bucket, or it cannot be listed.
         """
-        self.below(_NOTHING).listed()
+        try:
+            self._call("", lambda: self._find(f"{self._root}/{_NOTHING}"))
+        except FileNotFoundError:
+            raise self._no_bucket() from None
 
     def below(self, name: str) -> Bucket:
         """The objects whose names begin with ``name`` and a slash."""
@@ -175,7 +178,7 @@ class Bucket:
         """
         begin = f"{self._root}/"
         try:
-            found = self._call("", self._find)
+            found = self._call("", lambda: self._find(self._root))
         except FileNotFoundError:
             raise self._no_bucket() from None
         return {name[len(begin) :]: _thing(about) for name, about in found.items() if name.startswith(begin)}
@@ -200,9 +203,9 @@ class Bucket:
         except KeyError:  # of the store in memory
             raise FileNotFoundError(path) from None
 
-    def _find(self) -> dict[str, Any]:
+    def _find(self, path: str) -> dict[str, Any]:
         self._files.invalidate_cache()
-        found: dict[str, Any] = self._files.find(self._root, detail=True)
+        found: dict[str, Any] = self._files.find(path, detail=True)
         return found
 
     def _call(self, name: str, work: Callable[[], _Answer]) -> _Answer:

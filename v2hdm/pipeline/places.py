@@ -56,10 +56,13 @@ def in_place(config: RunConfig, work: Work, take: bool, progress: Progress) -> t
         V2hdmError: as ``work``; or a store does not work, or holds what is not ours.
     """
     output, cache = place_of(config.output, "output="), place_of(config.cache, "cache=")
+    if is_url(config.local_cache):
+        raise ConfigError(f"local_cache={config.local_cache}: is a URL; give a folder of this machine")
+    for place in (output, cache):
+        if isinstance(place, Bucket):
+            place.check()
     behind = cache if isinstance(cache, Bucket) else None
     folder = Path(config.local_cache) if isinstance(cache, Bucket) else cache
-    if behind is not None:
-        behind.check()
     local = _local(config, folder, progress)
     store = Store(folder, behind)
     if isinstance(output, Bucket):
