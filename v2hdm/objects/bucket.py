@@ -97,6 +97,11 @@ class Bucket:
             known = ", ".join(f"{one}://" for one in _PACKAGES if one != _MEMORY)
             raise ConfigError(f"{option} {url}: is at no store that we write to; choose a folder or {known}")
         parts = rest.rstrip("/").split("/")
+        if ":" in parts[0]:
+            raise ConfigError(
+                f"{option} {protocol}://...: holds what is no name of a bucket; credentials belong where "
+                f"{_PACKAGES[protocol]} looks for them, not into a URL"
+            )
         if not all(parts) or {".", ".."} & set(parts) or any(c in "?#*[" or not c.isprintable() for c in url):
             raise ConfigError(f"{option} {url}: is no place at a store; write it as in s3://bucket/results")
         fsspec = need("fsspec", "map", f"{option} {url}", ConfigError)
