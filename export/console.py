@@ -5,16 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from export.config import ExportConfig, Precision, check_export
 from export.manifest import record_network
-from export.onnx_file import Tell, export_float, export_int8
+from export.onnx_file import export_float, export_int8
 from export.source import Source, read_source
 from v2hdm.inputs import note_input, refuse_input
+from v2hdm.progress import TellShare, share_of_work
 
 
-def run(config: ExportConfig, tell: Tell = lambda share, doing: None) -> str:
+def run(config: ExportConfig, tell: TellShare = lambda share, doing: None) -> str:
     """Export as configured; returns what there is to say about it.
 
     Raises:
@@ -34,7 +34,7 @@ def run(config: ExportConfig, tell: Tell = lambda share, doing: None) -> str:
     return f"{output}: {size_mb:.2f} MB, step {source.label['steps']}, mean IoU {iou:.3f}, {parity}"
 
 
-def _export(source: Source, output: Path, config: ExportConfig, tell: Tell) -> str:
+def _export(source: Source, output: Path, config: ExportConfig, tell: TellShare) -> str:
     """Export, and say how near the file is to the network."""
     if config.precision is Precision.float32:
         return f"parity {export_float(source, output, config.opset, config.tolerance):.1e}"
@@ -51,13 +51,6 @@ def export(config: ExportConfig) -> None:
     note_input(Path(config.checkpoint))
     refuse_input(Path(config.output))
     console = Console(stderr=True)
-    columns = (
-        BarColumn(),
-        TextColumn("{task.percentage:.0f} %"),
-        TimeElapsedColumn(),
-        TextColumn("{task.description}"),
-    )
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("reading", total=1.0)
-        line = run(config, lambda share, doing: bar.update(task, completed=share, description=doing))
+    with share_of_work(console, "reading", transient=True) as tell:
+        line = run(config, tell)
     console.print(line, soft_wrap=True, highlight=False)

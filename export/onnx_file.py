@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import warnings
-from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import asdict
 from pathlib import Path
@@ -27,9 +26,7 @@ from train.checkpoint import Checkpoint
 from v2hdm.detection.network import METADATA_KEY
 from v2hdm.errors import ConfigError, DetectorError
 from v2hdm.files import whole_file
-
-Tell = Callable[[float, str], None]
-"""Is told what share of the work is done, and what is being done."""
+from v2hdm.progress import TellShare
 
 _PARITY_SEED_OFFSET = 1_000_003
 _FITTING = 0.15
@@ -65,7 +62,7 @@ def export_float(source: Source, path: Path, opset: int, tolerance: float) -> fl
     return difference
 
 
-def export_int8(source: Source, path: Path, opset: int, config: Int8Config, tell: Tell) -> Parity:
+def export_int8(source: Source, path: Path, opset: int, config: Int8Config, tell: TellShare) -> Parity:
     """Write a network to an ONNX file that computes with bytes; see :mod:`export.int8`.
 
     Inputs, outputs and label are those of :func:`export_float`.
@@ -159,7 +156,7 @@ def _checked(source: Source, path: Path, opset: int) -> onnx.ModelProto:
     return to_onnx(deepcopy(source.net).fold(), opset)
 
 
-def _images(seed: int, frames: int, tell: Tell, start: float, share: float) -> list[NDArray[np.uint8]]:
+def _images(seed: int, frames: int, tell: TellShare, start: float, share: float) -> list[NDArray[np.uint8]]:
     """All that the detector shows its network of some renders."""
     images: list[NDArray[np.uint8]] = []
     for index, seen in enumerate(looks(seed, frames)):

@@ -11,12 +11,12 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.logging import RichHandler
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from train.config import TrainConfig, check_training
 from train.distributed import Team, joined_team
 from train.loop import Trainer
 from v2hdm.outputs import locked_folder
+from v2hdm.progress import share_of_work
 
 
 def train(config: TrainConfig) -> None:
@@ -35,17 +35,8 @@ def _train(config: TrainConfig, team: Team) -> None:
     console = Console(stderr=True, quiet=not team.leads)
     handler = RichHandler(console=console, show_path=False)
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[handler], force=True)
-    columns = (
-        BarColumn(),
-        TextColumn("{task.percentage:.0f} %"),
-        TimeElapsedColumn(),
-        TextColumn("{task.description}"),
-    )
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task("rendering the validation set", total=1.0)
-        trainer = Trainer(
-            config, lambda share, line: bar.update(task, completed=share, description=line), team
-        )
+    with share_of_work(console, "rendering the validation set") as tell:
+        trainer = Trainer(config, tell, team)
         try:
             state = trainer.run()
         except KeyboardInterrupt:

@@ -9,13 +9,12 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from export.config import ExportConfig, Precision
 from export.console import run as export
@@ -27,6 +26,7 @@ from v2hdm.detection import weights
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError
 from v2hdm.files import whole_file
+from v2hdm.progress import TellShare, share_of_work
 from v2hdm.workers import share_out
 
 _ROOT = Path(__file__).resolve().parents[1]
@@ -44,9 +44,6 @@ _PART_IMAGES = 25
 
 _EXPORTED, _GATHERED, _JUDGED, _LANES_SEEN = 0.05, 0.6, 0.85, 0.99
 """Shares of the time that have passed after each step, about."""
-
-Tell = Callable[[float, str], None]
-"""Is told what share of the work is done, and what is being done."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +76,7 @@ class Order:
         return f"python -m train.ship {self.source} --precision {self.precision} {images}{kept}"
 
 
-def ship(order: Order, tell: Tell) -> Path:
+def ship(order: Order, tell: TellShare) -> Path:
     """Export, fit, and put the files in place; returns the folder that they are in.
 
     Raises:
@@ -110,17 +107,9 @@ def ship(order: Order, tell: Tell) -> Path:
 
 def ship_on_terminal(order: Order) -> None:
     """:func:`ship` with a bar over all of its steps."""
-    console = Console(stderr=True)
-    columns = (
-        BarColumn(),
-        TextColumn("{task.percentage:.0f} %"),
-        TimeElapsedColumn(),
-        TextColumn("{task.description}"),
-    )
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task("reading", total=1.0)
-        folder = ship(order, lambda share, doing: bar.update(task, completed=share, description=doing))
-        bar.update(task, completed=1.0, description="done")
+    with share_of_work(Console(stderr=True), "reading") as tell:
+        folder = ship(order, tell)
+        tell(1.0, "done")
     print(f"{folder}: network, judge and lane score of {order.source}")
 
 
@@ -147,7 +136,7 @@ def _state(order: Order) -> str:
     return digest.hexdigest()[:12]
 
 
-def _export(order: Order, folder: Path, tell: Tell) -> None:
+def _export(order: Order, folder: Path, tell: TellShare) -> None:
     """Write the network that runs on the vehicle and, unless it was rounded before, that of float32."""
     network, source = folder / weights.NETWORK_FILE.name, order.network
     if network.is_file():
@@ -161,7 +150,7 @@ def _export(order: Order, folder: Path, tell: Tell) -> None:
     print(export(config, lambda share, doing: tell(_EXPORTED * share, f"exporting the network: {doing}")))
 
 
-def _fit_judge(order: Order, folder: Path, tell: Tell) -> None:
+def _fit_judge(order: Order, folder: Path, tell: TellShare) -> None:
     parts = [
         fit_judge.Part(numbers, order.judge_images, folder / weights.NETWORK_FILE.name, folder / f"{k}.npz")
         for k, numbers in enumerate(_in_parts(order.judge_images))
@@ -186,7 +175,7 @@ def _fit_judge(order: Order, folder: Path, tell: Tell) -> None:
     fit_judge.write_both(judge, confidence, order.judge_images, folder)
 
 
-def _fit_lane_score(order: Order, folder: Path, tell: Tell) -> None:
+def _fit_lane_score(order: Order, folder: Path, tell: TellShare) -> None:
     network = folder / weights.NETWORK_FILE.name
     parts = [
         fit_lane_score.Part(numbers, order.lane_images, network) for numbers in _in_parts(order.lane_images)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
@@ -14,12 +13,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from v2hdm import pipeline
 from v2hdm.pipeline.config import run_name
 from v2hdm.pipeline.telling import logging_to
+from v2hdm.progress import progress_lines
 from v2hdm.quality import Status, Verdict
 from v2hdm.report.table import changes_table, results_table
 from v2hdm.viewer import RerunViewer, check_viewer
-
-_EVERY_S = 10.0
-"""Between two lines on one task."""
 
 _STYLES = {Status.PASS: "bold green", Status.WARN: "bold yellow", Status.FAIL: "bold red"}
 
@@ -45,19 +42,6 @@ def run_on_terminal(config: pipeline.RunConfig, config_yaml: str) -> Verdict:
         )
     console.print(f"results in {result.place}: open report.html", highlight=False, soft_wrap=True)
     return result.verdict
-
-
-def progress_lines(write: Callable[[str], None]) -> pipeline.Progress:
-    """Progress for a log file or a service: a line when a task begins and ends, and every few seconds."""
-    told_s: dict[str, float] = {}
-
-    def advance(task: str, done: int, total: int) -> None:
-        now_s = time.monotonic()
-        if task not in told_s or done == total or now_s - told_s[task] >= _EVERY_S:
-            told_s[task] = now_s
-            write(f"{task}: {done} of {total}")
-
-    return advance
 
 
 @contextmanager

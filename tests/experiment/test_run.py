@@ -11,12 +11,13 @@ import pytest
 
 from tests.experiment.scene import CALIBRATED, ESTIMATED, experiment, keep, record
 from tests.mapping.scene import SceneOptions, make_scene
+from v2hdm.caching.keys import key_of
 from v2hdm.errors import DriveError
-from v2hdm.experiment.drive import drive_record, recipe_file
+from v2hdm.experiment.drive import _content, drive_record, recipe_file, setting_key
 from v2hdm.experiment.plan import ExperimentConfig, jobs
 from v2hdm.experiment.residuals import residuals
 from v2hdm.experiment.run import run_experiment
-from v2hdm.experiment.stored import key_of, store, stored
+from v2hdm.experiment.stored import store, stored
 from v2hdm.mapping.methods import run_methods
 from v2hdm.records import HdMap, Truth
 
@@ -69,6 +70,19 @@ def test_only_the_recipe_that_is_missing_is_mapped_anew(tmp_path: Path) -> None:
     config.recipes = ["paper", "incremental"]
     with pytest.raises(DriveError, match="absent"):
         drive_record(jobs(config)[0], 1, lambda *_: None)
+
+
+def test_a_drive_whose_files_have_changed_is_another_one(tmp_path: Path) -> None:
+    job = jobs(finished(tmp_path))[0]
+    job.site.simulate, job.site.drive.path = None, str(tmp_path / "drive")
+    keys = []
+    for text in ("1 2 3", "1 2 4", "1 2 3"):
+        (tmp_path / "drive").mkdir(exist_ok=True)
+        (tmp_path / "drive" / "poses.tum").write_text(text)
+        _content.cache_clear()
+        keys.append(setting_key(job))
+    assert keys[0] != keys[1]
+    assert keys[0] == keys[2]
 
 
 @pytest.mark.parametrize("damage", ["cut", "text", "other"])

@@ -236,6 +236,12 @@ def test_two_run_files_never_write_one_folder(tmp_path: Path, drive: Path) -> No
     assert "give one of them another name" in refused[0].says
 
 
+def test_what_would_be_gone_with_a_worker_is_refused(tmp_path: Path, drive: Path) -> None:
+    jobs, refused = plan([written(tmp_path, "one", drive)], ["output=memory://results"])
+    assert not jobs
+    assert "gone with the process" in refused[0].says
+
+
 def test_the_table_has_a_code_for_the_worst_of_its_rows() -> None:
     def row(status: str) -> Row:
         return Row("a", status, "", 1, 1, 1.0, False, "", status)

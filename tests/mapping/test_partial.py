@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -18,7 +19,7 @@ from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.sightings.location import locate
 from v2hdm.mapping.sightings.table import Sightings, collect_sightings
 from v2hdm.mapping.sightings.views import views_of
-from v2hdm.records import HdMap, ImageDetections, MarkingDetection
+from v2hdm.records import HdMap, ImageDetections, Marking, MarkingDetection
 
 CAMERAS = ("front", "rear")
 
@@ -185,3 +186,74 @@ def test_sides_without_ends_are_attached_to_the_dash_that_they_are_of(scene: Sce
     assert (apart < 1.0).mean() > 0.98
     shown = np.stack([found.group, sightings.image])[:, found.group >= 0]
     assert len(np.unique(shown, axis=1).T) == len(shown.T)
+
+
+STOP_LINE = np.array([[0.0, 1.5], [-0.4, 1.5], [-0.4, -1.5], [0.0, -1.5]])
+"""Three metres across the lane, the ends at corners 0, 1 and 2, 3."""
+
+
+def with_a_stop_line(markings: list[Marking]) -> list[Marking]:
+    """A stop line in the place of the diamond nearest to the way, where the street begins."""
+    near = min(
+        range(len(markings)), key=lambda k: float(np.linalg.norm(markings[k].corners_map[0] - [12, 4]))
+    )
+    turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    corners = markings[near].corners_map.mean(axis=0) + STOP_LINE @ turn.T
+    out = [m for k, m in enumerate(markings) if k != near]
+    return [*out, replace(markings[near], kind="stop_line", corners_map=corners)]
+
+
+def crossed(seen: MarkingDetection, is_left: bool) -> MarkingDetection:
+    """The half of a stop line that lies on one side of an arrow, which ends where that begins."""
+    corners = seen.corners_px.astype(np.float32)
+    # Seen anticlockwise from above, whichever corner comes first; only the nearer or farther end is left.
+    sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+    k = int(np.argmax(sides[:2] + sides[2:]))
+    flat = np.roll(np.array([[0, 0], [3, 0], [3, 0.4], [0, 0.4]], np.float32), k, axis=0)
+    kept = np.array([[0, 0], [1.4, 0], [1.4, 0.4], [0, 0.4]], np.float32)
+    cut = np.array([False, True, True, False])
+    if not is_left:
+        kept, cut = np.array([[1.6, 0], [3, 0], [3, 0.4], [1.6, 0.4]], np.float32), ~cut
+    image_from_flat = cv2.getPerspectiveTransform(flat, corners)
+    at = cv2.perspectiveTransform(np.roll(kept, k, axis=0)[:, None], image_from_flat)[:, 0]
+    covariance, valid = seen.covariance_px.copy(), ~np.roll(cut, k)
+    for end in np.flatnonzero(~valid):
+        along = corners[end] - corners[(end + 1) % 4 if valid[(end + 1) % 4] else (end + 3) % 4]
+        rows = slice(2 * end, 2 * end + 2)
+        covariance[rows, rows] += 12.0**2 * np.outer(along, along) / (along @ along)
+    return replace(seen, corners_px=at.astype(float), covariance_px=covariance, corner_valid=valid)
+
+
+def stop_lines(whole_images: int) -> tuple[list[Marking], Marking]:
+    """Stop lines of the map, and the true one, which all but so many images of each camera show by halves."""
+    scene = make_scene(
+        SceneOptions(length_m=45.0, seed=3, false_rate=0.0, wild_rate=0.0, hidden_corner_rate=0.0),
+        with_a_stop_line,
+    )
+    left = dict.fromkeys(CAMERAS, whole_images)
+    detections = []
+    for found in scene.detections[::-1]:
+        name, markings = scene.drive.images[found.image].camera, []
+        for seen in found.markings:
+            if seen.kind != "stop_line" or (seen.corner_valid.all() and left[name] > 0):
+                markings.append(seen)
+                left[name] -= seen.kind == "stop_line"
+            elif seen.corner_valid.all():
+                markings += [crossed(seen, True), crossed(seen, False)]
+        detections.append(replace(found, markings=tuple(markings)))
+    mapped = run_methods(scene.drive, detections[::-1], CAMERAS, MappingOptions(pose_model="heave"))["Opt"]
+    true = next(m for m in scene.markings if m.kind == "stop_line")
+    return [m for m in mapped.hd_map.markings if m.kind == "stop_line"], true
+
+
+def test_a_stop_line_that_an_arrow_cuts_in_most_images_has_the_ends_that_the_others_show() -> None:
+    (found,), true = stop_lines(whole_images=1)
+    off = min(
+        np.linalg.norm(np.roll(found.corners_map, k, axis=0) - true.corners_map, axis=1).max()
+        for k in range(4)
+    )
+    assert off < 0.05
+
+
+def test_halves_that_all_images_cut_alike_are_no_stop_lines() -> None:
+    assert stop_lines(whole_images=0)[0] == []

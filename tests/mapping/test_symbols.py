@@ -36,17 +36,31 @@ def scene(arrow_x_m: float) -> tuple[Symbols, Rig]:
     return Symbols(np.zeros(3, dtype=np.int64), np.arange(3), tuple(outlines), ("arrow",) * 3), rig
 
 
-def test_points_on_the_arrow_are_counted_in_every_image_that_shows_it() -> None:
+def rectangle(centre: tuple[float, float], length_m: float, width_m: float) -> np.ndarray:
+    """Corners (4, 2) of a rectangle, long in x."""
+    half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [length_m / 2, width_m / 2]
+    return np.asarray(centre) + half
+
+
+def test_parts_of_the_arrow_are_counted_in_every_image_that_shows_it() -> None:
     symbols, rig = scene(9.0)
-    points = np.array([[8.5, 1.0], [9.0, 1.3], [9.9, 1.05], [5.0, 1.0], [np.nan, np.nan]])
-    assert images_with_symbol(symbols, rig, points).tolist() == [3, 0, 3, 0, 0]
+    shaft, head = rectangle((8.5, 1.0), 1.6, 0.15), rectangle((9.8, 1.02), 0.5, 0.3)
+    beside, far = rectangle((9.0, 1.4), 1.6, 0.15), rectangle((5.0, 1.0), 1.6, 0.15)
+    corners = np.stack([shaft, head, beside, far, np.full((4, 2), np.nan)])
+    assert images_with_symbol(symbols, rig, corners).tolist() == [3, 3, 0, 0, 0]
+
+
+def test_what_an_arrow_crosses_is_no_part_of_it() -> None:
+    symbols, rig = scene(9.0)
+    stop_line = rectangle((8.5, 1.0), 0.4, 3.0)
+    assert images_with_symbol(symbols, rig, stop_line[None]).tolist() == [0]
 
 
 def test_far_arrows_say_nothing() -> None:
     symbols, rig = scene(40.0)
-    assert images_with_symbol(symbols, rig, np.array([[40.0, 1.0]])).tolist() == [0]
+    assert images_with_symbol(symbols, rig, rectangle((40.0, 1.05), 0.5, 0.3)[None]).tolist() == [0]
 
 
 def test_without_symbols_there_is_nothing_to_count() -> None:
     _, rig = scene(9.0)
-    assert images_with_symbol(NO_SYMBOLS, rig, np.zeros((4, 2))).tolist() == [0, 0, 0, 0]
+    assert images_with_symbol(NO_SYMBOLS, rig, np.zeros((4, 4, 2))).tolist() == [0, 0, 0, 0]

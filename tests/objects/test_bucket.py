@@ -104,6 +104,7 @@ def test_what_goes_on_failing_is_one_line(failures: list[Exception], says: str, 
         ("s3://b/../x", "no place at a store"),
         ("s3://b/x?versionId=3", "no place at a store"),
         ("s3://b/\x1b[2J", "no place at a store"),
+        ("s3://key:secret@b/x", r"^output= s3://\.\.\.: holds what is no name of a bucket"),
         ("file://x/y", "named as in file:///data"),
     ],
 )

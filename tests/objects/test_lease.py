@@ -90,3 +90,12 @@ def test_of_many_that_follow_one_holds(memory: Bucket, monkeypatch: pytest.Monke
             thread.join()
     assert most == 1
     assert held_by >= 1
+
+
+def test_who_was_suspended_looks_again_before_it_writes(
+    memory: Bucket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with died(memory, monkeypatch) as left:
+        left.still()
+        with leased(memory, "run", quiet), pytest.raises(ConfigError, match="another process has taken over"):
+            left.still()

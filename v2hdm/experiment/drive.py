@@ -9,13 +9,13 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from v2hdm import __version__
+from v2hdm.caching.keys import code_key, file_digest, key_of
 from v2hdm.caching.room import Room
 from v2hdm.caching.store import Store
 from v2hdm.drive import read_drive
@@ -23,14 +23,14 @@ from v2hdm.drive.truth import read_truth
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.experiment.plan import OURS, PAPER, Job
 from v2hdm.experiment.residuals import residuals
-from v2hdm.experiment.stored import key_of, network_key, store, stored
+from v2hdm.experiment.stored import store, stored
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.mapping.methods import NAIVE_IPMS, run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.camera_sets import camera_sets
 from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.inspect import Inspection, inspect_once
-from v2hdm.pipeline.keys import Contents
+from v2hdm.pipeline.keys import Contents, model_key
 from v2hdm.records import Drive, HdMap, ImageDetections, Marking, Truth
 from v2hdm.report.evaluation import growth_figures
 from v2hdm.report.metrics import driven_past, extrinsic_metrics
@@ -43,18 +43,23 @@ SETTING_FILE = "drive.json.gz"
 GROWTH_STEPS = 8
 """Sizes of the growing map at which its error is told."""
 
-_LAYOUT = 3
-"""Raised whenever what the files hold changes."""
-
 
 def setting_key(job: Job) -> str:
     """The key of what a drive is before it is mapped."""
-    return key_of(_LAYOUT, __version__, job.site)
+    path = job.site.drive.path
+    return key_of(code_key(), job.site, _content(Path(path)) if path else None)
 
 
 def recipe_key(job: Job, recipe: str) -> str:
     """The key of all that a drive's maps under a recipe are made from."""
-    return key_of(setting_key(job), job.detector, network_key(job.detector), job.options[recipe])
+    return key_of(setting_key(job), job.detector, model_key(job.detector), job.options[recipe])
+
+
+@cache
+def _content(drive: Path) -> list[tuple[str, str]]:
+    """The files of a drive, or one, and the digests of what they hold."""
+    files = sorted(path for path in [drive, *drive.rglob("*")] if path.is_file())
+    return [(path.relative_to(drive).as_posix(), file_digest(path)) for path in files]
 
 
 def recipe_file(recipe: str) -> str:

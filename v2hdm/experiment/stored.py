@@ -7,33 +7,18 @@ of another key, or a damaged one, counts as absent.
 from __future__ import annotations
 
 import gzip
-import hashlib
 import json
 import zlib
 from collections.abc import Mapping
-from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.weights import NETWORK_FILE, digest
 from v2hdm.files import whole_file
 
 _FASTEST = 1
 """Level of gzip: a fifth of the size already, at a tenth of the time of the default."""
-
-
-def key_of(*parts: object) -> str:
-    """A key of settings and of what they are applied to."""
-    plain = [asdict(part) if is_dataclass(part) and not isinstance(part, type) else part for part in parts]
-    return hashlib.sha256(json.dumps(plain, sort_keys=True, default=str).encode()).hexdigest()[:16]
-
-
-def network_key(options: DetectorOptions) -> str:
-    """SHA-256 of the network that detector settings name."""
-    return digest(NETWORK_FILE if options.model is None else Path(options.model))
 
 
 def store(path: Path, key: str, content: Mapping[str, Any]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -15,12 +14,10 @@ from v2hdm.experiment.plan import ExperimentConfig
 from v2hdm.experiment.run import Tell, run_experiment
 from v2hdm.experiment.tables import by_port, results_table
 from v2hdm.experiment.words import claims
+from v2hdm.progress import progress_lines
 
 _SHOWN = ("method", "cameras", "markings", "RMSE (cm)", "RMSE of shared (cm)")
 """Columns of the main table that the terminal shows."""
-
-_EVERY_S = 30.0
-"""How often a stage that goes on has a line where there is no terminal."""
 
 
 def experiment_on_terminal(config: ExperimentConfig, config_yaml: str) -> None:
@@ -61,7 +58,8 @@ def _table(port: str, drives: Sequence[Measured]) -> Table:
 def _view(console: Console) -> Iterator[Tell]:
     """A bar for every drive on a terminal; elsewhere lines when a stage begins, ends and goes on."""
     if not console.is_terminal:
-        yield _Lines(console)
+        lines = progress_lines(lambda line: console.print(line, highlight=False, soft_wrap=True))
+        yield lambda drive, stage, done, total: lines(f"{drive}: {stage}", done, total)
         return
     columns = (
         TextColumn("{task.description:<18}"),
@@ -79,21 +77,3 @@ def _view(console: Console) -> Iterator[Tell]:
             bars.update(tasks[drive], completed=done, total=total, stage=stage)
 
         yield advance
-
-
-class _Lines:
-    """Progress in plain lines."""
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._told: dict[str, tuple[str, float]] = {}
-        self._begin_s = time.monotonic()
-
-    def __call__(self, drive: str, stage: str, done: int, total: int) -> None:
-        now_s = time.monotonic()
-        before, told_s = self._told.get(drive, ("", -_EVERY_S))
-        if stage == before and done < total and now_s - told_s < _EVERY_S:
-            return
-        self._told[drive] = stage, now_s
-        line = f"{now_s - self._begin_s:6.0f} s  {drive}: {stage} {done}/{total}"
-        self._console.print(line, highlight=False, soft_wrap=True)

@@ -68,4 +68,7 @@ def _job(file: Path, overrides: Sequence[str]) -> Job:
     config = to_dataclass(composed, RunConfig, f"set it in {file}")
     name = run_name(config)
     take_name(name, "name", ConfigError)
+    for place in (config.output, config.cache):
+        if place.startswith("memory:"):
+            raise ConfigError(f"{place}: is gone with the process that wrote it, and a fleet has many")
     return Job(name, file, config, to_yaml(composed))

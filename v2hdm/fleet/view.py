@@ -11,9 +11,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Table
 from rich.text import Text
 
-from v2hdm.console import progress_lines
 from v2hdm.fleet.rows import ERROR, Row
 from v2hdm.fleet.run import ALL, FleetOptions, Tell, run_fleet
+from v2hdm.progress import progress_lines
 
 _STYLES = {"PASS": "bold green", "WARN": "bold yellow", "FAIL": "bold red", ERROR: "bold red"}
 

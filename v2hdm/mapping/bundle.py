@@ -23,7 +23,7 @@ from v2hdm.adjust import (
 )
 from v2hdm.errors import MappingError
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.mapping.association.groups import Association, fuse_groups
+from v2hdm.mapping.association.groups import Association, fuse_groups, known_elsewhere, line_only
 from v2hdm.mapping.association.merge import group_kinds
 from v2hdm.mapping.known_sizes import known_lengths
 from v2hdm.mapping.motion import vehicle_twists
@@ -47,6 +47,9 @@ CLOCK_SIGMA_S = 0.01
 
 LEAST_OBSERVATIONS = 200
 """Of fewer, the residuals cannot tell how large their variance is."""
+
+OPEN_END_PX = 1000.0
+"""Sigma, px, of where along its side a corner lies that is no point: anywhere in the image."""
 
 VARIANCE_FACTORS = (0.05, 20.0)
 """Between these a detector's own statement may be corrected."""
@@ -185,7 +188,10 @@ def solve_bundle(
         *np.unique(sightings.frame[row], return_inverse=True),
     )
     own_corner = association.corner_order()[row, corner]
-    covariance_px = sightings.covariance_px[row, own_corner] + model.floor_px**2 * np.eye(2)
+    covariance_px = sightings.covariance_px[row, own_corner]
+    on_line = known_elsewhere(association, sightings.valid & usable, usable)[row, own_corner]
+    covariance_px[on_line] = line_only(covariance_px[on_line], OPEN_END_PX)
+    covariance_px = covariance_px + model.floor_px**2 * np.eye(2)
     observations = Observations(
         camera=used.camera.astype(np.int64),
         frame=used.frame.astype(np.int64),

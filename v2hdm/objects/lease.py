@@ -41,9 +41,15 @@ class Lease:
         self._objects, self._number, self._secret, self._shown = objects, number, secret, shown
         self._ended = threading.Event()
         self._beats = 0
+        self._checked_s = _clocks()
         self._thread = threading.Thread(target=self._keep_beating, name="v2hdm-lease", daemon=True)
         self._beat()
         self._thread.start()
+
+    def still(self) -> None:
+        """:meth:`check`, where that was long ago; before each of many puts."""
+        if max(now - before for now, before in zip(_clocks(), self._checked_s, strict=True)) > SILENT_S / 2:
+            self.check()
 
     def check(self) -> None:
         """Refuse to go on where another process has taken over, as after minutes without a network.
@@ -51,6 +57,7 @@ class Lease:
         Raises:
             ConfigError: it has.
         """
+        self._checked_s = _clocks()
         numbers = _numbers(self._objects)
         if (
             not numbers
@@ -146,6 +153,11 @@ def _told(objects: Bucket, number: int) -> tuple[str, str]:
         return str(told["secret"]), str(told["holder"])
     except (ValueError, LookupError, TypeError, RecursionError):
         return "", "another process"
+
+
+def _clocks() -> tuple[float, float]:
+    """Two clocks: one may stand still while a machine is suspended, the other may be set."""
+    return time.monotonic(), time.time()
 
 
 def _beat_of(secret: str) -> str:

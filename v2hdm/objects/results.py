@@ -114,6 +114,7 @@ class ResultObjects:
             self.objects.remove(name)
         for number, (name, content) in enumerate(contents.items()):
             tell(number, len(contents))
+            lease.still()
             if name not in ours:
                 if not self.objects.create(name, content):
                     raise self._foreign(name)

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from v2hdm.catalogue import LINE, Catalogue
-from v2hdm.detection.markings.fit import STATISTICS, Fit
+from v2hdm.detection.markings.fit import STATISTICS
+from v2hdm.detection.markings.fitted import Fit
 from v2hdm.detection.markings.foreground import Foreground
 from v2hdm.detection.markings.frames import Quads
 from v2hdm.detection.markings.propose import Proposal, symbol_share

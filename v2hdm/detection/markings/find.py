@@ -10,7 +10,8 @@ import numpy as np
 from v2hdm.catalogue import Catalogue
 from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.markings.evidence import gather
-from v2hdm.detection.markings.fit import TYPICAL_BLUR_PX, Fit, fit_quadrilaterals
+from v2hdm.detection.markings.fit import TYPICAL_BLUR_PX, fit_quadrilaterals
+from v2hdm.detection.markings.fitted import Fit
 from v2hdm.detection.markings.foreground import Foreground
 from v2hdm.detection.markings.frames import Quads
 from v2hdm.detection.markings.judge import judge_alone, judge_among

@@ -19,12 +19,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.markings.correlation import variance_inflation
 from v2hdm.detection.markings.coverage import blurred_coverage
+from v2hdm.detection.markings.fitted import Fit, corner_from_side
 from v2hdm.detection.markings.frames import StraightFrames
 from v2hdm.detection.markings.lattice import KNOTS, Lattice, Scene, lay_grid, lay_lattice
+from v2hdm.detection.markings.robust import add_paint, pixel_weights
 from v2hdm.geometry.planar import signed_area
-from v2hdm.geometry.quadrilateral import is_convex_px, preceding, side_frames
+from v2hdm.geometry.quadrilateral import is_convex_px, side_frames
 from v2hdm.records import BoolArray, FloatArray
 
 TYPICAL_BLUR_PX = 0.75
@@ -39,9 +40,6 @@ _SEARCH_BLUR, _LEAST_SEARCH_BLUR_PX = 0.6, 1.5
 
 _SEARCH_SIGMA = 0.1
 """How far the network's outline is from the end of a side before the search, in lengths of the marking."""
-
-_PAINT_SIGMA = 0.25
-"""How far the network's probability of paint is from the coverage."""
 
 _CLOSURE_SHARE, _CLOSURE_M = 0.03, 0.005
 """By how much the sum of a marking's opposite corners differs, in parts of the root of its area, at least in
@@ -75,24 +73,14 @@ _MOST_CONTRAST = 4.0
 _LIGHT_STEP = 0.4
 """By how much the log light differs from one knot to the next: the border of a shadow is a few of that."""
 
-_MIN_SCATTER = 0.01
-"""Least scatter of log grey: quantisation and noise of the best sensor."""
-
 _WIDE_SCATTER, _FINAL_SCATTER = 0.4, 0.1
 """Least scatter at the first step of search and fit, halved at each: the next may explain what one
 rejects."""
-
-_SHARED_PIXELS = 20.0
-"""A side's variance is drawn to that of all sides as if by so many pixels."""
-
-_CAUCHY = 2.385
-"""Cauchy's scale for 95 % efficiency (Holland and Welsch, 1977)."""
 
 _MODEL_SIGMA_PX = 0.04
 """Error of a side along the pixels' rows, px, with no noise at all: a Gaussian is not quite a pixel's
 aperture."""
 
-_MAX_CORRELATION = 0.7
 _SEARCH_STEPS, _STEPS = 4, 8
 _MAX_STEP = 2.0
 """Longest step of a side, in blurs."""
@@ -100,17 +88,11 @@ _MAX_STEP = 2.0
 _SETTLED_PX, _FOUND_PX = 0.05, 0.3
 """Steps of fit and of search that are shorter than this are the last, px."""
 
-_LEAST_SINE = 1e-3
-
 _BLUR, _K = 8, 9
 _LIGHT = 10
 _SLOPE = _LIGHT + KNOTS
 _UNKNOWNS = _SLOPE + 1
 """Places among the unknowns: starts of the sides 0 to 3, their ends 4 to 7, blur, contrast, light, slope."""
-
-_CORNER = np.arange(4)
-_END = 4 + (_CORNER - 1) % 4
-"""Each corner is the start of its own side and the end of the one before, in this place among the moves."""
 
 STATISTICS = (
     "contrast",
@@ -125,49 +107,13 @@ STATISTICS = (
     "log_last_step",
     "log_gap",
 )
-"""Names of the columns of :attr:`Fit.statistics`.
+"""Names of the columns of :attr:`~v2hdm.detection.markings.fitted.Fit.statistics`.
 
 Log contrast of paint over ground; scatter of log grey over contrast, over all and on the worst side; mean
 robust weight; share of clipped pixels; blur, px; log of the standard deviation of the two ends and of the two
 long sides, px; log of the longest way of a corner from the outline and of the last step, px; log of how far
 it is from a parallelogram on the ground, in the deviation that is expected.
 """
-
-
-@dataclass(frozen=True)
-class Fit:
-    """M quadrilaterals ``corners`` (M, 4, 2) in their ``frames``.
-
-    ``side_covariance`` (M, 8, 8), px^2, is that of the moves of the sides' starts and ends along their
-    outward normals. ``statistics`` (M, len(STATISTICS)) say how well the model explains the pixels.
-    ``open_sides`` (M, 4) are those cut by the image's border.
-    """
-
-    frames: StraightFrames
-    corners: FloatArray
-    side_covariance: FloatArray
-    statistics: FloatArray
-    open_sides: BoolArray
-
-    def in_image(self, side_sigma_px: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
-        """Corners (M, 4, 2), recorded px, and their covariance (M, 8, 8), px^2.
-
-        Args:
-            side_sigma_px: (M, 4) how far each side as a whole may be off besides, for reasons that residuals
-                do not show, px.
-        """
-        by_side = self.side_covariance
-        if side_sigma_px is not None:
-            by_side = by_side + _whole_sides(side_sigma_px)
-        jacobian = _corner_from_side(self.corners)
-        covariance = jacobian @ by_side @ jacobian.swapaxes(1, 2) + _second_order(self.corners, by_side)
-        return self.frames.to_image(self.corners, covariance)
-
-    def side_variance(self) -> FloatArray:
-        """Variance (M, 4), px^2, of the place of each side's middle along its normal."""
-        start, end = self.side_covariance[:, _CORNER], self.side_covariance[:, _CORNER + 4]
-        own = start[:, _CORNER, _CORNER] + end[:, _CORNER, _CORNER + 4] + 2 * start[:, _CORNER, _CORNER + 4]
-        return np.asarray(own / 4)
 
 
 def fit_quadrilaterals(
@@ -193,7 +139,7 @@ def fit_quadrilaterals(
     drawn = frames.from_image(corners_px)
     # Out of sight, so that the pixels at the border say nothing of where such a side is.
     beyond_px = np.tile(np.where(open_sides, _BEYOND_PX, 0.0), 2)
-    start = drawn + (_corner_from_side(drawn) @ beyond_px[..., None]).reshape(-1, 4, 2)
+    start = drawn + (corner_from_side(drawn) @ beyond_px[..., None]).reshape(-1, 4, 2)
     corners_px = frames.to_px(start)
     length_px = side_frames(start)[2].max(axis=1)
     grid, paint, spacing_px = lay_grid(scene, frames, corners_px)
@@ -213,7 +159,7 @@ def fit_quadrilaterals(
     inward_px = np.repeat(
         -_BLOOM * blur_px * np.minimum(lattice.clipped / _MUCH_CLIPPED, 1.0)[:, None], 8, axis=1
     )
-    begun = searched + (_corner_from_side(searched) @ inward_px[..., None]).reshape(-1, 4, 2)
+    begun = searched + (corner_from_side(searched) @ inward_px[..., None]).reshape(-1, 4, 2)
     state = _State.at(begun, np.full(len(start), blur_px), blur_px, frames)
     state.outline_sigma_px = np.tile(sigma_px, 2)
     system = state.settle(lattice, _STEPS)
@@ -339,7 +285,7 @@ class _State:
         # Where the sensor was at its limit the truth is as bright or brighter.
         use = lattice.use * ~(lattice.limited & (residual < 0))
         residual *= use
-        weight, scatter, inliers = _weights(residual, use, lattice, least_scatter)
+        weight, scatter, inliers = pixel_weights(residual, use, lattice, least_scatter)
         design = np.empty((len(coverage), _UNKNOWNS, coverage.shape[1]), dtype=np.float32)
         np.multiply(by_shape, gain[:, None], out=design[:, :_K])
         design[:, _K] = (gain + 1) * coverage
@@ -349,12 +295,12 @@ class _State:
         information = (weighted @ design.swapaxes(1, 2)).astype(np.float64)
         gradient = (weighted @ residual[..., None])[..., 0].astype(np.float64)
         if paint is not None:
-            _add_paint(information, gradient, coverage, by_shape, paint, lattice.use)
+            add_paint(information, gradient, coverage, by_shape, paint, lattice.use)
         self._add_priors(information, gradient, hold_blur=paint is not None)
         moved = np.linalg.solve(information, gradient[..., None])[..., 0]
         most_px = _MAX_STEP * self.blur_px[:, None]
         by_side = np.clip(moved[:, :_BLUR], -most_px, most_px)
-        self.corners += (_corner_from_side(self.corners) @ by_side[..., None]).reshape(-1, 4, 2)
+        self.corners += (corner_from_side(self.corners) @ by_side[..., None]).reshape(-1, 4, 2)
         if paint is None:
             self.blur_px = np.clip(self.blur_px + moved[:, _BLUR], *_BLUR_LIMITS_PX)
         self.contrast = self.contrast + np.clip(moved[:, _K], -0.5, 0.5)
@@ -391,7 +337,7 @@ class _State:
         place = np.arange(8)
         information[:, place, place] += stiffness
         gradient[:, :8] += stiffness * np.concatenate([start, end], axis=1)
-        by_side = self.closure @ _corner_from_side(self.corners)
+        by_side = self.closure @ corner_from_side(self.corners)
         open_ = self.open_gap()
         information[:, :8, :8] += by_side.swapaxes(1, 2) @ by_side
         gradient[:, :8] -= (by_side.swapaxes(1, 2) @ open_[..., None])[..., 0]
@@ -426,98 +372,8 @@ def _closure(corners: FloatArray, frames: StraightFrames) -> tuple[FloatArray, F
 _ALTERNATING = np.array([1.0, -1.0, 1.0, -1.0])
 
 
-def _add_paint(
-    information: FloatArray,
-    gradient: FloatArray,
-    coverage: np.ndarray,
-    by_shape: np.ndarray,
-    paint: np.ndarray,
-    use: np.ndarray,
-) -> None:
-    """Add that the network's probability of paint (M, N) is the coverage, with Cauchy weights."""
-    residual = paint - coverage
-    weight = use / (_PAINT_SIGMA**2 * (1 + (residual / (_CAUCHY * _PAINT_SIGMA)) ** 2))
-    by_side = by_shape[:, :8]
-    weighted = by_side * weight[:, None]
-    information[:, :8, :8] += weighted @ by_side.swapaxes(1, 2)
-    gradient[:, :8] += (weighted @ residual[..., None])[..., 0]
-
-
 _DIFFERENCE = np.diff(np.eye(KNOTS), axis=0)
 _ROUGHNESS = _DIFFERENCE.T @ _DIFFERENCE + 1e-6 * np.eye(KNOTS)
-
-
-def _weights(
-    residual: np.ndarray, use: np.ndarray, lattice: Lattice, least_scatter: float
-) -> tuple[np.ndarray, FloatArray, FloatArray]:
-    """What every pixel (M, N) weighs, 1 / variance; the scatter (M, 4) by side; the mean robust weight (M,).
-
-    The robust weight is Cauchy's; the variance is that of a side's own pixels, inflated by the correlation of
-    neighbours.
-    """
-    size = np.abs(residual)
-    scale = np.maximum(1.4826 * lattice.median_used(size, use), max(_MIN_SCATTER, least_scatter))
-    robust = use / (1 + (size / (_CAUCHY * scale[:, None])) ** 2)
-    square = robust * residual * residual
-    total, count = square.sum(axis=1), robust.sum(axis=1)
-    shared = total / np.maximum(count, 1)
-    by_side = np.stack([square, robust], axis=1) @ lattice.of_side
-    variance = (by_side[:, 0] + _SHARED_PIXELS * shared[:, None]) / (by_side[:, 1] + _SHARED_PIXELS)
-    variance = np.maximum(variance.astype(np.float64), _MIN_SCATTER**2)
-    inflation = np.ones(len(residual))
-    rows = np.arange(len(residual))[:, None]
-    for neighbour in lattice.neighbours:
-        pair = robust * robust[rows, neighbour] * (neighbour > 0)
-        inflation *= variance_inflation(residual, residual[rows, neighbour], pair, _MAX_CORRELATION)
-    per_pixel = 1 / (variance * inflation[:, None])
-    weight = robust * (per_pixel.astype(np.float32)[:, None] @ lattice.of_side.swapaxes(1, 2))[:, 0]
-    inliers = count / np.maximum(use.sum(axis=1), 1)
-    return weight, np.sqrt(variance), inliers.astype(np.float64)
-
-
-def _corner_from_side(corners: FloatArray) -> FloatArray:
-    """Moves (M, 8) of the sides' starts and ends along their normals to moves (M, 8) of the corners."""
-    tangent, _, _ = side_frames(corners)
-    before = preceding(tangent)
-    determinant = before[..., 0] * tangent[..., 1] - before[..., 1] * tangent[..., 0]
-    determinant = np.where(np.abs(determinant) < _LEAST_SINE, -_LEAST_SINE, determinant)[..., None]
-    jacobian = np.zeros((len(corners), 4, 2, 8))
-    # Each lies along the other's line.
-    jacobian[:, _CORNER, :, _CORNER] = (-before / determinant).swapaxes(0, 1)
-    jacobian[:, _CORNER, :, _END] = (tangent / determinant).swapaxes(0, 1)
-    return jacobian.reshape(-1, 8, 8)
-
-
-def _second_order(corners: FloatArray, by_side: FloatArray) -> FloatArray:
-    """What the error of a side's direction adds where its end is vague: (M, 8, 8), px^2.
-
-    A corner that may lie far along a side is off across it by its way times the error of the side's
-    direction.
-    """
-    _, normal, length = side_frames(corners)
-    start, end = by_side[:, _CORNER, _CORNER], by_side[:, _CORNER + 4, _CORNER + 4]
-    both = by_side[:, _CORNER, _CORNER + 4]
-    tilt = np.maximum(start + end - 2 * both, 0) / np.maximum(length, 1.0) ** 2
-    out = np.zeros((len(corners), 4, 2, 4, 2))
-    # Corner c runs along side c if the end of side c - 1 is vague, and along side c - 1 if the start of c is.
-    for of, slack in ((_CORNER, np.roll(end, 1, axis=1)), (_CORNER - 1, start)):
-        variance = tilt[:, of] * slack
-        outer = normal[:, of, :, None] * normal[:, of, None, :]
-        out[:, _CORNER, :, _CORNER] += (variance[..., None, None] * outer).swapaxes(0, 1)
-    return out.reshape(-1, 8, 8)
-
-
-_TILT_SHARE = 0.5
-"""A side that is off as a whole is askew by this share of that."""
-
-
-def _whole_sides(sigma_px: FloatArray) -> FloatArray:
-    """Covariance (M, 8, 8) of starts and ends of sides that are off as a whole by ``sigma_px`` (M, 4)."""
-    pattern = np.kron([[1.0, 1.0], [1.0, 1.0]], np.eye(4)) + _TILT_SHARE**2 * np.kron(
-        [[1.0, -1.0], [-1.0, 1.0]], np.eye(4)
-    )
-    sigma = np.tile(sigma_px, 2)
-    return np.asarray(sigma[:, :, None] * pattern * sigma[:, None, :])
 
 
 def _statistics(

@@ -19,6 +19,9 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 _LEAST_DEPTH_M = 1.0
 """Depth, m, from which a corner on a line may be projected: nearer, the line leaves the image steeply."""
 
+OPEN_END_M = 10.0
+"""Sigma, m, of where along its side a corner lies that is no point: markings are up to so long."""
+
 
 @dataclass(frozen=True)
 class Association:
@@ -76,6 +79,36 @@ class FusedGroups:
         return np.asarray(self.seen > 0)
 
 
+def known_elsewhere(association: Association, point: BoolArray, informs: BoolArray) -> BoolArray:
+    """Which corners (S, 4) lie on a line on whose end another image has put them as points.
+
+    Where other paint, a shadow or the image's border cuts a marking, its corner is only known to lie on the
+    marking's side, at least as far out as the cut. All images that are cut alike would be wrong alike, so
+    that of such a corner only the line counts, as soon as its end is known.
+
+    Args:
+        association: the groups.
+        point: corners (S, 4), in the sightings' own order, that are points.
+        informs: those that say anything.
+    """
+    grouped = (association.group >= 0)[:, None]
+    number = 4 * association.group[:, None] + np.arange(4)
+    points = association.in_group_order(point) & grouped
+    has_point = np.zeros(4 * association.count + 1, dtype=np.bool_)
+    has_point[number[points]] = True
+    out = np.zeros_like(point)
+    known = grouped & has_point[np.where(grouped, number, -1)]
+    np.put_along_axis(out, association.corner_order(), known, axis=1)
+    return np.asarray(out & informs & ~point)
+
+
+def line_only(covariance: FloatArray, sigma: float) -> FloatArray:
+    """Covariances (..., 2, 2) with ``sigma`` in the direction in which they are larger."""
+    value, vector = np.linalg.eigh(covariance)
+    value[..., 1] = np.maximum(value[..., 1], sigma**2)
+    return np.asarray((vector * value[..., None, :]) @ np.swapaxes(vector, -1, -2))
+
+
 def fuse_groups(association: Association, located: Located, jitter_rad: float) -> FusedGroups:
     """Information-weighted mean of each group's corners, with Huber weights from its own median.
 
@@ -87,6 +120,8 @@ def fuse_groups(association: Association, located: Located, jitter_rad: float) -
     informs = association.in_group_order(located.informs) & grouped
     point = association.in_group_order(located.valid) & grouped
     noise = located.covariance_m2 + located.direction_covariance_m2(jitter_rad)
+    on_line = known_elsewhere(association, located.valid, located.informs)
+    noise[on_line] = line_only(noise[on_line], OPEN_END_M)
     covariance = association.in_group_order(noise) + 1e-6 * np.eye(2)
     information = np.linalg.inv(np.where(informs[..., None, None], covariance, np.eye(2)))
     corner = np.where(informs, association.group[:, None] * 4 + np.arange(4), association.count * 4)

@@ -56,20 +56,34 @@ def collect_symbols(
     return Symbols(*indices, tuple(outlines), tuple(kinds))
 
 
-def images_with_symbol(symbols: Symbols, rig: Rig, points_map: FloatArray) -> IntArray:
-    """In how many images a symbol lies on each of the ground points (G, 2); nan points have none."""
-    count = np.zeros(len(points_map), dtype=np.int64)
-    known = np.flatnonzero(np.isfinite(points_map).all(axis=1))
+def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> IntArray:
+    """In how many images a symbol lies along each of the quadrilaterals (G, 4, 2); nan ones have none.
+
+    It lies along one that it holds most of the middle line of: an arrow that crosses a stop line does not.
+    """
+    count = np.zeros(len(corners_map), dtype=np.int64)
+    known = np.flatnonzero(np.isfinite(corners_map).all(axis=(1, 2)))
+    centre, points = corners_map.mean(axis=1), _middle_line(corners_map)
     for ground in outlines_on_ground(symbols, rig):
         if ground is None:
             continue
-        size_m = float(np.ptp(ground, axis=0).max())
-        near = known[np.linalg.norm(points_map[known] - ground.mean(axis=0), axis=1) < size_m]
-        polygon = (ground - ground.mean(axis=0)).astype(np.float32)
-        for group in near:
-            at = (points_map[group] - ground.mean(axis=0)).tolist()
-            count[group] += cv2.pointPolygonTest(polygon, at, False) >= 0
+        middle, size_m = ground.mean(axis=0), float(np.ptp(ground, axis=0).max())
+        polygon = (ground - middle).astype(np.float32)
+        for group in known[np.linalg.norm(centre[known] - middle, axis=1) < size_m]:
+            inside = [
+                cv2.pointPolygonTest(polygon, at, False) >= 0 for at in (points[group] - middle).tolist()
+            ]
+            count[group] += 2 * sum(inside) > len(inside)
     return count
+
+
+def _middle_line(corners_map: FloatArray) -> FloatArray:
+    """Five points (G, 5, 2) spread evenly over the longer middle lines of quadrilaterals (G, 4, 2)."""
+    sides = (corners_map + np.roll(corners_map, -1, axis=1)) / 2
+    across = np.stack([sides[:, 2] - sides[:, 0], sides[:, 3] - sides[:, 1]], axis=1)
+    longer = np.argmax(np.linalg.norm(across, axis=2), axis=1)
+    way = across[np.arange(len(across)), longer]
+    return np.asarray(corners_map.mean(axis=1)[:, None] + np.linspace(-0.4, 0.4, 5)[:, None] * way[:, None])
 
 
 def outlines_on_ground(symbols: Symbols, rig: Rig) -> list[FloatArray | None]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from v2hdm.geometry.quadrilateral import block_diagonal
-from v2hdm.mapping.association.groups import FusedGroups
+from v2hdm.mapping.association.groups import FusedGroups, line_only
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
@@ -97,6 +97,9 @@ def with_shared_errors(places: Places, fused: FusedGroups) -> Places:
     single = np.maximum(fused.seen, 1)[..., None, None] * fused.covariance_m2
     unseen = np.asarray(np.isnan(fused.corners_map).any(axis=2))[..., None, None]
     shared = np.where(unseen, 0.0, _CORRELATION * single)
+    # Images that are cut alike are wrong alike, so that no number of them says where a corner lies.
+    no_point = (fused.seen == 0) & ~unseen[..., 0, 0]
+    shared[no_point] = line_only(shared[no_point], UNSEEN_M2**0.5)
     return Places(places.corners_map, places.covariance_m2 + block_diagonal(shared))
 
 

@@ -70,7 +70,7 @@ class Seen:
             agreeing=np.bincount(group, minlength=count),
             easy_views=np.bincount(easy[0], minlength=count),
             found=np.bincount(easy[0, found], minlength=count),
-            as_symbol=images_with_symbol(self.sightings.symbols, self.rig, corners_map.mean(axis=1)),
+            as_symbol=images_with_symbol(self.sightings.symbols, self.rig, corners_map),
         )
 
 
