@@ -140,7 +140,8 @@ def test_a_drive_at_a_store_is_copied_once_for_each_content(
     assert mirrored(place, tmp_path / "cache", quiet) != copy
 
     work = Work()
-    in_place(replace(config, drive=DriveConfig(path=str(place))), work, True, quiet)
+    made, _ = in_place(replace(config, drive=DriveConfig(path=str(place))), work, True, quiet)
+    assert made.place == f"{memory}/results/monday"
     assert work.done[0].drive.paths[0].is_relative_to(tmp_path / "local")
 
 

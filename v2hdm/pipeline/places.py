@@ -78,6 +78,7 @@ def _local(config: RunConfig, folder: Path, progress: Progress) -> RunConfig:
     imports = str(folder) if is_url(drive.cache) else drive.cache
     paths = drive.path if isinstance(drive.path, list) else [drive.path]
     if any(isinstance(one, str) and is_url(one) for one in paths):
+        config = replace(config, name=run_name(config))  # as before anything was copied
         copied = [_copied(one, folder, progress) for one in paths]
         drive = replace(drive, path=copied if isinstance(drive.path, list) else copied[0])
     return replace(config, cache=str(folder), drive=replace(drive, cache=imports))
