@@ -65,7 +65,10 @@ def processor_s(process: int) -> float:
 
 def detecting(drive: Path, images: int, every: int) -> Iterator[Sample]:
     """Samples of the door's process while it looks at the images of one camera again and again."""
-    files = sorted(next(path.parent for path in drive.rglob("*.jpg")).glob("*.jpg"))
+    found = sorted(drive.rglob("*.jpg"))
+    if not found:
+        raise SystemExit(f"{drive}: no .jpg in it")
+    files = sorted(found[0].parent.glob("*.jpg"))
     with TemporaryDirectory(prefix="endurance-") as scratch:
         folder = Path(scratch)
         for i, file in zip(range(images), itertools.cycle(files), strict=False):
