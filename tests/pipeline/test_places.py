@@ -98,6 +98,22 @@ def test_a_result_whose_upload_failed_is_not_made_again(
     assert memory.below("results/example").read("maps/map.geojson")
 
 
+def test_what_another_finishes_while_its_lease_is_waited_for_is_taken(
+    config: RunConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = Work(), Work()
+    leased = places.ResultObjects.leased
+
+    def after_another(*arguments: Any) -> Any:
+        monkeypatch.setattr(places.ResultObjects, "leased", leased)
+        assert not in_place(config, first, True, quiet)[1]
+        return leased(*arguments)
+
+    monkeypatch.setattr(places.ResultObjects, "leased", after_another)
+    assert in_place(config, second, True, quiet)[1]
+    assert (len(first.done), len(second.done)) == (1, 0)
+
+
 def test_what_is_not_ours_is_told_before_any_work(config: RunConfig, memory: Bucket) -> None:
     memory.write("results/example/notes", b"mine")
     work = Work()
@@ -111,6 +127,8 @@ def test_a_folder_named_by_a_url_is_that_folder(config: RunConfig, tmp_path: Pat
     work = Work()
     assert in_place(local, work, True, quiet)[0].place == str(tmp_path / "out" / "example")
     assert in_place(local, work, True, quiet)[1]
+    drive = DriveConfig(path=f"file://{tmp_path}/drive")
+    assert in_place(replace(local, drive=drive), work, True, quiet)[1]
     assert (work.done[0].cache, work.done[0].output) == (str(tmp_path / "kept"), str(tmp_path / "out"))
 
 

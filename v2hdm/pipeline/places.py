@@ -77,18 +77,15 @@ def _local(config: RunConfig, folder: Path, progress: Progress) -> RunConfig:
     drive = config.drive
     imports = str(folder) if is_url(drive.cache) else drive.cache
     paths = drive.path if isinstance(drive.path, list) else [drive.path]
-    if any(isinstance(one, str) and is_url(one) for one in paths):
+    places = [place_of(one, "drive.path=") if isinstance(one, str) and is_url(one) else one for one in paths]
+    if any(isinstance(one, Bucket) for one in places):
         config = replace(config, name=run_name(config))  # as before anything was copied
-        copied = [_copied(one, folder, progress) for one in paths]
-        drive = replace(drive, path=copied if isinstance(drive.path, list) else copied[0])
+    tell = partial(progress, "copy")
+    folders = [mirrored(one, folder, tell) if isinstance(one, Bucket) else one for one in places]
+    if folders != paths:
+        told = [str(one) for one in folders]
+        drive = replace(drive, path=told if isinstance(drive.path, list) else told[0])
     return replace(config, cache=str(folder), drive=replace(drive, cache=imports))
-
-
-def _copied(path: object, folder: Path, progress: Progress) -> object:
-    if not isinstance(path, str) or not is_url(path):
-        return path
-    place = place_of(path, "drive.path=")
-    return str(place if isinstance(place, Path) else mirrored(place, folder, partial(progress, "copy")))
 
 
 def _put(
@@ -97,12 +94,13 @@ def _put(
     name = run_name(config)
     take_name(name, "name", ConfigError)
     result = ResultObjects(output.below(name))
-    url = result.objects.url
     there = _taken(result, config) if take else None
     if there is not None:
-        _log.info(NOTHING_CHANGED, url)
-        return replace(there, url=url), True
+        return there, True
     with result.leased(output, partial(progress, "listen")) as lease:
+        there = _taken(result, config) if take else None
+        if there is not None:  # who held the lease has finished it
+            return there, True
         result.ours()  # what is not ours is told before any work
         place = Path(config.cache) / _UPLOADS / key_of(output.url)[:16]
         local = replace(config, output=str(place))
@@ -111,7 +109,7 @@ def _put(
         record = {} if key is None else {_RECORD: encode(_Record(key, made))}
         result.put({**contents_of(made.folder, LIST), **record}, lease, partial(progress, "upload"))
     drop_result(made.folder)
-    return replace(made, url=url), False
+    return replace(made, url=result.objects.url), False
 
 
 def _taken(result: ResultObjects, config: RunConfig) -> RunResult | None:
@@ -120,6 +118,9 @@ def _taken(result: ResultObjects, config: RunConfig) -> RunResult | None:
         return None
     try:
         record = decode(result.objects.read(_RECORD) or b"", _Record)
-        return record.result if is_of(config, record.key) else None
+        if not is_of(config, record.key):
+            return None
     except (CodecError, V2hdmError, OSError):  # told by the run that follows
         return None
+    _log.info(NOTHING_CHANGED, result.objects)
+    return replace(record.result, url=result.objects.url)
