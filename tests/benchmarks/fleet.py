@@ -1,12 +1,14 @@
 """What Ray brings on two cores, and what a site in parts costs: times, bytes, and that maps are the same.
 
-``python -m tests.benchmarks.fleet [--drives 8] [--frames 600] [--images FOLDER] [--repeats 3]`` prints
+``python -m tests.benchmarks.fleet [--drives 8] [--frames 600] [--images FOLDER] [--visits FOLDERS]`` prints
 
 - detection of a drive by one actor and by two, if ``--images`` names a drive (in any format that is read);
 - the adjustment of a synthetic site of so many drives by :func:`v2hdm.adjust.solve`, in parts in this
   process, and in parts by one actor and by two; how far their corners are from the first's, and those of two
   actors one of which is killed in the middle;
-- the bytes that travel for an evaluation and for a whitening, by drive.
+- the bytes that travel for an evaluation and for a whitening, by drive;
+- the adjustment of 2, 4 and 8 drives of one way, together and in parts, one after the other in this process;
+- reading and checks of drives of one site, if ``--visits`` names them, here and by tasks on two cores.
 
 Runs with one and two actors take turns, and the fastest of each counts: on a machine that is busy otherwise
 the wall time tells little. Beside it stands the CPU time of the longest chain: the head's, and that of the
@@ -30,14 +32,23 @@ import torch
 from tests.adjust.site import site
 from v2hdm.adjust import Problem, Solution, SolveOptions, solve
 from v2hdm.adjust.parts import Local, solve_in_parts
+from v2hdm.adjust.parts.choice import cost_in_parts, cost_together
 from v2hdm.adjust.parts.split import split
+from v2hdm.caching.keys import key_of
+from v2hdm.caching.room import Room
 from v2hdm.detection.batch import with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.drive import ReadOptions, read_drive
 from v2hdm.fleet.cluster import LOCAL, cluster
+from v2hdm.fleet.crew import RayCrew
 from v2hdm.fleet.eyes import Eyes, detect_by
 from v2hdm.fleet.parts import RayTeam
+from v2hdm.mapping.crew import ALONE, Crew
+from v2hdm.pipeline.config import DriveConfig, RunConfig
+from v2hdm.pipeline.inspect import inspect_each
+from v2hdm.pipeline.keys import read_visits
+from v2hdm.pipeline.telling import silent
 
 OPTIONS = SolveOptions(coarse=False)
 _TICKS = os.sysconf("SC_CLK_TCK")
@@ -189,6 +200,47 @@ def adjustment(ray: Any, problem: Problem, repeats: int) -> None:
         print(f"{question}: asked {asked} times; {down:.1f} kB down and {up:.1f} kB up, a drive and time")
 
 
+def crowd(frames: int) -> None:
+    """Print what drives of one way cost together and in parts."""
+    for solve_it in (solve, lambda problem, options: solve_in_parts(problem, options, Local())):
+        solve_it(site(2, 40, 10), OPTIONS)  # compiles, or loads what was compiled
+    for drives in (2, 4, 8):
+        problem, spent, found = site(drives, frames, frames), [], []
+        for team in (None, Local()):
+            cpu = time.process_time()
+            one = solve(problem, OPTIONS) if team is None else solve_in_parts(problem, OPTIONS, team)
+            spent.append(time.process_time() - cpu)
+            found.append(one)
+        counted = cost_together(problem, OPTIONS), cost_in_parts(problem, OPTIONS)
+        print(
+            f"{drives} drives of one way: {spent[0]:.2f} s CPU together, {spent[1]:.2f} s in parts; "
+            f"{counted[0]:.1e} and {counted[1]:.1e} multiplications a whitening; {off_m(*found):.1e} m apart",
+            flush=True,
+        )
+
+
+def visits(folders: Sequence[Path], repeats: int) -> None:
+    """Print the row of reading and checks."""
+    config = RunConfig(drive=DriveConfig(path=[str(one) for one in folders]))
+    wall: dict[str, list[float]] = {"here": [], "by tasks": []}
+    found = {}
+    for _ in range(repeats):
+        crews: dict[str, Crew] = {"here": ALONE, "by tasks": RayCrew(2, str(Path.cwd()))}
+        for who, crew in crews.items():
+            began = time.perf_counter()
+            drives, contents = read_visits(config, config.drive.paths, crew)
+            max_gap_s = config.drive.max_gap_s
+            found[who] = inspect_each(drives, contents, max_gap_s, Room(None), 1, silent, crew)
+            wall[who].append(time.perf_counter() - began)
+            print(f"  reading and checks {who}: {wall[who][-1]:.2f} s", flush=True)
+    here, there = (min(times) for times in wall.values())
+    same = key_of(found["here"]) == key_of(found["by tasks"])
+    print(
+        f"reading and checks of {len(folders)} drives: {here:.2f} s here, {there:.2f} s by tasks on two "
+        f"cores: {here / there:.2f} x; the same found: {same}"
+    )
+
+
 def main() -> None:
     """Print all of it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -196,13 +248,23 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=600)
     parser.add_argument("--overlap", type=int, default=40)
     parser.add_argument("--images", type=Path)
+    parser.add_argument("--visits", type=Path, nargs="+")
+    parser.add_argument("--only", choices=["crowd", "visits"], help="leave all else out")
     parser.add_argument("--repeats", type=int, default=3)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    problem = site(arguments.drives, arguments.frames, arguments.overlap, every_m=1.0)
+    if arguments.only != "visits":
+        crowd(200)
+    if arguments.only == "crowd":
+        return
     with cluster(LOCAL, 2) as ray:
+        if arguments.visits is not None:
+            visits(arguments.visits, arguments.repeats)
+        if arguments.only == "visits":
+            return
         if arguments.images is not None:
             detection(ray, arguments.images, arguments.repeats)
+        problem = site(arguments.drives, arguments.frames, arguments.overlap, every_m=1.0)
         adjustment(ray, problem, arguments.repeats)
 
 

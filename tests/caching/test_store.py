@@ -7,12 +7,15 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from v2hdm.caching.room import Room
 from v2hdm.caching.store import Store
+from v2hdm.errors import DriveError
 
 KEY = "ab" * 32
 
@@ -111,3 +114,29 @@ def test_a_use_is_an_entrys_time_of_change(tmp_path: Path) -> None:
     os.utime(store.path("stage", KEY), (1, 1))
     store.get("stage", KEY)
     assert store.path("stage", KEY).stat().st_mtime > 1
+
+
+def test_of_several_results_the_missing_ones_are_begun_before_one_is_waited_for(tmp_path: Path) -> None:
+    store, told = Store(tmp_path), list[str]()
+    made(Room(store), [7])
+
+    def begin(value: int) -> Callable[[], list[int]]:
+        def wait() -> list[int]:
+            told.append(f"wait {value}")
+            if value < 0:
+                raise DriveError("unreadable")
+            return [value]
+
+        told.append(f"begin {value}")
+        return wait
+
+    room = Room(store)
+    jobs = [(key, partial(begin, value)) for key, value in (("a", 1), (KEY, 2), ("b", 3))]
+    found = room.each_made("stage", list[int], jobs)
+    assert next(found) == [1]
+    assert told == ["begin 1", "begin 3", "wait 1"]
+    assert Room(store).take("stage", "a", list[int]) == [1]
+    assert list(found) == [[7], [3]]
+    with pytest.raises(DriveError, match="unreadable"):
+        list(room.each_made("stage", list[int], [("c", partial(begin, 4)), ("d", partial(begin, -1))]))
+    assert Room(store).take("stage", "c", list[int]) == [4]

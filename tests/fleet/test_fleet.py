@@ -24,11 +24,11 @@ from v2hdm.detection.batch import detect_all, with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.drive import read_drive
-from v2hdm.errors import DriveError, WorkerError
+from v2hdm.errors import ConfigError, DriveError, WorkerError
 from v2hdm.fleet.board import Board
 from v2hdm.fleet.eyes import Eyes, detect_by, open_eyes
 from v2hdm.fleet.gpus import EYES_A_GPU, Shares
-from v2hdm.fleet.plan import plan
+from v2hdm.fleet.plan import plan, plan_site
 from v2hdm.fleet.rows import Row, exit_code
 from v2hdm.fleet.run import FleetOptions, run_fleet
 from v2hdm.fleet.work import map_drive
@@ -159,7 +159,7 @@ def test_a_drive_cache_and_results_at_an_object_store_make_the_same_map(
         if path.is_file():
             s3.upload_file(str(path), "bucket", f"drives/tiny/{path.relative_to(drive).as_posix()}")
     settings = ["output=s3://bucket/results", "cache=s3://bucket/cache", f"local_cache={tmp_path / 'one'}"]
-    (job,), _ = plan([written(tmp_path, "good", "s3://bucket/drives/tiny")], settings)
+    (job,) = plan([written(tmp_path, "good", "s3://bucket/drives/tiny")], settings).jobs
     assert job.place == "s3://bucket/results/good"
     eyes, board = eyes_of(ray, 1), ray.remote(Board).options(num_cpus=0).remote()
     for kept in (False, True):
@@ -169,7 +169,7 @@ def test_a_drive_cache_and_results_at_an_object_store_make_the_same_map(
 
     # Another machine, with the drive in a folder of its own: what was detected is at the store.
     settings = [f"output={tmp_path / 'out'}", "cache=s3://bucket/cache", f"local_cache={tmp_path / 'two'}"]
-    (job,), _ = plan([written(tmp_path, "good", drive)], settings)
+    (job,) = plan([written(tmp_path, "good", drive)], settings).jobs
     row, trace = map_drive(job, [], board, str(Path.cwd()))
     assert row.status == "PASS", (row, trace)
     for name in ("map.geojson", "calibration_front.yaml"):
@@ -220,7 +220,7 @@ def test_a_fleet_outlives_its_workers_keeps_what_is_finished_and_goes_on_past_wh
     assert [row["drive"] for row in table] == ["good", "nowhere", "typo"]
     assert json.loads((tmp_path / "table" / "fleet.json").read_text())["drives"][0]["status"] == "PASS"
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["good"]
-    (job,), _ = plan([good], [f"output={tmp_path / 'alone'}", f"cache={tmp_path / 'other'}", "workers=1"])
+    (job,) = plan([good], [f"output={tmp_path / 'alone'}", f"cache={tmp_path / 'other'}", "workers=1"]).jobs
     alone = pipeline.run(job.config, job.config_yaml).folder
     for name in ("map.geojson", "calibration_front.yaml", "residuals.csv", "trajectory.tum"):
         assert (tmp_path / "out" / "good" / name).read_bytes() == (alone / name).read_bytes(), name
@@ -231,15 +231,45 @@ def test_a_fleet_outlives_its_workers_keeps_what_is_finished_and_goes_on_past_wh
 def test_two_run_files_never_write_one_folder(tmp_path: Path, drive: Path) -> None:
     files = [written(tmp_path, "one", drive), tmp_path / "other.yaml"]
     files[1].write_text(files[0].read_text())
-    jobs, refused = plan(files, [])
-    assert [job.name for job in jobs] == ["one"]
-    assert "give one of them another name" in refused[0].says
+    planned = plan(files, [])
+    assert [job.name for job in planned.jobs] == ["one"]
+    assert "give one of them another name" in planned.refused[0].says
+
+
+def test_the_drives_of_run_files_become_one_site(tmp_path: Path) -> None:
+    monday = written(tmp_path, "monday", "drives/monday")
+    week = written(tmp_path, "week", "[drives/tuesday, drives/friday]")
+    planned = plan_site([monday, week], ["output=maps", "mapping.rounds=3"], "port")
+    (job,) = planned.jobs
+    assert job.config.drive.path == ["drives/monday", "drives/tuesday", "drives/friday"]
+    assert (job.name, job.place, job.config.mapping.rounds) == ("port", str(Path("maps/port").resolve()), 3)
+    assert planned.sources == [f"{monday}, {week}"] == [job.source]
+    far = written(tmp_path, "far", "s3://bucket/drives/far")
+    (job,) = plan_site([monday, far], [], "port").jobs
+    assert job.config.drive.path == ["drives/monday", "s3://bucket/drives/far"]
+
+
+def test_files_that_make_no_site_are_one_row_that_says_why(tmp_path: Path) -> None:
+    monday, tuesday = (written(tmp_path, name, name) for name in ("monday", "tuesday"))
+    tuesday.write_text(tuesday.read_text() + "mapping: {max_range_m: 9.0}\n")
+    (row,) = plan_site([monday, tuesday], [], "port").refused
+    assert (row.drive, row.status) == ("port", "ERROR")
+    assert "tuesday.yaml: mapping.max_range_m is 9.0, and 16.0 in" in row.says
+    assert plan_site([monday, tuesday], ["mapping.max_range_m=9.0"], "port").jobs
+    rendered = tmp_path / "rendered.yaml"
+    rendered.write_text("# @package _global_\nname: rendered\nsimulate: {}\n")
+    (row,) = plan_site([rendered, monday], [], "port").refused
+    assert "set drive.path" in row.says
+    (row,) = plan_site([monday, tmp_path / "absent.yaml"], [], "port").refused
+    assert "absent.yaml" in row.says
+    with pytest.raises(ConfigError, match="--site"):
+        plan_site([monday], [], "../port")
 
 
 def test_what_would_be_gone_with_a_worker_is_refused(tmp_path: Path, drive: Path) -> None:
-    jobs, refused = plan([written(tmp_path, "one", drive)], ["output=memory://results"])
-    assert not jobs
-    assert "gone with the process" in refused[0].says
+    planned = plan([written(tmp_path, "one", drive)], ["output=memory://results"])
+    assert not planned.jobs
+    assert "gone with the process" in planned.refused[0].says
 
 
 def test_the_table_has_a_code_for_the_worst_of_its_rows() -> None:

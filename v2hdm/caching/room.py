@@ -8,7 +8,7 @@ logged while a result was made is logged again when it is taken.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -17,7 +17,7 @@ from v2hdm.caching.keys import code_key, key_of
 from v2hdm.caching.store import Store
 
 _Value = TypeVar("_Value")
-_Line = tuple[str, int, str]
+Line = tuple[str, int, str]
 """Name of a logger, level, message."""
 
 
@@ -43,9 +43,27 @@ class Room:
         found = self.take(stage, key, kind)
         if found is not None:
             return found
-        with _recorded() as lines:
+        with recorded() as lines:
             value = make()
         return self.keep(stage, key, kind, value, lines)
+
+    def each_made(
+        self, stage: str, kind: type[_Value], jobs: Sequence[tuple[str, Callable[[], Callable[[], _Value]]]]
+    ) -> Iterator[_Value]:
+        """Several results of a stage, in order; all that are missing are begun before one is waited for.
+
+        A job is a key, and what begins to make the result and returns what waits for it.
+        """
+        found = [self.take(stage, key, kind) for key, _ in jobs]
+        begun = [begin() if one is None else None for one, (_, begin) in zip(found, jobs, strict=True)]
+        for one, wait, (key, _) in zip(found, begun, jobs, strict=True):
+            if wait is None:
+                assert one is not None
+                yield one
+                continue
+            with recorded() as lines:
+                value = wait()
+            yield self.keep(stage, key, kind, value, lines)
 
     def take(self, stage: str, key: str, kind: type[_Value]) -> _Value | None:
         """What is kept under ``key``; None where there is nothing."""
@@ -55,18 +73,17 @@ class Room:
         if data is None:
             return None
         try:
-            lines, content = decode(data, tuple[list[_Line], bytes])
+            lines, content = decode(data, tuple[list[Line], bytes])
             value = decode(content, kind)
         except CodecError:
             self._store.drop(stage, key)
             return None
-        for name, level, message in lines:
-            logging.getLogger(name).log(level, "%s", message)
+        log_again(lines)
         self.taken.append(stage)
         return value
 
     def keep(
-        self, stage: str, key: str, kind: type[_Value], value: _Value, lines: list[_Line] | None = None
+        self, stage: str, key: str, kind: type[_Value], value: _Value, lines: list[Line] | None = None
     ) -> _Value:
         """Keep ``value`` under ``key``; returns it as :meth:`take` will."""
         content = encode(value)
@@ -78,14 +95,20 @@ class Room:
 class _Recorder(logging.Handler):
     def __init__(self) -> None:
         super().__init__(logging.DEBUG)
-        self.lines: list[_Line] = []
+        self.lines: list[Line] = []
 
     def emit(self, record: logging.LogRecord) -> None:
         self.lines.append((record.name, record.levelno, record.getMessage()))
 
 
+def log_again(lines: Sequence[Line]) -> None:
+    """Log what was :func:`recorded`."""
+    for name, level, message in lines:
+        logging.getLogger(name).log(level, "%s", message)
+
+
 @contextmanager
-def _recorded() -> Iterator[list[_Line]]:
+def recorded() -> Iterator[list[Line]]:
     """What this library logs within."""
     recorder, logger = _Recorder(), logging.getLogger("v2hdm")
     logger.addHandler(recorder)

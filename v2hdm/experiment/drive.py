@@ -29,7 +29,7 @@ from v2hdm.mapping.methods import NAIVE_IPMS, run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.camera_sets import camera_sets
 from v2hdm.pipeline.detections import detect_in_pieces
-from v2hdm.pipeline.inspect import Inspection, inspect_once
+from v2hdm.pipeline.inspect import Inspection, inspect_each
 from v2hdm.pipeline.keys import Contents, model_key
 from v2hdm.records import Drive, HdMap, ImageDetections, Marking, Truth
 from v2hdm.report.evaluation import growth_figures
@@ -125,7 +125,7 @@ def _find(job: Job, workers: int, tell: Tell) -> None:
     cache, contents = Store(job.cache), Contents.of([drive])
     room, max_gap_s = Room(cache), job.site.drive.max_gap_s
     with cache.in_use():
-        inspection = inspect_once(drive, contents, max_gap_s, room, workers, partial(tell, "check"))
+        (inspection,) = inspect_each([drive], contents, max_gap_s, room, workers, tell)
         detections = detect_in_pieces(
             inspection.drive, contents, job.detector, room, workers, partial(tell, "detect")
         )

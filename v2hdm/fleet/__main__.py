@@ -2,7 +2,7 @@
 
 Detection and mapping are spread over this machine's cores, or a cluster's, by Ray. A drive whose result is
 finished and was made of the same is not done again; one that fails is a row of the table that says why, and
-the others go on. docs/fleet.md describes it.
+the others go on. With --site all drives are mapped together, as one site. docs/fleet.md describes it.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def _fleet(parsed: argparse.Namespace) -> int:
         raise ConfigError("no drive is named: give run files, as in python -m v2hdm.fleet drives/*.yaml")
     if any(is_url(one) for one in parsed.drives if one not in overrides):
         raise ConfigError("run files lie on this machine; their drive.path may be a URL (docs/stores.md)")
-    options = FleetOptions(parsed.table, parsed.workers, parsed.address, parsed.again)
+    options = FleetOptions(parsed.table, parsed.workers, parsed.address, parsed.again, parsed.site)
     return exit_code(fleet_on_terminal(files, overrides, options))
 
 
@@ -60,6 +60,9 @@ def _parser() -> argparse.ArgumentParser:
         default="outputs/fleet",
         metavar="FOLDER",
         help="or the URL of one, takes the table of verdicts, fleet.csv and fleet.json (outputs/fleet)",
+    )
+    parser.add_argument(
+        "--site", metavar="NAME", help="map all the drives together, as one site of that name"
     )
     parser.add_argument("--again", action="store_true", help="do what is finished again")
     parser.add_argument("--version", action=ShowVersion)

@@ -17,6 +17,9 @@ from v2hdm.extras import need
 LOCAL = "local"
 """The address of a Ray of our own on this machine."""
 
+RETRIES = 3
+"""How often work is begun anew whose worker died."""
+
 _OBJECT_STORE_BYTES = 1 << 30
 
 _QUIET = {

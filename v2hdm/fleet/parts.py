@@ -64,7 +64,9 @@ class RayTeam:
 
     def __init__(self, actors: int, cores_each: float = 1.0) -> None:
         """Start actors that take so many cores each."""
-        options = {"num_cpus": cores_each, "max_restarts": -1, "max_task_retries": -1}
+        options: dict[str, Any] = {"num_cpus": cores_each, "max_restarts": -1, "max_task_retries": -1}
+        # Without cores to book they would all be put on one machine.
+        options["scheduling_strategy"] = "SPREAD"
         self.actors: list[Any] = [ray.remote(Keeper).options(**options).remote() for _ in range(actors)]
 
     def start(self, parts: Sequence[Part]) -> list[tuple[Tensor, Tensor]]:

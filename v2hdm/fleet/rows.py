@@ -7,7 +7,6 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from pathlib import Path
 from typing import Any
 
 from v2hdm.door import EXIT_FAILED_VERDICT, EXIT_USER_ERROR, one_line
@@ -27,7 +26,7 @@ class Row:
         images, markings, minutes: how large it was, what is on its map, and how long it took.
         kept: whether an earlier result was found that was made of the same.
         folder: of the result, or its URL; empty without one.
-        source: the run file.
+        source: the run file, or those of a site.
     """
 
     drive: str
@@ -41,12 +40,12 @@ class Row:
     source: str
 
     @classmethod
-    def of_error(cls, drive: str, source: Path, message: str) -> Row:
+    def of_error(cls, drive: str, source: str, message: str) -> Row:
         """The row of a drive that gave no result."""
-        return cls(drive, ERROR, one_line(message), None, None, None, False, "", str(source))
+        return cls(drive, ERROR, one_line(message), None, None, None, False, "", source)
 
     @classmethod
-    def of_result(cls, drive: str, source: Path, place: str, metrics: Mapping[str, Any], kept: bool) -> Row:
+    def of_result(cls, drive: str, source: str, place: str, metrics: Mapping[str, Any], kept: bool) -> Row:
         """The row of a finished run, from its ``metrics.json``."""
         verdict = metrics["verdict"]
         raised = verdict["findings"]
@@ -56,7 +55,7 @@ class Row:
         minutes = round(sum(metrics.get("seconds", {}).values()) / 60, 3)
         images = int(metrics["drive"]["images"])
         status = str(verdict["status"])
-        where = (place, str(source))
+        where = (place, source)
         return cls(drive, status, one_line(says), images, markings, minutes, kept, *where)
 
 

@@ -9,9 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from v2hdm.fleet.cluster import LOCAL, cluster
+from v2hdm.fleet.cluster import LOCAL, RETRIES, cluster
 from v2hdm.fleet.gpus import NO_GPU, Shares, wants_gpu
-from v2hdm.fleet.plan import Job, plan
+from v2hdm.fleet.plan import Job, plan, plan_site
 from v2hdm.fleet.rows import Row, as_csv, as_json
 from v2hdm.objects.bucket import place_of
 from v2hdm.objects.results import GrowingObjects, growing_objects
@@ -23,9 +23,6 @@ Tell = Callable[[str, str, int, int], None]
 ALL = "fleet"
 """In place of a drive's name, for what is told of the fleet."""
 
-_RETRIES = 3
-"""How often work is begun anew whose worker died."""
-
 _LOOK_EVERY_S = 0.3
 
 
@@ -34,13 +31,15 @@ class FleetOptions:
     """What a user chooses beside the drives.
 
     ``workers`` are the cores that are used on this machine, 0 for all; ``address`` is that of a cluster.
-    ``folder``, or the URL of one, takes the table; ``again`` does what is finished again.
+    ``folder``, or the URL of one, takes the table; ``again`` does what is finished again. ``site`` names the
+    one that all drives are of; without a name each is mapped by itself.
     """
 
     folder: Path | str
     workers: int = 0
     address: str = LOCAL
     again: bool = False
+    site: str | None = None
 
 
 def run_fleet(
@@ -55,19 +54,20 @@ def run_fleet(
         tell: told how far it is.
 
     Returns:
-        A row for each file, in their order.
+        A row for each file, in their order; one for a site.
 
     Raises:
         V2hdmError: the table cannot be written, or there is no Ray.
     """
-    jobs, refused = plan(files, [*overrides, "resume=false"] if options.again else overrides)
+    told = [*overrides, "resume=false"] if options.again else overrides
+    todo = plan(files, told) if options.site is None else plan_site(files, told, options.site)
     with _growing(options.folder, tell) as folder:
-        table = _Table(folder, files, tell)
-        for row in refused:
+        table = _Table(folder, todo.sources, tell)
+        for row in todo.refused:
             table.add(row)
-        if jobs:
+        if todo.jobs:
             with cluster(options.address, options.workers) as ray:
-                _map_all(ray, jobs, table, tell)
+                _map_all(ray, todo.jobs, table, tell)
         return table.rows
 
 
@@ -83,14 +83,14 @@ def _growing(place: Path | str, tell: Tell) -> AbstractContextManager[GrowingFol
 class _Table:
     """The rows so far, on disk as well."""
 
-    def __init__(self, folder: GrowingFolder | GrowingObjects, files: Sequence[Path], tell: Tell) -> None:
-        self._folder, self._files, self._tell = folder, [str(file) for file in files], tell
+    def __init__(self, folder: GrowingFolder | GrowingObjects, sources: Sequence[str], tell: Tell) -> None:
+        self._folder, self._sources, self._tell = folder, sources, tell
         self._rows: dict[str, Row] = {}
 
     @property
     def rows(self) -> list[Row]:
-        """In the order of the files."""
-        return [self._rows[file] for file in self._files if file in self._rows]
+        """In the order of the sources."""
+        return [self._rows[one] for one in self._sources if one in self._rows]
 
     def add(self, row: Row, trace: str = "") -> None:
         """Take the row of a drive, and the traceback of a bug where there is one."""
@@ -100,7 +100,7 @@ class _Table:
         self._folder.write("fleet.csv", as_csv(self.rows))
         self._folder.write("fleet.json", as_json(self.rows))
         self._tell(row.drive, row.status, 1, 1)
-        self._tell(ALL, "drives", len(self._rows), len(self._files))
+        self._tell(ALL, "drives", len(self._rows), len(self._sources))
 
 
 def _map_all(ray: Any, todo: Sequence[Job], table: _Table, tell: Tell) -> None:
@@ -115,7 +115,7 @@ def _map_all(ray: Any, todo: Sequence[Job], table: _Table, tell: Tell) -> None:
         table.add(Row.of_error(job.name, job.source, NO_GPU))
     todo = [job for job in todo if gpus or not wants_gpu(job.config)]
     shares = Shares.of([job.config for job in todo])
-    eyes = open_eyes({job.config.detector.device for job in todo}, cores, gpus, shares.eyes, here, _RETRIES)
+    eyes = open_eyes({job.config.detector.device for job in todo}, cores, gpus, shares.eyes, here, RETRIES)
     board = ray.remote(Board).options(num_cpus=0, max_restarts=-1).remote()
     left = list(todo)[::-1]
     doing: dict[Any, Job] = {}
@@ -123,7 +123,7 @@ def _map_all(ray: Any, todo: Sequence[Job], table: _Table, tell: Tell) -> None:
         while left and len(doing) < cores:
             job = left.pop()
             share = shares.mapping if job.config.device == "cuda" else 0
-            mapping = ray.remote(map_drive).options(num_cpus=0.5, num_gpus=share, max_retries=_RETRIES)
+            mapping = ray.remote(map_drive).options(num_cpus=0.5, num_gpus=share, max_retries=RETRIES)
             doing[mapping.remote(job, eyes[job.config.detector.device], board, here)] = job
         done, _ = ray.wait(list(doing), num_returns=1, timeout=_LOOK_EVERY_S)
         for message in _told(ray, board):
@@ -146,7 +146,7 @@ def _outcome(ray: Any, reference: Any, job: Job) -> tuple[Row, str]:
     except ray.exceptions.RayError as error:
         # What map_drive raises is a row already: this is its process, again and again.
         line = (
-            f"its worker process died {_RETRIES + 1} times ({type(error).__name__}), perhaps for want of "
+            f"its worker process died {RETRIES + 1} times ({type(error).__name__}), perhaps for want of "
             "memory; set fewer --workers"
         )
         return Row.of_error(job.name, job.source, line), str(error)

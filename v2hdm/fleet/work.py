@@ -6,6 +6,7 @@ import os
 import traceback
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from v2hdm.caching.store import Store
@@ -44,6 +45,13 @@ def map_drive(job: Job, eyes: Sequence[Any], board: Any, folder: str) -> tuple[R
 
 
 def _mapped(job: Job, eyes: Sequence[Any], telling: Telling, config: RunConfig, store: Store) -> RunResult:
-    from v2hdm.pipeline.work import map_drives  # loads torch, which a finished result does not need
+    # They load torch, which a finished result does not need.
+    from v2hdm.fleet.crew import RayCrew
+    from v2hdm.mapping.crew import ALONE, Crew
+    from v2hdm.pipeline.work import map_drives
 
-    return map_drives(config, store, job.config_yaml, telling, detect=partial(detect_by, eyes))
+    crew: Crew = ALONE
+    if len(config.drive.paths) > 1:
+        crew = RayCrew(len(eyes), str(Path.cwd()))
+    detect = partial(detect_by, eyes)
+    return map_drives(config, store, job.config_yaml, telling, detect=detect, crew=crew)

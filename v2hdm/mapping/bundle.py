@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -44,6 +44,8 @@ HEAVE_SIGMA_M = 0.01
 CLOCK_SIGMA_S = 0.01
 """How far the clocks of camera and receiver may be apart where nobody says that they are synchronised."""
 
+
+Solve = Callable[[Problem, SolveOptions], Solution]
 
 LEAST_OBSERVATIONS = 200
 """Of fewer, the residuals cannot tell how large their variance is."""
@@ -163,6 +165,7 @@ def solve_bundle(
     rig: Rig,
     cameras: Mapping[str, Camera],
     model: Model,
+    solve: Solve = solve,
 ) -> Bundle:
     """Estimate extrinsics, poses and the corners of all groups together.
 
@@ -173,6 +176,7 @@ def solve_bundle(
         rig: Extrinsics to start from; the poses are always the recorded ones.
         cameras: Cameras by name, for the priors on their centres.
         model: Noise and what is estimated.
+        solve: takes the place of :func:`v2hdm.adjust.solve`.
 
     Raises:
         MappingError: No corner was seen twice.

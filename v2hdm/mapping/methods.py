@@ -20,6 +20,7 @@ from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.changes.update import Base, update_map
 from v2hdm.mapping.changes.watched import Observer
+from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mapping.growth import grow_map
 from v2hdm.mapping.lanes.fuse import map_lanes
 from v2hdm.mapping.lanes.points import ImageGround, collect_lane_points, ground_by_ipm, ground_by_rig
@@ -52,6 +53,7 @@ def run_methods(
     growth_steps: int = 0,
     base: Base | None = None,
     grey: Callable[[Image], NDArray[np.float32]] | None = None,
+    crew: Crew = ALONE,
 ) -> dict[str, MethodResult]:
     """Map a drive with every method that its IPMs allow.
 
@@ -64,6 +66,7 @@ def run_methods(
         growth_steps: At how many sizes of the growing map ``Opt`` is solved again; 0 for none.
         base: An earlier map that ``Opt`` brings up to date; None where there is none.
         grey: Reads the grey values (H, W) of an image, to look where ``base`` has paint; None does without.
+        crew: Who does what belongs to one visit of several.
 
     Returns:
         Results by method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``.
@@ -78,7 +81,7 @@ def run_methods(
         raise ConfigError(f"mapping.survey.file is {options.survey.file!r}: read it first, give its points")
     tell = progress or _silent
     tell("linking sightings")
-    given = Inputs(drive, detections, cameras, options)
+    given = Inputs(drive, detections, cameras, options, crew)
     results: dict[str, MethodResult] = {}
     for name, ipm in _given_ipms(drive, cameras).items():
         tell(name)

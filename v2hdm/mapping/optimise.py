@@ -14,7 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2hdm.adjust import Status, select_model
+from v2hdm.adjust import Problem, Solution, SolveOptions, Status, select_model
+from v2hdm.adjust.parts import adjust
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.mapping.association.attach import attach
@@ -29,6 +30,7 @@ from v2hdm.mapping.bundle import (
     full_model,
     solve_bundle,
 )
+from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mapping.incremental import IncrementalMapper
 from v2hdm.mapping.markings.conclude import Evidence, Optimised, conclude
 from v2hdm.mapping.options import AUTO, MappingOptions
@@ -60,8 +62,10 @@ class Optimiser:
         cameras: Mapping[str, Camera],
         pose_noise: PoseNoise | Sequence[PoseNoise],
         options: MappingOptions,
+        crew: Crew = ALONE,
     ) -> None:
         """``pose_noise`` is that of all visits, or of each; gates take the largest of each kind."""
+        self._crew = crew
         self._sightings = sightings
         self._views = views
         self._cameras = {name: cameras[name] for name in sightings.cameras}
@@ -128,7 +132,7 @@ class Optimiser:
         model = replace(model, clock_sigma_s=LOOSE_CLOCK_SIGMA_S)
         usable = self._usable(bundle.association, bundle.rig)
         solved = solve_bundle(
-            self._sightings, bundle.association, usable, bundle.rig, self._cameras, model
+            self._sightings, bundle.association, usable, bundle.rig, self._cameras, model, self._adjust
         ).solution
         return [
             {name: float(offset_s[c]) for name, c in bundle.camera_index.items()}
@@ -188,7 +192,7 @@ class Optimiser:
     def _track(self, rig: Rig, located: Located, direction_rad: float) -> Association:
         noise = self._pose_noise
         uncertainty = Uncertainty(direction_rad, noise.roll_pitch_rad, noise.position_m)
-        return build_tracks(self._sightings, located, rig, uncertainty, self._options.association)
+        return build_tracks(self._sightings, located, rig, uncertainty, self._options.association, self._crew)
 
     def _associate(self, rig: Rig) -> Association:
         """Tracks under an optimised ``rig``, merged across gaps, laps and cameras."""
@@ -228,11 +232,15 @@ class Optimiser:
             coarse_model(rig, self._noise_of_visits, self._options)
             if coarse
             else full_model(self._noise_of_visits, self._options, self._pose_model, self._variance_factor),
+            self._adjust,
         )
         status = bundle.solution.status
         if status is Status.UNDETERMINED or not np.isfinite(bundle.solution.corners_map).all():
             raise MappingError(f"the joint optimisation failed ({status.value}): {status.advice}")
         return bundle
+
+    def _adjust(self, problem: Problem, options: SolveOptions) -> Solution:
+        return adjust(problem, options, self._options.adjustment, self._crew.team)
 
     def _reweigh(self, bundle: Bundle) -> None:
         """Take the observations for as good as their residuals under ``bundle`` say.

@@ -19,6 +19,7 @@ from v2hdm.drive.clock import with_clock_offsets
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.bundle import Bundle
+from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mapping.evidence import Contradiction, SolveEvidence
 from v2hdm.mapping.fit import (
     along_route,
@@ -94,6 +95,7 @@ class Inputs:
     detections: Sequence[ImageDetections]
     cameras: Sequence[str]
     options: MappingOptions
+    crew: Crew = ALONE
 
     @cached_property
     def sightings(self) -> Sightings:
@@ -105,7 +107,7 @@ class Inputs:
         """Of these inputs, not yet run."""
         drive, options = self.drive, self.options
         views = views_of(drive, self.cameras)
-        return Optimiser(self.sightings, views, drive.cameras, drive.noises, options)
+        return Optimiser(self.sightings, views, drive.cameras, drive.noises, options, self.crew)
 
     @cached_property
     def tracks(self) -> Association:

@@ -11,6 +11,7 @@ from functools import partial
 from v2hdm.caching.room import Room
 from v2hdm.drive.truth import has_truth
 from v2hdm.mapping.changes.update import Base
+from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.base import grey_reader
@@ -54,6 +55,7 @@ def map_camera_sets(
     room: Room,
     progress: Progress,
     viewer: Viewer,
+    crew: Crew = ALONE,
 ) -> dict[str, MappedSet]:
     """Map a drive with each set of cameras, where that is not known yet.
 
@@ -66,6 +68,7 @@ def map_camera_sets(
         room: keeps the results.
         progress: told how many sets are done.
         viewer: shown the results of each set.
+        crew: maps the sets, and what belongs to one visit of several.
 
     Raises:
         MappingError: no map can be made.
@@ -73,19 +76,25 @@ def map_camera_sets(
     """
     sets = camera_sets(drive)
     begun = room.key(drive_key, list(detections), survey.mapping)
-    found = {}
-    for done, (name, cameras) in enumerate(sets.items()):
-        progress("map", done, len(sets))
-        last = done == len(sets) - 1
+    jobs = []
+    for number, (name, cameras) in enumerate(sets.items()):
+        last = number == len(sets) - 1
         # The picture of the growing map is drawn for the whole rig, which comes last, and needs truth.
         steps = GROWTH_STEPS if last and has_truth(drive) else 0
         of_last = (base, survey.check) if last else None
-        make = partial(
-            _map_set, drive, detections, name, cameras, survey, steps, base if last else None, last
+        work = partial(
+            _map_set, drive, detections, name, cameras, survey, steps, base if last else None, last, crew
         )
-        found[name] = room.made(STAGE, room.key(begun, name, cameras, steps, of_last), MappedSet, make)
-        viewer.mapped(name, found[name].methods)
-    progress("map", len(sets), len(sets))
+        # A single set is mapped here, where all that it needs is; others, too, where a GPU is.
+        shared_out = len(sets) > 1 and survey.mapping.device == "cpu"
+        begin = partial(crew.begin if shared_out else ALONE.begin, work)
+        jobs.append((room.key(begun, name, cameras, steps, of_last), begin))
+    progress("map", 0, len(sets))
+    found = {}
+    for name, mapped in zip(sets, room.each_made(STAGE, MappedSet, jobs), strict=True):
+        found[name] = mapped
+        viewer.mapped(name, mapped.methods)
+        progress("map", len(found), len(sets))
     return found
 
 
@@ -98,10 +107,11 @@ def _map_set(
     growth_steps: int,
     base: Base | None,
     last: bool,
+    crew: Crew,
 ) -> MappedSet:
     tell, begin_s = partial(_log.debug, "%s: %s", name), time.perf_counter()
     methods = run_methods(
-        drive, detections, cameras, survey.mapping, tell, growth_steps, base, grey_reader(drive)
+        drive, detections, cameras, survey.mapping, tell, growth_steps, base, grey_reader(drive), crew
     )
     best = methods[BEST]
     checked = compare_survey(survey, drive, best) if last else None

@@ -5,12 +5,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from v2hdm.caching.room import Room
 from v2hdm.drive import join_drives, with_clock_offsets
 from v2hdm.errors import MapFileError
 from v2hdm.ground import GroundEstimate, GroundStatus, better_start, estimate_cameras
 from v2hdm.ground.better import GROUND_IPM
+from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.pipeline.keys import Contents
 from v2hdm.quality import Finding, Status, check_drive, clock_corrections
 from v2hdm.quality.movement import movement
@@ -67,26 +69,32 @@ def inspect(drive: Drive, max_gap_s: float, workers: int, progress: Callable[[in
     return Inspection(corrected, drive.cameras, (ground,), findings)
 
 
-def inspect_once(
-    drive: Drive,
+def inspect_each(
+    drives: Sequence[Drive],
     contents: Contents,
     max_gap_s: float,
     room: Room,
     workers: int,
-    progress: Callable[[int, int], None],
-) -> Inspection:
-    """As :func:`inspect`, or what it found before of the same drive, with the same lines in the log.
+    progress: Callable[[str, int, int], None],
+    crew: Crew = ALONE,
+) -> list[Inspection]:
+    """As :func:`inspect` of each drive, or what it found before of the same, with the same lines in the log.
 
     Args:
-        drive: as it was read.
-        contents: of its images.
+        drives: as they were read.
+        contents: of their images.
         max_gap_s: as there.
         room: keeps what is found.
         workers: as there.
-        progress: as there.
+        progress: told how far the checks of each drive are.
+        crew: inspects.
     """
-    key = room.key(contents.key(drive), max_gap_s)
-    return room.made("check", key, Inspection, lambda: inspect(drive, max_gap_s, workers, progress))
+    jobs = []
+    for drive in drives:
+        tell = partial(progress, "check" if len(drives) == 1 else f"check {drive.name}")
+        work = partial(inspect, drive, max_gap_s, workers, tell)
+        jobs.append((room.key(contents.key(drive), max_gap_s), partial(crew.begin, work)))
+    return list(room.each_made("check", Inspection, jobs))
 
 
 def join(inspections: Sequence[Inspection]) -> Inspection:

@@ -21,6 +21,7 @@ from v2hdm.detection.weights import unknown_network
 from v2hdm.drive import join_drives
 from v2hdm.errors import AdjustError, ConfigError, MappingError, V2hdmError
 from v2hdm.mapping.changes.update import Base
+from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.orthophoto.result import write_mosaic
 from v2hdm.pipeline.about import describe_run
 from v2hdm.pipeline.admit import admit
@@ -30,8 +31,8 @@ from v2hdm.pipeline.config import NO_DRIVE, RunConfig
 from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.evaluate import evaluate
 from v2hdm.pipeline.finished import RunResult, note_finished
-from v2hdm.pipeline.inspect import Inspection, inspect_once, join
-from v2hdm.pipeline.keys import Contents, read_drives, result_key
+from v2hdm.pipeline.inspect import Inspection, inspect_each, join
+from v2hdm.pipeline.keys import Contents, read_visits, result_key
 from v2hdm.pipeline.survey import Survey, check_survey, take_survey
 from v2hdm.pipeline.telling import Progress, log_file, logging_to, timed
 from v2hdm.pipeline.viewer import Unwatched, Viewer
@@ -60,6 +61,7 @@ class _Task:
     progress: Progress
     viewer: Viewer
     detect: Detect
+    crew: Crew
 
     def result(self, metrics: Mapping[str, Any], headlines: Sequence[str], verdict: Verdict) -> RunResult:
         """What the run hands back."""
@@ -73,10 +75,12 @@ def map_drives(
     progress: Progress,
     viewer: Viewer | None = None,
     detect: Detect = detect_images,
+    crew: Crew = ALONE,
 ) -> RunResult:
     """Do what :func:`v2hdm.pipeline.run.run` says, with what ``store`` keeps.
 
-    ``detect`` takes the place of detection in processes of this machine.
+    ``detect`` takes the place of detection in processes of this machine, ``crew`` that of this process where
+    work can be parted.
     """
     name = admit(config)
     base = None if config.map.base is None else read_base(Path(config.map.base))
@@ -88,7 +92,8 @@ def map_drives(
             log.info("v2hdm %s, run %s", __version__, name)
             (folder / "config.yaml").write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
             room = Room(store, config.resume)
-            result, key = _write(config, name, base, room, folder, progress, viewer or Unwatched(), detect)
+            hands = viewer or Unwatched(), detect, crew
+            result, key = _write(config, name, base, room, folder, progress, *hands)
             for line in result.verdict.lines:
                 log.info("%s", line)
         note_finished(result, key, store)
@@ -105,6 +110,7 @@ def _write(
     progress: Progress,
     viewer: Viewer,
     detect: Detect,
+    crew: Crew,
 ) -> tuple[RunResult, str]:
     """Write a run's result into ``folder``; returns the key of what it was made of, too."""
     unknown = unknown_network(config.detector.model) if config.detector.model is not None else None
@@ -113,8 +119,7 @@ def _write(
     seconds: dict[str, float] = {}
     paths = _drive_folders(config, seconds, progress)
     with timed(seconds, "read"):
-        drives = read_drives(config, paths)
-        contents = Contents.of(drives)
+        drives, contents = read_visits(config, paths, crew)
     for drive in drives:
         count, names = len(drive.images), ", ".join(drive.cameras)
         log.info("drive %s: %d images of cameras %s", drive.name, count, names)
@@ -126,21 +131,16 @@ def _write(
     key = result_key(config, drives, contents, room.key())
     about = describe_run(name, whole, paths, config.drive)
     mapped = replace(config, mapping=survey.mapping)
-    task = _Task(mapped, room, folder, about, seconds, progress, viewer, detect)
+    task = _Task(mapped, room, folder, about, seconds, progress, viewer, detect, crew)
     with timed(seconds, "check"):
-        inspection = join([_inspect(task, drive, contents, len(drives)) for drive in drives])
+        max_gap_s, workers = config.drive.max_gap_s, _workers(config)
+        inspection = join(inspect_each(drives, contents, max_gap_s, room, workers, progress, crew))
     try:
         return _map_and_judge(task, inspection, contents, survey, base), key
     except (MappingError, AdjustError) as failure:
         if not inspection.has_failed:
             raise
         return _without_map(task, inspection, failure), key
-
-
-def _inspect(task: _Task, drive: Drive, contents: Contents, drives: int) -> Inspection:
-    tell = partial(task.progress, "check" if drives == 1 else f"check {drive.name}")
-    max_gap_s, workers = task.config.drive.max_gap_s, _workers(task.config)
-    return inspect_once(drive, contents, max_gap_s, task.room, workers, tell)
 
 
 def _map_and_judge(
@@ -153,7 +153,7 @@ def _map_and_judge(
     task.viewer.detected(task.folder, drive, detections)
     with timed(seconds, "map"):
         sets = map_camera_sets(
-            drive, contents.key(drive), detections, survey, base, task.room, progress, task.viewer
+            drive, contents.key(drive), detections, survey, base, task.room, progress, task.viewer, task.crew
         )
     task.viewer.close()
     methods = {name: one.methods for name, one in sets.items()}

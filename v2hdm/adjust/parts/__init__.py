@@ -7,7 +7,8 @@ factorised once a whitening, and the descent is that of :mod:`v2hdm.adjust.desce
 variables but for a rotation, under which L-BFGS takes the same steps.
 """
 
+from v2hdm.adjust.parts.choice import adjust
 from v2hdm.adjust.parts.solve import solve_in_parts
 from v2hdm.adjust.parts.team import Local, Team
 
-__all__ = ["Local", "Team", "solve_in_parts"]
+__all__ = ["Local", "Team", "adjust", "solve_in_parts"]

@@ -40,7 +40,7 @@ def split(problem: Problem, pose_states: tuple[str, ...], clock_offset: bool) ->
 
     Corners that known lengths join to a shared one are shared, too.
     """
-    shared = np.flatnonzero(_is_shared(problem))
+    shared = np.flatnonzero(is_shared(problem))
     number = np.full(problem.corner_count, -1, dtype=np.int64)
     number[shared] = np.arange(len(shared))
     visit = problem.visit_of_frame
@@ -54,7 +54,7 @@ def split(problem: Problem, pose_states: tuple[str, ...], clock_offset: bool) ->
     return parts, shared
 
 
-def _is_shared(problem: Problem) -> BoolArray:
+def is_shared(problem: Problem) -> BoolArray:
     """Which corners (N,) several visits have a say in."""
     count, seen = problem.corner_count, problem.observations
     visit = problem.visit_of_frame[seen.frame]

@@ -7,7 +7,9 @@ grows with the motion between the images, and only later compared across gaps, l
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -15,9 +17,11 @@ from scipy.optimize import linear_sum_assignment
 from v2hdm.geometry.quadrilateral import SHIFTS, align, diameters, mean_corners
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.mapping.association.groups import Association
+from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mapping.options import AssociationOptions
 from v2hdm.mapping.sightings.location import Located
 from v2hdm.mapping.sightings.rig import Rig
+from v2hdm.mapping.sightings.symbols import NO_SYMBOLS
 from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
@@ -25,9 +29,6 @@ _REFUSED = 1e9
 
 _LEAST_TOLERANCE_M = 0.05
 """How far corners of one shape may deviate, m, however small the marking is."""
-
-_ANOTHER_VISIT_M = 1e6
-"""Way, m, from one visit to the next: beyond any gap that a track survives."""
 
 
 @dataclass(frozen=True)
@@ -61,19 +62,77 @@ class _Track:
 
 
 def build_tracks(
-    sightings: Sightings, located: Located, rig: Rig, uncertainty: Uncertainty, options: AssociationOptions
+    sightings: Sightings,
+    located: Located,
+    rig: Rig,
+    uncertainty: Uncertainty,
+    options: AssociationOptions,
+    crew: Crew = ALONE,
 ) -> Association:
     """Link the ``sightings``, in image order and ``located`` under ``rig``, camera by camera.
 
     A sighting continues at most one track and a track takes at most one sighting of an image. A
     sighting that continues none starts its own. Sightings with fewer than two valid corners on the
-    ground belong to no track.
+    ground belong to no track. No track outlives its visit: each visit is linked by itself, by ``crew``.
     """
+    visit = sightings.visit[sightings.frame]
+    rows = [np.flatnonzero(visit == own) for own in np.unique(visit)]
+    begun = [
+        crew.begin(partial(_link, *_of_visit(sightings, located, rig, own), uncertainty, options))
+        for own in rows
+    ]
+    linked = [wait() for wait in begun]
     group = np.full(len(sightings), -1, dtype=np.int64)
     shift = np.zeros(len(sightings), dtype=np.int64)
-    linker = _Linker(sightings, located, rig, uncertainty, options)
-    count = 0
+    # Tracks are numbered camera by camera, and of each visit by visit.
+    counts = np.array([one.counts for one in linked], dtype=np.int64).reshape(-1, len(sightings.cameras))
+    before = np.cumsum(counts.T.flatten()).reshape(counts.T.shape).T - counts
+    for own, one, first in zip(rows, linked, before, strict=True):
+        group[own] = np.where(one.number >= 0, one.number + first[sightings.camera[own]], -1)
+        shift[own] = one.shift
+    return Association(group, shift, int(counts.sum()))
+
+
+class _Linked(NamedTuple):
+    """Tracks of one visit: ``number`` (S,) among those of the camera, -1 in none; ``counts`` by camera."""
+
+    number: IntArray
+    shift: IntArray
+    counts: list[int]
+
+
+def _of_visit(
+    sightings: Sightings, located: Located, rig: Rig, rows: IntArray
+) -> tuple[Sightings, Located, FloatArray]:
+    """The ``rows`` of one visit and its frames alone: sightings, where they lie, and its poses."""
+    own = sightings.subset(rows)
+    frames = slice(int(own.frame.min()), int(own.frame.max()) + 1)
+    own = replace(
+        own,
+        frame=own.frame - frames.start,
+        stamp_s=own.stamp_s[frames],
+        map_from_vehicle=own.map_from_vehicle[frames],
+        visit=own.visit[frames],
+        symbols=NO_SYMBOLS,
+    )
+    place = Located(**{name: values[rows] for name, values in vars(located).items()})
+    return own, place, rig.map_from_vehicle[frames]
+
+
+def _link(
+    sightings: Sightings,
+    located: Located,
+    map_from_vehicle: FloatArray,
+    uncertainty: Uncertainty,
+    options: AssociationOptions,
+) -> _Linked:
+    """Link the sightings of one visit, whose frames have the poses ``map_from_vehicle``."""
+    number = np.full(len(sightings), -1, dtype=np.int64)
+    shift = np.zeros(len(sightings), dtype=np.int64)
+    linker = _Linker(sightings, located, map_from_vehicle, uncertainty, options)
+    counts = []
     for camera in range(len(sightings.cameras)):
+        count = 0
         rows_of_camera = np.flatnonzero((sightings.camera == camera) & (located.valid.sum(axis=1) >= 2))
         images = np.flatnonzero(np.diff(sightings.image[rows_of_camera], prepend=-1) != 0)
         active: list[_Track] = []
@@ -90,8 +149,9 @@ def build_tracks(
                     track = _Track(count, row, located.corners_map[row].copy(), located.valid[row].copy())
                     active.append(track)
                     count += 1
-                group[row] = track.number
-    return Association(group, shift, count)
+                number[row] = track.number
+        counts.append(count)
+    return _Linked(number, shift, counts)
 
 
 class _Linker:
@@ -101,7 +161,7 @@ class _Linker:
         self,
         sightings: Sightings,
         located: Located,
-        rig: Rig,
+        map_from_vehicle: FloatArray,
         uncertainty: Uncertainty,
         options: AssociationOptions,
     ) -> None:
@@ -109,12 +169,9 @@ class _Linker:
         self._located = located
         self._uncertainty = uncertainty
         self._options = options
-        pose = rig.map_from_vehicle
-        steps_m = np.linalg.norm(np.diff(pose[:, :2, 3], axis=0), axis=1)
-        # No track outlives its visit, wherever the next one begins.
-        steps_m[np.diff(sightings.visit) != 0] = _ANOTHER_VISIT_M
+        steps_m = np.linalg.norm(np.diff(map_from_vehicle[:, :2, 3], axis=0), axis=1)
         self._odometer_m = np.concatenate([[0.0], np.cumsum(steps_m)])
-        self._heading_rad = np.unwrap(heading_rad(pose))
+        self._heading_rad = np.unwrap(heading_rad(map_from_vehicle))
         self._noise_m2 = _noise_covariances(located, uncertainty)
         self._ray_map, self._range_m = _mean_rays(located)
         self._centre_map = mean_corners(located.corners_map, located.valid)

@@ -1,0 +1,156 @@
+"""One site from many drives: by workers, some of which die, it is the map of one process."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+pytest.importorskip("ray", reason="ray, the extra 'fleet', is not installed")
+
+from tests.fleet.test_fleet import written
+from tests.mapping.test_crew import two_visits
+from v2hdm import pipeline
+from v2hdm.errors import DriveError, WorkerError
+from v2hdm.fleet.crew import RayCrew
+from v2hdm.fleet.parts import RayTeam
+from v2hdm.fleet.plan import plan_site
+from v2hdm.fleet.rows import Row
+from v2hdm.fleet.run import FleetOptions, run_fleet
+from v2hdm.fleet.work import map_drive
+from v2hdm.mapping.crew import ALONE, Crew
+from v2hdm.mapping.methods import run_methods
+from v2hdm.mapping.options import MappingOptions
+from v2hdm.simulate import PortConfig, render_drive
+from v2hdm.simulate.port.config import RouteConfig, YardConfig
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """One small port, seen on two visits."""
+    folders = []
+    for visit, name in enumerate(("monday", "friday")):
+        route = RouteConfig(pieces=[[26.0, 0.0]], image_spacing_m=2.6)
+        yard = YardConfig(parked_trucks=0, barriers=0, lamp_posts=0, moving_trucks=0, shadow_strips=0)
+        port = PortConfig(name=name, seed=3, visit=visit, initial_ipm="calibrated", route=route, yard=yard)
+        port.cameras = {"front": port.cameras["front"]}
+        folders.append(tmp_path_factory.mktemp("site") / name)
+        render_drive(port, folders[-1], 1, lambda done, total: None)
+    return folders
+
+
+def test_a_site_by_workers_one_of_which_dies_is_the_map_of_one_process(
+    ray: Any, drives: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @contextmanager
+    def here(address: str, workers: int) -> Iterator[Any]:
+        yield ray
+
+    died = tmp_path / "died"
+
+    def mapping(*arguments: Any) -> Any:
+        import v2hdm.fleet.crew as crew
+
+        done = crew._done
+
+        def dies_once(*work: Any) -> Any:
+            if not died.exists():
+                died.touch()
+                os.kill(os.getpid(), signal.SIGKILL)
+            return done(*work)
+
+        crew._done = dies_once
+        try:
+            return map_drive(*arguments)
+        finally:
+            crew._done = done
+
+    monkeypatch.setattr("v2hdm.fleet.run.cluster", here)
+    monkeypatch.setattr("v2hdm.fleet.work.map_drive", mapping)
+    files = [written(tmp_path, one.name, one) for one in drives]
+    settings = ["mapping.adjustment=together", "workers=1"]
+    told: list[tuple[str, str, int, int]] = []
+
+    def fleet() -> Row:
+        overrides = [*settings, f"output={tmp_path / 'out'}", f"cache={tmp_path / 'cache'}"]
+        options = FleetOptions(tmp_path / "table", site="port")
+        (row,) = run_fleet(files, overrides, options, lambda *message: told.append(message))
+        return row
+
+    row = fleet()
+    assert died.exists()
+    assert (row.drive, row.status, row.kept) == ("port", "PASS", False), row.says
+    assert {"check monday", "check friday"} <= {stage for drive, stage, *_ in told if drive == "port"}
+    overrides = [*settings, f"output={tmp_path / 'alone'}", f"cache={tmp_path / 'other'}"]
+    (job,) = plan_site(files, overrides, "port").jobs
+    with one_thread():
+        alone = pipeline.run(job.config, job.config_yaml).folder
+    result = tmp_path / "out" / "port"
+    for name in ("map.geojson", "calibration_front.yaml", "residuals.csv", "trajectory_friday.tum"):
+        assert (result / name).read_bytes() == (alone / name).read_bytes(), name
+    logs = [(one / "run.log").read_text() for one in (result, alone)]
+    for checks in ("v2hdm.pipeline.inspect: ", "v2hdm.mapping.optimise: "):
+        of_checks = [[line.split(checks)[1] for line in log.splitlines() if checks in line] for log in logs]
+        assert of_checks[0] == of_checks[1] != [], checks
+    assert fleet().kept
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """As in workers: how many threads share a product decides its last bits."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_the_visits_adjusted_by_actors_one_of_which_dies_make_the_same_map(
+    ray: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    killed: list[int] = []
+
+    class Mortal(RayTeam):
+        def ask(self, question: str, bases: Sequence[Any], *arguments: Sequence[Any]) -> list[Any]:
+            if question == "evaluate" and not killed:
+                killed.append(ray.get(self.actors[0].process.remote()))
+                os.kill(killed[0], signal.SIGKILL)
+            return super().ask(question, bases, *arguments)
+
+    monkeypatch.setattr("v2hdm.fleet.crew.RayTeam", Mortal)
+    drive, detections = two_visits(tmp_path)
+
+    def mapped(how: str, crew: Crew) -> Any:
+        options = MappingOptions(adjustment=how, pose_model="heave", rounds=1)
+        return run_methods(drive, detections, ("front",), options, crew=crew)["Opt"].hd_map.markings
+
+    parted, whole = mapped("parts", RayCrew(2, str(Path.cwd()))), mapped("together", ALONE)
+    assert killed
+    assert [one.kind for one in parted] == [one.kind for one in whole]
+    for one, other in zip(parted, whole, strict=True):
+        assert one.corners_map == pytest.approx(other.corners_map, abs=1e-9)
+
+
+def test_what_is_wrong_in_a_task_is_told_as_by_one_process(
+    ray: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuses() -> None:
+        raise DriveError("images/3.jpg: cannot be read")
+
+    def dies() -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    monkeypatch.setattr("v2hdm.fleet.crew.RETRIES", 0)
+    crew = RayCrew(2, str(tmp_path))
+    waits = [crew.begin(work) for work in (refuses, dies)]
+    with pytest.raises(DriveError, match="cannot be read"):
+        waits[0]()
+    with pytest.raises(WorkerError, match="died again and again"):
+        waits[1]()
