@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from v2hdm.door import ShowVersion, answer_signals, open_door
 
 if TYPE_CHECKING:
-    from v2hdm.caching.pruning import Item
+    from v2hdm.caching.pruning import Kept
 
 _INTERRUPTED = "interrupted; what was removed so far is made anew when it is needed"
 _GB = 1e9
@@ -25,31 +25,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _work(parsed: argparse.Namespace) -> None:
-    from v2hdm.caching.pruning import items_of, prune, remove_damaged
+    from v2hdm.caching.distant import items_at
+    from v2hdm.caching.pruning import items_of, prune, remove_damaged, remove_to
     from v2hdm.errors import ConfigError
+    from v2hdm.objects.bucket import place_of
 
-    cache: Path = parsed.cache
-    if not cache.is_dir():
+    cache = place_of(parsed.cache, "--cache")
+
+    def kept() -> Sequence[Kept]:
+        return items_of(cache) if isinstance(cache, Path) else items_at(cache)
+
+    if isinstance(cache, Path) and not cache.is_dir():
         raise ConfigError(f"{cache}: no such folder; give the cache of your runs with --cache")
     if parsed.what == "list":
-        _show(items_of(cache))
+        _show(kept(), "last used" if isinstance(cache, Path) else "last written")
     elif parsed.what == "prune":
         if not parsed.gb >= 0:
             raise ConfigError(f"--gb {parsed.gb:g}: give 0 or more")
-        removed = prune(cache, parsed.gb * _GB)
-        freed, left = sum(item.size for item in removed), sum(item.size for item in items_of(cache))
+        limit = parsed.gb * _GB
+        removed = prune(cache, limit) if isinstance(cache, Path) else remove_to(kept(), limit)
+        freed, left = sum(item.size for item in removed), sum(item.size for item in kept())
         print(f"removed {len(removed)} entries of {_size(freed)}; {_size(left)} are left")
     else:
-        items = items_of(cache)
+        items = kept()
         damaged = remove_damaged(items)
         for item in damaged:
             print(f"{item.path}: is damaged and was removed; the next run makes it anew")
         print(f"read {len(items)} entries, {len(damaged)} of them damaged")
 
 
-def _show(items: Sequence[Item]) -> None:
+def _show(items: Sequence[Kept], when: str) -> None:
     kinds = sorted({item.kind for item in items})
-    print(f"{'what':<20}{'entries':>8}{'size':>12}  last used")
+    print(f"{'what':<20}{'entries':>8}{'size':>12}  {when}")
     for kind in kinds:
         own = [item for item in items if item.kind == kind]
         used = time.strftime("%Y-%m-%d %H:%M", time.localtime(max(item.used_s for item in own)))
@@ -74,7 +81,7 @@ def _parser() -> argparse.ArgumentParser:
     pruned.add_argument("--gb", type=float, required=True, help="what may stay, GB; 0 empties the cache")
     verified = actions.add_parser("verify", help="read every entry and remove those that are damaged")
     for action in (shown, pruned, verified):
-        action.add_argument("--cache", type=Path, default=Path("cache"), help="the folder (default: cache)")
+        action.add_argument("--cache", default="cache", help="the folder or URL (default: cache)")
     return parser
 
 

@@ -58,7 +58,13 @@ class Job:
     label: str | None
 
     def folder(self, output: str) -> str:
-        """The folder ``output``, of a sweep one within it for this job."""
+        """The folder ``output``, of a sweep one within it for this job.
+
+        Raises:
+            ConfigError: a sweep is to write to a URL.
+        """
+        if self.label is not None:
+            _refuse_url(output)
         return output if self.label is None else str(Path(output) / self.label)
 
 
@@ -91,6 +97,10 @@ def work_on(
 
         print(help_text(about, schema, conf_dir()))
         return 0
+    if {"--multirun", "-m"} & set(sys.argv[1:]):  # Hydra would make folders that are called like URLs
+        for one in sys.argv[1:]:
+            if one.startswith("output="):
+                _refuse_url(one.removeprefix("output="))
     for path in _own_files(sys.argv[1:]):
         read_yaml(path, ConfigError)  # OmegaConf would expand whatever aliases repeat
     register(name, schema)
@@ -113,6 +123,14 @@ def work_on(
     if task.failure:
         raise task.failure[0]
     return task.codes[0] if task.codes else 0
+
+
+def _refuse_url(output: str) -> None:
+    if "://" in output:
+        raise ConfigError(
+            f"output={output}: a sweep writes to folders of this machine; give one, or map with one setting "
+            "at a time"
+        )
 
 
 def compose_run_file(path: Path, name: str, schema: type[Any], overrides: Sequence[str] = ()) -> DictConfig:

@@ -40,7 +40,7 @@ def run_on_terminal(config: pipeline.RunConfig, config_yaml: str) -> Verdict:
         console.print(
             line, style=style if number == 0 else None, highlight=False, markup=False, soft_wrap=True
         )
-    console.print(f"results in {result.folder}: open report.html", highlight=False, soft_wrap=True)
+    console.print(f"results in {result.place}: open report.html", highlight=False, soft_wrap=True)
     return result.verdict
 
 

@@ -13,6 +13,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 
@@ -24,8 +25,8 @@ EXIT_USER_ERROR = 2
 EXIT_FAILED_VERDICT = 3
 _ONE_PRESS_S = 2.0
 _OURS = ("v2hdm", "models", "train", "export")
-_TOLD = ("torch", "onnxruntime", "numba")
-"""Libraries whose version decides what a run gives, and how fast."""
+_TOLD = (("torch",), ("onnxruntime", "onnxruntime-gpu"), ("numba",))
+"""Libraries whose version decides what a run gives, and how fast, each by its packages."""
 
 _WEIGHTS_DIGITS = 8
 """Of the SHA-256 of the shipped network: enough to tell any two."""
@@ -138,11 +139,12 @@ def version_line() -> str:
     Nothing of it is imported: it answers where an install is broken, too.
     """
     told = [f"v2hdm {__version__}"]
-    for name in _TOLD:
-        try:
-            told.append(f"{name} {metadata.version(name)}")
-        except metadata.PackageNotFoundError:
-            told.append(f"no {name}")
+    for packages in _TOLD:
+        found = []
+        for name in packages:
+            with suppress(metadata.PackageNotFoundError):
+                found.append(f"{name} {metadata.version(name)}")
+        told += found or [f"no {packages[0]}"]
     return ", ".join([*told, _weights()])
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -30,6 +31,7 @@ __all__ = [
     "load_json",
     "load_yaml",
     "read_text",
+    "refuse_url",
     "replace_text",
     "take_array",
     "take_choice",
@@ -40,6 +42,7 @@ __all__ = [
     "whole_file",
 ]
 
+_URL = re.compile(r"[a-z][a-z0-9+.-]+:/")
 _LARGEST = sys.float_info.max
 
 Tell = Callable[[Path, Path], None]
@@ -67,6 +70,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         ConfigError: ``path`` is an input of this door, or no plain file.
         OSError: it cannot be written there; the error names ``path``.
     """
+    refuse_url(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     refuse_input(path)
     if path.exists() and not path.is_file():
@@ -85,6 +89,19 @@ def whole_file(path: Path) -> Iterator[Path]:
         raise
     finally:
         partial.unlink(missing_ok=True)
+
+
+def refuse_url(path: Path) -> None:
+    """Refuse a URL that was taken for a path: it would be a folder called ``s3:``.
+
+    Raises:
+        ConfigError: it is one.
+    """
+    if _URL.match(str(path)):
+        raise ConfigError(
+            f"{path}: no URL is written to here, only as output=, cache= and --table of v2hdm.map and "
+            "v2hdm.fleet; give a path on this machine"
+        )
 
 
 def replace_text(path: Path, text: str) -> None:

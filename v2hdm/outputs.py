@@ -18,7 +18,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from v2hdm.errors import ConfigError
-from v2hdm.files import told_of_files, whole_file
+from v2hdm.files import refuse_url, told_of_files, whole_file
 from v2hdm.listing import LIST as MARKER
 from v2hdm.locks import take_lock
 
@@ -213,6 +213,16 @@ def is_whole(folder: Path, files: Mapping[str, str]) -> bool:
     )
 
 
+def drop_result(folder: Path) -> None:
+    """Remove our files from a result folder, and the folders that are empty then."""
+    with suppress(OSError, ConfigError):
+        for name in [*files_of_result(folder), MARKER]:
+            (folder / name).unlink(missing_ok=True)
+        below = sorted((one for one in folder.rglob("*") if one.is_dir()), key=lambda one: -len(one.parts))
+        for one in [*below, folder, folder.parent, folder.parent.parent]:
+            one.rmdir()
+
+
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
 """The disk is at fault, whatever was being written."""
 
@@ -234,6 +244,7 @@ def _cannot_write(folder: Path, failure: OSError, option: str) -> ConfigError:
 
 def _resolved(folder: Path, option: str) -> Path:
     """Where ``folder`` leads; a folder that cannot be put aside is refused before any work."""
+    refuse_url(folder)
     try:
         target = folder.resolve()
     except (OSError, RuntimeError, ValueError):

@@ -1,13 +1,15 @@
 """Model files: what is refused, and that any image size is taken."""
 
 import numpy as np
+import onnxruntime
 import pytest
 
 from tests.detection.pictures import STRIDES, brightness_model, make_camera, save_model
 from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.network import Network
-from v2hdm.errors import DetectorError
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.errors import ConfigError, DetectorError
 
 KINDS = np.zeros(len(PAINT_CLASSES))
 
@@ -24,6 +26,30 @@ def test_the_outputs_cover_images_of_any_size(tmp_path):
 def test_a_missing_model_is_named(tmp_path):
     with pytest.raises(DetectorError, match=r"gone\.onnx: no such detector model"):
         Network(tmp_path / "gone.onnx")
+
+
+def test_a_gpu_that_this_onnxruntime_was_built_without_is_told(monkeypatch):
+    monkeypatch.setattr("onnxruntime.get_available_providers", lambda: ["CPUExecutionProvider"])
+    with pytest.raises(
+        DetectorError, match=r"detector\.device is cuda, .* install onnxruntime-gpu in its place"
+    ):
+        Detector.load(options=DetectorOptions(device="cuda"))
+    with pytest.raises(ConfigError, match="choose cpu or cuda"):
+        DetectorOptions(device="tpu")
+
+
+def test_a_gpu_that_does_not_start_is_told_and_not_left_out_in_silence(monkeypatch):
+    there = ["CUDAExecutionProvider", "CPUExecutionProvider"]
+    original = onnxruntime.InferenceSession
+
+    def without(path, options, providers):
+        assert [one if isinstance(one, str) else one[0] for one in providers] == there
+        return original(path, options, providers=["CPUExecutionProvider"])
+
+    monkeypatch.setattr("onnxruntime.get_available_providers", lambda: there)
+    monkeypatch.setattr("onnxruntime.InferenceSession", without)
+    with pytest.raises(DetectorError, match="could not start CUDAExecutionProvider: check the driver"):
+        Detector.load(options=DetectorOptions(device="cuda"))
 
 
 def test_a_damaged_model_is_refused(tmp_path):

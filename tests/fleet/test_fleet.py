@@ -19,16 +19,21 @@ import pytest
 pytest.importorskip("ray", reason="ray, the extra 'fleet', is not installed")
 
 from v2hdm import pipeline
+from v2hdm.detection import network
 from v2hdm.detection.batch import detect_all, with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.drive import read_drive
 from v2hdm.errors import ConfigError, DriveError, WorkerError
-from v2hdm.fleet.eyes import Eyes, detect_by
+from v2hdm.fleet.board import Board
+from v2hdm.fleet.eyes import Eyes, detect_by, open_eyes
+from v2hdm.fleet.gpus import EYES_A_GPU, Shares
 from v2hdm.fleet.plan import plan, plan_site
 from v2hdm.fleet.rows import Row, exit_code
 from v2hdm.fleet.run import FleetOptions, run_fleet
 from v2hdm.fleet.work import map_drive
+from v2hdm.pipeline import RunConfig
+from v2hdm.records import ImageDetections
 from v2hdm.simulate import PortConfig, render_drive
 from v2hdm.simulate.port.config import RouteConfig, YardConfig
 
@@ -92,6 +97,84 @@ def test_an_actor_that_dies_again_and_again_is_told(ray: Any, drive: Path) -> No
     eyes = [ray.remote(Blind).options(num_cpus=0.1).remote(str(Path.cwd()))]
     with pytest.raises(WorkerError, match="died again and again"):
         found_by(eyes, drive)
+
+
+def test_actors_share_a_gpu(ray: Any, drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class OnGpu(Eyes):
+        def __init__(self, folder: str) -> None:
+            # There is no GPU here: what is asked for there is done on the CPU.
+            network._PROVIDERS["cuda"] = network._PROVIDERS["cpu"]
+            super().__init__(folder)
+
+        def gpus(self) -> list[Any]:
+            ids: list[Any] = ray.get_gpu_ids()
+            return ids
+
+    monkeypatch.setattr("v2hdm.fleet.eyes.Eyes", OnGpu)
+    cuda = RunConfig(detector=DetectorOptions(device="cuda"))
+    shares = Shares.of([cuda])
+    eyes = open_eyes({"cuda"}, 2, 1, shares.eyes, str(Path.cwd()), 0)["cuda"]
+    assert [ray.get(one.gpus.remote()) for one in eyes] == [[0], [0]]
+    assert ray.available_resources()["GPU"] == 1 - 2 * shares.eyes
+    whole = with_own_vehicle(read_drive(drive), Detector.load())
+    found: list[ImageDetections] = []
+    detect_by(eyes, whole, cuda.detector, range(3), 1, found.append)
+    assert repr(found) == repr(detect_all(read_drive(drive), DetectorOptions())[:3])
+    for one in eyes:
+        ray.kill(one)
+
+
+def test_all_that_shares_a_gpu_fits_on_it() -> None:
+    detects = RunConfig(detector=DetectorOptions(device="cuda"))
+    maps = RunConfig(device="cuda")
+    assert Shares.of([detects, RunConfig()]).eyes * EYES_A_GPU == 1
+    assert Shares.of([maps, RunConfig()]).mapping == 1
+    both = Shares.of([detects, maps])
+    assert both.eyes * EYES_A_GPU + both.mapping == 1
+
+
+def test_a_drive_that_wants_a_gpu_where_there_is_none_is_a_row(
+    ray: Any, drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class WithoutGpus:
+        def __getattr__(self, name: str) -> Any:
+            return (lambda: {"CPU": 1.0}) if name == "cluster_resources" else getattr(ray, name)
+
+    @contextmanager
+    def here(address: str, workers: int) -> Iterator[Any]:
+        yield WithoutGpus()
+
+    monkeypatch.setattr("v2hdm.fleet.run.cluster", here)
+    for setting in ("device=cuda", "detector.device=cuda"):
+        files, options = [written(tmp_path, "good", drive)], FleetOptions(tmp_path / "table")
+        (row,) = run_fleet(files, [setting], options, lambda *_: None)
+        assert (row.status, "none of Ray's machines has a GPU" in row.says) == ("ERROR", True)
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_drive_cache_and_results_at_an_object_store_make_the_same_map(
+    ray: Any, s3: Any, drive: Path, tmp_path: Path
+) -> None:
+    for path in drive.rglob("*"):
+        if path.is_file():
+            s3.upload_file(str(path), "bucket", f"drives/tiny/{path.relative_to(drive).as_posix()}")
+    settings = ["output=s3://bucket/results", "cache=s3://bucket/cache", f"local_cache={tmp_path / 'one'}"]
+    (job,) = plan([written(tmp_path, "good", "s3://bucket/drives/tiny")], settings).jobs
+    assert job.place == "s3://bucket/results/good"
+    eyes, board = eyes_of(ray, 1), ray.remote(Board).options(num_cpus=0).remote()
+    for kept in (False, True):
+        row, trace = map_drive(job, eyes, board, str(Path.cwd()))
+        assert (row.status, row.kept, row.folder) == ("PASS", kept, job.place), (row, trace)
+    ray.kill(eyes[0])
+
+    # Another machine, with the drive in a folder of its own: what was detected is at the store.
+    settings = [f"output={tmp_path / 'out'}", "cache=s3://bucket/cache", f"local_cache={tmp_path / 'two'}"]
+    (job,) = plan([written(tmp_path, "good", drive)], settings).jobs
+    row, trace = map_drive(job, [], board, str(Path.cwd()))
+    assert row.status == "PASS", (row, trace)
+    for name in ("map.geojson", "calibration_front.yaml"):
+        there = s3.get_object(Bucket="bucket", Key=f"results/good/{name}")["Body"].read()
+        assert there == (tmp_path / "out" / "good" / name).read_bytes()
 
 
 def written(folder: Path, name: str, drive: object) -> Path:
@@ -159,8 +242,11 @@ def test_the_drives_of_run_files_become_one_site(tmp_path: Path) -> None:
     planned = plan_site([monday, week], ["output=maps", "mapping.rounds=3"], "port")
     (job,) = planned.jobs
     assert job.config.drive.path == ["drives/monday", "drives/tuesday", "drives/friday"]
-    assert (job.name, job.folder, job.config.mapping.rounds) == ("port", Path("maps/port"), 3)
+    assert (job.name, job.place, job.config.mapping.rounds) == ("port", str(Path("maps/port").resolve()), 3)
     assert planned.sources == [f"{monday}, {week}"] == [job.source]
+    far = written(tmp_path, "far", "s3://bucket/drives/far")
+    (job,) = plan_site([monday, far], [], "port").jobs
+    assert job.config.drive.path == ["drives/monday", "s3://bucket/drives/far"]
 
 
 def test_files_that_make_no_site_are_one_row_that_says_why(tmp_path: Path) -> None:
@@ -178,6 +264,12 @@ def test_files_that_make_no_site_are_one_row_that_says_why(tmp_path: Path) -> No
     assert "absent.yaml" in row.says
     with pytest.raises(ConfigError, match="--site"):
         plan_site([monday], [], "../port")
+
+
+def test_what_would_be_gone_with_a_worker_is_refused(tmp_path: Path, drive: Path) -> None:
+    planned = plan([written(tmp_path, "one", drive)], ["output=memory://results"])
+    assert not planned.jobs
+    assert "gone with the process" in planned.refused[0].says
 
 
 def test_the_table_has_a_code_for_the_worst_of_its_rows() -> None:

@@ -14,7 +14,16 @@ _PACKAGE = Path(__file__).parents[1]
 _CODE = {".py", ".yaml", ".json", ".onnx", ".html", ".js", ".css"}
 """Files of the package that decide what comes out: sources, catalogue, weights, templates."""
 
-LIBRARIES = ("torch", "kornia", "numpy", "scipy", "onnxruntime", "opencv-python-headless", "numba")
+LIBRARIES = (
+    "torch",
+    "kornia",
+    "numpy",
+    "scipy",
+    "onnxruntime",
+    "onnxruntime-gpu",
+    "opencv-python-headless",
+    "numba",
+)
 """Those that the figures of a run depend on."""
 
 

@@ -6,11 +6,13 @@ Only what is ours is looked at, and nothing goes that a run in progress uses.
 from __future__ import annotations
 
 import logging
+import math
 import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, TypeVar
 
 from v2hdm.caching.folders import LIST, remove_ours, size_of
 from v2hdm.caching.leases import STAGES, unused_before
@@ -18,7 +20,9 @@ from v2hdm.caching.store import ENDING, checked
 
 _log = logging.getLogger(__name__)
 
-_ENTRY = re.compile(rf"[0-9a-f]{{64}}{re.escape(ENDING)}")
+ENTRY = re.compile(rf"[0-9a-f]{{64}}{re.escape(ENDING)}")
+"""Names of entries."""
+
 _PARTIAL = re.compile(r"\.[0-9a-f]{16}\.[0-9a-f]{8}\.part")
 
 DRIVES = "drives and imports"
@@ -26,6 +30,35 @@ DRIVES = "drives and imports"
 
 LEFT = "left by killed runs"
 """Kind of what was never finished."""
+
+
+class Kept(Protocol):
+    """One thing that a cache keeps, on disk or elsewhere."""
+
+    @property
+    def kind(self) -> str:
+        """What it is: a stage, or one of the kinds above."""
+
+    @property
+    def path(self) -> object:
+        """Where it is, to be shown."""
+
+    @property
+    def size(self) -> int:
+        """Its bytes."""
+
+    @property
+    def used_s(self) -> float:
+        """Its last use, s since 1970."""
+
+    def read(self) -> bytes:
+        """What an entry holds."""
+
+    def remove(self) -> None:
+        """Remove it; what is gone already is removed."""
+
+
+_Kept = TypeVar("_Kept", bound=Kept)
 
 
 @dataclass(frozen=True)
@@ -40,6 +73,10 @@ class Item:
     size: int
     used_s: float
 
+    def read(self) -> bytes:
+        """What an entry's file holds."""
+        return self.path.read_bytes()
+
     def remove(self) -> None:
         """Remove it; what another process has removed is gone as well."""
         if self.path.is_dir():
@@ -52,7 +89,7 @@ def items_of(cache: Path) -> list[Item]:
     """All that is ours in a cache, what was not used for longest first."""
     found = []
     for path in (cache / STAGES).glob("*/*"):
-        kind = path.parent.name if _ENTRY.fullmatch(path.name) else LEFT
+        kind = path.parent.name if ENTRY.fullmatch(path.name) else LEFT
         if (kind == LEFT and not _PARTIAL.fullmatch(path.name)) or not path.is_file():
             continue
         with suppress(OSError):  # another process has removed it
@@ -73,8 +110,12 @@ def prune(cache: Path, limit: float) -> list[Item]:
     What killed runs have left goes in any case. More than the limit stays where runs in progress use it.
     """
     before_s = unused_before(cache)
-    items = items_of(cache)
-    size, removed = sum(item.size for item in items), []
+    return remove_to(items_of(cache), limit, before_s)
+
+
+def remove_to(items: Sequence[_Kept], limit: float, before_s: float = math.inf) -> list[_Kept]:
+    """Remove the first of some items until the rest has ``limit`` bytes, none used since ``before_s``."""
+    size, removed = sum(item.size for item in items), list[_Kept]()
     for item in items:
         if item.used_s >= before_s or (size <= limit and item.kind != LEFT):
             continue
@@ -98,14 +139,14 @@ def make_room(cache: Path, limit_gb: float) -> None:
         )  # fmt: skip
 
 
-def remove_damaged(items: Sequence[Item]) -> list[Item]:
+def remove_damaged(items: Sequence[_Kept]) -> list[_Kept]:
     """Read all entries among some items and remove those that are damaged; returns these."""
     damaged = []
     for item in items:
         if item.kind in (DRIVES, LEFT):
             continue
         with suppress(OSError):
-            if checked(item.path.read_bytes()) is None:
+            if checked(item.read()) is None:
                 item.remove()
                 damaged.append(item)
     return damaged

@@ -20,6 +20,9 @@ from v2hdm.workers import share_out
 
 _log = logging.getLogger(__name__)
 _worker: tuple[Detector, Drive] | None = None
+_WORKERS_A_GPU = 8
+"""Processes that share one: each takes memory of its own there."""
+
 _FEW_IMAGES = 8
 """Fewer are looked at before a process has started."""
 
@@ -107,6 +110,8 @@ def detect_images(
     Raises:
         V2hdmError: as :func:`detect_all`.
     """
+    if options.device != "cpu":
+        workers = min(workers, _WORKERS_A_GPU)
     if workers <= 1 or len(images) < _FEW_IMAGES:
         detector = Detector.load(options=options)
         for index in images:

@@ -64,7 +64,7 @@ class Detector:
         options = options or DetectorOptions()
         check_weights()
         path = path if path is not None else options.model
-        return cls(Network(None if path is None else Path(path), options.threads), options)
+        return cls(Network(None if path is None else Path(path), options.threads, options.device), options)
 
     def detect(
         self, image_bgr: np.ndarray, camera: Camera

@@ -23,6 +23,14 @@ METADATA_KEY = "v2hdm"
 
 _OUTPUTS = ["paint", "kinds", "lanes"]
 
+_PROVIDERS: dict[str, tuple[str, dict[str, str]]] = {
+    "cpu": ("CPUExecutionProvider", {}),
+    # float32 as on the CPU, and one algorithm each time: what is found does not depend on the process.
+    "cuda": ("CUDAExecutionProvider", {"use_tf32": "0", "cudnn_conv_algo_search": "HEURISTIC"}),
+}
+_BEHIND = {"cpu": [], "cuda": ["CPUExecutionProvider"]}
+"""For the few operations that a device does not have."""
+
 
 @dataclass(frozen=True)
 class NetworkInfo:
@@ -58,14 +66,15 @@ class NetworkOutput:
 class Network:
     """The paint and lane network: uint8 BGR images in, :class:`NetworkOutput` out."""
 
-    def __init__(self, path: Path | None = None, threads: int = 1):
-        """Load a model file.
+    def __init__(self, path: Path | None = None, threads: int = 1, device: str = "cpu"):
+        """Load a model file, to be run on ``cpu`` or ``cuda``.
 
         Raises:
-            DetectorError: there is no such file, it is not an ONNX model or not one of ours.
+            DetectorError: there is no such file, it is not an ONNX model or not one of ours, or the device is
+                not there.
         """
         self.path = DEFAULT_MODEL if path is None else Path(path)
-        self._session = open_session(self.path, threads)
+        self._session = open_session(self.path, threads, device)
         self.info = _read_info(self._session, self.path)
 
     def run(self, image_bgr: np.ndarray) -> NetworkOutput:
@@ -123,12 +132,27 @@ class Network:
         return np.asarray(output[0, :, : -(-size[0] // stride), : -(-size[1] // stride)])
 
 
-def open_session(path: Path, threads: int) -> Any:
-    """A model file ready to run on so many threads.
+def check_device(device: str) -> None:
+    """Refuse a device that this onnxruntime was built without.
 
     Raises:
-        DetectorError: there is no such file, or it is not an ONNX model.
+        DetectorError: says what to install.
     """
+    provider = _PROVIDERS[device][0]
+    if provider not in onnxruntime.get_available_providers():
+        raise DetectorError(
+            f"detector.device is {device}, but this onnxruntime has no {provider}: install onnxruntime-gpu "
+            "in its place, or set detector.device=cpu"
+        )
+
+
+def open_session(path: Path, threads: int, device: str = "cpu") -> Any:
+    """A model file ready to run on so many threads, on ``cpu`` or ``cuda``.
+
+    Raises:
+        DetectorError: there is no such file, it is not an ONNX model, or the device is not there.
+    """
+    check_device(device)
     if not path.is_file():
         raise DetectorError(
             f"{path}: no such detector model; give the path of an ONNX file written by `python -m export`"
@@ -138,11 +162,21 @@ def open_session(path: Path, threads: int) -> Any:
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
     try:
-        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        provider, settings = _PROVIDERS[device]
+        session = onnxruntime.InferenceSession(
+            str(path), options, providers=[(provider, settings), *_BEHIND[device]]
+        )
     except Exception as error:
         raise DetectorError(
             f"{path}: not a usable ONNX model ({_one_line(error)}); export it again"
         ) from error
+    # Where the driver or cuDNN fails, onnxruntime goes on without a word on the CPU.
+    if provider not in session.get_providers():
+        raise DetectorError(
+            f"detector.device is {device}, but onnxruntime could not start {provider}: check the driver, "
+            "CUDA and cuDNN, or set detector.device=cpu"
+        )
+    return session
 
 
 def read_catalogue(metadata: Mapping[str, Any]) -> Catalogue:

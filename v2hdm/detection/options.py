@@ -6,10 +6,13 @@ from dataclasses import dataclass
 
 from v2hdm.errors import ConfigError
 from v2hdm.settings import NOT_NEGATIVE, POSITIVE, check_settings
+from v2hdm.texts import shown
 
 _MOST_THREADS = 256
 """More take the machine's memory before they do any work."""
 
+
+DEVICES = ("cpu", "cuda")
 
 _RANGES = dict.fromkeys(("max_range_m", "max_corner_sigma_px", "lane_step_m"), POSITIVE) | {
     "border_px": NOT_NEGATIVE
@@ -22,6 +25,7 @@ class DetectorOptions:
 
     Attributes:
         model: path of the ONNX file; None takes the one that is shipped.
+        device: what the network runs on, ``cpu`` or ``cuda``; the rest of the detector runs on the CPU.
         threads: threads of one onnxruntime session. Throughput comes from worker processes.
         blur_px: standard deviation of the image's point spread, pixel aperture included, in px;
             None measures it on the near markings. It decides the far corners' bias: 0.6 to 1.2 px
@@ -37,6 +41,7 @@ class DetectorOptions:
     """
 
     model: str | None = None
+    device: str = "cpu"
     threads: int = 1
     blur_px: float | None = None
     max_range_m: float = 22.0
@@ -59,6 +64,8 @@ class DetectorOptions:
             ConfigError: a value is out of range.
         """
         check_settings(self, _RANGES, "detector.")
+        if self.device not in DEVICES:
+            raise ConfigError(f"detector.device is {shown(self.device)}: choose {' or '.join(DEVICES)}")
         if not 1 <= self.threads <= _MOST_THREADS:
             raise ConfigError(f"detector.threads is {self.threads}: set 1 to {_MOST_THREADS}")
         if self.blur_px is not None and not 0.2 <= self.blur_px <= 3.0:

@@ -10,6 +10,7 @@ from pathlib import Path
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError
+from v2hdm.files import refuse_url
 from v2hdm.mapping.options import INCREMENTAL, MappingOptions, check_options
 from v2hdm.pipeline import DriveConfig
 from v2hdm.simulate import PortConfig
@@ -128,6 +129,8 @@ def _options(given: MappingOptions, recipe: str) -> MappingOptions:
 
 
 def _check(config: ExperimentConfig) -> None:
+    for place in (config.output, config.cache):
+        refuse_url(Path(place))
     for key in (config.name, *config.ports):
         if not key.strip(".") or "/" in key:
             raise ConfigError(f"name is {key!r}: give the name of a folder, without '/'")

@@ -30,6 +30,7 @@ def _fleet(parsed: argparse.Namespace) -> int:
     from v2hdm.fleet.rows import exit_code
     from v2hdm.fleet.run import FleetOptions
     from v2hdm.fleet.view import fleet_on_terminal
+    from v2hdm.objects.bucket import is_url
     from v2hdm.settings import check_workers
 
     check_workers(parsed.workers)
@@ -37,6 +38,8 @@ def _fleet(parsed: argparse.Namespace) -> int:
     files = [Path(one) for one in dict.fromkeys(parsed.drives) if one not in overrides]
     if not files:
         raise ConfigError("no drive is named: give run files, as in python -m v2hdm.fleet drives/*.yaml")
+    if any(is_url(one) for one in parsed.drives if one not in overrides):
+        raise ConfigError("run files lie on this machine; their drive.path may be a URL (docs/stores.md)")
     options = FleetOptions(parsed.table, parsed.workers, parsed.address, parsed.again, parsed.site)
     return exit_code(fleet_on_terminal(files, overrides, options))
 
@@ -54,10 +57,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--table",
-        type=Path,
-        default=Path("outputs/fleet"),
+        default="outputs/fleet",
         metavar="FOLDER",
-        help="takes the table of verdicts, fleet.csv and fleet.json (outputs/fleet)",
+        help="or the URL of one, takes the table of verdicts, fleet.csv and fleet.json (outputs/fleet)",
     )
     parser.add_argument(
         "--site", metavar="NAME", help="map all the drives together, as one site of that name"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import cv2
@@ -13,7 +13,8 @@ from ray.exceptions import RayActorError, RayTaskError
 from v2hdm.detection.batch import detect_image
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.errors import WorkerError
+from v2hdm.errors import DriveError, WorkerError
+from v2hdm.fleet.gpus import EYES_A_GPU
 from v2hdm.records import Drive, ImageDetections
 
 IMAGES_A_BATCH = 8
@@ -49,10 +50,45 @@ class Eyes:
             while len(self._drives) >= _DRIVES_KEPT:
                 self._drives.pop(next(iter(self._drives)))
             self._drives[key] = ray.get(reference)
+            root = self._drives[key].root
+            if not root.exists():
+                raise DriveError(
+                    f"{root}: is not on {os.uname().nodename}, which is to detect in its images; put drives, "
+                    "and local_cache for those that are copied, on a folder that all machines share"
+                )
         known = repr(options)
         if known not in self._detectors:
             self._detectors = {known: Detector.load(options=options)}
         return [detect_image(self._detectors[known], self._drives[key], index) for index in images]
+
+
+def open_eyes(
+    devices: Collection[str], cores: int, gpus: int, gpu_share: float, folder: str, retries: int
+) -> dict[str, list[Any]]:
+    """Actors that detect, for each device that is asked for: one a core, on GPUs some to each.
+
+    Args:
+        devices: as in :attr:`DetectorOptions.device`.
+        cores: of all machines.
+        gpus: of all machines.
+        gpu_share: of a GPU that an actor there takes on Ray's books.
+        folder: where relative paths begin.
+        retries: how often a batch is begun anew whose actor died.
+    """
+    lasting = {"max_restarts": -1, "max_task_retries": retries}
+    # A core has one actor that detects and one drive that is mapped: the one waits for the other by turns.
+    # Those on GPUs are counted there.
+    places = {
+        "cpu": (cores, {"num_cpus": 0.5}),
+        "cuda": (min(cores, EYES_A_GPU * gpus), {"num_cpus": 0, "num_gpus": gpu_share}),
+    }
+    return {
+        device: [
+            ray.remote(Eyes).options(**lasting, **places[device][1]).remote(folder)
+            for _ in range(places[device][0])
+        ]
+        for device in devices
+    }
 
 
 def detect_by(

@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from v2hdm.config import compose_run_file, to_dataclass, to_yaml
 from v2hdm.errors import ConfigError, V2hdmError
 from v2hdm.fleet.rows import Row
+from v2hdm.objects.bucket import place_of
 from v2hdm.pipeline import RunConfig
 from v2hdm.pipeline.config import run_name
 from v2hdm.texts import shown, take_name
@@ -33,9 +34,10 @@ class Job:
     config_yaml: str
 
     @property
-    def folder(self) -> Path:
-        """The folder that takes the results."""
-        return Path(self.config.output) / self.name
+    def place(self) -> str:
+        """What takes the results: a folder, or the URL of one."""
+        there = place_of(self.config.output, "output=")
+        return str((there / self.name).resolve() if isinstance(there, Path) else there.below(self.name))
 
 
 @dataclass(frozen=True)
@@ -56,14 +58,14 @@ def plan(files: Sequence[Path], overrides: Sequence[str]) -> Plan:
     """
     jobs: list[Job] = []
     refused: list[Row] = []
-    taken: dict[Path, Path] = {}
+    taken: dict[str, Path] = {}
     for file in files:
         try:
             job = _job(file, overrides)
-            place = job.folder.resolve()
+            place = job.place
             if place in taken:
                 raise ConfigError(
-                    f"{file}: its results go to {job.folder}, as those of {taken[place]} do; give one of "
+                    f"{file}: its results go to {place}, as those of {taken[place]} do; give one of "
                     "them another name"
                 )
             taken[place] = file
@@ -101,21 +103,26 @@ def _job(file: Path, overrides: Sequence[str]) -> Job:
 
 def _site_job(files: Sequence[Path], overrides: Sequence[str], site: str, source: str) -> Job:
     first, settings = _composed(files[0], overrides)
-    paths: list[Path] = []
+    paths: list[str] = []
     for file in files:
         _, config = _composed(file, overrides)
         if not config.drive.paths:
             raise ConfigError(f"{file}: --site joins drives that lie in folders; set drive.path")
         _refuse_other_settings(files[0], settings, file, config)
-        paths += config.drive.paths
+        told = config.drive.path
+        paths += map(str, told if isinstance(told, list) else [told])
     OmegaConf.update(first, "name", site)
-    OmegaConf.update(first, "drive.path", [str(path) for path in paths])
+    OmegaConf.update(first, "drive.path", paths)
     return Job(site, source, to_dataclass(first, RunConfig, f"set it in {files[0]}"), to_yaml(first))
 
 
 def _composed(file: Path, overrides: Sequence[str]) -> tuple[DictConfig, RunConfig]:
     composed = compose_run_file(file, "map", RunConfig, overrides)
-    return composed, to_dataclass(composed, RunConfig, f"set it in {file}")
+    config = to_dataclass(composed, RunConfig, f"set it in {file}")
+    for place in (config.output, config.cache):
+        if place.startswith("memory:"):
+            raise ConfigError(f"{place}: is gone with the process that wrote it, and a fleet has many")
+    return composed, config
 
 
 def _refuse_other_settings(first: Path, settings: RunConfig, file: Path, config: RunConfig) -> None:

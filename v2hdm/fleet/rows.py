@@ -7,7 +7,6 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from pathlib import Path
 from typing import Any
 
 from v2hdm.door import EXIT_FAILED_VERDICT, EXIT_USER_ERROR, one_line
@@ -26,7 +25,7 @@ class Row:
         says: the worst finding, or what went wrong, in one line.
         images, markings, minutes: how large it was, what is on its map, and how long it took.
         kept: whether an earlier result was found that was made of the same.
-        folder: of the result, empty without one.
+        folder: of the result, or its URL; empty without one.
         source: the run file, or those of a site.
     """
 
@@ -46,7 +45,7 @@ class Row:
         return cls(drive, ERROR, one_line(message), None, None, None, False, "", source)
 
     @classmethod
-    def of_result(cls, drive: str, source: str, folder: Path, metrics: Mapping[str, Any], kept: bool) -> Row:
+    def of_result(cls, drive: str, source: str, place: str, metrics: Mapping[str, Any], kept: bool) -> Row:
         """The row of a finished run, from its ``metrics.json``."""
         verdict = metrics["verdict"]
         raised = verdict["findings"]
@@ -56,7 +55,7 @@ class Row:
         minutes = round(sum(metrics.get("seconds", {}).values()) / 60, 3)
         images = int(metrics["drive"]["images"])
         status = str(verdict["status"])
-        where = (str(folder), source)
+        where = (place, source)
         return cls(drive, status, one_line(says), images, markings, minutes, kept, *where)
 
 

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from v2hdm.fleet.cluster import LOCAL, RETRIES, cluster
+from v2hdm.fleet.gpus import NO_GPU, Shares, wants_gpu
 from v2hdm.fleet.plan import Job, plan, plan_site
 from v2hdm.fleet.rows import Row, as_csv, as_json
+from v2hdm.objects.bucket import place_of
+from v2hdm.objects.results import GrowingObjects, growing_objects
 from v2hdm.outputs import GrowingFolder, growing_folder
 
 Tell = Callable[[str, str, int, int], None]
@@ -26,11 +31,11 @@ class FleetOptions:
     """What a user chooses beside the drives.
 
     ``workers`` are the cores that are used on this machine, 0 for all; ``address`` is that of a cluster.
-    ``folder`` takes the table; ``again`` does what is finished again. ``site`` names the one that all drives
-    are of; without a name each is mapped by itself.
+    ``folder``, or the URL of one, takes the table; ``again`` does what is finished again. ``site`` names the
+    one that all drives are of; without a name each is mapped by itself.
     """
 
-    folder: Path
+    folder: Path | str
     workers: int = 0
     address: str = LOCAL
     again: bool = False
@@ -56,7 +61,7 @@ def run_fleet(
     """
     told = [*overrides, "resume=false"] if options.again else overrides
     todo = plan(files, told) if options.site is None else plan_site(files, told, options.site)
-    with growing_folder(options.folder, "--table") as folder:
+    with _growing(options.folder, tell) as folder:
         table = _Table(folder, todo.sources, tell)
         for row in todo.refused:
             table.add(row)
@@ -66,10 +71,19 @@ def run_fleet(
         return table.rows
 
 
+def _growing(place: Path | str, tell: Tell) -> AbstractContextManager[GrowingFolder | GrowingObjects]:
+    """Where the table goes: a folder, or a place at an object store."""
+    there = place_of(str(place), "--table")
+    if isinstance(there, Path):
+        return growing_folder(there, "--table")
+    there.check()
+    return growing_objects(there, partial(tell, ALL, "listen"))
+
+
 class _Table:
     """The rows so far, on disk as well."""
 
-    def __init__(self, folder: GrowingFolder, sources: Sequence[str], tell: Tell) -> None:
+    def __init__(self, folder: GrowingFolder | GrowingObjects, sources: Sequence[str], tell: Tell) -> None:
         self._folder, self._sources, self._tell = folder, sources, tell
         self._rows: dict[str, Row] = {}
 
@@ -92,23 +106,25 @@ class _Table:
 def _map_all(ray: Any, todo: Sequence[Job], table: _Table, tell: Tell) -> None:
     """Map the drives, as many at a time as there are cores."""
     from v2hdm.fleet.board import Board
-    from v2hdm.fleet.eyes import Eyes
+    from v2hdm.fleet.eyes import open_eyes
     from v2hdm.fleet.work import map_drive
 
-    cores = max(int(ray.cluster_resources().get("CPU", 1)), 1)
-    here = str(Path.cwd())
-    # A core has one actor that detects and one drive that is mapped: the one waits for the other by turns.
-    half = {"num_cpus": 0.5, "max_restarts": -1, "max_task_retries": RETRIES}
-    eyes = [ray.remote(Eyes).options(**half).remote(here) for _ in range(cores)]
+    cores, gpus = (int(ray.cluster_resources().get(kind, 0)) for kind in ("CPU", "GPU"))
+    cores, here = max(cores, 1), str(Path.cwd())
+    for job in [one for one in todo if gpus == 0 and wants_gpu(one.config)]:
+        table.add(Row.of_error(job.name, job.source, NO_GPU))
+    todo = [job for job in todo if gpus or not wants_gpu(job.config)]
+    shares = Shares.of([job.config for job in todo])
+    eyes = open_eyes({job.config.detector.device for job in todo}, cores, gpus, shares.eyes, here, RETRIES)
     board = ray.remote(Board).options(num_cpus=0, max_restarts=-1).remote()
     left = list(todo)[::-1]
     doing: dict[Any, Job] = {}
     while left or doing:
         while left and len(doing) < cores:
             job = left.pop()
-            gpus = 1 if job.config.device == "cuda" else 0
-            mapping = ray.remote(map_drive).options(num_cpus=0.5, num_gpus=gpus, max_retries=RETRIES)
-            doing[mapping.remote(job, eyes, board, here)] = job
+            share = shares.mapping if job.config.device == "cuda" else 0
+            mapping = ray.remote(map_drive).options(num_cpus=0.5, num_gpus=share, max_retries=RETRIES)
+            doing[mapping.remote(job, eyes[job.config.detector.device], board, here)] = job
         done, _ = ray.wait(list(doing), num_returns=1, timeout=_LOOK_EVERY_S)
         for message in _told(ray, board):
             tell(*message)

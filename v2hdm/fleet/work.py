@@ -15,7 +15,9 @@ from v2hdm.fleet.board import Telling
 from v2hdm.fleet.eyes import detect_by
 from v2hdm.fleet.plan import Job
 from v2hdm.fleet.rows import Row
-from v2hdm.pipeline.finished import RunResult, finished
+from v2hdm.pipeline import RunConfig
+from v2hdm.pipeline.finished import RunResult
+from v2hdm.pipeline.places import in_place
 
 
 def map_drive(job: Job, eyes: Sequence[Any], board: Any, folder: str) -> tuple[Row, str]:
@@ -30,27 +32,26 @@ def map_drive(job: Job, eyes: Sequence[Any], board: Any, folder: str) -> tuple[R
     os.chdir(folder)
     job.config.workers = 1
     try:
-        store = Store(Path(job.config.cache))
-        there = finished(job.config, store) if job.config.resume else None
-        result = there or _mapped(job, store, eyes, board)
+        telling = Telling(board, job.name)
+        mapped = partial(_mapped, job, eyes, telling)
+        result, kept = in_place(job.config, mapped, job.config.resume, telling)
     except Exception as error:  # a drive that fails is a row, and the others go on
         line = told(error)
         if line is not None:
             return Row.of_error(job.name, job.source, line), ""
         line = f"a bug of ours, {type(error).__name__}: {error}; its traceback is in the fleet's folder"
         return Row.of_error(job.name, job.source, line), traceback.format_exc()
-    return Row.of_result(job.name, job.source, result.folder, result.metrics, there is not None), ""
+    return Row.of_result(job.name, job.source, result.place, result.metrics, kept), ""
 
 
-def _mapped(job: Job, store: Store, eyes: Sequence[Any], board: Any) -> RunResult:
+def _mapped(job: Job, eyes: Sequence[Any], telling: Telling, config: RunConfig, store: Store) -> RunResult:
     # They load torch, which a finished result does not need.
     from v2hdm.fleet.crew import RayCrew
     from v2hdm.mapping.crew import ALONE, Crew
     from v2hdm.pipeline.work import map_drives
 
-    telling = Telling(board, job.name)
     crew: Crew = ALONE
-    if len(job.config.drive.paths) > 1:
+    if len(config.drive.paths) > 1:
         crew = RayCrew(len(eyes), str(Path.cwd()))
     detect = partial(detect_by, eyes)
-    return map_drives(job.config, store, job.config_yaml, telling, detect=detect, crew=crew)
+    return map_drives(config, store, job.config_yaml, telling, detect=detect, crew=crew)

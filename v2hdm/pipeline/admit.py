@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from v2hdm.detection.detector import Detector
@@ -69,7 +71,8 @@ def admit(config: RunConfig) -> str:
         for camera in config.simulate.cameras:
             take_camera_name(camera, "simulate.cameras", ConfigError)
     check_settings(config, _RANGES)
-    detector = Detector.load(options=config.detector)
+    # Wherever the detector will run, it can be looked at here.
+    detector = Detector.load(options=replace(config.detector, device="cpu"))
     check_options(config.mapping, detector.catalogue.cornered)
     table_of(config.mapping.survey)
     check_formats(config.export, "export")

@@ -61,7 +61,8 @@ def detect_in_pieces(
         "own_vehicle",
         key_of(detector_key, contents.key(drive)),
         _Masks,
-        lambda: own_vehicles(drive, Detector.load(options=options)),
+        # On the CPU wherever the rest runs, so that it is the same and needs no GPU here.
+        lambda: own_vehicles(drive, Detector.load(options=replace(options, device="cpu"))),
     )
     drive = with_masks(drive, masks)
     keys = _keys(drive, contents, detector_key)

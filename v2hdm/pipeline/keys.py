@@ -67,8 +67,8 @@ def result_key(config: RunConfig, drives: Sequence[Drive], contents: Contents, c
         code: key of the code.
     """
     asked = replace(
-        config, name=run_name(config), output="", cache="", cache_gb=0.0, resume=True, workers=0,
-        drive=replace(config.drive, path=None, cache=""),
+        config, name=run_name(config), output="", cache="", local_cache="", cache_gb=0.0, resume=True,
+        workers=0, drive=replace(config.drive, path=None, cache=""),
     )  # fmt: skip
     files: list[Path] = []
     if config.map.base is not None:

@@ -6,11 +6,10 @@ result of just that lies in its place, nothing else is loaded or done.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from v2hdm.caching.store import Store
 from v2hdm.pipeline.config import RunConfig
-from v2hdm.pipeline.finished import RunResult, finished
+from v2hdm.pipeline.finished import RunResult
+from v2hdm.pipeline.places import in_place
 from v2hdm.pipeline.telling import Progress, silent
 from v2hdm.pipeline.viewer import Viewer
 
@@ -29,11 +28,14 @@ def run(
     Raises:
         V2hdmError: The configuration, the drive or the detector is at fault, or no map can be made.
     """
-    store = Store(Path(config.cache))
-    there = finished(config, store) if config.resume and viewer is None else None
-    if there is not None:
-        return there
-    # Loads torch and much else, which takes seconds.
-    from v2hdm.pipeline.work import map_drives
 
-    return map_drives(config, store, config_yaml, progress, viewer)
+    def work(config: RunConfig, store: Store) -> RunResult:
+        # Loads torch and much else, which takes seconds.
+        from v2hdm.detection.network import check_device
+        from v2hdm.pipeline.work import map_drives
+
+        check_device(config.detector.device)
+
+        return map_drives(config, store, config_yaml, progress, viewer)
+
+    return in_place(config, work, config.resume and viewer is None, progress)[0]

@@ -1,0 +1,160 @@
+"""Objects are read as they were put, created once, and what fails is told in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+from v2hdm.config import Job
+from v2hdm.errors import ConfigError
+from v2hdm.files import whole_file
+from v2hdm.objects.bucket import Bucket, place_of
+from v2hdm.outputs import result_folder
+
+
+def test_what_was_put_is_read_listed_and_removed(memory: Bucket, tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"12345")
+    memory.write("c/b", tmp_path / "file")
+    memory.write("a", b"x")
+    memory.write("a", b"xy")
+    assert memory.read("a") == b"xy"
+    assert {name: one.size for name, one in memory.listed().items()} == {"c/b": 5, "a": 2}
+    assert memory.below("c").read("b") == b"12345"
+    memory.remove("a")
+    memory.remove("a")
+    assert memory.read("a") is None
+    memory.fetch({"c/b": tmp_path / "deep" / "copy"})
+    assert (tmp_path / "deep" / "copy").read_bytes() == b"12345"
+
+
+def test_an_object_is_created_once(memory: Bucket) -> None:
+    assert memory.create("a", b"first")
+    assert not memory.create("a", b"other")
+    assert memory.read("a") == b"first"
+
+
+def test_a_create_whose_answer_was_lost_counts(memory: Bucket) -> None:
+    assert memory.create("a", b"first")
+    assert memory.create("a", b"first")
+
+
+def test_a_name_that_begins_alike_is_not_below(memory: Bucket) -> None:
+    memory.write("run2/map", b"x")
+    assert not memory.below("run").listed()
+
+
+def test_a_token_changes_with_the_object(memory: Bucket) -> None:
+    memory.write("a", b"x")
+    before = memory.listed()["a"]
+    memory.write("a", b"y")
+    assert memory.listed()["a"] != before
+
+
+class Failing:
+    """A store whose calls fail so often."""
+
+    def __init__(self, *failures: Exception) -> None:
+        self.failures = list(failures)
+
+    def cat_file(self, path: str) -> bytes:
+        if self.failures:
+            raise self.failures.pop(0)
+        return path.encode()
+
+
+@pytest.mark.usefixtures("quick")
+def test_what_fails_for_a_moment_is_tried_again(caplog: pytest.LogCaptureFixture) -> None:
+    failing = Failing(OSError("reset by peer"), TimeoutError())
+    assert Bucket(failing, "b", "s3://b", "output=").read("a") == b"b/a"
+    assert [one.levelname for one in caplog.records] == ["WARNING"] * 2
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize(
+    ("failures", "says", "left"),
+    [
+        (
+            [OSError("no route\nto host")] * 4,
+            "s3://b/a: does not work .no route to host.; check the network",
+            1,
+        ),
+        ([PermissionError("Forbidden")] * 2, "Forbidden.; check the credentials", 1),
+        ([type("NoCredentialsError", (Exception,), {})("none found")] * 2, "none found.; check the cred", 1),
+    ],
+)
+def test_what_goes_on_failing_is_one_line(failures: list[Exception], says: str, left: int) -> None:
+    failing = Failing(*failures)
+    with pytest.raises(ConfigError, match=says) as told:
+        Bucket(failing, "b", "s3://b", "output=").read("a")
+    assert "\n" not in str(told.value)
+    assert len(failing.failures) == left
+
+
+@pytest.mark.parametrize(
+    ("url", "says"),
+    [
+        ("ssh://host/x", "at no store that we write to; choose a folder or s3://"),
+        ("simplecache::s3://b/x", "at no store"),
+        ("http://host/x", "at no store"),
+        ("s3://", "no place at a store"),
+        ("s3://b//x", "no place at a store"),
+        ("s3://b/../x", "no place at a store"),
+        ("s3://b/x?versionId=3", "no place at a store"),
+        ("s3://b/\x1b[2J", "no place at a store"),
+        ("s3://key:secret@b/x", r"^output= s3://\.\.\.: holds what is no name of a bucket"),
+        ("file://x/y", "named as in file:///data"),
+    ],
+)
+def test_what_is_no_place_is_refused(url: str, says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        place_of(url, "output=")
+
+
+def test_a_package_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(*_: object, **__: object) -> Any:
+        raise ImportError("Install gcsfs")
+
+    monkeypatch.setattr("fsspec.core.url_to_fs", absent)
+    with pytest.raises(ConfigError, match=r"output= gs://b/x: needs gcsfs, pip install it"):
+        place_of("gs://b/x", "output=")
+
+
+def test_a_folder_may_be_named_by_a_url() -> None:
+    assert place_of("file:///data/my%20runs", "output=") == Path("/data/my runs")
+    assert place_of("outputs", "output=") == Path("outputs")
+
+
+def test_s3_does_what_the_store_in_memory_does(s3: Any, tmp_path: Path) -> None:
+    place = Bucket.at("s3://bucket/place", "output=")
+    assert not place.listed()
+    test_what_was_put_is_read_listed_and_removed(place, tmp_path)
+    test_an_object_is_created_once(place.below("once"))
+    test_a_create_whose_answer_was_lost_counts(place.below("twice"))
+    test_a_name_that_begins_alike_is_not_below(place)
+    test_a_token_changes_with_the_object(place)
+
+
+def test_a_bucket_that_is_not_there_is_told(s3: Any) -> None:
+    nowhere = Bucket.at("s3://nowhere/results", "output=")
+    for work in (nowhere.check, lambda: nowhere.write("a", b"x"), lambda: nowhere.create("a", b"x")):
+        with pytest.raises(ConfigError, match="no such bucket or container"):
+            work()
+
+
+def test_a_url_where_only_paths_are_written_is_told_and_not_made_a_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for write in (result_folder, whole_file):
+        with (
+            pytest.raises(ConfigError, match="no URL is written to here"),
+            write(Path("s3://bucket/results")),
+        ):
+            pass
+    job = Job(OmegaConf.create(), "0-a=b")
+    with pytest.raises(ConfigError, match="a sweep writes to folders of this machine"):
+        job.folder("s3://bucket/results")
+    assert not list(tmp_path.iterdir())
