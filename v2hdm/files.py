@@ -10,8 +10,9 @@ import difflib
 import os
 import re
 import sys
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -37,11 +38,25 @@ __all__ = [
     "take_mapping",
     "take_number",
     "take_text",
+    "told_of_files",
     "whole_file",
 ]
 
 _URL = re.compile(r"[a-z][a-z0-9+.-]+:/")
 _LARGEST = sys.float_info.max
+
+Tell = Callable[[Path, Path], None]
+_tell: ContextVar[Tell | None] = ContextVar("told of each file before it is there", default=None)
+
+
+@contextmanager
+def told_of_files(tell: Tell) -> Iterator[None]:
+    """Within, ``tell`` is given each new file and the path whose place it is about to take; it may refuse."""
+    token = _tell.set(tell)
+    try:
+        yield
+    finally:
+        _tell.reset(token)
 
 
 @contextmanager
@@ -53,7 +68,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
     Raises:
         ConfigError: ``path`` is an input of this door, or no plain file.
-        OSError: it cannot be written there.
+        OSError: it cannot be written there; the error names ``path``.
     """
     refuse_url(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -64,7 +79,14 @@ def whole_file(path: Path) -> Iterator[Path]:
     try:
         yield partial
         refuse_input(path)
+        if (tell := _tell.get()) is not None:
+            tell(partial, path)
         partial.replace(path)
+    except OSError as failure:
+        # Calls on an open file name none, and the hidden name is of no use to anybody.
+        if failure.errno is not None and failure.filename in (None, str(partial)):
+            failure.filename = str(path)
+        raise
     finally:
         partial.unlink(missing_ok=True)
 

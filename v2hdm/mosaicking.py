@@ -9,7 +9,7 @@ from pathlib import Path
 
 from v2hdm.drive.of_result import drive_of
 from v2hdm.errors import DriveError, MapFileError
-from v2hdm.orthophoto.result import MOSAIC_FILES, RESOLUTION_M, write_mosaic
+from v2hdm.orthophoto.result import RESOLUTION_M, write_mosaic
 from v2hdm.outputs import added_to
 from v2hdm.pipeline.admit import check_device
 from v2hdm.records import Drive
@@ -51,7 +51,7 @@ def mosaic_of_result(parsed: argparse.Namespace) -> list[str]:
         raise MapFileError(f"{parsed.result}: no such folder; give the result folder of v2hdm.map")
     drive = drive_of_result(parsed.result, parsed.drive)
     resolution_m = RESOLUTION_M if parsed.resolution is None else parsed.resolution
-    with added_to(parsed.result, MOSAIC_FILES, "RESULT") as folder:
+    with added_to(parsed.result, "RESULT") as folder:
         found = write_mosaic(folder, drive, resolution_m, parsed.device, _tell)
     sharpness = found["sharpness"]
     lines = []

@@ -13,14 +13,14 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from v2hdm.errors import ConfigError
-from v2hdm.files import refuse_url, whole_file
+from v2hdm.files import refuse_url, told_of_files, whole_file
+from v2hdm.listing import LIST as MARKER
 from v2hdm.locks import take_lock
-from v2hdm.objects.results import LIST as MARKER
 
 _log = logging.getLogger(__name__)
 
@@ -69,52 +69,81 @@ def result_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
 
 
 @contextmanager
-def added_to(folder: Path, names: Sequence[str], option: str) -> Iterator[Path]:
-    """A finished result to write further files into, which are on its list afterwards.
+def added_to(folder: Path, option: str) -> Iterator[Path]:
+    """A finished result to write further files into, each listed before it is there.
 
     Args:
         folder: of the result.
-        names: of the files that may be written.
         option: which says what folder it is, for errors.
 
     Raises:
-        ConfigError: the folder is no result of ours, a file of these names in it is not ours, it cannot be
-            written, or another process is writing it.
+        ConfigError: the folder is no result of ours, a file that is to be replaced in it is not ours, it
+            cannot be written, or another process is writing it.
     """
     target = _resolved(folder, option)
     with ExitStack() as stack:
         with _explained(folder, option):
             stack.enter_context(_locked(target, folder, option))
-            ours = _ours(target, folder, option, unchanged=False)
-        if ours is None:
-            raise ConfigError(f"{folder}: is no result of ours; give another {option}")
-        for name in names:
-            if (target / name).exists() and ours.get(name) != _digest(target / name):
-                raise ConfigError(f"{folder / name}: is no file of ours; move it, or give another {option}")
-        try:
+            if _listed(target, folder, option) is None:
+                raise ConfigError(f"{folder}: is no result of ours; give another {option}")
+        with listed_files(folder, option):
             yield target
-        except OSError as failure:
-            if failure.errno in _FULL:
-                raise _cannot_write(folder, failure, option) from None
-            raise
-        finally:
-            with (target / MARKER).open("a", encoding="utf-8") as stream:
-                for name in names:
-                    if (target / name).is_file():
-                        entry = {"file": name, "sha256": _digest(target / name)}
-                        stream.write(json.dumps(entry) + "\n")
+
+
+@contextmanager
+def listed_files(folder: Path, option: str) -> Iterator[None]:
+    """Within, each file that is written whole into a folder of ours is put on its list before it is there.
+
+    Listed first, a file is ours whenever the work is cut off; what it was before stays ours as well.
+
+    Raises:
+        ConfigError: a file that is to be replaced is not ours, or the folder cannot be written.
+    """
+    target = _resolved(folder, option)
+    ours = _listed(target, folder, option) or {}
+
+    def list_file(partial: Path, path: Path) -> None:
+        if not (place := path.resolve()).is_relative_to(target):
+            return
+        name = place.relative_to(target).as_posix()
+        if path.exists() and _digest(path) not in ours.get(name, ()):
+            raise ConfigError(f"{folder / name}: is no file of ours; move it, or give another {option}")
+        digest = _digest(partial)
+        _append(target / MARKER, json.dumps({"file": name, "sha256": digest}) + "\n")
+        ours.setdefault(name, []).append(digest)
+
+    try:
+        with told_of_files(list_file):
+            yield
+    except OSError as failure:
+        if failure.errno in _FULL:
+            raise _cannot_write(folder, failure, option) from None
+        raise
+
+
+def _append(path: Path, line: str) -> None:
+    """Append a line, or nothing: half of one would damage the list."""
+    size = path.stat().st_size
+    try:
+        with path.open("ab", buffering=0) as stream:
+            data = line.encode()
+            if stream.write(data) < len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+    except OSError:
+        os.truncate(path, size)
+        raise
 
 
 class GrowingFolder:
     """A folder whose files are written one by one, each at once."""
 
-    def __init__(self, target: Path, shown: Path, ours: dict[str, str], option: str) -> None:
-        self._target, self._shown, self._ours, self._option = target, shown, ours, option
+    def __init__(self, target: Path) -> None:
+        self._target = target
 
     @property
     def has_files(self) -> bool:
         """Whether any file of it is ours."""
-        return bool(self._ours)
+        return any((self._target / name).is_file() for name in files_of_result(self._target))
 
     def write(self, name: str, data: bytes) -> None:
         """Write the file ``name``.
@@ -122,21 +151,13 @@ class GrowingFolder:
         Raises:
             ConfigError: it cannot be written, or there is a file of this name that is not ours.
         """
-        path = self._target / name
-        if path.exists() and self._ours.get(name) != _digest(path):
-            raise ConfigError(f"{self._shown / name}: is no file of ours; give another {self._option}")
-        digest = hashlib.sha256(data).hexdigest()
-        with _explained(self._shown, self._option):
-            with (self._target / MARKER).open("a", encoding="utf-8") as stream:
-                stream.write(json.dumps({"file": name, "sha256": digest}) + "\n")
-            with whole_file(path) as partial:
-                partial.write_bytes(data)
-        self._ours[name] = digest
+        with whole_file(self._target / name) as partial:
+            partial.write_bytes(data)
 
 
 @contextmanager
 def growing_folder(folder: Path, option: str) -> Iterator[GrowingFolder]:
-    """``folder`` to write single files into.
+    """``folder`` to write single files into, each listed before it is there.
 
     Raises:
         ConfigError: as :func:`result_folder`.
@@ -146,15 +167,16 @@ def growing_folder(folder: Path, option: str) -> Iterator[GrowingFolder]:
         with _explained(folder, option):
             stack.enter_context(_parents(target))
             stack.enter_context(_locked(target, folder, option))
-            ours = _ours(target, folder, option, unchanged=False)
+            there = _listed(target, folder, option)
             target.mkdir(exist_ok=True)
-            if ours is None:
+            if there is None:
                 (target / MARKER).write_text(json.dumps(_HEAD) + "\n", encoding="utf-8")
-        growing = GrowingFolder(target, folder, ours or {}, option)
+        growing = GrowingFolder(target)
         try:
-            yield growing
+            with listed_files(folder, option):
+                yield growing
         finally:
-            if ours is None and not growing.has_files:
+            if there is None and not growing.has_files:
                 (target / MARKER).unlink(missing_ok=True)
                 with suppress(OSError):
                     target.rmdir()
@@ -181,7 +203,7 @@ def files_of_result(folder: Path) -> dict[str, str]:
     Raises:
         ConfigError: its list is damaged.
     """
-    return _ours(folder, folder, "output=", unchanged=False) or {}
+    return {name: digests[-1] for name, digests in (_listed(folder, folder, "output=") or {}).items()}
 
 
 def is_whole(folder: Path, files: Mapping[str, str]) -> bool:
@@ -265,11 +287,28 @@ def _recover(target: Path, unfinished: Path, previous: Path, option: str) -> Non
             shutil.rmtree(left)
 
 
-def _ours(target: Path, shown: Path, option: str, unchanged: bool = True) -> dict[str, str] | None:
-    """Hashes of our files in ``target`` by their names; None if there is nothing yet.
+def _ours(target: Path, shown: Path, option: str) -> set[str] | None:
+    """Names of our files in ``target``; None if there is nothing yet.
 
     Raises:
         ConfigError: it holds something and is not ours, or a file of ours was changed.
+    """
+    listed = _listed(target, shown, option)
+    for name, digests in (listed or {}).items():
+        path = target / name
+        if path.is_file() and _digest(path) not in digests:
+            raise ConfigError(
+                f"{shown / name}: was changed after we wrote it and is not replaced; move it, or give "
+                f"another {option}"
+            )
+    return None if listed is None else set(listed)
+
+
+def _listed(target: Path, shown: Path, option: str) -> dict[str, list[str]] | None:
+    """By name of a file of ours in ``target`` what we wrote there, the last at the end; None if it is empty.
+
+    Raises:
+        ConfigError: it holds something and is not ours.
     """
     if not target.exists() or not any(target.iterdir()):
         return None
@@ -278,21 +317,13 @@ def _ours(target: Path, shown: Path, option: str, unchanged: bool = True) -> dic
         raise ConfigError(
             f"output folder {shown} holds files that are no results of ours: give another {option}"
         )
-    listed: dict[str, str] = {}
+    listed: dict[str, list[str]] = {}
     try:
         for line in marker.read_text(encoding="utf-8").splitlines()[1:]:
             entry = json.loads(line)
-            listed[str(entry["file"])] = str(entry["sha256"])
+            listed.setdefault(str(entry["file"]), []).append(str(entry["sha256"]))
     except (ValueError, TypeError, LookupError, RecursionError):
         raise ConfigError(f"{shown / MARKER}: is damaged; give another {option}") from None
-    if unchanged:
-        for name, digest in listed.items():
-            path = target / name
-            if path.is_file() and _digest(path) != digest:
-                raise ConfigError(
-                    f"{shown / name}: was changed after we wrote it and is not replaced; move it, or give "
-                    f"another {option}"
-                )
     return listed
 
 
@@ -309,7 +340,7 @@ def _list(folder: Path) -> None:
     )
 
 
-def _bring_over(earlier: Path, new: Path, ours: dict[str, str]) -> None:
+def _bring_over(earlier: Path, new: Path, ours: set[str]) -> None:
     """Give what the user has put into an ``earlier`` result to the ``new`` one as well."""
     for root, folders, files in os.walk(earlier):
         here = Path(root)
@@ -328,7 +359,7 @@ def _bring_over(earlier: Path, new: Path, ours: dict[str, str]) -> None:
                 shutil.copy2(path, place, follow_symlinks=False)
 
 
-def _is_ours(path: Path, folder: Path, ours: dict[str, str]) -> bool:
+def _is_ours(path: Path, folder: Path, ours: set[str]) -> bool:
     name = path.relative_to(folder).as_posix()
     return name == MARKER or name in ours
 

@@ -20,6 +20,7 @@ import yaml
 
 from v2hdm.errors import V2hdmError
 from v2hdm.inputs import note_input
+from v2hdm.listing import tell_if_changed
 
 MOST_BYTES = 1 << 30
 """Largest text file that is read; an hour of poses at 100 Hz is 30 MB."""
@@ -44,7 +45,7 @@ _SHORT, _FEW = 60, 4
 
 
 def read_bytes(path: Path, error: type[V2hdmError], most: int = MOST_BYTES) -> bytes:
-    """The bytes of the plain file at ``path``.
+    """The bytes of the plain file at ``path``; a warning says so where it is ours and was changed.
 
     Raises:
         V2hdmError: of type ``error``, when it is missing, no plain file (a pipe would be waited for),
@@ -60,12 +61,14 @@ def read_bytes(path: Path, error: type[V2hdmError], most: int = MOST_BYTES) -> b
                 f"{path}: has {about.st_size / 1e6:.0f} MB, {most / 1e6:.0f} MB at most; check the path"
             )
         note_input(path)
-        return path.read_bytes()
+        data = path.read_bytes()
     except (FileNotFoundError, NotADirectoryError):
         raise error(f"{path}: no such file; check the path or restore it") from None
     except (OSError, ValueError) as failure:  # ValueError: a path with a zero byte
         reason = getattr(failure, "strerror", None) or failure
         raise error(f"{path}: cannot be read ({reason}); check the path and its permissions") from None
+    tell_if_changed(path, data)
+    return data
 
 
 def read_text(path: Path, error: type[V2hdmError], most: int = MOST_BYTES) -> str:

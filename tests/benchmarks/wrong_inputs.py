@@ -90,7 +90,9 @@ def port_of(port: str, route: str, seed: int) -> PortConfig:
     return port
 
 
-def map_drive(folder: Path, output: Path, mapping: MappingOptions, good: Path) -> Outcome:
+def map_drive(
+    folder: Path, output: Path, mapping: MappingOptions, good: Path, cache: Path = Path("cache")
+) -> Outcome:
     """Map a drive as a user would, and compare what was written with the truth of the ``good`` drive."""
     begin_s = time.perf_counter()
     output.mkdir(parents=True, exist_ok=True)
@@ -99,6 +101,7 @@ def map_drive(folder: Path, output: Path, mapping: MappingOptions, good: Path) -
         drive=DriveConfig(path=str(folder)),
         mapping=mapping,
         output=str(output),
+        cache=str(cache),
         workers=1,
     )
     try:

@@ -161,6 +161,10 @@ def test_a_second_reading_decodes_nothing_and_mends_what_was_damaged(
         content["poses"].pop("lever_arm_m")
         mended = read(tmp_path / "drive", content)
         assert caplog.text.count(", once") == 2
+        (poses,) = (tmp_path / "drive" / "cache").glob("*/positions.txt")
+        poses.write_text(poses.read_text().replace("1", "2", 1))
+        mended = read(tmp_path / "drive", content)
+        assert caplog.text.count(", once") == 3
     assert_same_drive(mended, read_drive(folder))
     assert not list((tmp_path / "drive" / "cache").glob(".*"))
 

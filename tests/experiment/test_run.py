@@ -12,22 +12,24 @@ import pytest
 from tests.experiment.scene import CALIBRATED, ESTIMATED, experiment, keep, record
 from tests.mapping.scene import SceneOptions, make_scene
 from v2hdm.caching.keys import key_of
-from v2hdm.errors import DriveError
+from v2hdm.errors import ConfigError, DriveError
 from v2hdm.experiment.drive import _content, drive_record, recipe_file, setting_key
 from v2hdm.experiment.plan import ExperimentConfig, jobs
 from v2hdm.experiment.residuals import residuals
 from v2hdm.experiment.run import run_experiment
 from v2hdm.experiment.stored import store, stored
 from v2hdm.mapping.methods import run_methods
+from v2hdm.outputs import growing_folder
 from v2hdm.records import HdMap, Truth
 
 
 def finished(output: Path) -> ExperimentConfig:
     """An experiment whose drives are finished, and nowhere to be read again."""
     config = experiment(str(output))
-    for job, start in zip(jobs(config), (CALIBRATED, ESTIMATED), strict=True):
-        keep(job, record(job.port, job.seed, start))
-        cv2.imwrite(str(job.folder / "front.jpg"), np.full((480, 640, 3), 90, np.uint8))
+    with growing_folder(output / config.name, "output="):
+        for job, start in zip(jobs(config), (CALIBRATED, ESTIMATED), strict=True):
+            keep(job, record(job.port, job.seed, start))
+            cv2.imwrite(str(job.folder / "front.jpg"), np.full((480, 640, 3), 90, np.uint8))
     return config
 
 
@@ -44,6 +46,16 @@ def test_finished_drives_are_never_opened_again(tmp_path: Path) -> None:
         image = cv2.imread(str(folder / name))
         assert len(np.unique(image.reshape(-1, 3), axis=0)) > 10
     assert "All 14 figures agree" in (folder / "experiment.md").read_text()
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "results.csv", "drives/port1/front.jpg"])
+def test_a_folder_with_files_of_the_users_is_refused(tmp_path: Path, name: str) -> None:
+    mine = tmp_path / experiment(str(tmp_path)).name / name
+    mine.parent.mkdir(parents=True)
+    mine.write_text("mine")
+    with pytest.raises(ConfigError, match="no results of ours"):
+        run_experiment(experiment(str(tmp_path)), "", lambda *_: None)
+    assert mine.read_text() == "mine"
 
 
 def test_another_setting_takes_nothing_from_an_earlier_run(tmp_path: Path) -> None:

@@ -1,8 +1,8 @@
 """The judge of a bad input: what the door may do with it, and what it may not.
 
-A case makes a folder of inputs and names a door with its arguments. The judge runs that door in this process
-and asserts its exit code, exactly one line of error without a traceback, that every file that was there is
-what it was, that nothing new is left, and that it ended in time.
+A case makes a folder of inputs and names a door with its arguments. The judge runs that door, as a rule in
+this process, and asserts its exit code, exactly one line of error without a traceback, that every file that
+was there is what it was, that nothing new is left, and that it ended in time.
 """
 
 from __future__ import annotations
@@ -26,9 +26,11 @@ from pathlib import Path
 import pytest
 
 LONGEST_S = 60
-HYDRA_DOORS = ("v2hdm.map", "train.__main__", "export.__main__")
+HYDRA_DOORS = ("v2hdm.map", "v2hdm.experiment.__main__", "train.__main__", "export.__main__")
 
 Prepare = Callable[[Path], None]
+Ran = tuple[int | str, str, str]
+"""What a door did: its exit code, or the name of what it raised, and what it wrote to stderr and stdout."""
 
 
 @dataclass(frozen=True)
@@ -92,24 +94,30 @@ class Outcome:
         return found
 
 
-def judge(case: Case, folder: Path) -> Outcome:
-    """Run a case in an empty ``folder``."""
+def judge(case: Case, folder: Path, run: Callable[[Case], Ran] | None = None) -> Outcome:
+    """Run a case in an empty ``folder``; ``run`` takes the place of running its door in this process."""
     here = folder / "work" / "here"
     here.mkdir(parents=True)
     (folder / "precious.txt").write_text("not ours")
     (here / "precious.txt").write_text("not ours")
     case.prepare(here)
-    before = _state(folder)
-    with _in_folder(here):
-        code, error, output = _run(case)
-    return Outcome(code, error, output, before, _state(folder))
+    return judge_again(case, folder, run)
+
+
+def judge_again(case: Case, folder: Path, run: Callable[[Case], Ran] | None = None) -> Outcome:
+    """Run a case in a ``folder`` as it is, after :func:`judge`."""
+    before = state_of(folder)
+    with _in_folder(folder / "work" / "here"):
+        code, error, output = (run or run_here)(case)
+    return Outcome(code, error, output, before, state_of(folder))
 
 
 class TookTooLongError(BaseException):
     """A door did not end."""
 
 
-def _run(case: Case) -> tuple[int | str, str, str]:
+def run_here(case: Case) -> Ran:
+    """Run the door of a case in this process and in this folder."""
     module = importlib.import_module(case.door)
     error, output = io.StringIO(), io.StringIO()
     logger = logging.getLogger()
@@ -121,7 +129,7 @@ def _run(case: Case) -> tuple[int | str, str, str]:
         patch.setattr(sys, "stderr", error)
         patch.setattr(sys, "stdout", output)
         logger.handlers = []
-        with _full_disk(case.disk_bytes):
+        with full_disk(case.disk_bytes):
             try:
                 main = module.main
                 code = main() if case.door in HYDRA_DOORS else main(list(case.arguments))
@@ -160,7 +168,7 @@ def _in_time() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _full_disk(most: int | None) -> Iterator[None]:
+def full_disk(most: int | None) -> Iterator[None]:
     """Files end at ``most`` bytes: the kernel refuses what is written beyond."""
     if most is None:
         yield
@@ -173,7 +181,7 @@ def _full_disk(most: int | None) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def _state(folder: Path) -> dict[str, str]:
+def state_of(folder: Path) -> dict[str, str]:
     """Kind and content of everything in a folder."""
     found = {}
     for path in sorted(folder.rglob("*")):

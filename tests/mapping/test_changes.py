@@ -11,6 +11,8 @@ import pytest
 from tests.mapping.scene import Scene, SceneOptions, make_scene
 from tests.mapping.test_methods import match
 from v2hdm.errors import MappingError
+from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
+from v2hdm.geometry.rigid import inverse
 from v2hdm.hdmap.geojson import read_geojson, write_geojson
 from v2hdm.mapping.changes.decide import Decision, Watched, decide
 from v2hdm.mapping.changes.field import Errors
@@ -120,6 +122,27 @@ def test_ids_stay(base: Base, updated: tuple[Scene, MethodResult]) -> None:
     ids = [one.id for one in (*updated[1].hd_map.markings, *updated[1].hd_map.lanes)]
     assert len(set(ids)) == len(ids)
     assert {one.id for one in base.hd_map.lanes} <= set(ids)
+
+
+def test_observations_bear_the_ids_and_corners_of_the_updated_map(
+    updated: tuple[Scene, MethodResult],
+) -> None:
+    now, result = updated
+    assert result.residuals is not None
+    assert result.poses is not None
+    corners = {one.id: one.corners_map for one in result.hd_map.markings}
+    images = {image.path.as_posix(): image for image in now.drive.images}
+    found, off_px = result.residuals, []
+    for k in np.flatnonzero((found.marking > 0) & found.is_point):
+        image = images[found.image[found.row_image[k]]]
+        calibration = result.calibrations[image.camera]
+        cam_from_map = calibration.cam_from_vehicle @ inverse(result.poses.of_image(image))
+        corner = corners[found.marking[k]][found.corner[k]]
+        px = apply_homography(pinhole_px_from_ground(calibration.info.intrinsic, cam_from_map), corner)
+        off_px.append(np.linalg.norm(px - found.observed_px[k]))
+    assert {one.id for one in changes_of(result).of(Fate.NEW)} <= set(found.marking)
+    assert len(off_px) > 500
+    assert np.percentile(off_px, 90) < 8.0
 
 
 def test_two_drives_together_are_better_than_either(

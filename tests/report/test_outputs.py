@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.faults.judge import full_disk
 from v2hdm.errors import ConfigError
-from v2hdm.outputs import MARKER, growing_folder, result_folder
+from v2hdm.outputs import MARKER, added_to, files_of_result, growing_folder, result_folder
 from v2hdm.report.outputs import write_json
 
 ROOT = Path(__file__).parents[2]
@@ -166,6 +167,46 @@ def test_single_files_are_added_and_replaced_but_never_the_users(tmp_path: Path)
         growing_folder(tmp_path / "photos", "--draw"),
     ):
         pass
+
+
+def test_a_file_stays_ours_where_the_work_was_cut_off_before_or_after_its_replacement(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "drawn"
+    with growing_folder(folder, "--draw") as growing:
+        growing.write("a.jpg", b"first")
+        growing.write("b.jpg", b"first")
+    monkeypatch.setattr(Path, "replace", lambda *_: 1 / 0)
+    for name in ("a.jpg", "b.jpg"):
+        with growing_folder(folder, "--draw") as growing, pytest.raises(ZeroDivisionError):
+            growing.write(name, b"second")
+    monkeypatch.undo()
+    (folder / "b.jpg").write_bytes(b"second")
+    assert (folder / "a.jpg").read_bytes() == b"first"
+    with growing_folder(folder, "--draw") as growing:
+        growing.write("a.jpg", b"third")
+        growing.write("b.jpg", b"third")
+
+
+def test_what_is_added_to_a_result_is_on_its_list_and_the_users_stays(tmp_path: Path) -> None:
+    write(tmp_path / "run", config="ours")
+    with added_to(tmp_path / "run", "RESULT") as folder:
+        write_json(folder / "more.json", {"a": 1})
+    assert "more.json" in files_of_result(tmp_path / "run")
+    (tmp_path / "run" / "mine.json").write_text("mine")
+    with pytest.raises(ConfigError, match="no file of ours"), added_to(tmp_path / "run", "RESULT") as folder:
+        write_json(folder / "mine.json", {"a": 1})
+    assert (tmp_path / "run" / "mine.json").read_text() == "mine"
+
+
+def test_a_list_never_ends_in_half_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with growing_folder(tmp_path / "drawn", "--draw") as folder:
+        folder.write("a.jpg", b"first")
+    before = (tmp_path / "drawn" / MARKER).read_bytes()
+    refused = pytest.raises(ConfigError, match="cannot be written")
+    with refused, full_disk(len(before) + 9), growing_folder(tmp_path / "drawn", "--draw") as folder:
+        folder.write("b.jpg", b"second")
+    assert (tmp_path / "drawn" / MARKER).read_bytes() == before
 
 
 def test_json_leaves_out_what_does_not_exist(tmp_path: Path) -> None:

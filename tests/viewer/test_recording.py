@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from v2hdm.caching.room import Room
+from v2hdm.caching.store import Store
+from v2hdm.detection.options import DetectorOptions
 from v2hdm.drive import read_drive
 from v2hdm.errors import ConfigError
 from v2hdm.hdmap import read_geojson
 from v2hdm.hdmap.calibration import read_calibration
 from v2hdm.pipeline import DriveConfig, RunConfig, run
+from v2hdm.pipeline.detections import detect_in_pieces
+from v2hdm.pipeline.keys import Contents
+from v2hdm.records import ImageDetections
 from v2hdm.simulate import PortConfig, render_drive
 from v2hdm.simulate.port.config import RouteConfig, YardConfig
 from v2hdm.viewer import FILE, RerunViewer, check_viewer
@@ -153,8 +159,11 @@ def test_a_run_that_nothing_has_changed_for_is_shown_all_the_same(result: Path, 
         def __init__(self) -> None:
             self.calls: list[str] = []
 
-        def detected(self, *_: object) -> None:
-            self.calls.append("detected")
+        def begun(self, *_: object) -> None:
+            self.calls.append("begun")
+
+        def detected(self, found: Sequence[ImageDetections]) -> None:
+            self.calls.append(f"{len(found)} images")
 
         def mapped(self, cameras: str, *_: object) -> None:
             self.calls.append(cameras)
@@ -164,4 +173,17 @@ def test_a_run_that_nothing_has_changed_for_is_shown_all_the_same(result: Path, 
 
     seen = Seen()
     run(configured(drive_folder, result.parent), viewer=seen)
-    assert seen.calls == ["detected", "front", "closed"]
+    assert seen.calls == ["begun", f"{len(read_drive(drive_folder).images)} images", "front", "closed"]
+
+
+def test_images_are_shown_as_they_are_looked_at(drive_folder: Path, tmp_path: Path) -> None:
+    drive = read_drive(drive_folder, DriveConfig(limit=3))
+    shown: list[list[int]] = []
+
+    def show(found: Sequence[ImageDetections]) -> None:
+        shown.append([one.image for one in found])
+
+    for _ in range(2):
+        room = Room(Store(tmp_path))
+        detect_in_pieces(drive, Contents.of([drive]), DetectorOptions(), room, 1, lambda *_: None, show=show)
+    assert shown == [[], [0], [1], [2], [0, 1, 2]]

@@ -1,7 +1,7 @@
 """Streams of bags and videos kept as plain files: imported once, whole or not at all.
 
 An entry is a folder that is named by a hash of its source (names, sizes and times of change of the files) and
-of how it was read. Its list of contents, with the size of every file, tells a damaged one, which is made
+of how it was read. Its list of contents, with size and hash of every file, tells a damaged one, which is made
 anew.
 """
 
@@ -16,12 +16,14 @@ from pathlib import Path
 from typing import Any
 
 from v2hdm.caching.folders import note_use
+from v2hdm.caching.keys import file_digest
 from v2hdm.errors import DriveError
 
-_VERSION = 1
+_VERSION = 2
 """Raised whenever an import comes out as other files."""
 
 _CONTENTS = "contents.txt"
+_IMAGES = (".png", ".jpg", ".jpeg")
 
 
 def entry_folder(cache: Path, files: Sequence[Path], label: str, settings: Any) -> Path:
@@ -44,15 +46,21 @@ def entry_folder(cache: Path, files: Sequence[Path], label: str, settings: Any) 
 
 
 def is_whole(folder: Path) -> bool:
-    """Whether ``folder`` is an entry with all of its files at their sizes."""
+    """Whether ``folder`` is an entry with all of its files: images by their size, the rest by content."""
     try:
         lines = (folder / _CONTENTS).read_text(encoding="utf-8").splitlines()
-        sizes = [line.split(" ", 1) for line in lines[1:]]
-        return lines[0] == str(len(sizes)) and all(
-            (folder / name).stat().st_size == int(size) for size, name in sizes
+        entries = [line.split(" ", 2) for line in lines[1:]]
+        return lines[0] == str(len(entries)) and all(
+            [size, digest] == _told(folder / name) for size, digest, name in entries
         )
     except (OSError, ValueError, IndexError):
         return False
+
+
+def _told(path: Path) -> list[str]:
+    """What the list of contents says of a file; a decoder tells of a damaged image."""
+    size = str(path.stat().st_size)
+    return [size, "-" if path.suffix in _IMAGES else file_digest(path)]
 
 
 def begin_entry(folder: Path) -> Path:
@@ -73,7 +81,7 @@ def finish_entry(folder: Path) -> None:
     partial = _partial(folder)
     try:
         files = sorted(path for path in partial.rglob("*") if path.is_file())
-        lines = [f"{path.stat().st_size} {path.relative_to(partial).as_posix()}" for path in files]
+        lines = [" ".join([*_told(path), path.relative_to(partial).as_posix()]) for path in files]
         (partial / _CONTENTS).write_text("\n".join([str(len(lines)), *lines]) + "\n", encoding="utf-8")
         if folder.exists() and not is_whole(folder):
             shutil.rmtree(folder)

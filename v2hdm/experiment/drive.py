@@ -24,6 +24,7 @@ from v2hdm.errors import AdjustError, MappingError
 from v2hdm.experiment.plan import OURS, PAPER, Job
 from v2hdm.experiment.residuals import residuals
 from v2hdm.experiment.stored import store, stored
+from v2hdm.files import whole_file
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.mapping.methods import NAIVE_IPMS, run_methods
 from v2hdm.mapping.results import MethodResult
@@ -146,7 +147,8 @@ def _setting(job: Job, drive: Drive, truth: Truth) -> dict[str, Any]:
         if not images:
             continue
         picture = f"{name}{images[len(images) // 2].path.suffix}"
-        shutil.copyfile(images[len(images) // 2].path, job.folder / picture)
+        with whole_file(job.folder / picture) as partial_file:
+            shutil.copyfile(images[len(images) // 2].path, partial_file)
         clicks = manual[name][1] if name in manual else None
         cameras[name] = {
             "picture": picture,

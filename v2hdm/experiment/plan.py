@@ -80,6 +80,11 @@ class Job:
     folder: Path
 
     @property
+    def root(self) -> Path:
+        """The experiment's folder."""
+        return self.folder.parent.parent
+
+    @property
     def title(self) -> str:
         """The drive in words."""
         return self.port if self.seed is None else f"{self.port} seed {self.seed}"

@@ -21,11 +21,13 @@ from v2hdm.experiment.plan import ExperimentConfig, Job, jobs
 from v2hdm.experiment.tables import write_tables
 from v2hdm.experiment.words import write_words
 from v2hdm.files import replace_text
+from v2hdm.outputs import growing_folder, listed_files
 from v2hdm.workers import share_out
 
 Tell = Callable[[str, str, int, int], None]
 """Told a drive, its stage, and how many of the stage's steps are done, of how many."""
 
+_OPTION = "output="
 _PATIENCE_S = 2.0
 _queue: SimpleQueue[tuple[str, str, int, int] | None] | None = None
 
@@ -44,18 +46,19 @@ def run_experiment(config: ExperimentConfig, config_yaml: str, tell: Tell) -> tu
         The folder, and the figures of every drive.
 
     Raises:
-        V2hdmError: a setting or a drive is at fault.
+        V2hdmError: a setting or a drive is at fault, or the folder holds something that is not ours.
     """
     todo = jobs(config)
     folder = Path(config.output) / config.name
     try:
-        replace_text(folder / "config.yaml", config_yaml or f"{config!r}\n")
-        records = _records(todo, config.workers or os.cpu_count() or 1, tell)
-        measured = [measure(record) for record in records]
-        drawing = partial(tell, "figures", "draw")
-        captions = save_figures(folder, todo, records, measured, drawing)
-        write_tables(folder, measured)
-        write_words(folder, measured, captions, config)
+        with growing_folder(folder, _OPTION):
+            replace_text(folder / "config.yaml", config_yaml or f"{config!r}\n")
+            records = _records(todo, config.workers or os.cpu_count() or 1, tell)
+            measured = [measure(record) for record in records]
+            drawing = partial(tell, "figures", "draw")
+            captions = save_figures(folder, todo, records, measured, drawing)
+            write_tables(folder, measured)
+            write_words(folder, measured, captions, config)
     except OSError as failure:
         raise ConfigError(
             f"output folder {folder} cannot be written: {failure.strerror}; set output="
@@ -98,7 +101,8 @@ def _start_worker(queue: SimpleQueue[tuple[str, str, int, int] | None]) -> None:
 
 
 def _work(job: Job) -> dict[str, Any]:
-    return drive_record(job, 1, partial(_tell, job.title))
+    with listed_files(job.root, _OPTION):
+        return drive_record(job, 1, partial(_tell, job.title))
 
 
 def _tell(title: str, stage: str, done: int, total: int) -> None:

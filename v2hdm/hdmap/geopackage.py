@@ -8,6 +8,7 @@ is to be known of the map. With a geodetic origin coordinates are longitude, lat
 from __future__ import annotations
 
 import json
+import re
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -51,6 +52,9 @@ _LAYERS = {
 AnyArray = NDArray[Any]
 
 _ABOUT = "v2hdm"
+_SQL = re.compile(r"sqlite3_\w+\(.*\) failed: |Failed to prepare SQL .*: ")
+"""What a user need not know of an error."""
+
 _EXACT = ("heights_m", "covariance_m2")
 """Columns that hold JSON, as does the one of the exact coordinates."""
 
@@ -89,7 +93,7 @@ def write_geopackage(hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | Non
             _write_table(raw, unfinished, "layer_styles", _styles(features), FID="id")
             unfinished.replace(partial)
         except (errors.DataSourceError, errors.DataLayerError, errors.FeatureError) as failure:
-            problem = str(failure).splitlines()[0]
+            problem = _SQL.sub("", str(failure).splitlines()[0])
             raise MapFileError(f"{path}: cannot be written ({problem}); set another folder") from None
         finally:
             unfinished.unlink(missing_ok=True)
@@ -139,7 +143,7 @@ class _Content:
         try:
             meta, _, geometry, columns = self._raw.read(str(self._path), layer=layer)
         except (errors.DataSourceError, errors.DataLayerError, errors.FeatureError) as failure:
-            problem = str(failure).splitlines()[0]
+            problem = _SQL.sub("", str(failure).splitlines()[0])
             raise MapFileError(
                 f"{self._path}: not a map written by v2hdm ({problem}); give one that is"
             ) from None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +55,21 @@ class Residuals:
 
     def __len__(self) -> int:
         return len(self.row_image)
+
+    def renamed(self, marking: IntArray, corner: IntArray) -> Residuals:
+        """The same under other names of the M markings that are 1 to M here.
+
+        Args:
+            marking: (M,) ids, 0 where it is left out.
+            corner: (M, 4) the place of each corner in the other order.
+        """
+        known = self.marking > 0
+        of = np.maximum(self.marking - 1, 0)
+        return replace(
+            self,
+            marking=np.where(known, np.append(marking, 0)[of], 0),
+            corner=np.where(known, np.vstack([corner, np.arange(4)])[of, self.corner], self.corner),
+        )
 
 
 def write_residuals(residuals: Residuals, path: Path) -> None:

@@ -199,9 +199,11 @@ def _brought_up_to_date(
     )
     mapped = np.isin(group, optimised.groups)
     over_m = drive.pose_noise.position_drift_over_m
-    hd_map, changes = update_map(base, made.hd_map, observer, mapped, over_m)
-    corners = StatedCorners(hd_map.markings)
-    return replace(made, hd_map=hd_map, changes=changes, corners=corners, residuals=None)
+    hd_map, changes, names = update_map(base, made.hd_map, observer, mapped, over_m)
+    corners, residuals = StatedCorners(hd_map.markings), made.residuals
+    if residuals is not None:
+        residuals = residuals.renamed(names.id, names.corner)
+    return replace(made, hd_map=hd_map, changes=changes, corners=corners, residuals=residuals)
 
 
 def _certainty(bundle: Bundle) -> dict[str, str]:

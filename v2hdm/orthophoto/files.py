@@ -30,6 +30,7 @@ _SEEN_ALPHA = 128
 
 _BLOCK_PX = 512
 _OVERVIEWS = (2, 4, 8, 16)
+_AT_ONCE_BYTES = 1 << 24
 _SEMI_MAJOR_M = 6378137.0
 
 _ENGINEERING = (
@@ -84,11 +85,19 @@ def geotiff(path: Path, canvas: Canvas, origin: GeodeticOrigin | None) -> Iterat
         "tiled": True, "blockxsize": _BLOCK_PX, "blockysize": _BLOCK_PX, "compress": "jpeg",
         "photometric": "ycbcr", "jpeg_quality": _JPEG_QUALITY, "bigtiff": "if_safer", "sparse_ok": True,
     }  # fmt: skip
-    with whole_file(path) as partial, rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True, GDAL_CACHEMAX=64):
-        with rasterio.open(partial, "w", **profile) as dataset:
+    # In memory first, compressed: on a disk, GDAL goes on after a call that fails and says nothing.
+    with (
+        rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True, GDAL_CACHEMAX=64),
+        rasterio.MemoryFile(ext=".tif") as memory,
+    ):
+        with memory.open(**profile) as dataset:
             yield GeoTiff(dataset, rasterio)
-        with rasterio.open(partial, "r+") as dataset:
+        with rasterio.open(memory.name, "r+") as dataset:
             dataset.build_overviews(_OVERVIEWS, rasterio.enums.Resampling.average)
+        memory.seek(0)
+        with whole_file(path) as partial, partial.open("wb") as file:
+            while data := memory.read(_AT_ONCE_BYTES):
+                file.write(data)
 
 
 class Picture:

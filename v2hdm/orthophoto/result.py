@@ -33,8 +33,6 @@ RESOLUTION_M = 0.02
 """Side of a pixel of the mosaic unless another is asked for."""
 
 TIFF, PICTURE, EXTENT, COMPARISON = "mosaic.tif", "mosaic.webp", "mosaic.json", "mosaic_before_after.png"
-MOSAIC_FILES = (TIFF, PICTURE, EXTENT, COMPARISON)
-"""All that may be written."""
 
 Progress = Callable[[int, int], None]
 

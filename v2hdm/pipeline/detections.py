@@ -7,7 +7,7 @@ drive they are.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -39,6 +39,7 @@ def detect_in_pieces(
     workers: int,
     progress: Callable[[int, int], None],
     detect: Detect = detect_images,
+    show: Callable[[_Piece], None] = lambda found: None,
 ) -> list[ImageDetections]:
     """Detect in every image of a drive, in the drive's order, where that is not known yet.
 
@@ -50,6 +51,7 @@ def detect_in_pieces(
         workers: processes, one thread each.
         progress: called as ``progress(done, total)`` with numbers of images.
         detect: takes the place of processes of this machine.
+        show: given what was found as it comes: first all that is known, then image by image.
 
     Raises:
         V2hdmError: as :func:`v2hdm.detection.batch.detect_all`.
@@ -71,12 +73,14 @@ def detect_in_pieces(
     if len(todo) < total:
         _log.info("detections in %d of %d images were kept by an earlier run", total - len(todo), total)
     progress(total - len(todo), total)
+    show(_together(pieces))
     begun: _Piece = []
     done = 0
 
     def take(found: ImageDetections) -> None:
         nonlocal done
         done += 1
+        show([found])
         start = found.image - found.image % PIECE
         begun.append(replace(found, image=found.image - start))
         if len(begun) == min(PIECE, total - start):
@@ -86,6 +90,11 @@ def detect_in_pieces(
 
     if todo:
         detect(drive, options, todo, workers, take)
+    return _together(pieces)
+
+
+def _together(pieces: Mapping[int, _Piece | None]) -> _Piece:
+    """What is known of the pieces, by their first images, under the drive's numbers of images."""
     return [
         replace(found, image=start + found.image) for start, piece in pieces.items() for found in piece or ()
     ]

@@ -15,20 +15,26 @@ if TYPE_CHECKING:  # loads torch, which a finished run does without
 class Viewer(Protocol):
     """Shows a run while it goes on."""
 
-    def detected(self, folder: Path, drive: Drive, detections: Sequence[ImageDetections]) -> None:
-        """The detections in a drive's images; ``folder`` takes what a viewer keeps of the run."""
+    def begun(self, folder: Path, drive: Drive) -> None:
+        """Detection in a drive's images has begun; ``folder`` takes what a viewer keeps of the run."""
+
+    def detected(self, detections: Sequence[ImageDetections]) -> None:
+        """What was found in some more of its images, in any order."""
 
     def mapped(self, cameras: str, methods: Mapping[str, MethodResult]) -> None:
         """The results by method of a set of cameras, ``front`` or ``both``; all cameras come last."""
 
     def close(self) -> None:
-        """All has been mapped: whatever is kept in the folder must be whole now."""
+        """All has been mapped, or nothing more will be: whatever is kept in the folder must be whole now."""
 
 
 class Unwatched:
     """A :class:`Viewer` that shows nothing."""
 
-    def detected(self, folder: Path, drive: Drive, detections: Sequence[ImageDetections]) -> None:
+    def begun(self, folder: Path, drive: Drive) -> None:
+        """Nothing."""
+
+    def detected(self, detections: Sequence[ImageDetections]) -> None:
         """Nothing."""
 
     def mapped(self, cameras: str, methods: Mapping[str, MethodResult]) -> None:

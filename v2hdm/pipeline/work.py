@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -148,14 +149,14 @@ def _map_and_judge(
 ) -> RunResult:
     """Detect, map, check and write."""
     config, drive, seconds, progress = task.config, inspection.drive, task.seconds, task.progress
-    with timed(seconds, "detect"):
-        detections = _detect(task, drive, contents)
-    task.viewer.detected(task.folder, drive, detections)
-    with timed(seconds, "map"):
-        sets = map_camera_sets(
-            drive, contents.key(drive), detections, survey, base, task.room, progress, task.viewer
-        )
-    task.viewer.close()
+    with closing(task.viewer):
+        with timed(seconds, "detect"):
+            task.viewer.begun(task.folder, drive)
+            detections = _detect(task, drive, contents)
+        with timed(seconds, "map"):
+            sets = map_camera_sets(
+                drive, contents.key(drive), detections, survey, base, task.room, progress, task.viewer
+            )
     methods = {name: one.methods for name, one in sets.items()}
     best, checked = list(methods.values())[-1][BEST], list(sets.values())[-1].checked
     with timed(seconds, "judge"):
@@ -214,7 +215,7 @@ def _detect(task: _Task, drive: Drive, contents: Contents) -> list[ImageDetectio
     tell = partial(task.progress, "detect")
     workers = _workers(task.config)
     detections = detect_in_pieces(
-        drive, contents, task.config.detector, task.room, workers, tell, task.detect
+        drive, contents, task.config.detector, task.room, workers, tell, task.detect, task.viewer.detected
     )
     markings = sum(len(found.markings) for found in detections)
     lanes = sum(len(found.lanes) for found in detections)

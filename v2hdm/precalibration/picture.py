@@ -112,12 +112,12 @@ def _draw_view(axes: Axes, image: np.ndarray | None, scene: _Scene) -> None:
     dense = np.concatenate([np.linspace(a, b, 40) for a, b in pairwise(closed)])
     for piece in project_line(info, mounting, dense):
         axes.plot(*piece.T, color=_ROI, lw=1.5)
-    _draw_residuals(axes, scene, scene.fit.seen.points_px, -scene.residuals.off_px, info.width, "px")
     axes.set_xlim(-0.5, info.width - 0.5)
     axes.set_ylim(info.height - 0.5, -0.5)
     axes.set_aspect("equal")
     axes.set_xlabel("u (px)")
     axes.set_ylabel("v (px)")
+    _draw_residuals(axes, scene, scene.fit.seen.points_px, -scene.residuals.off_px, info.width, "px")
     axes.set_title(f"{info.name}: grid of the ground, ROI, arrows from the clicked to the predicted pixel")
 
 
@@ -152,6 +152,7 @@ def _draw_plan(axes: Axes, scene: _Scene) -> None:
     axes.annotate(
         "", (tip[1], tip[0]), (centre[1], centre[0]), arrowprops={"arrowstyle": "-|>", "color": "k"}
     )
+    axes.set_xlabel("y, left (m)")
     factor = _draw_residuals(axes, scene, points, scene.residuals.off_m, span, "cm")
     angles = np.linspace(0, 2 * np.pi, 60)
     circle = np.column_stack([np.cos(angles), np.sin(angles)])
@@ -163,7 +164,6 @@ def _draw_plan(axes: Axes, scene: _Scene) -> None:
     axes.set_aspect("equal")
     axes.grid(color="#e6eaed", lw=0.6)
     axes.set_axisbelow(True)
-    axes.set_xlabel("y, left (m)")
     axes.set_ylabel("x, forward (m)")
     axes.set_title("from above; circles: 2 sigmas")
     axes.legend(loc="upper right", fontsize=8)
@@ -172,7 +172,10 @@ def _draw_plan(axes: Axes, scene: _Scene) -> None:
 def _draw_residuals(
     axes: Axes, scene: _Scene, at: FloatArray, off: FloatArray, size: float, unit: str
 ) -> float:
-    """Draw points and residuals, those of right points magnified by the factor that is returned."""
+    """Draw points and residuals, those of right points magnified by the factor that is returned.
+
+    The label of the first axis says so.
+    """
     right = scene.fit.is_right
     length = np.hypot(*off.T)
     longest = float(np.nanmax(length[right], initial=0.0))
@@ -182,7 +185,8 @@ def _draw_residuals(
         tip = at[k] + (factor if is_right else 1.0) * off[k]
         (a, b), (c, d) = (at[k], tip) if unit == "px" else (at[k, ::-1], tip[::-1])
         colour = _RIGHT if is_right else _WRONG
-        axes.plot(a, b, "o", ms=6, mfc="none", mec=colour, mew=1.8)
+        sign = "o" if is_right else "x"
+        axes.plot(a, b, sign, ms=6 if is_right else 9, mfc="none", mec=colour, mew=1.8, path_effects=_HALO)
         axes.annotate(
             label, (a, b), (6, -10), textcoords="offset points", color=colour, fontsize=8, path_effects=_HALO
         )
@@ -190,13 +194,12 @@ def _draw_residuals(
             arrow = {"arrowstyle": "->", "color": colour, "lw": 1.8, "shrinkA": 0, "shrinkB": 0}
             axes.annotate("", (c, d), (a, b), arrowprops=arrow, annotation_clip=True)
     if unit == "cm":
-        words = f"arrows and circles {factor:.0f} times as large; longest arrow {100 * longest:.1f} cm"
+        words = f"arrows and circles {factor:.0f} times as large; longest {100 * longest:.1f} cm"
     else:
         words = f"arrows {factor:.0f} times as long; the longest is {longest:.2f} px"
     if not right.all():
-        words += "\nred: contradicts the others, true to scale"
-    axes.text(
-        0.01, 0.01, words, transform=axes.transAxes, fontsize=8, va="bottom",
-        bbox={"fc": "white", "ec": "none", "alpha": 0.8},
-    )  # fmt: skip
+        words += (
+            "; crosses contradict the others, true to scale" if unit == "px" else "; crosses true to scale"
+        )
+    axes.set_xlabel(f"{axes.get_xlabel()}\n{words}")
     return factor

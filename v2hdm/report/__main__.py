@@ -23,10 +23,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _report(parsed: argparse.Namespace) -> None:
     from v2hdm.drive.of_result import drive_of
     from v2hdm.outputs import added_to
-    from v2hdm.report.page.write import FILE, write_page
+    from v2hdm.report.page.write import write_page
 
     drive = drive_of(parsed.folder, parsed.drive)
-    with added_to(parsed.folder, [FILE], "folder") as folder:
+    with added_to(parsed.folder, "folder") as folder:
         path = write_page(folder, drive)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB" + ("" if drive else ", without the drive's images"))
 

@@ -42,6 +42,9 @@ def save_changes(path: Path, changes: Changes, hd_map: HdMap, route_map: FloatAr
             whole, close = np.asarray(fig.subfigures(1, 2, width_ratios=[site_in, detail_in])).tolist()
             rows = -(-len(moved) // columns)
             axes = close.subplots(rows, columns, squeeze=False).ravel()
+            close.suptitle(
+                "The largest moves by id: dashed before, solid now; east and north (m)", fontsize=9
+            )
             for place, one in zip(axes, moved, strict=False):
                 _close_up(place, one, changes, hd_map)
             for place in axes[len(moved) :]:
@@ -92,7 +95,7 @@ def _close_up(axes: Axes, one: Change, changes: Changes, hd_map: HdMap) -> None:
     begin, end = one.before.mean(axis=0), one.after.mean(axis=0)
     axes.annotate("", xy=end, xytext=begin, arrowprops={"arrowstyle": "->", "color": "#2d3439", "lw": 1.4})
     sigma_cm = 100 * float(np.sqrt(np.mean(one.shift_sigma_m**2)))
-    axes.set_title(f"{one.id}: {100 * _distance_m(one):.0f} cm (sigma {sigma_cm:.1f})", fontsize=8)
+    axes.set_title(f"id {one.id}: {100 * _distance_m(one):.0f} +- {sigma_cm:.1f} cm", fontsize=8)
     middle = np.concatenate([one.before, one.after]).mean(axis=0)
     axes.set_xlim(middle[0] - _AROUND_M, middle[0] + _AROUND_M)
     axes.set_ylim(middle[1] - _AROUND_M, middle[1] + _AROUND_M)

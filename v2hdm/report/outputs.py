@@ -8,14 +8,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from v2hdm.files import replace_text
 from v2hdm.outputs import result_folder
 
 __all__ = ["result_folder", "write_json"]
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write strict JSON; figures that do not exist (nan) are left out of their object."""
-    path.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    """Write strict JSON, whole; figures that do not exist (nan) are left out of their object."""
+    replace_text(path, json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
 
 
 def _finite(value: Any) -> Any:

@@ -51,8 +51,8 @@ class RerunViewer:
         self._stream: Any = None
         self._drive: Drive | None = None
 
-    def detected(self, folder: Path, drive: Drive, detections: Sequence[ImageDetections]) -> None:
-        """Begin the recording in ``folder`` with all images and what was found in them."""
+    def begun(self, folder: Path, drive: Drive) -> None:
+        """Begin the recording in ``folder`` with the recorded route and the cameras as described."""
         rr, self._drive = self._rr, drive
         self._stream = rr.RecordingStream("v2hdm", recording_id=None)
         sinks = [rr.FileSink(str(folder / FILE))]
@@ -68,8 +68,13 @@ class RerunViewer:
         self._log("map/route_recorded", rr.LineStrips3D(route, colors=[_ROUTE]))
         for name, camera in drive.cameras.items():
             self._log_camera(name, camera, _guess(camera))
+
+    def detected(self, detections: Sequence[ImageDetections]) -> None:
+        """Add images and what was found in them."""
+        if self._stream is None or self._drive is None:
+            return
         for found in detections:
-            self._show_image(drive, found)
+            self._show_image(self._drive, found)
 
     def mapped(self, cameras: str, methods: Mapping[str, MethodResult]) -> None:
         """Add the map of a set of cameras; the vehicle and its cameras move to where it has them."""

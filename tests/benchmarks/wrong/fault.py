@@ -46,7 +46,7 @@ def copy_of(good: Path, folder: Path) -> Path:
     content.pop("truth", None)
     replace_text(folder / DRIVE_FILE, dump_yaml(content))
     shutil.copy(good / POSES_FILE, folder / POSES_FILE)
-    for camera in CAMERAS:
+    for camera in content["cameras"]:
         (folder / camera).mkdir()
         for name in ("camera_info.yaml", "images.txt"):
             shutil.copy(good / camera / name, folder / camera / name)

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 
-from v2hdm.experiment.figures.look import LINE, SIGN, colour
+from v2hdm.experiment.figures.look import LINE, SIGN, colour, method_of
 from v2hdm.experiment.measures import Matched, Measured
 from v2hdm.experiment.plan import OURS, PAPER
 from v2hdm.experiment.tables import by_port
@@ -186,41 +186,45 @@ def save_balance(path: Path, measured: Sequence[Measured]) -> str | None:
     """Draw bias against spread of every map; returns the caption."""
     ports = by_port(measured)
     sets = list(dict.fromkeys(cameras for one in measured for cameras in one.rows))
-    signs = dict(zip(sets, ("<", ">", "o", "s", "D", "^"), strict=False))
     shown = ("CNI", "ENI", "Opt", "ONI", f"Opt, {PAPER}")
-    with style.figure(path, 6.2 * len(ports), 6.2) as fig:
-        panels = fig.subplots(1, len(ports), squeeze=False, sharex=True, sharey=True)[0]
-        for axes, (port, drives) in zip(panels, ports.items(), strict=True):
-            for one in drives:
-                for cameras, rows in one.rows.items():
-                    for name in shown:
-                        if name in rows and rows[name].spread_m > 0:
-                            axes.plot(
-                                100 * rows[name].spread_m, 100 * rows[name].bias_m, signs.get(cameras, "o"),
-                                color=colour(name), ms=7, mfc="white" if PAPER in name else colour(name),
-                            )  # fmt: skip
-            _logarithmic(axes, "x")
-            _logarithmic(axes, "y")
+    with style.figure(path, 6.2 * len(ports), 0.8 + 3.6 * len(sets)) as fig:
+        panels = fig.subplots(len(sets), len(ports), squeeze=False, sharex=True, sharey=True)
+        for row, cameras in zip(panels, sets, strict=True):
+            for axes, (port, drives) in zip(row, ports.items(), strict=True):
+                for name in shown:
+                    found = [one.rows[cameras][name] for one in drives if name in one.rows.get(cameras, {})]
+                    spread, bias = ([100 * value for value in values] for values in (
+                        [one.spread_m for one in found if one.spread_m > 0],
+                        [one.bias_m for one in found if one.spread_m > 0],
+                    ))  # fmt: skip
+                    axes.plot(spread, bias, **_sign(name))
+                _logarithmic(axes, "x")
+                _logarithmic(axes, "y")
+                axes.set_title(f"{port}, {cameras}")
+        for axes in panels[:, 0]:
+            axes.set_ylabel("bias (cm)")
+        for axes in panels[-1]:
             axes.set_xlabel("spread of the corner errors (cm)")
-            axes.set_ylabel("bias: length of the mean error (cm)")
-            axes.set_title(f"{port}: bias against spread")
-        _equal_errors(panels)
+        _equal_errors(list(panels.flat))
         handles = [
-            Line2D([], [], color=colour(name), lw=0, marker="o", label=name,
-                   mfc="white" if PAPER in name else colour(name))
+            Line2D([], [], label=name, **_sign(name))
             for name in shown if any(name in rows for one in measured for rows in one.rows.values())
         ]  # fmt: skip
-        handles += [
-            Line2D([], [], color="k", lw=0, marker=signs[name], mfc="none", label=name) for name in signs
-        ]
         handles.append(Line2D([], [], color=style.TRUTH, ls=":", label="equal RMSE"))
-        fig.legend(handles=handles, loc="outside lower center", ncols=5)
+        fig.legend(handles=handles, loc="outside lower center", ncols=6)
     return (
-        "Bias against spread of the corner errors (cm), a sign per seed: colour is the method, shape the "
-        "cameras, hollow the paper's recipe; dotted lines join points of equal RMSE. Bias moves the whole "
-        "map, as a wrong calibration or the receiver's drift do; spread is what is left. See how far the "
-        "optimisation moves the points to the left and down, and which of the two is what remains."
+        "Bias, the length of the mean corner error, against the spread of the corner errors (cm), a sign per "
+        "seed: a row of panels for each set of cameras, colour and shape are the method, hollow the paper's "
+        "recipe; dotted lines join points of equal RMSE. Bias moves the whole map, as a wrong calibration or "
+        "the receiver's drift do; spread is what is left. See how far the optimisation moves the points to "
+        "the left and down, and which of the two is what remains."
     )
+
+
+def _sign(row: str) -> dict[str, Any]:
+    """How a row of the tables is drawn as single points."""
+    face = "white" if PAPER in row else colour(row)
+    return {"lw": 0, "marker": SIGN[method_of(row)], "color": colour(row), "mfc": face, "ms": 7}
 
 
 def _equal_errors(panels: Sequence[Axes]) -> None:

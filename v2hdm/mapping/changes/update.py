@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from v2hdm.errors import MappingError
+from v2hdm.geometry.quadrilateral import SHIFTS
 from v2hdm.mapping.changes.decide import Decision, Pair, Watched, decide
 from v2hdm.mapping.changes.field import Errors
 from v2hdm.mapping.changes.fuse import fused_markings
@@ -15,7 +16,7 @@ from v2hdm.mapping.changes.lanes import updated_lanes, updated_symbols
 from v2hdm.mapping.changes.watched import Looks, Observer, find_rates, with_paint
 from v2hdm.mapping.sightings.rig import Rig
 from v2hdm.mapping.sightings.views import Views
-from v2hdm.records import BoolArray, Change, Changes, Fate, FloatArray, HdMap, Marking
+from v2hdm.records import BoolArray, Change, Changes, Fate, FloatArray, HdMap, IntArray, Marking
 
 DRIFT_OVER_M = 30.0
 """Distance over which the error that a map's markings share fades, m, where the map does not say."""
@@ -43,10 +44,21 @@ class Base:
     left_out: tuple[tuple[str, FloatArray, int], ...] = ()
 
 
+@dataclass(frozen=True)
+class Names:
+    """What an updated map calls the M markings of the drive's own map.
+
+    ``id`` (M,) is 0 for one that it does not have, ``corner`` (M, 4) where each corner stands in its order.
+    """
+
+    id: IntArray
+    corner: IntArray
+
+
 def update_map(
     base: Base, made: HdMap, observer: Observer, mapped: BoolArray, drift_over_m: float
-) -> tuple[HdMap, Changes]:
-    """Bring the ``base`` map up to date.
+) -> tuple[HdMap, Changes, Names]:
+    """Bring the ``base`` map up to date; returns it, what changed, and what ``made``'s markings are called.
 
     Args:
         base: the earlier map.
@@ -96,7 +108,20 @@ def update_map(
     )
     same = sum(pair.moved <= LIKELY for pair in decision.pairs)
     shift_m = decision.shift.off_map.mean(axis=0) if len(decision.shift.old) else np.zeros(2)
-    return updated, Changes(tuple(changes), same, shift_m)
+    names = _names(len(new), decision, by_old, fresh)
+    return updated, Changes(tuple(changes), same, shift_m), names
+
+
+def _names(
+    count: int, decision: Decision, by_old: Mapping[int, Marking], fresh: Mapping[int, Marking]
+) -> Names:
+    names = Names(np.zeros(count, dtype=np.int64), np.tile(np.arange(4), (count, 1)))
+    for k, one in fresh.items():
+        names.id[k] = one.id or 0
+    for pair in decision.pairs:
+        names.id[pair.new] = by_old[pair.old].id or 0
+        names.corner[pair.new] = np.argsort(SHIFTS[pair.turn])
+    return names
 
 
 class _Numbers:

@@ -1,0 +1,88 @@
+"""Doors on a disk that fails at one call; `python -m tests.benchmarks.faults` makes all of them fail."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.faults.cases import picture
+from tests.faults.doors import Expected, Situation, calibrating
+from tests.faults.failing_calls import Failure, watch, why_not
+from tests.faults.forked import Forked
+from tests.faults.judge import Case, judge, judge_again
+from v2hdm.orthophoto.blend import Sheet
+from v2hdm.orthophoto.canvas import Canvas
+from v2hdm.orthophoto.files import geotiff
+
+pytestmark = pytest.mark.skipif(why_not() is not None, reason=str(why_not()))
+
+
+def detecting() -> Situation:
+    def prepare(root: Path) -> None:
+        (root / "images").mkdir()
+        for name in ("a.jpg", "b.jpg"):
+            (root / "images" / name).write_bytes(picture(height=96, width=128))
+
+    words = ("images", "--output", "found.jsonl", "--draw", "drawn")
+    return Situation(Case("detect", "v2hdm.detect", words, prepare, ""), grows=True)
+
+
+@pytest.mark.parametrize(("situation", "places"), [(detecting(), 5), (calibrating(), 1)])
+def test_a_door_on_a_failing_disk_does_all_or_tells_and_works_afterwards(
+    situation: Situation, places: int, tmp_path: Path
+) -> None:
+    outcomes, calls = [], []
+    for number in range(2):
+        runner = Forked(tmp_path / f"good{number}")
+        outcomes.append(judge(situation.case, tmp_path / f"good{number}", runner))
+        calls = runner.calls
+    expected = Expected.of(situation, *outcomes)
+    assert len(calls) > 10
+    for at in np.linspace(0, len(calls) - 1, places + 2).astype(int)[1:-1].tolist():
+        for failure in (Failure(at, errno.ENOSPC, True), Failure(at, errno.EIO, False)):
+            folder = tmp_path / f"{at}-{failure.number}"
+            outcome = judge(situation.case, folder, Forked(folder, failure))
+            again = judge_again(situation.case, folder, Forked(folder))
+            defects = expected.defects(situation, outcome, again)
+            assert not defects, (calls[at], failure, outcome.error)
+
+
+def test_a_mosaic_on_a_failing_disk_is_whole_or_not_there(tmp_path: Path) -> None:
+    pytest.importorskip("rasterio", reason="no rasterio: pip install 'v2hdm[gis]'")
+    canvas = Canvas(np.zeros(2), 0.02, 512, 512)
+    seen = np.random.default_rng(0).integers(0, 255, (512, 512, 4), dtype=np.uint8)
+
+    def write() -> int:
+        try:
+            with geotiff(tmp_path / "a.tif", canvas, None) as mosaic:
+                mosaic.put(Sheet(0, 0, seen))
+        except OSError:
+            return 2
+        return 0
+
+    good = watch(write, tmp_path, None, 30)
+    assert good.code == 0
+    whole = (tmp_path / "a.tif").read_bytes()
+    for at in range(len(good.calls)):
+        (tmp_path / "a.tif").unlink(missing_ok=True)
+        ended = watch(write, tmp_path, Failure(at, errno.EIO, False), 30)
+        assert ended.code in (0, 2)
+        left = [path.read_bytes() for path in tmp_path.iterdir()]
+        assert left == ([whole] if ended.code == 0 else [])
+
+
+def test_calls_below_a_folder_are_counted_and_no_others(tmp_path: Path) -> None:
+    def work() -> int:
+        (tmp_path / "here").mkdir()
+        os.write(os.open(tmp_path / "here" / "a", os.O_WRONLY | os.O_CREAT), b"a")
+        (tmp_path / "here" / "a").rename(tmp_path / "here" / "b")
+        (tmp_path / "there").write_text("not counted")
+        return 7
+
+    watched = watch(work, tmp_path / "here", None, 30)
+    assert watched.code == 7
+    assert watched.calls == ["openat a", "write a", "rename b"]
