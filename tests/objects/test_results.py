@@ -13,8 +13,9 @@ from typing import Any
 import pytest
 
 from v2hdm.errors import ConfigError
+from v2hdm.listing import LIST
 from v2hdm.objects.bucket import Bucket
-from v2hdm.objects.results import LIST, UNFINISHED, ResultObjects, contents_of, growing_objects
+from v2hdm.objects.results import UNFINISHED, ResultObjects, contents_of, growing_objects
 
 pytestmark = pytest.mark.usefixtures("quick")
 

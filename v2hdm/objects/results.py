@@ -15,10 +15,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from v2hdm.errors import ConfigError
+from v2hdm.listing import LIST
 from v2hdm.objects.bucket import Bucket, Thing
 from v2hdm.objects.lease import LEASES, Lease, held
 
-LIST = ".v2hdm-results.jsonl"
 UNFINISHED = ".v2hdm-unfinished.jsonl"
 _ABOUT = {"about": "objects that v2hdm wrote here; a rerun replaces these and no others"}
 

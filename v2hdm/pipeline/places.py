@@ -17,8 +17,9 @@ from v2hdm.caching.keys import key_of
 from v2hdm.caching.store import Store
 from v2hdm.drive.mirror import mirrored
 from v2hdm.errors import ConfigError, V2hdmError
+from v2hdm.listing import LIST
 from v2hdm.objects.bucket import Bucket, is_url, place_of
-from v2hdm.objects.results import LIST, ResultObjects, contents_of
+from v2hdm.objects.results import ResultObjects, contents_of
 from v2hdm.outputs import drop_result
 from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.pipeline.finished import NOTHING_CHANGED, RunResult, finished, is_of, key_of_finished
