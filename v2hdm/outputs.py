@@ -19,7 +19,7 @@ from pathlib import Path
 
 from v2hdm.errors import ConfigError
 from v2hdm.files import refuse_url, told_of_files, whole_file
-from v2hdm.listing import LIST as MARKER
+from v2hdm.listing import LIST
 from v2hdm.locks import take_lock
 
 _log = logging.getLogger(__name__)
@@ -47,7 +47,7 @@ def result_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
             _recover(target, unfinished, previous, option)
             ours = _ours(target, folder, option)
             unfinished.mkdir()
-            (unfinished / MARKER).write_text(json.dumps(_HEAD) + "\n", encoding="utf-8")
+            (unfinished / LIST).write_text(json.dumps(_HEAD) + "\n", encoding="utf-8")
         try:
             yield unfinished
             with _explained(folder, option):
@@ -109,7 +109,7 @@ def listed_files(folder: Path, option: str) -> Iterator[None]:
         if path.exists() and _digest(path) not in ours.get(name, ()):
             raise ConfigError(f"{folder / name}: is no file of ours; move it, or give another {option}")
         digest = _digest(partial)
-        _append(target / MARKER, json.dumps({"file": name, "sha256": digest}) + "\n")
+        _append(target / LIST, json.dumps({"file": name, "sha256": digest}) + "\n")
         ours.setdefault(name, []).append(digest)
 
     try:
@@ -170,14 +170,14 @@ def growing_folder(folder: Path, option: str) -> Iterator[GrowingFolder]:
             there = _listed(target, folder, option)
             target.mkdir(exist_ok=True)
             if there is None:
-                (target / MARKER).write_text(json.dumps(_HEAD) + "\n", encoding="utf-8")
+                (target / LIST).write_text(json.dumps(_HEAD) + "\n", encoding="utf-8")
         growing = GrowingFolder(target)
         try:
             with listed_files(folder, option):
                 yield growing
         finally:
             if there is None and not growing.has_files:
-                (target / MARKER).unlink(missing_ok=True)
+                (target / LIST).unlink(missing_ok=True)
                 with suppress(OSError):
                     target.rmdir()
 
@@ -216,7 +216,7 @@ def is_whole(folder: Path, files: Mapping[str, str]) -> bool:
 def drop_result(folder: Path) -> None:
     """Remove our files from a result folder, and the folders that are empty then."""
     with suppress(OSError, ConfigError):
-        for name in [*files_of_result(folder), MARKER]:
+        for name in [*files_of_result(folder), LIST]:
             (folder / name).unlink(missing_ok=True)
         below = sorted((one for one in folder.rglob("*") if one.is_dir()), key=lambda one: -len(one.parts))
         for one in [*below, folder, folder.parent, folder.parent.parent]:
@@ -276,7 +276,7 @@ def _parents(target: Path) -> Iterator[None]:
 def _recover(target: Path, unfinished: Path, previous: Path, option: str) -> None:
     """Tidy up after a process that was killed: its work is dropped, an earlier result put back."""
     for left in (unfinished, previous):
-        if left.exists() and not (left / MARKER).is_file() and any(left.iterdir()):
+        if left.exists() and not (left / LIST).is_file() and any(left.iterdir()):
             raise ConfigError(
                 f"{left}: is in the way of our work and not ours; move it, or give another {option}"
             )
@@ -312,7 +312,7 @@ def _listed(target: Path, shown: Path, option: str) -> dict[str, list[str]] | No
     """
     if not target.exists() or not any(target.iterdir()):
         return None
-    marker = target / MARKER
+    marker = target / LIST
     if not marker.is_file():
         raise ConfigError(
             f"output folder {shown} holds files that are no results of ours: give another {option}"
@@ -323,7 +323,7 @@ def _listed(target: Path, shown: Path, option: str) -> dict[str, list[str]] | No
             entry = json.loads(line)
             listed.setdefault(str(entry["file"]), []).append(str(entry["sha256"]))
     except (ValueError, TypeError, LookupError, RecursionError):
-        raise ConfigError(f"{shown / MARKER}: is damaged; give another {option}") from None
+        raise ConfigError(f"{shown / LIST}: is damaged; give another {option}") from None
     return listed
 
 
@@ -333,9 +333,9 @@ def _digest(path: Path) -> str:
 
 
 def _list(folder: Path) -> None:
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != MARKER)
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != LIST)
     entries = [{"file": path.relative_to(folder).as_posix(), "sha256": _digest(path)} for path in files]
-    (folder / MARKER).write_text(
+    (folder / LIST).write_text(
         "".join(json.dumps(entry) + "\n" for entry in [_HEAD, *entries]), encoding="utf-8"
     )
 
@@ -361,7 +361,7 @@ def _bring_over(earlier: Path, new: Path, ours: set[str]) -> None:
 
 def _is_ours(path: Path, folder: Path, ours: set[str]) -> bool:
     name = path.relative_to(folder).as_posix()
-    return name == MARKER or name in ours
+    return name == LIST or name in ours
 
 
 @contextmanager

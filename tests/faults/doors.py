@@ -20,7 +20,7 @@ from v2hdm.drive.camera_info import write_camera_info
 from v2hdm.drive.tum import read_image_list, write_image_list
 from v2hdm.errors import DriveError
 from v2hdm.files import dump_yaml, load_yaml, replace_text
-from v2hdm.outputs import MARKER
+from v2hdm.listing import LIST
 from v2hdm.simulate import render_drive
 
 IMAGES = 16
@@ -278,5 +278,5 @@ def _without(situation: Situation, state: dict[str, str]) -> dict[str, str]:
         for name, one in state.items()
         if name != cache
         and not name.startswith(f"{cache}/")
-        and not (situation.grows and name.rpartition("/")[2].startswith((MARKER, "events.out.")))
+        and not (situation.grows and name.rpartition("/")[2].startswith((LIST, "events.out.")))
     }

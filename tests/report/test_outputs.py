@@ -14,7 +14,8 @@ import pytest
 
 from tests.faults.judge import full_disk
 from v2hdm.errors import ConfigError
-from v2hdm.outputs import MARKER, added_to, files_of_result, growing_folder, result_folder
+from v2hdm.listing import LIST
+from v2hdm.outputs import added_to, files_of_result, growing_folder, result_folder
 from v2hdm.report.outputs import write_json
 
 ROOT = Path(__file__).parents[2]
@@ -27,7 +28,7 @@ def write(target: Path, **files: str) -> None:
 
 
 def names(folder: Path) -> list[str]:
-    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.name != MARKER)
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.name != LIST)
 
 
 def test_a_failed_run_leaves_the_earlier_result_untouched(tmp_path: Path) -> None:
@@ -110,7 +111,7 @@ def test_a_file_where_the_folder_is_to_be_is_one_line(tmp_path: Path) -> None:
 
 def test_a_damaged_list_of_ours_is_one_line(tmp_path: Path) -> None:
     write(tmp_path / "run", config="first")
-    (tmp_path / "run" / MARKER).write_text("{}\n[" * 9000)
+    (tmp_path / "run" / LIST).write_text("{}\n[" * 9000)
     with pytest.raises(ConfigError, match="damaged"):
         write(tmp_path / "run", config="")
 
@@ -202,11 +203,11 @@ def test_what_is_added_to_a_result_is_on_its_list_and_the_users_stays(tmp_path: 
 def test_a_list_never_ends_in_half_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with growing_folder(tmp_path / "drawn", "--draw") as folder:
         folder.write("a.jpg", b"first")
-    before = (tmp_path / "drawn" / MARKER).read_bytes()
+    before = (tmp_path / "drawn" / LIST).read_bytes()
     refused = pytest.raises(ConfigError, match="cannot be written")
     with refused, full_disk(len(before) + 9), growing_folder(tmp_path / "drawn", "--draw") as folder:
         folder.write("b.jpg", b"second")
-    assert (tmp_path / "drawn" / MARKER).read_bytes() == before
+    assert (tmp_path / "drawn" / LIST).read_bytes() == before
 
 
 def test_json_leaves_out_what_does_not_exist(tmp_path: Path) -> None:
