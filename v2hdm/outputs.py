@@ -137,8 +137,8 @@ def _append(path: Path, line: str) -> None:
 class GrowingFolder:
     """A folder whose files are written one by one, each at once."""
 
-    def __init__(self, target: Path) -> None:
-        self._target = target
+    def __init__(self, target: Path, shown: Path, option: str) -> None:
+        self._target, self._shown, self._option = target, shown, option
 
     @property
     def has_files(self) -> bool:
@@ -151,7 +151,7 @@ class GrowingFolder:
         Raises:
             ConfigError: it cannot be written, or there is a file of this name that is not ours.
         """
-        with whole_file(self._target / name) as partial:
+        with _explained(self._shown, self._option), whole_file(self._target / name) as partial:
             partial.write_bytes(data)
 
 
@@ -171,7 +171,7 @@ def growing_folder(folder: Path, option: str) -> Iterator[GrowingFolder]:
             target.mkdir(exist_ok=True)
             if there is None:
                 (target / LIST).write_text(json.dumps(_HEAD) + "\n", encoding="utf-8")
-        growing = GrowingFolder(target)
+        growing = GrowingFolder(target, folder, option)
         try:
             with listed_files(folder, option):
                 yield growing
