@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 
-from v2hdm.experiment.figures.look import LINE, SIGN, colour, method_of
+from v2hdm.experiment.figures.look import colour, method_of
 from v2hdm.experiment.measures import Matched, Measured
 from v2hdm.experiment.plan import OURS, PAPER
 from v2hdm.experiment.tables import by_port
@@ -112,8 +112,8 @@ def _draw_growth(axes: Axes, growth: Mapping[str, Any]) -> None:
             counts, errors = np.array(points, dtype=np.float64).T
             incremental = recipe == INCREMENTAL
             axes.plot(
-                counts, 100 * errors, marker=SIGN[method], ms=5, lw=1.3, color=colour(method),
-                ls=(0, (2, 1)) if incremental else LINE[method],
+                counts, 100 * errors, marker=style.MARKER[method], ms=5, lw=1.3, color=colour(method),
+                ls=(0, (2, 1)) if incremental else style.LINE[method],
                 mfc="white" if incremental else colour(method),
             )  # fmt: skip
 
@@ -121,12 +121,13 @@ def _draw_growth(axes: Axes, growth: Mapping[str, Any]) -> None:
 def _growth_legend(records: Sequence[Mapping[str, Any]]) -> list[Line2D]:
     methods = dict.fromkeys(name for record in records for name in record["growth"].get(OURS, {}))
     handles = [
-        Line2D([], [], color=colour(name), marker=SIGN[name], ls=LINE[name], label=name) for name in methods
+        Line2D([], [], color=colour(name), marker=style.MARKER[name], ls=style.LINE[name], label=name)
+        for name in methods
     ]
     if any(INCREMENTAL in record["growth"] for record in records):
         handles.append(
             Line2D(
-                [], [], color=colour("Opt"), marker=SIGN["Opt"], mfc="white", ls=(0, (2, 1)),
+                [], [], color=colour("Opt"), marker=style.MARKER["Opt"], mfc="white", ls=(0, (2, 1)),
                 label="Opt, incremental",
             )
         )  # fmt: skip
@@ -156,7 +157,8 @@ def save_ranges(path: Path, records: Sequence[Mapping[str, Any]]) -> str | None:
                 axes.set_ylabel("error on the ground (cm)")
                 axes.set_title(f"{port}, {camera}")
         handles = [
-            Line2D([], [], color=colour(name), marker=SIGN[name], ls=LINE[name], label=name) for name in SIGN
+            Line2D([], [], color=colour(name), marker=style.MARKER[name], ls=style.LINE[name], label=name)
+            for name in style.MARKER
         ]
         fig.legend(handles=handles, loc="outside lower center", ncols=4)
     return (
@@ -169,7 +171,7 @@ def save_ranges(path: Path, records: Sequence[Mapping[str, Any]]) -> str | None:
 
 
 def _draw_ranges(axes: Axes, found: Sequence[Mapping[str, Any]]) -> None:
-    for method in SIGN:
+    for method in style.MARKER:
         bins: dict[float, list[list[float]]] = {}
         for one in found:
             for middle, *quartiles, _ in one.get(method, []):
@@ -178,7 +180,9 @@ def _draw_ranges(axes: Axes, found: Sequence[Mapping[str, Any]]) -> None:
             continue
         middle = np.array(sorted(bins))
         lower, median, upper = 100 * np.array([np.mean(bins[m], axis=0) for m in middle]).T
-        axes.plot(middle, median, marker=SIGN[method], ms=4, color=colour(method), ls=LINE[method])
+        axes.plot(
+            middle, median, marker=style.MARKER[method], ms=4, color=colour(method), ls=style.LINE[method]
+        )
         axes.fill_between(middle, lower, upper, color=colour(method), alpha=0.13, lw=0)
 
 
@@ -224,7 +228,7 @@ def save_balance(path: Path, measured: Sequence[Measured]) -> str | None:
 def _sign(row: str) -> dict[str, Any]:
     """How a row of the tables is drawn as single points."""
     face = "white" if PAPER in row else colour(row)
-    return {"lw": 0, "marker": SIGN[method_of(row)], "color": colour(row), "mfc": face, "ms": 7}
+    return {"lw": 0, "marker": style.MARKER[method_of(row)], "color": colour(row), "mfc": face, "ms": 7}
 
 
 def _equal_errors(panels: Sequence[Axes]) -> None:

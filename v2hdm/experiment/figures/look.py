@@ -1,4 +1,4 @@
-"""How the methods look in figures: apart by colour, and by line and sign for those who see no colours."""
+"""Colours and words of the figures: methods look as in the report of a run (:mod:`v2hdm.report.style`)."""
 
 from __future__ import annotations
 
@@ -6,12 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from v2hdm.report import style
-
-SIGN: Mapping[str, str] = {"CNI": "o", "ENI": "s", "Opt": "D", "ONI": "^"}
-"""Sign of each method."""
-
-LINE: Mapping[str, Any] = {"CNI": (0, (1, 1)), "ENI": (0, (5, 2)), "Opt": "-", "ONI": (0, (5, 1, 1, 1))}
-"""Line of each method."""
 
 PAINT = "#dfe4e8"
 """Filling of true markings."""
