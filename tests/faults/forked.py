@@ -14,8 +14,13 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
+import cv2
+
 from tests.faults.failing_calls import Failure, watch
 from tests.faults.judge import LONGEST_S, Case, Ran, run_here
+
+# A fork has none of the threads of OpenCV's pool, and would wait for them when it sets their number.
+cv2.setNumThreads(1)
 
 _LOADED = ("v2hdm", "train", "matplotlib", "rich", "hydra", "torch", "scipy", "cv2")
 """Packages that are loaded here once a door has loaded them."""
