@@ -219,7 +219,7 @@ def drop_result(folder: Path) -> None:
         for name in [*files_of_result(folder), LIST]:
             (folder / name).unlink(missing_ok=True)
         below = sorted((one for one in folder.rglob("*") if one.is_dir()), key=lambda one: -len(one.parts))
-        for one in [*below, folder, folder.parent, folder.parent.parent]:
+        for one in [*below, folder]:
             one.rmdir()
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -110,6 +111,9 @@ def _put(
         record = {} if key is None else {_RECORD: encode(_Record(key, made))}
         result.put({**contents_of(made.folder, LIST), **record}, lease, partial(progress, "upload"))
     drop_result(made.folder)
+    with suppress(OSError):  # other results wait there for their upload
+        place.rmdir()
+        place.parent.rmdir()
     return replace(made, url=result.objects.url), False
 
 

@@ -80,11 +80,11 @@ class FusedGroups:
 
 
 def known_elsewhere(association: Association, point: BoolArray, informs: BoolArray) -> BoolArray:
-    """Which corners (S, 4) lie on a line on whose end another image has put them as points.
+    """Corners (S, 4) that a sighting knows only across their side, and others of its group as points.
 
-    Where other paint, a shadow or the image's border cuts a marking, its corner is only known to lie on the
-    marking's side, at least as far out as the cut. All images that are cut alike would be wrong alike, so
-    that of such a corner only the line counts, as soon as its end is known.
+    Where other paint, a shadow or the image's border cuts a marking, its corner is somewhere on the line of
+    the side, no nearer than the cut. Images that are cut alike are wrong alike, so that their mean is no
+    better than one of them: as soon as another image shows the corner, only the line counts.
 
     Args:
         association: the groups.
@@ -103,7 +103,7 @@ def known_elsewhere(association: Association, point: BoolArray, informs: BoolArr
 
 
 def line_only(covariance: FloatArray, sigma: float) -> FloatArray:
-    """Covariances (..., 2, 2) with ``sigma`` in the direction in which they are larger."""
+    """Covariances (..., 2, 2) whose longer axis is made at least ``sigma`` long."""
     value, vector = np.linalg.eigh(covariance)
     value[..., 1] = np.maximum(value[..., 1], sigma**2)
     return np.asarray((vector * value[..., None, :]) @ np.swapaxes(vector, -1, -2))
