@@ -7,10 +7,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from v2hdm.door import answer_signals, open_door
+from v2hdm.cli.door import answer_signals, open_door
 
 if TYPE_CHECKING:
-    from v2hdm.config import Job
+    from v2hdm.cli.config import Job
 
 _INTERRUPTED = "interrupted; nothing was written"
 
@@ -25,7 +25,7 @@ _settle = partial(open_door, "export", "train", _INTERRUPTED)
 
 def _export() -> int:
     from export.config import ExportConfig
-    from v2hdm.config import work_on
+    from v2hdm.cli.config import work_on
 
     return work_on("export", ExportConfig, _run, _settle, __doc__ or "")
 
@@ -33,7 +33,7 @@ def _export() -> int:
 def _run(job: Job) -> None:
     from export.config import ExportConfig
     from export.console import export
-    from v2hdm.config import to_dataclass
+    from v2hdm.cli.config import to_dataclass
 
     config = to_dataclass(job.composed, ExportConfig, "`python -m export checkpoint=... output=...`")
     output = Path(config.output)

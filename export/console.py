@@ -10,8 +10,8 @@ from export.config import ExportConfig, Precision, check_export
 from export.manifest import record_network
 from export.onnx_file import export_float, export_int8
 from export.source import Source, read_source
-from v2hdm.inputs import note_input, refuse_input
 from v2hdm.progress import TellShare, share_of_work
+from v2hdm.store.inputs import note_input, refuse_input
 
 
 def run(config: ExportConfig, tell: TellShare = lambda share, doing: None) -> str:

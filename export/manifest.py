@@ -10,7 +10,7 @@ from pathlib import Path
 
 from v2hdm.detection import weights
 from v2hdm.errors import DetectorError
-from v2hdm.files import replace_text
+from v2hdm.store.files import replace_text
 
 
 def record(names: Sequence[str], command: str, folder: Path = weights.FOLDER) -> None:

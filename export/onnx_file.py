@@ -25,8 +25,8 @@ from models.marking_net import MULTIPLE
 from train.checkpoint import Checkpoint
 from v2hdm.detection.network import METADATA_KEY
 from v2hdm.errors import ConfigError, DetectorError
-from v2hdm.files import whole_file
 from v2hdm.progress import TellShare
+from v2hdm.store.files import whole_file
 
 _PARITY_SEED_OFFSET = 1_000_003
 _FITTING = 0.15

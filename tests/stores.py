@@ -10,8 +10,8 @@ from typing import Any
 import fsspec
 import pytest
 
-from v2hdm.objects import bucket, lease
-from v2hdm.objects.bucket import Bucket
+from v2hdm.store.objects import bucket, lease
+from v2hdm.store.objects.bucket import Bucket
 
 
 @pytest.fixture

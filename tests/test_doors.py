@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from v2hdm import __version__
-from v2hdm.door import version_line
+from v2hdm.cli.door import version_line
 
 ROOT = Path(__file__).parents[1]
 PRESSED_TWICE = """
@@ -49,14 +49,14 @@ def run_door(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
         (("train",), "torch"),
         (("train.ship", "runs/gpu"), "onnx"),
         (("export", "checkpoint=a", "output=b"), "onnx"),
-        (("v2hdm.mosaic", "outputs/port2"), "torch"),
+        (("v2hdm.cli.mosaic", "outputs/port2"), "torch"),
         (("v2hdm.detect", "images"), "cv2"),
-        (("v2hdm.check", "drive"), "cv2"),
+        (("v2hdm.cli.check", "drive"), "cv2"),
         (("v2hdm.report", "results"), "cv2"),
         (("v2hdm.experiment",), "torch"),
         (("v2hdm.fleet", "drive.yaml"), "ray"),
-        (("v2hdm.export", "map.geojson", "--format", "csv"), "cv2"),
-        (("v2hdm.calibrate", "points.csv", "--intrinsics", "a.yaml"), "torch"),
+        (("v2hdm.cli.export", "map.geojson", "--format", "csv"), "cv2"),
+        (("v2hdm.cli.calibrate", "points.csv", "--intrinsics", "a.yaml"), "torch"),
     ],
 )
 def test_an_interruption_while_libraries_are_loaded_is_one_line(
@@ -75,9 +75,9 @@ def test_an_interruption_while_libraries_are_loaded_is_one_line(
         (("v2hdm.map", "+run=port2"), "torch", "map"),
         (("v2hdm.map", "+run=port2"), "kornia", "map"),
         (("v2hdm.experiment",), "matplotlib", "map"),
-        (("v2hdm.check", "drive"), "matplotlib", "map"),
-        (("v2hdm.calibrate", "points.csv", "--intrinsics", "a.yaml"), "kornia", "map"),
-        (("v2hdm.mosaic", "outputs/port2"), "kornia", "map"),
+        (("v2hdm.cli.check", "drive"), "matplotlib", "map"),
+        (("v2hdm.cli.calibrate", "points.csv", "--intrinsics", "a.yaml"), "kornia", "map"),
+        (("v2hdm.cli.mosaic", "outputs/port2"), "kornia", "map"),
         (("v2hdm.report", "results"), "jinja2", "map"),
         (("v2hdm.fleet", "drive.yaml"), "ray", "fleet"),
         (("train",), "tensorboard", "train"),

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from export.config import ExportConfig
-from v2hdm.config import Job, work_on
+from v2hdm.cli.config import Job, work_on
 from v2hdm.errors import ConfigError
 
 

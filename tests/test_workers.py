@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from v2hdm.errors import DriveError, WorkerError
-from v2hdm.files import whole_file
+from v2hdm.store.files import whole_file
 from v2hdm.workers import share_out
 
 ROOT = Path(__file__).parents[1]

@@ -6,10 +6,10 @@ import sys
 from functools import partial
 from typing import TYPE_CHECKING
 
-from v2hdm.door import answer_signals, open_door
+from v2hdm.cli.door import answer_signals, open_door
 
 if TYPE_CHECKING:
-    from v2hdm.config import Job
+    from v2hdm.cli.config import Job
 
 _INTERRUPTED = "interrupted; what was saved until then is kept"
 
@@ -24,7 +24,7 @@ _settle = partial(open_door, "train", "train", _INTERRUPTED)
 
 def _train() -> int:
     from train.config import TrainConfig
-    from v2hdm.config import work_on
+    from v2hdm.cli.config import work_on
 
     return work_on("train", TrainConfig, _run, _settle, __doc__ or "")
 
@@ -32,7 +32,7 @@ def _train() -> int:
 def _run(job: Job) -> None:
     from train.config import TrainConfig
     from train.console import train
-    from v2hdm.config import to_dataclass
+    from v2hdm.cli.config import to_dataclass
 
     config = to_dataclass(job.composed, TrainConfig, "set it on the command line")
     config.output = job.folder(config.output)

@@ -17,8 +17,8 @@ from train.exported import read_exported, unfold
 from train.growth import can_grow, class_count, grow, recorded_net, with_classes
 from v2hdm.catalogue import SHIPPED, Catalogue, load_catalogue
 from v2hdm.errors import ConfigError
-from v2hdm.files import whole_file
-from v2hdm.inputs import note_input, refuse_input
+from v2hdm.store.files import whole_file
+from v2hdm.store.inputs import note_input, refuse_input
 
 # What may differ between the parts of a resumed run without making it another experiment.
 _FREE_TO_CHANGE = (

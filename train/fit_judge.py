@@ -41,9 +41,9 @@ from v2hdm.detection.markings.judge import (
 from v2hdm.detection.markings.rectified import CHANNELS, CLAIMED_CHANNELS, SIZE
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE, being_fitted
-from v2hdm.files import replace_text, whole_file
 from v2hdm.geometry.quadrilateral import following, side_frames
 from v2hdm.records import BoolArray, FloatArray
+from v2hdm.store.files import replace_text, whole_file
 
 SEED = 917
 EASY = 0.2

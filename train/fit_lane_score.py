@@ -33,8 +33,8 @@ from v2hdm.detection.markings.foreground import Foreground
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.sight import AnchorRow
 from v2hdm.detection.weights import LANE_SCORE_FILE, being_fitted
-from v2hdm.files import replace_text
 from v2hdm.records import BoolArray, FloatArray, LaneDetection
+from v2hdm.store.files import replace_text
 
 SEED = 921
 ROUNDS = 2

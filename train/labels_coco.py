@@ -11,9 +11,9 @@ import numpy as np
 from train.labels_image import LabelledImage, Shape
 from v2hdm.catalogue import NOT_PAINT, PAINT_CLASSES
 from v2hdm.errors import LabelError
-from v2hdm.files import load_json
+from v2hdm.io.texts import shown
 from v2hdm.records import FloatArray
-from v2hdm.texts import shown
+from v2hdm.store.files import load_json
 
 _HALF_PX = 0.5
 """COCO counts from the top-left pixel's corner, this project from its centre."""

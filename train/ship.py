@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.door import answer_signals, open_door
+from v2hdm.cli.door import answer_signals, open_door
 
 _INTERRUPTED = "interrupted; the same command goes on from here, and the detector's files are as they were"
 

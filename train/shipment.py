@@ -25,8 +25,8 @@ from train.fit_judge import Gathered
 from v2hdm.detection import weights
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError
-from v2hdm.files import whole_file
 from v2hdm.progress import TellShare, share_of_work
+from v2hdm.store.files import whole_file
 from v2hdm.workers import share_out
 
 _ROOT = Path(__file__).resolve().parents[1]

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from v2hdm.errors import ConfigError
+from v2hdm.io.texts import read_yaml, shown
 from v2hdm.records import LANE_BOUNDARY
-from v2hdm.texts import read_yaml, shown
 
 CATALOGUE_FILE = Path(__file__).with_name("catalogue.yaml")
 

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.door import ShowVersion, answer_signals, open_door
+from v2hdm.cli.door import ShowVersion, answer_signals, open_door
 
 _ROUGH_MOUNTING = (1.6, 5.0, 60.0)
 _INTERRUPTED = "interrupted before the last image; no --output was written"
@@ -24,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _watch(arguments: Sequence[str] | None) -> None:
     parsed = _parser().parse_args(arguments)
-    from v2hdm.watch import watch
+    from v2hdm.pipeline.watch import watch
 
     watch(parsed)
 

@@ -6,10 +6,10 @@ import sys
 from functools import partial
 from typing import TYPE_CHECKING
 
-from v2hdm.door import EXIT_FAILED_VERDICT, answer_signals, open_door, version_line
+from v2hdm.cli.door import EXIT_FAILED_VERDICT, answer_signals, open_door, version_line
 
 if TYPE_CHECKING:
-    from v2hdm.config import Job
+    from v2hdm.cli.config import Job
 
 _INTERRUPTED = "interrupted; what was found so far is kept in the cache, no result was written"
 _RUNS = "choose a run (+run=port1, +run=port2, +run=kitti drive.path=...) or set it on the command line"
@@ -30,16 +30,16 @@ _settle = partial(open_door, "v2hdm.map", "map", _INTERRUPTED)
 
 
 def _map() -> int:
-    from v2hdm.config import work_on
+    from v2hdm.cli.config import work_on
     from v2hdm.pipeline import RunConfig
 
     return work_on("map", RunConfig, _run, _settle, __doc__ or "")
 
 
 def _run(job: Job) -> int:
-    from v2hdm import config, console
+    from v2hdm.cli import config, console
     from v2hdm.pipeline import RunConfig
-    from v2hdm.quality import Status
+    from v2hdm.verdict import Status
 
     run = config.to_dataclass(job.composed, RunConfig, _RUNS)
     run.output = job.folder(run.output)

@@ -226,7 +226,7 @@ class Drive:
     poses that those of the images were interpolated from, at the receiver's rate, with the road laid flat;
     ``recorded`` the same poses as they were recorded. ``road`` is the recorded ground, None where it was
     recorded as the plane z = 0. ``unposed`` counts, by camera, the images left out for want of a pose.
-    ``joined`` are the drives that it was made of (:func:`v2hdm.drive.join.join_drives`), empty for one that
+    ``joined`` are the drives that it was made of (:func:`v2hdm.io.drive.join.join_drives`), empty for one that
     was recorded in one piece; a joined drive has no trajectory of its own, and the largest of each noise.
     """
 

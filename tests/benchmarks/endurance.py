@@ -24,10 +24,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from v2hdm.caching.room import Room
-from v2hdm.caching.store import Store
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.drive import read_drive
+from v2hdm.io.drive import read_drive
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline.camera_sets import map_camera_sets
 from v2hdm.pipeline.config import DriveConfig
@@ -39,8 +37,10 @@ from v2hdm.pipeline.survey import take_survey
 from v2hdm.pipeline.telling import silent
 from v2hdm.pipeline.viewer import Unwatched
 from v2hdm.pipeline.write import write_results
-from v2hdm.quality import Verdict
-from v2hdm.quality.results.result import check_result
+from v2hdm.store.cache.room import Room
+from v2hdm.store.cache.store import Store
+from v2hdm.verdict import Verdict
+from v2hdm.verdict.results.result import check_result
 
 _FIRST = 0.1
 """Share of the whole after which memory must not grow."""

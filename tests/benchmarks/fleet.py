@@ -34,21 +34,21 @@ from v2hdm.adjust import Problem, Solution, SolveOptions, solve
 from v2hdm.adjust.parts import Local, solve_in_parts
 from v2hdm.adjust.parts.choice import cost_in_parts, cost_together
 from v2hdm.adjust.parts.split import split
-from v2hdm.caching.keys import key_of
-from v2hdm.caching.room import Room
 from v2hdm.detection.batch import with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.drive import ReadOptions, read_drive
 from v2hdm.fleet.cluster import LOCAL, cluster
 from v2hdm.fleet.crew import RayCrew
 from v2hdm.fleet.eyes import Eyes, detect_by
 from v2hdm.fleet.parts import RayTeam
+from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.inspect import inspect_each
 from v2hdm.pipeline.keys import read_visits
 from v2hdm.pipeline.telling import silent
+from v2hdm.store.cache.keys import key_of
+from v2hdm.store.cache.room import Room
 
 OPTIONS = SolveOptions(coarse=False)
 _TICKS = os.sysconf("SC_CLK_TCK")

@@ -29,9 +29,9 @@ from tests.benchmarks.real_reference import Reference, Route, make_reference
 from tests.benchmarks.real_view import View
 from v2hdm.detection.batch import detect_all, read_image
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.drive import ReadOptions, read_drive
-from v2hdm.files import replace_text
+from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.records import FloatArray
+from v2hdm.store.files import replace_text
 
 TILE_M = 20.0
 RESOLUTION_M = 0.02

@@ -22,8 +22,8 @@ from scipy.stats import chi2
 
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.drive import read_drive
-from v2hdm.drive.truth import read_truth
+from v2hdm.io.drive import read_drive
+from v2hdm.io.drive.truth import read_truth
 from v2hdm.mapping.markings.relative import neighbours
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions

@@ -15,12 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from v2hdm.caching.codec import CodecError, decode, encode
 from v2hdm.ground import GroundStatus, Reading
 from v2hdm.mapping.results import AdjustedPoses
 from v2hdm.pipeline.camera_sets import MappedSet
 from v2hdm.pipeline.inspect import Inspection
 from v2hdm.records import FloatArray, ImageDetections, MarkingDetection
+from v2hdm.store.cache.codec import CodecError, decode, encode
 
 
 @dataclass(frozen=True)

@@ -16,16 +16,16 @@ import pytest
 from onnx import numpy_helper
 
 from tests.detection.pictures import HEIGHT, WIDTH, brightness_model, diamond, extrinsic, make_camera, picture
-from v2hdm import watch
 from v2hdm.detect import main
 from v2hdm.detection import frames
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.draw import draw_detections
 from v2hdm.detection.road import RoadDetector
 from v2hdm.detection.stopwatch import Stopwatch, lap
-from v2hdm.hdmap import write_calibration
-from v2hdm.hdmap.calibration import Provenance
-from v2hdm.hdmap.calibration_formats import write_calibration_as
+from v2hdm.io.calibration.document import Provenance
+from v2hdm.io.calibration.formats import write_calibration_as
+from v2hdm.io.maps import write_calibration
+from v2hdm.pipeline import watch
 from v2hdm.records import Calibration, LaneDetection, MarkingDetection
 
 DIAMONDS = [diamond(8.0, 0.5), diamond(11.0, -0.5)]

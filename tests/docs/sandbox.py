@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 
 from tests.drive.bags import messages_of, write_ros2
-from v2hdm.drive import read_drive
-from v2hdm.drive.truth import read_truth
 from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
 from v2hdm.geometry.lens import distort_points
-from v2hdm.hdmap import read_geojson
-from v2hdm.hdmap.geopackage import write_geopackage
+from v2hdm.io.drive import read_drive
+from v2hdm.io.drive.truth import read_truth
+from v2hdm.io.maps import read_geojson
+from v2hdm.io.maps.geopackage import write_geopackage
 from v2hdm.records import Drive, Truth
 
 _COPIES = ("mysite", "monday", "friday", "port2_again")

@@ -14,7 +14,10 @@ SMALL_PORT = (
 def smaller(arguments: list[str]) -> list[str]:
     """The arguments of ``python`` with what makes the command small."""
     door, given = arguments[1], arguments[2:]
-    if door in ("v2hdm.check", "v2hdm.extrinsic", "v2hdm.localize") and "--list-topics" not in given:
+    if (
+        door in ("v2hdm.cli.check", "v2hdm.cli.extrinsic", "v2hdm.cli.localize")
+        and "--list-topics" not in given
+    ):
         return [*arguments, "--workers", "1"]
     if door != "v2hdm.map" or "--cfg=job" in given:
         return arguments

@@ -21,7 +21,7 @@ from tests.docs.blocks import ROOT, Block, blocks, document, documents
 from tests.docs.processes import python_in
 from tests.docs.sandbox import furnish
 from v2hdm import __version__
-from v2hdm.hdmap import read_geojson
+from v2hdm.io.maps import read_geojson
 
 RUN_BY = {
     "docs/calibrate.md": "tests/precalibration/test_door.py",

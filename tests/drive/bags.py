@@ -14,8 +14,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from v2hdm.drive import read_drive
 from v2hdm.geometry.rigid import inverse, quaternion_from_rotation
+from v2hdm.io.drive import read_drive
 from v2hdm.records import Drive, FloatArray
 
 VIDEO = "foxglove_msgs/msg/CompressedVideo"

@@ -7,10 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from v2hdm.drive import Trajectory, write_drive
-from v2hdm.drive.truth import write_truth
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import rotation_from_euler
+from v2hdm.io.drive import Trajectory, write_drive
+from v2hdm.io.drive.truth import write_truth
 from v2hdm.records import (
     Camera,
     CameraInfo,

@@ -26,12 +26,12 @@ from tests.drive.bags import (
     write_ros2,
 )
 from tests.drive.example import make_drive
-from v2hdm.drive import ReadOptions, drive_name, read_drive
-from v2hdm.drive.bag.bare import list_topics
-from v2hdm.drive.bag.importing import import_streams
-from v2hdm.drive.bag.pixels import file_of
-from v2hdm.drive.bag.streams import ImageStream
 from v2hdm.errors import DriveError
+from v2hdm.io.drive import ReadOptions, drive_name, read_drive
+from v2hdm.io.importers.bag.bare import list_topics
+from v2hdm.io.importers.bag.importing import import_streams
+from v2hdm.io.importers.bag.pixels import file_of
+from v2hdm.io.importers.bag.streams import ImageStream
 from v2hdm.records import Drive
 
 

@@ -13,12 +13,12 @@ import yaml
 from tests.docs.blocks import blocks, document
 from tests.drive.bags import messages_of, write_ros2
 from tests.drive.example import make_drive
-from v2hdm import check
-from v2hdm.drive import ReadOptions, read_drive
-from v2hdm.drive.poses import POSE_FORMATS, TOPIC_KEYS
-from v2hdm.drive.poses.settings import COMMON_KEYS
-from v2hdm.drive.poses.table import NAMES
-from v2hdm.drive.sources import IMAGE_SOURCES
+from v2hdm.cli import check
+from v2hdm.io.drive import ReadOptions, read_drive
+from v2hdm.io.drive.sources import IMAGE_SOURCES
+from v2hdm.io.importers.poses import POSE_FORMATS, TOPIC_KEYS
+from v2hdm.io.importers.poses.settings import COMMON_KEYS
+from v2hdm.io.importers.poses.table import NAMES
 
 TEXT = document("docs/bags.md")
 

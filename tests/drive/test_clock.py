@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.drive.example import make_drive
-from v2hdm.drive import read_drive, with_clock_offsets
 from v2hdm.errors import DriveError
+from v2hdm.io.drive import read_drive, with_clock_offsets
 from v2hdm.mapping.sightings.table import frames_of
 
 

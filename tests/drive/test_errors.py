@@ -12,9 +12,9 @@ import pytest
 import yaml
 
 from tests.drive.example import make_drive
-from v2hdm.drive import ReadOptions, read_drive
-from v2hdm.drive.truth import read_truth
 from v2hdm.errors import DriveError
+from v2hdm.io.drive import ReadOptions, read_drive
+from v2hdm.io.drive.truth import read_truth
 
 Damage = Callable[[Path], None]
 

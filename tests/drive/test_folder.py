@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.drive.example import ORIGIN, make_drive, make_truth
-from v2hdm.drive import ReadOptions, read_drive
-from v2hdm.drive.truth import read_truth
 from v2hdm.errors import DriveError
+from v2hdm.io.drive import ReadOptions, read_drive
+from v2hdm.io.drive.truth import read_truth
 from v2hdm.records import PoseNoise
 
 

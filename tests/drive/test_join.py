@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from tests.drive.example import make_drive
-from v2hdm.drive import join_drives, read_drive, with_clock_offsets
 from v2hdm.errors import DriveError
+from v2hdm.geometry.geodetic import enu_from_geodetic, geodetic_from_enu
 from v2hdm.geometry.rigid import heading_rad
-from v2hdm.hdmap.geodetic import enu_from_geodetic, geodetic_from_enu
+from v2hdm.io.drive import join_drives, read_drive, with_clock_offsets
 from v2hdm.mapping.sightings.table import frames_of
 from v2hdm.records import Drive, GeodeticOrigin, PoseNoise
 

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from v2hdm.drive import KittiOptions, ReadOptions, read_drive
 from v2hdm.errors import DriveError
-from v2hdm.hdmap.geodetic import geodetic_from_enu
+from v2hdm.geometry.geodetic import geodetic_from_enu
+from v2hdm.io.drive import KittiOptions, ReadOptions, read_drive
 from v2hdm.records import FloatArray, GeodeticOrigin
 
 START = GeodeticOrigin(49.0, 8.4, 115.0)

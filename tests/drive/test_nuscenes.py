@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from tests.drive.bags import mountings
 from tests.drive.example import make_drive
-from v2hdm.drive import read_drive
 from v2hdm.errors import DriveError
+from v2hdm.io.drive import read_drive
 from v2hdm.records import Drive, FloatArray
 
 Tables = dict[str, list[dict[str, Any]]]

@@ -15,12 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from tests.drive.bags import Messages, write_ros2
 from tests.drive.example import ORIGIN, make_drive
-from v2hdm.drive import ReadOptions, read_drive
-from v2hdm.drive.poses import Recorded, read_poses
-from v2hdm.drive.poses.table import read_table
 from v2hdm.errors import DriveError
-from v2hdm.quality import check_drive
+from v2hdm.io.drive import ReadOptions, read_drive
+from v2hdm.io.importers.poses import Recorded, read_poses
+from v2hdm.io.importers.poses.table import read_table
 from v2hdm.records import FloatArray, GeodeticOrigin
+from v2hdm.verdict import check_drive
 
 START_S = 1715934630.0
 """2024-05-17 08:30:30 UTC."""

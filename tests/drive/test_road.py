@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from v2hdm.drive.road import lay_flat, tell, unevenness
 from v2hdm.geometry.rigid import rotation_from_euler
+from v2hdm.io.drive.road import lay_flat, tell, unevenness
 from v2hdm.records import FloatArray, Road, Trajectory
 
 SIGMA_M = 0.02

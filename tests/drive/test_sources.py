@@ -15,8 +15,8 @@ import yaml
 
 from tests.drive.bags import assert_same_drive
 from tests.drive.example import make_drive
-from v2hdm.drive import ReadOptions, read_drive
 from v2hdm.errors import DriveError
+from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.records import Drive, Image
 
 STAMPS = tuple(100.05 + 0.1 * n for n in range(6))
@@ -123,7 +123,7 @@ def test_a_source_that_does_not_fit_is_named(folder: Path) -> None:
 def test_a_library_that_is_not_installed_is_named_with_its_extra(
     module: str, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from v2hdm.hdmap import geodetic
+    from v2hdm.geometry import geodetic
 
     content = yaml.safe_load((folder / "drive.yaml").read_text())
     extra, images = {"rosbags": "ros", "av": "video", "pyproj": "map"}[module], "front/images.txt"

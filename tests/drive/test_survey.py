@@ -9,9 +9,9 @@ import numpy as np
 import pyproj
 import pytest
 
-from v2hdm.drive.survey import SurveyedPoint, in_map, misreadings, read_survey
 from v2hdm.errors import DriveError
-from v2hdm.hdmap.geodetic import geodetic_from_enu
+from v2hdm.geometry.geodetic import geodetic_from_enu
+from v2hdm.io.drive.survey import SurveyedPoint, in_map, misreadings, read_survey
 from v2hdm.records import FloatArray, GeodeticOrigin
 
 ORIGIN = GeodeticOrigin(53.54, 9.02, 45.0)

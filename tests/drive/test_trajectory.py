@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
 from tests.drive.example import straight_trajectory
-from v2hdm.drive.trajectory import interpolate
 from v2hdm.geometry.rigid import (
     quaternion_from_rotation,
     rotation_from_euler,
     rotation_from_quaternion,
     slerp,
 )
+from v2hdm.io.drive.trajectory import interpolate
 from v2hdm.records import FloatArray, Trajectory
 
 SEEDS = st.integers(0, 2**32 - 1)

@@ -17,11 +17,11 @@ import yaml
 
 from tests.drive.example import camera_info, looking_forward, make_drive, make_map
 from tests.faults.judge import Case, Prepare
-from v2hdm.hdmap.calibration import write_calibration
-from v2hdm.hdmap.geojson import write_geojson
+from v2hdm.io.calibration.document import write_calibration
+from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.records import Calibration
 
-CHECK = "v2hdm.check"
+CHECK = "v2hdm.cli.check"
 CHECKED = ("drive", "--no-ground", "--workers", "1", "--output", "out")
 
 
@@ -269,12 +269,12 @@ def texts() -> Iterator[Case]:
             either = f"{says}|no intrinsics of a known format" if file.startswith("front") else says
             yield Case(f"{file}: {name}", CHECK, CHECKED, drive(write(file, text)), either)
         yield Case(
-            f"calibration: {name}", "v2hdm.calibration", ("a.yaml", "a.yaml"), write("a.yaml", text), says
+            f"calibration: {name}", "v2hdm.cli.calibration", ("a.yaml", "a.yaml"), write("a.yaml", text), says
         )  # fmt: skip
     for name, (text, says) in JSON_TEXTS.items():
         yield Case(
             f"map: {name}",
-            "v2hdm.export",
+            "v2hdm.cli.export",
             ("map.geojson", "--format", "csv", "--output", "there"),
             write("map.geojson", text),
             says,
@@ -324,7 +324,7 @@ def names() -> Iterator[Case]:
         if isinstance(text, str):
             yield Case(
                 f"class in a map: {name}",
-                "v2hdm.export",
+                "v2hdm.cli.export",
                 ("map.geojson", "--format", "csv", "--output", "there"),
                 _map_of_class(text),
                 says,
@@ -477,11 +477,11 @@ def outputs() -> Iterator[Case]:
         name = f"result on a disk with room for {most} bytes"
         yield Case(name, CHECK, CHECKED, drive(), "cannot be written", disk_bytes=most)
     yield Case(
-        "export onto the map", "v2hdm.export", ("map.geojson", "--format", "geojson"),
+        "export onto the map", "v2hdm.cli.export", ("map.geojson", "--format", "geojson"),
         lambda root: write_geojson(make_map(), root / "map.geojson"), "written over",
     )  # fmt: skip
     yield Case(
-        "export onto a link to the map", "v2hdm.export",
+        "export onto a link to the map", "v2hdm.cli.export",
         ("map.geojson", "--format", "csv", "--output", "there"), _linked_map, "written over",
     )  # fmt: skip
 
@@ -549,14 +549,14 @@ def arguments() -> Iterator[Case]:
         "precious.txt precious.txt": "precious.txt",
         ". .": "no calibration_",
     }.items():
-        yield Case(f"calibration {line}", "v2hdm.calibration", line.split(), _both(), says)
+        yield Case(f"calibration {line}", "v2hdm.cli.calibration", line.split(), _both(), says)
     for line, says in {
         "nowhere.geojson --format csv": "nowhere.geojson",
         "precious.txt --format csv": "precious",
         "map.geojson --format pdf": "pdf",
         ". --format csv": "",
     }.items():
-        yield Case(f"export {line}", "v2hdm.export", line.split(), _both(), says)
+        yield Case(f"export {line}", "v2hdm.cli.export", line.split(), _both(), says)
 
 
 SETTINGS = {

@@ -10,18 +10,18 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from tests.calibration.site import INFO, clicked, write_table
 from tests.faults.judge import Case, Outcome, Prepare
 from tests.pipeline.test_run import short_port
-from tests.precalibration.site import INFO, clicked, write_table
-from v2hdm.caching.keys import code_key
-from v2hdm.caching.leases import STAGES
-from v2hdm.caching.pruning import LEFT, items_of, remove_damaged
-from v2hdm.drive.camera_info import write_camera_info
-from v2hdm.drive.tum import read_image_list, write_image_list
 from v2hdm.errors import DriveError
-from v2hdm.files import dump_yaml, load_yaml, replace_text
-from v2hdm.listing import LIST
+from v2hdm.io.calibration.camera_info import write_camera_info
+from v2hdm.io.drive.tum import read_image_list, write_image_list
 from v2hdm.simulate import render_drive
+from v2hdm.store.cache.keys import code_key
+from v2hdm.store.cache.leases import STAGES
+from v2hdm.store.cache.pruning import LEFT, items_of, remove_damaged
+from v2hdm.store.files import dump_yaml, load_yaml, replace_text
+from v2hdm.store.listing import LIST
 
 IMAGES = 16
 """Of the drive's one camera: enough for a map, few enough for a second or two a run."""
@@ -130,10 +130,10 @@ class Doors:
 
     def _of_drives(self) -> Iterator[Situation]:
         common = (str(self.drive), "--workers", "1", "--output", "out")
-        yield Situation(Case("check", "v2hdm.check", common, self.given(), ""))
-        yield Situation(Case("extrinsic", "v2hdm.extrinsic", common, self.given(), ""))
+        yield Situation(Case("check", "v2hdm.cli.check", common, self.given(), ""))
+        yield Situation(Case("extrinsic", "v2hdm.cli.extrinsic", common, self.given(), ""))
         localised = ("out/run", str(self.drive), "--workers", "1", "--output", "where")
-        yield Situation(Case("localize", "v2hdm.localize", localised, self.given("out/run"), ""))
+        yield Situation(Case("localize", "v2hdm.cli.localize", localised, self.given("out/run"), ""))
         port = f"+ports={{small: {{drive: {{path: {self.drive}}}}}}}"
         only = ("~run@ports.port1", "~run@ports.port2", "recipes=[ours]")
         experiment = (port, *only, "workers=1", "output=out", "cache=cache")
@@ -143,15 +143,15 @@ class Doors:
 
     def _of_results(self) -> Iterator[Situation]:
         done = self.given("out/run")
-        yield Situation(Case("mosaic", "v2hdm.mosaic", ("out/run",), done, ""), grows=True)
+        yield Situation(Case("mosaic", "v2hdm.cli.mosaic", ("out/run",), done, ""), grows=True)
         yield Situation(Case("report", "v2hdm.report.__main__", ("out/run",), done, ""), grows=True)
         formats = [word for name in _FORMATS.split(",") for word in ("--format", name)]
         given = ("out/run/map.geojson", *formats, "--output", "there")
-        yield Situation(Case("export", "v2hdm.export", given, done, ""), grows=True)
+        yield Situation(Case("export", "v2hdm.cli.export", given, done, ""), grows=True)
         forms = ("camera_info", "static_transform", "urdf", "kalibr", "opencv")
         formats = [word for name in forms for word in ("--format", name)]
         given = ("out/run/calibration_front.yaml", *formats, "--output", "there")
-        yield Situation(Case("export a calibration", "v2hdm.export", given, done, ""), grows=True)
+        yield Situation(Case("export a calibration", "v2hdm.cli.export", given, done, ""), grows=True)
 
     def _of_files(self) -> Iterator[Situation]:
         detect = ("images", "--limit", "3", "--output", "found.jsonl", "--draw", "drawn")
@@ -194,7 +194,7 @@ class _Given:
 def calibrating() -> Situation:
     """The door to a pre-calibration."""
     words = ("points.csv", "--intrinsics", "camera_info.yaml", "--output", "out")
-    return Situation(Case("calibrate", "v2hdm.calibrate", words, _points, ""))
+    return Situation(Case("calibrate", "v2hdm.cli.calibrate", words, _points, ""))
 
 
 def _points(root: Path) -> None:

@@ -23,7 +23,6 @@ from v2hdm.detection import network
 from v2hdm.detection.batch import detect_all, with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.drive import read_drive
 from v2hdm.errors import ConfigError, DriveError, WorkerError
 from v2hdm.fleet.board import Board
 from v2hdm.fleet.eyes import Eyes, detect_by, open_eyes
@@ -32,6 +31,7 @@ from v2hdm.fleet.plan import plan, plan_site
 from v2hdm.fleet.rows import Row, exit_code
 from v2hdm.fleet.run import FleetOptions, run_fleet
 from v2hdm.fleet.work import map_drive
+from v2hdm.io.drive import read_drive
 from v2hdm.pipeline import RunConfig
 from v2hdm.records import ImageDetections
 from v2hdm.simulate import PortConfig, render_drive

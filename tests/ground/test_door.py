@@ -1,4 +1,4 @@
-"""``python -m v2hdm.extrinsic``: a mounting, its picture and a verdict, and no foreign file touched."""
+"""``python -m v2hdm.cli.extrinsic``: a mounting, its picture and a verdict, and no foreign file touched."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.ground.scene import extrinsic, make_drive
-from v2hdm.drive import write_drive
-from v2hdm.extrinsic import main
-from v2hdm.hdmap.calibration import read_calibration
+from v2hdm.cli.extrinsic import main
+from v2hdm.io.calibration.document import read_calibration
+from v2hdm.io.drive import write_drive
 
 
 def test_the_door_writes_a_mounting_and_its_picture(

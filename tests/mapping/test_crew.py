@@ -15,8 +15,8 @@ from tests.adjust.site import site
 from tests.mapping.scene import SceneOptions, make_scene
 from v2hdm.adjust import SolveOptions, solve
 from v2hdm.adjust.parts import Local, Team, choice
-from v2hdm.drive import join_drives
 from v2hdm.errors import ConfigError
+from v2hdm.io.drive import join_drives
 from v2hdm.mapping.crew import Alone
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions, check_options

@@ -14,15 +14,15 @@ from typing import Any
 
 import pytest
 
-from v2hdm.caching.pruning import items_of
 from v2hdm.detection import batch
-from v2hdm.drive import ReadOptions, read_drive
 from v2hdm.errors import DriveError
+from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline import DriveConfig, RunConfig, RunResult, detections, run, work
 from v2hdm.pipeline import inspect as inspection
 from v2hdm.simulate import PortConfig, render_drive
 from v2hdm.simulate.port.config import RouteConfig, YardConfig
+from v2hdm.store.cache.pruning import items_of
 
 SAME = ("map.geojson", "trajectory.tum", "excluded.geojson", "residuals.csv")
 

@@ -13,23 +13,23 @@ import pytest
 import yaml
 
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.drive import ReadOptions, read_drive
-from v2hdm.drive.tum import read_tum, write_tum
 from v2hdm.errors import ConfigError, DetectorError, DriveError, V2hdmError
 from v2hdm.geometry.rigid import rotation_from_euler
-from v2hdm.hdmap.calibration import read_calibration
-from v2hdm.hdmap.calibration_formats import CALIBRATION_FORMATS
-from v2hdm.hdmap.formats import FORMATS
-from v2hdm.hdmap.geojson import read_geojson
-from v2hdm.hdmap.residuals import read_residuals
+from v2hdm.io.calibration.document import read_calibration
+from v2hdm.io.calibration.formats import CALIBRATION_FORMATS
+from v2hdm.io.drive import ReadOptions, read_drive
+from v2hdm.io.drive.tum import read_tum, write_tum
+from v2hdm.io.maps.formats import FORMATS
+from v2hdm.io.maps.geojson import read_geojson
+from v2hdm.io.maps.residuals import read_residuals
 from v2hdm.mapping.options import AcceptanceOptions, LaneOptions, MappingOptions
 from v2hdm.pipeline import DriveConfig, RunConfig, run
 from v2hdm.pipeline.camera_sets import camera_sets
 from v2hdm.pipeline.config import run_name
-from v2hdm.quality import Status
 from v2hdm.records import Trajectory
 from v2hdm.simulate import PortConfig, render_drive
 from v2hdm.simulate.port.config import RouteConfig, YardConfig
+from v2hdm.verdict import Status
 
 
 def short_port() -> PortConfig:

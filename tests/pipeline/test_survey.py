@@ -18,11 +18,11 @@ import yaml
 
 from tests.docs.blocks import blocks
 from tests.pipeline.test_run import run_config, short_port
-from v2hdm.drive import read_drive
-from v2hdm.drive.truth import read_truth
-from v2hdm.drive.tum import read_tum, write_tum
 from v2hdm.errors import DriveError
-from v2hdm.hdmap.geodetic import geodetic_from_enu
+from v2hdm.geometry.geodetic import geodetic_from_enu
+from v2hdm.io.drive import read_drive
+from v2hdm.io.drive.truth import read_truth
+from v2hdm.io.drive.tum import read_tum, write_tum
 from v2hdm.mapping.options import MappingOptions, SurveyOptions
 from v2hdm.pipeline import DriveConfig, RunConfig, run
 from v2hdm.records import FloatArray, Trajectory

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from v2hdm.drive.survey import SurveyedPoint
+from v2hdm.io.drive.survey import SurveyedPoint
 from v2hdm.records import FloatArray, HdMap, IntArray, Marking
 from v2hdm.report.check_points import COLUMNS, CheckTable, compare, write_check_points
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from tests.simulate.conftest import tiny_port
-from v2hdm.drive import read_drive
-from v2hdm.drive.truth import read_truth
 from v2hdm.errors import DriveError
+from v2hdm.io.drive import read_drive
+from v2hdm.io.drive.truth import read_truth
 from v2hdm.simulate import render_drive, rendered_drive
 
 

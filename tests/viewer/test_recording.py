@@ -15,19 +15,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from v2hdm.caching.room import Room
-from v2hdm.caching.store import Store
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.drive import read_drive
 from v2hdm.errors import ConfigError
-from v2hdm.hdmap import read_geojson
-from v2hdm.hdmap.calibration import read_calibration
+from v2hdm.io.calibration.document import read_calibration
+from v2hdm.io.drive import read_drive
+from v2hdm.io.maps import read_geojson
 from v2hdm.pipeline import DriveConfig, RunConfig, run
 from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.keys import Contents
 from v2hdm.records import ImageDetections
 from v2hdm.simulate import PortConfig, render_drive
 from v2hdm.simulate.port.config import RouteConfig, YardConfig
+from v2hdm.store.cache.room import Room
+from v2hdm.store.cache.store import Store
 from v2hdm.viewer import FILE, RerunViewer, check_viewer
 
 ROOT = Path(__file__).parents[2]

@@ -23,8 +23,8 @@ from v2hdm.detection.sight import Sight, look
 from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.weights import check_weights
 from v2hdm.errors import DetectorError
+from v2hdm.io.texts import shown
 from v2hdm.records import BoolArray, Camera, LaneDetection, MarkingDetection
-from v2hdm.texts import shown
 
 _NO_PAINT = -20.0
 """Log odds of paint where the vehicle itself is."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from v2hdm.errors import ConfigError
+from v2hdm.io.texts import shown
 from v2hdm.settings import NOT_NEGATIVE, POSITIVE, check_settings
-from v2hdm.texts import shown
 
 _MOST_THREADS = 256
 """More take the machine's memory before they do any work."""

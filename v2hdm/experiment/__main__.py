@@ -9,10 +9,10 @@ import sys
 from functools import partial
 from typing import TYPE_CHECKING
 
-from v2hdm.door import answer_signals, open_door, version_line
+from v2hdm.cli.door import answer_signals, open_door, version_line
 
 if TYPE_CHECKING:
-    from v2hdm.config import Job
+    from v2hdm.cli.config import Job
 
 _INTERRUPTED = "interrupted; finished drives and detections are kept, the same command goes on from there"
 _PORTS = "name ports (+run@ports.port1=port1) or set what is missing on the command line"
@@ -32,14 +32,14 @@ _settle = partial(open_door, "v2hdm.experiment", "map", _INTERRUPTED)
 def _experiment() -> int:
     import torch  # noqa: F401  # its absence is told before that of what is built on it
 
-    from v2hdm.config import work_on
+    from v2hdm.cli.config import work_on
     from v2hdm.experiment.plan import ExperimentConfig
 
     return work_on("experiment", ExperimentConfig, _run, _settle, __doc__ or "")
 
 
 def _run(job: Job) -> None:
-    from v2hdm import config
+    from v2hdm.cli import config
     from v2hdm.experiment.plan import ExperimentConfig
     from v2hdm.experiment.view import experiment_on_terminal
 

@@ -15,17 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.caching.keys import code_key, file_digest, key_of
-from v2hdm.caching.room import Room
-from v2hdm.caching.store import Store
-from v2hdm.drive import read_drive
-from v2hdm.drive.truth import read_truth
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.experiment.plan import OURS, PAPER, Job
 from v2hdm.experiment.residuals import residuals
 from v2hdm.experiment.stored import store, stored
-from v2hdm.files import whole_file
 from v2hdm.geometry.ipm import extrinsic_from_ipm
+from v2hdm.io.drive import read_drive
+from v2hdm.io.drive.truth import read_truth
 from v2hdm.mapping.methods import NAIVE_IPMS, run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.camera_sets import camera_sets
@@ -36,6 +32,10 @@ from v2hdm.records import Drive, HdMap, ImageDetections, Marking, Truth
 from v2hdm.report.evaluation import growth_figures
 from v2hdm.report.metrics import driven_past, extrinsic_metrics
 from v2hdm.simulate import rendered_drive, surveyed_cameras
+from v2hdm.store.cache.keys import code_key, file_digest, key_of
+from v2hdm.store.cache.room import Room
+from v2hdm.store.cache.store import Store
+from v2hdm.store.files import whole_file
 
 Tell = Callable[[str, int, int], None]
 """Told a stage, and how many of its steps are done, of how many."""

@@ -20,8 +20,8 @@ from v2hdm.experiment.measures import Measured, measure
 from v2hdm.experiment.plan import ExperimentConfig, Job, jobs
 from v2hdm.experiment.tables import write_tables
 from v2hdm.experiment.words import write_words
-from v2hdm.files import replace_text
-from v2hdm.outputs import growing_folder, listed_files
+from v2hdm.store.files import replace_text
+from v2hdm.store.outputs import growing_folder, listed_files
 from v2hdm.workers import share_out
 
 Tell = Callable[[str, str, int, int], None]

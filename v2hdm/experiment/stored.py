@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.files import whole_file
+from v2hdm.store.files import whole_file
 
 _FASTEST = 1
 """Level of gzip: a fifth of the size already, at a tenth of the time of the default."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from v2hdm.experiment.measures import ROWS, Measured, Row
 from v2hdm.experiment.plan import OURS, PAPER
-from v2hdm.files import replace_text
+from v2hdm.store.files import replace_text
 
 _CM = 100.0
 

@@ -13,7 +13,7 @@ from v2hdm import __version__
 from v2hdm.experiment.measures import Measured, Row
 from v2hdm.experiment.plan import RECIPES, ExperimentConfig
 from v2hdm.experiment.tables import NOTE, by_port, calibrations_table, markdown, results_table
-from v2hdm.files import replace_text
+from v2hdm.store.files import replace_text
 
 OPT_TO_CNI = 1.1
 """The optimised map is to be at most so many times as far off as one under a manual calibration (port1)."""

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.door import ShowVersion, answer_signals, open_door
+from v2hdm.cli.door import ShowVersion, answer_signals, open_door
 
 _INTERRUPTED = "interrupted; finished drives are kept, the same command goes on from there"
 
@@ -30,8 +30,8 @@ def _fleet(parsed: argparse.Namespace) -> int:
     from v2hdm.fleet.rows import exit_code
     from v2hdm.fleet.run import FleetOptions
     from v2hdm.fleet.view import fleet_on_terminal
-    from v2hdm.objects.bucket import is_url
     from v2hdm.settings import check_workers
+    from v2hdm.store.objects.bucket import is_url
 
     check_workers(parsed.workers)
     overrides = [one for one in parsed.drives if "=" in one and not Path(one).exists()]

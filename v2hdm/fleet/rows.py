@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from v2hdm.door import EXIT_FAILED_VERDICT, EXIT_USER_ERROR, one_line
+from v2hdm.cli.door import EXIT_FAILED_VERDICT, EXIT_USER_ERROR, one_line
 
 ERROR = "ERROR"
 """Status of a drive of which there is no result."""

@@ -9,8 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from v2hdm.caching.store import Store
-from v2hdm.door import told
+from v2hdm.cli.door import told
 from v2hdm.fleet.board import Telling
 from v2hdm.fleet.eyes import detect_by
 from v2hdm.fleet.plan import Job
@@ -18,6 +17,7 @@ from v2hdm.fleet.rows import Row
 from v2hdm.pipeline import RunConfig
 from v2hdm.pipeline.finished import RunResult
 from v2hdm.pipeline.places import in_place
+from v2hdm.store.cache.store import Store
 
 
 def map_drive(job: Job, eyes: Sequence[Any], board: Any, folder: str) -> tuple[Row, str]:

@@ -16,13 +16,13 @@ import numpy as np
 
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.drive import ReadOptions, read_drive
-from v2hdm.drive.tum import write_tum
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.rigid import heading_rad
-from v2hdm.hdmap.calibration import trusted_calibrations
-from v2hdm.hdmap.geojson import read_geojson
+from v2hdm.io.calibration.document import trusted_calibrations
+from v2hdm.io.drive import ReadOptions, read_drive
+from v2hdm.io.drive.tum import write_tum
+from v2hdm.io.maps.geojson import read_geojson
 from v2hdm.localization.figure import save_errors
 from v2hdm.localization.match import Markings, Seen, locate
 from v2hdm.localization.motion import State, predict, start
@@ -193,7 +193,7 @@ def localise_drive(parsed: argparse.Namespace) -> bool:
     """Localise a drive in a map, print the figures and write them with poses and picture.
 
     Args:
-        parsed: the arguments of :mod:`v2hdm.localize`.
+        parsed: the arguments of :mod:`v2hdm.cli.localize`.
 
     Returns:
         Whether the map explains the drive.

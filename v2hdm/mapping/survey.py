@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from v2hdm.adjust import ControlPoints, PoseSigma
-from v2hdm.hdmap.surveyed import match
+from v2hdm.io.maps.surveyed import match
 from v2hdm.mapping.options import ControlOptions, SurveyOptions
 from v2hdm.records import FloatArray, IntArray
 

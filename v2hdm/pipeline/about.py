@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from v2hdm import __version__
-from v2hdm.caching.keys import library_versions
-from v2hdm.drive import ReadOptions
-from v2hdm.drive.of_result import told_of
+from v2hdm.io.drive import ReadOptions
+from v2hdm.io.drive.of_result import told_of
 from v2hdm.records import Drive
+from v2hdm.store.cache.keys import library_versions
 
 
 def describe_run(name: str, drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[str, Any]:

@@ -8,12 +8,12 @@ import torch
 
 from v2hdm.detection.detector import Detector
 from v2hdm.errors import ConfigError
-from v2hdm.hdmap.formats import check_formats
+from v2hdm.io.maps.formats import check_formats
+from v2hdm.io.texts import shown, take_camera_name, take_name
 from v2hdm.mapping.options import INCREMENTAL, check_options
 from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.pipeline.survey import table_of
 from v2hdm.settings import COUNT, MOST_PROCESSES, NOT_NEGATIVE, POSITIVE, SEED, SHARE, Within, check_settings
-from v2hdm.texts import shown, take_camera_name, take_name
 
 _RANGES = {
     "workers": Within(0, MOST_PROCESSES),

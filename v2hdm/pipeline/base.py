@@ -12,15 +12,21 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from v2hdm.detection.batch import read_image
-from v2hdm.drive.road import lay_flat
-from v2hdm.drive.tum import read_tum
 from v2hdm.errors import MapFileError
-from v2hdm.files import load_json, take_array
-from v2hdm.hdmap.geojson import geojson_feature, geojson_positions, read_geojson, read_verdict, write_features
+from v2hdm.io.drive.road import lay_flat
+from v2hdm.io.drive.tum import read_tum
+from v2hdm.io.maps.geojson import (
+    geojson_feature,
+    geojson_positions,
+    read_geojson,
+    read_verdict,
+    write_features,
+)
 from v2hdm.mapping.changes.update import Base
 from v2hdm.pipeline.keys import base_files
 from v2hdm.records import Change, Changes, Drive, Fate, FloatArray, HdMap, Image
 from v2hdm.report.changes import save_changes
+from v2hdm.store.files import load_json, take_array
 
 _SITE_M = 40.0
 """A marking farther from all of a drive's route is not seen from it, m: twice what a camera reaches."""

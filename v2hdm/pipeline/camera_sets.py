@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from v2hdm.caching.room import Room
-from v2hdm.drive.truth import has_truth
+from v2hdm.io.drive.truth import has_truth
 from v2hdm.mapping.changes.update import Base
 from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mapping.methods import run_methods
@@ -21,6 +20,7 @@ from v2hdm.pipeline.viewer import Viewer
 from v2hdm.pipeline.write import BEST
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.check_points import CheckTable
+from v2hdm.store.cache.room import Room
 
 _log = logging.getLogger(__name__)
 

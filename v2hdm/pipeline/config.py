@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.drive import ReadOptions, drive_name
 from v2hdm.errors import ConfigError
+from v2hdm.io.drive import ReadOptions, drive_name
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.simulate import PortConfig
 

@@ -13,13 +13,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.caching.keys import key_of
-from v2hdm.caching.room import Room
 from v2hdm.detection.batch import Detect, detect_images, own_vehicles, with_masks
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.pipeline.keys import Contents, model_key
 from v2hdm.records import Drive, ImageDetections
+from v2hdm.store.cache.keys import key_of
+from v2hdm.store.cache.room import Room
 
 _log = logging.getLogger(__name__)
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.drive.truth import has_truth, read_truth
 from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
+from v2hdm.io.drive.truth import has_truth, read_truth
 from v2hdm.mapping.methods import run_naive
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.remedy import Inputs

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from v2hdm.caching.folders import note_use
-from v2hdm.caching.keys import code_key, key_of
-from v2hdm.caching.room import Room
-from v2hdm.caching.store import Store
 from v2hdm.errors import V2hdmError
-from v2hdm.outputs import files_of_result, is_whole
 from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.pipeline.keys import Contents, read_drives, result_key
-from v2hdm.quality.verdict import Verdict
 from v2hdm.simulate.port.drive import folder_of_port
+from v2hdm.store.cache.folders import note_use
+from v2hdm.store.cache.keys import code_key, key_of
+from v2hdm.store.cache.room import Room
+from v2hdm.store.cache.store import Store
+from v2hdm.store.outputs import files_of_result, is_whole
+from v2hdm.verdict.verdict import Verdict
 
 _log = logging.getLogger(__name__)
 

@@ -13,19 +13,19 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from v2hdm.caching.codec import CodecError, decode, encode
-from v2hdm.caching.keys import key_of
-from v2hdm.caching.store import Store
-from v2hdm.drive.mirror import mirrored
 from v2hdm.errors import ConfigError, V2hdmError
-from v2hdm.listing import LIST
-from v2hdm.objects.bucket import Bucket, is_url, place_of
-from v2hdm.objects.results import ResultObjects, contents_of
-from v2hdm.outputs import drop_result
+from v2hdm.io.importers.mirror import mirrored
+from v2hdm.io.texts import take_name
 from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.pipeline.finished import NOTHING_CHANGED, RunResult, finished, is_of, key_of_finished
 from v2hdm.pipeline.telling import Progress
-from v2hdm.texts import take_name
+from v2hdm.store.cache.codec import CodecError, decode, encode
+from v2hdm.store.cache.keys import key_of
+from v2hdm.store.cache.store import Store
+from v2hdm.store.listing import LIST
+from v2hdm.store.objects.bucket import Bucket, is_url, place_of
+from v2hdm.store.objects.results import ResultObjects, contents_of
+from v2hdm.store.outputs import drop_result
 
 _log = logging.getLogger(__name__)
 

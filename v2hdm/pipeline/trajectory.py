@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.drive.trajectory import interpolate
-from v2hdm.drive.tum import write_tum
-from v2hdm.files import replace_text
+from v2hdm.io.drive.trajectory import interpolate
+from v2hdm.io.drive.tum import write_tum
 from v2hdm.mapping.results import AdjustedPoses
 from v2hdm.records import Drive, FloatArray, Trajectory, Visit
+from v2hdm.store.files import replace_text
 
 _HEADER = "stamp_s,seen,forward_m,left_m,up_m,roll_rad,pitch_rad,heading_rad"
 

@@ -14,16 +14,13 @@ from typing import Any
 import torch  # noqa: F401  # its absence is told before that of what is built on it
 
 from v2hdm import __version__
-from v2hdm.caching.pruning import make_room
-from v2hdm.caching.room import Room
-from v2hdm.caching.store import Store
 from v2hdm.detection.batch import Detect, detect_images
 from v2hdm.detection.weights import unknown_network
-from v2hdm.drive import join_drives
 from v2hdm.errors import AdjustError, ConfigError, MappingError, V2hdmError
+from v2hdm.io.drive import join_drives
 from v2hdm.mapping.changes.update import Base
 from v2hdm.mapping.crew import ALONE, Crew
-from v2hdm.orthophoto.result import write_mosaic
+from v2hdm.mosaic.result import write_mosaic
 from v2hdm.pipeline.about import describe_run
 from v2hdm.pipeline.admit import admit
 from v2hdm.pipeline.base import changes_json, check_together, read_base
@@ -38,14 +35,17 @@ from v2hdm.pipeline.survey import Survey, check_survey, take_survey
 from v2hdm.pipeline.telling import Progress, log_file, logging_to, timed
 from v2hdm.pipeline.viewer import Unwatched, Viewer
 from v2hdm.pipeline.write import BEST, write_results
-from v2hdm.quality import Finding, Status, Verdict
-from v2hdm.quality.results.known_sizes import check_known_sizes
-from v2hdm.quality.results.result import check_result
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.check_points import write_check_points
 from v2hdm.report.outputs import result_folder, write_json
 from v2hdm.report.page.write import write_page
 from v2hdm.simulate import rendered_drive
+from v2hdm.store.cache.pruning import make_room
+from v2hdm.store.cache.room import Room
+from v2hdm.store.cache.store import Store
+from v2hdm.verdict import Finding, Status, Verdict
+from v2hdm.verdict.results.known_sizes import check_known_sizes
+from v2hdm.verdict.results.result import check_result
 
 log = logging.getLogger(__name__)
 

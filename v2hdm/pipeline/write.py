@@ -14,22 +14,22 @@ from v2hdm.detection.batch import read_image
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import facing_ipm, flat_motion, pinhole_px_from_ground
 from v2hdm.geometry.rigid import inverse
-from v2hdm.hdmap.calibration import Provenance, write_calibration
-from v2hdm.hdmap.calibration_formats import CALIBRATION_FORMATS, write_calibration_as
-from v2hdm.hdmap.exclusions import ExcludedMarking, write_exclusions
-from v2hdm.hdmap.formats import write_map
-from v2hdm.hdmap.geojson import write_geojson
-from v2hdm.hdmap.heights import with_heights
-from v2hdm.hdmap.residuals import FILE as RESIDUALS
-from v2hdm.hdmap.residuals import write_residuals
+from v2hdm.io.calibration.document import Provenance, write_calibration
+from v2hdm.io.calibration.formats import CALIBRATION_FORMATS, write_calibration_as
+from v2hdm.io.maps.exclusions import ExcludedMarking, write_exclusions
+from v2hdm.io.maps.formats import write_map
+from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.io.maps.heights import with_heights
+from v2hdm.io.maps.residuals import FILE as RESIDUALS
+from v2hdm.io.maps.residuals import write_residuals
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.base import write_changes
 from v2hdm.pipeline.evaluate import CameraSets, Judgement
 from v2hdm.pipeline.trajectory import write_trajectories
-from v2hdm.quality import Verdict
 from v2hdm.records import Calibration, Drive, FloatArray, HdMap, Image, ImageDetections
 from v2hdm.report.figures import save_birdseye, save_growth, save_overlay
 from v2hdm.report.outputs import write_json
+from v2hdm.verdict import Verdict
 
 _log = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ def write_results(
         metrics: what goes into ``metrics.json``.
         verdict: on the run.
         all_maps: whether to write the map of every method and camera set as well.
-        formats: those of the map, of :data:`v2hdm.hdmap.formats.FORMATS`.
+        formats: those of the map, of :data:`v2hdm.io.maps.formats.FORMATS`.
     """
     methods = list(sets.values())[-1]
     best, told = methods[BEST], verdict.as_json()

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from v2hdm.door import ShowVersion, answer_signals, open_door
+from v2hdm.cli.door import ShowVersion, answer_signals, open_door
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -21,9 +21,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _report(parsed: argparse.Namespace) -> None:
-    from v2hdm.drive.of_result import drive_of
-    from v2hdm.outputs import added_to
+    from v2hdm.io.drive.of_result import drive_of
     from v2hdm.report.page.write import write_page
+    from v2hdm.store.outputs import added_to
 
     drive = drive_of(parsed.folder, parsed.drive)
     with added_to(parsed.folder, "folder") as folder:

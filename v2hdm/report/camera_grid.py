@@ -10,13 +10,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from v2hdm.files import whole_file
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import Camera, CameraInfo, FloatArray
 from v2hdm.report.drawing import Pen, draw_lines, with_legend
 from v2hdm.report.style import OKABE_ITO
+from v2hdm.store.files import whole_file
 
 _FARTHEST_M = 40.0
 """Lines farther along the view lie on top of each other near the horizon."""

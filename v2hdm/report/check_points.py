@@ -22,11 +22,11 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.stats import chi2
 
-from v2hdm.drive.survey import SurveyedPoint
-from v2hdm.files import replace_text
-from v2hdm.hdmap.features import features_of
-from v2hdm.hdmap.surveyed import match
+from v2hdm.io.drive.survey import SurveyedPoint
+from v2hdm.io.maps.features import features_of
+from v2hdm.io.maps.surveyed import match
 from v2hdm.records import FloatArray, HdMap, IntArray
+from v2hdm.store.files import replace_text
 
 JointCovariance = Callable[[IntArray, IntArray], FloatArray]
 """Joint covariance (2N, 2N), m^2, of the corners (N,) of markings (N,) of a map, stacked x0, y0, x1, ..."""
@@ -185,7 +185,7 @@ def compare(
 ) -> CheckTable:
     """Hold check points against the corners of a map.
 
-    Which corner a point is of, :func:`v2hdm.hdmap.surveyed.match` decides; what is reported is how far the
+    Which corner a point is of, :func:`v2hdm.io.maps.surveyed.match` decides; what is reported is how far the
     two are apart, of every point that has a corner within reach.
 
     Args:

@@ -11,12 +11,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 
-from v2hdm.files import whole_file
 from v2hdm.geometry.ipm import apply_in_front
 from v2hdm.geometry.lens import distort_points
 from v2hdm.records import CameraInfo, FloatArray, HdMap, Truth
 from v2hdm.report import metrics, style
 from v2hdm.report.drawing import Pen, draw_lines, with_legend
+from v2hdm.store.files import whole_file
 
 _HEIGHT_IN = 7.6
 _BESIDE_ROUTE_M = 12.0

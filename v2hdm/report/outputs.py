@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from v2hdm.files import replace_text
-from v2hdm.outputs import result_folder
+from v2hdm.store.files import replace_text
+from v2hdm.store.outputs import result_folder
 
 __all__ = ["result_folder", "write_json"]
 

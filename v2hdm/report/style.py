@@ -11,7 +11,7 @@ import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from v2hdm.files import whole_file
+from v2hdm.store.files import whole_file
 
 OKABE_ITO = {
     "orange": "#e69f00",

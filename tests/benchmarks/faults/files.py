@@ -125,10 +125,10 @@ def damaged_results(order: Order) -> Iterator[Row]:
             yield from _told(order, situation, "out/run/*.[gjty][esua]*")
     for source, form in (("map.geojson", "csv"), ("calibration_front.yaml", "kalibr")):
         words = (f"out/run/{source}", "--format", form, "--output", "there")
-        case = Case(f"export {source}", "v2hdm.export", words, done, "")
+        case = Case(f"export {source}", "v2hdm.cli.export", words, done, "")
         yield from _told(order, Situation(case, grows=True), f"out/run/{source}")
     words = ("out/run/calibration_front.yaml", "out/run")
-    compare = Case("compare calibrations", "v2hdm.calibration", words, done, "")
+    compare = Case("compare calibrations", "v2hdm.cli.calibration", words, done, "")
     yield from _told(order, Situation(compare), "out/run/calibration_front.yaml")
 
 

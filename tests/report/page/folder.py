@@ -8,13 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from v2hdm.drive import Trajectory, write_drive
-from v2hdm.drive.tum import write_tum
 from v2hdm.geometry.ipm import ipm_from_extrinsic, project_ground
-from v2hdm.hdmap.calibration import write_calibration
-from v2hdm.hdmap.exclusions import ExcludedMarking, write_exclusions
-from v2hdm.hdmap.geojson import write_geojson
-from v2hdm.hdmap.residuals import Residuals, write_residuals
+from v2hdm.io.calibration.document import write_calibration
+from v2hdm.io.drive import Trajectory, write_drive
+from v2hdm.io.drive.tum import write_tum
+from v2hdm.io.maps.exclusions import ExcludedMarking, write_exclusions
+from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.io.maps.residuals import Residuals, write_residuals
 from v2hdm.records import (
     ARROW,
     DIAMOND,

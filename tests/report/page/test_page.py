@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from tests.report.page.folder import DIAMOND_M, INFO, NASTY_NAME, PLACES, SHIFT_PX, make_result, make_site
-from v2hdm.drive import read_drive
-from v2hdm.drive.of_result import drive_of
 from v2hdm.errors import DriveError, MapFileError
-from v2hdm.hdmap.residuals import COLUMNS, read_residuals
+from v2hdm.io.drive import read_drive
+from v2hdm.io.drive.of_result import drive_of
+from v2hdm.io.maps.residuals import COLUMNS, read_residuals
 from v2hdm.records import DIAMOND, Drive, Marking
 from v2hdm.report.__main__ import main
 from v2hdm.report.outputs import write_json

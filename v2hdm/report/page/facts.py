@@ -11,19 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.drive.trajectory import interpolate
-from v2hdm.drive.truth import read_truth
-from v2hdm.drive.tum import read_tum
 from v2hdm.errors import MapFileError
-from v2hdm.files import load_json, load_yaml, read_text
 from v2hdm.geometry.rigid import inverse
-from v2hdm.hdmap.calibration import read_calibration
-from v2hdm.hdmap.exclusions import ExcludedMarking, read_exclusions
-from v2hdm.hdmap.features import features_of
-from v2hdm.hdmap.geojson import read_geojson
-from v2hdm.hdmap.residuals import FILE as RESIDUALS
-from v2hdm.hdmap.residuals import Residuals, read_residuals
+from v2hdm.io.calibration.document import read_calibration
+from v2hdm.io.drive.trajectory import interpolate
+from v2hdm.io.drive.truth import read_truth
+from v2hdm.io.drive.tum import read_tum
+from v2hdm.io.maps.exclusions import ExcludedMarking, read_exclusions
+from v2hdm.io.maps.features import features_of
+from v2hdm.io.maps.geojson import read_geojson
+from v2hdm.io.maps.residuals import FILE as RESIDUALS
+from v2hdm.io.maps.residuals import Residuals, read_residuals
 from v2hdm.records import BoolArray, Calibration, Drive, FloatArray, HdMap, Trajectory, Truth
+from v2hdm.store.files import load_json, load_yaml, read_text
 
 BEST = "Opt"
 """The method whose map is the run's result, as ``metrics.json`` names it."""

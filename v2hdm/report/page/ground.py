@@ -1,4 +1,4 @@
-"""The mosaic of the ground, where ``python -m v2hdm.mosaic`` has put one into the folder (docs/mosaic.md)."""
+"""The mosaic of the ground, where ``python -m v2hdm.cli.mosaic`` has put one into the folder (docs/mosaic.md)."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import MapFileError
-from v2hdm.files import load_json, take_array, take_mapping, take_text
 from v2hdm.report.page.coding import as_base64, jpeg
+from v2hdm.store.files import load_json, take_array, take_mapping, take_text
 
 EXTENT, COMPARISON = "mosaic.json", "mosaic_before_after.png"
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import jinja2
 
-from v2hdm.files import replace_text
 from v2hdm.records import Drive
 from v2hdm.report.page.document import document
 from v2hdm.report.page.facts import read_facts
+from v2hdm.store.files import replace_text
 
 FILE = "report.html"
 """Name of the page in a result folder."""

@@ -15,22 +15,22 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from v2hdm.caching.folders import note_use
-from v2hdm.drive import write_drive
-from v2hdm.drive.folder import DRIVE_FILE, TRUTH_FOLDER
-from v2hdm.drive.truth import write_truth
-from v2hdm.drive.tum import read_image_list
 from v2hdm.errors import DriveError
-from v2hdm.files import whole_file
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.rigid import ground_in_vehicle
-from v2hdm.pixels import read_header
+from v2hdm.io.drive import write_drive
+from v2hdm.io.drive.folder import DRIVE_FILE, TRUTH_FOLDER
+from v2hdm.io.drive.truth import write_truth
+from v2hdm.io.drive.tum import read_image_list
+from v2hdm.io.pixels import read_header
 from v2hdm.records import Drive, Image, Truth
 from v2hdm.simulate.port.build import Port, build_port
 from v2hdm.simulate.port.config import AlteredConfig, PortConfig
 from v2hdm.simulate.port.disturbance import measured_disturbances, pose_noise
 from v2hdm.simulate.port.visibility import points_seen, quad_samples
 from v2hdm.simulate.render.renderer import RENDERER_VERSION
+from v2hdm.store.cache.folders import note_use
+from v2hdm.store.files import whole_file
 from v2hdm.workers import share_out
 
 Progress = Callable[[int, int], None]

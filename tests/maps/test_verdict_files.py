@@ -1,0 +1,65 @@
+"""The verdict, the clocks and what was left out, beside map and calibration."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from v2hdm.errors import MapFileError
+from v2hdm.io.calibration.document import read_calibration, write_calibration
+from v2hdm.io.maps.exclusions import ExcludedMarking, write_exclusions
+from v2hdm.io.maps.geojson import read_geojson, read_verdict, write_geojson
+from v2hdm.records import Calibration, CameraInfo, GeodeticOrigin, HdMap, Marking, Road
+from v2hdm.store.files import load_yaml
+
+VERDICT = {"status": "WARN", "findings": [{"check": "clock", "says": "late"}], "passed": []}
+MAP = HdMap((Marking("diamond", np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), 3),))
+CALIBRATION = Calibration(CameraInfo("front", 640, 480, np.diag([500.0, 500.0, 1.0])), np.eye(4))
+
+
+def test_a_map_keeps_the_verdict_on_it(tmp_path: Path) -> None:
+    write_geojson(MAP, tmp_path / "map.geojson", VERDICT)
+    assert read_verdict(tmp_path / "map.geojson") == VERDICT
+    np.testing.assert_array_equal(
+        read_geojson(tmp_path / "map.geojson").markings[0].corners_map, MAP.markings[0].corners_map
+    )
+
+
+def test_a_map_without_a_verdict_has_none(tmp_path: Path) -> None:
+    write_geojson(MAP, tmp_path / "map.geojson")
+    assert read_verdict(tmp_path / "map.geojson") is None
+
+
+@pytest.mark.parametrize(("sigma_s", "known"), [(0.001, True), (float("inf"), False)])
+def test_a_calibration_says_the_clock_and_the_verdict(tmp_path: Path, sigma_s: float, known: bool) -> None:
+    calibration = Calibration(CALIBRATION.info, _looking_down())
+    path = tmp_path / "front.yaml"
+    write_calibration(calibration, path, clock_s=(0.06, sigma_s), verdict=VERDICT)
+    content = load_yaml(path, MapFileError)
+    assert content["clock_offset_s"] == 0.06
+    assert ("clock_sigma_s" in content) is known
+    assert content["verdict"] == VERDICT
+    np.testing.assert_allclose(read_calibration(path).cam_from_vehicle, _looking_down())
+
+
+def test_what_was_left_out_is_a_point_with_its_reason(tmp_path: Path) -> None:
+    one = ExcludedMarking("diamond", np.array([3.0, 4.0]), 2, "seen once", "front")
+    road = Road(np.array([[3.0, 4.0]]), np.array([46.2]), np.zeros((1, 2)))
+    write_exclusions([one], tmp_path / "excluded.geojson", None, road)
+    (feature,) = json.loads((tmp_path / "excluded.geojson").read_text())["features"]
+    assert feature["geometry"] == {"type": "Point", "coordinates": [3.0, 4.0, 46.2]}
+    assert feature["properties"]["reason"] == "seen once"
+    assert feature["properties"]["cameras"] == "front"
+    write_exclusions([one], tmp_path / "wgs.geojson", GeodeticOrigin(48.0, 11.0, 500.0), None)
+    (feature,) = json.loads((tmp_path / "wgs.geojson").read_text())["features"]
+    assert feature["geometry"]["coordinates"][:2] == pytest.approx([11.0, 48.0], abs=1e-3)
+
+
+def _looking_down() -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]
+    matrix[2, 3] = 2.0
+    return matrix

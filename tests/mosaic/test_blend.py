@@ -1,0 +1,148 @@
+"""The mosaic shows the ground as it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.mosaic import scene
+from v2hdm.errors import ConfigError, DriveError
+from v2hdm.geometry.ipm import apply_homography
+from v2hdm.geometry.lens import distort_points
+from v2hdm.mosaic import blend as module
+from v2hdm.mosaic.blend import WARP_ERROR_PX, Tiling, whole
+from v2hdm.mosaic.canvas import Canvas
+from v2hdm.mosaic.shots import FEATHER, Lens, Shot, adjusted_shots, lens_of, recorded_shots
+from v2hdm.records import Calibration, Drive
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
+    return scene.drive_of(tmp_path_factory.mktemp("drive"), scene.waves)
+
+
+def lenses(drive: Drive) -> dict[str, Lens]:
+    return {"front": lens_of(drive.cameras["front"], scene.cam_from_vehicle())}
+
+
+def points_of(canvas: Canvas) -> np.ndarray:
+    at = np.stack(np.meshgrid(np.arange(canvas.columns), np.arange(canvas.rows)), axis=-1).astype(float)
+    return apply_homography(canvas.map_from_canvas, at.reshape(-1, 2)).reshape(at.shape)
+
+
+@pytest.mark.parametrize("right", [(1.0, 0.0), (0.6, -0.8)])
+def test_a_mosaic_shows_the_ground_where_it_lies(drive: Drive, right: tuple[float, float]) -> None:
+    """Lens, mounting, pose, axes and weights in one: images made from the ground give that ground back."""
+    canvas = Canvas(np.array([6.5, 2.5]), 0.02, 220, 240, right)
+    rgba = whole(canvas, recorded_shots(drive), lenses(drive))
+    seen = rgba[..., 3] == 255
+    assert seen.mean() > 0.5
+    off = np.abs(rgba[..., 0].astype(float) - scene.waves(points_of(canvas)))[seen]
+    assert np.median(off) < 1.0
+    assert off.max() < 6.0
+
+
+def test_the_result_does_not_depend_on_the_size_of_sheets(
+    drive: Drive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    canvas = Canvas(np.array([5.0, 3.0]), 0.02, 300, 400)
+    at_once = whole(canvas, recorded_shots(drive), lenses(drive))
+    monkeypatch.setattr(module, "SHEET_PX", 128)
+    monkeypatch.setattr(module, "_KEPT_IMAGES", 2)
+    in_sheets = whole(canvas, recorded_shots(drive), lenses(drive))
+    assert np.abs(at_once.astype(int) - in_sheets).max() <= 1
+
+
+def test_images_count_with_the_number_of_pixels_that_they_show_ground_with(tmp_path: Path) -> None:
+    """Two images of one grey each, one from nearer: the density by finite differences gives the mixture."""
+    drive = scene.drive_of(tmp_path, lambda points: np.full(points.shape[:-1], 100.0))
+    cv2.imwrite(str(drive.images[4].path), np.full((270, 480, 3), 200, np.uint8))
+    two = [recorded_shots(drive)[k] for k in (0, 4)]
+    lens = lenses(drive)
+    place = np.array([8.0, 0.2])
+    canvas = Canvas(place - [0.01, -0.01], 0.02, 1, 1)
+    shares = []
+    for shot in two:
+        step = 1e-5
+        corners = apply_homography(
+            shot.pinhole_px_from_map, place + step * np.array([[0, 0], [1, 0], [0, 1]])
+        )
+        density = abs(np.linalg.det((corners[1:] - corners[0]) / step))
+        u, v = np.round(distort_points(scene.INFO, corners[:1])[0]).astype(int)
+        assert lens["front"].trust[v, u] == 1
+        shares.append(density)
+    expected = (100 * shares[0] + 200 * shares[1]) / sum(shares)
+    assert whole(canvas, two, lens)[0, 0, 0] == pytest.approx(expected, abs=1)
+
+
+def test_the_own_vehicle_and_what_lies_outside_of_the_roi_are_left_out(drive: Drive) -> None:
+    mask = np.zeros((270, 480), dtype=bool)
+    mask[:, :240] = True
+    camera = replace(drive.cameras["front"], own_vehicle=mask)
+    lens = lens_of(camera, scene.cam_from_vehicle())
+    shot = recorded_shots(drive)[0]
+    canvas = Canvas(np.array([4.0, 4.0]), 0.02, 400, 450)
+    rgba, points = whole(canvas, [shot], {"front": lens}), points_of(canvas)
+    seen = rgba[..., 3] > 0
+    assert seen.any()
+    assert points[seen][:, 1].max() < 0.15
+    assert points[seen][:, 0].max() < 11.2  # a pixel shows 10 cm of ground there
+
+
+def test_trust_rises_from_the_edge_of_the_roi_over_the_feather(drive: Drive) -> None:
+    trust = lenses(drive)["front"].trust
+    edge = np.flatnonzero(trust[:, 240])
+    feather_px = round(FEATHER * 270)
+    rise = np.diff(trust[edge[0] : edge[0] + feather_px // 2, 240])
+    np.testing.assert_allclose(rise, 1 / feather_px, rtol=0.05)
+
+
+def test_tiles_are_as_large_as_the_warp_stays_exact_and_a_coarse_canvas_is_refused(drive: Drive) -> None:
+    shots, lens = recorded_shots(drive), lenses(drive)
+    fine, coarse = (Canvas(np.zeros(2), cell, 9, 9) for cell in (0.01, 0.04))
+    sides = [Tiling.of(canvas, shots, lens).side_px for canvas in (fine, coarse)]
+    assert sides[0] > sides[1]
+    for canvas, side in zip((fine, coarse), sides, strict=True):
+        assert Tiling(side).error_px(canvas.cell_m, shots[0], lens["front"]) <= WARP_ERROR_PX
+    with pytest.raises(ConfigError, match="too coarse"):
+        Tiling.of(Canvas(np.zeros(2), 1.0, 9, 9), shots, lens)
+
+
+def test_tiles_under_a_polygon_are_all_that_it_touches_and_few_else() -> None:
+    generator = np.random.default_rng(3)
+    for _ in range(20):
+        points = generator.uniform(0, 900, (5, 2)).astype(np.float32)
+        polygon = cv2.convexHull(points)[:, 0].astype(float)
+        found = {tuple(tile) for tile in module._tiles_under(polygon, np.array([8, 8]), 128)}
+        weights = generator.dirichlet(np.ones(len(polygon)), 4000)
+        touched = {tuple(t) for t in np.floor((weights @ polygon + 0.5) / 128).astype(int)}
+        assert {t for t in touched if max(t) < 8} <= found
+        box = np.floor(polygon.min(axis=0) / 128), np.floor(polygon.max(axis=0) / 128)
+        assert all((t >= box[0] - 1).all() and (t <= box[1] + 1).all() for t in map(np.array, found))
+
+
+def test_a_sloping_road_is_undone_and_clocks_are_kept(drive: Drive) -> None:
+    """Poses written in the recorded frame come back to the flat one, at the time that the image was taken."""
+    up = np.eye(4)
+    up[2, 3] = 3.0
+    sloped = replace(drive.recorded, map_from_vehicle=up @ drive.trajectory.map_from_vehicle)
+    calibrations = {"front": Calibration(scene.INFO, scene.cam_from_vehicle())}
+    on_slope = replace(drive, recorded=sloped)
+    flat = adjusted_shots(drive, calibrations, {"front": 0.0}, drive.trajectory)
+    same = adjusted_shots(on_slope, calibrations, {"front": 0.0}, sloped)
+    later = adjusted_shots(drive, calibrations, {"front": 0.1}, drive.trajectory)
+    for k in range(len(flat) - 1):
+        np.testing.assert_allclose(same[k].pinhole_px_from_map, flat[k].pinhole_px_from_map, atol=1e-6)
+        np.testing.assert_allclose(later[k].pinhole_px_from_map, flat[k + 1].pinhole_px_from_map, atol=1e-6)
+
+
+def test_an_image_of_another_size_is_named(drive: Drive, tmp_path: Path) -> None:
+    path = tmp_path / "small.png"
+    cv2.imwrite(str(path), np.zeros((20, 30, 3), np.uint8))
+    shot = Shot(path, "front", recorded_shots(drive)[0].pinhole_px_from_map)
+    with pytest.raises(DriveError, match=r"small.png: the image is 30x20"):
+        whole(Canvas(np.array([6.0, 1.0]), 0.02, 50, 50), [shot], lenses(drive))

@@ -1,0 +1,89 @@
+"""Rates, gaps, repeats and overlap of stamps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from tests.verdict.drives import drive, motion, poses, raised
+from v2hdm.io.importers.stamp_units import why_no_pose
+from v2hdm.records import Trajectory
+from v2hdm.verdict import Status
+from v2hdm.verdict.inputs.clocks import check_clocks
+
+
+def every(recorded: Trajectory, rows: np.ndarray) -> Trajectory:
+    return Trajectory(recorded.stamp_s[rows], recorded.map_from_vehicle[rows])
+
+
+def check(recorded: Trajectory) -> dict[str, str]:
+    return raised(check_clocks(drive(poses()), motion(recorded)))
+
+
+def test_twenty_poses_a_second_without_gaps_pass() -> None:
+    assert not check(poses())
+
+
+def test_one_pose_a_second_is_too_few() -> None:
+    assert "poses are 1.00 s apart" in check(every(poses(), np.arange(0, 320, 20)))["pose rate"]
+
+
+def test_a_gap_on_the_way_is_told_with_its_error() -> None:
+    kept = np.delete(np.arange(320), np.arange(100, 120))
+    told = check(every(poses(), kept))
+    assert list(told) == ["pose gaps"]
+    assert "gap of 1.05 s" in told["pose gaps"]
+
+
+def test_a_log_faster_than_its_receiver_repeats_poses() -> None:
+    recorded = poses()
+    held = every(recorded, np.arange(320) // 5 * 5)
+    told = check(Trajectory(recorded.stamp_s, held.map_from_vehicle))
+    assert list(told) == ["repeated poses"]
+    assert "80 %" in told["repeated poses"]
+
+
+def test_a_vehicle_that_stands_repeats_poses_and_is_fine() -> None:
+    recorded = poses(turn_s=0.0)
+    stand = np.full(200, len(recorded.stamp_s) - 1)
+    matrices = np.concatenate([recorded.map_from_vehicle, recorded.map_from_vehicle[stand]])
+    assert not check(Trajectory(np.arange(len(matrices)) / 20, matrices))
+
+
+def test_images_without_pose_are_counted() -> None:
+    some = replace(drive(poses()), unposed={"front": 20})
+    found = {finding.check: finding for finding in check_clocks(some, motion(poses()))}["images without pose"]
+    assert found.status is Status.WARN
+    assert "20 of 100 images" in found.says
+    most = replace(some, unposed={"front": 200})
+    found = {finding.check: finding for finding in check_clocks(most, motion(poses()))}["images without pose"]
+    assert found.status is Status.FAIL
+
+
+def test_a_camera_that_stops_early_is_told() -> None:
+    whole = drive(poses(), ("front", "rear"))
+    images = [image for image in whole.images if image.camera == "front" or image.stamp_s < 8]
+    told = raised(check_clocks(replace(whole, images=images), motion(poses())))
+    assert "misses 51 %" in told["camera span"]
+
+
+def test_images_farther_apart_than_half_the_roi_are_too_few() -> None:
+    told = raised(check_clocks(drive(poses(), every=20), motion(poses())))
+    assert "5.0 m apart and the ROI is 7.0 m deep" in told["image spacing"]
+
+
+def test_the_unit_of_stamps_is_named() -> None:
+    seconds = np.arange(0.0, 20.0, 0.1)
+    for unit, factor in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
+        assert f"images' stamps are in {unit}" in why_no_pose(factor * seconds, seconds, 0.5)
+        assert f"poses' stamps are in {unit}" in why_no_pose(seconds, factor * seconds, 0.5)
+        assert f"all stamps are in {unit}" in why_no_pose(factor * seconds, factor * seconds, 0.5)
+    since_1970 = 1.7e9 + seconds
+    assert "images' stamps are in nanoseconds" in why_no_pose(1e9 * since_1970, since_1970, 0.5)
+
+
+def test_another_epoch_is_told_from_another_unit() -> None:
+    seconds = np.arange(0.0, 20.0, 0.1)
+    assert "1700000000 s later" in why_no_pose(seconds, 1.7e9 + seconds, 0.5)
+    assert "1 s apart, more than max_gap_s 0.5" in why_no_pose(seconds + 0.05, np.arange(0.0, 20.0), 0.5)

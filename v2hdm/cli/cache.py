@@ -1,0 +1,90 @@
+"""The cache door: ``python -m v2hdm.cli.cache list`` says what is kept; ``prune`` and ``verify`` mend it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from v2hdm.cli.door import ShowVersion, answer_signals, open_door
+
+if TYPE_CHECKING:
+    from v2hdm.store.cache.pruning import Kept
+
+_INTERRUPTED = "interrupted; what was removed so far is made anew when it is needed"
+_GB = 1e9
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the door; the exit code is 0, or 2 where a user must mend something."""
+    parsed = _parser().parse_args(arguments)
+    return open_door("v2hdm.cli.cache", None, _INTERRUPTED, lambda: _work(parsed))
+
+
+def _work(parsed: argparse.Namespace) -> None:
+    from v2hdm.errors import ConfigError
+    from v2hdm.store.cache.distant import items_at
+    from v2hdm.store.cache.pruning import items_of, prune, remove_damaged, remove_to
+    from v2hdm.store.objects.bucket import place_of
+
+    cache = place_of(parsed.cache, "--cache")
+
+    def kept() -> Sequence[Kept]:
+        return items_of(cache) if isinstance(cache, Path) else items_at(cache)
+
+    if isinstance(cache, Path) and not cache.is_dir():
+        raise ConfigError(f"{cache}: no such folder; give the cache of your runs with --cache")
+    if parsed.what == "list":
+        _show(kept(), "last used" if isinstance(cache, Path) else "last written")
+    elif parsed.what == "prune":
+        if not parsed.gb >= 0:
+            raise ConfigError(f"--gb {parsed.gb:g}: give 0 or more")
+        limit = parsed.gb * _GB
+        removed = prune(cache, limit) if isinstance(cache, Path) else remove_to(kept(), limit)
+        freed, left = sum(item.size for item in removed), sum(item.size for item in kept())
+        print(f"removed {len(removed)} entries of {_size(freed)}; {_size(left)} are left")
+    else:
+        items = kept()
+        damaged = remove_damaged(items)
+        for item in damaged:
+            print(f"{item.path}: is damaged and was removed; the next run makes it anew")
+        print(f"read {len(items)} entries, {len(damaged)} of them damaged")
+
+
+def _show(items: Sequence[Kept], when: str) -> None:
+    kinds = sorted({item.kind for item in items})
+    print(f"{'what':<20}{'entries':>8}{'size':>12}  {when}")
+    for kind in kinds:
+        own = [item for item in items if item.kind == kind]
+        used = time.strftime("%Y-%m-%d %H:%M", time.localtime(max(item.used_s for item in own)))
+        print(f"{kind:<20}{len(own):>8}{_size(sum(item.size for item in own)):>12}  {used}")
+    print(f"{'all':<20}{len(items):>8}{_size(sum(item.size for item in items)):>12}")
+
+
+def _size(size: int) -> str:
+    return f"{size / _GB:.2f} GB" if size >= _GB else f"{size / 1e6:.1f} MB"
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m v2hdm.cli.cache", description="What the cache of runs keeps (docs/cache.md)."
+    )
+    parser.add_argument("--version", action=ShowVersion)
+    actions = parser.add_subparsers(dest="what", required=True)
+    shown = actions.add_parser("list", help="say what is kept, how large it is, and when it was last used")
+    pruned = actions.add_parser(
+        "prune", help="remove what was not used for longest, and what killed runs left"
+    )
+    pruned.add_argument("--gb", type=float, required=True, help="what may stay, GB; 0 empties the cache")
+    verified = actions.add_parser("verify", help="read every entry and remove those that are damaged")
+    for action in (shown, pruned, verified):
+        action.add_argument("--cache", default="cache", help="the folder or URL (default: cache)")
+    return parser
+
+
+if __name__ == "__main__":
+    answer_signals()
+    sys.exit(main())

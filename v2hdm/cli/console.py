@@ -1,0 +1,67 @@
+"""A run on the terminal: progress bars, the log, and the table that ends it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from v2hdm import pipeline
+from v2hdm.pipeline.config import run_name
+from v2hdm.pipeline.telling import logging_to
+from v2hdm.progress import progress_lines
+from v2hdm.report.table import changes_table, results_table
+from v2hdm.verdict import Status, Verdict
+from v2hdm.viewer import RerunViewer, check_viewer
+
+_STYLES = {Status.PASS: "bold green", Status.WARN: "bold yellow", Status.FAIL: "bold red"}
+
+
+def run_on_terminal(config: pipeline.RunConfig, config_yaml: str) -> Verdict:
+    """Run the pipeline, show what it does and found, and return the verdict on it."""
+    console = Console()
+    handler = RichHandler(logging.INFO, console, show_path=False, show_level=False, log_time_format="%X")
+    viewer = RerunViewer(run_name(config)) if check_viewer(config.viewer) else None
+    with logging_to(handler), _bars(console) as progress:
+        result = pipeline.run(config, config_yaml, progress, viewer)
+    console.print()
+    for line in result.headlines:
+        console.print(line, highlight=False)
+    if result.metrics["results"]:
+        console.print(results_table(result.metrics["name"], result.metrics["results"]))
+    if "changes" in result.metrics:
+        console.print(changes_table(result.metrics["changes"]))
+    style = _STYLES[result.verdict.status]
+    for number, line in enumerate(result.verdict.lines):
+        console.print(
+            line, style=style if number == 0 else None, highlight=False, markup=False, soft_wrap=True
+        )
+    console.print(f"results in {result.place}: open report.html", highlight=False, soft_wrap=True)
+    return result.verdict
+
+
+@contextmanager
+def _bars(console: Console) -> Iterator[pipeline.Progress]:
+    """A progress bar per task, made the first time that a task reports; lines where there is no terminal."""
+    if not console.is_terminal:
+        yield progress_lines(console.print)
+        return
+    columns = (
+        TextColumn("{task.description:<28}"),
+        BarColumn(40),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as bars:
+        tasks = {}
+
+        def advance(task: str, done: int, total: int) -> None:
+            if task not in tasks:
+                tasks[task] = bars.add_task(task, total=total)
+            bars.update(tasks[task], completed=done, total=total)
+
+        yield advance

@@ -1,0 +1,100 @@
+"""A drive on disk to records: one reader a format, one registry of readers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from v2hdm.errors import DriveError
+from v2hdm.io.drive.clock import with_clock_offsets
+from v2hdm.io.drive.folder import (
+    folder_drive_name,
+    is_folder_drive,
+    read_description,
+    read_folder_drive,
+    write_drive,
+)
+from v2hdm.io.drive.join import join_drives
+from v2hdm.io.drive.kitti import is_kitti_drive, read_kitti_drive
+from v2hdm.io.drive.options import KittiOptions, ReadOptions
+from v2hdm.io.drive.part import part_of
+from v2hdm.io.importers.bag.bare import describe_bag
+from v2hdm.io.importers.bag.reading import is_bag
+from v2hdm.io.importers.nuscenes import is_nuscenes_drive, read_nuscenes_drive
+from v2hdm.records import Drive, Trajectory
+
+__all__ = [
+    "READERS",
+    "KittiOptions",
+    "ReadOptions",
+    "Reader",
+    "Trajectory",
+    "drive_name",
+    "join_drives",
+    "read_drive",
+    "with_clock_offsets",
+    "write_drive",
+]
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One format: ``accepts`` a path by a look at it, ``read`` makes a drive of it."""
+
+    accepts: Callable[[Path], bool]
+    read: Callable[[Path, ReadOptions], Drive]
+
+
+def _read_bag(path: Path, options: ReadOptions) -> Drive:
+    path = path.resolve()
+    return read_description(describe_bag(path, Path(options.cache)), path.parent, str(path), options)
+
+
+READERS: Mapping[str, Reader] = {
+    "folder": Reader(accepts=is_folder_drive, read=read_folder_drive),
+    "kitti": Reader(accepts=is_kitti_drive, read=read_kitti_drive),
+    "nuscenes": Reader(accepts=is_nuscenes_drive, read=read_nuscenes_drive),
+    "bag": Reader(accepts=is_bag, read=_read_bag),
+}
+
+
+def read_drive(path: Path, options: ReadOptions | None = None) -> Drive:
+    """Read the drive at ``path`` in whatever format it is.
+
+    Every image gets the vehicle's pose at its time: position linear, rotation slerp, never
+    extrapolated, not across a gap longer than ``options.max_gap_s``; images without a pose are
+    dropped with a logged count. All image files are checked for presence, completeness and size. Then
+    those are taken that ``options.start_s``, ``end_s`` and ``limit`` ask for.
+
+    Raises:
+        DriveError: naming what is wrong, where, and what to do about it.
+    """
+    options = options or ReadOptions()
+    if not path.exists():
+        raise DriveError(f"{path}: no such drive folder or bag; check drive.path")
+    if options.max_gap_s <= 0:
+        raise DriveError(f"max_gap_s is {options.max_gap_s:g}; give a positive number of seconds")
+    if options.format != "auto":
+        if options.format not in READERS:
+            raise DriveError(
+                f"unknown drive format '{options.format}'; choose from: auto, {', '.join(READERS)}"
+            )
+        return part_of(READERS[options.format].read(path, options), options)
+    for reader in READERS.values():
+        if reader.accepts(path):
+            return part_of(reader.read(path, options), options)
+    raise DriveError(
+        f"{path}: not a drive in any known format ({', '.join(READERS)}); see docs/drive-format.md"
+    )
+
+
+def drive_name(path: Path) -> str:
+    """What the drive at ``path`` is called: by its ``drive.yaml``, else like its folder.
+
+    Raises:
+        DriveError: when ``drive.yaml`` cannot be read or names it otherwise than by text.
+    """
+    if is_folder_drive(path):
+        return folder_drive_name(path)
+    return path.resolve().stem if is_bag(path) else path.resolve().name

@@ -1,0 +1,204 @@
+"""A KITTI raw drive: ``<date>/<date>_drive_<number>_sync`` with its calibration in ``<date>``.
+
+The vehicle frame has its origin on the road under the IMU, which sits near the rear axle. The map
+is the local tangent plane at the first pose, with the road laid flat into z = 0. docs/kitti.md
+gives the reasons for what the format leaves open.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from v2hdm.errors import DriveError
+from v2hdm.geometry.geodetic import enu_from_geodetic, geodetic_from_enu
+from v2hdm.geometry.ipm import ipm_from_extrinsic
+from v2hdm.geometry.rigid import rotation_from_euler
+from v2hdm.io.drive.images import ImageFiles, check_image_files, count_unposed, pose_images, select_cameras
+from v2hdm.io.drive.kitti_calibration import KittiCamera, read_kitti_camera
+from v2hdm.io.drive.options import KittiOptions, ReadOptions
+from v2hdm.io.drive.road import lay_flat, tell
+from v2hdm.io.drive.trajectory import check_geodetic, check_trajectory
+from v2hdm.records import (
+    Camera,
+    CentrePrior,
+    Drive,
+    FloatArray,
+    GeodeticOrigin,
+    PoseNoise,
+    Trajectory,
+)
+from v2hdm.store.files import read_text
+
+_log = logging.getLogger(__name__)
+
+_CAMERAS = ("image_00", "image_01", "image_02", "image_03")
+_SUFFIXES = (".png", ".jpg", ".jpeg")
+_OXTS_COLUMNS = 30
+_POSE_NOISE = PoseNoise(
+    position_m=0.032,
+    position_drift_m=0.03,
+    heading_rad=0.001,
+    heading_drift_rad=0.0009,
+    heading_drift_over_m=30.0,
+    roll_pitch_rad=0.002,
+    roll_pitch_drift_rad=0.0014,
+)
+"""Of the data sheet's 0.1 m and 0.1 deg most is drift that a stretch of road in view shares.
+
+What else there is wanders: steps of 1.1 m are 6 to 10 mm and 0.014 deg off the integrated velocity and turn
+rate (drive 0011), those of 3 cm and 0.05 deg that fade over 30 m. Errors drawn anew would step further.
+"""
+
+
+def is_kitti_drive(path: Path) -> bool:
+    """Whether ``path`` looks like the folder of one KITTI raw drive."""
+    return (path / "oxts").is_dir() and any((path / name).is_dir() for name in _CAMERAS)
+
+
+def read_kitti_drive(path: Path, options: ReadOptions) -> Drive:
+    """Read the KITTI raw drive at ``path``; see :func:`v2hdm.io.drive.read_drive`."""
+    path = path.resolve()
+    available = [name for name in _CAMERAS if (path / name).is_dir()]
+    if not available:
+        raise DriveError(f"{path}: no folder image_00 to image_03; give the folder of one drive, ..._sync")
+    names = select_cameras(available, options.cameras, path)
+    files = [_list_images(path, name) for name in names]
+    calibrations = {name: read_kitti_camera(path.parent, name) for name in names}
+    stamp_s, oxts = _read_oxts(path, names[0])
+
+    check_geodetic(oxts[:, :3], f"{path / 'oxts'}")
+    origin_imu = GeodeticOrigin(float(oxts[0, 0]), float(oxts[0, 1]), float(oxts[0, 2]))
+    position_enu = enu_from_geodetic(origin_imu, oxts[:, :3])
+    enu_from_imu = np.tile(np.eye(4), (len(oxts), 1, 1))
+    enu_from_imu[:, :3, :3] = rotation_from_euler(*oxts[:, 3:6].T)
+    enu_from_imu[:, :3, 3] = position_enu
+    by_imu = lay_flat(Trajectory(stamp_s, enu_from_imu), _POSE_NOISE.position_m)
+    vehicle_from_imu = _level_mount(calibrations[names[0]], by_imu.mount_rad, options.kitti.camera_height_m)
+    enu_from_vehicle = enu_from_imu @ np.linalg.inv(vehicle_from_imu)
+    enu_from_vehicle[:, 2, 3] += vehicle_from_imu[2, 3]  # the map's origin is on the road
+    recorded = Trajectory(stamp_s, enu_from_vehicle)
+    check_trajectory(recorded, origin_imu, f"{path / 'oxts'}")
+    laid = lay_flat(recorded, _POSE_NOISE.position_m)
+    cameras = {
+        name: _mount(calibration, vehicle_from_imu, options.kitti)
+        for name, calibration in calibrations.items()
+    }
+    tell(replace(laid, mount_rad=by_imu.mount_rad), path)
+    images = pose_images(files, laid.trajectory, options.max_gap_s, path)
+    check_image_files(images, cameras)
+    return Drive(
+        name=path.name,
+        root=path,
+        cameras=cameras,
+        images=images,
+        pose_noise=_POSE_NOISE,
+        origin=_lower(origin_imu, float(vehicle_from_imu[2, 3])),
+        unposed=count_unposed(files, images),
+        trajectory=laid.trajectory,
+        recorded=recorded,
+        road=laid.road,
+    )
+
+
+def _list_images(path: Path, camera: str) -> ImageFiles:
+    """The images of one camera; the file number k is the line number of its time stamp."""
+    folder = path / camera
+    paths = sorted(
+        p for p in (folder / "data").glob("*") if p.suffix.lower() in _SUFFIXES and p.stem.isdecimal()
+    )
+    if not paths:
+        raise DriveError(f"{folder / 'data'}: no PNG or JPEG image; restore KITTI's images")
+    stamps = _read_stamps(folder / "timestamps.txt")
+    last = int(paths[-1].stem)
+    if last >= len(stamps):
+        raise DriveError(
+            f"{folder / 'timestamps.txt'}: {len(stamps)} lines, but image {last} exists; restore the file"
+        )
+    stamp_s = stamps[[int(p.stem) for p in paths]]
+    if (np.diff(stamp_s) <= 0).any():
+        raise DriveError(f"{folder / 'timestamps.txt'}: times are not strictly rising; restore the file")
+    return ImageFiles(camera=camera, stamp_s=stamp_s, paths=paths)
+
+
+def _read_oxts(path: Path, camera: str) -> tuple[FloatArray, FloatArray]:
+    """Stamps (P,) and OXTS rows (P, 30); without stamps of its own, line k has those of image k."""
+    folder = path / "oxts"
+    paths = sorted(p for p in (folder / "data").glob("*.txt") if p.stem.isdecimal())
+    if not paths:
+        raise DriveError(f"{folder / 'data'}: no OXTS file; restore KITTI's oxts folder")
+    stamps_path = folder / "timestamps.txt"
+    if not stamps_path.is_file():
+        stamps_path = path / camera / "timestamps.txt"
+    stamps = _read_stamps(stamps_path)
+    last = int(paths[-1].stem)
+    if last >= len(stamps):
+        raise DriveError(f"{stamps_path}: {len(stamps)} lines, but OXTS file {last} exists; restore the file")
+    stamp_s = stamps[[int(p.stem) for p in paths]]
+    oxts = np.array([_read_oxts_row(p) for p in paths])
+    rising = np.concatenate([[True], stamp_s[1:] > np.maximum.accumulate(stamp_s)[:-1]])
+    if not rising.all():
+        _log.warning("%s: dropped %d poses whose time does not rise", stamps_path, int((~rising).sum()))
+    return stamp_s[rising], oxts[rising]
+
+
+def _read_oxts_row(path: Path) -> FloatArray:
+    try:
+        row = np.array(read_text(path, DriveError).split(), dtype=np.float64)
+    except ValueError:
+        raise DriveError(f"{path}: holds something that is not a number; restore KITTI's own file") from None
+    if len(row) != _OXTS_COLUMNS or not np.isfinite(row[:6]).all():
+        raise DriveError(
+            f"{path}: expected {_OXTS_COLUMNS} finite numbers, got {len(row)}; restore KITTI's own file"
+        )
+    return row
+
+
+def _read_stamps(path: Path) -> FloatArray:
+    """Seconds since 1970 of ``YYYY-MM-DD hh:mm:ss.fraction`` lines, the clock taken for UTC."""
+    stamps = []
+    for number, line in enumerate(read_text(path, DriveError).splitlines(), start=1):
+        # datetime stops at microseconds; KITTI writes nanoseconds.
+        whole, _, fraction = line.strip().partition(".")
+        try:
+            seconds = datetime.fromisoformat(whole).replace(tzinfo=UTC).timestamp()
+            stamps.append(seconds + float(f"0.{fraction or 0}"))
+        except ValueError:
+            raise DriveError(
+                f"{path}: line {number}: expected 'YYYY-MM-DD hh:mm:ss.fraction', got '{line}'; mend it"
+            ) from None
+    return np.array(stamps)
+
+
+def _level_mount(calibration: KittiCamera, mount_rad: FloatArray, camera_height_m: float) -> FloatArray:
+    """``vehicle_from_imu``: how the IMU sits on the vehicle, and its height from that of the camera."""
+    vehicle_from_imu = np.eye(4)
+    roll, pitch = mount_rad[:, None]
+    vehicle_from_imu[:3, :3] = rotation_from_euler(roll, pitch, np.zeros(1))[0]
+    camera_imu = np.linalg.inv(calibration.cam_from_imu)[:3, 3]
+    vehicle_from_imu[2, 3] = camera_height_m - (vehicle_from_imu[:3, :3] @ camera_imu)[2]
+    return vehicle_from_imu
+
+
+def _mount(calibration: KittiCamera, vehicle_from_imu: FloatArray, options: KittiOptions) -> Camera:
+    cam_from_vehicle = calibration.cam_from_imu @ np.linalg.inv(vehicle_from_imu)
+    centre_vehicle = np.linalg.inv(cam_from_vehicle)[:3, 3]
+    near, far, half = options.roi_near_m, options.roi_far_m, options.roi_half_width_m
+    roi = np.array([[near, -half], [far, -half], [far, half], [near, half]]) + centre_vehicle[:2]
+    return Camera(
+        info=calibration.info,
+        ipm={"estimated": ipm_from_extrinsic(calibration.info, cam_from_vehicle)},
+        initial_ipm="estimated",
+        roi_vehicle=roi,
+        centre_prior=CentrePrior(centre_vehicle, np.full(3, options.centre_sigma_m)),
+    )
+
+
+def _lower(origin: GeodeticOrigin, height_m: float) -> GeodeticOrigin:
+    """``origin`` moved down to the road."""
+    latitude, longitude, altitude = geodetic_from_enu(origin, np.array([[0.0, 0.0, -height_m]]))[0]
+    return GeodeticOrigin(float(latitude), float(longitude), float(altitude))

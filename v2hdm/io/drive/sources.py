@@ -1,0 +1,244 @@
+"""Where a drive's images, intrinsics and poses come from: files, an image folder, a video, topics of a bag.
+
+All that a drive wants of its bag is gathered first and then imported in one pass.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from v2hdm.errors import DriveError
+from v2hdm.io.calibration.camera_info import read_camera_info
+from v2hdm.io.calibration.intrinsics import read_intrinsics
+from v2hdm.io.drive.images import ImageFiles
+from v2hdm.io.drive.tum import read_image_list
+from v2hdm.io.importers.bag.importing import import_streams
+from v2hdm.io.importers.bag.streams import (
+    IMAGE_LIST,
+    INFO_FILE,
+    STAMPS,
+    ImageStream,
+    InfoStream,
+    PoseStream,
+    Stream,
+    TfStream,
+)
+from v2hdm.io.importers.bag.tf import TF_TOPIC
+from v2hdm.io.importers.poses.kitti_rows import read_stamps
+from v2hdm.io.importers.poses.readings import Attitudes, Readings
+from v2hdm.io.importers.stamp_units import UNITS
+from v2hdm.io.importers.video import IMAGE_LIST as VIDEO_LIST
+from v2hdm.io.importers.video import import_video
+from v2hdm.records import CameraInfo
+from v2hdm.store.files import check_keys, take_choice, take_mapping, take_number, take_text
+
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+
+
+@dataclass
+class Sources:
+    """What a drive's sources are relative to.
+
+    Attributes:
+        root: folder that file names are relative to.
+        cache: folder that keeps what was imported.
+        bag: the drive's bag; None where it has none.
+        max_gap_s: transforms further apart are not interpolated across.
+    """
+
+    root: Path
+    cache: Path
+    bag: Path | None
+    max_gap_s: float
+    _streams: list[Stream] = field(default_factory=list)
+    _folders: list[Path] = field(default_factory=list)
+
+    def want(self, stream: Stream) -> Callable[[], Path]:
+        """Put ``stream`` on the list; what is returned gives its folder, and imports all that are on it."""
+        if self.bag is None:
+            raise DriveError(f"{stream.where}: names a topic, but the drive has no bag; add bag at the top")
+        place = len(self._streams)
+        self._streams.append(stream)
+
+        def folder() -> Path:
+            if len(self._folders) < len(self._streams):
+                assert self.bag is not None
+                self._folders = import_streams(self.bag, self._streams, self.cache)
+            return self._folders[place]
+
+        return folder
+
+
+def plan_images(content: object, camera: str, sources: Sources, where: str) -> Callable[[], ImageFiles]:
+    """How to list the images that ``images`` of a camera names; called once all sources are planned.
+
+    Raises:
+        DriveError: it names no source, or a key is wrong.
+    """
+    if isinstance(content, str):
+        path = sources.root / take_text(content, where, DriveError)
+        if path.is_dir():
+            return lambda: _of_folder({"folder": content}, camera, sources, where)()
+        return lambda: _of_list(camera, path, 0.0)
+    entry = take_mapping(content, where, DriveError)
+    named = [key for key in IMAGE_SOURCES if key in entry]
+    if len(named) != 1:
+        raise DriveError(
+            f"{where}: name one source, a list file or one of {', '.join(IMAGE_SOURCES)}; "
+            f"got {', '.join(named) or 'none'}"
+        )
+    source = IMAGE_SOURCES[named[0]]
+    check_keys(entry, (named[0],), source.keys, where, DriveError)
+    return source.plan(entry, camera, sources, where)
+
+
+def plan_info(content: object, camera: str, sources: Sources, where: str) -> Callable[[], CameraInfo]:
+    """How to read the intrinsics that ``camera_info`` of a camera names, a file or a topic."""
+    if not isinstance(content, dict):
+        path = sources.root / take_text(content, where, DriveError)
+        return lambda: _read_info(path, None)
+    if "file" in content:
+        check_keys(content, ("file",), ("camera",), where, DriveError)
+        named = sources.root / take_text(content["file"], f"{where}, file", DriveError)
+        chosen = content.get("camera")
+        if chosen is not None and not isinstance(chosen, int):  # COLMAP numbers its cameras
+            chosen = take_text(chosen, f"{where}, camera", DriveError)
+        return lambda: _read_info(named, None if chosen is None else str(chosen))
+    check_keys(content, ("topic",), (), where, DriveError)
+    folder = sources.want(InfoStream(take_text(content["topic"], f"{where}, topic", DriveError), where))
+    return lambda: replace(read_camera_info(folder() / INFO_FILE), name=camera)
+
+
+def _read_info(path: Path, camera: str | None) -> CameraInfo:
+    return read_intrinsics(path, camera, f"camera_info: {{file: {path.name}, camera: NAME}}")
+
+
+def plan_topic_poses(
+    content: object, sources: Sources, where: str
+) -> Callable[[dict[str, Any], str], Readings]:
+    """How to read the poses of ``poses`` if they are a topic's: of messages of poses, or of transforms."""
+    if not isinstance(content, dict) or "topic" not in content:
+        return _not_planned
+    topic = take_text(content["topic"], f"{where}, topic", DriveError)
+    if topic == TF_TOPIC:
+        for key in ("frame", "vehicle"):
+            if key not in content:
+                raise DriveError(
+                    f"{where}: add {key} for {TF_TOPIC}: frame of the map, vehicle of the vehicle"
+                )
+        frame, vehicle = (
+            take_text(content[key], f"{where}, {key}", DriveError) for key in ("frame", "vehicle")
+        )
+        transforms = TfStream(True, where)
+        tf_folder = sources.want(transforms)
+
+        def of_frames(entry: dict[str, Any], where: str) -> Readings:
+            found = transforms.frames(tf_folder()).moving(frame, vehicle, sources.max_gap_s, where)
+            unknown = np.full(len(found.stamp_s), np.nan)
+            poses = found.map_from_vehicle
+            attitudes = Attitudes(found.stamp_s, poses[:, :3, :3], unknown)
+            return Readings(found.stamp_s, poses[:, :3, 3], False, unknown, attitudes)
+
+        return of_frames
+    for key in ("frame", "vehicle"):
+        if key in content:
+            raise DriveError(f"{where}, {key}: only for {TF_TOPIC}; drop it")
+    heading = content.get("heading_topic")
+    if heading is not None:
+        heading = take_text(heading, f"{where}, heading_topic", DriveError)
+    stream = PoseStream(topic, heading, _take_stamps(content, where), where)
+    folder = sources.want(stream)
+    return lambda entry, where: stream.readings(folder())
+
+
+def _not_planned(entry: dict[str, Any], where: str) -> Readings:
+    raise AssertionError(where)
+
+
+def _of_list(camera: str, path: Path, start_s: float) -> ImageFiles:
+    stamp_s, names = read_image_list(path)
+    return ImageFiles(camera=camera, stamp_s=stamp_s + start_s, paths=[path.parent / name for name in names])
+
+
+def _of_folder(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> Callable[[], ImageFiles]:
+    folder = sources.root / take_text(entry["folder"], f"{where}, folder", DriveError)
+    unit = take_choice(entry.get("unit", "s"), UNITS, f"{where}, unit", DriveError)
+
+    def images() -> ImageFiles:
+        if not folder.is_dir():
+            raise DriveError(f"{where}: {folder}: no such folder; check the path")
+        paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
+        if not paths:
+            raise DriveError(f"{where}: {folder}: no image ({', '.join(_SUFFIXES)}) in this folder")
+        if "stamps" in entry:
+            stamp_s = read_stamps(sources.root / take_text(entry["stamps"], f"{where}, stamps", DriveError))
+            if len(stamp_s) != len(paths):
+                raise DriveError(f"{where}: {len(paths)} images in {folder}, but {len(stamp_s)} stamps")
+        else:
+            try:
+                stamp_s = np.array([float(path.stem) for path in paths])
+            except ValueError:
+                raise DriveError(
+                    f"{where}: the images of {folder} are not named by their times; add stamps, a file with "
+                    "one time a line"
+                ) from None
+            order = np.argsort(stamp_s, kind="stable")
+            stamp_s, paths = stamp_s[order], [paths[n] for n in order.tolist()]
+        if (np.diff(stamp_s) <= 0).any():
+            raise DriveError(f"{where}: the times of the images of {folder} do not rise strictly; mend them")
+        return ImageFiles(camera=camera, stamp_s=stamp_s / UNITS[unit], paths=paths)
+
+    return images
+
+
+def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> Callable[[], ImageFiles]:
+    path = sources.root / take_text(entry["video"], f"{where}, video", DriveError)
+    if ("start_s" in entry) == ("stamps" in entry):
+        raise DriveError(
+            f"{where}: add start_s, the time of the first frame on the poses' clock, or stamps, a file with "
+            "the time of every frame; one of the two"
+        )
+
+    def images() -> ImageFiles:
+        frames = import_video(path, sources.cache, where) / VIDEO_LIST
+        if "start_s" in entry:
+            return _of_list(camera, frames, take_number(entry["start_s"], f"{where}, start_s", DriveError))
+        listed = _of_list(camera, frames, 0.0)
+        stamp_s = read_stamps(sources.root / take_text(entry["stamps"], f"{where}, stamps", DriveError))
+        if len(stamp_s) != len(listed.paths) or (np.diff(stamp_s) <= 0).any():
+            raise DriveError(
+                f"{where}: {len(listed.paths)} frames in {path} and {len(stamp_s)} stamps; give one a frame, "
+                "rising"
+            )
+        return replace(listed, stamp_s=stamp_s)
+
+    return images
+
+
+def _of_topic(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> Callable[[], ImageFiles]:
+    topic = take_text(entry["topic"], f"{where}, topic", DriveError)
+    folder = sources.want(ImageStream(topic, _take_stamps(entry, where), where))
+    return lambda: _of_list(camera, folder() / IMAGE_LIST, 0.0)
+
+
+def _take_stamps(entry: Mapping[str, Any], where: str) -> str:
+    return take_choice(entry.get("stamps", STAMPS[0]), STAMPS, f"{where}, stamps", DriveError)
+
+
+@dataclass(frozen=True)
+class _ImageSource:
+    plan: Callable[[dict[str, Any], str, Sources, str], Callable[[], ImageFiles]]
+    keys: tuple[str, ...]
+
+
+IMAGE_SOURCES: Mapping[str, _ImageSource] = {
+    "folder": _ImageSource(_of_folder, ("stamps", "unit")),
+    "video": _ImageSource(_of_video, ("start_s", "stamps")),
+    "topic": _ImageSource(_of_topic, ("stamps",)),
+}
+"""Sources of images that are no list file, by the key that names them."""

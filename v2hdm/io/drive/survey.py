@@ -1,0 +1,369 @@
+"""A survey's points in a CSV file with named columns: control points and check points.
+
+Coordinates are local metres, latitudes and longitudes, or eastings and northings of any projected system;
+what brings them into the map is :func:`in_map`. docs/survey.md describes the file.
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from pathlib import Path
+
+import numpy as np
+
+from v2hdm.errors import DriveError
+from v2hdm.geometry.geodetic import (
+    datum_of,
+    enu_from_geodetic,
+    geodetic_from_grid,
+    has_height_datum,
+    is_geographic,
+)
+from v2hdm.records import FloatArray, GeodeticOrigin
+from v2hdm.store.files import read_text
+
+_log = logging.getLogger(__name__)
+
+
+class Frame(Enum):
+    """What a survey's coordinates count from."""
+
+    MAP = "x_m, y_m"
+    GRID = "east_m, north_m"
+    GEODETIC = "latitude_deg, longitude_deg"
+
+    @property
+    def columns(self) -> tuple[str, str]:
+        """The columns of its two coordinates."""
+        first, second = self.value.split(", ")
+        return first, second
+
+
+_CALLED: Mapping[str, tuple[str, ...]] = {
+    "id": ("point", "name", "point_id"),
+    "x_m": ("x", "x_map_m"),
+    "y_m": ("y", "y_map_m"),
+    "east_m": ("east", "easting", "easting_m"),
+    "north_m": ("north", "northing", "northing_m"),
+    "latitude_deg": ("latitude", "lat"),
+    "longitude_deg": ("longitude", "lon"),
+    "height_m": ("height", "z_m", "z", "altitude_m", "altitude", "ellipsoidal_height_m"),
+    "sigma_m": (),
+    "sigma_east_m": ("sigma_east", "sigma_x_m"),
+    "sigma_north_m": ("sigma_north", "sigma_y_m"),
+    "role": (),
+    "description": ("about", "comment"),
+}
+"""Columns that are understood, and what else they may be called."""
+
+NAMES: Mapping[str, str] = {name: ours for ours, others in _CALLED.items() for name in (ours, *others)}
+_CONTROL, _CHECK = "control", "check"
+_NEARLY = 0.8
+"""Likeness (:mod:`difflib`) from which an unknown column is taken for a misspelt one."""
+
+
+@dataclass(frozen=True)
+class SurveyedPoint:
+    """A point of a survey, in the map.
+
+    Attributes:
+        id: its name in the survey.
+        position_map: (2,) m.
+        sigma_m: (2,) standard deviations along the map's axes, m.
+        height_m: above the map's origin; None where it is not known.
+        is_check: whether it is held out of the adjustment, to check the map by.
+        description: what the survey says of it.
+    """
+
+    id: str
+    position_map: FloatArray
+    sigma_m: FloatArray
+    height_m: float | None = None
+    is_check: bool = False
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class SurveyTable:
+    """N points as a file states them.
+
+    Attributes:
+        path: the file.
+        frame: what the coordinates count from.
+        coordinates: (N, 2) in the order of the frame's columns.
+        height_m: (N,) nan where none is stated.
+        sigma_m: (N, 2) east, north.
+        ids: their names.
+        is_check: which are held out.
+        descriptions: what the file says of each.
+        crs: the system of the coordinates; None for that of the drive.
+        geoid_m: of the geoid above the ellipsoid, where heights count from the sea.
+    """
+
+    path: Path
+    frame: Frame
+    coordinates: FloatArray
+    height_m: FloatArray
+    sigma_m: FloatArray
+    ids: tuple[str, ...]
+    is_check: tuple[bool, ...]
+    descriptions: tuple[str, ...]
+    crs: str | None = None
+    geoid_m: float | None = None
+
+
+def read_survey(path: Path, crs: str | None, geoid_m: float | None, sigma_m: float) -> SurveyTable:
+    """Read the CSV file at ``path``: names in its first line, then a point a line.
+
+    Args:
+        path: the file; its columns are parted by commas, semicolons or tabs.
+        crs: the projected system of eastings and northings, such as ``EPSG:32632``.
+        geoid_m: height of the geoid above the ellipsoid, where heights count from the sea.
+        sigma_m: how well points are known of which the file does not say it.
+
+    Raises:
+        DriveError: a column is missing, misspelt or says a thing twice, or a cell does not parse; with the
+            line.
+    """
+    rows = _rows(path)
+    frame = _frame(rows[0].cells, crs, path)
+    first, second = frame.columns
+    seen: dict[str, int] = {}
+    for row in rows:
+        name = row.text("id")
+        if not name:
+            raise DriveError(f"{row.where}: the point has no id; name it")
+        if name in seen:
+            raise DriveError(f"{row.where}: the point {name} stands in line {seen[name]} already; keep one")
+        seen[name] = row.line
+    return SurveyTable(
+        path,
+        frame,
+        np.array([[row.number(first), row.number(second)] for row in rows]),
+        np.array([row.number("height_m", np.nan) for row in rows]),
+        np.array([row.sigmas(sigma_m) for row in rows]),
+        tuple(seen),
+        tuple(row.role() == _CHECK for row in rows),
+        tuple(row.text("description") for row in rows),
+        crs,
+        geoid_m,
+    )
+
+
+def in_map(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[SurveyedPoint, ...]:
+    """The points of ``table`` in the map of a drive with that ``origin``.
+
+    Eastings and northings become latitudes and longitudes, and these local metres, over the earth's centre:
+    the grid's scale and convergence are gone with that. A point without a height is at the origin's. Sigmas
+    stay as they are: a grid's north is a few degrees off at most.
+
+    Raises:
+        DriveError: the coordinates need an origin that the drive does not have, are of another datum, or lie
+            outside of their system.
+    """
+    positions, height_m = table.coordinates, table.height_m
+    if table.frame is not Frame.MAP:
+        positions, height_m = _on_earth(table, origin)
+    known = np.isfinite(height_m)
+    return tuple(
+        SurveyedPoint(
+            name,
+            positions[k],
+            table.sigma_m[k],
+            float(height_m[k]) if known[k] else None,
+            table.is_check[k],
+            table.descriptions[k],
+        )
+        for k, name in enumerate(table.ids)
+    )
+
+
+def misreadings(table: SurveyTable, origin: GeodeticOrigin | None) -> dict[str, FloatArray]:
+    """Where the points (N, 2) would lie in the map, had the file meant something else; by what it meant."""
+    first, second = table.frame.columns
+    told = {f"with {first} and {second} swapped": replace(table, coordinates=table.coordinates[:, ::-1])}
+    if table.frame is not Frame.GEODETIC:
+        told["in feet"] = replace(table, coordinates=0.3048 * table.coordinates)
+        told["in millimetres"] = replace(table, coordinates=1e-3 * table.coordinates)
+    if table.frame is Frame.GRID:
+        told["as local metres (columns x_m, y_m)"] = replace(table, frame=Frame.MAP)
+    if table.frame is Frame.MAP:
+        told["as latitude and longitude"] = replace(table, frame=Frame.GEODETIC)
+    for crs in _other_systems(table, origin):
+        told[f"in {crs}"] = replace(table, frame=Frame.GRID, crs=crs)
+    out = {}
+    for says, other in told.items():
+        try:
+            out[says] = np.array([point.position_map for point in in_map(other, origin)])
+        except DriveError:
+            continue
+    return {says: positions for says, positions in out.items() if np.isfinite(positions).all()}
+
+
+def _other_systems(table: SurveyTable, origin: GeodeticOrigin | None) -> list[str]:
+    """Systems that a survey's coordinates may be of: the neighbouring zones, or the UTM zone of the site."""
+    systems = []
+    authority, _, code = (table.crs or "").partition(":")
+    if authority.upper() == "EPSG" and code.isdecimal():
+        systems = [f"EPSG:{int(code) - 1}", f"EPSG:{int(code) + 1}"]
+    if origin is not None and table.frame is not Frame.GEODETIC:
+        zone = int((origin.longitude_deg + 180) // 6) % 60 + 1
+        if origin.datum.upper().startswith("ETRS"):
+            systems.append(f"EPSG:{25800 + zone}")
+        else:
+            systems.append(f"EPSG:{(32600 if origin.latitude_deg >= 0 else 32700) + zone}")
+    return [crs for crs in systems if crs != table.crs]
+
+
+def _on_earth(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[FloatArray, FloatArray]:
+    """Positions (N, 2) and heights (N,) in the map, nan where they are not known."""
+    where, crs = str(table.path), table.crs
+    if origin is None:
+        raise DriveError(
+            f"{where}: {table.frame.value} have a place on the earth, the drive's map has none; give the "
+            "drive an origin, or the points as x_m, y_m in the frame of its poses"
+        )
+    height_m = table.height_m
+    if crs is not None:
+        datum = datum_of(crs, where, DriveError)
+        if datum.replace(" ", "") != origin.datum.replace(" ", ""):
+            raise DriveError(
+                f"{where}: the points are in {datum} ({crs}), the drive's origin in {origin.datum}, which "
+                "differ by decimetres; give the points in that of the origin"
+            )
+        if has_height_datum(crs, where, DriveError) and table.geoid_m is None:
+            _log.warning(
+                "%s: heights of %s count from the sea and are not used: set mapping.survey.geoid_m",
+                where,
+                crs,
+            )
+            height_m = np.full_like(height_m, np.nan)
+    known = np.isfinite(height_m)
+    raised_m = np.where(known, height_m + (table.geoid_m or 0.0), origin.altitude_m)
+    points = np.column_stack([table.coordinates, raised_m])
+    if table.frame is Frame.GEODETIC:
+        if (np.abs(table.coordinates) > [90, 180]).any():
+            k = int(np.argmax((np.abs(table.coordinates) > [90, 180]).any(axis=1)))
+            latitude_deg, longitude_deg = table.coordinates[k]
+            raise DriveError(
+                f"{where}: latitude {latitude_deg:g}, longitude {longitude_deg:g} of {table.ids[k]} is no "
+                "place on the earth; are they swapped?"
+            )
+    else:
+        assert crs is not None
+        points = geodetic_from_grid(crs, points, where, DriveError)
+    out = enu_from_geodetic(origin, points)
+    return out[:, :2], np.where(known, out[:, 2], np.nan)
+
+
+@dataclass(frozen=True)
+class _Row:
+    """One line of the file: its cells by our names of the columns."""
+
+    line: int
+    cells: Mapping[str, str]
+    where: str
+
+    def text(self, name: str) -> str:
+        return self.cells.get(name, "")
+
+    def number(self, name: str, missing: float | None = None) -> float:
+        cell = self.text(name)
+        if not cell and missing is not None:
+            return missing
+        try:
+            value = float(cell)
+        except ValueError:
+            value = np.nan
+        if not np.isfinite(value):
+            raise DriveError(f"{self.where}: {name} '{cell}' is not a number such as 12.345; mend that line")
+        return value
+
+    def sigmas(self, usual_m: float) -> tuple[float, float]:
+        both_m = self.number("sigma_m", usual_m)
+        east_m, north_m = self.number("sigma_east_m", both_m), self.number("sigma_north_m", both_m)
+        if min(east_m, north_m) <= 0:
+            raise DriveError(f"{self.where}: a sigma of {min(east_m, north_m):g} m; give one above 0")
+        return east_m, north_m
+
+    def role(self) -> str:
+        role = self.text("role").lower() or _CONTROL
+        if role not in (_CONTROL, _CHECK):
+            raise DriveError(f"{self.where}: role '{role}' is neither control nor check; mend that line")
+        return role
+
+
+def _rows(path: Path) -> list[_Row]:
+    text = read_text(path, DriveError).removeprefix("\ufeff")
+    lines = [
+        (number, line)
+        for number, line in enumerate(text.splitlines(), 1)
+        if line.strip() and not (number > 1 and line.lstrip().startswith("#"))
+    ]
+    if len(lines) < 2:
+        raise DriveError(f"{path}: holds no point; expected a line of column names and one line a point")
+    title = lines[0][1].lstrip("# ")
+    separator = next((mark for mark in ";\t," if mark in title), ",")
+    columns = _columns(_split(title, separator), path)
+    rows = []
+    for number, line in lines[1:]:
+        cells = _split(line, separator)
+        if len(cells) != len(columns):
+            raise DriveError(
+                f"{path}: line {number}: {len(cells)} cells under {len(columns)} columns; mend that line"
+            )
+        named = {name: cell for name, cell in zip(columns, cells, strict=True) if name is not None}
+        rows.append(_Row(number, named, f"{path}: line {number}"))
+    return rows
+
+
+def _split(line: str, separator: str) -> list[str]:
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
+
+
+def _columns(header: Sequence[str], path: Path) -> list[str | None]:
+    """Our name of each column, None for those that are not used."""
+    ours = [NAMES.get(name.lower()) for name in header]
+    for name, own in zip(header, ours, strict=True):
+        if own is not None and ours.count(own) > 1:
+            twice = [other for other, its in zip(header, ours, strict=True) if its == own]
+            raise DriveError(f"{path}: the columns {' and '.join(twice)} say the same; keep one of them")
+        near = difflib.get_close_matches(name.lower(), NAMES, n=1, cutoff=_NEARLY)
+        if own is None and near:
+            raise DriveError(f"{path}: unknown column '{name}'; did you mean '{near[0]}'?")
+    unused = [name for name, own in zip(header, ours, strict=True) if own is None]
+    if unused:
+        _log.info("%s: the columns %s are not used", path, ", ".join(unused))
+    if "id" not in ours:
+        raise DriveError(f"{path}: has no column id; it has: {', '.join(header)}")
+    return ours
+
+
+def _frame(cells: Mapping[str, str], crs: str | None, path: Path) -> Frame:
+    """What the coordinates count from, by the columns that hold them."""
+    found = [frame for frame in Frame if any(name in cells for name in frame.columns)]
+    if len(found) != 1:
+        ways = " or ".join(frame.value for frame in Frame)
+        raise DriveError(f"{path}: needs the columns {ways}, one of these pairs")
+    missing = [name for name in found[0].columns if name not in cells]
+    if missing:
+        raise DriveError(f"{path}: has no column {missing[0]}; add it")
+    if found[0] is Frame.GRID and crs is None:
+        raise DriveError(
+            f"{path}: of which system are east and north? Set mapping.survey.crs, such as EPSG:32632, or "
+            "call the columns x_m, y_m if they are in the frame of the poses"
+        )
+    if found[0] is Frame.MAP and crs is not None:
+        raise DriveError(
+            f"{path}: x_m, y_m are in the frame of the poses, and mapping.survey.crs is {crs}; call them "
+            "east_m, north_m, or drop crs"
+        )
+    if crs is not None and (found[0] is Frame.GEODETIC) != is_geographic(crs, str(path), DriveError):
+        kind = "latitudes and longitudes" if found[0] is Frame.GEODETIC else "east and north"
+        raise DriveError(f"{path}: holds {kind}, which {crs} has not; mend mapping.survey.crs")
+    return found[0]

@@ -1,0 +1,253 @@
+"""A bag's topics and messages; whatever is wrong with its files ends in one line."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+from v2hdm.errors import DriveError
+from v2hdm.extras import need
+from v2hdm.store.files import load_yaml, take_mapping
+
+SUFFIXES = (".bag", ".mcap", ".db3")
+_METADATA = "metadata.yaml"
+_MEND = {
+    ".bag": "rosbag reindex",
+    ".mcap": "mcap recover",
+    ".db3": "ros2 bag reindex",
+}
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One topic of a bag."""
+
+    name: str
+    kind: str
+    messages: int
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message: its topic, its type, when it was received (s), and its fields."""
+
+    topic: str
+    kind: str
+    received_s: float
+    fields: Any
+
+
+def is_bag(path: Path) -> bool:
+    """Whether ``path`` looks like a bag: a file of one, or a folder of a recorder."""
+    return bool(_parts(path)) if path.is_dir() else path.suffix in SUFFIXES
+
+
+def bag_files(path: Path) -> list[Path]:
+    """All files of the bag at ``path``.
+
+    Raises:
+        DriveError: there is none.
+    """
+    if path.is_file():
+        return [path]
+    if not path.is_dir():
+        raise DriveError(f"{path}: no such bag; check the path")
+    files = _parts(path)
+    if not files:
+        raise DriveError(f"{path}: no bag in this folder ({', '.join(SUFFIXES)}); check the path")
+    described = path / _METADATA
+    return [described, *files] if described.is_file() else files
+
+
+def _parts(path: Path) -> list[Path]:
+    endings = (*SUFFIXES, ".db3.zstd", ".mcap.zstd")
+    return sorted(file for file in path.iterdir() if file.is_file() and file.name.endswith(endings))
+
+
+class Bag:
+    """An open bag: a reader for each of its files, in the order of time.
+
+    Types are taken from the bag as they are needed: a definition that is not understood, such as a service's,
+    does not concern the other topics.
+    """
+
+    def __init__(self, path: Path, readers: Sequence[Any]) -> None:
+        self.path = path
+        self._readers = readers
+        self._is_ros1 = path.suffix == ".bag" or any(reader.path.suffix == ".bag" for reader in readers)
+        self._stores: dict[str, Any] = {}
+        kinds: dict[str, set[str]] = defaultdict(set)
+        counts: dict[str, int] = defaultdict(int)
+        for reader in readers:
+            for connection in reader.connections:
+                kinds[connection.topic].add(connection.msgtype)
+                counts[connection.topic] += connection.msgcount
+        self.topics: Mapping[str, Topic] = {
+            name: Topic(name, " and ".join(sorted(kinds[name])), counts[name]) for name in sorted(kinds)
+        }
+
+    def messages(self, topics: Collection[str]) -> Iterator[Message]:
+        """The messages of some topics, those of each in the order in which they were received.
+
+        Raises:
+            DriveError: the bag is damaged, holds fewer messages than it says, or its types are not known.
+        """
+        missing = sum(self.topics[name].messages for name in topics if name in self.topics)
+        streams = (
+            reader.messages(connections=wanted)
+            for reader in self._readers
+            if (wanted := [connection for connection in reader.connections if connection.topic in topics])
+        )
+        stream = chain.from_iterable(streams)
+        while True:
+            with _one_line(self.path):
+                item = next(stream, None)
+            if item is None:
+                break
+            missing -= 1
+            connection, received_ns, data = item
+            with _one_line(self.path, f"topic {connection.topic}, type {connection.msgtype}: "):
+                fields = self._fields(connection, data)
+            yield Message(connection.topic, connection.msgtype, received_ns / 1e9, fields)
+        if missing > 0:
+            raise DriveError(
+                f"{self.path}: {missing} messages of {', '.join(sorted(topics))} that it lists are not "
+                "there; copy it again, or mend it with 'ros2 bag reindex'"
+            )
+
+    def _fields(self, connection: Any, data: bytes) -> Any:
+        kind = connection.msgtype
+        if kind not in self._stores:
+            self._stores[kind] = self._store_of(connection)
+        read = self._stores[kind].deserialize_ros1 if self._is_ros1 else self._stores[kind].deserialize_cdr
+        return read(data, kind)
+
+    def _store_of(self, connection: Any) -> Any:
+        """The types of one connection: as the bag defines them, else the common ones."""
+        from rosbags.interfaces import MessageDefinitionFormat
+        from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+        definition = connection.msgdef
+        if definition.format == MessageDefinitionFormat.NONE:
+            return get_typestore(Stores.ROS1_NOETIC if self._is_ros1 else Stores.LATEST)
+        store = get_typestore(Stores.EMPTY)
+        if definition.format == MessageDefinitionFormat.MSG:
+            store.register(get_types_from_msg(definition.data, connection.msgtype))
+            return store
+        types: dict[str, Any] = {}
+        for part in definition.data.split("=" * 80 + "\n"):
+            head, _, rest = part.partition("\n")
+            types.update(
+                get_types_from_idl(rest if head.startswith("IDL: ") else part) if part.strip() else {}
+            )
+        store.register(types)
+        return store
+
+    def need(self, name: str, kinds: Collection[str], where: str) -> Topic:
+        """The topic ``name``, which is of one of the types ``kinds``.
+
+        Raises:
+            DriveError: there is none such; names those that would do.
+        """
+        fitting = ", ".join(topic.name for topic in self.topics.values() if topic.kind in kinds) or "none"
+        wanted = ", ".join(sorted(kind.split("/")[-1] for kind in kinds))
+        topic = self.topics.get(name)
+        if topic is None:
+            raise DriveError(f"{where}: {self.path} has no topic {name}; of type {wanted} it has: {fitting}")
+        if topic.kind not in kinds:
+            raise DriveError(
+                f"{where}: topic {name} of {self.path} is of type {topic.kind}, wanted is {wanted}; it has: "
+                f"{fitting}"
+            )
+        if not topic.messages:
+            raise DriveError(f"{where}: topic {name} of {self.path} holds no message; record it")
+        return topic
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator[Bag]:
+    """Open the bag at ``path``: a ROS 1 file, a ROS 2 folder, or one file of it.
+
+    Raises:
+        DriveError: it is none, damaged or cut off, or rosbags is not installed.
+    """
+    need("rosbags", "ros", f"{path}: a bag", DriveError)
+    from rosbags import rosbag1, rosbag2
+
+    files = bag_files(path)
+    for one in files:
+        if one.suffix == ".db3":
+            _check_database(one)
+    with ExitStack() as opened:
+        with _one_line(path):
+            readers: list[Any] = []
+            if files[0].name == _METADATA and _is_compressed(path):
+                readers.append(opened.enter_context(rosbag2.Reader(path)))
+            else:
+                # rosbags skips, without a word, topics of which the folder's description and the file state
+                # other qualities of service, as bags that were rewritten do. The files alone have them all.
+                for one in files[files[0].name == _METADATA :]:
+                    kind = rosbag1.Reader if one.suffix == ".bag" else rosbag2.Reader
+                    readers.append(opened.enter_context(kind(one)))
+                readers.sort(key=lambda reader: reader.start_time)
+            bag = Bag(path, readers)
+        yield bag
+
+
+def _check_database(path: Path) -> None:
+    """Refuse an SQLite file whose end is missing or still in a journal: SQLite reads on without it.
+
+    The places in the header are those of https://www.sqlite.org/fileformat.html, 1.3.
+    """
+    with path.open("rb") as file:
+        header = file.read(100)
+    journal = path.with_name(f"{path.name}-wal")
+    if journal.is_file() and journal.stat().st_size:
+        raise DriveError(
+            f"{path}: was not closed, {journal.name} holds its end; mend it with 'ros2 bag reindex'"
+        )
+    if len(header) < 100:
+        return
+    # One stands for 65536, which two bytes cannot.
+    page_bytes = int.from_bytes(header[16:18], "big")
+    page_bytes = 65536 if page_bytes == 1 else page_bytes
+    pages = int.from_bytes(header[28:32], "big")
+    counts = header[24:28] == header[92:96]
+    if counts and path.stat().st_size < pages * page_bytes:
+        raise DriveError(
+            f"{path}: is cut off: {path.stat().st_size} of {pages * page_bytes} bytes are there; copy it "
+            "again"
+        )
+
+
+def _is_compressed(path: Path) -> bool:
+    """Whether the files of a folder, or each of its messages, are compressed."""
+    about = load_yaml(path / _METADATA, DriveError).get("rosbag2_bagfile_information")
+    mode = take_mapping(about, f"{path / _METADATA}", DriveError).get("compression_mode")
+    return str(mode or "none").lower() not in ("none", "storage")
+
+
+@contextmanager
+def _one_line(path: Path, what: str = "") -> Iterator[None]:
+    """Turn whatever goes wrong in a damaged bag into one line."""
+    try:
+        yield
+    except DriveError:
+        raise
+    # Bytes that are not what they should be fail anywhere within rosbags, with any error.
+    except Exception as failure:
+        if isinstance(failure, KeyError):
+            raise DriveError(
+                f"{path}: {what}the bag does not define the type {failure}; convert it to MCAP, which holds "
+                "its types, where it was recorded: 'ros2 bag convert'"
+            ) from None
+        reason = " ".join(str(failure).split()) or type(failure).__name__
+        raise DriveError(
+            f"{path}: {what}not readable as a bag ({reason[:200].rstrip('.')}); copy it again, or mend it "
+            f"with '{_MEND.get(path.suffix, 'ros2 bag reindex')}' if the recording was cut off"
+        ) from None

@@ -1,0 +1,175 @@
+"""Poses in a CSV file with named columns.
+
+A column's name says what it holds and in which unit; ``columns`` in ``drive.yaml`` says what the file calls
+it.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from v2hdm.errors import DriveError
+from v2hdm.geometry.rigid import rotation_from_euler, rotation_from_quaternion
+from v2hdm.io.importers.poses.readings import SIGMA_OF_QUALITY_M, Attitudes, Readings
+from v2hdm.io.importers.poses.rising import in_order
+from v2hdm.records import FloatArray
+from v2hdm.store.files import check_keys, read_text, take_mapping, take_text
+
+KEYS = ("columns",)
+
+_STAMPS: Mapping[str, float] = {"stamp_s": 1.0, "stamp_ms": 1e3, "stamp_us": 1e6, "stamp_ns": 1e9}
+_MAP = ("x_m", "y_m", "z_m")
+_GEODETIC = ("latitude_deg", "longitude_deg", "altitude_m")
+_QUATERNION = ("qx", "qy", "qz", "qw")
+_ANGLES = (
+    "heading_deg", "yaw_deg", "yaw_rad", "roll_deg", "roll_rad", "pitch_deg", "pitch_rad", "pitch_up_deg",
+)  # fmt: skip
+_SURENESS = ("quality", "sigma_m", "heading_sigma_deg")
+NAMES = (*_STAMPS, "utc", *_MAP, *_GEODETIC, *_QUATERNION, *_ANGLES, *_SURENESS)
+"""Columns that are understood. ``heading_deg`` counts clockwise from north, ``yaw_...`` counter-clockwise
+from x or east; roll is positive with the left side up, ``pitch_...`` with the nose down, ``pitch_up_deg``
+up."""
+
+_NORM_TOLERANCE = 1e-3
+
+
+def read_table(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
+    """Read the CSV file at ``path``: names in its first line, then a pose a line.
+
+    Columns are parted by commas, semicolons, tabs or blanks.
+
+    Raises:
+        DriveError: columns are missing or say a thing twice, or a cell does not parse; with the line.
+    """
+    columns = _columns(path, _take_names(entry.get("columns"), f"{where}, columns"))
+    stamp_s = _stamps(columns, path)
+    rows = in_order(stamp_s, str(path), "pose")
+    columns = {name: values[rows] for name, values in columns.items()}
+    geodetic = _GEODETIC[0] in columns
+    names = _GEODETIC if geodetic else _MAP
+    if geodetic == (_MAP[0] in columns):
+        raise DriveError(
+            f"{path}: needs positions, as columns {', '.join(_MAP)} or {', '.join(_GEODETIC)}, one of the two"
+        )
+    _need(columns, names[:2], path)
+    count = len(rows)
+    points = np.column_stack([columns.get(name, np.zeros(count)) for name in names])
+    sigma_m = columns.get("sigma_m", np.full(count, np.nan))
+    if "quality" in columns:
+        stated = np.array([SIGMA_OF_QUALITY_M.get(value, np.inf) for value in columns["quality"]])
+        sigma_m = np.where(np.isfinite(sigma_m) & np.isfinite(stated), sigma_m, stated)
+    heading_sigma = np.radians(columns.get("heading_sigma_deg", np.full(count, np.nan)))
+    rotation = _rotation(columns, path)
+    attitudes = None if rotation is None else Attitudes(stamp_s[rows], rotation, heading_sigma)
+    return Readings(stamp_s[rows], points, geodetic, sigma_m, attitudes, antenna=geodetic)
+
+
+def _take_names(content: object, where: str) -> dict[str, str]:
+    if content is None:
+        return {}
+    entry = take_mapping(content, where, DriveError)
+    check_keys(entry, (), NAMES, where, DriveError)
+    return {ours: take_text(theirs, f"{where}, {ours}", DriveError) for ours, theirs in entry.items()}
+
+
+def _columns(path: Path, names: Mapping[str, str]) -> dict[str, FloatArray]:
+    """The columns of our ``NAMES`` that the file has, each (N,)."""
+    lines = [(n, line) for n, line in enumerate(read_text(path, DriveError).splitlines(), 1) if line.strip()]
+    if len(lines) < 2:
+        raise DriveError(f"{path}: holds no pose; expected a line of column names and one line a pose")
+    title = lines[0][1].lstrip("\ufeff# ")
+    separator = next((mark for mark in ",;\t" if mark in title), None)
+    header = [name.strip() for name in _split(title, separator)]
+    for ours, theirs in names.items():
+        if header.count(theirs) != 1:
+            raise DriveError(
+                f"{path}: has no column '{theirs}' for {ours}, or two; it has: {', '.join(header)}"
+            )
+    found = {ours: header.index(theirs) for ours, theirs in names.items()}
+    for place, name in enumerate(header):
+        if name in NAMES and place not in found.values() and name not in found:
+            found[name] = place
+    table: dict[str, list[float]] = {name: [] for name in found}
+    for number, line in lines[1:]:
+        if line.lstrip().startswith("#"):
+            continue
+        cells = _split(line, separator)
+        if len(cells) != len(header):
+            raise DriveError(
+                f"{path}: line {number}: {len(cells)} cells under {len(header)} columns; mend that line"
+            )
+        for name, place in found.items():
+            table[name].append(_parse(name, cells[place].strip(), f"{path}: line {number}: {header[place]}"))
+    return {name: np.array(values, dtype=np.float64) for name, values in table.items()}
+
+
+def _split(line: str, separator: str | None) -> Sequence[str]:
+    return line.split() if separator is None else next(csv.reader([line], delimiter=separator))
+
+
+def _parse(name: str, cell: str, where: str) -> float:
+    try:
+        if name == "utc":
+            moment = datetime.fromisoformat(cell)
+            return moment.replace(tzinfo=moment.tzinfo or UTC).timestamp()
+        value = float(cell) if cell or name not in _SURENESS else np.nan
+    except ValueError:
+        kind = "a time such as 2024-05-17T08:30:00.25Z" if name == "utc" else "a number"
+        raise DriveError(f"{where}: '{cell}' is not {kind}; mend that line") from None
+    if not np.isfinite(value) and name not in _SURENESS:
+        raise DriveError(f"{where}: '{cell}' is not a finite number; drop or mend that line")
+    return value
+
+
+def _stamps(columns: Mapping[str, FloatArray], path: Path) -> FloatArray:
+    named = [name for name in (*_STAMPS, "utc") if name in columns]
+    if len(named) != 1:
+        has = ", ".join(named) or "none"
+        raise DriveError(
+            f"{path}: needs one column of times, {', '.join(_STAMPS)} or utc, has {has}; see columns"
+        )
+    return columns[named[0]] / _STAMPS.get(named[0], 1.0)
+
+
+def _rotation(columns: Mapping[str, FloatArray], path: Path) -> FloatArray | None:
+    angles = [name for name in _ANGLES if name in columns]
+    yaws = [name for name in angles if name.startswith(("heading", "yaw"))]
+    if "qw" in columns:
+        _need(columns, _QUATERNION, path)
+        if angles:
+            raise DriveError(f"{path}: has a quaternion and {angles[0]}: say one of them under columns")
+        quaternion = np.column_stack([columns[name] for name in _QUATERNION])
+        norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
+        if (np.abs(norm - 1) > _NORM_TOLERANCE).any():
+            k = int(np.argmax(np.abs(norm - 1) > _NORM_TOLERANCE))
+            raise DriveError(f"{path}: pose {k + 1}: quaternion of norm {norm[k, 0]:.6g} instead of 1")
+        return rotation_from_quaternion(quaternion / norm)
+    if not yaws:
+        return None
+    for kind in (("heading_deg", "yaw_deg", "yaw_rad"), ("roll_deg", "roll_rad"),
+                 ("pitch_deg", "pitch_rad", "pitch_up_deg")):  # fmt: skip
+        twice = [name for name in kind if name in columns]
+        if len(twice) > 1:
+            raise DriveError(f"{path}: says {twice[0]} and {twice[1]}: name one of them under columns")
+    zeros = np.zeros(len(columns[yaws[0]]))
+
+    def radians(kind: str) -> FloatArray:
+        if f"{kind}_rad" in columns:
+            return columns[f"{kind}_rad"]
+        return np.radians(columns.get(f"{kind}_deg", zeros))
+
+    yaw = np.pi / 2 - radians("heading") if "heading_deg" in columns else radians("yaw")
+    pitch = -radians("pitch_up") if "pitch_up_deg" in columns else radians("pitch")
+    return rotation_from_euler(radians("roll"), pitch, yaw)
+
+
+def _need(columns: Mapping[str, FloatArray], names: Sequence[str], path: Path) -> None:
+    missing = [name for name in names if name not in columns]
+    if missing:
+        raise DriveError(f"{path}: has no column '{missing[0]}'; say under columns what the file calls it")

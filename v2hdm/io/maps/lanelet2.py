@@ -1,0 +1,320 @@
+"""An HD map as Lanelet2 OSM in the dialect of Autoware, with its ``map_projector_info.yaml``.
+
+Every marking is a polygon ``pose_marker`` of four counter-clockwise vertices, a landmark for localisation; a
+stop line is a line string as well, with the regulatory element that Autoware's map validator asks for. Lane
+lines are line strings; where two of them bound a lane there is a lanelet.
+
+Lanelet2 has no word for paint without a sign: a stop line's element is a ``traffic_sign``, whose sign is a
+line beside the paint, tagged ``virtual``. The id of a marking or lane line is that of the map; the other ids
+follow from it, so that they stay when the map is written again.
+"""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from v2hdm.errors import ConfigError, MapFileError
+from v2hdm.geometry.geodetic import geodetic_from_enu
+from v2hdm.io.maps.closed_lanes import ClosedLane, closed_lanes
+from v2hdm.io.maps.features import Feature, features_of
+from v2hdm.io.maps.mgrs import GridPlaces, grid_places
+from v2hdm.records import LANE_DASH, STOP_LINE, FloatArray, GeodeticOrigin, HdMap, IntArray
+from v2hdm.store.files import dump_yaml, replace_text
+
+PROJECTOR_FILE = "map_projector_info.yaml"
+LOCAL, LOCAL_CARTESIAN, MGRS = PROJECTORS = ("Local", "LocalCartesian", "MGRS")
+"""Autoware's projectors that this format knows, by their names in ``map_projector_info.yaml``."""
+
+_FORMAT_VERSION = "1"
+_MAP_VERSION = "1"
+_DEGREE_DECIMALS = 12  # 1e-7 m; JOSM writes 11
+_HEIGHT_DECIMALS = 6
+
+_FIRST_PART = 1 << 40
+_PARTS = 1 << 20
+"""Ids that each feature has for its parts, above all ids of features and exact in every language."""
+
+_MOST_VERTICES = _PARTS // 2
+"""Vertices take the lower half of a feature's parts; what follows the others."""
+
+_NOWHERE = GeodeticOrigin(0.0, 0.0, 0.0)
+"""Lanelet2 reads no node without latitude and longitude: local maps lie where the equator meets Greenwich."""
+
+
+def write_lanelet2(
+    hd_map: HdMap,
+    path: Path,
+    verdict: Mapping[str, Any] | None = None,
+    projector: str | None = None,
+) -> None:
+    """Write ``hd_map`` to ``path`` and ``map_projector_info.yaml`` beside it, each atomically.
+
+    Args:
+        hd_map: what is written.
+        path: of the OSM file; Autoware looks for ``lanelet2_map.osm``.
+        verdict: not written, the format has no place for it.
+        projector: one of :data:`PROJECTORS`; None takes ``LocalCartesian`` for a map with an origin, else
+            ``Local``.
+
+    Raises:
+        ConfigError: the projector does not suit the map.
+        MapFileError: a line has too many vertices.
+    """
+    projector = projector or (LOCAL if hd_map.origin is None else LOCAL_CARTESIAN)
+    if projector not in PROJECTORS:
+        raise ConfigError(f"unknown projector '{projector}'; choose from: {', '.join(PROJECTORS)}")
+    if hd_map.origin is None and projector != LOCAL:
+        raise ConfigError(
+            f"the map has no origin on the earth, which the projector {projector} needs: choose {LOCAL}"
+        )
+    features = features_of(hd_map)
+    for feature in features:
+        if len(feature.points_map) >= _MOST_VERTICES:
+            raise MapFileError(f"feature {feature.id}: more than {_MOST_VERTICES} vertices; split it")
+    document = _Document(hd_map.origin, projector)
+    lines = [feature for feature in features if not feature.closed]
+    vertices = {line.id: document.nodes(line, line.xyz_map) for line in lines}
+    lanes = _Lanes(document, lines, closed_lanes([line.points_map for line in lines]), vertices)
+    for feature in features:
+        if feature.symbol:
+            outline = document.nodes(feature, feature.xyz_map[feature.ring])
+            tags = {"type": "road_symbol", "subtype": feature.kind, "area": "yes"}
+            document.way(feature.id, outline, tags | _told(feature))
+        elif feature.closed:
+            _write_marking(document, feature, lanes)
+        else:
+            document.way(feature.id, vertices[feature.id], _line_tags(feature) | _told(feature))
+    lanes.write()
+    square = document.place_nodes()
+    replace_text(path, document.text())
+    replace_text(path.with_name(PROJECTOR_FILE), dump_yaml(_projector_info(projector, hd_map.origin, square)))
+
+
+def _write_marking(document: _Document, feature: Feature, lanes: _Lanes) -> None:
+    corners = feature.xyz_map[feature.ring]
+    tags = {"type": "pose_marker", "subtype": feature.kind, "area": "yes", "marker_id": str(feature.id)}
+    document.way(feature.id, document.nodes(feature, corners), tags | _told(feature))
+    if feature.kind != STOP_LINE:
+        return
+    middle = corners[:, :2].mean(axis=0)
+    lane = lanes.of(middle)
+    stop, sign = _stop_edges(corners, None if lane is None else lanes.direction(lane, middle))
+    part = _MOST_VERTICES
+    stop_id, sign_id, rule_id = (_part(feature, part + k) for k in range(3))
+    document.way(stop_id, document.nodes(feature, stop, part + 10), {"type": "stop_line"})
+    sign_tags = {"type": "traffic_sign", "subtype": "stop_sign", "virtual": "yes"}
+    document.way(sign_id, document.nodes(feature, sign, part + 20), sign_tags)
+    members = [("way", sign_id, "refers"), ("way", stop_id, "ref_line")]
+    document.relation(rule_id, members, {"type": "regulatory_element", "subtype": "traffic_sign"})
+    if lane is not None:
+        lanes.rules[lane].append(rule_id)
+
+
+def _stop_edges(corners: FloatArray, direction: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+    """Where to stop, and the paint's other edge: lines (2, 3) along a stop line's ``corners`` (4, 3).
+
+    One stops at the edge that is met first (Autoware's requirement vm-02-01), along the middle of the paint
+    where the ``direction`` (2,) of travel is not known.
+    """
+    sides = np.roll(corners, -1, axis=0) - corners
+    start = int(
+        np.linalg.norm(sides[1]) + np.linalg.norm(sides[3])
+        > np.linalg.norm(sides[0]) + np.linalg.norm(sides[2])
+    )
+    one, two = corners[[start, start + 1]], corners[[(start + 3) % 4, (start + 2) % 4]]
+    if direction is None:
+        return (one + two) / 2, two
+    return (one, two) if (two - one)[:, :2].mean(axis=0) @ direction > 0 else (two, one)
+
+
+class _Lanes:
+    """The lanelets of a map, and the stop lines' rules that they refer to."""
+
+    def __init__(
+        self,
+        document: _Document,
+        lines: Sequence[Feature],
+        lanes: Sequence[ClosedLane],
+        vertices: Mapping[int, Sequence[int]],
+    ) -> None:
+        self._document = document
+        self._lines = lines
+        self._lanes = lanes
+        self._vertices = vertices
+        self._bounds: dict[tuple[int, int, int], int] = {}
+        self.rules: list[list[int]] = [[] for _ in lanes]
+
+    def of(self, place_map: FloatArray) -> int | None:
+        """The lane in which a place (2,) of the map lies."""
+        for number, lane in enumerate(self._lanes):
+            left, right = (self._points(*bound) for bound in (lane.left, lane.right))
+            outline = np.concatenate([left, right[::-1]]) - place_map
+            if cv2.pointPolygonTest(outline.astype(np.float32), (0.0, 0.0), False) >= 0:
+                return number
+        return None
+
+    def direction(self, lane: int, place_map: FloatArray) -> FloatArray:
+        """In which direction (2,) a lane passes a place (2,) of the map."""
+        left = self._points(*self._lanes[lane].left)
+        nearest = int(np.argmin(((left - place_map) ** 2).sum(axis=1)))
+        return np.asarray(np.gradient(left, axis=0)[nearest])
+
+    def write(self) -> None:
+        """Write a lanelet of each lane, with those lines of its own that it needs as bounds."""
+        counts: dict[int, int] = {}
+        for lane, rules in zip(self._lanes, self.rules, strict=True):
+            owner = self._lines[lane.left[0]]
+            counts[owner.id] = counts.get(owner.id, 0) + 1
+            lanelet_id = _part(owner, _MOST_VERTICES + _PARTS // 4 + counts[owner.id])
+            members = [("way", self._bound(*lane.left), "left"), ("way", self._bound(*lane.right), "right")]
+            members += [("relation", rule, "regulatory_element") for rule in rules]
+            tags = {"type": "lanelet", "subtype": "road", "location": "urban"}
+            self._document.relation(
+                lanelet_id, members, tags | {"one_way": "yes", "participant:vehicle": "yes"}
+            )
+
+    def _points(self, line: int, order: IntArray) -> FloatArray:
+        return self._lines[line].points_map[order]
+
+    def _bound(self, line: int, order: IntArray) -> int:
+        """The line string of a bound: the line itself where that is all of it, else a piece of its nodes."""
+        owner = self._lines[line]
+        first, last = sorted((int(order[0]), int(order[-1])))
+        if last - first + 1 == len(owner.points_map):
+            return owner.id
+        key = (line, first, last)
+        if key not in self._bounds:
+            pieces = sum(1 for other, _, _ in self._bounds if other == line)
+            self._bounds[key] = _part(owner, _MOST_VERTICES + 1 + pieces)
+            nodes = self._vertices[owner.id][first : last + 1]
+            self._document.way(self._bounds[key], nodes, _line_tags(owner) | {"part_of": str(owner.id)})
+        return self._bounds[key]
+
+
+@dataclass(frozen=True)
+class _Node:
+    id: int
+    xyz_map: FloatArray
+
+
+class _Document:
+    """The OSM document; nodes are placed last, all at once."""
+
+    def __init__(self, origin: GeodeticOrigin | None, projector: str) -> None:
+        self._origin = origin
+        self._projector = projector
+        self._root = ET.Element("osm", version="0.6", generator="v2hdm")
+        ET.SubElement(self._root, "MetaInfo", format_version=_FORMAT_VERSION, map_version=_MAP_VERSION)
+        self._nodes: list[_Node] = []
+        self._ways: list[ET.Element] = []
+        self._relations: list[ET.Element] = []
+
+    def nodes(self, owner: Feature, xyz_map: FloatArray, first: int = 0) -> list[int]:
+        """Ids of new nodes at places (N, 3) of the map, from part ``first`` of their owner on."""
+        made = [_Node(_part(owner, first + number), place) for number, place in enumerate(xyz_map)]
+        self._nodes += made
+        return [node.id for node in made]
+
+    def way(self, number: int, nodes: Sequence[int], tags: Mapping[str, str]) -> None:
+        way = ET.Element("way", id=str(number))
+        for node in nodes:
+            ET.SubElement(way, "nd", ref=str(node))
+        _add_tags(way, tags)
+        self._ways.append(way)
+
+    def relation(self, number: int, members: Sequence[tuple[str, int, str]], tags: Mapping[str, str]) -> None:
+        relation = ET.Element("relation", id=str(number))
+        for kind, ref, role in members:
+            ET.SubElement(relation, "member", type=kind, ref=str(ref), role=role)
+        _add_tags(relation, tags)
+        self._relations.append(relation)
+
+    def place_nodes(self) -> str | None:
+        """Write the nodes; returns the grid square where the projector has one."""
+        xyz_map = np.array([node.xyz_map for node in self._nodes]).reshape(-1, 3)
+        degrees = geodetic_from_enu(self._origin or _NOWHERE, xyz_map)
+        local, grid = xyz_map[:, :2], None
+        if self._projector == MGRS:
+            if self._origin is not None and not len(xyz_map):
+                degrees_of_origin = np.array([[self._origin.latitude_deg, self._origin.longitude_deg]])
+                return grid_places(degrees_of_origin[:, 1], degrees_of_origin[:, 0]).square
+            grid = grid_places(degrees[:, 1], degrees[:, 0])
+            local = grid.local
+        heights_m = xyz_map[:, 2] if self._projector == LOCAL else degrees[:, 2]
+        for node, (latitude, longitude, _), (x, y), height in zip(
+            self._nodes, degrees.tolist(), local.tolist(), heights_m.tolist(), strict=True
+        ):
+            element = ET.SubElement(
+                self._root,
+                "node",
+                id=str(node.id),
+                lat=f"{latitude:.{_DEGREE_DECIMALS}f}",
+                lon=f"{longitude:.{_DEGREE_DECIMALS}f}",
+            )
+            tags = {} if grid is None else {"mgrs_code": _mgrs_code(grid, x, y)}
+            tags |= {"local_x": repr(x), "local_y": repr(y), "ele": f"{height:.{_HEIGHT_DECIMALS}f}"}
+            _add_tags(element, tags)
+        return None if grid is None else grid.square
+
+    def text(self) -> str:
+        self._root.extend([*self._ways, *self._relations])
+        ET.indent(self._root, " ")
+        return f'<?xml version="1.0" encoding="UTF-8"?>\n{ET.tostring(self._root, encoding="unicode")}\n'
+
+
+def _mgrs_code(grid: GridPlaces, x: float, y: float) -> str:
+    """A place to the metre, which the grid rounds down."""
+    return f"{grid.square}{int(x):05d}{int(y):05d}"
+
+
+def _part(owner: Feature, number: int) -> int:
+    """The id of a part of a feature."""
+    return _FIRST_PART + owner.id * _PARTS + number
+
+
+def _line_tags(feature: Feature) -> dict[str, str]:
+    dashed = feature.kind == LANE_DASH
+    return {
+        "type": "line_thin",
+        "subtype": "dashed" if dashed else "solid",
+        "lane_change": "yes" if dashed else "no",
+    }
+
+
+def _told(feature: Feature) -> dict[str, str]:
+    """What the map knows of a feature and Lanelet2 has no tag for."""
+    told = {"class": feature.kind, "sightings": str(feature.sightings)}
+    if feature.relative_sigma_m is not None:
+        told["relative_sigma_m"] = repr(feature.relative_sigma_m)
+    if feature.covariance_m2 is not None:
+        order = [2 * k + axis for k in feature.ring for axis in (0, 1)]
+        told["sigma_m"] = repr(feature.sigma_m)
+        told["covariance_m2"] = json.dumps(feature.covariance_m2[order][:, order].tolist())
+    return told
+
+
+def _add_tags(element: ET.Element, tags: Mapping[str, str]) -> None:
+    for key, value in tags.items():
+        ET.SubElement(element, "tag", k=key, v=value)
+
+
+def _projector_info(projector: str, origin: GeodeticOrigin | None, square: str | None) -> dict[str, Any]:
+    if projector == LOCAL or origin is None:
+        return {"projector_type": LOCAL}
+    info: dict[str, Any] = {"projector_type": projector, "vertical_datum": "WGS84"}
+    if square is not None:
+        return info | {"mgrs_grid": square}
+    place = {
+        "latitude": origin.latitude_deg,
+        "longitude": origin.longitude_deg,
+        "altitude": origin.altitude_m,
+    }
+    return info | {"map_origin": place}

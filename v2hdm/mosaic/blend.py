@@ -1,0 +1,344 @@
+"""All images of a drive on one canvas: the mean of what they show, weighted by how finely they show it.
+
+An image counts with the number of its pixels that a pixel of the canvas covers: the determinant of the
+derivative of the homography ``H`` from canvas to image, which is ``det(H) / w^3``, with ``w`` the third
+coordinate of the mapped point. That is proportional to its depth, so that near views outweigh far ones. What
+the image is trusted for is warped with its colours, in one pass.
+
+The canvas is done in sheets, so that memory does not grow with the drive, and each sheet in tiles of which an
+image touches only those that it shows. Within a tile lens, projection and weight are smooth: kornia evaluates
+them at Chebyshev nodes, and the polynomial through these gives them at every pixel.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from v2hdm.detection.image_file import read_bgr
+from v2hdm.errors import ConfigError, DriveError
+from v2hdm.geometry.ipm import apply_homography
+from v2hdm.geometry.tensors import distort_points
+from v2hdm.mosaic.canvas import Canvas
+from v2hdm.mosaic.shots import Lens, Shot
+from v2hdm.records import FloatArray
+
+TILES_PX = (128, 64, 32, 16)
+"""Sides that a tile may have, px of the canvas: as large as :data:`WARP_ERROR_PX` allows."""
+
+SHEET_PX = 2048
+"""Side of a sheet, px of the canvas: 70 MB of weighted sums where all of it is seen."""
+
+WARP_ERROR_PX = 0.02
+"""By so much of an image's pixels may interpolated positions be off."""
+
+_NODES = 8
+"""Chebyshev nodes along a tile's side."""
+
+_KEPT_IMAGES = 96
+"""Decoded images that neighbouring sheets share, 1.5 MB each."""
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A finished part of a canvas, its first pixel at (``row``, ``column``).
+
+    ``rgba`` (rows, columns, 4) uint8. Alpha is 255 where the images together show the ground at least as
+    finely as a single one shows the farthest ground that it is trusted for, less where more coarsely.
+    """
+
+    row: int
+    column: int
+    rgba: np.ndarray
+
+
+def whole(
+    canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Lens], device: str = "cpu"
+) -> np.ndarray:
+    """A canvas in one piece: (rows, columns, 4) uint8 RGBA."""
+    out = np.zeros((canvas.rows, canvas.columns, 4), dtype=np.uint8)
+    for sheet in blend(canvas, shots, lenses, device):
+        rows, columns = sheet.rgba.shape[:2]
+        out[sheet.row : sheet.row + rows, sheet.column : sheet.column + columns] = sheet.rgba
+    return out
+
+
+def blend(
+    canvas: Canvas,
+    shots: Sequence[Shot],
+    lenses: Mapping[str, Lens],
+    device: str = "cpu",
+    progress: Callable[[int, int], None] | None = None,
+) -> Iterator[Sheet]:
+    """The sheets of a canvas that any image shows, in the order in which the drive reaches them.
+
+    Args:
+        canvas: what to fill.
+        shots: images in driving order.
+        lenses: their cameras.
+        device: of torch.
+        progress: called as ``progress(done, total)``, in images put onto sheets.
+
+    Raises:
+        DriveError: an image is missing, damaged or of the wrong size.
+    """
+    tiling = Tiling.of(canvas, shots, lenses)
+    plan = _plan(canvas, shots, lenses, tiling.side_px)
+    full_weight = _full_weight(canvas, shots, lenses)
+    order = [index for _, views in plan for index, _ in views]
+    sources = _Sources(shots, lenses, device).of(order)
+    done = 0
+    for (row, column), views in plan:
+        rows, columns = min(SHEET_PX, canvas.rows - row), min(SHEET_PX, canvas.columns - column)
+        sums = _Sums((rows, columns), views, tiling, device)
+        map_from_sheet = canvas.window(row, column, rows, columns).map_from_canvas
+        for index, tiles in views:
+            sums.add(next(sources), shots[index].pinhole_px_from_map @ map_from_sheet, tiles)
+            done += 1
+            if progress:
+                progress(done, len(order))
+        yield Sheet(row, column, sums.mean(full_weight))
+
+
+_Views = list[tuple[int, FloatArray]]
+"""Of each image that shows a sheet: its index and the (column, row) of the tiles (T, 2) that it shows."""
+
+
+def _plan(
+    canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Lens], side_px: int
+) -> list[tuple[tuple[int, int], _Views]]:
+    """By the first pixel (row, column) of each sheet, in the order of the first image: its views."""
+    canvas_from_map = canvas.canvas_from_map
+    in_sheet = SHEET_PX // side_px
+    limit = np.ceil([canvas.columns / side_px, canvas.rows / side_px]).astype(int)
+    plan: dict[tuple[int, int], _Views] = {}
+    for index, shot in enumerate(shots):
+        outline = shot.outline_map(lenses[shot.camera])
+        tiles = _tiles_under(outline @ canvas_from_map[:2, :2].T + canvas_from_map[:2, 2], limit, side_px)
+        for sheet in np.unique(tiles // in_sheet, axis=0):
+            mine = tiles[(tiles // in_sheet == sheet).all(axis=1)] - sheet * in_sheet
+            key = (int(sheet[1]) * SHEET_PX, int(sheet[0]) * SHEET_PX)
+            plan.setdefault(key, []).append((index, mine))
+    return list(plan.items())
+
+
+def _full_weight(canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Lens]) -> float:
+    """The least weight of ground that an image is trusted for: in px of the image a px of the canvas."""
+    least = []
+    for shot in {shot.camera: shot for shot in shots}.values():
+        px_from_canvas = shot.pinhole_px_from_map @ canvas.map_from_canvas
+        outline = apply_homography(canvas.canvas_from_map, shot.outline_map(lenses[shot.camera]))
+        third = outline @ px_from_canvas[2, :2] + px_from_canvas[2, 2]
+        least.append(float((np.linalg.det(px_from_canvas) / third**3).min()))
+    return min(least, default=1.0)
+
+
+def _tiles_under(polygon: FloatArray, limit: np.ndarray, side_px: int) -> np.ndarray:
+    """The (column, row) of the tiles (T, 2) that share ground with a convex polygon (N, 2), in pixels.
+
+    Two convex shapes are apart if a side of either parts them; the box around the polygon is that of the
+    tiles' sides.
+    """
+    low = np.maximum(np.floor((polygon.min(axis=0) - 1) / side_px).astype(int), 0)
+    high = np.minimum(np.floor((polygon.max(axis=0) + 1) / side_px).astype(int) + 1, limit)
+    columns, rows = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
+    tiles = np.column_stack([columns.ravel(), rows.ravel()])
+    along = np.roll(polygon, -1, axis=0) - polygon
+    normal = np.column_stack([-along[:, 1], along[:, 0]])
+    normal *= np.sign(np.einsum("ni,ni->n", normal, polygon.mean(axis=0) - polygon))[:, None]
+    corners = side_px * np.array([[0, 0], [0, 1], [1, 0], [1, 1]]) - 0.5
+    reach = ((side_px * tiles[:, None, None] + corners[:, None] - polygon) * normal).sum(axis=-1)
+    return np.asarray(tiles[(reach.max(axis=1) >= 0).all(axis=1)])
+
+
+@dataclass(frozen=True)
+class _Source:
+    """An image cut to the rows and columns that are trusted: (4, height, width), B, G, R and trust."""
+
+    values: Tensor
+    corner_px: tuple[int, int]
+    lens: Lens
+
+
+class _Sources:
+    """The images of shots in the order in which they are asked for; the next is decoded meanwhile.
+
+    The last used are kept, cut to what is trusted.
+    """
+
+    def __init__(self, shots: Sequence[Shot], lenses: Mapping[str, Lens], device: str):
+        self._shots, self._lenses, self._device = shots, lenses, device
+        self._kept: OrderedDict[Path, np.ndarray] = OrderedDict()
+        self._boxes = {name: _box(lens.trust) for name, lens in lenses.items()}
+        self._trust = {
+            name: torch.from_numpy(lens.trust[self._boxes[name]].copy()).to(device)
+            for name, lens in lenses.items()
+        }
+
+    def of(self, order: Sequence[int]) -> Iterator[_Source]:
+        """The images of these indices of shots."""
+        with ThreadPoolExecutor(1) as decoder:
+            ahead = decoder.submit(self._pixels, self._shots[order[0]]) if order else None
+            for position, index in enumerate(order):
+                assert ahead is not None
+                pixels = ahead.result()
+                if position + 1 < len(order):
+                    ahead = decoder.submit(self._pixels, self._shots[order[position + 1]])
+                yield self._source(self._shots[index], pixels)
+
+    def _source(self, shot: Shot, pixels: np.ndarray) -> _Source:
+        box, trust = self._boxes[shot.camera], self._trust[shot.camera]
+        values = torch.empty((4, *trust.shape), dtype=torch.float32, device=self._device)
+        values[:3] = torch.from_numpy(pixels).to(self._device).permute(2, 0, 1)
+        values[3] = trust
+        return _Source(values, (box[1].start, box[0].start), self._lenses[shot.camera])
+
+    def _pixels(self, shot: Shot) -> np.ndarray:
+        if shot.path in self._kept:
+            self._kept.move_to_end(shot.path)
+            return self._kept[shot.path]
+        pixels, lens = read_bgr(shot.path), self._lenses[shot.camera]
+        if pixels.shape[:2] != lens.trust.shape:
+            raise DriveError(
+                f"{shot.path}: the image is {pixels.shape[1]}x{pixels.shape[0]} but camera "
+                f"{shot.camera!r} has {lens.info.width}x{lens.info.height}; mend its camera_info or images"
+            )
+        self._kept[shot.path] = cut = pixels[self._boxes[shot.camera]].copy()
+        if len(self._kept) > _KEPT_IMAGES:
+            self._kept.popitem(last=False)
+        return cut
+
+
+class Tiling:
+    """Tiles of ``side_px``: from Chebyshev nodes of the first kind in each to all of its pixels."""
+
+    def __init__(self, side_px: int):
+        self.side_px = side_px
+        at_nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
+        nodes = (side_px - 1) / 2 * (1 + at_nodes)
+        self.nodes = np.stack(np.meshgrid(nodes, nodes), axis=-1)
+        vandermonde = np.polynomial.chebyshev.chebvander
+        at_pixels = vandermonde(np.linspace(-1, 1, side_px), _NODES - 1)
+        self.pixels_from_nodes = at_pixels @ np.linalg.inv(vandermonde(at_nodes, _NODES - 1))
+
+    @classmethod
+    def of(cls, canvas: Canvas, shots: Sequence[Shot], lenses: Mapping[str, Lens]) -> Tiling:
+        """The largest tiles in which the first image of each camera lies as exactly as it has to.
+
+        Raises:
+            ConfigError: not even the smallest do; the canvas is too coarse for the cameras.
+        """
+        first = {shot.camera: shot for shot in reversed(shots)}
+        for side_px in TILES_PX:
+            tiling = cls(side_px)
+            errors = [tiling.error_px(canvas.cell_m, shot, lenses[name]) for name, shot in first.items()]
+            if max(errors, default=0.0) <= WARP_ERROR_PX:
+                return tiling
+        raise ConfigError(
+            f"a resolution of {canvas.cell_m:g} m a pixel is too coarse for what the cameras show close by; "
+            "give a finer one"
+        )
+
+    def error_px(self, cell_m: float, shot: Shot, lens: Lens) -> float:
+        """The largest error, px, of interpolated positions in an image over the tiles that it shows."""
+        outline_map = shot.outline_map(lens)
+        canvas = Canvas.around(outline_map, cell_m)
+        px_from_canvas = shot.pinhole_px_from_map @ canvas.map_from_canvas
+        outline = apply_homography(canvas.canvas_from_map, outline_map)
+        tiles = _tiles_under(outline, np.full(2, np.iinfo(np.int64).max), self.side_px)
+        at = np.arange(self.side_px)
+        pixels = np.stack(np.meshgrid(at, at), axis=-1)
+        exact, third = _project(px_from_canvas, pixels, tiles * self.side_px)
+        nodes, third_nodes = _project(px_from_canvas, self.nodes, tiles * self.side_px)
+        if min(third.min(), third_nodes.min()) <= 0:
+            return np.inf
+        across = self.pixels_from_nodes
+        found = np.moveaxis(across @ np.moveaxis(_distorted(lens, nodes), 3, 1) @ across.T, 1, 3)
+        return float(np.abs(found - _distorted(lens, exact)).max())
+
+
+def _project(
+    px_from_canvas: FloatArray, at: np.ndarray, corners: np.ndarray
+) -> tuple[FloatArray, FloatArray]:
+    """Pinhole pixels (T, ..., 2) and third coordinates (T, ...) of points in tiles that begin at (T, 2)."""
+    homogeneous = (at + corners[:, None, None]) @ px_from_canvas[:, :2].T + px_from_canvas[:, 2]
+    return homogeneous[..., :2] / homogeneous[..., 2:], homogeneous[..., 2]
+
+
+def _distorted(lens: Lens, pinhole_px: FloatArray) -> FloatArray:
+    flat = torch.from_numpy(pinhole_px.reshape(-1, 2))
+    return np.asarray(distort_points(lens.info, flat).reshape(pinhole_px.shape).numpy())
+
+
+class _Sums:
+    """The weighted sums (tiles, 4, side, side) of colours and weights on one sheet."""
+
+    def __init__(self, shape: tuple[int, int], views: _Views, tiling: Tiling, device: str):
+        self._shape, self._tiling, self._device = shape, tiling, device
+        self._tiles = np.unique(np.concatenate([tiles for _, tiles in views]), axis=0)
+        self._at = {(int(c), int(r)): k for k, (c, r) in enumerate(self._tiles)}
+        side = tiling.side_px
+        self._sums = torch.zeros((len(self._tiles), 4, side, side), device=device)
+        self._rows = torch.from_numpy(tiling.pixels_from_nodes).float().to(device)
+        # For x and y side by side.
+        self._pairs = torch.from_numpy(np.kron(tiling.pixels_from_nodes.T, np.eye(2))).float().to(device)
+
+    def add(self, source: _Source, pinhole_px_from_sheet: FloatArray, tiles: np.ndarray) -> None:
+        """Add an image to the tiles (T, 2) of (column, row) that it shows."""
+        grid, density = self._warp(source, pinhole_px_from_sheet, tiles)
+        values = grid_sample(
+            source.values.expand(len(tiles), -1, -1, -1), grid, padding_mode="zeros", align_corners=True
+        )
+        weight = values[:, 3] * density
+        values[:, :3] *= weight[:, None]
+        values[:, 3] = weight
+        at = torch.tensor([self._at[int(c), int(r)] for c, r in tiles], device=self._device)
+        self._sums.index_add_(0, at, values)
+
+    def _warp(
+        self, source: _Source, pinhole_px_from_sheet: FloatArray, tiles: np.ndarray
+    ) -> tuple[Tensor, Tensor]:
+        """Where the pixels of tiles lie in an image, and how many of its pixels each covers.
+
+        Returns:
+            ``grid`` (T, side, side, 2) in [-1, 1] over the cut image, as of ``grid_sample``, and the density
+            (T, side, side) in px of the image a px of the sheet.
+        """
+        side = self._tiling.side_px
+        pinhole_px, third = _project(pinhole_px_from_sheet, self._tiling.nodes, side * tiles)
+        density = torch.from_numpy(np.linalg.det(pinhole_px_from_sheet) / third**3).float().to(self._device)
+        px = distort_points(source.lens.info, torch.from_numpy(pinhole_px.reshape(-1, 2)).to(self._device))
+        height, width = source.values.shape[1:]
+        size = px.new_tensor([width - 1, height - 1])
+        pairs = (2 * (px - px.new_tensor(source.corner_px)) / size - 1).float()
+        grid = self._rows @ pairs.reshape(len(tiles), _NODES, 2 * _NODES) @ self._pairs
+        return grid.reshape(len(tiles), side, side, 2), self._rows @ density @ self._rows.mT
+
+    def mean(self, full_weight: float) -> np.ndarray:
+        """The sheet as (rows, columns, 4) uint8 RGBA, opaque from ``full_weight`` on."""
+        weight = self._sums[:, 3:]
+        colours = self._sums[:, [2, 1, 0]] / weight.where(weight > 0, torch.ones_like(weight))
+        alpha = (255 / full_weight * weight).clamp(max=255)
+        rgba = torch.cat([colours, alpha], dim=1).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
+        (rows, columns), side = self._shape, self._tiling.side_px
+        down, across = -(-rows // side), -(-columns // side)
+        out = np.zeros((down, side, across, side, 4), dtype=np.uint8)
+        out[self._tiles[:, 1], :, self._tiles[:, 0]] = rgba
+        return out.reshape(down * side, -1, 4)[:rows, :columns]
+
+
+def _box(trust: np.ndarray) -> tuple[slice, slice]:
+    """The rows and columns that are trusted at all, and one around them."""
+    rows, columns = (np.flatnonzero(trust.any(axis=axis)) for axis in (1, 0))
+    return (
+        slice(max(int(rows[0]) - 1, 0), int(rows[-1]) + 2),
+        slice(max(int(columns[0]) - 1, 0), int(columns[-1]) + 2),
+    )

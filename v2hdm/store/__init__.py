@@ -1,0 +1,1 @@
+"""Files on disk and at object stores: whole or absent, listed, locked, cached."""

@@ -1,0 +1,213 @@
+"""Reading and writing files so that a user can mend what is wrong with them.
+
+Every reader takes the :class:`~v2hdm.errors.V2hdmError` child to raise, so that a damaged drive
+and a damaged map report as what they are. Writers never leave half a file behind.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import sys
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from v2hdm.errors import ConfigError, V2hdmError
+from v2hdm.io.texts import read_json, read_text, read_yaml, shown
+from v2hdm.records import FloatArray
+from v2hdm.store.inputs import refuse_input
+
+__all__ = [
+    "check_keys",
+    "dump_yaml",
+    "forget_stdout",
+    "load_json",
+    "load_yaml",
+    "read_text",
+    "refuse_url",
+    "replace_text",
+    "take_array",
+    "take_choice",
+    "take_mapping",
+    "take_number",
+    "take_text",
+    "told_of_files",
+    "whole_file",
+]
+
+_URL = re.compile(r"[a-z][a-z0-9+.-]+:/")
+_LARGEST = sys.float_info.max
+
+Tell = Callable[[Path, Path], None]
+_tell: ContextVar[Tell | None] = ContextVar("told of each file before it is there", default=None)
+
+
+@contextmanager
+def told_of_files(tell: Tell) -> Iterator[None]:
+    """Within, ``tell`` is given each new file and the path whose place it is about to take; it may refuse."""
+    token = _tell.set(tell)
+    try:
+        yield
+    finally:
+        _tell.reset(token)
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A hidden name beside ``path`` to write to: readers see the old file or the whole new one.
+
+    What was written takes the place of ``path`` when the block succeeds; else nothing of it is left. The
+    folder is created when absent.
+
+    Raises:
+        ConfigError: ``path`` is an input of this door, or no plain file.
+        OSError: it cannot be written there; the error names ``path``.
+    """
+    refuse_url(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    refuse_input(path)
+    if path.exists() and not path.is_file():
+        raise ConfigError(f"{path}: is no plain file, and nothing is put in its place; name another output")
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        yield partial
+        refuse_input(path)
+        if (tell := _tell.get()) is not None:
+            tell(partial, path)
+        partial.replace(path)
+    except OSError as failure:
+        # Calls on an open file name none, and the hidden name is of no use to anybody.
+        if failure.errno is not None and failure.filename in (None, str(partial)):
+            failure.filename = str(path)
+        raise
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def refuse_url(path: Path) -> None:
+    """Refuse a URL that was taken for a path: it would be a folder called ``s3:``.
+
+    Raises:
+        ConfigError: it is one.
+    """
+    if _URL.match(str(path)):
+        raise ConfigError(
+            f"{path}: no URL is written to here, only as output=, cache= and --table of v2hdm.map and "
+            "v2hdm.fleet; give a path on this machine"
+        )
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write ``text`` to ``path`` as :func:`whole_file` does."""
+    with whole_file(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+def load_yaml(path: Path, error: type[V2hdmError]) -> dict[str, Any]:
+    """The mapping at the top of a YAML file, whose keys are texts; see :func:`v2hdm.io.texts.read_yaml`.
+
+    Raises:
+        V2hdmError: of type ``error``, when the file is missing, has a syntax error (with its line)
+            or holds anything but a mapping.
+    """
+    content = read_yaml(path, error)
+    if not isinstance(content, dict):
+        raise error(
+            f"{path}: expected 'key: value' entries, got {shown(content)}; see the format's description"
+        )
+    return content
+
+
+def dump_yaml(content: Mapping[str, Any]) -> str:
+    """YAML text of ``content``, keys in the order given, short lists on one line."""
+    return yaml.safe_dump(dict(content), sort_keys=False, default_flow_style=None, width=120)
+
+
+def load_json(path: Path, error: type[V2hdmError]) -> dict[str, Any]:
+    """The object at the top of a JSON file; errors as in :func:`load_yaml`."""
+    content = read_json(path, error)
+    if not isinstance(content, dict):
+        raise error(f"{path}: expected a JSON object, got {shown(content)}")
+    return content
+
+
+def take_mapping(content: object, where: str, error: type[V2hdmError]) -> dict[str, Any]:
+    """``content`` itself if it is a mapping, else an ``error`` that names ``where``."""
+    if not isinstance(content, dict):
+        raise error(f"{where}: expected 'key: value' entries, got {shown(content)}")
+    return content
+
+
+def check_keys(
+    content: Mapping[str, Any],
+    required: Collection[str],
+    optional: Collection[str],
+    where: str,
+    error: type[V2hdmError],
+) -> None:
+    """Refuse unknown and missing keys; an unknown key is reported with the nearest valid one."""
+    valid = [*required, *optional]
+    for key in content:
+        if key not in valid:
+            near = difflib.get_close_matches(str(key), valid, n=1, cutoff=0.5)
+            advice = f"did you mean '{near[0]}'?" if near else f"valid keys: {', '.join(valid)}"
+            raise error(f"{where}: unknown key {shown(key)}; {advice}")
+    missing = [key for key in required if key not in content]
+    if missing:
+        raise error(f"{where}: missing key '{missing[0]}'; add it")
+
+
+def take_array(content: object, shape: tuple[int, ...], where: str, error: type[V2hdmError]) -> FloatArray:
+    """``content`` as a finite float64 array of ``shape``, in which -1 stands for any length.
+
+    Raises:
+        V2hdmError: of type ``error``, when it is not numeric, not finite or shaped otherwise.
+    """
+    wanted = " x ".join("N" if length < 0 else str(length) for length in shape)
+    try:
+        raw = np.array(content)
+        if raw.dtype.kind not in "iuf" and raw.size:  # NumPy would make numbers of texts
+            raise TypeError
+        array = raw.astype(np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise error(f"{where}: expected {wanted} numbers, got {shown(content)}") from None
+    fits = array.ndim == len(shape) and all(w in (-1, n) for w, n in zip(shape, array.shape, strict=True))
+    if not fits:
+        got = " x ".join(map(str, array.shape)) or "a single number"
+        raise error(f"{where}: expected {wanted} numbers, got {got}")
+    if not np.isfinite(array).all():
+        raise error(f"{where}: holds a number that is not finite; replace it")
+    return array
+
+
+def take_number(content: object, where: str, error: type[V2hdmError]) -> float:
+    """``content`` as a finite float, else an ``error`` that names ``where``."""
+    if isinstance(content, int | float) and not isinstance(content, bool) and abs(content) <= _LARGEST:
+        return float(content)
+    raise error(f"{where}: expected a finite number, got {shown(content)}")
+
+
+def take_text(content: object, where: str, error: type[V2hdmError]) -> str:
+    """``content`` as a string that is not empty, else an ``error`` that names ``where``."""
+    if not isinstance(content, str) or not content:
+        raise error(f"{where}: expected a text, got {shown(content)}")
+    return content
+
+
+def take_choice(content: object, choices: Collection[str], where: str, error: type[V2hdmError]) -> str:
+    """``content`` as one of a few texts, else an ``error`` that names them."""
+    if not isinstance(content, str) or content not in choices:
+        raise error(f"{where}: expected one of {', '.join(choices)}, got {shown(content)}")
+    return content
+
+
+def forget_stdout() -> None:
+    """Keep Python from writing at its end what could not be written before."""
+    sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123

@@ -1,0 +1,397 @@
+"""Folders of results: each belongs to one process at a time, and only what is ours is ever replaced.
+
+A folder that we wrote holds a list of our files with their hashes, ``.v2hdm-results.jsonl``. What is not on
+the list is the user's and stays through a rerun; where a file on it was changed, the rerun is refused. A
+lock beside the folder is held by the process that writes and released by its end, whatever ends it.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import logging
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+from v2hdm.errors import ConfigError
+from v2hdm.store.files import refuse_url, told_of_files, whole_file
+from v2hdm.store.listing import LIST
+from v2hdm.store.locks import take_lock
+
+_log = logging.getLogger(__name__)
+
+_HEAD = {"about": "files that v2hdm wrote here; a rerun replaces these and no others"}
+
+
+@contextmanager
+def result_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
+    """A hidden folder beside ``folder`` to write into, which takes its place when the block succeeds.
+
+    An earlier result stays untouched until then; after an error nothing new is left. Files of the user's in
+    an earlier result are kept. Errors name the ``option`` that says which folder it is.
+
+    Raises:
+        ConfigError: The folder cannot be written, holds something that is no earlier result of ours, or
+            another process is writing it.
+    """
+    target = _resolved(folder, option)
+    with ExitStack() as stack:
+        with _explained(folder, option):
+            stack.enter_context(_parents(target))
+            stack.enter_context(_locked(target, folder, option))
+            unfinished, previous = _hidden(target, "part"), _hidden(target, "previous")
+            _recover(target, unfinished, previous, option)
+            ours = _ours(target, folder, option)
+            unfinished.mkdir()
+            (unfinished / LIST).write_text(json.dumps(_HEAD) + "\n", encoding="utf-8")
+        try:
+            yield unfinished
+            with _explained(folder, option):
+                _list(unfinished)
+                if ours is not None:
+                    _bring_over(target, unfinished, ours)
+                    target.replace(previous)
+                elif target.exists():
+                    target.rmdir()
+                unfinished.replace(target)
+        except OSError as failure:
+            if failure.errno in _FULL:
+                raise _cannot_write(folder, failure, option) from None
+            raise
+        finally:
+            shutil.rmtree(unfinished, ignore_errors=True)
+            if target.exists():
+                shutil.rmtree(previous, ignore_errors=True)
+
+
+@contextmanager
+def added_to(folder: Path, option: str) -> Iterator[Path]:
+    """A finished result to write further files into, each listed before it is there.
+
+    Args:
+        folder: of the result.
+        option: which says what folder it is, for errors.
+
+    Raises:
+        ConfigError: the folder is no result of ours, a file that is to be replaced in it is not ours, it
+            cannot be written, or another process is writing it.
+    """
+    target = _resolved(folder, option)
+    with ExitStack() as stack:
+        with _explained(folder, option):
+            stack.enter_context(_locked(target, folder, option))
+            if _listed(target, folder, option) is None:
+                raise ConfigError(f"{folder}: is no result of ours; give another {option}")
+        with listed_files(folder, option):
+            yield target
+
+
+@contextmanager
+def listed_files(folder: Path, option: str) -> Iterator[None]:
+    """Within, each file that is written whole into a folder of ours is put on its list before it is there.
+
+    Listed first, a file is ours whenever the work is cut off; what it was before stays ours as well.
+
+    Raises:
+        ConfigError: a file that is to be replaced is not ours, or the folder cannot be written.
+    """
+    target = _resolved(folder, option)
+    ours = _listed(target, folder, option) or {}
+
+    def list_file(partial: Path, path: Path) -> None:
+        if not (place := path.resolve()).is_relative_to(target):
+            return
+        name = place.relative_to(target).as_posix()
+        if path.exists() and _digest(path) not in ours.get(name, ()):
+            raise ConfigError(f"{folder / name}: is no file of ours; move it, or give another {option}")
+        digest = _digest(partial)
+        _append(target / LIST, json.dumps({"file": name, "sha256": digest}) + "\n")
+        ours.setdefault(name, []).append(digest)
+
+    try:
+        with told_of_files(list_file):
+            yield
+    except OSError as failure:
+        if failure.errno in _FULL:
+            raise _cannot_write(folder, failure, option) from None
+        raise
+
+
+def _append(path: Path, line: str) -> None:
+    """Append a line, or nothing: half of one would damage the list."""
+    size = path.stat().st_size
+    try:
+        with path.open("ab", buffering=0) as stream:
+            data = line.encode()
+            if stream.write(data) < len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+    except OSError:
+        os.truncate(path, size)
+        raise
+
+
+class GrowingFolder:
+    """A folder whose files are written one by one, each at once."""
+
+    def __init__(self, target: Path, shown: Path, option: str) -> None:
+        self._target, self._shown, self._option = target, shown, option
+
+    @property
+    def has_files(self) -> bool:
+        """Whether any file of it is ours."""
+        return any((self._target / name).is_file() for name in files_of_result(self._target))
+
+    def write(self, name: str, data: bytes) -> None:
+        """Write the file ``name``.
+
+        Raises:
+            ConfigError: it cannot be written, or there is a file of this name that is not ours.
+        """
+        with _explained(self._shown, self._option), whole_file(self._target / name) as partial:
+            partial.write_bytes(data)
+
+
+@contextmanager
+def growing_folder(folder: Path, option: str) -> Iterator[GrowingFolder]:
+    """``folder`` to write single files into, each listed before it is there.
+
+    Raises:
+        ConfigError: as :func:`result_folder`.
+    """
+    target = _resolved(folder, option)
+    with ExitStack() as stack:
+        with _explained(folder, option):
+            stack.enter_context(_parents(target))
+            stack.enter_context(_locked(target, folder, option))
+            there = _listed(target, folder, option)
+            target.mkdir(exist_ok=True)
+            if there is None:
+                (target / LIST).write_text(json.dumps(_HEAD) + "\n", encoding="utf-8")
+        growing = GrowingFolder(target, folder, option)
+        try:
+            with listed_files(folder, option):
+                yield growing
+        finally:
+            if there is None and not growing.has_files:
+                (target / LIST).unlink(missing_ok=True)
+                with suppress(OSError):
+                    target.rmdir()
+
+
+@contextmanager
+def locked_folder(folder: Path, option: str = "output=") -> Iterator[None]:
+    """Keep other processes of ours from writing ``folder`` at the same time.
+
+    Raises:
+        ConfigError: one does already; the message names it.
+    """
+    target = _resolved(folder, option)
+    with ExitStack() as stack:
+        with _explained(folder, option):
+            stack.enter_context(_parents(target))
+            stack.enter_context(_locked(target, folder, option))
+        yield
+
+
+def files_of_result(folder: Path) -> dict[str, str]:
+    """SHA-256 of our files in a result folder by their names; none where it is no result.
+
+    Raises:
+        ConfigError: its list is damaged.
+    """
+    return {name: digests[-1] for name, digests in (_listed(folder, folder, "output=") or {}).items()}
+
+
+def is_whole(folder: Path, files: Mapping[str, str]) -> bool:
+    """Whether a result folder holds these files of ours, unchanged, and none is missing."""
+    return bool(files) and all(
+        (folder / name).is_file() and _digest(folder / name) == digest for name, digest in files.items()
+    )
+
+
+def drop_result(folder: Path) -> None:
+    """Remove our files from a result folder, and the folders that are empty then."""
+    with suppress(OSError, ConfigError):
+        for name in [*files_of_result(folder), LIST]:
+            (folder / name).unlink(missing_ok=True)
+        below = sorted((one for one in folder.rglob("*") if one.is_dir()), key=lambda one: -len(one.parts))
+        for one in [*below, folder]:
+            one.rmdir()
+
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
+"""The disk is at fault, whatever was being written."""
+
+
+@contextmanager
+def _explained(folder: Path, option: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as failure:
+        raise _cannot_write(folder, failure, option) from None
+
+
+def _cannot_write(folder: Path, failure: OSError, option: str) -> ConfigError:
+    return ConfigError(
+        f"output folder {folder} cannot be written: {failure.strerror}; nothing new is left: free space "
+        f"or give another {option}"
+    )
+
+
+def _resolved(folder: Path, option: str) -> Path:
+    """Where ``folder`` leads; a folder that cannot be put aside is refused before any work."""
+    refuse_url(folder)
+    try:
+        target = folder.resolve()
+    except (OSError, RuntimeError, ValueError):
+        raise ConfigError(f"output folder {folder}: leads nowhere; give another {option}") from None
+    if target.is_mount():
+        raise ConfigError(f"output folder {folder} is a disk of its own; give a folder within it")
+    if target.exists() and not target.is_dir():
+        raise ConfigError(f"output folder {folder} is a file; give another {option}")
+    return target
+
+
+def _hidden(target: Path, kind: str) -> Path:
+    return target.with_name(f".{target.name}.{kind}")
+
+
+@contextmanager
+def _parents(target: Path) -> Iterator[None]:
+    """Make the folders that ``target`` is to lie in; those that end up empty go again."""
+    missing = [parent for parent in target.parents if not parent.exists()]
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    finally:
+        for parent in missing:
+            with suppress(OSError):
+                parent.rmdir()
+
+
+def _recover(target: Path, unfinished: Path, previous: Path, option: str) -> None:
+    """Tidy up after a process that was killed: its work is dropped, an earlier result put back."""
+    for left in (unfinished, previous):
+        if left.exists() and not (left / LIST).is_file() and any(left.iterdir()):
+            raise ConfigError(
+                f"{left}: is in the way of our work and not ours; move it, or give another {option}"
+            )
+    if previous.exists() and not target.exists():
+        previous.replace(target)
+    for left in (unfinished, previous):
+        if left.exists():
+            shutil.rmtree(left)
+
+
+def _ours(target: Path, shown: Path, option: str) -> set[str] | None:
+    """Names of our files in ``target``; None if there is nothing yet.
+
+    Raises:
+        ConfigError: it holds something and is not ours, or a file of ours was changed.
+    """
+    listed = _listed(target, shown, option)
+    for name, digests in (listed or {}).items():
+        path = target / name
+        if path.is_file() and _digest(path) not in digests:
+            raise ConfigError(
+                f"{shown / name}: was changed after we wrote it and is not replaced; move it, or give "
+                f"another {option}"
+            )
+    return None if listed is None else set(listed)
+
+
+def _listed(target: Path, shown: Path, option: str) -> dict[str, list[str]] | None:
+    """By name of a file of ours in ``target`` what we wrote there, the last at the end; None if it is empty.
+
+    Raises:
+        ConfigError: it holds something and is not ours.
+    """
+    if not target.exists() or not any(target.iterdir()):
+        return None
+    marker = target / LIST
+    if not marker.is_file():
+        raise ConfigError(
+            f"output folder {shown} holds files that are no results of ours: give another {option}"
+        )
+    listed: dict[str, list[str]] = {}
+    try:
+        for line in marker.read_text(encoding="utf-8").splitlines()[1:]:
+            entry = json.loads(line)
+            listed.setdefault(str(entry["file"]), []).append(str(entry["sha256"]))
+    except (ValueError, TypeError, LookupError, RecursionError):
+        raise ConfigError(f"{shown / LIST}: is damaged; give another {option}") from None
+    return listed
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _list(folder: Path) -> None:
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != LIST)
+    entries = [{"file": path.relative_to(folder).as_posix(), "sha256": _digest(path)} for path in files]
+    (folder / LIST).write_text(
+        "".join(json.dumps(entry) + "\n" for entry in [_HEAD, *entries]), encoding="utf-8"
+    )
+
+
+def _bring_over(earlier: Path, new: Path, ours: set[str]) -> None:
+    """Give what the user has put into an ``earlier`` result to the ``new`` one as well."""
+    for root, folders, files in os.walk(earlier):
+        here = Path(root)
+        links = [name for name in folders if (here / name).is_symlink()]
+        names = [path for path in map(here.joinpath, (*files, *links)) if not _is_ours(path, earlier, ours)]
+        if names or not (files or folders):
+            (new / here.relative_to(earlier)).mkdir(parents=True, exist_ok=True)
+        for path in names:
+            place = new / path.relative_to(earlier)
+            while place.exists() or place.is_symlink():
+                place = place.with_name(f"{place.stem}.kept{place.suffix}")
+                _log.warning("%s is not ours; it is kept as %s", path, place.name)
+            try:
+                os.link(path, place, follow_symlinks=False)
+            except OSError:  # a file system without links
+                shutil.copy2(path, place, follow_symlinks=False)
+
+
+def _is_ours(path: Path, folder: Path, ours: set[str]) -> bool:
+    name = path.relative_to(folder).as_posix()
+    return name == LIST or name in ours
+
+
+@contextmanager
+def _locked(target: Path, shown: Path, option: str) -> Iterator[None]:
+    """Hold the lock of ``target``, a file beside it, until the block or the process ends."""
+    path = _hidden(target, "lock")
+    while True:
+        stream = path.open("a+", encoding="utf-8")
+        if not take_lock(stream):
+            stream.seek(0)
+            holder = stream.read(200).strip()
+            stream.close()
+            raise ConfigError(
+                f"output folder {shown} is being written by {holder or 'another process'}; wait for it, or "
+                f"give another {option}"
+            )
+        # The last holder may have removed the file between our opening and locking it.
+        with suppress(OSError):
+            if os.path.samestat(os.fstat(stream.fileno()), path.stat()):
+                break
+        stream.close()
+    try:
+        stream.seek(0)
+        stream.truncate()
+        stream.write(
+            f"process {os.getpid()} on {os.uname().nodename if hasattr(os, 'uname') else 'this host'}\n"
+        )
+        stream.flush()
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        with suppress(OSError):
+            stream.close()

@@ -1,0 +1,120 @@
+"""All checks before a run: poses, clocks, noise, cameras, images, and what the ground says."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+
+from v2hdm.ground.results import GroundEstimate
+from v2hdm.records import Drive
+from v2hdm.verdict.inputs import ground as ground_checks
+from v2hdm.verdict.inputs.cameras import check_camera
+from v2hdm.verdict.inputs.clocks import check_clocks
+from v2hdm.verdict.inputs.ground import check_ground, path_of
+from v2hdm.verdict.inputs.heading import check_heading
+from v2hdm.verdict.inputs.images import check_images
+from v2hdm.verdict.inputs.motion import Motion
+from v2hdm.verdict.inputs.noise import check_noise
+from v2hdm.verdict.inputs.path import check_attitude, check_jumps, check_path
+from v2hdm.verdict.inputs.road import check_road
+from v2hdm.verdict.inputs.suspects import find_suspect
+from v2hdm.verdict.verdict import Finding, Status
+
+_STEPS = ("position jumps", "height jumps", "pose scatter", "image spacing", "pose gaps", "pose rate")
+_MOUNTING = ("roi", "roi range", "ipm against camera matrix", "camera height", "survey against guess")
+
+_SURVEY = ("survey height", "survey forward", "survey left")
+
+HIDES: Mapping[str, tuple[str, ...]] = {
+    "path length": (*_STEPS, *ground_checks.CHECKS),
+    "speed": (*_STEPS, *ground_checks.CHECKS),
+    "heading": ("heading offset", "attitude", "pitch sign", "road", "origin", *_STEPS, *ground_checks.CHECKS),
+    "attitude": ("pitch sign", "road", *ground_checks.CHECKS),
+    "repeated poses": (*_STEPS, *ground_checks.CHECKS),
+    "pose scatter": ("position jumps", *ground_checks.CHECKS),
+    "position jumps": ground_checks.CHECKS,
+    "pose noise": ground_checks.CHECKS,
+    "height jumps": ("road", "grade", "ground match", "ground residual", "poses against ground"),
+    "origin": ("survey forward", "poses against ground"),
+    "own images": ("frozen images", *ground_checks.CHECKS),
+    "bright images": ("frozen images", "ground match"),
+    "dark images": ("frozen images", "ground match"),
+    "frozen images": ground_checks.CHECKS,
+    "principal point": ("focal length", *_MOUNTING, *ground_checks.CHECKS),
+    "focal length": (*_MOUNTING, *ground_checks.CHECKS),
+    "square pixels": (
+        "ipm against camera matrix",
+        "ground residual",
+        "focal length from ground",
+        "distortion",
+    ),
+    "camera tilt": ("roi", "ground match"),
+    "camera height": ("survey against guess", "ground match"),
+    "roi": ("image spacing", "roi range", "ground match"),
+    "survey against guess": ground_checks.CHECKS,
+    "distortion": ("focal length from ground", "ground residual", *_SURVEY),
+    "focal length from ground": ("ipm against camera matrix", "ground residual", *_SURVEY),
+    "clock": ("survey forward", "survey left", "poses against ground"),
+}
+"""Checks that fail because another one did: the cause is told, its consequences are not."""
+
+
+def check_drive(drive: Drive, ground: Mapping[str, GroundEstimate] | None = None) -> list[Finding]:
+    """Everything that can be said of a drive before any long work; causes without their consequences.
+
+    Args:
+        drive: the drive.
+        ground: what bare ground says, by camera; cameras that it leaves out are checked without.
+
+    Raises:
+        DriveError: a sampled image cannot be decoded.
+    """
+    ground = ground or {}
+    motion = Motion.of(drive)
+    findings = [
+        *check_path(motion),
+        *check_heading(motion, path_of(ground)),
+        *check_attitude(motion),
+        *check_jumps(motion, drive.pose_noise),
+        *check_clocks(drive, motion),
+        *check_noise(motion, drive.pose_noise),
+        *check_road(drive),
+    ]
+    for name, camera in drive.cameras.items():
+        findings += check_camera(name, camera)
+    findings += check_images(drive)
+    return causes([*findings, *_of_ground(drive, ground, findings)])
+
+
+def _of_ground(
+    drive: Drive, ground: Mapping[str, GroundEstimate], findings: Iterable[Finding]
+) -> list[Finding]:
+    """What the ground says; where it never matches and nothing else explains that, suspects are tried."""
+    explained = any("ground match" in HIDES.get(f.check, ()) for f in findings if f.status is not Status.PASS)
+    return check_ground(drive, ground, None if explained else find_suspect(drive, ground))
+
+
+def causes(findings: Iterable[Finding]) -> list[Finding]:
+    """The findings without those that another one explains (:data:`HIDES`).
+
+    A cause hides its consequences about the same camera, one in the poses those about every camera. It is as
+    bad as the worst of them.
+    """
+    findings = list(findings)
+    raised = [finding for finding in findings if finding.status is not Status.PASS]
+    explained: set[int] = set()
+    worst: dict[int, Status] = {}
+    for cause in raised:
+        own = [finding for finding in raised if _explains(cause, finding)]
+        explained |= {id(finding) for finding in own}
+        worst[id(cause)] = max((finding.status for finding in (cause, *own)), key=lambda status: status.rank)
+    return [
+        replace(finding, status=worst.get(id(finding), finding.status))
+        for finding in findings
+        if id(finding) not in explained
+    ]
+
+
+def _explains(cause: Finding, finding: Finding) -> bool:
+    same = cause.about == finding.about or cause.about.startswith("pose")
+    return same and finding is not cause and finding.check in HIDES.get(cause.check, ())

@@ -1,0 +1,226 @@
+"""Course over ground against the recorded attitude: the conventions that users mix up, told by name.
+
+A vehicle goes where it points. For each chord of the path its direction is compared with the vehicle's x
+axis midway; where they disagree, each usual mistake is undone in turn, and the one after which they agree
+is the cause.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import numpy as np
+
+from v2hdm.records import BoolArray, FloatArray
+from v2hdm.verdict.inputs.conventions import AXES_SWAPPED, CONVENTIONS, REFLECTED
+from v2hdm.verdict.inputs.motion import Chords, Motion, angle_between
+from v2hdm.verdict.judgement import judge, passed
+from v2hdm.verdict.verdict import Finding, Status
+
+_AGREES_RAD = np.deg2rad(15)
+"""Course and heading agree within this: an origin 1.5 m ahead of the axle errs so on a circle of 6 m."""
+
+_UPRIGHT_RAD = np.deg2rad(15)
+"""No road that a vehicle maps is steeper, nor rolls it farther."""
+
+_FITS = 0.8
+"""A convention fits if this share of the chords agrees: the rest may be wheel spin, ferries, bad fixes."""
+
+_MISALIGNED_RAD = np.deg2rad(1.0)
+"""A heading that is off by this moves a camera 3.4 m ahead of the axle by 6 cm, three sigmas of a survey."""
+
+_STRAIGHT_RAD = np.deg2rad(2.0)
+"""A chord on which the heading turns less is straight: where the origin sits does not matter there."""
+
+_LEVER_M = 0.3
+"""Origin this far from the axle, along the vehicle: 15 sigmas of a surveyed camera centre."""
+
+_SURE = 5.0
+"""Sigmas beyond which a measured offset is told: the poses' drift makes sigmas optimistic by up to two."""
+
+
+class Path(Enum):
+    """What the images' ground says of the recorded path."""
+
+    AS_GIVEN = "path and yaw are as the images show them"
+    RIGHT_YAW_WRONG = "the path is right, the yaw is not"
+    MIRRORED = "the path is mirrored"
+
+
+def check_heading(motion: Motion, path: Path | None = None) -> list[Finding]:
+    """Whether the recorded poses drive where they point, z up.
+
+    Args:
+        motion: the recorded poses.
+        path: what the images' ground says of the recorded path; None where it was not asked or does not say.
+    """
+    chords = motion.chords
+    if not len(chords):
+        return []  # the check of the path's length says so
+    _, either = _agreement(motion.position, motion.rotation, chords)
+    if either >= _FITS:
+        return [_as_given(motion, either, path), *_alignment(motion)]
+    says = _cause(motion, _fitting(motion), path)
+    if says is None:
+        return []  # the check of the attitude says so
+    return [Finding("heading", Status.FAIL, 1 - either, 1 - _FITS, "", says, "poses")]
+
+
+def backwards_share(motion: Motion) -> float:
+    """The share of chords on which the vehicle drives backwards, if its heading is right."""
+    return float((np.abs(_course_minus_yaw(motion)) > np.pi / 2).mean()) if len(motion.chords) else 0.0
+
+
+def _as_given(motion: Motion, agrees: float, path: Path | None) -> Finding:
+    back = backwards_share(motion)
+    if back > _FITS and path is Path.RIGHT_YAW_WRONG:
+        says = "yaw points backwards although the images drive forwards; turn yaw by 180 deg"
+        return Finding("heading", Status.FAIL, back, _FITS, "", says, "poses")
+    if back > _FITS and path is not Path.AS_GIVEN:
+        says = (
+            "the vehicle drives backwards all the time; if it did not, yaw is off by 180 deg (turn it), or "
+            "the poses are vehicle_from_map (write their inverse)"
+        )
+        return Finding("heading", Status.WARN, back, _FITS, "", says, "poses")
+    how = f"it drives backwards on {100 * back:.0f} % of the way" if back > 0.01 else "it drives forwards"
+    return passed("heading", "poses", f"the vehicle goes where its heading points; {how}", 1 - agrees)
+
+
+def _alignment(motion: Motion) -> list[Finding]:
+    """The constant angle between course and heading, and the lever from the axle to the origin."""
+    offset = _course_minus_yaw(motion)
+    reverse = np.abs(offset) > np.pi / 2
+    offset = np.where(reverse, angle_of(offset + np.pi), offset)
+    length = np.linalg.norm(
+        motion.position[motion.chords.last, :2] - motion.position[motion.chords.first, :2], axis=1
+    )
+    curvature = motion.turn_rad / length * np.where(reverse, -1.0, 1.0)
+    keep = np.abs(offset) < _AGREES_RAD
+    findings = [_constant_offset(offset[keep], np.abs(motion.turn_rad[keep]), _overlap(motion))]
+    findings += _lever(offset[keep], curvature[keep], _overlap(motion))
+    return findings
+
+
+def _constant_offset(offset_rad: FloatArray, turn_rad: FloatArray, overlap: float) -> Finding:
+    straight = offset_rad[turn_rad < _STRAIGHT_RAD]
+    if len(straight) < 10:
+        return passed("heading offset", "poses", "the route has no straight stretch that would tell it")
+    value = float(np.rad2deg(np.median(straight)))
+    sigma = 1.25 * np.std(straight) / np.sqrt(max(1.0, len(straight) / overlap))  # of a median
+    limit = float(np.rad2deg(_MISALIGNED_RAD + _SURE * sigma))
+    return judge(
+        "heading offset", "poses", value, limit, "deg",
+        fine="on straight stretches the vehicle goes where its heading points",
+        wrong=f"on straight stretches the vehicle drives {abs(value):.1f} deg to the "
+        f"{'left' if value > 0 else 'right'} of its heading; mend the alignment of the heading's antennas",
+        status=Status.WARN,
+    )  # fmt: skip
+
+
+def _lever(offset_rad: FloatArray, curvature: FloatArray, overlap: float) -> list[Finding]:
+    """How far ahead of the axle, which does not slip sideways, the origin is: tan(offset) / curvature."""
+    turns = np.abs(curvature) > 0.02
+    if turns.sum() < 30:
+        same = "a straight route looks the same in a mirrored world (x and y swapped, NED): drive a turn"
+        untold = "straight poses do not tell how far the origin (antenna?) is from the axle: drive a turn"
+        return [passed("mirrored", "poses", same), passed("origin", "poses", untold)]
+    centred = offset_rad - np.median(offset_rad[~turns]) if (~turns).any() else offset_rad
+    lever = np.tan(centred[turns]) / curvature[turns]
+    weight = curvature[turns] ** 2
+    value = float((weight * lever).sum() / weight.sum())
+    residual = np.tan(centred[turns]) - value * curvature[turns]
+    sigma = float(np.std(residual) / np.sqrt(weight.sum() / overlap))
+    return [
+        judge(
+            "origin", "poses", value, _LEVER_M + _SURE * sigma, "m",
+            fine="the recorded point follows its heading in turns, as one at the rear axle does",
+            wrong=f"in turns the recorded point moves as one {abs(value):.1f} m "
+            f"{'ahead of' if value > 0 else 'behind'} the rear axle does (the antenna?); give the poses and "
+            "the survey of the cameras for one and the same origin",
+            status=Status.WARN,
+        )
+    ]  # fmt: skip
+
+
+def _overlap(motion: Motion) -> float:
+    """How many neighbouring chords share their poses and count as one."""
+    return float(max(1.0, np.median(motion.chords.last - motion.chords.first)))
+
+
+def _fitting(motion: Motion) -> list[str]:
+    """The names of the conventions under which the vehicle drives ahead."""
+    return [
+        name
+        for name, convention in CONVENTIONS.items()
+        if _agreement(*convention.undo(motion.position, motion.rotation), motion.chords)[0] >= _FITS
+    ]
+
+
+def _cause(motion: Motion, fitting: list[str], path: Path | None) -> str | None:
+    """The sentence that names what is wrong; None where it is not the heading."""
+    if path is Path.MIRRORED:
+        return AXES_SWAPPED
+    if fitting:
+        told = [CONVENTIONS[name].says for name in fitting[:2]]
+        if path is None and fitting[0] in REFLECTED:
+            told.insert(1, AXES_SWAPPED)
+        return "; or ".join(told)
+    offset = _course_minus_yaw(motion)
+    if not _is_upright(motion):
+        return None
+    offset_rad = _circular_median(offset)
+    if (np.abs(angle_of(offset - offset_rad)) < _AGREES_RAD).mean() >= _FITS:
+        return (
+            f"the vehicle drives {abs(np.rad2deg(offset_rad)):.0f} deg to the "
+            f"{'left' if offset_rad > 0 else 'right'} of its heading all the time; subtract that offset of "
+            "the heading's antennas from yaw"
+        )
+    if _turns_too_fast(motion):
+        return (
+            "yaw turns 57 times as fast as the path: degrees were taken for radians; convert yaw to radians"
+        )
+    return "heading and path have nothing to do with each other; check that both are of one drive"
+
+
+def _is_upright(motion: Motion) -> bool:
+    return bool((motion.rotation[motion.chords.first, 2, 2] > np.cos(_UPRIGHT_RAD)).mean() >= _FITS)
+
+
+def _turns_too_fast(motion: Motion) -> bool:
+    """Whether the heading turns about 180 / pi times as much as the path."""
+    course = np.unwrap(np.arctan2(*_course(motion.position, motion.chords).T[::-1]))
+    path_turn = np.abs(np.diff(course)).sum()
+    steps = angle_between(motion.rotation[:-1, :2, 0], motion.rotation[1:, :2, 0])
+    return bool(np.abs(steps).sum() > 10 * max(path_turn, 0.1))
+
+
+def _agreement(position: FloatArray, rotation: FloatArray, chords: Chords) -> tuple[float, float]:
+    """The shares of chords along which the vehicle stands upright and points ahead, and ahead or back."""
+    angle = angle_between(_forward(rotation, chords), _course(position, chords))
+    upright: BoolArray = rotation[chords.first, 2, 2] > np.cos(_UPRIGHT_RAD)
+    along = (np.abs(np.sin(angle)) < np.sin(_AGREES_RAD)) & upright
+    return float((along & (np.cos(angle) > 0)).mean()), float(along.mean())
+
+
+def _course_minus_yaw(motion: Motion) -> FloatArray:
+    chords = motion.chords
+    return angle_between(_forward(motion.rotation, chords), _course(motion.position, chords))
+
+
+def _course(position: FloatArray, chords: Chords) -> FloatArray:
+    return np.asarray(position[chords.last, :2] - position[chords.first, :2])
+
+
+def _forward(rotation: FloatArray, chords: Chords) -> FloatArray:
+    """The vehicle's x axis (N, 2) in the plane, midway on each chord."""
+    return np.asarray(rotation[chords.first, :2, 0] + rotation[chords.last, :2, 0])
+
+
+def angle_of(angle_rad: FloatArray) -> FloatArray:
+    """Angles wrapped to +-pi."""
+    return np.asarray((angle_rad + np.pi) % (2 * np.pi) - np.pi)
+
+
+def _circular_median(angles_rad: FloatArray) -> float:
+    mean = np.arctan2(np.sin(angles_rad).mean(), np.cos(angles_rad).mean())
+    return float(angle_of(np.array([mean + np.median(angle_of(angles_rad - mean))]))[0])

@@ -1,0 +1,124 @@
+"""Whether a camera has moved on its vehicle between two calibrations, by how much, and how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.stats import chi2, ncx2
+
+from v2hdm.errors import MapFileError
+from v2hdm.geometry.rigid import adjoint, camera_centre, inverse, log
+from v2hdm.records import Calibration, FloatArray
+
+FALSE_ALARM = 1e-3
+"""Probability that a camera which has not moved is said to have: an alarm in 20 years of weekly checks."""
+
+MISSED = 0.05
+"""Probability with which a movement of the size told as detectable would be missed."""
+
+_SAME_LENS = 2e-3
+"""Difference of the intrinsics, as a share of focal length or width, up to which they are of one lens.
+
+More of it turns into pitch, yaw and height.
+"""
+
+
+@dataclass(frozen=True)
+class Movement:
+    """How a camera has moved along and about the vehicle's axes: forward, left, up.
+
+    ``shift_m`` (3,) and ``turn_rad`` (3,) are the movement, ``covariance`` (6, 6) is that of both.
+    ``probability`` is that of differences at least as large where nothing has moved.
+    """
+
+    camera: str
+    shift_m: FloatArray
+    turn_rad: FloatArray
+    covariance: FloatArray
+    probability: float
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations (6,) of shift, m, and turn, rad."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def detectable(self) -> FloatArray:
+        """The least shifts, m, and turns, rad, each alone (6,), that would hardly be missed."""
+        limit = chi2.isf(FALSE_ALARM, 6)
+        needed = brentq(lambda offset: ncx2.sf(limit, 6, offset) - (1 - MISSED), 1.0, 1e3)
+        return np.asarray(np.sqrt(needed / np.diag(np.linalg.inv(self.covariance))))
+
+    @property
+    def moved(self) -> bool:
+        """Whether the difference is more than the two calibrations' own errors."""
+        return self.probability < FALSE_ALARM
+
+
+def movement(before: Calibration, after: Calibration) -> Movement:
+    """The movement between two calibrations of one camera, whose errors are independent.
+
+    Raises:
+        MapFileError: they are of two cameras or lenses, or one has no covariance.
+    """
+    _check_comparable(before, after)
+    assert before.covariance is not None
+    assert after.covariance is not None
+    change = after.cam_from_vehicle @ inverse(before.cam_from_vehicle)
+    tangent, carried = log(change), adjoint(change)
+    spread = after.covariance + carried @ before.covariance @ carried.T
+    squared = float(tangent @ np.linalg.solve(spread, tangent))
+    # A left perturbation (v, w) of cam_from_vehicle moves the centre by -R'v and turns the camera by -R'w.
+    to_vehicle = -np.kron(np.eye(2), before.cam_from_vehicle[:3, :3].T)
+    shift_m = camera_centre(after.cam_from_vehicle) - camera_centre(before.cam_from_vehicle)
+    return Movement(
+        camera=before.info.name,
+        shift_m=np.asarray(shift_m),
+        turn_rad=np.asarray(to_vehicle[3:, 3:] @ tangent[3:]),
+        covariance=np.asarray(to_vehicle @ spread @ to_vehicle.T),
+        probability=float(chi2.sf(squared, 6)),
+    )
+
+
+def turned_alike(movements: Sequence[Movement]) -> bool:
+    """Whether several cameras have moved, all by the same turn: then it is no camera that has moved."""
+    if len(movements) < 2 or not all(one.moved for one in movements):
+        return False
+    first = movements[0]
+    for other in movements[1:]:
+        off = other.turn_rad - first.turn_rad
+        spread = other.covariance[3:, 3:] + first.covariance[3:, 3:]
+        if chi2.sf(off @ np.linalg.solve(spread, off), 3) < FALSE_ALARM:
+            return False
+    return True
+
+
+def _check_comparable(before: Calibration, after: Calibration) -> None:
+    first, second = before.info, after.info
+    who = f"camera '{first.name}'"
+    if first.name != second.name:
+        raise MapFileError(f"{who} and '{second.name}': these are two cameras; give two calibrations of one")
+    if (first.width, first.height, first.distortion_model) != (
+        second.width,
+        second.height,
+        second.distortion_model,
+    ):
+        raise MapFileError(
+            f"{who}: image sizes or lens models differ; calibrate with the same intrinsics both times"
+        )
+    off = np.abs(first.intrinsic - second.intrinsic)
+    if off.max() > _SAME_LENS * max(first.intrinsic[0, 0], first.width):
+        raise MapFileError(
+            f"{who}: the intrinsics differ by {off.max():.1f} px, which looks like a movement; calibrate "
+            "with the same intrinsics both times"
+        )
+    for calibration, which in ((before, "first"), (after, "second")):
+        covariance = calibration.covariance
+        if covariance is None or np.linalg.eigvalsh(covariance).min() <= 0:
+            raise MapFileError(
+                f"{who}: the {which} calibration has no covariance, so that no movement can be told from its "
+                "error; take one that python -m v2hdm.map or v2hdm.cli.extrinsic wrote"
+            )
