@@ -12,7 +12,7 @@ from pathlib import Path
 
 from tests.calibration.site import INFO, clicked, write_table
 from tests.faults.judge import Case, Outcome, Prepare
-from tests.pipeline.test_run import short_port
+from tests.ports import short_port
 from v2hdm.errors import DriveError
 from v2hdm.io.calibration.camera_info import write_camera_info
 from v2hdm.io.drive.tum import read_image_list, write_image_list

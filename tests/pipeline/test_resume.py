@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,25 +20,16 @@ from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline import DriveConfig, RunConfig, RunResult, detections, run, work
 from v2hdm.pipeline import inspect as inspection
-from v2hdm.simulate import PortConfig, render_drive
-from v2hdm.simulate.port.config import RouteConfig, YardConfig
 from v2hdm.store.cache.pruning import items_of
 
 SAME = ("map.geojson", "trajectory.tum", "excluded.geojson", "residuals.csv")
 
 
-def smallest_port() -> PortConfig:
-    route = RouteConfig(pieces=[[16.0, 0.0], [10.0, 40.0]], image_spacing_m=1.0)
-    yard = YardConfig(parked_trucks=0, barriers=0, lamp_posts=0, moving_trucks=0, shadow_strips=0)
-    port = PortConfig(name="smallest", seed=11, initial_ipm="estimated", route=route, yard=yard)
-    return replace(port, cameras={"front": port.cameras["front"]})
-
-
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def site(small_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a drive, what a first run has made of it, and its cache."""
     folder = tmp_path_factory.mktemp("site")
-    render_drive(smallest_port(), folder / "drive", 1, lambda done, total: None)
+    shutil.copytree(small_drive, folder / "drive")
     run(config(folder, "first"))
     return folder
 
@@ -75,7 +66,7 @@ def test_another_mapping_setting_needs_no_image_again(site: Path, monkeypatch: p
     monkeypatch.setattr(inspection, "inspect", refused)
     monkeypatch.setattr(batch, "detect_image", refused)
     monkeypatch.setattr(detections, "own_vehicles", refused)
-    nearer = run(config(site, "nearer", mapping=MappingOptions(max_range_m=9.0)))
+    nearer = run(config(site, "nearer", mapping=MappingOptions(max_range_m=6.0)))
     before, after = ((one / "map.geojson").read_bytes() for one in (site / "first" / "short", nearer.folder))
     assert before != after
 

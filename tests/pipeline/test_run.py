@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.ports import run_config, short_port
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError, DetectorError, DriveError, V2hdmError
 from v2hdm.geometry.rigid import rotation_from_euler
@@ -23,42 +24,17 @@ from v2hdm.io.maps.formats import FORMATS
 from v2hdm.io.maps.geojson import read_geojson
 from v2hdm.io.maps.residuals import read_residuals
 from v2hdm.mapping.options import AcceptanceOptions, LaneOptions, MappingOptions
-from v2hdm.pipeline import DriveConfig, RunConfig, run
+from v2hdm.pipeline import run
 from v2hdm.pipeline.camera_sets import camera_sets
 from v2hdm.pipeline.config import run_name
 from v2hdm.records import Trajectory
-from v2hdm.simulate import PortConfig, render_drive
-from v2hdm.simulate.port.config import RouteConfig, YardConfig
 from v2hdm.verdict import Status
 
 
-def short_port() -> PortConfig:
-    """A straight and a turn of the default port, with another vehicle's IPM to start from.
-
-    What stands in the way and throws shadows comes in numbers for a whole port, so fewer do here.
-    """
-    route = RouteConfig(pieces=[[20.0, 0.0], [16.0, 70.0], [10.0, 0.0]], image_spacing_m=1.0)
-    yard = YardConfig(parked_trucks=1, barriers=2, lamp_posts=2, moving_trucks=1, shadow_strips=2)
-    return PortConfig(name="short", seed=11, initial_ipm="estimated", route=route, yard=yard)
-
-
 @pytest.fixture(scope="module")
-def drive_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("drive") / "short"
-    render_drive(short_port(), folder, 1, lambda done, total: None)
-    return folder
-
-
-def run_config(drive: Path, output: Path, **changes: object) -> RunConfig:
-    drive_config = DriveConfig(path=str(drive))
-    given = {"name": "short", "drive": drive_config, "output": str(output), "workers": 1}
-    return RunConfig(**{**given, "cache": f"{output}.cache", **changes})
-
-
-@pytest.fixture(scope="module")
-def result(drive_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def result(short_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("outputs")
-    return run(run_config(drive_folder, output, export=list(FORMATS), mosaic=True)).folder
+    return run(run_config(short_drive, output, export=list(FORMATS), mosaic=True)).folder
 
 
 def test_every_method_is_judged_on_every_camera_set(result: Path) -> None:
@@ -84,10 +60,10 @@ def test_a_good_drive_passes_and_every_file_says_so(result: Path) -> None:
 
 
 def test_yaw_from_north_fails_by_name_and_what_was_computed_is_still_written(
-    drive_folder: Path, tmp_path: Path
+    short_drive: Path, tmp_path: Path
 ) -> None:
     drive = tmp_path / "north"
-    shutil.copytree(drive_folder, drive)
+    shutil.copytree(short_drive, drive)
     recorded = read_tum(drive / "poses.tum")
     poses = recorded.map_from_vehicle.copy()
     yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
@@ -148,8 +124,8 @@ def test_paint_seen_from_above_is_sharp_after_the_optimisation(result: Path) -> 
     assert cv2.imread(str(result / "mosaic_before_after.png")) is not None
 
 
-def test_lane_lines_run_as_the_drive_passed_them(result: Path, drive_folder: Path) -> None:
-    poses = np.array([image.map_from_vehicle for image in read_drive(drive_folder).images])
+def test_lane_lines_run_as_the_drive_passed_them(result: Path, short_drive: Path) -> None:
+    poses = np.array([image.map_from_vehicle for image in read_drive(short_drive).images])
     lanes = read_geojson(result / "map.geojson").lanes
     assert lanes
     for lane in lanes:
@@ -160,10 +136,10 @@ def test_lane_lines_run_as_the_drive_passed_them(result: Path, drive_folder: Pat
 
 
 def test_the_map_is_the_same_to_the_byte_without_the_truth(
-    result: Path, drive_folder: Path, tmp_path: Path
+    result: Path, short_drive: Path, tmp_path: Path
 ) -> None:
     blind = tmp_path / "short"
-    shutil.copytree(drive_folder, blind)
+    shutil.copytree(short_drive, blind)
     shutil.rmtree(blind / "truth")
     description = blind / "drive.yaml"
     lines = description.read_text().splitlines(keepends=True)
@@ -173,22 +149,22 @@ def test_the_map_is_the_same_to_the_byte_without_the_truth(
         assert (again / name).read_bytes() == (result / name).read_bytes()
 
 
-def test_two_worker_processes_find_the_same_map(result: Path, drive_folder: Path, tmp_path: Path) -> None:
-    again = run(run_config(drive_folder, tmp_path, workers=2)).folder
+def test_two_worker_processes_find_the_same_map(result: Path, short_drive: Path, tmp_path: Path) -> None:
+    again = run(run_config(short_drive, tmp_path, workers=2)).folder
     assert (again / "map.geojson").read_bytes() == (result / "map.geojson").read_bytes()
 
 
-def small_copy(drive_folder: Path, target: Path) -> Path:
+def small_copy(short_drive: Path, target: Path) -> Path:
     """The first three time stamps of the drive."""
-    shutil.copytree(drive_folder, target, ignore=shutil.ignore_patterns("truth", "*.jpg"))
+    shutil.copytree(short_drive, target, ignore=shutil.ignore_patterns("truth", "*.jpg"))
     for camera in ("front", "rear"):
         listing = target / camera / "images.txt"
         kept = [line for line in listing.read_text().splitlines() if line and not line.startswith("#")][:3]
         listing.write_text("\n".join(kept) + "\n")
         for line in kept:
             name = Path(line.split()[1])
-            source = next((drive_folder / camera).rglob(name.name))
-            destination = target / source.relative_to(drive_folder)
+            source = next((short_drive / camera).rglob(name.name))
+            destination = target / source.relative_to(short_drive)
             destination.parent.mkdir(exist_ok=True)
             shutil.copy(source, destination)
     description = target / "drive.yaml"
@@ -205,22 +181,22 @@ def fails(drive: Path, output: Path, kind: type[V2hdmError]) -> str:
     return str(caught.value)
 
 
-def test_a_missing_image_is_named_and_leaves_nothing_behind(drive_folder: Path, tmp_path: Path) -> None:
-    drive = small_copy(drive_folder, tmp_path / "drive")
+def test_a_missing_image_is_named_and_leaves_nothing_behind(short_drive: Path, tmp_path: Path) -> None:
+    drive = small_copy(short_drive, tmp_path / "drive")
     image = sorted((drive / "rear").rglob("*.jpg"))[1]
     image.unlink()
     assert image.name in fails(drive, tmp_path / "out", DriveError)
 
 
-def test_a_truncated_image_is_named(drive_folder: Path, tmp_path: Path) -> None:
-    drive = small_copy(drive_folder, tmp_path / "drive")
+def test_a_truncated_image_is_named(short_drive: Path, tmp_path: Path) -> None:
+    drive = small_copy(short_drive, tmp_path / "drive")
     image = sorted((drive / "front").rglob("*.jpg"))[2]
     image.write_bytes(image.read_bytes()[:-2000])
     assert image.name in fails(drive, tmp_path / "out", DriveError)
 
 
-def test_an_image_of_another_size_is_named_with_both_sizes(drive_folder: Path, tmp_path: Path) -> None:
-    drive = small_copy(drive_folder, tmp_path / "drive")
+def test_an_image_of_another_size_is_named_with_both_sizes(short_drive: Path, tmp_path: Path) -> None:
+    drive = small_copy(short_drive, tmp_path / "drive")
     image = sorted((drive / "front").rglob("*.jpg"))[0]
     cv2.imwrite(str(image), np.zeros((480, 640, 3), np.uint8))
     message = fails(drive, tmp_path / "out", DriveError)
@@ -230,9 +206,9 @@ def test_an_image_of_another_size_is_named_with_both_sizes(drive_folder: Path, t
 
 
 def test_a_drive_past_nothing_fails_and_says_that_no_marking_was_found(
-    drive_folder: Path, tmp_path: Path
+    short_drive: Path, tmp_path: Path
 ) -> None:
-    drive = small_copy(drive_folder, tmp_path / "drive")
+    drive = small_copy(short_drive, tmp_path / "drive")
     for image in drive.rglob("*.jpg"):
         cv2.imwrite(str(image), np.full((720, 1280, 3), 90, np.uint8))
     outcome = run(run_config(drive, tmp_path / "out"))
@@ -272,8 +248,8 @@ def test_what_cannot_work_is_refused_before_anything_is_read(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_run_without_a_name_has_that_of_its_drive(drive_folder: Path, tmp_path: Path) -> None:
-    drive = small_copy(drive_folder, tmp_path / "folder")
+def test_a_run_without_a_name_has_that_of_its_drive(short_drive: Path, tmp_path: Path) -> None:
+    drive = small_copy(short_drive, tmp_path / "folder")
     assert run_name(run_config(drive, tmp_path, name=None)) == "short"
     description = drive / "drive.yaml"
     lines = description.read_text().splitlines(keepends=True)
@@ -288,6 +264,6 @@ def test_a_run_that_both_renders_and_reads_is_refused(tmp_path: Path) -> None:
         run(config)
 
 
-def test_a_single_camera_is_one_set_and_two_are_three(drive_folder: Path) -> None:
-    assert list(camera_sets(read_drive(drive_folder))) == ["front", "rear", "both"]
-    assert list(camera_sets(read_drive(drive_folder, ReadOptions(cameras=["rear"])))) == ["rear"]
+def test_a_single_camera_is_one_set_and_two_are_three(short_drive: Path) -> None:
+    assert list(camera_sets(read_drive(short_drive))) == ["front", "rear", "both"]
+    assert list(camera_sets(read_drive(short_drive, ReadOptions(cameras=["rear"])))) == ["rear"]

@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from tests.docs.blocks import blocks
-from tests.pipeline.test_run import run_config, short_port
+from tests.ports import run_config
 from v2hdm.errors import DriveError
 from v2hdm.geometry.geodetic import geodetic_from_enu
 from v2hdm.io.drive import read_drive
@@ -27,7 +27,6 @@ from v2hdm.mapping.options import MappingOptions, SurveyOptions
 from v2hdm.pipeline import DriveConfig, RunConfig, run
 from v2hdm.records import FloatArray, Trajectory
 from v2hdm.report.metrics import driven_past
-from v2hdm.simulate import render_drive
 
 (DOCUMENTED,) = blocks("docs/survey.md", "sh")
 DRIFT_M = np.array([0.06, -0.05])
@@ -71,9 +70,9 @@ def survey(corners_map: FloatArray, kinds: list[str], origin: object, check_off_
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
+def site(short_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Site:
     site = Site(tmp_path_factory.mktemp("site"))
-    render_drive(short_port(), site.drive, 1, lambda done, total: None)
+    shutil.copytree(short_drive, site.drive)
     drive = read_drive(site.drive)
     truth = read_truth(drive)
     write_tum(drifted(read_tum(site.drive / "poses.tum")), site.drive / "poses.tum")

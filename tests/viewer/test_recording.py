@@ -8,7 +8,6 @@ import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,31 +23,12 @@ from v2hdm.pipeline import DriveConfig, RunConfig, run
 from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.keys import Contents
 from v2hdm.records import ImageDetections
-from v2hdm.simulate import PortConfig, render_drive
-from v2hdm.simulate.port.config import RouteConfig, YardConfig
 from v2hdm.store.cache.room import Room
 from v2hdm.store.cache.store import Store
 from v2hdm.viewer import FILE, RerunViewer, check_viewer
 
 ROOT = Path(__file__).parents[2]
 Columns = Mapping[str, list[Any]]
-
-
-def small_port() -> PortConfig:
-    """One camera of half the pixels on 46 m."""
-    route = RouteConfig(pieces=[[20.0, 0.0], [16.0, 70.0], [10.0, 0.0]], image_spacing_m=2.0)
-    yard = YardConfig(parked_trucks=0, barriers=0, lamp_posts=0, moving_trucks=0, shadow_strips=1)
-    front = replace(PortConfig().cameras["front"], width=640, height=360, focal_px=450.0)
-    return PortConfig(
-        name="small", seed=11, initial_ipm="estimated", route=route, yard=yard, cameras={"front": front}
-    )
-
-
-@pytest.fixture(scope="module")
-def drive_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("drive") / "small"
-    render_drive(small_port(), folder, 1, lambda done, total: None)
-    return folder
 
 
 def configured(drive: Path, output: Path) -> RunConfig:
@@ -62,13 +42,13 @@ def configured(drive: Path, output: Path) -> RunConfig:
 
 
 @pytest.fixture(scope="module")
-def result(drive_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def result(small_drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("rerun", reason="no rerun: pip install 'v2hdm[viewer]'")
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("DISPLAY", raising=False)
         patch.delenv("WAYLAND_DISPLAY", raising=False)
         output = tmp_path_factory.mktemp("outputs")
-        return run(configured(drive_folder, output), viewer=RerunViewer("small")).folder
+        return run(configured(small_drive, output), viewer=RerunViewer("small")).folder
 
 
 @pytest.fixture(scope="module")
@@ -90,9 +70,9 @@ def only(columns: Columns, ending: str) -> list[Any]:
 
 
 def test_every_image_is_in_the_recording_byte_for_byte(
-    recorded: Mapping[str, Columns], drive_folder: Path
+    recorded: Mapping[str, Columns], small_drive: Path
 ) -> None:
-    drive = read_drive(drive_folder)
+    drive = read_drive(small_drive)
     columns = recorded["/map/vehicle/front/image"]
     blobs = [bytes(one[0]) for one in only(columns, "EncodedImage:blob") if one]
     assert sorted(blobs) == sorted(image.path.read_bytes() for image in drive.images)
@@ -100,7 +80,7 @@ def test_every_image_is_in_the_recording_byte_for_byte(
     assert sorted(frames) == list(range(len(drive.images)))
 
 
-def test_detections_lie_in_the_images(recorded: Mapping[str, Columns], drive_folder: Path) -> None:
+def test_detections_lie_in_the_images(recorded: Mapping[str, Columns], small_drive: Path) -> None:
     columns = recorded["/map/vehicle/front/image/markings"]
     strips = [strip for one in only(columns, "LineStrips2D:strips") for strip in one or ()]
     assert len(strips) > 20
@@ -154,7 +134,7 @@ def test_without_its_package_the_viewer_is_one_line_before_any_work(tmp_path: Pa
     assert not (tmp_path / "outputs").exists()
 
 
-def test_a_run_that_nothing_has_changed_for_is_shown_all_the_same(result: Path, drive_folder: Path) -> None:
+def test_a_run_that_nothing_has_changed_for_is_shown_all_the_same(result: Path, small_drive: Path) -> None:
     class Seen:
         def __init__(self) -> None:
             self.calls: list[str] = []
@@ -172,12 +152,12 @@ def test_a_run_that_nothing_has_changed_for_is_shown_all_the_same(result: Path, 
             self.calls.append("closed")
 
     seen = Seen()
-    run(configured(drive_folder, result.parent), viewer=seen)
-    assert seen.calls == ["begun", f"{len(read_drive(drive_folder).images)} images", "front", "closed"]
+    run(configured(small_drive, result.parent), viewer=seen)
+    assert seen.calls == ["begun", f"{len(read_drive(small_drive).images)} images", "front", "closed"]
 
 
-def test_images_are_shown_as_they_are_looked_at(drive_folder: Path, tmp_path: Path) -> None:
-    drive = read_drive(drive_folder, DriveConfig(limit=3))
+def test_images_are_shown_as_they_are_looked_at(small_drive: Path, tmp_path: Path) -> None:
+    drive = read_drive(small_drive, DriveConfig(limit=3))
     shown: list[list[int]] = []
 
     def show(found: Sequence[ImageDetections]) -> None:

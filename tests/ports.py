@@ -1,0 +1,77 @@
+"""The rendered ports that tests share: each is rendered once a run, whichever process asks for it first."""
+
+from __future__ import annotations
+
+import fcntl
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from v2hdm.pipeline import DriveConfig, RunConfig
+from v2hdm.simulate import PortConfig
+from v2hdm.simulate.port.config import RouteConfig, YardConfig
+from v2hdm.simulate.port.drive import rendered_drive
+
+ROUTE = [[20.0, 0.0], [16.0, 70.0], [10.0, 0.0]]
+"""A straight, a bend and a straight, as [metres, degrees to the left]."""
+
+
+def short_port() -> PortConfig:
+    """A straight and a bend of the default port, with another vehicle's IPM to start from.
+
+    The default numbers of obstacles are those of a whole port, so there are fewer here.
+    """
+    route = RouteConfig(pieces=ROUTE, image_spacing_m=1.0)
+    yard = YardConfig(parked_trucks=1, barriers=2, lamp_posts=2, moving_trucks=1, shadow_strips=2)
+    return PortConfig(name="short", seed=11, initial_ipm="estimated", route=route, yard=yard)
+
+
+def small_port(**changes: object) -> PortConfig:
+    """The same route with one camera of half the pixels and an image every two metres."""
+    port = PortConfig(
+        name="small",
+        seed=11,
+        initial_ipm="estimated",
+        route=RouteConfig(pieces=ROUTE, image_spacing_m=2.0),
+        yard=YardConfig(parked_trucks=0, barriers=0, lamp_posts=0, moving_trucks=0, shadow_strips=1),
+        cameras={
+            "front": replace(PortConfig().cameras["front"], width=640, height=360, focal_px=450.0),
+        },
+    )
+    return replace(port, **changes)  # type: ignore[arg-type]
+
+
+def run_config(drive: Path, output: Path, **changes: object) -> RunConfig:
+    """A run over a drive in one process, with a cache of its own beside the output."""
+    drive_config = DriveConfig(path=str(drive))
+    given = {"name": "short", "drive": drive_config, "output": str(output), "workers": 1}
+    return RunConfig(**{**given, "cache": f"{output}.cache", **changes})
+
+
+@pytest.fixture(scope="session")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Callable[[PortConfig], Path]:
+    """Renders a port, or finds what this run has rendered of it: a drive's folder, to be read only."""
+    base = tmp_path_factory.getbasetemp()
+    shared = (base.parent if base.name.startswith("popen-") else base) / "ports"
+    shared.mkdir(exist_ok=True)
+
+    def drive_of(port: PortConfig) -> Path:
+        with (shared / "lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            return rendered_drive(port, shared, 1, lambda done, total: None)
+
+    return drive_of
+
+
+@pytest.fixture(scope="session")
+def short_drive(rendered: Callable[[PortConfig], Path]) -> Path:
+    """The drive through :func:`short_port`."""
+    return rendered(short_port())
+
+
+@pytest.fixture(scope="session")
+def small_drive(rendered: Callable[[PortConfig], Path]) -> Path:
+    """The drive through :func:`small_port`."""
+    return rendered(small_port())
