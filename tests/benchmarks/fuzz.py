@@ -28,7 +28,7 @@ def main() -> int:
         print("fuzzing needs atheris: pip install 'v2hdm[bench]'", file=sys.stderr)
         return 2
     with atheris.instrument_imports(include=["v2hdm", "yaml"]):
-        from tests.faults.test_readers import READERS
+        from tests.faults.readers import READERS
         from v2hdm.errors import V2hdmError
     if parsed.reader not in READERS:
         print("readers: " + ", ".join(READERS))

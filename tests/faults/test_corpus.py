@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.test_readers import READERS, refusal
+from tests.faults.readers import READERS, refusal
 from v2hdm.errors import V2hdmError
 
 CORPUS = Path(__file__).with_name("corpus.tar.xz")

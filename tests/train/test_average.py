@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from models import MarkingNet
-from tests.train.test_training import tiny
+from tests.train.small import tiny
 from train.average import mean_checkpoint, scored
 from train.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from train.loop import Trainer

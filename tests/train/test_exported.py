@@ -10,7 +10,7 @@ import torch
 
 from export.onnx_file import export_checkpoint, to_onnx
 from models import MarkingNet, NetConfig
-from tests.train.test_training import tiny
+from tests.train.small import tiny
 from train.checkpoint import Checkpoint, fresh_checkpoint, load_checkpoint, save_checkpoint
 from train.exported import read_exported, unfold
 from train.loop import Trainer

@@ -5,13 +5,13 @@ import re
 from itertools import islice
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.train.small import HEIGHT, WIDTH, coco
 from train.config import DataConfig, TrainConfig
 from train.data import RenderStream
 from train.labels import LabelledImages, paint_labels, read_labels
@@ -23,32 +23,12 @@ from v2hdm.cli.config import register
 from v2hdm.errors import ConfigError, LabelError
 from v2hdm.records import ARROW, CROSSWALK_BAR, DIAMOND
 
-WIDTH, HEIGHT = 96, 64
 CONF = str(Path(__file__).resolve().parents[2] / "conf")
 
 
 def config(**changes: object) -> DataConfig:
     small = {"width": 64, "height": 32, "render_width": 80, "render_height": 48, "workers": 0}
     return DataConfig(**(small | changes))
-
-
-def coco(folder: Path, **changes: object) -> Path:
-    """A file of two images, a bright rectangle (columns 30 to 49, rows 20 to 39) an arrow."""
-    for name, grey in (("a.png", 60), ("b.png", 90)):
-        image = np.full((HEIGHT, WIDTH, 3), grey, dtype=np.uint8)
-        if name == "a.png":
-            image[20:40, 30:50] = 220
-        cv2.imwrite(str(folder / name), image)
-    size = {"width": WIDTH, "height": HEIGHT}
-    content = {
-        "images": [{"id": 7, "file_name": "a.png", **size}, {"id": 9, "file_name": "b.png", **size}],
-        "categories": [{"id": 1, "name": "Arrow"}, {"id": 2, "name": "zebra"}],
-        "annotations": [
-            {"id": 1, "image_id": 7, "category_id": 1, "segmentation": [[30, 20, 50, 20, 50, 40, 30, 40]]}
-        ],
-    } | changes
-    (folder / "coco.json").write_text(json.dumps(content))
-    return folder / "coco.json"
 
 
 def tusimple(folder: Path, name: str = "a.png", **changes: object) -> Path:

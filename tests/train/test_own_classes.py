@@ -12,8 +12,7 @@ import torch
 from export.onnx_file import export_checkpoint
 from export.source import read_source
 from models import MarkingNet, Prediction
-from tests.train.test_labels import coco
-from tests.train.test_training import tiny
+from tests.train.small import coco, tiny
 from train.average import mean_checkpoint
 from train.checkpoint import Checkpoint, fresh_checkpoint, load_checkpoint, save_checkpoint
 from train.config import DataConfig, TrainConfig

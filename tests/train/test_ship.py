@@ -9,7 +9,7 @@ import pytest
 
 from export.onnx_file import export_checkpoint
 from models.judge import Judge
-from tests.train.test_training import tiny, train
+from tests.train.small import tiny, train
 from train import fit_judge, fit_lane_score, ship, shipment
 from train.checkpoint import load_checkpoint
 from train.exported import read_exported

@@ -13,11 +13,11 @@ from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 
-from models import NetConfig
+from tests.train.small import tiny, train
 from train import __main__ as door
 from train import data
 from train.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from train.config import DataConfig, LossConfig, TrainConfig, ValidationConfig
+from train.config import DataConfig, LossConfig, TrainConfig
 from train.loop import Trainer
 from train.scenes.scenes import TrainingSample
 from train.targets import Targets, targets
@@ -25,23 +25,6 @@ from v2hdm.cli.config import register
 from v2hdm.errors import ConfigError
 
 CONF = str(Path(__file__).resolve().parents[2] / "conf")
-
-
-def tiny(output: Path, steps: int = 3) -> TrainConfig:
-    return TrainConfig(
-        output=str(output),
-        steps=steps,
-        batch=2,
-        net=NetConfig(widths=[16, 16, 16, 16], dilations=[1], separable=True, wide_kinds=False),
-        data=DataConfig(
-            width=64, height=32, render_width=80, render_height=48, views_per_render=2, reservoir=4, workers=0
-        ),
-        validation=ValidationConfig(images=2),
-    )
-
-
-def train(config: TrainConfig) -> Checkpoint:
-    return Trainer(config, lambda share, line: None).run()
 
 
 def test_a_run_leaves_checkpoints_whose_network_runs(tmp_path: Path) -> None:
