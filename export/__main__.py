@@ -1,4 +1,4 @@
-"""The door: ``python -m export checkpoint=CHECKPOINT output=v2hdm/detection/weights/default.onnx``."""
+"""The command ``python -m export checkpoint=CHECKPOINT output=v2hdm/detection/weights/default.onnx``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _INTERRUPTED = "interrupted; nothing was written"
 
 
 def main() -> int:
-    """Run the door, whose arguments are Hydra overrides (``--help`` lists them); returns its exit code."""
+    """Run the command, whose arguments are Hydra overrides (``--help`` lists them); returns its exit code."""
     return _settle(_export)
 
 

@@ -28,7 +28,7 @@ from export.graph import Graph
 _CHANNELS_LAST, _CHANNELS_FIRST = [0, 2, 3, 1], [0, 3, 1, 2]
 
 _TO_FINER = ["Reshape", "Transpose", "Reshape", "Transpose", "Reshape"]
-"""What brings channels, four for each finer one, to twice the resolution."""
+"""The nodes that turn four channels into one of twice the resolution."""
 
 
 def arrange(graph: Graph) -> None:
@@ -136,7 +136,7 @@ class _Arranger:
         return once, self._write("Reshape", [each, self._constant([-1, 2, 0])])
 
     def _products(self, conv: onnx.NodeProto) -> str:
-        """What a convolution of one pixel gives before its bias, channels last."""
+        """The output of a convolution of one pixel before its bias, channels last."""
         decode = self._maker[conv.input[0]]
         pixels = self._write("Transpose", [decode.input[0]], perm=_CHANNELS_LAST)
         values = self._write("DequantizeLinear", [pixels, *decode.input[1:]])
@@ -152,7 +152,7 @@ class _Arranger:
         return kernel == (1, 1) and decode is not None and decode.op_type == "DequantizeLinear"
 
     def _behind(self, name: str, steps: list[str]) -> str | None:
-        """What a tensor is made of by such steps, the last first; None if it is made otherwise."""
+        """The steps of this kind that make a tensor, the last first; None if it is made otherwise."""
         for step in steps:
             node = self._maker.get(name)
             if node is None or node.op_type != step:

@@ -1,4 +1,4 @@
-"""What the network is shown by the detector, on renders: the images that an int8 network is made from."""
+"""The network's inputs on renders, from which an int8 network is calibrated."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _PATCH_M = 0.1
 def looks(
     seed: int, frames: int, sizes: tuple[tuple[int, int], ...] = FRAME_SIZES
 ) -> Iterator[list[NDArray[np.uint8]]]:
-    """What the detector gives to its network for each of ``frames`` renders of full difficulty.
+    """The network's input for each of ``frames`` renders of full difficulty.
 
     Every render is of another scene and camera, with the hardships of a training; it is cropped, and its
     near ground halved, by :func:`v2hdm.detection.sight.look` itself.

@@ -1,4 +1,4 @@
-"""What can be set about an export; `conf/export.yaml` holds the values that are used."""
+"""The settings of an export; `conf/export.yaml` holds the values that are used."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from v2hdm.settings import COUNT, POSITIVE, SEED, SHARE, Within, check_settings
 
 
 class Precision(Enum):
-    """What the exported network computes with."""
+    """The arithmetic of the exported network."""
 
     float32 = "float32"
     int8 = "int8"

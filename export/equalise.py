@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from export.graph import Convolution, FloatTensor, Graph
 
 _THROUGH = ("Relu", "Resize", "Add")
-"""What computes the same when every channel of all it reads and writes is scaled alike."""
+"""Operators that commute with scaling a channel in all their inputs and outputs."""
 
 _LEAST = 1e-3
 """A channel that stays below this share of the largest says nothing on the images seen, and is left alone."""
@@ -51,7 +51,7 @@ def equalise(graph: Graph, images: Sequence[NDArray[np.uint8]]) -> None:
 
 
 def _scale(ranges: FloatTensor) -> FloatTensor:
-    """What to divide each channel by; 1 in the geometric mean, and 1 for channels that are as good as 0."""
+    """The divisor of each channel; 1 in the geometric mean, and 1 for channels that are as good as 0."""
     alive = ranges > _LEAST * ranges.max()
     scale = np.ones_like(ranges)
     if alive.any():
@@ -60,7 +60,7 @@ def _scale(ranges: FloatTensor) -> FloatTensor:
 
 
 def _groups(graph: Graph) -> list[_Group]:
-    """Those groups that nothing but convolutions and what is linear in every channel touches."""
+    """The groups that only convolutions and operators linear in every channel touch."""
     parent: dict[str, str] = {}
 
     def root(name: str) -> str:

@@ -32,7 +32,7 @@ HIGHEST_WEIGHT = 64
 _HIGHEST_INPUT = 255
 
 _ROWS = slice(None, None, 4)
-"""Of each output, a quarter of the rows is enough to learn how inputs go together."""
+"""Share of an output's rows that the correlation of its inputs is estimated from."""
 
 _BYTES, _SCALE, _ZERO = "{}.bytes", "{}.scale", "{}.zero"
 

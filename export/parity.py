@@ -25,7 +25,7 @@ Pair = tuple[list[NDArray[np.float32]], list[NDArray[np.float32]]]
 
 @dataclass(frozen=True)
 class Parity:
-    """What int8 does to what the detector makes of the outputs, over some images.
+    """The effect of int8 arithmetic on the detector's results, over some images.
 
     Attributes:
         paint_changed: elements that only one of network and file calls paint, per element of the network's.
@@ -45,7 +45,7 @@ class Parity:
     lane_offset_px: float
 
     def beyond(self, bounds: dict[str, float]) -> list[str]:
-        """What is worse than its bound, with both figures; nan is worse than any."""
+        """The figures that exceed their bounds, with both values; nan exceeds any."""
         out = []
         for name, value in asdict(self).items():
             bound = bounds[name]

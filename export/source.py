@@ -1,4 +1,4 @@
-"""What is exported: a network and its label, of a checkpoint or of a file that was exported before."""
+"""The source of an export: a network and its label, from a checkpoint or an earlier export."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """A small network that says of a quadrilateral whether it is a marking: the second stage of the detector.
 
-:class:`models.MarkingNet` tells paint from ground, pixel by pixel; whether some paint is a whole marking of a
+:class:`models.MarkingNet` separates paint from ground, pixel by pixel; whether some paint is a whole marking of a
 class shows in its shape, and in the image about it. The judge gets both: the quadrilateral seen in its own
 frame (:mod:`v2hdm.detection.corners.rectified`) and what was measured of it
 (:data:`v2hdm.detection.corners.evidence.FEATURES`), as the second stage of Faster R-CNN gets features of its
@@ -29,7 +29,7 @@ class Judge(nn.Module):
     Args:
         channels: of the views, which have 20 rows and columns.
         features: of the evidence.
-        shapes: among which classes are told apart.
+        shapes: the classes are classified by.
         width: channels of the first convolution.
         dropout: share of what is hidden in training.
         hidden: units between the convolutions and the answer.

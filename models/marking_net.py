@@ -60,7 +60,7 @@ class NetConfig:
 
 
 class Prediction(NamedTuple):
-    """What the network says of images (B, H, W, 3); the names are those of the ONNX file's outputs.
+    """The network's output for images (B, H, W, 3); names as in the ONNX file.
 
     ``paint`` (B, 1, H/2, W/2): log odds of paint against everything else; element (i, j) is centred on the
     image pixel (u, v) = (2j + 0.5, 2i + 0.5). ``kinds`` (B, classes, H/4, W/4): logits of the class
@@ -109,7 +109,7 @@ class MarkingNet(nn.Module):
 
     Args:
         config: channel counts.
-        classes: how many classes of paint it tells apart.
+        classes: how many classes of paint it distinguishes.
     """
 
     def __init__(self, config: NetConfig | None = None, classes: int = len(PAINT_CLASSES)) -> None:

@@ -1,4 +1,4 @@
-"""The training door: ``python -m train [key=value ...]``."""
+"""The training command: ``python -m train [key=value ...]``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _INTERRUPTED = "interrupted; what was saved until then is kept"
 
 
 def main() -> int:
-    """Run the door, whose arguments are Hydra overrides (``--help`` lists them); returns its exit code."""
+    """Run the command, whose arguments are Hydra overrides (``--help`` lists them); returns its exit code."""
     return _settle(_train)
 
 

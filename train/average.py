@@ -1,4 +1,4 @@
-"""The door: `python -m train.average runs/b/last.pt runs/a/last.pt --output runs/mean.pt`.
+"""The command `python -m train.average runs/b/last.pt runs/a/last.pt --output runs/mean.pt`.
 
 The mean of the weights of runs that went on from each other often does better than any of them: what each
 learnt is kept, what each came to by chance is averaged out (Izmailov et al., "Averaging Weights Leads to
@@ -64,7 +64,7 @@ def mean_checkpoint(
 
 @torch.inference_mode()
 def scored(checkpoint: Checkpoint) -> dict[str, float]:
-    """What a checkpoint's averaged weights score on the validation renders of its own settings."""
+    """The score of a checkpoint's averaged weights on the validation renders of its own settings."""
     config, net, tally = checkpoint.config, checkpoint.network(), Tally(checkpoint.catalogue.names)
     images = config["validation"]["images"]
     for image, targets in validation_pairs(DataConfig(**config["data"]), config["seed"], images):

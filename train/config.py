@@ -1,4 +1,4 @@
-"""What can be set about a training; `conf/train.yaml` holds the values that are used."""
+"""The settings of a training; `conf/train.yaml` holds the values that are used."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class DataConfig:
     renders to show again are kept in a ``reservoir``. ``easy_samples`` renders pass until scenes are as hard
     as they get. ``shadows_on_paint`` and those that follow it up to ``aside``
     are the :class:`~train.scenes.hardships.Hardships` of the renders. ``workers`` processes render; None is
-    one for each core but the trainer's, shared among the processes of a team.
+    one for each core but the trainer's, shared among its processes.
 
     ``coco`` and ``tusimple`` are files of users' own labels: polygons of markings in COCO's format, lanes in
     TuSimple's. The images' names in them start from ``coco_images`` and ``tusimple_images``, or else from the
@@ -105,7 +105,7 @@ class TrainConfig:
     Attributes:
         seed: of the network's first weights and of the renders.
         device: auto, cpu or cuda.
-        batch: images an update, on each member of a team.
+        batch: images per update, on each process.
         weight_decay: of AdamW.
         threads: of torch, for each process.
         checkpoint_minutes: time between two checkpoints.

@@ -20,7 +20,7 @@ from v2hdm.store.outputs import locked_folder
 
 
 def train(config: TrainConfig) -> None:
-    """Train the detector's network, in the team that this process is part of."""
+    """Train the detector's network, together with the processes that torchrun started."""
     check_training(config)
     with joined_team(config.device) as team, _alone(config, team):
         _train(config, team)

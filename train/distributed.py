@@ -1,4 +1,4 @@
-"""Several processes that train one network, started by torchrun; one process alone is a team of one.
+"""Several processes that train one network, started by torchrun; or one process alone.
 
 Every process shows its own images to its own copy of the network; before each update all take the mean of
 their gradients, so that the copies stay the same. The network is so small that one message an update does.
@@ -36,7 +36,7 @@ class Team:
         return self.rank == 0
 
     def average(self, tensors: Iterable[Tensor]) -> None:
-        """Replace tensors of one type by their means over the team, in place; all must call it alike."""
+        """Replace tensors of one type by their means over all processes, in place; each must call it alike."""
         if self.size == 1:
             return
         group = list(tensors)
@@ -63,7 +63,7 @@ class Team:
         return float(message.item())
 
     def from_leader(self, make: Callable[[], _T]) -> _T:
-        """What the leader makes. Its mistakes of a user end all processes; it alone says which.
+        """The leader's result. An error of the user ends all processes; only the leader reports it.
 
         Raises:
             V2hdmError: In the leader, what ``make`` raised.
@@ -99,7 +99,7 @@ class Team:
 
 @contextmanager
 def joined_team(device: str) -> Iterator[Team]:
-    """The team that torchrun made this process part of, as long as the context lasts.
+    """The processes that torchrun started with this one, for as long as the context lasts.
 
     Args:
         device: ``auto``, ``cpu`` or ``cuda``; on GPUs every process of a machine takes one of its own.

@@ -90,7 +90,7 @@ def example(index: int, difficulty: float = 1.0, seed: int = SEED) -> Example:
 def example_of(
     scene: Scene, lanes_map: list[FloatArray], view: TrainingView, rendered: Rendered, camera: Camera
 ) -> Example:
-    """What there is to be found in an image of a scene, whose lines (N, 2) have a point every half metre."""
+    """The ground truth of an image of a scene, whose lines (N, 2) have a point every half metre."""
     lines_px = [image_line(view, lane) for lane in lanes_map]
     seen = [lane for lane, line_px in zip(lanes_map, lines_px, strict=True) if len(line_px) > 1]
     lanes_px = [line_px for line_px in lines_px if len(line_px) > 1]

@@ -27,7 +27,7 @@ that no normalisation follows)."""
 
 @dataclass(frozen=True)
 class Exported:
-    """What an exported file says of its training, and its weights by their names in the folded network.
+    """The training metadata of an exported file, and its weights by their names in the folded network.
 
     ``config`` are the training's settings, ``renders`` how many renders had taught it, as in a checkpoint;
     ``label`` is all that the file says. The weights of an int8 file are multiples of the steps that they were
@@ -67,7 +67,7 @@ def read_exported(path: Path) -> Exported:
 
 
 def _constants(graph: onnx.GraphProto) -> dict[str, np.ndarray]:
-    """What a graph holds by the names that its nodes read: as stored, or as integers with a scale each."""
+    """The constants of a graph by the names that its nodes read: as stored, or as integers with a scale each."""
     arrays = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
     for node in graph.node:
         if node.op_type == "DequantizeLinear" and node.input[0] in arrays:

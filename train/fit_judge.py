@@ -6,7 +6,7 @@ half. They are false where the quality benchmark would say so, and on arrows. Th
 learns to tell them apart, and how far the sides of the true ones are off. Logistic regressions with a weak
 ridge, one for each shape, then weigh the claims of the others in an image: ``confidence.json``. Each scene
 is looked at as on the vehicle; every third as in the mapping, too; every other one once more with spots of
-sun of which the paint network swears that they are markings. The seed is neither that of the quality
+sun that the network confidently takes for markings. The seed is neither that of the quality
 benchmark nor one of training. Printed: the log odds that each feature of the others adds per standard
 deviation; log loss, and the count of true ones at given counts of false ones, on the images of each fifth by
 a fit to the others.
@@ -78,7 +78,7 @@ class Gathered:
     lit: list[bool] = field(default_factory=list)
 
     def add(self, index: int, shown: Example, detector: Detector, spots: Spots | None = None) -> None:
-        """What the detector proposes in one image; its network swears that ``spots`` are markings."""
+        """The detector's proposals in one image, whose network is confident that ``spots`` are markings."""
         with swearing(spots) if spots is not None else nullcontext():
             seen = detector.see(shown.image, shown.camera)
         readings = detector.read(shown.image, seen)
@@ -110,7 +110,7 @@ class Gathered:
 
     @classmethod
     def load(cls, paths: Sequence[Path]) -> Gathered:
-        """What several files of :meth:`save` hold, one after the other."""
+        """The contents of several files of :meth:`save`, one after the other."""
         whole = cls()
         for path in paths:
             first_look = 1 + max(whole.look, default=-1)
@@ -221,7 +221,7 @@ def fit_all(
 ) -> tuple[Judge, dict[str, dict[str, object]]]:
     """The judge, and what ``confidence.json`` is to hold; prints what both are worth on images left out.
 
-    ``tell`` is told what share of the work is done.
+    ``tell`` is called with the share of the work that is done.
     """
     known = np.array([true is not None for true in gathered.true])
     true = np.array([true is True for true in gathered.true])
@@ -239,7 +239,7 @@ def fit_all(
     )
     # What is true of the images with spots has been seen without them, too.
     lessons = known & ~(spotted & true)
-    # Each is told of by odds that its own image had no part in.
+    # Each is judged by odds that its own image had no part in.
     odds, side_sigma_px = np.zeros(len(true)), np.ones((len(true), 4))
     for k in range(FOLDS):
         judge = train_judge(asked.take(lessons & (fold != k)), CONFIG)
@@ -265,7 +265,7 @@ def _print_sides(asked: Quadrilaterals, side_sigma_px: FloatArray) -> None:
 
 
 def fit_among(gathered: Gathered, odds: FloatArray) -> dict[str, dict[str, object]]:
-    """What ``confidence.json`` is to hold, of the log odds (N,) of each alone; prints what that is worth."""
+    """The content of ``confidence.json`` from the log odds (N,) of each proposal alone; prints its log loss."""
     # With spots of sun in it an image is no more what others look like.
     known = np.array([true is not None for true in gathered.true]) & ~np.array(gathered.lit)
     true = np.array([true is True for true in gathered.true])
@@ -305,7 +305,7 @@ def _fit_each(
 
 
 def _print_worth(name: str, odds: FloatArray, true: BoolArray) -> None:
-    """What log odds (N,) of images that had no part in them are worth."""
+    """The quality of log odds (N,) on images that had no part in their fit."""
     order = np.argsort(-odds)
     false, found = np.cumsum(~true[order]), np.cumsum(true[order])
     ranks = [np.searchsorted(false, count, side="right") for count in COUNTS]

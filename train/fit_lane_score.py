@@ -3,8 +3,8 @@
 ``python -m train.ship`` runs it. The lines that the detector proposes on rendered scenes, sure or not, two
 thirds of them of full difficulty and a third easy ones, are true if four fifths of the rows that they were
 seen on lie on one true line, by the tolerance of the quality benchmark; how far a line was drawn on from
-there does not count. A logistic regression with a weak ridge tells them apart by the features of each alone;
-a second one tells each from its log odds, by weights that its own image had no part in, from its span and
+there does not count. A logistic regression with a weak ridge separates them by the features of each alone;
+a second one scores each by its log odds, by weights that its own image had no part in, from its span and
 from the others. Which lines are proposed depends a little on the score itself, so the fit is made twice. The
 seed is neither that of the quality benchmark nor one of training. Printed: by how much each feature changes
 the log odds per standard deviation, the log loss on the images of each fifth by weights that were fitted to
@@ -44,12 +44,12 @@ _MOST_SLOPE = 10.0
 KEYS = {"alone": score.ALONE, "among": score.AMONG}
 
 Weights = dict[str, tuple[FloatArray, float]]
-"""Those of :func:`v2hdm.detection.lanes.score.fitted`."""
+"""The weights of :func:`v2hdm.detection.lanes.score.fitted`."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What the lanes of one image are made of, and the truth."""
+    """The evidence for the lanes of one image, and the truth."""
 
     rows: list[AnchorRow]
     paint: list[LaneDetection]
@@ -60,7 +60,7 @@ class Seen:
 
 
 def seen(shown: Example, detector: Detector) -> Seen:
-    """What the network and the paint of an image say of its lanes."""
+    """The evidence for lanes in the network's output and the paint of an image."""
     kept: list[Seen] = []
 
     def spy(
@@ -159,7 +159,7 @@ class Gathered:
         return weights, alone, self._left_out(among)
 
     def effects(self, weights: Weights) -> Weights:
-        """What each feature adds to the log odds per standard deviation."""
+        """The change of the log odds per standard deviation of each feature."""
         among = self._among(self._alone @ weights["alone"][0] + weights["alone"][1])
         columns = {"alone": self._alone, "among": among}
         return {name: (weights[name][0] * columns[name].std(axis=0), 0.0) for name in weights}
@@ -188,7 +188,7 @@ class Part:
 
 
 def see(part: Part) -> list[Seen]:
-    """What a part of the scenes says of its lanes."""
+    """The evidence for lanes in a part of the scenes."""
     with being_fitted():
         detector = Detector.load(options=DetectorOptions(model=str(part.model), max_range_m=24.0))
     return [seen(render_to_fit(number, part.images, SEED)[1], detector) for number in part.numbers]

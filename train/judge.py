@@ -129,7 +129,7 @@ def judged(judge: Judge, asked: Quadrilaterals) -> tuple[NDArray[np.float64], ND
 
 @dataclass(frozen=True)
 class _Claims:
-    """What the paint network claims of markings on average: channels (C', S, S) and features (F')."""
+    """The network's mean output on markings: channels (C', S, S) and features (F')."""
 
     channels: list[int]
     features: list[int]

@@ -1,4 +1,4 @@
-"""What is known of one labelled image, whatever format said so."""
+"""The labels of one image, independent of their file format."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def coverage(ring_px: FloatArray, left: int, top: int, width: int, height: int) 
 
 
 def _scan(ring: FloatArray, v: FloatArray, width: int) -> FloatArray:
-    """What lines ``v`` (S,) share with the polygon, in each cell (S, width) from u = 0 on."""
+    """The length of the lines ``v`` (S,) within the polygon, in each cell (S, width) from u = 0 on."""
     start, end = ring, np.roll(ring, -1, axis=0)
     line, edge = np.nonzero((start[:, 1] <= v[:, None]) != (end[:, 1] <= v[:, None]))
     slope = (end[edge, 0] - start[edge, 0]) / (end[edge, 1] - start[edge, 1])

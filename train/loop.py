@@ -41,7 +41,7 @@ Progress = Callable[[float, str], None]
 class Trainer:
     """A training run in the folder ``config.output``: last.pt, best.pt and TensorBoard's log.
 
-    Of a ``team`` each member has its trainer; ``config.batch`` images a member make up an update.
+    Each process of a distributed training has its trainer; an update takes ``config.batch`` images per process.
     """
 
     config: TrainConfig

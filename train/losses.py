@@ -1,4 +1,4 @@
-"""What the training minimises: one term for each output of the network."""
+"""The loss of a training: one term per output of the network."""
 
 from __future__ import annotations
 

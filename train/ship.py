@@ -1,4 +1,4 @@
-"""The door: ``python -m train.ship runs/gpu`` makes a trained network the detector's own.
+"""The command ``python -m train.ship runs/gpu`` makes a trained network the detector's own.
 
 It exports the network, fits the judge, the confidence and the score of lanes to it, and puts all of them with
 their manifest where the detector looks for them. Nothing is put there before everything is done.
@@ -17,7 +17,7 @@ _INTERRUPTED = "interrupted; the same command goes on from here, and the detecto
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the door; the exit code is 0, or 2 with one line on stderr for what a user can mend."""
+    """Run the command; the exit code is 0, or 2 with one line on stderr for what a user can mend."""
     parsed = _parser().parse_args(arguments)
     return open_door("train.ship", "train", _INTERRUPTED, lambda: _ship(parsed))
 

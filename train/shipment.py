@@ -1,4 +1,4 @@
-"""What makes a trained network the detector's own: export, judge, lane score, manifest, in this order.
+"""Ship a trained network as the detector's own: export, classifier, lane score, manifest, in this order.
 
 Each step leaves its files in a folder of ``runs/`` named by all that they depend on: the network, the numbers
 of renders and the code. A run that was stopped finds there what it has done; after a change it begins anew.
@@ -48,7 +48,7 @@ _EXPORTED, _GATHERED, _JUDGED, _LANES_SEEN = 0.05, 0.6, 0.85, 0.99
 
 @dataclass(frozen=True, kw_only=True)
 class Order:
-    """What to ship, and how; the fields are the arguments of :mod:`train.ship`."""
+    """A shipment; its fields are the arguments of :mod:`train.ship`."""
 
     source: Path
     into: Path | None = None

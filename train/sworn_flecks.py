@@ -1,4 +1,4 @@
-"""Spots of sun that the paint network swears are markings: what the judge must see through by itself.
+"""Spots of sun that the network confidently takes for markings, which the classifier must reject by itself.
 
 Renders show spots, too, but the network seldom takes them for paint there, so that a judge who has learnt
 from what it does alone would believe it where it is wrong.
@@ -30,7 +30,7 @@ _SOFT = (0.15, 0.8)
 
 _GAIN = (1.3, 3.5)
 _BOUND_PX = 6
-"""What spots keep from markings, which must not change."""
+"""Distance of spots from markings, which must not change, px."""
 
 _SWORN_ODDS = (4.0, 16.0)
 """How fast the network's log odds of paint rise with the light of a spot."""
@@ -48,7 +48,7 @@ class Spots:
     kind: str
 
     def sworn(self, sight: Sight, view: CameraView, stride: int) -> Sight:
-        """What the network says, and that the spots are paint of their class."""
+        """The network's output, in which the spots are confident paint of their class."""
         paint, kinds = sight.paint.copy(), sight.kinds.copy()
         light = self._at(paint.shape, stride, view.far_row)
         claimed = np.clip(self.steepness * (light - 0.5), -6, 6)
@@ -113,7 +113,7 @@ def _spot(ground: FloatArray, view: CameraView, soft: float, rng: np.random.Gene
 
 @contextmanager
 def swearing(spots: Spots) -> Iterator[None]:
-    """Within, the paint network swears that the spots of sun are markings."""
+    """Within, the network is confident that the spots of sun are markings."""
 
     def seen(network: Network, image: np.ndarray, view: CameraView, mirrored: bool = False) -> Sight:
         return spots.sworn(look(network, image, view, mirrored), view, network.info.paint_stride)

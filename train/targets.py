@@ -1,4 +1,4 @@
-"""What the network is to answer for a labelled image, at the resolution of each of its outputs."""
+"""The network's target outputs for a labelled image, at the resolution of each output."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _FULL_SIZE = 64
 """A piece of paint of so many cells of 4 px is a near marking."""
 
 _MOST_WEIGHT = 4.0
-"""What the paint of the smallest pieces weighs, that of near ones weighing 1."""
+"""The weight of the smallest pieces of paint, relative to near ones."""
 
 _LEAST_PAINT = 0.4
 """A cell shows the class of its paint where that covers at least this share of it."""
@@ -98,7 +98,7 @@ def piece_size(kinds: Bytes) -> NDArray[np.float32]:
 
 
 def kind_weight(size: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What the class of each cell weighs: a piece of paint of n cells counts as much as sqrt(n) ones.
+    """The weight of each cell's class: a piece of paint of n cells counts as much as sqrt(n) ones.
 
     A map asks for each marking alike, and a far one has a hundredth of the cells that a near one has.
     """
@@ -106,7 +106,7 @@ def kind_weight(size: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def paint_weight(size: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What it weighs whether there is paint: more for the same reason in and around small pieces.
+    """The weight of each cell's paint: larger in and around small pieces, for the same reason.
 
     Around them too: if paint weighed more than what lies beside it, its learnt edge would move outwards.
     """

@@ -1,4 +1,4 @@
-"""What a training sees oftener than chance would have it: what networks were seen to fail on."""
+"""Hard cases, which networks have failed on and a training therefore shows more often than chance."""
 
 from __future__ import annotations
 
