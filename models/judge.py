@@ -1,8 +1,8 @@
-"""A small network that says of a quadrilateral whether it is a marking: the second stage of the detector.
+"""The classifier of quadrilaterals, a small network: the second stage of the detector.
 
-:class:`models.MarkingNet` separates paint from ground, pixel by pixel; whether some paint is a whole marking of a
-class shows in its shape, and in the image about it. The judge gets both: the quadrilateral seen in its own
-frame (:mod:`v2hdm.detection.corners.rectified`) and what was measured of it
+:class:`models.MarkingNet` separates paint from ground, pixel by pixel. Whether a piece of paint is a whole
+marking of a class shows in its shape and in the image about it. The classifier gets both: the quadrilateral
+rectified (:mod:`v2hdm.detection.corners.rectified`) and what was measured of it
 (:data:`v2hdm.detection.corners.evidence.FEATURES`), as the second stage of Faster R-CNN gets features of its
 region (Ren et al., NeurIPS 2015).
 """

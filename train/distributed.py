@@ -36,7 +36,7 @@ class Team:
         return self.rank == 0
 
     def average(self, tensors: Iterable[Tensor]) -> None:
-        """Replace tensors of one type by their means over all processes, in place; each must call it alike."""
+        """Replace tensors of one type by their means over all processes, in place; all must call it."""
         if self.size == 1:
             return
         group = list(tensors)

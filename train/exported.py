@@ -67,7 +67,7 @@ def read_exported(path: Path) -> Exported:
 
 
 def _constants(graph: onnx.GraphProto) -> dict[str, np.ndarray]:
-    """The constants of a graph by the names that its nodes read: as stored, or as integers with a scale each."""
+    """The constants of a graph by the names that its nodes read: as stored, or as scaled integers."""
     arrays = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
     for node in graph.node:
         if node.op_type == "DequantizeLinear" and node.input[0] in arrays:

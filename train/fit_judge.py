@@ -265,7 +265,7 @@ def _print_sides(asked: Quadrilaterals, side_sigma_px: FloatArray) -> None:
 
 
 def fit_among(gathered: Gathered, odds: FloatArray) -> dict[str, dict[str, object]]:
-    """The content of ``confidence.json`` from the log odds (N,) of each proposal alone; prints its log loss."""
+    """Content of ``confidence.json`` from the log odds (N,) of each proposal alone; prints its log loss."""
     # With spots of sun in it an image is no more what others look like.
     known = np.array([true is not None for true in gathered.true]) & ~np.array(gathered.lit)
     true = np.array([true is True for true in gathered.true])

@@ -41,7 +41,7 @@ Progress = Callable[[float, str], None]
 class Trainer:
     """A training run in the folder ``config.output``: last.pt, best.pt and TensorBoard's log.
 
-    Each process of a distributed training has its trainer; an update takes ``config.batch`` images per process.
+    Each process of a distributed training has its trainer; an update takes ``config.batch`` of each.
     """
 
     config: TrainConfig
