@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from v2hdm.ground.matcher import read_grey
+from v2hdm.ground.patches import read_grey
 
 
 def test_the_grey_of_an_image_is_the_same_from_a_jpeg_and_from_its_pixels_as_png(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from v2hdm.records import (
     Trajectory,
 )
 from v2hdm.verdict import Finding, Status
-from v2hdm.verdict.inputs.motion import Motion
+from v2hdm.verdict.inputs.poses import Motion
 
 SPEED_MPS = 5.0
 RADIUS_M = 10.0

@@ -10,7 +10,7 @@ from tests.verdict.drives import drive, motion, poses, raised
 from v2hdm.io.importers.stamp_units import why_no_pose
 from v2hdm.records import Trajectory
 from v2hdm.verdict import Status
-from v2hdm.verdict.inputs.clocks import check_clocks
+from v2hdm.verdict.inputs.recording import check_clocks
 
 
 def every(recorded: Trajectory, rows: np.ndarray) -> Trajectory:

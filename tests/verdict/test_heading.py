@@ -12,7 +12,7 @@ from v2hdm.geometry.rigid import quaternion_from_rotation, rotation_from_euler, 
 from v2hdm.records import FloatArray, Trajectory
 from v2hdm.verdict import Status
 from v2hdm.verdict.inputs.heading import Path, check_heading
-from v2hdm.verdict.inputs.path import check_attitude
+from v2hdm.verdict.inputs.poses import check_attitude
 
 Spoil = Callable[[Trajectory], Trajectory]
 

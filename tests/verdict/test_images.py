@@ -13,7 +13,7 @@ import pytest
 from tests.verdict.drives import drive, poses, raised
 from v2hdm.errors import DriveError
 from v2hdm.records import Drive
-from v2hdm.verdict.inputs.images import check_images
+from v2hdm.verdict.inputs.recording import check_images
 
 Paint = Callable[[int], np.ndarray]
 

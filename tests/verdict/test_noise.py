@@ -11,7 +11,7 @@ from tests.verdict.drives import NOISE, motion, poses, raised
 from v2hdm.records import PoseNoise
 from v2hdm.verdict import Finding, Status
 from v2hdm.verdict.inputs.drive import causes
-from v2hdm.verdict.inputs.noise import check_noise
+from v2hdm.verdict.inputs.poses import check_noise
 
 
 def test_poses_that_scatter_as_stated_pass() -> None:

@@ -8,7 +8,7 @@ import pytest
 from tests.verdict.drives import NOISE, motion, poses, raised
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.verdict import Status
-from v2hdm.verdict.inputs.path import check_attitude, check_jumps, check_path
+from v2hdm.verdict.inputs.poses import check_attitude, check_jumps, check_path
 
 
 @pytest.mark.parametrize(

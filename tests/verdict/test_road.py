@@ -10,7 +10,7 @@ import pytest
 from tests.verdict.drives import drive, poses, raised
 from v2hdm.records import FloatArray, Road
 from v2hdm.verdict import Status
-from v2hdm.verdict.inputs.road import check_road
+from v2hdm.verdict.inputs.drive import check_road
 
 
 def road(height_m: FloatArray) -> Road:

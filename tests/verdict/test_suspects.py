@@ -13,8 +13,8 @@ from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.ground import GroundEstimate, GroundOptions, GroundStatus, Reading
 from v2hdm.records import Drive
-from v2hdm.verdict.inputs import suspects
-from v2hdm.verdict.inputs.suspects import find_suspect, scaled, upside_down
+from v2hdm.verdict.inputs import ground as suspects
+from v2hdm.verdict.inputs.ground import find_suspect, scaled, upside_down
 
 LOST = replace(estimate(), status=GroundStatus.NO_MATCH, shares={Reading.AS_GIVEN: 0.0})
 

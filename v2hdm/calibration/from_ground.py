@@ -11,8 +11,7 @@ from pathlib import Path
 import cv2
 
 from v2hdm.ground import GroundEstimate, estimate_cameras
-from v2hdm.ground.picture import draw_matched_ground
-from v2hdm.ground.say import lines
+from v2hdm.ground.show import draw_matched_ground, lines
 from v2hdm.io.calibration.document import Provenance, write_calibration
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.drive.lossless import png

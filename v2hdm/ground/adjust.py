@@ -1,15 +1,60 @@
-"""Robust least squares: the mounting under which matched pixels show the same ground."""
+"""How far the recorded poses of a set of images may be off, together.
+
+Robust least squares: the mounting under which matched pixels show the same ground.
+
+What is known of a camera and its vehicle's poses before the ground is seen.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from v2hdm.geometry.rigid import rotation_from_vector
-from v2hdm.ground.model import GroundHits, by_lens, by_pixel, hit_ground
-from v2hdm.ground.mount import Mount
-from v2hdm.records import BoolArray, FloatArray, IntArray
+from v2hdm.ground.model import GroundHits, Mount, by_lens, by_pixel, hit_ground
+from v2hdm.ground.motion import Motion
+from v2hdm.records import BoolArray, Camera, Drive, FloatArray, IntArray, PoseNoise
+
+HEAVE_SIGMA_M = 0.01
+"""How far a vehicle's body moves up and down on its suspension on paved ground; the mapper's figure."""
+
+_LEAST = 1e-6
+"""Poses stated to be exact would make the matrix singular: m or rad."""
+
+STATES = ("roll", "pitch", "yaw", "forward", "left", "up")
+"""Errors of a pose, rad and m, in vehicle axes."""
+
+
+def state_sigmas(noise: PoseNoise) -> FloatArray:
+    """Standard deviations (6,) of a pose's :data:`STATES`."""
+    tilt, position = noise.roll_pitch_rad, noise.position_m
+    sigmas = [tilt, tilt, noise.heading_rad, position, position, HEAVE_SIGMA_M]
+    return np.asarray(np.maximum(np.array(sigmas), _LEAST))
+
+
+def pose_information(noise: PoseNoise, path_m: FloatArray, loosened: FloatArray) -> FloatArray:
+    """Inverse covariance (6, I, I) of each state's errors at the images.
+
+    Args:
+        noise: as the drive states it; drifts tie images together that are near to each other on the path.
+        path_m: (I,) distance driven at each image.
+        loosened: (6,) factors on the standard deviations.
+    """
+    apart_m = np.abs(path_m[:, None] - path_m[None])
+    drifts = (
+        [(noise.roll_pitch_drift_rad, noise.roll_pitch_drift_over_m)] * 2
+        + [(noise.heading_drift_rad, noise.heading_drift_over_m)]
+        + [(noise.position_drift_m, noise.position_drift_over_m)] * 2
+        + [(0.0, 1.0)]
+    )
+    out = []
+    for sigma, (drift, over_m), factor in zip(state_sigmas(noise), drifts, loosened, strict=True):
+        white = np.sqrt(max(sigma**2 - drift**2, _LEAST**2))
+        covariance = white**2 * np.eye(len(path_m)) + drift**2 * np.exp(-apart_m / over_m)
+        out.append(np.linalg.inv(factor**2 * covariance))
+    return np.array(out)
+
 
 PIXEL_SIGMA = 0.4
 """What a patch's place in an image is off, px, at the most; the unit of the residuals."""
@@ -72,7 +117,7 @@ class Believed:
 
     Attributes:
         poses: (I, 4, 4) ``map_from_vehicle`` as recorded.
-        pose_information: (6, I, I) of the poses' errors; see :func:`v2hdm.ground.noise.pose_information`.
+        pose_information: (6, I, I) of the poses' errors; see :func:`v2hdm.ground.adjust.pose_information`.
         velocity: (I, 3) smoothed motion.
         climb_m: (I,) what a grade of 1 has lifted the poses by, m.
         centre_vehicle: (3,) surveyed camera centre.
@@ -95,7 +140,7 @@ class Adjusted:
         mount: with the lens as freed.
         extra: the freed parameter's value, 0 without one.
         covariance: (K, K) of turn (3, rad), centre (3, m) and the freed parameter, if any.
-        pose_errors: (I, 6) estimated :data:`v2hdm.ground.noise.STATES`.
+        pose_errors: (I, 6) estimated :data:`v2hdm.ground.adjust.STATES`.
         bends: (12,) estimated smooth error of the pixels, px.
         poses: (I, 4, 4) ``map_from_vehicle`` with their errors, and the parameter, taken in.
         residual: (N,) lengths in units of :data:`PIXEL_SIGMA` over both pixels.
@@ -298,3 +343,73 @@ def tangent_covariance(mount: Mount, covariance: FloatArray) -> FloatArray:
     jacobian[:3, CENTRE] = turn
     jacobian[3:, TURN] = turn
     return np.asarray(jacobian @ covariance[:6, :6] @ jacobian.T)
+
+
+_FORWARD_LOOSENED = 2.0
+"""At most so much for the place along the path: with more, distance and height slide together."""
+
+_UNSURVEYED_M = 0.5
+"""How far the centre that follows from a guess may be off, m."""
+
+_HEIGHT_SIGMA_M = 0.2
+"""The ground tells the height to millimetres; a survey's own sigma would only pull it, m."""
+
+
+@dataclass(frozen=True)
+class Beliefs:
+    """Poses, survey and their noise; ``clock_s`` is added to the images' stamps.
+
+    ``centre_sigma_m`` replaces the survey's own along single axes; not ``surveyed``, only the
+    guess tells where the centre is.
+    """
+
+    drive: Drive
+    camera: Camera
+    motion: Motion
+    guess: Mount
+    clock_s: float = 0.0
+    centre_sigma_m: dict[int, float] = field(default_factory=dict)
+    surveyed: bool = True
+
+    def at_clock(self, clock_s: float) -> Beliefs:
+        """The same with another offset of the clock."""
+        return replace(self, clock_s=clock_s)
+
+    def poses(self) -> FloatArray:
+        """``map_from_vehicle`` (I, 4, 4) at all images."""
+        return self.motion.poses(self.clock_s)
+
+    def path_m(self) -> FloatArray:
+        """Distance driven (I,) at all images."""
+        return self.motion.path_at_images(self.clock_s)
+
+    def about(
+        self, observations: Observations, loosened: float = 1.0
+    ) -> tuple[Observations, Believed, IntArray]:
+        """The observations with images counted anew, what is known of these images, and their rows.
+
+        Args:
+            observations: matches between rows of the motion.
+            loosened: how much further off than stated headings and sideways places may be.
+        """
+        rows, place = np.unique(
+            np.concatenate([observations.first, observations.second]), return_inverse=True
+        )
+        count = len(observations.first)
+        path_m = self.path_m()[rows]
+        prior = self.camera.centre_prior if self.surveyed else None
+        sigma_m = np.full(3, _UNSURVEYED_M) if prior is None else prior.sigma_m.copy()
+        sigma_m[2] = max(sigma_m[2], _HEIGHT_SIGMA_M)
+        for axis, wider_m in self.centre_sigma_m.items():
+            sigma_m[axis] = wider_m
+        ahead = min(loosened, _FORWARD_LOOSENED)
+        factors = np.array([1.0, 1.0, loosened, ahead, loosened, 1.0])
+        believed = Believed(
+            poses=self.poses()[rows],
+            pose_information=pose_information(self.drive.pose_noise, path_m, factors),
+            velocity=self.motion.velocity_at_images(self.clock_s)[rows],
+            climb_m=path_m - path_m.mean(),
+            centre_vehicle=self.guess.centre_vehicle if prior is None else prior.centre_vehicle,
+            centre_sigma_m=sigma_m,
+        )
+        return replace(observations, first=place[:count], second=place[count:]), believed, rows

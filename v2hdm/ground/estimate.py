@@ -1,26 +1,173 @@
-"""From a drive to what its bare ground says of one camera."""
+"""Quantities that the ground may contradict, each freed alone beside the mounting.
+
+How much further the answers of different stretches of a drive lie apart than their noise explains.
+
+From a drive to what its bare ground says of one camera.
+
+What the ground says of all cameras of a drive, each in a process of its own.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
-from v2hdm.ground.adjust import Adjusted, adjust, tangent_covariance
-from v2hdm.ground.beliefs import Beliefs
-from v2hdm.ground.matcher import Matcher, Round
-from v2hdm.ground.motion import motion_of
-from v2hdm.ground.mount import Mount, guessed_mount
-from v2hdm.ground.noise import state_sigmas
-from v2hdm.ground.options import GroundOptions
-from v2hdm.ground.pairs import changing_pairs, spread_pairs
-from v2hdm.ground.parameters import clock_shows, free_parameters
-from v2hdm.ground.readings import Readings, try_readings
-from v2hdm.ground.results import GroundEstimate, GroundStatus, MatchedGround, Parameter, Reading
-from v2hdm.ground.scatter import scatter
+from v2hdm.ground.adjust import (
+    CENTRE,
+    Adjusted,
+    Beliefs,
+    Observations,
+    adjust,
+    state_sigmas,
+    tangent_covariance,
+)
+from v2hdm.ground.model import Mount, guessed_mount
+from v2hdm.ground.motion import Motion, changing_pairs, motion_of, spread_pairs
+from v2hdm.ground.patches import Matcher, Round
+from v2hdm.ground.results import (
+    GroundEstimate,
+    GroundOptions,
+    GroundStatus,
+    MatchedGround,
+    Parameter,
+    Reading,
+)
+from v2hdm.ground.start import Readings, try_readings
 from v2hdm.records import Calibration, Drive, FloatArray, IntArray, PoseNoise
+from v2hdm.workers import share_out
+
+_FREE_CENTRE = {"forward_m": (0, 2.0), "left_m": (1, 2.0), "up_m": (2, 0.3)}
+"""Axis of the centre, and how far from its survey it may be, m."""
+
+_TOLD_SIGMA = {
+    "focal_scale": 0.01,
+    "distortion_k1": 0.03,
+    "grade": 0.001,
+    "up_m": 0.03,
+    "forward_m": 0.1,
+    "left_m": 0.1,
+    "clock_s": 0.015,
+}
+"""Standard deviations above which a value says nothing: a third of the smallest fault worth telling."""
+
+_STEEP_RAD = np.deg2rad(10)
+"""A camera that looks down less shows focal length and height only as a product, unless the vehicle turns."""
+
+_REAL_CHANGE = 4.0
+"""Changes of motion must be so many times what the noise of the poses looks like."""
+
+_LEAST_SPEED_CHANGE_MPS = 0.5
+_LEAST_TURN_RADPS = 0.05
+"""Changes of speed and of yaw rate within a pair's length that show 15 ms over the noise of 20 pairs."""
+
+_REMEDY = {
+    "clock_s": "speed and direction hardly change: drive a turn",
+    "focal_scale": "the camera looks too level and the vehicle drives straight: drive a turn",
+    "distortion_k1": "too little ground is matched away from the image's middle: drive on rougher ground",
+    "grade": "too few matches: drive further",
+    "up_m": "too few matches: drive further",
+    "forward_m": "the vehicle drives straight: drive a turn",
+    "left_m": "the vehicle drives straight: drive a turn",
+}
+
+
+def clock_shows(motion: Motion) -> bool:
+    """Whether speed or yaw rate really change along the drive, beyond the noise of smoothed poses."""
+    velocity = motion.velocity_at_images()
+    calm = np.percentile(velocity, 97, axis=0) - np.percentile(velocity, 3, axis=0)
+    return bool(calm[2] > _LEAST_TURN_RADPS)
+
+
+def free_parameters(
+    names: tuple[str, ...],
+    observations: Observations,
+    beliefs: Beliefs,
+    solved: Adjusted,
+    clock: Parameter | None,
+    factor: float,
+) -> Mapping[str, Parameter]:
+    """Each of ``names`` freed alone.
+
+    Args:
+        names: see :class:`v2hdm.ground.results.Parameter`.
+        observations: matches between rows of the motion.
+        beliefs: about poses and survey.
+        solved: the solution without any of them.
+        clock: its estimate, where the drive shows it.
+        factor: of all variances; see :func:`v2hdm.ground.estimate.scatter`.
+    """
+    turns = clock_shows(beliefs.motion)
+    out = {}
+    for name in names:
+        if name == "clock_s" and clock is not None:
+            out[name] = replace(clock, sigma=clock.sigma * float(np.sqrt(factor)))
+            continue
+        value, sigma = _free(name, observations, beliefs, solved)
+        # A fault widens the scatter; that it shows must not hang on it.
+        told = sigma < _TOLD_SIGMA[name]
+        sigma *= float(np.sqrt(factor))
+        if name == "clock_s":
+            told = False
+        if name == "focal_scale":
+            told = told and (turns or solved.mount.depression_rad > _STEEP_RAD)
+        out[name] = Parameter(name, value, sigma, told, "" if told else _REMEDY[name])
+    return out
+
+
+def _free(name: str, observations: Observations, beliefs: Beliefs, solved: Adjusted) -> tuple[float, float]:
+    if name in _FREE_CENTRE:
+        axis, sigma_m = _FREE_CENTRE[name]
+        wider = replace(beliefs, centre_sigma_m={**beliefs.centre_sigma_m, axis: sigma_m})
+        used, believed, _ = wider.about(observations)
+        adjusted = adjust(used, believed, solved.mount, near=solved)
+        value = adjusted.mount.centre_vehicle[axis] - believed.centre_vehicle[axis]
+        return float(value), float(np.sqrt(adjusted.covariance[CENTRE, CENTRE][axis, axis]))
+    prior = beliefs.camera.centre_prior
+    if name == "focal_scale" and prior is not None:
+        # A longer focal length and a higher camera look alike; the survey tells them apart.
+        beliefs = replace(beliefs, centre_sigma_m={2: float(prior.sigma_m[2])})
+    used, believed, _ = beliefs.about(observations)
+    adjusted = adjust(used, believed, solved.mount, free=name, near=solved)
+    return adjusted.extra, float(np.sqrt(adjusted.covariance[6, 6]))
+
+
+_STRETCHES = 8
+"""Enough to tell a spread, few enough that each has several pairs."""
+
+_TOLD = [0, 1, 2, 5]
+"""Roll, pitch, yaw and height: what is left is mostly the survey's word."""
+
+
+def scatter(observations: Observations, beliefs: Beliefs, solved: Adjusted) -> float:
+    """The factor, at least 1, by which the variances of ``solved`` are too small.
+
+    A road is no plane, poses err otherwise than stated, and neighbouring matches share their errors. All that
+    makes stretches disagree. Each is left out in turn (Efron and Stein, The jackknife estimate of variance,
+    1981); the variance of the answers, over the one that they should have, is averaged over the angles and
+    the height.
+    """
+    pairs = np.unique(observations.pair)
+    place = {int(pair): float(observations.first[observations.pair == pair][0]) for pair in pairs}
+    ordered = sorted(place, key=lambda pair: place[pair])
+    stretches = [part for part in np.array_split(np.array(ordered), _STRETCHES) if len(part)]
+    free = "clock_s" if len(solved.covariance) > 6 else None
+    answers = []
+    for part in stretches:
+        rest = observations.only(~np.isin(observations.pair, part))
+        used, believed, _ = beliefs.about(rest)
+        mount = adjust(used, believed, solved.mount, free).mount
+        turn = mount.vehicle_from_cam_rotation @ solved.mount.vehicle_from_cam_rotation.T
+        small = [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+        answers.append([*(np.array(small) / 2), *(mount.centre_vehicle - solved.mount.centre_vehicle)])
+    count = len(stretches)
+    if count < 2:
+        return 1.0
+    spread = (count - 1) * np.var(np.array(answers), axis=0)
+    return max(1.0, float(np.mean(spread[_TOLD] / np.diag(solved.covariance)[_TOLD])))
 
 
 @dataclass(frozen=True)
@@ -187,3 +334,52 @@ def _nothing(camera: str, beliefs: Beliefs, readings: Readings) -> GroundEstimat
         patches=None,
         seconds=0.0,
     )
+
+
+_worker: tuple[Drive, GroundOptions | None] | None = None
+
+
+def estimate_cameras(
+    drive: Drive,
+    workers: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+    options: GroundOptions | None = None,
+) -> dict[str, GroundEstimate]:
+    """Estimate every camera's mounting from bare ground; see :func:`v2hdm.ground.estimate_ground`.
+
+    Args:
+        drive: the drive.
+        workers: processes, one thread each; 1 stays in this process.
+        progress: called as ``progress(done, total)`` after each camera.
+        options: of the estimate.
+
+    Raises:
+        DriveError: an image cannot be read.
+        WorkerError: a process died.
+    """
+    found: dict[str, GroundEstimate] = {}
+
+    def take(estimate: GroundEstimate) -> None:
+        found[estimate.camera] = estimate
+        if progress:
+            progress(len(found), len(drive.cameras))
+
+    names = list(drive.cameras)
+    if workers <= 1 or len(names) == 1:
+        for name in names:
+            take(estimate_ground(drive, name, options))
+    else:
+        share_out(_work, names, workers, _start_worker, (drive, options), take)
+    return found
+
+
+def _start_worker(drive: Drive, options: GroundOptions | None) -> None:
+    global _worker
+    cv2.setNumThreads(1)
+    _worker = drive, options
+
+
+def _work(camera: str) -> GroundEstimate:
+    assert _worker is not None
+    drive, options = _worker
+    return estimate_ground(drive, camera, options)

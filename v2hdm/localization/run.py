@@ -1,4 +1,7 @@
-"""From a map and a drive to where the vehicle was, and how far the recorded poses are from that."""
+"""The errors of a localisation over time, as a picture.
+
+From a map and a drive to where the vehicle was, and how far the recorded poses are from that.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
@@ -23,13 +28,43 @@ from v2hdm.io.calibration.document import trusted_calibrations
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.drive.tum import write_tum
 from v2hdm.io.maps.geojson import read_geojson
-from v2hdm.localization.figure import save_errors
-from v2hdm.localization.match import Markings, Seen, locate
-from v2hdm.localization.motion import State, predict, start
+from v2hdm.localization.filter import Markings, Seen, State, locate, predict, start
 from v2hdm.mapping.sightings.table import Sightings, collect_sightings
 from v2hdm.records import Calibration, Drive, FloatArray, HdMap, ImageDetections, Trajectory
 from v2hdm.report.outputs import result_folder, write_json
 from v2hdm.settings import check_workers
+
+_PANELS = (("ahead", 100.0, "cm"), ("to the left", 100.0, "cm"), ("heading", float(np.degrees(1.0)), "deg"))
+_KNOWN, _LOST, _BAND = "#0072b2", "#d55e00", "#bbbbbb"
+
+
+def save_errors(
+    path: Path, stamp_s: FloatArray, error: FloatArray, sigma: FloatArray, known: np.ndarray
+) -> None:
+    """Draw errors (F, 3) beside the recorded poses as PNG.
+
+    Bands are two standard deviations (F, 3) of estimate and recorded pose together. ``known`` (F,) says in
+    which frames the vehicle knows where it is; the others are drawn as crosses.
+    """
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    FigureCanvasAgg(figure)
+    time_s = stamp_s - stamp_s[0]
+    axes = figure.subplots(3, 1, sharex=True)
+    for k, (axis, (name, factor, unit)) in enumerate(zip(axes, _PANELS, strict=True)):
+        band = 2 * factor * sigma[:, k]
+        axis.fill_between(time_s, -band, band, color=_BAND, alpha=0.6, lw=0, label="two sigmas, of both")
+        axis.plot(time_s[known], factor * error[known, k], ".", ms=3, color=_KNOWN, label="localised")
+        if not known.all():
+            axis.plot(time_s[~known], factor * error[~known, k], "x", ms=4, color=_LOST, label="lost")
+        limit = 1.2 * float(np.percentile(np.abs(factor * error[:, k]), 99)) + 1e-9
+        axis.set_ylim(-max(limit, 2 * float(np.median(band))), max(limit, 2 * float(np.median(band))))
+        axis.set_ylabel(f"{name}, {unit}")
+        axis.grid(alpha=0.3)
+    axes[0].legend(loc="upper right", ncols=3, fontsize=8)
+    axes[0].set_title("Localised by the map's markings, less the recorded pose")
+    axes[-1].set_xlabel("time, s")
+    figure.savefig(path, dpi=110)
+
 
 START_SIGMA_M, START_SIGMA_RAD = 0.5, float(np.deg2rad(3.0))
 """How well the first pose is known: a coordinate of a place that RTK has once fixed, and a compass."""

@@ -7,16 +7,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+from v2hdm.calibration.compare import movement
 from v2hdm.errors import MapFileError
 from v2hdm.ground import GroundEstimate, GroundStatus, better_start, estimate_cameras
-from v2hdm.ground.better import GROUND_IPM
+from v2hdm.ground.results import GROUND_IPM
 from v2hdm.io.drive import join_drives, with_clock_offsets
 from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.pipeline.keys import Contents
 from v2hdm.records import Camera, Drive
 from v2hdm.store.cache.room import Room
 from v2hdm.verdict import Finding, Status, check_drive, clock_corrections
-from v2hdm.verdict.movement import movement
 
 log = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ import numpy as np
 from v2hdm.detection.image_file import read_bgr
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.ground import GroundEstimate
-from v2hdm.ground.rig import estimate_cameras
+from v2hdm.ground.estimate import estimate_cameras
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.records import Drive, FloatArray, Trajectory
 from v2hdm.report.camera_grid import save_grid

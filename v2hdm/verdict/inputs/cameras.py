@@ -9,8 +9,7 @@ from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.planar import inside_convex, signed_area
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import Camera, CameraInfo, CentrePrior, FloatArray
-from v2hdm.verdict.judgement import judge, judge_between, passed
-from v2hdm.verdict.verdict import Finding, Status
+from v2hdm.verdict.verdict import Finding, Status, judge, judge_between, passed
 
 _OFF_CENTRE = 0.15
 """Lenses sit over their sensor to a few percent of the image's width; cropped images are rare beyond this."""

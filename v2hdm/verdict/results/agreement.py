@@ -1,18 +1,61 @@
-"""Each camera alone against all together: markings that several saw, and the mountings."""
+"""Two estimates of one camera's mounting, compared.
+
+Each camera alone against all together: markings that several saw, and the mountings.
+
+The mapper's mountings against those that bare ground gives, which no marking has a part in.
+
+The same marking mapped twice beside itself, as clocks, drift and mountings that disagree map it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import combinations
 
+import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
+from v2hdm.geometry.rigid import camera_centre, inverse, log
+from v2hdm.ground import GroundEstimate, GroundStatus
 from v2hdm.mapping.results import MethodResult
-from v2hdm.records import Drive, FloatArray
-from v2hdm.verdict.judgement import judge
-from v2hdm.verdict.results.mountings import centre_sigma_m, mounting_sigmas
-from v2hdm.verdict.verdict import Finding
+from v2hdm.records import Calibration, Drive, FloatArray, Marking
+from v2hdm.verdict.verdict import Finding, judge
+
+_LEAST_VARIANCE = np.array([1e-8] * 3 + [1e-10] * 3)
+"""Added to a covariance's diagonal (m^2, rad^2): a tenth of a millimetre, a thousandth of a degree."""
+
+
+def mounting_sigmas(one: Calibration, other: Calibration, of_both: bool = False) -> float:
+    """Distance of two mountings: root of the mean squared deviation of their six parameters, in sigmas.
+
+    ``one`` knows less; where ``other`` rests on the same data, its covariance must not be added.
+
+    Args:
+        one: its covariance is what the deviation is measured by.
+        other: the other one.
+        of_both: whether they are independent, so that both covariances count.
+    """
+    assert one.covariance is not None
+    covariance = one.covariance + np.diag(_LEAST_VARIANCE)
+    if of_both and other.covariance is not None:
+        covariance = covariance + other.covariance
+    off = mounting_difference(one, other)
+    return float(np.sqrt(off @ np.linalg.solve(covariance, off) / len(off)))
+
+
+def mounting_difference(one: Calibration, other: Calibration) -> FloatArray:
+    """The left tangent (6,) from ``other`` to ``one``: translation m, rotation rad."""
+    return log(one.cam_from_vehicle @ inverse(other.cam_from_vehicle))
+
+
+def centre_sigma_m(calibration: Calibration) -> FloatArray:
+    """Standard deviations (3,) of a camera's centre along the vehicle's axes; 0 without a covariance."""
+    if calibration.covariance is None:
+        return np.zeros(3)
+    rotation = calibration.cam_from_vehicle[:3, :3]
+    return np.sqrt(np.diagonal(rotation.T @ calibration.covariance[:3, :3] @ rotation))
+
 
 SAME_M = 1.0
 """Centres of one marking in the maps of two cameras lie closer than this."""
@@ -118,3 +161,105 @@ def shared_offsets(a: MethodResult, b: MethodResult, drive: Drive) -> FloatArray
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     left = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
     return np.stack([(apart * forward).sum(1), (apart * left).sum(1)], axis=1)
+
+
+GROUND_LIMIT_SIGMAS = 4.0
+"""Root mean square of the six parameters' deviations, in the sigmas of both: one in a million by chance."""
+
+LEAST_TURN_DEG = 0.2
+LEAST_HEIGHT_M = 0.04
+"""Where the mountings turn by less and their heights differ by less, the ground is no better judge."""
+
+
+def check_against_ground(
+    calibrations: Mapping[str, Calibration], ground: Mapping[str, GroundEstimate]
+) -> list[Finding]:
+    """Each camera's mounting as the mapper has it against that of the bare ground, where there is one."""
+    findings = []
+    for name, calibration in calibrations.items():
+        estimate = ground.get(name)
+        if estimate is None or estimate.status is not GroundStatus.FOUND or estimate.calibration is None:
+            continue
+        if calibration.covariance is None or estimate.calibration.covariance is None:
+            continue
+        findings.append(_compare(name, calibration, estimate.calibration))
+    return findings
+
+
+def _compare(name: str, mapped: Calibration, ground: Calibration) -> Finding:
+    off = mounting_difference(ground, mapped)
+    rotation = mapped.cam_from_vehicle[:3, :3]
+    turn_deg = np.rad2deg(rotation.T @ off[3:])
+    up_m = float(camera_centre(mapped.cam_from_vehicle)[2] - camera_centre(ground.cam_from_vehicle)[2])
+    small = np.abs(turn_deg).max() < LEAST_TURN_DEG and abs(up_m) < LEAST_HEIGHT_M
+    sigmas = mounting_sigmas(ground, mapped, of_both=True)
+    roll, pitch, yaw = turn_deg
+    return judge(
+        "ground",
+        name,
+        0.0 if small else sigmas,
+        GROUND_LIMIT_SIGMAS,
+        "sigmas",
+        fine=f"markings and bare ground agree on its mounting ({np.abs(turn_deg).max():.2f} deg at most)",
+        wrong=f"markings and bare ground do not agree on its mounting (roll {roll:+.2f}, pitch "
+        f"{pitch:+.2f}, yaw "
+        f"{yaw:+.2f} deg, height {100 * up_m:+.0f} cm): wrong associations, or ground that is not flat; "
+        f"look at "
+        "the overlay",
+    )
+
+
+OVERLAP = 0.1
+"""Share of the smaller of two markings of a class that both cover; paint does not lie on paint."""
+
+DOUBLES_LIMIT = 0.02
+"""Share of markings that overlap another: clean drives have none, one in a hundred may be paint over old
+paint."""
+
+
+def check_doubles(best: MethodResult) -> list[Finding]:
+    """Markings of one class that overlap."""
+    pairs = overlapping(best.hd_map.markings)
+    count = len(best.hd_map.markings)
+    if not count:
+        return []
+    where = ""
+    if pairs:
+        x, y = best.hd_map.markings[pairs[0][0]].corners_map.mean(axis=0)
+        where = f", first at ({x:.1f}, {y:.1f})"
+    return [
+        judge(
+            "double markings",
+            "map",
+            len(pairs) / count,
+            DOUBLES_LIMIT,
+            "",
+            fine=f"{len(pairs)} of {count} markings overlap another of their class",
+            wrong=f"{len(pairs)} of {count} markings overlap another of their class{where}: laps or "
+            f"cameras do not "
+            "agree; check clocks, the receiver's fix and the mountings",
+        )
+    ]
+
+
+def overlapping(markings: tuple[Marking, ...]) -> list[tuple[int, int]]:
+    """Pairs of markings of one class that share at least :data:`OVERLAP` of the smaller one."""
+    if len(markings) < 2:
+        return []
+    corners = [np.ascontiguousarray(one.corners_map, dtype=np.float32) for one in markings]
+    centres = np.array([one.mean(axis=0) for one in corners])
+    longest_m = max(float(np.ptp(one, axis=0).max()) for one in corners)
+    near = KDTree(centres).query_pairs(longest_m, output_type="ndarray")
+    return [
+        (int(a), int(b))
+        for a, b in near
+        if markings[a].kind == markings[b].kind and _overlap(corners[a], corners[b]) > OVERLAP
+    ]
+
+
+def _overlap(first: FloatArray, second: FloatArray) -> float:
+    area = min(abs(cv2.contourArea(first)), abs(cv2.contourArea(second)))
+    # About an origin of their own: in map coordinates single precision would not do.
+    origin = first.mean(axis=0)
+    shared, _ = cv2.intersectConvexConvex(first - origin, second - origin)
+    return float(shared) / max(area, 1e-6)
