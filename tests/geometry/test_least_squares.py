@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -26,9 +28,7 @@ def noisy(seed: int) -> FloatArray:
 
 
 def test_a_curve_is_recovered_and_its_sigmas_hold() -> None:
-    fits = [
-        gauss_newton(lambda x, seen=noisy(seed): curve(x, seen), np.array([1.0, 0.0])) for seed in range(200)
-    ]
+    fits = [gauss_newton(partial(curve, seen=noisy(seed)), np.array([1.0, 0.0])) for seed in range(200)]
     assert all(fit.converged for fit in fits)
     squares = [(fit.x - TRUE) @ np.linalg.solve(fit.covariance, fit.x - TRUE) for fit in fits]
     assert np.mean(squares) == pytest.approx(2.0, abs=0.45)  # three deviations of a mean of 200

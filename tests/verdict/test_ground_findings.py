@@ -22,7 +22,9 @@ SIGMA = {
 
 def estimate(name: str = "front", **values: float) -> GroundEstimate:
     """A clean camera, apart from some parameters."""
-    parameters = {key: Parameter(key, values.get(key, 0.0), sigma, told=True) for key, sigma in SIGMA.items()}
+    parameters = {
+        key: Parameter(key, values.get(key, 0.0), sigma, observable=True) for key, sigma in SIGMA.items()
+    }
     guess = np.eye(4)
     guess[:3, :3] = [[0, -1, 0], [-0.26, 0, -0.966], [0.966, 0, -0.26]]  # 15 deg down
     return GroundEstimate(
@@ -88,14 +90,17 @@ def test_a_clock_beyond_what_is_corrected_fails() -> None:
 
 def test_a_value_within_five_of_its_sigmas_passes() -> None:
     vague = estimate(clock_s=0.05)
-    parameters = {**vague.parameters, "clock_s": Parameter("clock_s", 0.05, 0.012, told=True)}
+    parameters = {**vague.parameters, "clock_s": Parameter("clock_s", 0.05, 0.012, observable=True)}
     assert not told(replace(vague, parameters=parameters))
 
 
 def test_what_a_drive_cannot_tell_is_said_with_what_would() -> None:
     straight = estimate()
     why = "constant speed on a straight road: drive a turn"
-    parameters = {**straight.parameters, "clock_s": Parameter("clock_s", 0.1, 0.01, told=False, why_not=why)}
+    parameters = {
+        **straight.parameters,
+        "clock_s": Parameter("clock_s", 0.1, 0.01, observable=False, why_not=why),
+    }
     findings = check_ground(drive(poses()), {"front": replace(straight, parameters=parameters)})
     (clock,) = [finding for finding in findings if finding.check == "clock"]
     assert clock.is_untold
@@ -104,7 +109,7 @@ def test_what_a_drive_cannot_tell_is_said_with_what_would() -> None:
 
 def test_a_place_known_worse_than_a_decimetre_is_not_told() -> None:
     vague = estimate()
-    parameters = {**vague.parameters, "forward_m": Parameter("forward_m", 3.0, 0.5, told=True)}
+    parameters = {**vague.parameters, "forward_m": Parameter("forward_m", 3.0, 0.5, observable=True)}
     findings = check_ground(drive(poses()), {"front": replace(vague, parameters=parameters)})
     assert [finding.check for finding in findings if finding.is_untold] == ["survey forward"]
 
@@ -186,7 +191,7 @@ def test_a_clean_drive_that_matches_mirrored_as_well_is_taken_as_given() -> None
 
 def test_a_straight_road_cannot_tell_the_focal_length_from_the_height() -> None:
     straight = estimate(focal_scale=0.08)
-    ahead = Parameter("forward_m", 0.4, 0.8, told=False, why_not="the vehicle drives straight")
+    ahead = Parameter("forward_m", 0.4, 0.8, observable=False, why_not="the vehicle drives straight")
     straight = replace(straight, parameters={**straight.parameters, "forward_m": ahead})
     findings = check_ground(drive(poses()), {"front": straight})
     assert not raised(findings)

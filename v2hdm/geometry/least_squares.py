@@ -40,7 +40,7 @@ class Normal:
 
 
 def normal_equations(residual: FloatArray, jacobian: FloatArray, weight: FloatArray | None = None) -> Normal:
-    """The normal equations of residuals (N, D), their derivatives (N, D, U) and weights (N, D, D), default 1."""
+    """The equations of residuals (N, D), their derivatives (N, D, U) and weights (N, D, D), by default 1."""
     weighted = jacobian if weight is None else weight @ jacobian
     moved = residual if weight is None else (weight @ residual[..., None])[..., 0]
     return Normal(

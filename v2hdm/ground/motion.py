@@ -1,7 +1,4 @@
-"""Where the vehicle was at each image and how it moved, under each reading of its poses.
-
-Which images of a camera are compared with each other.
-"""
+"""Where the vehicle was at each image and how it moved, and which images are compared with each other."""
 
 from __future__ import annotations
 
@@ -20,6 +17,9 @@ SMOOTHING_S = 0.5
 
 _STANDING_MPS = 0.3
 """Below this a path has no direction: receivers wander by centimetres."""
+
+_ARM_M = 10.0
+"""A turn by one radian moves the ground in view by about this."""
 
 
 @dataclass(frozen=True)
@@ -58,13 +58,14 @@ def motion_of(drive: Drive, camera: str, reading: Reading) -> Motion:
     """The motion of ``drive`` at the images of ``camera``, its poses read as ``reading`` says."""
     image = np.array([k for k, entry in enumerate(drive.images) if entry.camera == camera], dtype=np.int64)
     stamp_s = np.array([drive.images[k].stamp_s for k in image])
-    trajectory = _read_as(drive.trajectory or _of_images(drive), reading)
+    trajectory = _read_as(drive.trajectory or trajectory_of_images(drive), reading)
     position = trajectory.map_from_vehicle[:, :2, 3]
     path_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))])
     return Motion(image, stamp_s, trajectory, path_m, _velocity(trajectory))
 
 
-def _of_images(drive: Drive) -> Trajectory:
+def trajectory_of_images(drive: Drive) -> Trajectory:
+    """The poses of a drive's images, for drives of which nothing else is kept."""
     stamp_s, first = np.unique([image.stamp_s for image in drive.images], return_index=True)
     return Trajectory(stamp_s, np.array([drive.images[k].map_from_vehicle for k in first]))
 
@@ -109,10 +110,6 @@ def _slopes(at: FloatArray, values: FloatArray) -> FloatArray:
     return out
 
 
-_ARM_M = 10.0
-"""A turn by one radian moves the ground in view by about this."""
-
-
 def spread_pairs(path_m: FloatArray, count: int, shortest_m: float, longest_m: float) -> IntArray:
     """Pairs (P, 2) of images, spread evenly along the path, no image used twice where that is possible.
 
@@ -124,44 +121,26 @@ def spread_pairs(path_m: FloatArray, count: int, shortest_m: float, longest_m: f
     """
     chosen: list[tuple[int, int]] = []
     used: set[int] = set()
-    last = len(path_m) - 1
+    middle = (shortest_m + longest_m) / 2
     for start_m in np.linspace(path_m[0], max(path_m[-1] - longest_m, path_m[0]), count):
-        nearest = int(np.searchsorted(path_m, start_m))
-        pair = _pair_from(path_m, min(nearest, last), shortest_m, longest_m, used)
-        if pair is not None:
+        start = min(int(np.searchsorted(path_m, start_m)), len(path_m) - 1)
+        first = next((k for k in range(start, len(path_m)) if k not in used), None)
+        if first is None:
+            continue
+        away = path_m - path_m[first]
+        fitting = np.flatnonzero((away >= shortest_m) & (away <= longest_m)).tolist()
+        if fitting:
+            free = [k for k in fitting if k not in used] or fitting
+            pair = first, min(free, key=lambda k, away=away: abs(float(away[k]) - middle))
             chosen.append(pair)
             used.update(pair)
     return np.array(chosen, dtype=np.int64).reshape(-1, 2)
 
 
-def _pair_from(
-    path_m: FloatArray, start: int, shortest_m: float, longest_m: float, used: set[int]
-) -> tuple[int, int] | None:
-    first = next((k for k in range(start, len(path_m)) if k not in used), None)
-    if first is None:
-        return None
-    away = path_m - path_m[first]
-    fitting = np.flatnonzero((away >= shortest_m) & (away <= longest_m))
-    if not len(fitting):
-        return None
-    middle = (shortest_m + longest_m) / 2
-    free = [k for k in fitting if k not in used] or list(fitting)
-    second = min(free, key=lambda k: abs(float(away[k]) - middle))
-    return first, int(second)
-
-
 def changing_pairs(
     path_m: FloatArray, velocity: FloatArray, count: int, shortest_m: float, longest_m: float
 ) -> IntArray:
-    """Pairs (P, 2) of images between which the motion changes most, so that a clock shows.
-
-    Args:
-        path_m: (I,) distance driven at each image.
-        velocity: (I, 3) smoothed velocity there; see :class:`v2hdm.ground.motion.Motion`.
-        count: how many pairs are wanted.
-        shortest_m: distance between the images of a pair, at least.
-        longest_m: and at most.
-    """
+    """Pairs (P, 2) of images between which the velocity (I, 3) changes most, so that a clock shows."""
 
     def worth(first: int, second: int) -> float:
         change = velocity[second] - velocity[first]
@@ -173,15 +152,7 @@ def changing_pairs(
 def turning_pairs(
     path_m: FloatArray, yaw_rad: FloatArray, count: int, shortest_m: float, longest_m: float
 ) -> IntArray:
-    """Pairs (P, 2) of images between which the vehicle turns most, so that a mirrored path shows.
-
-    Args:
-        path_m: (I,) distance driven at each image.
-        yaw_rad: (I,) heading there, without jumps.
-        count: how many pairs are wanted.
-        shortest_m: distance between the images of a pair, at least.
-        longest_m: and at most.
-    """
+    """Pairs (P, 2) of images between which the unwrapped heading (I,) turns most: a mirrored path shows."""
 
     def worth(first: int, second: int) -> float:
         return abs(float(yaw_rad[second] - yaw_rad[first]))
@@ -198,10 +169,9 @@ def _best_pairs(
         away = path_m - path_m[first]
         for second in np.flatnonzero((away >= shortest_m) & (away <= longest_m)).tolist():
             found.append((worth(first, second), first, second))
-    found.sort(reverse=True)
     used: set[int] = set()
     chosen: list[tuple[int, int]] = []
-    for _, first, second in found:
+    for _, first, second in sorted(found, reverse=True):
         if first not in used and second not in used and len(chosen) < count:
             chosen.append((first, second))
             used.update((first, second))

@@ -1,7 +1,4 @@
-"""Patches of ground that two images share: laid out from above, matched, and turned back into raw pixels.
-
-All that matching the ground of one camera needs at hand: its images, its region, the driven path.
-"""
+"""Patches of ground that two images share: resampled from above, matched, and turned back into raw pixels."""
 
 from __future__ import annotations
 
@@ -14,9 +11,9 @@ from numpy.typing import NDArray
 
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.rigid import ground_in_vehicle
-from v2hdm.ground.adjust import Observations
 from v2hdm.ground.model import Mount
 from v2hdm.ground.motion import Motion
+from v2hdm.ground.prior import Observations
 from v2hdm.ground.results import GroundOptions
 from v2hdm.io.pixels import read_pixels
 from v2hdm.records import BoolArray, Drive, FloatArray, IntArray
@@ -47,10 +44,14 @@ _ALL = 0.9999
 """Mean of flags that are all set, but for rounding."""
 
 _HOMOGRAPHY_PX = 2.0
-"""Matches of a pair lie on one plane to within this: off it are kerbs, shadows and what moves."""
+"""Matches of a pair lie on one plane to within this: off it are kerbs, shadows and moving things."""
 
 _LEAST_OF_A_PAIR = 8
 """Twice the four that a homography takes."""
+
+_PATH_STEP_M = 0.5
+_BEYOND_M = 30.0
+"""How far the path is continued straight beyond the drive's ends: as far as regions reach."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,11 @@ class Matches:
     correlation: FloatArray
     sought: int
 
+    @classmethod
+    def none_of(cls, sought: int) -> Matches:
+        """No matches at all."""
+        return cls(np.empty((0, 2)), np.empty((0, 2)), np.empty(0), sought)
+
 
 @dataclass(frozen=True)
 class Sheet:
@@ -84,6 +90,15 @@ class Sheet:
     axes: FloatArray
     grid_m: float
     shape: tuple[int, int]
+
+    @classmethod
+    def around(cls, points_map: FloatArray, pose: FloatArray, margin_m: float, grid_m: float) -> Sheet:
+        """A sheet around points (N, 2), aligned with a pose (4, 4): rows ahead, columns to the left."""
+        axes = _axes(pose)
+        along = points_map @ axes.T
+        low, high = np.nanmin(along, axis=0) - margin_m, np.nanmax(along, axis=0) + margin_m
+        rows, columns = np.ceil((high - low) / grid_m).astype(int)
+        return cls(low @ axes, axes, grid_m, (int(rows), int(columns)))
 
     def points(self) -> FloatArray:
         """All grid points (rows * columns, 2) in the map."""
@@ -95,7 +110,7 @@ class Sheet:
         """Map points (N, 2) of grid places (N, 2): rows, columns."""
         return np.asarray(self.corner_map + self.grid_m * np.asarray(cells, dtype=np.float64) @ self.axes)
 
-    def lay(self, view: View) -> tuple[Float32Array, BoolArray]:
+    def resample(self, view: View) -> tuple[Float32Array, BoolArray]:
         """The ground as ``view`` shows it (rows, columns), float32, and where it does."""
         px = view.pixels(self.points()).astype(np.float32).reshape(*self.shape, 2)
         seen = ~np.isnan(px[..., 0])
@@ -104,8 +119,8 @@ class Sheet:
         return grey, seen
 
     def texture(self, view: View) -> tuple[Float32Array, BoolArray]:
-        """The same without what is wider than the texture of the ground."""
-        grey, seen = self.lay(view)
+        """The same without anything wider than the texture of the ground."""
+        grey, seen = self.resample(view)
         return grey - cv2.GaussianBlur(grey, (0, 0), _COARSEST_M / self.grid_m), seen
 
 
@@ -130,7 +145,6 @@ def patch_centres(
     centres = centres[inside]
     if not len(centres):
         return centres
-    # The path goes on straight beyond the drive's ends.
     near = np.linalg.norm(centres[:, None] - path_map[None], axis=2).min(axis=1) <= options.strip_m
     return np.asarray(centres[near])
 
@@ -154,16 +168,13 @@ def match_pair(
         row, column = cells[number]
         own = np.s_[row - half : row + half + 1, column - half : column + half + 1]
         area = np.s_[row - wide : row + wide + 1, column - wide : column + wide + 1]
-        peak = _peak(
-            np.asarray(
-                cv2.matchTemplate(second_grey[area], first_grey[own], cv2.TM_CCOEFF_NORMED), np.float32
-            )
-        )
+        score = cv2.matchTemplate(second_grey[area], first_grey[own], cv2.TM_CCOEFF_NORMED)
+        peak = _peak(np.asarray(score, np.float32))
         if peak is not None:
             found.append((number, *peak))
     sought = int(in_view.sum())
     if len(found) < _LEAST_OF_A_PAIR:
-        return _no_matches(sought)
+        return Matches.none_of(sought)
     table = np.array(found)
     at = cells[table[:, 0].astype(np.int64)]
     first_px = first.pixels(sheet.at(at))
@@ -176,16 +187,17 @@ def _mean(values: Float32Array | BoolArray, half: int) -> Float32Array:
     return np.asarray(cv2.blur(values.astype(np.float32), (2 * half + 1, 2 * half + 1)))
 
 
-def _no_matches(sought: int) -> Matches:
-    return Matches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0), sought)
+def _axes(pose: FloatArray) -> FloatArray:
+    """Unit vectors (2, 2) of the map ahead and to the left of a pose, as rows."""
+    forward = pose[:2, 0] / np.linalg.norm(pose[:2, 0])
+    return np.array([forward, [-forward[1], forward[0]]])
 
 
 def _sheet_around(
     centres_map: FloatArray, pose: FloatArray, margin: int, grid_m: float
 ) -> tuple[Sheet, FloatArray]:
     """A sheet that holds all centres with a ``margin`` of cells, and the centres' cells (N, 2) in it."""
-    axes = pose[:2, :2].T / np.linalg.norm(pose[:2, :2], axis=0)[:, None]
-    axes[1] = [-axes[0, 1], axes[0, 0]]
+    axes = _axes(pose)
     along = centres_map @ axes.T
     low = along.min(axis=0)
     cells = np.round((along - low) / grid_m).astype(np.int64) + margin
@@ -213,31 +225,24 @@ def _peak(score: Float32Array) -> tuple[float, float, float] | None:
     if abs(down) > 1 or abs(right) > 1:
         return None
     rest = score.copy()
-    rest[
-        max(row - _PEAK_CELLS, 0) : row + _PEAK_CELLS + 1,
-        max(column - _PEAK_CELLS, 0) : column + _PEAK_CELLS + 1,
-    ] = -1
+    top, left = max(row - _PEAK_CELLS, 0), max(column - _PEAK_CELLS, 0)
+    rest[top : row + _PEAK_CELLS + 1, left : column + _PEAK_CELLS + 1] = -1
     if rest.max() > best - _LEAST_LEAD:
         return None
     return row + float(down), column + float(right), float(best)
 
 
 def _on_one_plane(matches: Matches) -> Matches:
-    """Those that one homography of the two images explains: a plane seen twice."""
+    """The matches that one homography of the two images explains: a plane seen twice."""
     known = ~(np.isnan(matches.first_px) | np.isnan(matches.second_px)).any(axis=1)
     first, second = matches.first_px[known], matches.second_px[known]
     if len(first) < _LEAST_OF_A_PAIR:
-        return _no_matches(matches.sought)
+        return Matches.none_of(matches.sought)
     _, inlier = cv2.findHomography(first, second, cv2.RANSAC, _HOMOGRAPHY_PX)
     if inlier is None or inlier.sum() < _LEAST_OF_A_PAIR:
-        return _no_matches(matches.sought)
+        return Matches.none_of(matches.sought)
     keep = inlier.ravel().astype(np.bool_)
     return Matches(first[keep], second[keep], matches.correlation[known][keep], matches.sought)
-
-
-_PATH_STEP_M = 0.5
-_BEYOND_M = 30.0
-"""How far the path is continued straight beyond the drive's ends: as far as regions reach."""
 
 
 @dataclass(frozen=True)
@@ -257,7 +262,7 @@ class Matcher:
         self._drive = drive
         self._image = motion.image
         self._roi = np.asarray(drive.cameras[camera].roi_vehicle, dtype=np.float64)
-        self._path = path_of(motion)
+        self._path = _path_of(motion)
         self._options = options
         self._grey: dict[int, ImageArray] = {}
 
@@ -265,51 +270,43 @@ class Matcher:
         """The same images under another reading of the poses, the region ``turned`` to the other end."""
         other = object.__new__(Matcher)
         other.__dict__.update(self.__dict__)
-        other._path = path_of(motion)
+        other._path = _path_of(motion)
         other._roi = -self._roi if turned else self._roi
         return other
 
-    def grey(self, row: int) -> ImageArray:
+    def match(
+        self, mount: Mount, poses: FloatArray, pairs: IntArray, search_m: float, grid_m: float
+    ) -> Round:
+        """Match every pair (P, 2) of rows of ``poses`` on a grid that is laid out from ``mount``."""
+        options = replace(self._options, grid_m=grid_m)
+        found: list[Matches] = []
+        for first, second in pairs.tolist():
+            centres = patch_centres((poses[first], poses[second]), self._roi, self._path, options)
+            views = [View(self._read(k), mount, poses[k]) for k in (first, second)]
+            matches = match_pair(*views, centres, search_m, options) if len(centres) else Matches.none_of(0)
+            found.append(matches)
+        counts = [len(each.correlation) for each in found]
+        pair = np.repeat(np.arange(len(pairs)), counts)
+        sought = sum(each.sought for each in found)
+        none = Matches.none_of(0)
+        first_px, second_px, correlation = (
+            np.concatenate([getattr(each, name) for each in (none, *found)])
+            for name in ("first_px", "second_px", "correlation")
+        )
+        observations = Observations(pairs[pair, 0], pairs[pair, 1], first_px, second_px, pair)
+        return Round(observations, correlation, sought, sum(counts) / sought if sought else 0.0)
+
+    def _read(self, row: int) -> ImageArray:
         """The image of a row of the motion, as grey values."""
         if row not in self._grey:
             self._grey[row] = read_grey(str(self._drive.images[int(self._image[row])].path))
         return self._grey[row]
 
-    def match(
-        self, mount: Mount, poses: FloatArray, pairs: IntArray, search_m: float, grid_m: float | None = None
-    ) -> Round:
-        """Match every pair (P, 2) of rows of ``poses``, laid out from ``mount``."""
-        options = self._options if grid_m is None else replace(self._options, grid_m=grid_m)
-        found: list[Matches] = []
-        for first, second in pairs:
-            views = [View(self.grey(int(k)), mount, poses[k]) for k in (first, second)]
-            centres = patch_centres((poses[first], poses[second]), self._roi, self._path, options)
-            if len(centres):
-                found.append(match_pair(views[0], views[1], centres, search_m, options))
-            else:
-                found.append(Matches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0), 0))
-        counts = [len(each.correlation) for each in found]
-        pair = np.repeat(np.arange(len(pairs)), counts)
-        sought = sum(each.sought for each in found)
-        return Round(
-            Observations(
-                first=pairs[pair, 0],
-                second=pairs[pair, 1],
-                first_px=np.concatenate([np.empty((0, 2)), *(each.first_px for each in found)]),
-                second_px=np.concatenate([np.empty((0, 2)), *(each.second_px for each in found)]),
-                pair=pair,
-            ),
-            np.concatenate([np.empty(0), *(each.correlation for each in found)]),
-            sought,
-            sum(counts) / sought if sought else 0.0,
-        )
 
-
-def path_of(motion: Motion) -> FloatArray:
+def _path_of(motion: Motion) -> FloatArray:
     """Places (N, 2) of the driven path, half a metre apart, continued straight at both ends."""
     poses = motion.trajectory.map_from_vehicle
-    length = motion.path_m[-1]
-    at = np.arange(0.0, length + _PATH_STEP_M, _PATH_STEP_M)
+    at = np.arange(0.0, motion.path_m[-1] + _PATH_STEP_M, _PATH_STEP_M)
     keep = np.concatenate([[True], np.diff(motion.path_m) > 1e-9])
     path = np.column_stack([np.interp(at, motion.path_m[keep], poses[keep, axis, 3]) for axis in (0, 1)])
     beyond = np.arange(_PATH_STEP_M, _BEYOND_M, _PATH_STEP_M)[:, None]

@@ -1,19 +1,14 @@
-"""An estimate in words: one line of figures, and a line for each thing that a drive cannot tell.
-
-The matched ground of one pair of images, laid out from above under the guess and under the estimate.
-"""
+"""An estimate in words, and a picture of the matched ground under the guess and under the estimate."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.geometry.mounting import angle_sigmas, mounting_angles
-from v2hdm.geometry.rigid import camera_centre
+from v2hdm.geometry.mounting import mounting_words
 from v2hdm.ground.model import Mount, guessed_mount, hit_ground
 from v2hdm.ground.patches import Sheet, View, read_grey
 from v2hdm.ground.results import GroundEstimate, GroundStatus, MatchedGround, Reading
@@ -28,45 +23,12 @@ _NAMES = {
     "forward_m": ("centre forward", 1e2, "cm"),
     "left_m": ("centre left", 1e2, "cm"),
 }
-"""What each parameter is called, and the factor and unit that people read it in."""
+"""Each parameter's name, and the factor and unit that people read it in."""
 
 _WHY = {
     GroundStatus.NO_MATCH: "the ground does not match between images: check poses, clock and guess",
     GroundStatus.TOO_LITTLE: "too little ground is seen by two images: drive further, or widen roi_vehicle",
 }
-
-
-def lines(estimate: GroundEstimate) -> Iterator[str]:
-    """What the terminal shows of one camera."""
-    calibration = estimate.calibration
-    if calibration is None or calibration.covariance is None:
-        reading = estimate.reading
-        other = "" if reading is Reading.AS_GIVEN else f"; it does with the poses read as: {reading.value}"
-        yield f"{estimate.camera}: {_WHY[estimate.status]}{other}"
-        return
-    matrix = calibration.cam_from_vehicle
-    angles = np.rad2deg(mounting_angles(matrix))
-    sigmas = np.rad2deg(angle_sigmas(matrix, calibration.covariance))
-    height_m = camera_centre(matrix)[2]
-    up = matrix[:3, 2]
-    height_sigma_m = float(np.sqrt(up @ calibration.covariance[:3, :3] @ up))
-    parts = [
-        f"{name} {angle:.2f} +- {sigma:.2f} deg"
-        for name, angle, sigma in zip(("roll", "pitch", "yaw"), angles, sigmas, strict=True)
-    ]
-    parts.append(f"height {height_m:.3f} +- {height_sigma_m:.3f} m")
-    yield f"{estimate.camera}: {', '.join(parts)}"
-    told = [p for p in estimate.parameters.values() if p.told]
-    if told:
-        yield "  beside it: " + ", ".join(
-            f"{_NAMES[p.name][0]} {_NAMES[p.name][1] * p.value:+.2g} +- "
-            f"{_NAMES[p.name][1] * p.sigma:.2g} {_NAMES[p.name][2]}".rstrip()
-            for p in told
-        )
-    for parameter in estimate.parameters.values():
-        if not parameter.told:
-            yield f"  cannot tell {_NAMES[parameter.name][0]}: {parameter.why_not}"
-
 
 _GRID_M = 0.02
 _MARGIN_M = 0.6
@@ -78,33 +40,44 @@ _GAP_PX = 12
 _TITLE_PX = 30
 
 
-@dataclass(frozen=True)
-class _Pair:
-    """One pair: indices into the drive's images, estimated poses (2, 4, 4) and the matches' pixels (N, 2)."""
-
-    images: tuple[int, int]
-    poses: FloatArray
-    first_px: FloatArray
-    second_px: FloatArray
+def lines(estimate: GroundEstimate) -> Iterator[str]:
+    """The estimate for a terminal: a line of figures, and one for each quantity that is not observable."""
+    calibration = estimate.calibration
+    if calibration is None or calibration.covariance is None:
+        reading = estimate.reading
+        other = "" if reading is Reading.AS_GIVEN else f"; it does with the poses read as: {reading.value}"
+        yield f"{estimate.camera}: {_WHY[estimate.status]}{other}"
+        return
+    angles, place = mounting_words(calibration.cam_from_vehicle, calibration.covariance)
+    yield f"{estimate.camera}: {', '.join((*angles, place[2]))}"
+    found = []
+    for parameter in estimate.parameters.values():
+        if parameter.observable:
+            name, factor, unit = _NAMES[parameter.name]
+            value, sigma = factor * parameter.value, factor * parameter.sigma
+            found.append(f"{name} {value:+.2g} +- {sigma:.2g} {unit}".rstrip())
+    if found:
+        yield f"  beside it: {', '.join(found)}"
+    for parameter in estimate.parameters.values():
+        if not parameter.observable:
+            yield f"  cannot tell {_NAMES[parameter.name][0]}: {parameter.why_not}"
 
 
 def draw_matched_ground(drive: Drive, estimate: GroundEstimate) -> NDArray[np.uint8] | None:
     """The pair with most matches, under the guess and under the estimate side by side; BGR.
 
     Both with the estimated errors of the two poses, so that the mounting makes the difference. Orange and
-    blue are the two images: where they agree the ground is grey. An arrow leads from where the first image
-    sees a patch to where the second sees it, five times as long. None without an estimate.
+    blue are the two images: where they agree the ground is grey. An arrow leads from a patch in the first
+    image to its partner in the second, five times as long. None without an estimate.
     """
     if estimate.calibration is None or estimate.patches is None:
         return None
-    pair = _fullest(estimate.patches)
     guess = guessed_mount(drive.cameras[estimate.camera])
-    matrix = estimate.calibration.cam_from_vehicle
-    turn = matrix[:3, :3].T
-    found = Mount(guess.info, turn, -turn @ matrix[:3, 3])
-    panels = []
-    for title, mount in (("guess", guess), ("estimate", found)):
-        panels.append(_panel(drive, pair, mount, title))
+    found = Mount.at(guess.info, estimate.calibration.cam_from_vehicle)
+    panels = [
+        _panel(drive, estimate.patches, mount, title)
+        for title, mount in (("guess", guess), ("estimate", found))
+    ]
     height = max(panel.shape[0] for panel in panels)
     padded = [
         cv2.copyMakeBorder(p, 0, height - p.shape[0], 0, _GAP_PX, cv2.BORDER_CONSTANT, value=(255,) * 3)
@@ -113,23 +86,17 @@ def draw_matched_ground(drive: Drive, estimate: GroundEstimate) -> NDArray[np.ui
     return np.hstack(padded).astype(np.uint8)
 
 
-def _fullest(patches: MatchedGround) -> _Pair:
+def _panel(drive: Drive, patches: MatchedGround, mount: Mount, title: str) -> NDArray[np.uint8]:
     number = int(np.argmax(np.bincount(patches.pair)))
-    own = patches.pair == number
-    first, second = (int(image) for image in patches.pair_images[number])
-    return _Pair((first, second), patches.pair_poses[number], patches.first_px[own], patches.second_px[own])
-
-
-def _panel(drive: Drive, pair: _Pair, mount: Mount, title: str) -> NDArray[np.uint8]:
-    images = [drive.images[k] for k in pair.images]
+    own, poses = patches.pair == number, patches.pair_poses[number]
     hits = [
-        hit_ground(mount, px, np.tile(pose, (len(px), 1, 1))).points_map
-        for px, pose in zip((pair.first_px, pair.second_px), pair.poses, strict=True)
+        hit_ground(mount, px[own], np.tile(pose, (int(own.sum()), 1, 1))).points_map
+        for px, pose in zip((patches.first_px, patches.second_px), poses, strict=True)
     ]
-    sheet = _sheet(hits[0], pair.poses[0])
+    sheet = Sheet.around(hits[0], poses[0], _MARGIN_M, _GRID_M)
     layers = []
-    for image, pose in zip(images, pair.poses, strict=True):
-        grey, seen = sheet.lay(View(read_grey(str(image.path)), mount, pose))
+    for image, pose in zip(patches.pair_images[number].tolist(), poses, strict=True):
+        grey, seen = sheet.resample(View(read_grey(str(drive.images[image].path)), mount, pose))
         low, high = np.percentile(grey[seen], (1, 99)) if seen.any() else (0.0, 255.0)
         layers.append(np.where(seen, np.clip((grey - low) / max(high - low, 1.0), 0, 1), 0.5))
     # Orange on blue: blue and red channels from one image each, green from both.
@@ -139,20 +106,9 @@ def _panel(drive: Drive, pair: _Pair, mount: Mount, title: str) -> NDArray[np.ui
     _arrows(panel, sheet, *hits)
     rms_cm = 100 * float(np.sqrt(np.nanmean(np.sum((hits[1] - hits[0]) ** 2, axis=1))))
     head = np.full((_TITLE_PX, panel.shape[1], 3), 255, dtype=np.uint8)
-    cv2.putText(
-        head, f"{title}: {rms_cm:.1f} cm", (6, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (0, 0, 0), 1, cv2.LINE_AA
-    )
+    text = f"{title}: {rms_cm:.1f} cm"
+    cv2.putText(head, text, (6, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (0, 0, 0), 1, cv2.LINE_AA)
     return np.vstack([head, panel])
-
-
-def _sheet(points_map: FloatArray, pose: FloatArray) -> Sheet:
-    """A sheet around points, aligned with a pose: rows ahead, columns to the left."""
-    forward = pose[:2, 0] / np.linalg.norm(pose[:2, 0])
-    axes = np.array([forward, [-forward[1], forward[0]]])
-    along = points_map @ axes.T
-    low, high = np.nanmin(along, axis=0) - _MARGIN_M, np.nanmax(along, axis=0) + _MARGIN_M
-    rows, columns = np.ceil((high - low) / _GRID_M).astype(int)
-    return Sheet(low @ axes, axes, _GRID_M, (int(rows), int(columns)))
 
 
 def _arrows(panel: NDArray[np.uint8], sheet: Sheet, first_map: FloatArray, second_map: FloatArray) -> None:
@@ -164,9 +120,7 @@ def _arrows(panel: NDArray[np.uint8], sheet: Sheet, first_map: FloatArray, secon
 
     start = place(first_map)
     end = start + _LONGER * (place(second_map) - start)
-    for a, b in zip(start, end, strict=True):
-        if np.isfinite(a).all() and np.isfinite(b).all():
-            cv2.arrowedLine(
-                panel, tuple(np.round(a).astype(int).tolist()), tuple(np.round(b).astype(int).tolist()),
-                _ARROW, 2, cv2.LINE_AA, tipLength=0.25,
-            )  # fmt: skip
+    for ends in np.stack([start, end], axis=1):
+        if np.isfinite(ends).all():
+            tail, tip = np.round(ends).astype(int).tolist()
+            cv2.arrowedLine(panel, tail, tip, _ARROW, 2, cv2.LINE_AA, tipLength=0.25)

@@ -1,7 +1,4 @@
-"""The state of a vehicle that localises itself, and how it moves between two frames.
-
-Which marking of the map each detection shows, and what that says of the vehicle's state.
-"""
+"""The filter behind localisation: the vehicle's state, its motion, and what a matched marking says of it."""
 
 from __future__ import annotations
 
@@ -13,6 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from v2hdm.geometry.ipm import homography_jacobian, pinhole_px_from_ground, project_ground
+from v2hdm.geometry.least_squares import Normal, gauss_newton
 from v2hdm.geometry.quadrilateral import SHIFTS, align, block_diagonal
 from v2hdm.geometry.rigid import inverse, rotation_from_euler
 from v2hdm.records import BoolArray, FloatArray, HdMap, IntArray, Marking
@@ -29,11 +27,44 @@ SLIP_M_S = 0.05
 _START_SPEED_M_S, _START_TURN_RAD_S = 5.0, 0.3
 """Sigmas of speed and yaw rate before the first frame: anything that a vehicle does in a yard."""
 
+_LARGEST_SQUARE = float(chi2.isf(1e-3, 8))
+"""Squared distance, in sigmas, up to which a detection fits: one in a thousand is farther."""
+
+_CLEARER_BY = 9.0
+"""How much worse, in the same unit, any other marking must fit: odds of ninety to one."""
+
+_REACH_SIGMAS = 4.0
+_LEAST_REACH_M = 1.5
+"""How far from where a detection seems to lie its marking is looked for, in sigmas of the place, and at
+least: the far corners of a cut marking are not where they seem."""
+
+_UNKNOWN_SIGMA_M = 0.02
+"""Sigma of a corner of a map that states none."""
+
+_REPEATS = 2.8
+"""Factor of a detection's covariance: an edge that shadow or wear misplaces stays so in the next images.
+
+Errors of one corner correlate by about .2 from image to image (:mod:`v2hdm.mapping.site_model.places`); over
+the ten frames that the filter remembers that is 1 + 9 x .2.
+"""
+
+_ITERATIONS = 3
+"""Of an update; half a metre off at the first, a few millimetres at the third."""
+
+_SETTLED = 1e-3
+"""Change of a state, m or rad, after which the next iteration would change no pixel by a tenth."""
+
 X, Y, HEADING, SPEED, TURN, ROLL, PITCH = range(7)
 """The states: place, m, heading, rad, speed, m/s, yaw rate, rad/s; roll and pitch of one frame, rad."""
 
 POSE = [X, Y, HEADING, ROLL, PITCH]
 """The states that an image depends on."""
+
+_STEP = np.array([1e-4, 1e-4, 1e-5, 1e-5, 1e-5])
+"""Steps of the differences by :data:`POSE`: m and rad."""
+
+_SHIFT_ROWS = (2 * SHIFTS[..., None] + np.arange(2)).reshape(4, 8)
+"""Rows (4, 8) of the stacked corners of a detection, for each corner that may be the marking's first."""
 
 
 @dataclass(frozen=True)
@@ -82,9 +113,8 @@ def predict(state: State, step_s: float, attitude_rad: float) -> State:
     middle = heading + turn * step_s / 2
     ahead = np.array([np.cos(middle), np.sin(middle)])
     left = np.array([-ahead[1], ahead[0]])
-    mean = np.array(
-        [*(np.array([x, y]) + speed * step_s * ahead), heading + turn * step_s, speed, turn, 0, 0]
-    )
+    place = np.array([x, y]) + speed * step_s * ahead
+    mean = np.array([*place, heading + turn * step_s, speed, turn, 0, 0])
     change = np.eye(7)
     change[:2, HEADING] = speed * step_s * left
     change[:2, SPEED] = step_s * ahead
@@ -102,41 +132,6 @@ def predict(state: State, step_s: float, attitude_rad: float) -> State:
     return State(mean, covariance)
 
 
-_GATE = float(chi2.isf(1e-3, 8))
-"""Squared distance, in sigmas, up to which a detection fits: one in a thousand is farther."""
-
-_CLEARER_BY = 9.0
-"""How much worse, in the same unit, any other marking must fit: odds of ninety to one."""
-
-_REACH_SIGMAS = 4.0
-"""How far from where a detection seems to lie its marking is looked for."""
-
-_LEAST_REACH_M = 1.5
-"""And at least so far: the far corners of a cut marking are not where they seem."""
-
-_UNKNOWN_SIGMA_M = 0.02
-"""Sigma of a corner of a map that states none."""
-
-SHIFT_ROWS = (2 * SHIFTS[..., None] + np.arange(2)).reshape(4, 8)
-"""Rows (4, 8) of the stacked corners of a detection, for each corner that may be the marking's first."""
-
-_REPEATS = 2.8
-"""Factor of a detection's covariance: an edge that shadow or wear misplaces stays so in the next images.
-
-Errors of one corner correlate by about .2 from image to image (:mod:`v2hdm.mapping.site_model.places`); over
-the ten frames that the filter remembers that is 1 + 9 x .2.
-"""
-
-_ITERATIONS = 3
-"""Of an update; half a metre off at the first, a few millimetres at the third."""
-
-_SETTLED = 1e-3
-"""Change of a state, m or rad, after which the next iteration would change no pixel by a tenth."""
-
-_STEP = np.array([1e-4, 1e-4, 1e-5, 1e-5, 1e-5])
-"""Steps of the differences by x, y, heading, roll, pitch: m and rad."""
-
-
 @dataclass(frozen=True)
 class Seen:
     """One detection: its class, camera, and corners (4, 2) with covariances (4, 2, 2) in pinhole pixels.
@@ -150,6 +145,32 @@ class Seen:
     corners_px: FloatArray
     covariance_px: FloatArray
     informs: BoolArray
+
+    def project(self, pose: FloatArray, corners_map: FloatArray) -> FloatArray:
+        """Pixels (..., 4, 2) of a marking (4, 2) from poses (..., 5)."""
+        cam_from_map = self.cam_from_vehicle @ inverse(pose_of(pose))
+        return project_ground(self.intrinsic, cam_from_map, corners_map)[0]
+
+    def by_state(self, mean: FloatArray, corners_map: FloatArray) -> FloatArray:
+        """Derivative (8, 7) of the pixels of a marking (4, 2) by a state (7,), by central differences."""
+        steps = np.diag(_STEP)
+        pixels = self.project(mean[POSE] + np.concatenate([steps, -steps]), corners_map).reshape(10, 8)
+        out = np.zeros((8, 7))
+        out[:, POSE] = ((pixels[:5] - pixels[5:]) / (2 * _STEP[:, None])).T
+        return out
+
+    def by_place(self, pose: FloatArray, corners_map: FloatArray) -> FloatArray:
+        """Derivative (8, 8) of a marking's pixels by its corners in the map."""
+        px_from_map = pinhole_px_from_ground(self.intrinsic, self.cam_from_vehicle @ inverse(pose_of(pose)))
+        return np.asarray(block_diagonal(homography_jacobian(px_from_map, corners_map)[None])[0])
+
+    def on_ground(self, pose: FloatArray) -> FloatArray:
+        """Where on the ground the corners (4, 2) lie; nan above the horizon."""
+        map_from_cam = pose_of(pose) @ inverse(self.cam_from_vehicle)
+        pixels = np.column_stack([self.corners_px, np.ones(4)])
+        rays = np.linalg.solve(self.intrinsic, pixels.T).T @ map_from_cam[:3, :3].T
+        down = np.where(rays[:, 2:] < 0, rays[:, 2:], np.nan)
+        return np.asarray((map_from_cam[:3, 3] - rays * map_from_cam[2, 3] / down)[:, :2])
 
 
 @dataclass(frozen=True)
@@ -167,18 +188,17 @@ class Match:
     corners_map: FloatArray
 
     def against(self, mean: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The residual (2 K,), px, at a state (7,), and the derivative (2 K, 7) of what is expected."""
-        expected = _project(self.seen, mean[POSE], self.corners_map)
-        derivative = _by_state(self.seen, mean, self.corners_map)
+        """The residual (2 K,), px, at a state (7,), and the derivative (2 K, 7) of the expected pixels."""
+        expected = self.seen.project(mean[POSE], self.corners_map)
         residual = self.seen.corners_px.reshape(8)[self.rows] - expected.reshape(8)[self.kept]
-        return residual, derivative[self.kept]
+        return residual, self.seen.by_state(mean, self.corners_map)[self.kept]
 
 
 class Markings:
     """The map's markings, to be looked up by place.
 
-    Of their errors, what all share (drift, survey) shifts the vehicle with them: of variance ``shared_m2`` a
-    coordinate, it is no noise between two of them.
+    Of their errors, a part that all share (drift, survey) shifts the vehicle with them: of variance
+    ``shared_m2`` a coordinate, it is no noise between two of them.
     """
 
     def __init__(self, hd_map: HdMap) -> None:
@@ -194,7 +214,7 @@ class Markings:
 
     def match(self, seen: Seen, state: State) -> tuple[int, State] | None:
         """The one marking that fits a detection, and the state after it; None where not just one fits."""
-        ground = _on_ground(seen, state.mean[POSE])
+        ground = seen.on_ground(state.mean[POSE])
         known = seen.informs & np.isfinite(ground).all(axis=1)
         candidates = self._near(seen.kind, ground[known], state)
         if not len(candidates):
@@ -203,11 +223,11 @@ class Markings:
         shifts = align(corners, np.ones(corners.shape[:2], dtype=bool), ground, known).shift
         fits: list[tuple[float, int, State]] = []
         for marking, shift in zip(candidates.tolist(), shifts.tolist(), strict=True):
-            pair = self._pair(seen, state, marking, SHIFT_ROWS[shift])
+            pair = self._pair(seen, state, marking, _SHIFT_ROWS[shift])
             if not np.isfinite(pair.noise).all():  # a corner is behind the camera
                 continue
             after, squared, worth = fit(state, pair)
-            if squared <= _GATE:
+            if squared <= _LARGEST_SQUARE:
                 fits.append((worth, marking, after))
         fits.sort(key=lambda one: one[0])
         if not fits or (len(fits) > 1 and fits[1][0] < fits[0][0] + _CLEARER_BY):
@@ -217,7 +237,7 @@ class Markings:
     def _pair(self, seen: Seen, state: State, marking: int, order: IntArray) -> Match:
         kept = np.repeat(seen.informs, 2)[order]
         rows, corners = order[kept], self._corners[marking]
-        by_place = _by_place(seen, state.mean[POSE], corners)[kept]
+        by_place = seen.by_place(state.mean[POSE], corners)[kept]
         noise = _REPEATS * block_diagonal(seen.covariance_px[None])[0][np.ix_(rows, rows)]
         return Match(seen, rows, kept, noise + by_place @ self._covariance[marking] @ by_place.T, corners)
 
@@ -236,36 +256,38 @@ class Markings:
 def fit(state: State, match: Match) -> tuple[State, float, float]:
     """The state after a match, its squared distance, in sigmas, and that less twice the log likelihood.
 
-    A Kalman update in Joseph's form, iterated as no projection is linear: the distance is what is left of
-    pixels and state where both are best.
+    The iterated update of an extended Kalman filter as least squares over the state whitened by its own
+    covariance, which may be singular; the distance is the part of pixels and state that no state explains.
     """
-    mean, squared = state.mean, np.inf
-    for _ in range(_ITERATIONS):
-        residual, slope = match.against(mean)
-        innovation = slope @ state.covariance @ slope.T + match.noise
-        off = residual - slope @ (state.mean - mean)
-        weighed = np.linalg.solve(innovation, off)
-        squared = float(off @ weighed)
-        before, mean = mean, state.mean + state.covariance @ slope.T @ weighed
-        if np.abs(mean - before)[POSE].max() < _SETTLED:
-            break
-    gain = np.linalg.solve(innovation, slope @ state.covariance).T
-    left = np.eye(7) - gain @ slope
-    covariance = left @ state.covariance @ left.T + gain @ match.noise @ gain.T
+    values, axes = np.linalg.eigh(state.covariance)
+    spread = axes * np.sqrt(np.maximum(values, 0.0))
+    weight = np.linalg.inv(match.noise)
+
+    def linearise(whitened: FloatArray) -> Normal:
+        residual, slope = match.against(state.mean + spread @ whitened)
+        slope = slope @ spread
+        weighed = slope.T @ weight
+        gradient = whitened - weighed @ residual
+        cost = 0.5 * float(whitened @ whitened + residual @ weight @ residual)
+        return Normal(np.eye(7) + weighed @ slope, gradient, cost)
+
+    def settled(step: FloatArray) -> bool:
+        return bool(np.abs(spread @ step)[POSE].max() < _SETTLED)
+
+    found = gauss_newton(linearise, np.zeros(7), steps=_ITERATIONS, settled=settled)
+    squared = 2 * found.predicted_cost
     if not np.isfinite(squared):
-        squared = np.inf
-    return (
-        State(mean, (covariance + covariance.T) / 2),
-        squared,
-        squared + float(np.linalg.slogdet(innovation)[1]),
-    )
+        return state, np.inf, np.inf
+    after = State(state.mean + spread @ found.x, spread @ found.covariance @ spread.T)
+    volume = np.linalg.slogdet(match.noise)[1] + np.linalg.slogdet(found.last.information)[1]
+    return after, squared, squared + float(volume)
 
 
 def locate(state: State, seen: Sequence[Seen], markings: Markings) -> tuple[State, list[int]]:
     """The state after one frame's detections, and the markings matched.
 
-    What only one marking explains is used first, near ones before far ones; then the rest is tried again
-    with the better state.
+    Detections that only one marking explains are used first, near ones before far ones; then the rest is
+    tried again with the better state.
     """
     matched: list[int] = []
     waiting = sorted(seen, key=lambda one: -float(one.corners_px[:, 1].max()))
@@ -286,33 +308,3 @@ def locate(state: State, seen: Sequence[Seen], markings: Markings) -> tuple[Stat
 
 def _covariance(marking: Marking) -> FloatArray:
     return np.eye(8) * _UNKNOWN_SIGMA_M**2 if marking.covariance_m2 is None else marking.covariance_m2
-
-
-def _project(seen: Seen, pose: FloatArray, corners_map: FloatArray) -> FloatArray:
-    """Pixels (..., 4, 2) of a marking (4, 2) from poses (..., 5)."""
-    cam_from_map = seen.cam_from_vehicle @ inverse(pose_of(pose))
-    return project_ground(seen.intrinsic, cam_from_map, corners_map)[0]
-
-
-def _by_state(seen: Seen, mean: FloatArray, corners_map: FloatArray) -> FloatArray:
-    """Derivative (8, 7) of the pixels of a marking (4, 2) by a state (7,), by central differences."""
-    steps = np.diag(_STEP)
-    pixels = _project(seen, mean[POSE] + np.concatenate([steps, -steps]), corners_map).reshape(10, 8)
-    out = np.zeros((8, 7))
-    out[:, POSE] = ((pixels[:5] - pixels[5:]) / (2 * _STEP[:, None])).T
-    return out
-
-
-def _by_place(seen: Seen, pose: FloatArray, corners_map: FloatArray) -> FloatArray:
-    """Derivative (8, 8) of a marking's pixels by its corners in the map."""
-    pixels_from_map = pinhole_px_from_ground(seen.intrinsic, seen.cam_from_vehicle @ inverse(pose_of(pose)))
-    return np.asarray(block_diagonal(homography_jacobian(pixels_from_map, corners_map)[None])[0])
-
-
-def _on_ground(seen: Seen, pose: FloatArray) -> FloatArray:
-    """Where on the ground a detection's corners (4, 2) lie; nan above the horizon."""
-    map_from_cam = pose_of(pose) @ inverse(seen.cam_from_vehicle)
-    pixels = np.column_stack([seen.corners_px, np.ones(4)])
-    rays = np.linalg.solve(seen.intrinsic, pixels.T).T @ map_from_cam[:3, :3].T
-    down = np.where(rays[:, 2:] < 0, rays[:, 2:], np.nan)
-    return np.asarray((map_from_cam[:3, 3] - rays * map_from_cam[2, 3] / down)[:, :2])

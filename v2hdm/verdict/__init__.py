@@ -1,7 +1,6 @@
 """Whether a result can be trusted: named checks, each with a value, a limit, a cause and a remedy.
 
-``inputs`` holds the checks before a run (``python -m v2hdm.cli.check``), which need no torch; ``results`` those
-after it. Both end in one :class:`Verdict`.
+``inputs`` holds the checks before a run, which need no torch, ``results`` those after it.
 """
 
 from v2hdm.verdict.inputs.drive import check_drive

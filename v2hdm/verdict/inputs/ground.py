@@ -106,7 +106,7 @@ def _is_bent(estimate: GroundEstimate) -> bool:
     clock, focal = estimate.parameters.get("clock_s"), estimate.parameters.get("focal_scale")
     return (
         (clock is not None and _is_off(clock))
-        or (focal is not None and focal.told and abs(focal.value) > _FOCAL)
+        or (focal is not None and focal.observable and abs(focal.value) > _FOCAL)
         or max(estimate.pulls.values(), default=0.0) > _PULL
     )
 
@@ -188,7 +188,7 @@ def _confounded(estimate: GroundEstimate, key: str) -> str:
     focal length slide together; with a level camera, k1 came out .05 wrong at 10 sigmas.
     """
     ahead = estimate.parameters.get("forward_m")
-    if key == "focal_scale" and ahead is not None and not ahead.told:
+    if key == "focal_scale" and ahead is not None and not ahead.observable:
         return "on a straight road focal length and height slide together: drive a turn"
     calibration = estimate.calibration
     if key == "distortion_k1" and calibration is not None:
@@ -201,7 +201,7 @@ def _confounded(estimate: GroundEstimate, key: str) -> str:
 def _judge_parameter(name: str, parameter: Parameter, confounded: str) -> Finding:
     check, limit, unit, scale, status, fine, wrong = _PARAMETERS[parameter.name]
     vague = parameter.name in ("forward_m", "left_m") and parameter.sigma > _VAGUE_M
-    if not parameter.told or vague or confounded:
+    if not parameter.observable or vague or confounded:
         why = parameter.why_not or confounded or "the route turns too little; drive a turn"
         return Finding(
             check, Status.PASS, None, scale * limit, unit, f"this drive cannot tell it: {why}", name
@@ -314,7 +314,7 @@ def _late(ground: Mapping[str, GroundEstimate]) -> dict[str, Parameter]:
 
 
 def _is_off(clock: Parameter) -> bool:
-    return clock.told and abs(clock.value) > max(_CLOCK_S, _SURE * clock.sigma)
+    return clock.observable and abs(clock.value) > max(_CLOCK_S, _SURE * clock.sigma)
 
 
 def _clocks(ground: Mapping[str, GroundEstimate]) -> list[Finding]:
@@ -323,7 +323,7 @@ def _clocks(ground: Mapping[str, GroundEstimate]) -> list[Finding]:
     common = len(late) == len(clocks) > 1 and np.ptp([clock.value for clock in late.values()]) < _CLOCK_S
     findings = []
     for name, clock in clocks.items():
-        if not clock.told:
+        if not clock.observable:
             says = f"this drive cannot tell whether the clock is right: {clock.why_not}"
             findings.append(Finding("clock", Status.PASS, None, 1e3 * _CLOCK_S, "ms", says, name))
             continue
