@@ -11,7 +11,7 @@ from tests.verdict.drives import poses, raised, with_yaw, yaw_of
 from tests.verdict.test_ground_findings import estimate
 from tests.verdict.test_images import noisy, pictured
 from v2hdm.ground.results import GroundStatus, Reading
-from v2hdm.verdict import Finding, Status, check_drive
+from v2hdm.verdict import Finding, Status, input_findings
 from v2hdm.verdict.inputs.drive import HIDES, causes
 
 
@@ -21,8 +21,8 @@ def finding(check: str, about: str, status: Status = Status.FAIL) -> Finding:
 
 def test_a_clean_drive_passes_with_and_without_ground(tmp_path: Path) -> None:
     clean = pictured(tmp_path, noisy)
-    assert not raised(check_drive(clean))
-    assert not raised(check_drive(clean, {"front": estimate()}))
+    assert not raised(input_findings(clean))
+    assert not raised(input_findings(clean, {"front": estimate()}))
 
 
 def test_a_yaw_from_north_is_told_once_although_the_ground_does_not_match_either(tmp_path: Path) -> None:
@@ -36,7 +36,7 @@ def test_a_yaw_from_north_is_told_once_although_the_ground_does_not_match_either
         reading=Reading.HEADING_FROM_PATH,
         shares={Reading.AS_GIVEN: 0.0, Reading.HEADING_FROM_PATH: 0.85},
     )
-    told = raised(check_drive(spoilt, {"front": ground}))
+    told = raised(input_findings(spoilt, {"front": ground}))
     assert list(told) == ["heading"]
     assert told["heading"].startswith("yaw counts clockwise from north")
 

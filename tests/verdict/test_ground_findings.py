@@ -103,7 +103,7 @@ def test_what_a_drive_cannot_tell_is_said_with_what_would() -> None:
     }
     findings = check_ground(drive(poses()), {"front": replace(straight, parameters=parameters)})
     (clock,) = [finding for finding in findings if finding.check == "clock"]
-    assert clock.is_untold
+    assert clock.is_unobservable
     assert why in clock.says
 
 
@@ -111,7 +111,7 @@ def test_a_place_known_worse_than_a_decimetre_is_not_told() -> None:
     vague = estimate()
     parameters = {**vague.parameters, "forward_m": Parameter("forward_m", 3.0, 0.5, observable=True)}
     findings = check_ground(drive(poses()), {"front": replace(vague, parameters=parameters)})
-    assert [finding.check for finding in findings if finding.is_untold] == ["survey forward"]
+    assert [finding.check for finding in findings if finding.is_unobservable] == ["survey forward"]
 
 
 def test_a_camera_without_survey_has_none_to_contradict() -> None:
@@ -152,7 +152,7 @@ def test_too_little_ground_is_no_fault() -> None:
         estimate(), status=GroundStatus.TOO_LITTLE, shares={Reading.AS_GIVEN: 0.0}, parameters={}
     )
     (found,) = check_ground(drive(poses()), {"front": little})
-    assert found.is_untold
+    assert found.is_unobservable
 
 
 def test_residuals_without_another_cause_point_to_the_lens() -> None:
@@ -195,7 +195,7 @@ def test_a_straight_road_cannot_tell_the_focal_length_from_the_height() -> None:
     straight = replace(straight, parameters={**straight.parameters, "forward_m": ahead})
     findings = check_ground(drive(poses()), {"front": straight})
     assert not raised(findings)
-    assert "focal length from ground" in {finding.check for finding in findings if finding.is_untold}
+    assert "focal length from ground" in {finding.check for finding in findings if finding.is_unobservable}
 
 
 def test_a_level_camera_cannot_tell_a_bent_lens_from_a_bent_road() -> None:
@@ -204,4 +204,4 @@ def test_a_level_camera_cannot_tell_a_bent_lens_from_a_bent_road() -> None:
     flat = replace(estimate(distortion_k1=-0.055), calibration=Calibration(camera().info, level, np.eye(6)))
     findings = check_ground(drive(poses()), {"front": flat})
     assert not raised(findings)
-    assert "distortion" in {finding.check for finding in findings if finding.is_untold}
+    assert "distortion" in {finding.check for finding in findings if finding.is_unobservable}

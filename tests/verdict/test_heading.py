@@ -122,8 +122,8 @@ def test_the_lever_from_the_axle_to_the_antenna_is_measured_in_turns(ahead_m: fl
 
 def test_a_straight_route_cannot_tell_where_the_origin_is() -> None:
     found = {finding.check: finding for finding in check_heading(motion(poses(turn_s=0.0)))}
-    assert found["origin"].is_untold
-    assert found["mirrored"].is_untold
+    assert found["origin"].is_unobservable
+    assert found["mirrored"].is_unobservable
 
 
 def test_roll_and_pitch_in_degrees_are_no_vehicle_s() -> None:

@@ -13,8 +13,8 @@ from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.ground import GroundEstimate, GroundOptions, GroundStatus, Reading
 from v2hdm.records import Drive
-from v2hdm.verdict.inputs import ground as suspects
-from v2hdm.verdict.inputs.ground import find_suspect, scaled, upside_down
+from v2hdm.verdict.inputs import ground as ground_checks
+from v2hdm.verdict.inputs.ground import find_cause, scaled, upside_down
 
 LOST = replace(estimate(), status=GroundStatus.NO_MATCH, shares={Reading.AS_GIVEN: 0.0})
 
@@ -48,13 +48,13 @@ def test_the_first_mistake_whose_undoing_makes_the_ground_match_is_told(
         length_m = tried.images[-1].map_from_vehicle[0, 3]
         return estimate() if length_m < 0.5 * drive(poses()).images[-1].map_from_vehicle[0, 3] else LOST
 
-    monkeypatch.setattr(suspects, "estimate_ground", only_in_metres)
-    says = find_suspect(drive(poses()), {"front": LOST})
+    monkeypatch.setattr(ground_checks, "estimate_ground", only_in_metres)
+    says = find_cause(drive(poses()), {"front": LOST})
     assert says is not None
     assert "feet" in says
 
 
 def test_nothing_is_tried_where_a_camera_matches(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(suspects, "estimate_ground", None)
-    assert find_suspect(drive(poses()), {"front": LOST, "rear": estimate("rear")}) is None
-    assert find_suspect(drive(poses()), {}) is None
+    monkeypatch.setattr(ground_checks, "estimate_ground", None)
+    assert find_cause(drive(poses()), {"front": LOST, "rear": estimate("rear")}) is None
+    assert find_cause(drive(poses()), {}) is None

@@ -1,19 +1,15 @@
-"""How the vehicle moved, as its recorded poses say: chords of the path, course, speed.
-
-The recorded path: its unit, its jumps, its attitude.
-
-The stated noise of the poses: its units, and against what the poses themselves show.
-"""
+"""The recorded poses: how the vehicle moved, units and jumps of the path, attitude, and stated noise."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from v2hdm.records import BoolArray, Drive, FloatArray, IntArray, PoseNoise, Trajectory
+from v2hdm.ground.motion import trajectory_of_images
+from v2hdm.records import BoolArray, Drive, FloatArray, IntArray, PoseNoise
 from v2hdm.verdict.verdict import Finding, Status, judge
 
 CHORD_M = 2.0
@@ -22,8 +18,52 @@ CHORD_M = 2.0
 SLOWEST_MPS = 0.5
 """A vehicle that takes longer for a chord counts as standing: its path is then mostly noise."""
 
+STEEPEST_DEG = 15.0
+"""No road that is mapped is steeper, nor rolls a vehicle farther."""
+
 _MOST_STARTS = 4000
 """Chords per drive: enough for medians to a hundredth of a degree, and a tenth of a second of work."""
+
+_FASTEST_MPS = 40.0
+"""No vehicle maps markings faster (144 km/h): its images would be metres apart."""
+
+_HARDEST_MPS2 = 9.0
+"""No tyre turns or brakes a road vehicle harder."""
+
+_EXTREME = 12.0
+"""A second difference of noisy positions has sqrt(6) sigmas; five of those are never reached by chance."""
+
+_HEIGHT_NOISE = 2.0
+"""RTK heights are about twice as noisy as positions in the plane."""
+
+_TOO_LARGE: Mapping[str, float] = {"centimetres": 1e2, "millimetres": 1e3}
+_TOO_SMALL: Mapping[str, float] = {"kilometres": 1e3, "degrees": 1.113e5, "radians": 6.378e6}
+"""Metres in a unit that positions may be in by mistake; of an angle on the earth at the equator."""
+
+_GRADE_CHANGE_RAD = 0.02
+"""Grades must spread over this (2 %) before the sign of the pitch is observable."""
+
+_RTK_M = 0.3
+"""A position that is worse than this is no RTK, not even with a float solution."""
+
+_HEADING_RAD = 0.035
+"""Two degrees: worse than any heading from two antennas a metre apart, or from a gyro compass."""
+
+_ROLL_PITCH_RAD = 0.05
+"""Three degrees: a vehicle that sways more than this on its suspension overturns."""
+
+_UNDERSTATED, _USELESS = 3.0, 10.0
+"""Poses that scatter so many times more than stated make every sigma of the map wrong by as much, and beyond
+the second the map itself."""
+
+_DIFFERENCES = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
+"""The fourth difference: driving at 10 Hz leaves millimetres in it, white noise sqrt(70) sigmas."""
+
+_REGULAR = 0.2
+"""Poses whose intervals vary less than this share are evenly spaced, as a fourth difference needs."""
+
+_SLOWEST_HZ = 8.0
+"""Below this rate driving itself shows in a fourth difference."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +80,7 @@ class Chords:
 
 @dataclass(frozen=True)
 class Motion:
-    """A trajectory as the checks see it: ``stamp_s`` (P,), ``position`` (P, 3), ``rotation`` (P, 3, 3)."""
+    """The recorded trajectory: ``stamp_s`` (P,), ``position`` (P, 3), ``rotation`` (P, 3, 3)."""
 
     stamp_s: FloatArray
     position: FloatArray
@@ -49,7 +89,7 @@ class Motion:
     @classmethod
     def of(cls, drive: Drive) -> Motion:
         """The poses of a drive as they were recorded; those of its images where nothing else is kept."""
-        poses = drive.recorded or drive.trajectory or _of_images(drive)
+        poses = drive.recorded or drive.trajectory or trajectory_of_images(drive)
         return cls(poses.stamp_s, poses.map_from_vehicle[:, :3, 3], poses.map_from_vehicle[:, :3, :3])
 
     @cached_property
@@ -83,11 +123,14 @@ class Motion:
         return np.asarray(np.cumsum(covered)[:-1] > 0)
 
     @cached_property
+    def course(self) -> FloatArray:
+        """The vector (N, 2) in the plane from the first to the last pose of each chord, m."""
+        return np.asarray(self.position[self.chords.last, :2] - self.position[self.chords.first, :2])
+
+    @cached_property
     def speed_mps(self) -> FloatArray:
         """Speed (N,) on each chord."""
-        length = np.linalg.norm(
-            self.position[self.chords.last, :2] - self.position[self.chords.first, :2], axis=1
-        )
+        length = np.linalg.norm(self.course, axis=1)
         return np.asarray(length / (self.stamp_s[self.chords.last] - self.stamp_s[self.chords.first]))
 
     @cached_property
@@ -110,34 +153,6 @@ def angle_between(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.asarray(np.arctan2(cross, (first * second).sum(axis=1)))
 
 
-def _of_images(drive: Drive) -> Trajectory:
-    stamp_s, rows = np.unique([image.stamp_s for image in drive.images], return_index=True)
-    return Trajectory(stamp_s, np.array([drive.images[row].map_from_vehicle for row in rows]))
-
-
-_FASTEST_MPS = 40.0
-"""No vehicle maps markings faster (144 km/h): its images would be metres apart."""
-
-_HARDEST_MPS2 = 9.0
-"""No tyre turns or brakes a road vehicle harder."""
-
-_EXTREME = 12.0
-"""A second difference of noisy positions has sqrt(6) sigmas; five of those are never seen by chance."""
-
-_HEIGHT_NOISE = 2.0
-"""RTK heights are about twice as noisy as positions in the plane."""
-
-_STEEPEST_DEG = 15.0
-"""No road that is mapped is steeper, nor rolls a vehicle farther."""
-
-_TOO_LARGE: Mapping[str, float] = {"centimetres": 1e2, "millimetres": 1e3}
-_TOO_SMALL: Mapping[str, float] = {"kilometres": 1e3, "degrees": 1.113e5, "radians": 6.378e6}
-"""Metres in a unit that positions may be in by mistake; of an angle on the earth at the equator."""
-
-_GRADE_CHANGE_RAD = 0.02
-"""Grades must spread over this (2 %) before the sign of the pitch can be told."""
-
-
 def check_path(motion: Motion) -> list[Finding]:
     """Whether the path is one that a road vehicle drives in metres and seconds."""
     if not len(motion.chords):
@@ -155,57 +170,21 @@ def check_path(motion: Motion) -> list[Finding]:
     ]  # fmt: skip
 
 
-def check_jumps(motion: Motion, noise: PoseNoise) -> list[Finding]:
-    """Whether positions and heights jump by more than noise and tyres allow."""
-    if len(motion.stamp_s) < 3 or not len(motion.chords):
-        return []
-    plane, height = _off_line(motion, motion.position[:, :2]), _off_line(motion, motion.position[:, 2:])
-    longest_s = np.maximum(motion.interval_s[:-1], motion.interval_s[1:])
-    spare = 0.5 * _HARDEST_MPS2 * longest_s**2
-    return [
-        _jump("position jumps", motion, plane, _EXTREME * noise.position_m / 2 + spare),
-        _jump("height jumps", motion, height, _EXTREME * _HEIGHT_NOISE * noise.position_m / 2 + spare),
-    ]
-
-
-def check_attitude(motion: Motion) -> list[Finding]:
-    """Whether roll and pitch are those of a road vehicle, and pitch has the sign of the grade."""
-    pitch_rad = -np.arcsin(np.clip(motion.rotation[:, 2, 0], -1, 1))
-    roll_rad = np.arctan2(motion.rotation[:, 2, 1], motion.rotation[:, 2, 2])
-    largest_deg = float(
-        np.rad2deg(max(np.percentile(np.abs(roll_rad), 95), np.percentile(np.abs(pitch_rad), 95)))
-    )
-    findings = [
-        judge(
-            "attitude", "poses", largest_deg, _STEEPEST_DEG, "deg",
-            fine="roll and pitch are those of a vehicle on a road",
-            wrong=f"roll or pitch reach {largest_deg:.0f} deg, no vehicle's on a road: were degrees taken "
-            f"for radians (then it is {np.deg2rad(largest_deg):.1f} deg), or the quaternions not in the "
-            "order qx qy qz qw?",
-        )
-    ]  # fmt: skip
-    return findings + _pitch_sign(motion, pitch_rad)
-
-
 def _hardly_moves(motion: Motion) -> Finding:
-    lag_s = CHORD_M / SLOWEST_MPS
     moved_m = float(np.linalg.norm(np.ptp(motion.position[:, :2], axis=0)))
+    says = (
+        f"the vehicle nowhere moves {CHORD_M:g} m in {CHORD_M / SLOWEST_MPS:g} s: a drive that stands maps "
+        "nothing; check that positions are in metres and stamps in seconds"
+    )
     for unit, scale in _TOO_SMALL.items():
         scaled = Motion(motion.stamp_s, motion.position * scale, motion.rotation)
-        if len(scaled.chords) < 0.2 * len(motion.stamp_s) or not _is_smooth(scaled):
-            continue
-        return Finding(
-            "path length", Status.FAIL, moved_m, CHORD_M, "m",
-            f"positions are in {unit}: the path is {moved_m:.2g} m long and smooth; convert them to metres "
-            "east and north of the site",
-            "poses",
-        )  # fmt: skip
-    return Finding(
-        "path length", Status.FAIL, moved_m, CHORD_M, "m",
-        f"the vehicle nowhere moves {CHORD_M:g} m in {lag_s:g} s: a drive that stands maps nothing; check "
-        "that positions are in metres and stamps in seconds",
-        "poses",
-    )  # fmt: skip
+        if len(scaled.chords) >= 0.2 * len(motion.stamp_s) and _is_smooth(scaled):
+            says = (
+                f"positions are in {unit}: the path is {moved_m:.2g} m long and smooth; convert them to "
+                "metres east and north of the site"
+            )
+            break
+    return Finding("path length", Status.FAIL, moved_m, CHORD_M, "m", says, "poses")
 
 
 def _is_smooth(motion: Motion) -> bool:
@@ -217,101 +196,90 @@ def _is_smooth(motion: Motion) -> bool:
     return bool((directed & (motion.speed_mps < _FASTEST_MPS)).mean() > 0.8)
 
 
-def _off_line(motion: Motion, values: FloatArray) -> FloatArray:
-    """How far (P - 2, D) each value is from the line between its neighbours."""
+def check_jumps(motion: Motion, noise: PoseNoise) -> list[Finding]:
+    """Whether positions and heights jump by more than noise and tyres allow."""
+    if len(motion.stamp_s) < 3 or not len(motion.chords):
+        return []
+    longest_s = np.maximum(motion.interval_s[:-1], motion.interval_s[1:])
+    spare = 0.5 * _HARDEST_MPS2 * longest_s**2
+    usual = _EXTREME * noise.position_m / 2
+    return [
+        _jump("position", motion, motion.position[:, :2], usual + spare),
+        _jump("height", motion, motion.position[:, 2:], _HEIGHT_NOISE * usual + spare),
+    ]
+
+
+def _jump(which: str, motion: Motion, values: FloatArray, limit: FloatArray) -> Finding:
+    """The worst of all offsets of values (P, D), m, from the line between their neighbours, by its limit."""
     part = (motion.interval_s[:-1] / (motion.interval_s[:-1] + motion.interval_s[1:]))[:, None]
-    return np.asarray(values[1:-1] - (values[:-2] + part * (values[2:] - values[:-2])))
-
-
-def _jump(check: str, motion: Motion, off: FloatArray, limit: FloatArray) -> Finding:
-    """The worst of all offsets ``off`` (P - 2, D), m, from the line between the neighbours, by its limit."""
+    off = values[1:-1] - (values[:-2] + part * (values[2:] - values[:-2]))
     size = np.linalg.norm(off, axis=1)
     worst = int(np.argmax(size / limit))
     count = int((size > limit).sum())
     # A step shows as half of it before and minus half of it behind.
     beside = off[max(worst - 1, 0) : worst + 2]
     step_m = float(np.linalg.norm(beside - off[worst], axis=1).max())
-    kind = "the position" if check.startswith("position") else "the height"
     return judge(
-        check, "poses", float(size[worst]), float(limit[worst]), "m",
-        fine=f"{kind} never jumps",
-        wrong=f"{kind} jumps by {step_m:.2f} m at {motion.stamp_s[worst + 1]:.2f} s ({count} such records): "
-        "the receiver lost its RTK fix; leave that stretch out, or state its noise in pose_noise",
+        f"{which} jumps", "poses", float(size[worst]), float(limit[worst]), "m",
+        fine=f"the {which} never jumps",
+        wrong=f"the {which} jumps by {step_m:.2f} m at {motion.stamp_s[worst + 1]:.2f} s ({count} such "
+        "records): the receiver lost its RTK fix; leave that stretch out, or state its noise in pose_noise",
     )  # fmt: skip
 
 
-def _pitch_sign(motion: Motion, pitch_rad: FloatArray) -> list[Finding]:
+def check_attitude(motion: Motion) -> Iterator[Finding]:
+    """Whether roll and pitch are those of a road vehicle, and pitch has the sign of the grade."""
+    pitch_rad = -np.arcsin(np.clip(motion.rotation[:, 2, 0], -1, 1))
+    roll_rad = np.arctan2(motion.rotation[:, 2, 1], motion.rotation[:, 2, 2])
+    largest_rad = max(np.percentile(np.abs(angle), 95) for angle in (roll_rad, pitch_rad))
+    largest_deg = float(np.rad2deg(largest_rad))
+    yield judge(
+        "attitude", "poses", largest_deg, STEEPEST_DEG, "deg",
+        fine="roll and pitch are those of a vehicle on a road",
+        wrong=f"roll or pitch reach {largest_deg:.0f} deg, no vehicle's on a road: were degrees taken "
+        f"for radians (then it is {np.deg2rad(largest_deg):.1f} deg), or the quaternions not in the "
+        "order qx qy qz qw?",
+    )  # fmt: skip
+    yield from _pitch_sign(motion, pitch_rad)
+
+
+def _pitch_sign(motion: Motion, pitch_rad: FloatArray) -> Iterator[Finding]:
     """Compare the pitch (positive nose down) with the recorded grade, where both change enough."""
     chords = motion.chords
     if not len(chords):
-        return []
-    offset = motion.position[chords.last] - motion.position[chords.first]
-    forward = motion.rotation[chords.first, :2, 0]
-    along = (offset[:, :2] * forward).sum(axis=1)
-    grade_rad = np.arctan2(offset[:, 2] * np.sign(along), np.abs(along))
+        return
+    along = (motion.course * motion.rotation[chords.first, :2, 0]).sum(axis=1)
+    rise_m = motion.position[chords.last, 2] - motion.position[chords.first, 2]
+    grade_rad = np.arctan2(rise_m * np.sign(along), np.abs(along))
     middle = (pitch_rad[chords.first] + pitch_rad[chords.last]) / 2
     spread = np.subtract(*np.percentile(grade_rad, [95, 5]))
     if spread < _GRADE_CHANGE_RAD or np.std(middle) < 0.3 * np.std(grade_rad):
-        return []
+        return
     slope = float(np.cov(middle, -grade_rad)[0, 1] / np.var(grade_rad))
-    return [
-        judge(
-            "pitch sign", "poses", 1 - slope, 1.0, "",
-            fine="the pitch follows the grade",
-            wrong="the recorded pitch goes against the grade: it counts nose up; write pitch positive nose "
-            "down (a rotation about y, which points left)",
-        )
-    ]  # fmt: skip
-
-
-_RTK_M = 0.3
-"""A position that is worse than this is no RTK, not even with a float solution."""
-
-_HEADING_RAD = 0.035
-"""Two degrees: worse than any heading from two antennas a metre apart, or from a gyro compass."""
-
-_ROLL_PITCH_RAD = 0.05
-"""Three degrees: a vehicle that sways more than this on its suspension overturns."""
-
-_UNDERSTATED = 3.0
-"""Poses that scatter this many times more than stated make every sigma of the map wrong by as much."""
-
-_USELESS = 10.0
-"""Poses that scatter this many times more than stated make a map that is wrong, not only overconfident."""
-
-_DIFFERENCES = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
-"""The fourth difference: driving at 10 Hz leaves millimetres in it, white noise sqrt(70) sigmas."""
-
-_REGULAR = 0.2
-"""Poses whose intervals vary less than this share are evenly spaced, as a fourth difference needs."""
-
-_SLOWEST_HZ = 8.0
-"""Below this rate driving itself shows in a fourth difference."""
+    yield judge(
+        "pitch sign", "poses", 1 - slope, 1.0, "",
+        fine="the pitch follows the grade",
+        wrong="the recorded pitch goes against the grade: it counts nose up; write pitch positive nose "
+        "down (a rotation about y, which points left)",
+    )  # fmt: skip
 
 
 def check_noise(motion: Motion, noise: PoseNoise) -> list[Finding]:
     """Whether the stated noise has the right units and the poses' own scatter."""
-    return [
-        *_units(motion, noise),
-        *_scatter(motion, noise),
-    ]
-
-
-def _units(motion: Motion, noise: PoseNoise) -> list[Finding]:
-    scatter = _white_position_m(motion)
-    measured = "" if scatter is None else f"; from pose to pose they scatter by {scatter:.3f} m"
+    position_m, heading_rad = _white_noise(motion)
+    measured = "" if position_m is None else f"; from pose to pose they scatter by {position_m:.3f} m"
     if noise.position_m > 1:
         measured += f"; if millimetres were meant, it is {noise.position_m / 1e3:g} m"
-    return [
-        _unit("position_m", noise.position_m, _RTK_M, "m", f"no RTK position{measured}", "metres"),
-        _unit(
-            "heading_rad", noise.heading_rad, _HEADING_RAD, "rad", _in_degrees(noise.heading_rad), "radians"
-        ),
-        _unit(
-            "roll_pitch_rad", noise.roll_pitch_rad, _ROLL_PITCH_RAD, "rad",
-            _in_degrees(noise.roll_pitch_rad), "radians",
-        ),
-    ]  # fmt: skip
+    findings = [_unit("position_m", noise.position_m, _RTK_M, "m", f"no RTK position{measured}", "metres")]
+    for key, limit in (("heading_rad", _HEADING_RAD), ("roll_pitch_rad", _ROLL_PITCH_RAD)):
+        value = getattr(noise, key)
+        means = f"{np.rad2deg(value):.1f} deg; if degrees were meant, it is {np.deg2rad(value):.4f} rad"
+        findings.append(_unit(key, value, limit, "rad", means, "radians"))
+    if position_m is not None and noise.position_m > 0:
+        findings.append(_against("position_m", position_m, noise.position_m, "m"))
+    if heading_rad is not None and noise.heading_rad > 0:
+        findings.append(_against("heading_rad", heading_rad, noise.heading_rad, "rad"))
+    return findings
 
 
 def _unit(key: str, value: float, limit: float, unit: str, means: str, wanted: str) -> Finding:
@@ -326,21 +294,6 @@ def _unit(key: str, value: float, limit: float, unit: str, means: str, wanted: s
     )  # fmt: skip
 
 
-def _in_degrees(value: float) -> str:
-    return f"{np.rad2deg(value):.1f} deg; if degrees were meant, it is {np.deg2rad(value):.4f} rad"
-
-
-def _scatter(motion: Motion, noise: PoseNoise) -> list[Finding]:
-    findings = []
-    position = _white_position_m(motion)
-    if position is not None and noise.position_m > 0:
-        findings.append(_against("position_m", position, noise.position_m, "m"))
-    heading = _white_heading_rad(motion)
-    if heading is not None and noise.heading_rad > 0:
-        findings.append(_against("heading_rad", heading, noise.heading_rad, "rad"))
-    return findings
-
-
 def _against(key: str, measured: float, stated: float, unit: str) -> Finding:
     ratio = measured / stated
     degrees = " (degrees taken for radians would do that)" if unit == "rad" and ratio > _USELESS else ""
@@ -353,19 +306,21 @@ def _against(key: str, measured: float, stated: float, unit: str) -> Finding:
     )  # fmt: skip
 
 
-def _white_position_m(motion: Motion) -> float | None:
-    """Standard deviation per axis of what changes from pose to pose; None where driving would hide it."""
-    if not _is_regular(motion):
-        return None
-    return _robust_sigma(np.column_stack([_fourth(axis) for axis in motion.position[:, :2].T]).ravel())
+def _white_noise(motion: Motion) -> tuple[float, float] | tuple[None, None]:
+    """Standard deviations of a coordinate, m, and of the heading, rad, from pose to pose.
 
-
-def _white_heading_rad(motion: Motion) -> float | None:
-    if not _is_regular(motion):
-        return None
+    None where the poses are too rare or uneven, so that driving would hide the noise.
+    """
+    if len(motion.stamp_s) < 50:
+        return None, None
+    interval_s = float(np.median(motion.interval_s))
+    uneven = np.abs(motion.interval_s / interval_s - 1) > _REGULAR
+    if interval_s > 1 / _SLOWEST_HZ or uneven.mean() >= _REGULAR:
+        return None, None
     forward = motion.rotation[:, :2, 0]
     heading = np.concatenate([[0.0], np.cumsum(angle_between(forward[:-1], forward[1:]))])
-    return _robust_sigma(_fourth(heading))
+    position = np.column_stack([_fourth(axis) for axis in motion.position[:, :2].T])
+    return _robust_sigma(position.ravel()), _robust_sigma(_fourth(heading))
 
 
 def _fourth(values: FloatArray) -> FloatArray:
@@ -374,11 +329,3 @@ def _fourth(values: FloatArray) -> FloatArray:
 
 def _robust_sigma(values: FloatArray) -> float:
     return float(1.4826 * np.median(np.abs(values)))
-
-
-def _is_regular(motion: Motion) -> bool:
-    if len(motion.stamp_s) < 50:
-        return False
-    interval_s = float(np.median(motion.interval_s))
-    uneven = np.abs(motion.interval_s / interval_s - 1) > _REGULAR
-    return bool(interval_s <= 1 / _SLOWEST_HZ and uneven.mean() < _REGULAR)

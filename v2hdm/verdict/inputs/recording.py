@@ -1,12 +1,9 @@
-"""Stamps of poses and images: rates, gaps, repeats, overlap.
-
-A sample of each camera's images: frozen, given twice, too dark or too bright on the road.
-"""
+"""Stamps of poses and images, their gaps and repeats, and a sample of the images themselves."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -16,9 +13,11 @@ import numpy as np
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import distort_points
 from v2hdm.io.pixels import read_pixels
-from v2hdm.records import Camera, Drive, FloatArray, Image
+from v2hdm.records import Camera, Drive, Image
 from v2hdm.verdict.inputs.poses import Motion
-from v2hdm.verdict.verdict import Finding, Status, judge
+from v2hdm.verdict.verdict import Finding, Status, judge, passed
+
+_Item = TypeVar("_Item")
 
 _DRIVEN_MPS2 = 2.0
 """Acceleration and turning of ordinary driving: between poses t apart a line errs by this times t^2 / 8."""
@@ -27,132 +26,13 @@ _WITHOUT_POSE = 0.1
 """More than this share of images without a pose is no brief loss at the ends of a drive."""
 
 _HALF = 0.5
-"""Beyond this share of what was recorded the drive is not the one that was meant."""
+"""Beyond this share of the recording the drive is not the one that was meant."""
 
 _HELD = 0.02
 """More than this share of repeated poses on the way is a receiver slower than its log."""
 
 _VIEWS = 2.0
-"""A marking must be seen at least twice within the ROI to be placed and checked."""
-
-
-def check_clocks(drive: Drive, motion: Motion) -> list[Finding]:
-    """Whether poses come often enough, and images have poses."""
-    findings = [*_pose_rate(drive, motion), *_held(motion)]
-    spans = {name: _stamps(drive, name) for name in drive.cameras}
-    for name, stamps in spans.items():
-        findings += _posed(drive, name, len(stamps))
-        if len(stamps):
-            findings += [*_overlap(spans, name), *_spacing(drive, motion, name)]
-    return findings
-
-
-def _pose_rate(drive: Drive, motion: Motion) -> list[Finding]:
-    if not motion.moving.any():
-        return []
-    interval_s = float(np.median(motion.interval_s[motion.moving]))
-    longest_s = float(motion.interval_s[motion.moving].max())
-    limit_s = float(np.sqrt(8 * max(drive.pose_noise.position_m, 0.01) / _DRIVEN_MPS2))
-    error_m = _DRIVEN_MPS2 * longest_s**2 / 8
-    rare = judge(
-        "pose rate", "poses", interval_s, limit_s, "s",
-        fine=f"{1 / interval_s:.0f} poses a second are enough",
-        wrong=f"poses are {interval_s:.2f} s apart: between them they err by more than the stated noise; "
-        "record the receiver's full rate",
-        status=Status.WARN,
-    )  # fmt: skip
-    if rare.status is not Status.PASS:
-        return [rare]
-    return [
-        rare,
-        judge(
-            "pose gaps", "poses", longest_s, max(2 * limit_s, 3 * interval_s), "s",
-            fine="the poses have no gap while the vehicle moves",
-            wrong=f"the poses have a gap of {longest_s:.2f} s while the vehicle moves, across which images' "
-            f"poses err by {error_m:.2f} m; lower drive.max_gap_s below it or restore the missing poses",
-            status=Status.WARN,
-        ),
-    ]  # fmt: skip
-
-
-def _held(motion: Motion) -> list[Finding]:
-    """Poses that repeat the one before while the vehicle moves."""
-    if not motion.moving.any():
-        return []
-    same = (np.diff(motion.position, axis=0) == 0).all(axis=1) & motion.moving
-    share = float(same.sum() / motion.moving.sum())
-    after = motion.step_m[1:][same[:-1]]
-    jump_m = float(after.max()) if len(after) else 0.0
-    return [
-        judge(
-            "repeated poses", "poses", share, _HELD, "",
-            fine="no pose repeats the one before while the vehicle moves",
-            wrong=f"{100 * share:.0f} % of the poses repeat the one before while the vehicle moves, up to "
-            f"{jump_m:.2f} m off: the log is faster than the receiver, or the receiver froze; drop the "
-            "repeats",
-        )
-    ]  # fmt: skip
-
-
-def _posed(drive: Drive, name: str, posed: int) -> list[Finding]:
-    without = drive.unposed.get(name, 0)
-    share = without / max(1, posed + without)
-    return [
-        judge(
-            "images without pose", name, share, _WITHOUT_POSE, "",
-            fine="the images have poses",
-            wrong=f"{without} of {posed + without} images have no pose at their time: poses and images "
-            "overlap only in part, or the poses have gaps; check that both are of the same drive and on "
-            "one clock",
-            status=Status.FAIL if share > _HALF else Status.WARN,
-        )
-    ]  # fmt: skip
-
-
-def _overlap(spans: dict[str, FloatArray], name: str) -> list[Finding]:
-    """How much of the time that any camera recorded this one missed."""
-    if len(spans) < 2:
-        return []
-    start = min(stamps[0] for stamps in spans.values() if len(stamps))
-    end = max(stamps[-1] for stamps in spans.values() if len(stamps))
-    missed = 1 - (spans[name][-1] - spans[name][0]) / max(end - start, 1e-9)
-    return [
-        judge(
-            "camera span", name, missed, _HALF / 2, "",
-            fine="the camera records as long as the others",
-            wrong=f"the camera misses {100 * missed:.0f} % of the time that another records; check that its "
-            "stamps are on the common clock",
-            status=Status.WARN,
-        )
-    ]  # fmt: skip
-
-
-def _spacing(drive: Drive, motion: Motion, name: str) -> list[Finding]:
-    """Distance between images where the vehicle moves, against the depth of the ROI."""
-    images = [image for image in drive.images if image.camera == name]
-    centres = np.array([image.map_from_vehicle[:2, 3] for image in images])
-    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
-    steps = steps[steps > 0]
-    if not len(steps) or not len(motion.chords):
-        return []
-    depth_m = float(np.ptp(drive.cameras[name].roi_vehicle[:, 0]))
-    spacing_m = float(np.median(steps))
-    return [
-        judge(
-            "image spacing", name, spacing_m, depth_m / _VIEWS, "m",
-            fine="markings stay in the ROI for several images",
-            wrong=f"images are {spacing_m:.1f} m apart and the ROI is {depth_m:.1f} m deep: markings are "
-            "seen less than twice; drive slower, record more images or enlarge roi_vehicle",
-            status=Status.WARN,
-        )
-    ]  # fmt: skip
-
-
-def _stamps(drive: Drive, name: str) -> FloatArray:
-    return np.array([image.stamp_s for image in drive.images if image.camera == name])
-
-
-_Item = TypeVar("_Item")
+"""A marking must be in the ROI of at least two images to be placed and checked."""
 
 _SAMPLES = 12
 """Pairs of consecutive images looked at in each camera; each costs about 15 ms."""
@@ -176,7 +56,104 @@ _BRIGHTEST, _DARKEST = 250, 5
 """Grey values at which an image of 8 bits is clipped."""
 
 _CLIPPED = 0.25
-"""Share of clipped road that leaves markings unseen; paint itself takes a few percent."""
+"""Share of clipped road that hides markings; paint itself takes a few percent."""
+
+
+def check_clocks(drive: Drive, motion: Motion) -> Iterator[Finding]:
+    """Whether poses come often enough, and images have poses."""
+    if motion.moving.any():
+        yield from _pose_rate(drive, motion)
+        yield _held(motion)
+    stamps = {
+        name: [image.stamp_s for image in drive.images if image.camera == name] for name in drive.cameras
+    }
+    spans = {name: (own[0], own[-1]) for name, own in stamps.items() if own}
+    for name, own in stamps.items():
+        yield _posed(drive, name, len(own))
+        if own and len(stamps) > 1:
+            yield _overlap(spans, name)
+        if own:
+            yield from _spacing(drive, motion, name)
+
+
+def _pose_rate(drive: Drive, motion: Motion) -> Iterator[Finding]:
+    interval_s = float(np.median(motion.interval_s[motion.moving]))
+    longest_s = float(motion.interval_s[motion.moving].max())
+    limit_s = float(np.sqrt(8 * max(drive.pose_noise.position_m, 0.01) / _DRIVEN_MPS2))
+    error_m = _DRIVEN_MPS2 * longest_s**2 / 8
+    rare = judge(
+        "pose rate", "poses", interval_s, limit_s, "s",
+        fine=f"{1 / interval_s:.0f} poses a second are enough",
+        wrong=f"poses are {interval_s:.2f} s apart: between them they err by more than the stated noise; "
+        "record the receiver's full rate",
+        status=Status.WARN,
+    )  # fmt: skip
+    yield rare
+    if rare.status is Status.PASS:
+        yield judge(
+            "pose gaps", "poses", longest_s, max(2 * limit_s, 3 * interval_s), "s",
+            fine="the poses have no gap while the vehicle moves",
+            wrong=f"the poses have a gap of {longest_s:.2f} s while the vehicle moves, across which images' "
+            f"poses err by {error_m:.2f} m; lower drive.max_gap_s below it or restore the missing poses",
+            status=Status.WARN,
+        )  # fmt: skip
+
+
+def _held(motion: Motion) -> Finding:
+    """Poses that repeat the one before while the vehicle moves."""
+    same = (np.diff(motion.position, axis=0) == 0).all(axis=1) & motion.moving
+    share = float(same.sum() / motion.moving.sum())
+    jump_m = float(motion.step_m[1:][same[:-1]].max(initial=0.0))
+    return judge(
+        "repeated poses", "poses", share, _HELD, "",
+        fine="no pose repeats the one before while the vehicle moves",
+        wrong=f"{100 * share:.0f} % of the poses repeat the one before while the vehicle moves, up to "
+        f"{jump_m:.2f} m off: the log is faster than the receiver, or the receiver froze; drop the repeats",
+    )  # fmt: skip
+
+
+def _posed(drive: Drive, name: str, posed: int) -> Finding:
+    without = drive.unposed.get(name, 0)
+    share = without / max(1, posed + without)
+    return judge(
+        "images without pose", name, share, _WITHOUT_POSE, "",
+        fine="the images have poses",
+        wrong=f"{without} of {posed + without} images have no pose at their time: poses and images "
+        "overlap only in part, or the poses have gaps; check that both are of the same drive and on "
+        "one clock",
+        status=Status.FAIL if share > _HALF else Status.WARN,
+    )  # fmt: skip
+
+
+def _overlap(spans: dict[str, tuple[float, float]], name: str) -> Finding:
+    """How much of the time that any camera recorded this one missed."""
+    start, end = min(first for first, _ in spans.values()), max(last for _, last in spans.values())
+    missed = 1 - (spans[name][1] - spans[name][0]) / max(end - start, 1e-9)
+    return judge(
+        "camera span", name, missed, _HALF / 2, "",
+        fine="the camera records as long as the others",
+        wrong=f"the camera misses {100 * missed:.0f} % of the time that another records; check that its "
+        "stamps are on the common clock",
+        status=Status.WARN,
+    )  # fmt: skip
+
+
+def _spacing(drive: Drive, motion: Motion, name: str) -> Iterator[Finding]:
+    """Distance between images where the vehicle moves, against the depth of the ROI."""
+    centres = np.array([image.map_from_vehicle[:2, 3] for image in drive.images if image.camera == name])
+    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    steps = steps[steps > 0]
+    if not len(steps) or not len(motion.chords):
+        return
+    depth_m = float(np.ptp(drive.cameras[name].roi_vehicle[:, 0]))
+    spacing_m = float(np.median(steps))
+    yield judge(
+        "image spacing", name, spacing_m, depth_m / _VIEWS, "m",
+        fine="markings stay in the ROI for several images",
+        wrong=f"images are {spacing_m:.1f} m apart and the ROI is {depth_m:.1f} m deep: markings are "
+        "seen less than twice; drive slower, record more images or enlarge roi_vehicle",
+        status=Status.WARN,
+    )  # fmt: skip
 
 
 def check_images(drive: Drive) -> list[Finding]:
@@ -185,12 +162,11 @@ def check_images(drive: Drive) -> list[Finding]:
     Raises:
         DriveError: a sampled image cannot be decoded.
     """
-    findings = [*_shared(drive)]
+    findings = _shared(drive)
     for name, camera in drive.cameras.items():
         images = [image for image in drive.images if image.camera == name]
-        if len(images) < 2:
-            continue
-        findings += [_frozen(name, images), *_exposure(name, camera, images)]
+        if len(images) >= 2:
+            findings += [_frozen(name, images), *_exposure(name, camera, images)]
     return findings
 
 
@@ -210,10 +186,9 @@ def _frozen(name: str, images: Sequence[Image]) -> Finding:
     moving = [k for k in range(1, len(images)) if _distance_m(images[k - 1], images[k]) > _MOVED_M]
     if not moving:
         says = "the vehicle does not move between the images, so that repeated ones cannot be told"
-        return Finding("frozen images", Status.PASS, None, None, "", says, name)
+        return passed("frozen images", name, says)
     copied = [k for k in moving if _same_file(images[k - 1].path, images[k].path)]
-    share = len(copied) / len(moving)
-    at = copied
+    share, at = len(copied) / len(moving), copied
     if share <= _FROZEN:
         sampled = _spread(moving, _SAMPLES)
         alike = [k for k in sampled if _alike(images[k - 1].path, images[k].path)]
@@ -224,8 +199,7 @@ def _frozen(name: str, images: Sequence[Image]) -> Finding:
         if length >= _STUCK:
             says = (
                 f"{length + 1} images in a row from {images[begin - 1].stamp_s:.2f} s on are one and the "
-                "same while "
-                "the vehicle moves: the camera froze there; drop the repeats from the list"
+                "same while the vehicle moves: the camera froze there; drop the repeats from the list"
             )
             return Finding("frozen images", Status.WARN, float(length), _STUCK - 1.0, "", says, name)
     where = f", first at {images[at[0]].stamp_s:.2f} s" if at else ""
@@ -248,32 +222,28 @@ def _longest_run(numbers: Sequence[int]) -> tuple[int, int]:
     return best
 
 
-def _exposure(name: str, camera: Camera, images: Sequence[Image]) -> list[Finding]:
+def _exposure(name: str, camera: Camera, images: Sequence[Image]) -> Iterator[Finding]:
     """The clipped share of the ROI in sampled images."""
-    bright, dark = [], []
-    mask = None
-    for image in _spread(images, _SAMPLES):
-        grey = _read(image.path)
-        if mask is None:
-            mask = _roi_mask(camera, grey)
-        road = grey[mask]
-        if not len(road):
-            return []
-        bright.append(float((road >= _BRIGHTEST).mean()))
-        dark.append(float((road <= _DARKEST).mean()))
-    return [
-        judge(
-            check, name, float(np.median(shares)), _CLIPPED, "",
+    first, *rest = _spread(images, _SAMPLES)
+    greys = [_read(first.path)]
+    mask = _roi_mask(camera, greys[0])
+    if not mask.any():
+        return
+    greys += [_read(image.path) for image in rest]
+    bright = [float((grey[mask] >= _BRIGHTEST).mean()) for grey in greys]
+    dark = [float((grey[mask] <= _DARKEST).mean()) for grey in greys]
+    for check, shares, how, cause in (
+        ("bright images", bright, "clipped to white", "overexposed"),
+        ("dark images", dark, "black", "underexposed, or the lens is covered"),
+    ):
+        share = float(np.median(shares))
+        yield judge(
+            check, name, share, _CLIPPED, "",
             fine="the road is well exposed",
-            wrong=f"{100 * np.median(shares):.0f} % of the road in the ROI is {how}: the images are "
-            f"{cause}; set the camera's exposure for the road",
+            wrong=f"{100 * share:.0f} % of the road in the ROI is {how}: the images are {cause}; set the "
+            "camera's exposure for the road",
             status=Status.WARN,
-        )
-        for check, shares, how, cause in (
-            ("bright images", bright, "clipped to white", "overexposed"),
-            ("dark images", dark, "black", "underexposed, or the lens is covered"),
-        )
-    ]  # fmt: skip
+        )  # fmt: skip
 
 
 def _distance_m(first: Image, second: Image) -> float:
@@ -284,9 +254,7 @@ def _same_file(first: Path, second: Path) -> bool:
     """Whether two files are one, or hold the same bytes; files of other sizes are not opened."""
     if first == second:
         return True
-    if first.stat().st_size != second.stat().st_size:
-        return False
-    return _digest(first) == _digest(second)
+    return first.stat().st_size == second.stat().st_size and _digest(first) == _digest(second)
 
 
 def _digest(path: Path) -> bytes:
