@@ -1,67 +1,26 @@
-"""Two estimates of one camera's mounting, compared.
-
-Each camera alone against all together: markings that several saw, and the mountings.
-
-The mapper's mountings against those that bare ground gives, which no marking has a part in.
-
-The same marking mapped twice beside itself, as clocks, drift and mountings that disagree map it.
-"""
+"""Results against each other: cameras alone and together, markings and bare ground, markings that overlap."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from itertools import combinations
 
 import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
+from v2hdm.geometry.mounting import centre_sigmas
 from v2hdm.geometry.rigid import camera_centre, inverse, log
 from v2hdm.ground import GroundEstimate, GroundStatus
 from v2hdm.mapping.results import MethodResult
 from v2hdm.records import Calibration, Drive, FloatArray, Marking
 from v2hdm.verdict.verdict import Finding, judge
 
-_LEAST_VARIANCE = np.array([1e-8] * 3 + [1e-10] * 3)
-"""Added to a covariance's diagonal (m^2, rad^2): a tenth of a millimetre, a thousandth of a degree."""
-
-
-def mounting_sigmas(one: Calibration, other: Calibration, of_both: bool = False) -> float:
-    """Distance of two mountings: root of the mean squared deviation of their six parameters, in sigmas.
-
-    ``one`` knows less; where ``other`` rests on the same data, its covariance must not be added.
-
-    Args:
-        one: its covariance is what the deviation is measured by.
-        other: the other one.
-        of_both: whether they are independent, so that both covariances count.
-    """
-    assert one.covariance is not None
-    covariance = one.covariance + np.diag(_LEAST_VARIANCE)
-    if of_both and other.covariance is not None:
-        covariance = covariance + other.covariance
-    off = mounting_difference(one, other)
-    return float(np.sqrt(off @ np.linalg.solve(covariance, off) / len(off)))
-
-
-def mounting_difference(one: Calibration, other: Calibration) -> FloatArray:
-    """The left tangent (6,) from ``other`` to ``one``: translation m, rotation rad."""
-    return log(one.cam_from_vehicle @ inverse(other.cam_from_vehicle))
-
-
-def centre_sigma_m(calibration: Calibration) -> FloatArray:
-    """Standard deviations (3,) of a camera's centre along the vehicle's axes; 0 without a covariance."""
-    if calibration.covariance is None:
-        return np.zeros(3)
-    rotation = calibration.cam_from_vehicle[:3, :3]
-    return np.sqrt(np.diagonal(rotation.T @ calibration.covariance[:3, :3] @ rotation))
-
-
 SAME_M = 1.0
 """Centres of one marking in the maps of two cameras lie closer than this."""
 
 LEAST_SHARED = 8
-"""Markings that two maps must share for their offset to be told."""
+"""Markings that two maps must share for their offset to be observable."""
 
 OFFSET_LIMIT_SIGMAS = 5.0
 """Offset of two cameras' maps in the sigmas of their centres and markings: clean drives stay below 3."""
@@ -70,11 +29,43 @@ LEAST_OFFSET_M = 0.03
 """An offset of less than this is no finding, however sure it is: corners are good to two centimetres."""
 
 MOUNTING_LIMIT_SIGMAS = 5.0
-"""A mounting by one camera alone against that by all, in the sigmas of the former: clean drives stay below
-2."""
+"""A mounting by one camera alone against that by all, in the former's sigmas: below 2 on clean drives."""
+
+GROUND_LIMIT_SIGMAS = 4.0
+"""Root mean square of the six parameters' deviations, in the sigmas of both: one in a million by chance."""
+
+LEAST_TURN_DEG, LEAST_HEIGHT_M = 0.2, 0.04
+"""Where the mountings turn by less and their heights differ by less, the ground is no better judge."""
+
+OVERLAP = 0.1
+"""Share of the smaller of two markings of a class that both cover; paint does not lie on paint."""
+
+DOUBLES_LIMIT = 0.02
+"""Share of markings that overlap another: clean drives have none, one in a hundred may be on old paint."""
+
+_LEAST_VARIANCE = np.array([1e-8] * 3 + [1e-10] * 3)
+"""Added to a covariance's diagonal (m^2, rad^2): a tenth of a millimetre, a thousandth of a degree."""
 
 
-def check_agreement(results: Mapping[str, MethodResult], drive: Drive) -> list[Finding]:
+def mounting_sigmas(one: Calibration, other: Calibration, of_both: bool = False) -> float:
+    """Distance of two mountings: root of the mean squared deviation of their six parameters, in sigmas.
+
+    The sigmas are those of ``one``, which is known less; where the two are independent, ``of_both``.
+    """
+    assert one.covariance is not None
+    covariance = one.covariance + np.diag(_LEAST_VARIANCE)
+    if of_both and other.covariance is not None:
+        covariance = covariance + other.covariance
+    off = _difference(one, other)
+    return float(np.sqrt(off @ np.linalg.solve(covariance, off) / len(off)))
+
+
+def _difference(one: Calibration, other: Calibration) -> FloatArray:
+    """The left tangent (6,) from ``other`` to ``one``: translation m, rotation rad."""
+    return log(one.cam_from_vehicle @ inverse(other.cam_from_vehicle))
+
+
+def check_agreement(results: Mapping[str, MethodResult], drive: Drive) -> Iterator[Finding]:
     """Single cameras against one another and against all of them.
 
     Args:
@@ -83,60 +74,53 @@ def check_agreement(results: Mapping[str, MethodResult], drive: Drive) -> list[F
     """
     together = list(results.values())[-1]
     alone = {name: one for name, one in results.items() if len(one.cameras) == 1}
-    findings = [
-        finding
-        for (first, a), (second, b) in combinations(alone.items(), 2)
-        if (finding := _offset(first, a, second, b, drive)) is not None
-    ]
+    for (first, a), (second, b) in combinations(alone.items(), 2):
+        apart = shared_offsets(a, b, drive)
+        if len(apart) >= LEAST_SHARED:
+            calibrations = a.calibrations[first], b.calibrations[second]
+            yield _offset(first, second, apart, *(_centre_sigma_m(one) for one in calibrations))
     for name, one in alone.items():
         if one.calibrations[name].covariance is None or together.calibrations[name].covariance is None:
             continue
         sigmas = mounting_sigmas(one.calibrations[name], together.calibrations[name])
-        findings.append(
-            judge(
-                "alone and together",
-                name,
-                sigmas,
-                MOUNTING_LIMIT_SIGMAS,
-                "sigmas",
-                fine="mapped alone and with the others, it has the same mounting",
-                wrong=f"mapped alone its mounting is {sigmas:.0f} sigmas from the one that it has with "
-                f"the others: "
-                "cameras do not agree; check its clock, its survey and camera_info",
-            )
-        )
-    return findings
+        yield judge(
+            "alone and together", name, sigmas, MOUNTING_LIMIT_SIGMAS, "sigmas",
+            fine="mapped alone and with the others, it has the same mounting",
+            wrong=f"mapped alone its mounting is {sigmas:.0f} sigmas from the one that it has with the others"
+            ": cameras do not agree; check its clock, its survey and camera_info",
+        )  # fmt: skip
 
 
-def _offset(first: str, a: MethodResult, second: str, b: MethodResult, drive: Drive) -> Finding | None:
+def _centre_sigma_m(calibration: Calibration) -> FloatArray:
+    if calibration.covariance is None:
+        return np.zeros(3)
+    return centre_sigmas(calibration.cam_from_vehicle, calibration.covariance)
+
+
+def _offset(
+    first: str, second: str, apart: FloatArray, sigma_m: FloatArray, other_sigma_m: FloatArray
+) -> Finding:
     """How far two cameras' maps are apart in the driving direction and across."""
-    apart = shared_offsets(a, b, drive)
-    if len(apart) < LEAST_SHARED:
-        return None
     middle = np.median(apart, axis=0)
     spread = 1.4826 * np.median(np.abs(apart - middle), axis=0) / np.sqrt(len(apart))
-    sigma = np.hypot(centre_sigma_m(a.calibrations[first])[:2], centre_sigma_m(b.calibrations[second])[:2])
+    sigma = np.hypot(sigma_m[:2], other_sigma_m[:2])
     sigmas = np.where(np.abs(middle) > LEAST_OFFSET_M, np.abs(middle) / np.hypot(sigma, spread), 0.0)
     axis = int(np.argmax(sigmas))
     where = (("behind", "ahead of"), ("right of", "left of"))[axis][int(middle[axis] > 0)]
     cause = (
         "their clocks or the forward survey of a centre disagree",
         "a heading or a lateral survey disagrees",
-    )
+    )[axis]
     return judge(
-        "cameras apart",
-        f"{first}, {second}",
-        float(sigmas[axis]),
-        OFFSET_LIMIT_SIGMAS,
-        "sigmas",
+        "cameras apart", f"{first}, {second}", float(sigmas[axis]), OFFSET_LIMIT_SIGMAS, "sigmas",
         fine=f"{len(apart)} markings that both saw lie in one place",
         wrong=f"{second} maps {len(apart)} markings {100 * abs(middle[axis]):.0f} cm {where} where {first} "
-        f"does: {cause[axis]}; synchronise and measure anew",
-    )
+        f"does: {cause}; synchronise and measure anew",
+    )  # fmt: skip
 
 
 def shared_offsets(a: MethodResult, b: MethodResult, drive: Drive) -> FloatArray:
-    """Offsets (N, 2), forward and left, of the markings of ``b`` from those of ``a`` that they are.
+    """Offsets (N, 2), forward and left, of the markings of ``b`` from the same ones of ``a``.
 
     A marking is that of the other map that is nearest to it, of its class, both ways.
     """
@@ -163,83 +147,54 @@ def shared_offsets(a: MethodResult, b: MethodResult, drive: Drive) -> FloatArray
     return np.stack([(apart * forward).sum(1), (apart * left).sum(1)], axis=1)
 
 
-GROUND_LIMIT_SIGMAS = 4.0
-"""Root mean square of the six parameters' deviations, in the sigmas of both: one in a million by chance."""
-
-LEAST_TURN_DEG = 0.2
-LEAST_HEIGHT_M = 0.04
-"""Where the mountings turn by less and their heights differ by less, the ground is no better judge."""
-
-
 def check_against_ground(
     calibrations: Mapping[str, Calibration], ground: Mapping[str, GroundEstimate]
-) -> list[Finding]:
-    """Each camera's mounting as the mapper has it against that of the bare ground, where there is one."""
-    findings = []
-    for name, calibration in calibrations.items():
+) -> Iterator[Finding]:
+    """Each camera's mounting from markings against that from bare ground, where there is one."""
+    for name, mapped in calibrations.items():
         estimate = ground.get(name)
         if estimate is None or estimate.status is not GroundStatus.FOUND or estimate.calibration is None:
             continue
-        if calibration.covariance is None or estimate.calibration.covariance is None:
-            continue
-        findings.append(_compare(name, calibration, estimate.calibration))
-    return findings
+        if mapped.covariance is not None and estimate.calibration.covariance is not None:
+            yield _compare(name, mapped, estimate.calibration)
 
 
 def _compare(name: str, mapped: Calibration, ground: Calibration) -> Finding:
-    off = mounting_difference(ground, mapped)
-    rotation = mapped.cam_from_vehicle[:3, :3]
-    turn_deg = np.rad2deg(rotation.T @ off[3:])
+    off = _difference(ground, mapped)
+    turn_deg = np.rad2deg(mapped.cam_from_vehicle[:3, :3].T @ off[3:])
     up_m = float(camera_centre(mapped.cam_from_vehicle)[2] - camera_centre(ground.cam_from_vehicle)[2])
-    small = np.abs(turn_deg).max() < LEAST_TURN_DEG and abs(up_m) < LEAST_HEIGHT_M
-    sigmas = mounting_sigmas(ground, mapped, of_both=True)
+    most_deg = np.abs(turn_deg).max()
+    small = most_deg < LEAST_TURN_DEG and abs(up_m) < LEAST_HEIGHT_M
+    sigmas = 0.0 if small else mounting_sigmas(ground, mapped, of_both=True)
     roll, pitch, yaw = turn_deg
     return judge(
-        "ground",
-        name,
-        0.0 if small else sigmas,
-        GROUND_LIMIT_SIGMAS,
-        "sigmas",
-        fine=f"markings and bare ground agree on its mounting ({np.abs(turn_deg).max():.2f} deg at most)",
-        wrong=f"markings and bare ground do not agree on its mounting (roll {roll:+.2f}, pitch "
-        f"{pitch:+.2f}, yaw "
-        f"{yaw:+.2f} deg, height {100 * up_m:+.0f} cm): wrong associations, or ground that is not flat; "
-        f"look at "
-        "the overlay",
-    )
-
-
-OVERLAP = 0.1
-"""Share of the smaller of two markings of a class that both cover; paint does not lie on paint."""
-
-DOUBLES_LIMIT = 0.02
-"""Share of markings that overlap another: clean drives have none, one in a hundred may be paint over old
-paint."""
+        "ground", name, sigmas, GROUND_LIMIT_SIGMAS, "sigmas",
+        fine=f"markings and bare ground agree on its mounting ({most_deg:.2f} deg at most)",
+        wrong=f"markings and bare ground do not agree on its mounting (roll {roll:+.2f}, pitch {pitch:+.2f}, "
+        f"yaw {yaw:+.2f} deg, height {100 * up_m:+.0f} cm): wrong associations, or ground that is not flat; "
+        "look at the overlay",
+    )  # fmt: skip
 
 
 def check_doubles(best: MethodResult) -> list[Finding]:
-    """Markings of one class that overlap."""
-    pairs = overlapping(best.hd_map.markings)
-    count = len(best.hd_map.markings)
-    if not count:
+    """Markings mapped twice beside themselves, as clocks, drift and mountings that disagree map them."""
+    markings = best.hd_map.markings
+    if not markings:
         return []
+    pairs = overlapping(markings)
     where = ""
     if pairs:
-        x, y = best.hd_map.markings[pairs[0][0]].corners_map.mean(axis=0)
+        x, y = markings[pairs[0][0]].corners_map.mean(axis=0)
         where = f", first at ({x:.1f}, {y:.1f})"
+    says = f"{len(pairs)} of {len(markings)} markings overlap another of their class"
     return [
         judge(
-            "double markings",
-            "map",
-            len(pairs) / count,
-            DOUBLES_LIMIT,
-            "",
-            fine=f"{len(pairs)} of {count} markings overlap another of their class",
-            wrong=f"{len(pairs)} of {count} markings overlap another of their class{where}: laps or "
-            f"cameras do not "
-            "agree; check clocks, the receiver's fix and the mountings",
+            "double markings", "map", len(pairs) / len(markings), DOUBLES_LIMIT, "",
+            fine=says,
+            wrong=f"{says}{where}: laps or cameras do not agree; check clocks, the receiver's fix and the "
+            "mountings",
         )
-    ]
+    ]  # fmt: skip
 
 
 def overlapping(markings: tuple[Marking, ...]) -> list[tuple[int, int]]:

@@ -1,18 +1,14 @@
-"""Contradicted inputs in words: what is wrong by how much, and what to do.
+"""After the solve: contradicted inputs, how well everything fits, and whether results agree.
 
-After the solve: what the drive says of its own inputs, and how well everything fits.
-
-The inputs are tested one at a time (:mod:`v2hdm.adjust.suspect`); what was contradicted and could be done
-without has been dropped (:mod:`v2hdm.mapping.remedy`) and is told here. Everything else that a wrong input
-shows in is measured as well, so that a fault that nobody thought of is not silent. docs/verdict.md has what
-clean and spoilt drives measure.
-
-All checks of a result, in the order in which they are told.
+The inputs are tested one at a time (:mod:`v2hdm.adjust.suspect`); an input that was contradicted and could be
+done without has been dropped (:mod:`v2hdm.mapping.remedy`) and is reported here. Every other sign of a wrong
+input is measured as well, so that a fault that nobody thought of is not silent. docs/verdict.md has the
+figures of clean and spoilt drives.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -26,90 +22,6 @@ from v2hdm.mapping.site_model.verdict import TOO_UNCERTAIN
 from v2hdm.records import Drive
 from v2hdm.verdict.results.agreement import check_against_ground, check_agreement, check_doubles
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
-
-CHECKS: Mapping[Fault, str] = {
-    Fault.CLOCK: "clock",
-    Fault.FOCAL: "focal length",
-    Fault.DISTORTION: "distortion",
-    Fault.PRINCIPAL: "principal point",
-    Fault.SLOPE: "slope",
-    Fault.SURVEY: "survey",
-    Fault.LEVER: "survey",
-    Fault.SIZE: "known_sizes",
-    Fault.CONTROL: "surveyed points",
-    Fault.DATUM: "surveyed points",
-}
-"""The check that each fault is told by."""
-
-_WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))
-_MAP_AXES = ("east", "north")
-
-_REMEDIES: Mapping[Fault, str] = {
-    Fault.CLOCK: "synchronise the clocks of cameras and receiver, or shift the stamps by as much",
-    Fault.FOCAL: "check fx and fy in camera_info against the resolution, or calibrate the lens anew",
-    Fault.DISTORTION: "check distortion_coefficients (and the focal length) in camera_info, or "
-    "calibrate anew",
-    Fault.PRINCIPAL: "check cx and cy in camera_info against the image's size and crop, or calibrate anew",
-    Fault.SLOPE: "record the height of the poses, or roll and pitch against the road",
-    Fault.SURVEY: "measure the camera's centre anew, mind signs, axes and the origin on the ground "
-    "under the axle",
-    Fault.LEVER: "state the centres from the point that the poses are of, such as the antenna, or "
-    "move the poses",
-    Fault.SIZE: "measure the paint, or leave it out of mapping.known_sizes",
-    Fault.CONTROL: "measure it anew, or leave it out of mapping.survey",
-    Fault.DATUM: "check that survey and poses have the same datum and origin",
-}
-
-
-def _way(one: Contradiction) -> str:
-    """How far and where to along an axis of the vehicle."""
-    return f"{100 * abs(one.value):.0f} cm {_WAYS[one.axis][one.value > 0]}"
-
-
-def remedy_of(one: Contradiction) -> str:
-    """What to do about it."""
-    return _REMEDIES[one.fault]
-
-
-def wrong_as(one: Contradiction) -> str:
-    """What is wrong by how much, as a clause."""
-    whose = " and ".join(one.cameras)
-    cm, off = 100 * one.value, abs(one.value)
-    match one.fault:
-        case Fault.CLOCK:
-            late = "later" if one.value > 0 else "earlier"
-            where = f" {one.about}" if one.about else ""
-            return (
-                f"the images of {whose}{where} were taken {1e3 * off:.0f} ms {late} than stamped: their "
-                "clock is off"
-            )
-        case Fault.FOCAL:
-            larger = "longer" if one.value > 0 else "shorter"
-            return f"the focal length of {whose} is {100 * off:.1f} % {larger} than camera_info says"
-        case Fault.DISTORTION:
-            return f"the lens distortion of {whose} is not that of camera_info (k1 off by {one.value:+.3f})"
-        case Fault.PRINCIPAL:
-            way = ("right", "down")[one.axis]
-            return f"the principal point of {whose} lies {one.value:+.0f} px {way} of where camera_info says"
-        case Fault.SLOPE:
-            return (
-                f"the ground rises by {100 * one.value:+.1f} % to the {_MAP_AXES[one.axis]} under the poses"
-            )
-        case Fault.SURVEY:
-            return f"the centre of {whose} lies {_way(one)} its survey"
-        case Fault.LEVER:
-            return (
-                f"the centres of {whose} all lie {_way(one)} their surveys, as if the poses were of another "
-                "point of the vehicle (antenna instead of axle)"
-            )
-        case Fault.SIZE:
-            longer = "longer" if one.value > 0 else "shorter"
-            return f"paint that known_sizes states as {one.about} is {100 * off:.1f} cm {longer}"
-        case Fault.CONTROL:
-            return f"the surveyed point {one.about} is {100 * off:.0f} cm off the marking's corner"
-        case Fault.DATUM:
-            return f"the surveyed points all lie {cm:+.0f} cm {_MAP_AXES[one.axis]} of the markings"
-
 
 BEST = "Opt"
 """The method whose map is the result."""
@@ -125,29 +37,85 @@ REJECTED_LIMIT = 0.06
 """Share of corner observations that the rest contradicts: clean drives reach .02, no distortion .14."""
 
 VARIANCE_LIMIT = 3.0
-"""Variance of observations as a multiple of the detector's statement: clean drives reach .2, no distortion
-6."""
+"""Variance of observations over the detector's statement: clean drives reach .2, no distortion 6."""
 
 WINDOW_LIMIT = 8.0
 """The worst window of the route as a multiple of the median one: clean drives reach 2."""
 
 POSE_PULL_LIMIT = 1.4
-"""Root mean square of what is taken off a recorded pose, in its sigmas: at most 1 where these are right."""
+"""Root mean square of a recorded pose's corrections, in its sigmas: at most 1 where these are right."""
 
 JUMP_LIMIT = 9.0
-"""Largest single pull on a pose, in sigmas."""
+"""Largest single correction of a pose, in sigmas."""
 
-LEVER_TOLD_M = 0.15
-"""Sigma of the point that the poses are of, m, up to which a drive tells it."""
+LEVER_OBSERVABLE_M = 0.15
+"""Sigma of the point that the poses are of, m, up to which a drive makes it observable."""
+
+_CHECKS: Mapping[Fault, tuple[str, str]] = {
+    Fault.CLOCK: (
+        "clock", "synchronise the clocks of cameras and receiver, or shift the stamps by as much",
+    ),
+    Fault.FOCAL: (
+        "focal length",
+        "check fx and fy in camera_info against the resolution, or calibrate the lens anew",
+    ),
+    Fault.DISTORTION: (
+        "distortion",
+        "check distortion_coefficients (and the focal length) in camera_info, or calibrate anew",
+    ),
+    Fault.PRINCIPAL: (
+        "principal point",
+        "check cx and cy in camera_info against the image's size and crop, or calibrate anew",
+    ),
+    Fault.SLOPE: ("slope", "record the height of the poses, or roll and pitch against the road"),
+    Fault.SURVEY: (
+        "survey",
+        "measure the camera's centre anew, mind signs, axes and the origin on the ground under the axle",
+    ),
+    Fault.LEVER: (
+        "survey",
+        "state the centres from the point that the poses are of, such as the antenna, or move the poses",
+    ),
+    Fault.SIZE: ("known_sizes", "measure the paint, or leave it out of mapping.known_sizes"),
+    Fault.CONTROL: ("surveyed points", "measure it anew, or leave it out of mapping.survey"),
+    Fault.DATUM: ("surveyed points", "check that survey and poses have the same datum and origin"),
+}  # fmt: skip
+"""The check that reports each fault, and the recovery."""
+
+_CORRECTED_BY = {
+    Fault.CLOCK: "the images were posed anew",
+    Fault.SIZE: "all known sizes were left out of the result",
+}
+"""How an input was corrected, where it was not just left out."""
+
+_POSE_KEYS = {"roll": "roll_pitch_rad", "pitch": "roll_pitch_rad", "heading": "heading_rad"}
+_WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))
+_MAP_AXES = ("east", "north")
+
+
+def check_result(
+    drive: Drive,
+    methods: Mapping[str, Mapping[str, MethodResult]],
+    ground: Sequence[Mapping[str, GroundEstimate]] = (),
+) -> list[Finding]:
+    """The checks after the solve, and the mapper's mountings against those of bare ground.
+
+    Args:
+        drive: the mapped drive.
+        methods: results by camera set, the one of all cameras last, then by method.
+        ground: of each session, by camera, the estimates of bare ground; empty where it was not asked.
+    """
+    best = list(methods.values())[-1][BEST]
+    findings = check_solution(drive, methods)
+    for visit, estimates in zip(drive.visits, ground, strict=False):
+        own = check_against_ground(best.calibrations, estimates)
+        suffix = f" of {visit.name}" if drive.joined else ""
+        findings += [replace(finding, about=f"{finding.about}{suffix}") for finding in own]
+    return findings
 
 
 def check_solution(drive: Drive, methods: Mapping[str, Mapping[str, MethodResult]]) -> list[Finding]:
-    """All checks after the solve.
-
-    Args:
-        drive: what was mapped.
-        methods: results by camera set, the one of all cameras last, then by method.
-    """
+    """All checks after the solve; arguments as for :func:`check_result`."""
     best = list(methods.values())[-1][BEST]
     causes: list[Finding] = []
     symptoms: list[Finding] = []
@@ -164,7 +132,7 @@ def check_solution(drive: Drive, methods: Mapping[str, Mapping[str, MethodResult
 def _explained(finding: Finding, named: Finding | None) -> Finding:
     """A symptom that points to the cause which the tests of the inputs have named, if they have.
 
-    What is wrong stands before the colon of its sentence, and the causes that are likely otherwise after it.
+    The colon of its sentence divides the symptom from the causes that are likely otherwise.
     """
     if named is None or finding.status is Status.PASS:
         return finding
@@ -172,7 +140,7 @@ def _explained(finding: Finding, named: Finding | None) -> Finding:
 
 
 def check_inputs(evidence: SolveEvidence) -> list[Finding]:
-    """What was dropped, what is contradicted still, and what this drive cannot tell."""
+    """Inputs that were dropped, inputs that are contradicted still, and what is not observable."""
     findings = [_corrected(one) for one in evidence.corrected]
     raised = {finding.check for finding in findings}
     still = [one for one in evidence.suspects if is_contradicted(one)]
@@ -182,89 +150,69 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
         raised.add(findings[-1].check)
     by_check: dict[str, list[Contradiction]] = {}
     for one in evidence.suspects:
-        by_check.setdefault(CHECKS[one.fault], []).append(one)
-    untold = _untold(evidence, raised)
-    said = raised | {finding.check for finding in untold if not _is_told(by_check[finding.check])}
+        by_check.setdefault(_CHECKS[one.fault][0], []).append(one)
+    unobservable = list(_unobservable(evidence, raised))
+    said = raised | {one.check for one in unobservable if not _observable(by_check[one.check])}
     findings += [_agrees(check, tested) for check, tested in by_check.items() if check not in said]
-    return [*findings, *untold]
+    return [*findings, *unobservable]
 
 
-def _is_told(tested: list[Contradiction]) -> bool:
-    return any(one.sigma <= TOLD_SIGMA[one.fault] for one in tested)
+def _observable(tested: list[Contradiction]) -> list[Contradiction]:
+    return [one for one in tested if one.sigma <= TOLD_SIGMA[one.fault]]
 
 
 def _corrected(one: Contradiction) -> Finding:
-    done = _DONE.get(one.fault, "it was left out of the result")
-    says = f"{wrong_as(one)} ({one.sigmas:.0f} sigmas); {done}: {remedy_of(one)}"
-    return Finding(
-        CHECKS[one.fault],
-        Status.WARN,
-        one.sigmas,
-        CONTRADICTED_SIGMAS,
-        "sigmas",
-        says,
-        ", ".join(one.cameras),
+    done = _CORRECTED_BY.get(one.fault, "it was left out of the result")
+    return _input(
+        one, Status.WARN, f"{_words(one)} ({one.sigmas:.0f} sigmas); {done}: {_CHECKS[one.fault][1]}"
     )
-
-
-_DONE = {
-    Fault.CLOCK: "the images were posed anew",
-    Fault.SIZE: "all known sizes were left out of the result",
-}
-"""How an input was corrected, where it was not just left out."""
 
 
 def _contradicted(one: Contradiction, others: list[Contradiction]) -> Finding:
-    rivals = [wrong_as(other) for other in others if other.sigmas > 0.8 * one.sigmas]
-    instead = f" or {rivals[0]}" if rivals else ""
-    says = f"{wrong_as(one)}{instead} ({one.sigmas:.0f} sigmas), and the map is wrong by it: {remedy_of(one)}"
-    return Finding(
-        CHECKS[one.fault],
-        Status.FAIL,
-        one.sigmas,
-        CONTRADICTED_SIGMAS,
-        "sigmas",
-        says,
-        ", ".join(one.cameras),
-    )
+    rivals = [_words(other) for other in others if other.sigmas > 0.8 * one.sigmas]
+    says = f"{_words(one)}{f' or {rivals[0]}' if rivals else ''} ({one.sigmas:.0f} sigmas)"
+    return _input(one, Status.FAIL, f"{says}, and the map is wrong by it: {_CHECKS[one.fault][1]}")
+
+
+def _input(one: Contradiction, status: Status, says: str) -> Finding:
+    """The finding on a tested input."""
+    check, about = _CHECKS[one.fault][0], ", ".join(one.cameras)
+    return Finding(check, status, one.sigmas, CONTRADICTED_SIGMAS, "sigmas", says, about)
 
 
 def _agrees(check: str, tested: list[Contradiction]) -> Finding:
-    if not _is_told(tested):
+    observable = _observable(tested)
+    if not observable:
         says = "the markings of this drive do not tell it: drive a turn, and past more of them"
         return passed(check, ", ".join(tested[0].cameras), says)
-    told = [one for one in tested if one.sigma <= TOLD_SIGMA[one.fault]]
-    worst = max(told, key=lambda one: one.sigmas)
-    names = ", ".join(worst.cameras)
+    worst = max(observable, key=lambda one: one.sigmas)
     if is_contradicted(worst):
-        return passed(check, names, "not told apart from what is named as wrong: mend that first")
+        says = "not told apart from what is named as wrong: mend that first"
+        return passed(check, ", ".join(worst.cameras), says)
     says = f"the markings agree with what is stated, to {worst.sigmas:.1f} sigmas"
-    return Finding(check, Status.PASS, worst.sigmas, CONTRADICTED_SIGMAS, "sigmas", says, names)
+    return _input(worst, Status.PASS, says)
 
 
-def _untold(evidence: SolveEvidence, raised: set[str]) -> list[Finding]:
-    """What no drive of this kind can tell of all cameras together, and what would."""
-    findings = []
+def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding]:
+    """Errors of all cameras together that no drive of this kind shows, and the drive that would."""
     clocks = _of_all(evidence, Fault.CLOCK, Fault.CLOCK)
     loosest_s = max((one.sigma for one in clocks), default=0.0)
     if loosest_s > CLOCK_TOLD_S and "clock" not in raised:
-        sigma_ms = 1e3 * loosest_s
-        sure = f"better than {2 * sigma_ms:.0f} ms" if np.isfinite(sigma_ms) else "at all"
+        sure = f"better than {2e3 * loosest_s:.0f} ms" if np.isfinite(loosest_s) else "at all"
         says = (
             f"the markings do not tell {sure} whether all clocks are late alike: drive a turn, or change the "
             "speed"
         )
-        findings.append(passed("clock", "all cameras", says))
+        yield passed("clock", "all cameras", says)
     levers = _of_all(evidence, Fault.LEVER, Fault.SURVEY)
-    axes = sorted({one.axis for one in levers if one.axis < 2 and one.sigma > LEVER_TOLD_M})
+    axes = sorted({one.axis for one in levers if one.axis < 2 and one.sigma > LEVER_OBSERVABLE_M})
     if axes and "survey" not in raised:
         names = " and ".join(("forward", "left")[axis] for axis in axes)
         says = (
             f"this drive does not tell how far {names} the cameras sit of the point that the poses are of: "
             "the survey of centre and antenna is relied on; drive a turn"
         )
-        findings.append(passed("survey", "all cameras", says))
-    return findings
+        yield passed("survey", "all cameras", says)
 
 
 def _of_all(evidence: SolveEvidence, shared: Fault, single: Fault) -> list[Contradiction]:
@@ -273,138 +221,113 @@ def _of_all(evidence: SolveEvidence, shared: Fault, single: Fault) -> list[Contr
     return together or [one for one in evidence.suspects if one.fault is single]
 
 
-def check_fit(evidence: SolveEvidence) -> list[Finding]:
+def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
     """How well observations and poses fit, before any variance was adapted to them."""
     factor = evidence.variance_factor
+    scatter = "times the variance that the detector states"
+    yield judge(
+        "fit", "map", factor, VARIANCE_LIMIT, "",
+        fine=f"corners scatter with {factor:.2f} {scatter}",
+        wrong=f"corners scatter with {factor:.1f} {scatter}: poses, lens and images do not fit together; "
+        "check camera_info and the pose_noise first",
+    )  # fmt: skip
     worst = int(np.argmax(evidence.along_route))
     window = float(evidence.along_route[worst] / max(np.median(evidence.along_route), 1e-12))
-    findings = [
-        judge(
-            "fit",
-            "map",
-            factor,
-            VARIANCE_LIMIT,
-            "",
-            fine=f"corners scatter with {factor:.2f} times the variance that the detector states",
-            wrong=f"corners scatter with {factor:.1f} times the variance that the detector states: poses, "
-            f"lens and "
-            "images do not fit together; check camera_info and the pose_noise first",
-        ),
-        judge(
-            "fit along the route",
-            "map",
-            window,
-            WINDOW_LIMIT,
-            "",
-            fine="the fit is even along the route",
-            wrong=f"from {evidence.window_s[worst]:.1f} s on corners scatter with {window:.0f} times the "
-            f"usual "
-            "variance: the position jumps there, or poses are missing; check the fix of the receiver",
-        ),
-    ]
+    yield judge(
+        "fit along the route", "map", window, WINDOW_LIMIT, "",
+        fine="the fit is even along the route",
+        wrong=f"from {evidence.window_s[worst]:.1f} s on corners scatter with {window:.0f} times the usual "
+        "variance: the position jumps there, or poses are missing; check the fix of the receiver",
+    )  # fmt: skip
     for name, fit in evidence.fits.items():
-        findings.append(
-            judge(
-                "rejected",
-                name,
-                fit.rejected_share,
-                REJECTED_LIMIT,
-                "",
-                fine=f"{100 * fit.rejected_share:.1f} % of its corners contradict the rest",
-                wrong=f"{100 * fit.rejected_share:.0f} % of its corners contradict the rest: its lens, "
-                f"clock or "
-                "mounting is not as stated",
-            )
-        )
-    loss = evidence.held_out_loss
-    if loss is not None:
-        findings.append(
-            judge(
-                "held out",
-                "map",
-                loss,
-                HELD_OUT_LIMIT,
-                "",
-                fine="the map predicts corners that it has not seen as well as the noise allows",
-                wrong="the map mispredicts corners that it has not seen: an error of poses, clocks or "
-                "lens is left",
-            )
-        )
-    return [*findings, *_poses(evidence)]
+        percent = 100 * fit.rejected_share
+        yield judge(
+            "rejected", name, fit.rejected_share, REJECTED_LIMIT, "",
+            fine=f"{percent:.1f} % of its corners contradict the rest",
+            wrong=f"{percent:.0f} % of its corners contradict the rest: its lens, clock or mounting is not "
+            "as stated",
+        )  # fmt: skip
+    if evidence.held_out_loss is not None:
+        yield judge(
+            "held out", "map", evidence.held_out_loss, HELD_OUT_LIMIT, "",
+            fine="the map predicts corners that it has not seen as well as the noise allows",
+            wrong="the map mispredicts corners that it has not seen: an error of poses, clocks or lens is "
+            "left",
+        )  # fmt: skip
+    if evidence.pose_pulls:
+        yield from _poses(evidence)
 
 
-def _poses(evidence: SolveEvidence) -> list[Finding]:
-    if not evidence.pose_pulls:
-        return []
+def _poses(evidence: SolveEvidence) -> Iterator[Finding]:
     state = max(evidence.pose_pulls, key=lambda name: evidence.pose_pulls[name])
     pull = evidence.pose_pulls[state]
-    key = {"roll": "roll_pitch_rad", "pitch": "roll_pitch_rad", "heading": "heading_rad"}.get(
-        state, "position_m"
-    )
-    return [
-        judge(
-            "pose noise",
-            "poses",
-            pull,
-            POSE_PULL_LIMIT,
-            "sigmas",
-            fine="the poses are as good as pose_noise says, or better",
-            wrong=f"the {state} of the poses errs {pull:.1f} times as much as pose_noise says: sigmas of "
-            f"the map are "
-            f"too small; state a larger {key}",
-            status=Status.WARN,
-        ),
-        judge(
-            "pose jump",
-            "poses",
-            evidence.worst_pull,
-            JUMP_LIMIT,
-            "sigmas",
-            fine="no pose stands out from the others",
-            wrong=f"at {evidence.worst_pull_s:.1f} s the pose is {evidence.worst_pull:.0f} sigmas from "
-            f"where the "
-            "markings put it: the position jumps, or the fix was lost; check the receiver's log there",
-            status=Status.WARN,
-        ),
-    ]
+    yield judge(
+        "pose noise", "poses", pull, POSE_PULL_LIMIT, "sigmas",
+        fine="the poses are as good as pose_noise says, or better",
+        wrong=f"the {state} of the poses errs {pull:.1f} times as much as pose_noise says: sigmas of the map "
+        f"are too small; state a larger {_POSE_KEYS.get(state, 'position_m')}",
+        status=Status.WARN,
+    )  # fmt: skip
+    yield judge(
+        "pose jump", "poses", evidence.worst_pull, JUMP_LIMIT, "sigmas",
+        fine="no pose stands out from the others",
+        wrong=f"at {evidence.worst_pull_s:.1f} s the pose is {evidence.worst_pull:.0f} sigmas from where the "
+        "markings put it: the position jumps, or the fix was lost; check the receiver's log there",
+        status=Status.WARN,
+    )  # fmt: skip
 
 
 def _excluded(best: MethodResult) -> Finding:
-    # A place that is merely uncertain was seen too far off, or too briefly: it contradicts nothing.
+    # A merely uncertain candidate was too far off, or too briefly in view: it contradicts nothing.
     left_out = sum(one.reason != TOO_UNCERTAIN for one in best.excluded)
     count = left_out + len(best.hd_map.markings)
     share = left_out / max(count, 1)
     surely = share - 2 * float(np.sqrt(share * (1 - share) / max(count, 1)))
+    says = f"{left_out} of {count} candidates were left out"
     return judge(
-        "excluded",
-        "map",
-        surely,
-        EXCLUDED_LIMIT,
-        "",
-        fine=f"{left_out} of {count} candidates were left out, those aside that are merely uncertain",
-        wrong=f"{left_out} of {count} candidates were left out: markings are seen, but not where others put "
-        "them; see excluded.geojson",
+        "excluded", "map", surely, EXCLUDED_LIMIT, "",
+        fine=f"{says}, those aside that are merely uncertain",
+        wrong=f"{says}: markings are seen, but not where others put them; see excluded.geojson",
         status=Status.WARN,
-    )
+    )  # fmt: skip
 
 
-def check_result(
-    drive: Drive,
-    methods: Mapping[str, Mapping[str, MethodResult]],
-    ground: Sequence[Mapping[str, GroundEstimate]] = (),
-) -> list[Finding]:
-    """The checks after the solve, and the mapper's mountings against those of bare ground.
-
-    Args:
-        drive: what was mapped.
-        methods: results by camera set, the one of all cameras last, then by method.
-        ground: of each visit, by camera, what bare ground says; empty where it was not asked.
-    """
-    best = list(methods.values())[-1][BEST]
-    findings = check_solution(drive, methods)
-    for visit, estimates in zip(drive.visits, ground, strict=False):
-        own = check_against_ground(best.calibrations, estimates)
-        if drive.joined:
-            own = [replace(finding, about=f"{finding.about} of {visit.name}") for finding in own]
-        findings += own
-    return findings
+def _words(one: Contradiction) -> str:
+    """What is wrong by how much, as a clause."""
+    whose, size = " and ".join(one.cameras), abs(one.value)
+    cm = 100 * size
+    way = f"{cm:.0f} cm {_WAYS[one.axis][one.value > 0]}"
+    match one.fault:
+        case Fault.CLOCK:
+            late = "later" if one.value > 0 else "earlier"
+            where = f" {one.about}" if one.about else ""
+            return (
+                f"the images of {whose}{where} were taken {1e3 * size:.0f} ms {late} than stamped: their "
+                "clock is off"
+            )
+        case Fault.FOCAL:
+            longer = "longer" if one.value > 0 else "shorter"
+            return f"the focal length of {whose} is {100 * size:.1f} % {longer} than camera_info says"
+        case Fault.DISTORTION:
+            return f"the lens distortion of {whose} is not that of camera_info (k1 off by {one.value:+.3f})"
+        case Fault.PRINCIPAL:
+            axis = ("right", "down")[one.axis]
+            return f"the principal point of {whose} lies {one.value:+.0f} px {axis} of where camera_info says"
+        case Fault.SLOPE:
+            axis = _MAP_AXES[one.axis]
+            return f"the ground rises by {100 * one.value:+.1f} % to the {axis} under the poses"
+        case Fault.SURVEY:
+            return f"the centre of {whose} lies {way} its survey"
+        case Fault.LEVER:
+            return (
+                f"the centres of {whose} all lie {way} their surveys, as if the poses were of another "
+                "point of the vehicle (antenna instead of axle)"
+            )
+        case Fault.SIZE:
+            longer = "longer" if one.value > 0 else "shorter"
+            return f"paint that known_sizes states as {one.about} is {cm:.1f} cm {longer}"
+        case Fault.CONTROL:
+            return f"the surveyed point {one.about} is {cm:.0f} cm off the marking's corner"
+        case Fault.DATUM:
+            axis = _MAP_AXES[one.axis]
+            return f"the surveyed points all lie {100 * one.value:+.0f} cm {axis} of the markings"
