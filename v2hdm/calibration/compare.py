@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,13 +17,11 @@ FALSE_ALARM = 1e-3
 """Probability that a camera which has not moved is said to have: an alarm in 20 years of weekly checks."""
 
 MISSED = 0.05
-"""Probability with which a movement of the size told as detectable would be missed."""
+"""Probability with which a movement of the size reported as detectable would be missed."""
 
+# Difference of the intrinsics, as a share of focal length or width, up to which they are of one lens: more of
+# it turns into pitch, yaw and height.
 _SAME_LENS = 2e-3
-"""Difference of the intrinsics, as a share of focal length or width, up to which they are of one lens.
-
-More of it turns into pitch, yaw and height.
-"""
 
 
 @dataclass(frozen=True)
@@ -56,6 +54,22 @@ class Movement:
     def moved(self) -> bool:
         """Whether the difference is more than the two calibrations' own errors."""
         return self.probability < FALSE_ALARM
+
+
+def compare_calibrations(
+    before: Mapping[str, Calibration], after: Mapping[str, Calibration]
+) -> list[Movement]:
+    """The movements of the cameras, by name, that both hold.
+
+    Raises:
+        MapFileError: they have no camera in common, or see :func:`movement`.
+    """
+    common = [name for name in before if name in after]
+    if not common:
+        raise MapFileError(
+            f"the cameras {', '.join(before)} and {', '.join(after)} are compared: no camera in common"
+        )
+    return [movement(before[name], after[name]) for name in common]
 
 
 def movement(before: Calibration, after: Calibration) -> Movement:
@@ -101,18 +115,15 @@ def _check_comparable(before: Calibration, after: Calibration) -> None:
     who = f"camera '{first.name}'"
     if first.name != second.name:
         raise MapFileError(f"{who} and '{second.name}': these are two cameras; give two calibrations of one")
-    if (first.width, first.height, first.distortion_model) != (
-        second.width,
-        second.height,
-        second.distortion_model,
-    ):
+    kinds = [(info.width, info.height, info.distortion_model) for info in (first, second)]
+    if kinds[0] != kinds[1]:
         raise MapFileError(
             f"{who}: image sizes or lens models differ; calibrate with the same intrinsics both times"
         )
-    off = np.abs(first.intrinsic - second.intrinsic)
-    if off.max() > _SAME_LENS * max(first.intrinsic[0, 0], first.width):
+    off = np.abs(first.intrinsic - second.intrinsic).max()
+    if off > _SAME_LENS * max(first.intrinsic[0, 0], first.width):
         raise MapFileError(
-            f"{who}: the intrinsics differ by {off.max():.1f} px, which looks like a movement; calibrate "
+            f"{who}: the intrinsics differ by {off:.1f} px, which looks like a movement; calibrate "
             "with the same intrinsics both times"
         )
     for calibration, which in ((before, "first"), (after, "second")):

@@ -43,27 +43,16 @@ STATED_AS = 4.0
 UNKNOWNS = 6
 """Of a mounting."""
 
-_LEAST_VARIANCE_PX2 = 1e-9
-"""Keeps V invertible where neither error is stated."""
-
-_SUBSETS = 300
-"""Subsets of four points that are tried; of ten points these are all 210."""
-
-_REFINED = 4
-"""Starts that are refined."""
-
+_LEAST_VARIANCE_PX2 = 1e-9  # keeps V invertible where neither error is stated
+_SUBSETS = 300  # subsets of four points that are tried; of ten points these are all 210
+_REFINED = 4  # starts that are refined
+# Rounds of expectation maximisation after which a refinement ends, and steps of each, converged or not.
 _ROUNDS, _STEPS = 60, 30
-"""Rounds of expectation maximisation after which a refinement ends, and steps of each, converged or not."""
-
+# Noise factors q under which a start is scored; the refinement finds its own.
 _FACTORS = np.array([1.0, 10.0, 100.0, 1e3, 1e4])
-"""Noise factors q under which a start is scored; the refinement finds its own."""
-
 _DAMPING = 1e-6
-_SETTLED = 1e-10
-"""Relative change of the log posterior that ends the rounds."""
-
-_SINGULAR = 1e-14
-"""Reciprocal condition of a homography below which its points lie on a line."""
+_SETTLED = 1e-10  # relative change of the log posterior that ends the rounds
+_SINGULAR = 1e-14  # reciprocal condition of a homography below which its points lie on a line
 
 
 @dataclass(frozen=True)
@@ -118,7 +107,7 @@ class Seen:
         """V (..., N, 2, 2), px^2, under mountings (..., 4, 4)."""
         pinhole_from_ground = pinhole_px_from_ground(self.info.intrinsic, cam_from_vehicle)
         by_ground = self.by_pinhole @ homography_jacobian(pinhole_from_ground, self.points_vehicle)
-        # A point behind the camera has no pixel to err by.
+        # a point behind the camera has no pixel to err by.
         by_ground = np.nan_to_num(by_ground, nan=0.0, posinf=0.0, neginf=0.0)
         clicked = (self.noise.pixel_px**2 + _LEAST_VARIANCE_PX2) * np.eye(2)
         return np.asarray(clicked + self.noise.survey_m**2 * by_ground @ np.swapaxes(by_ground, -1, -2))

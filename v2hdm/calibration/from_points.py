@@ -43,29 +43,15 @@ PICTURE_FILE = "points.png"
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}
 """Units other than metres, in m."""
 
-_MISREAD = 0.01
-"""Prior probability of each way to write the table wrongly."""
-
-_SURE = np.log(1e3)
-"""Log odds from which a reading is reported as the cause."""
-
-_ROLL_RAD = np.radians(15.0)
-"""Standard deviation of the roll of cameras on vehicles."""
-
-_BESIDE_M = 1.5
-"""Standard deviation of their place to the left."""
-
-_UNUSUAL = 8.0
-"""Log odds at most against an unusual mounting: some cameras hang on their side or head."""
-
+_MISREAD = 0.01  # prior probability of each way to write the table wrongly
+_SURE = np.log(1e3)  # log odds from which a reading is reported as the cause
+_ROLL_RAD = np.radians(15.0)  # standard deviation of the roll of cameras on vehicles
+_BESIDE_M = 1.5  # standard deviation of their place to the left
+_UNUSUAL = 8.0  # log odds at most against an unusual mounting: some cameras hang on their side or head
+# Median height of cameras on vehicles, m, and the standard deviation of its logarithm.
 _HEIGHT_M, _LOG_HEIGHT = 2.0, 0.7
-"""Median height of cameras on vehicles, m, and the standard deviation of its logarithm."""
-
-_SCALES = (0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0)
-"""Usual ratios of the sizes of one camera's images."""
-
-_STARTS, _ROUNDS = 1, 6
-"""Enough to tell a reading that explains the points from one that does not."""
+_SCALES = (0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0)  # usual ratios of the sizes of one camera's images
+_STARTS, _ROUNDS = 1, 6  # enough to tell a reading that explains the points from one that does not
 
 
 @dataclass(frozen=True)

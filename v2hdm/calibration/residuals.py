@@ -28,15 +28,11 @@ CHANCE = 1e-3
 WELL_KNOWN_M = 0.3
 """Standard deviation up to which a start serves the mapping, which copes with IPMs decimetres off, m."""
 
+# Error of the focal length from which it is another lens or image size, rather than a poor calibration.
 _FOCAL_OFF = 0.05
-"""Error of the focal length from which it is another lens or image size, rather than a poor calibration."""
-
-_RIVAL = float(np.log(100.0))
-"""Log odds up to which another mounting explains the points nearly as well."""
-
+_RIVAL = float(np.log(100.0))  # log odds up to which another mounting explains the points nearly as well
 _FOCAL_ROUNDS = 3
-_AROUND = 12
-"""Places on the circle of :func:`known_around`."""
+_AROUND = 12  # places on the circle of known_around
 
 
 @dataclass(frozen=True)
@@ -185,7 +181,7 @@ def _freed(fit: Fit) -> tuple[float, float, float]:
     """The chance of the disagreement, and the focal length's relative error with its sigma."""
     seen = fit.seen
     right = fit.is_right
-    stated = np.linalg.inv(seen.covariance(fit.cam_from_vehicle)[right])
+    stated = np.asarray(np.linalg.inv(seen.covariance(fit.cam_from_vehicle)[right]), dtype=np.float64)
     slopes = seen.jacobian(fit.cam_from_vehicle)[right]
     residual = seen.residual_px(fit.cam_from_vehicle)[right]
     from_centre = seen.points_px[right] - seen.info.intrinsic[:2, 2]

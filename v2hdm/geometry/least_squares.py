@@ -106,7 +106,7 @@ def gauss_newton(
         limit: shortens a step to what the linearisation holds for.
         settled: whether a step is the last, in place of ``tolerance``.
     """
-    move = retract or (lambda x, step: np.asarray(x) + step)
+    move: Callable[[X, FloatArray], X] = retract or _add
     x, last, damped = x0, linearise(x0), damping
     step, taken = np.zeros(len(last.gradient)), 0
     while taken < steps:
@@ -127,6 +127,10 @@ def gauss_newton(
         else:
             x, last, damped = moved, after, damped / 10.0
     return Fit(x, last, step, False, taken)
+
+
+def _add(x: Any, step: FloatArray) -> Any:
+    return np.asarray(x) + step
 
 
 def _is_short(step: FloatArray, last: Normal, tolerance: float) -> bool:
@@ -154,7 +158,7 @@ def covariance_of(information: FloatArray) -> FloatArray:
     return np.asarray((axes / values) @ axes.T / np.outer(scale, scale))
 
 
-def _scaled(information: FloatArray) -> tuple[FloatArray, Any]:
+def _scaled(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Scales (U,), and the information with them divided out: its diagonal is 1, or 0."""
     diagonal = np.diag(information)
     scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))

@@ -15,28 +15,18 @@ from v2hdm.records import FloatArray, IntArray
 PIXEL_SIGMA = 0.4
 """Largest standard deviation of a patch's place in an image, px; the unit of the residuals."""
 
-_LEAST_PIXEL_SIGMA = 0.1
-"""Interpolation and the grid itself limit the matches to this, px."""
-
+_LEAST_PIXEL_SIGMA = 0.1  # interpolation and the grid itself limit the matches to this, px
+# Median length of a plane vector whose components have a standard deviation of one.
 _RAYLEIGH_MEDIAN = np.sqrt(2 * np.log(2))
-"""Median length of a plane vector whose components have a standard deviation of one."""
-
-_CAUCHY = 2.5
-"""Length of a whitened residual from which on it loses its weight."""
-
+_CAUCHY = 2.5  # length of a whitened residual from which on it loses its weight
+# How far a good lens model and the matching are off, px, smoothly over the image and alike in all: little
+# against a pixel, but thousands of matches share it.
 _LENS_SIGMA_PX = 0.1
-"""How far a good lens model and the matching are off, px, smoothly over the image and alike in all: little
-against a pixel, but thousands of matches share it."""
-
-_BENDS = 6
-"""Terms of a smooth error of each pixel coordinate: a polynomial of the second degree."""
-
+_BENDS = 6  # terms of a smooth error of each pixel coordinate: a polynomial of the second degree
+# Longer steps leave the range in which the equations are linear.
 _LARGEST_TURN_RAD, _LARGEST_SHIFT_M = 0.05, 0.2
-"""Longer steps leave the range in which the equations are linear."""
-
 _STEPS = 20
-_CONVERGED = 0.02
-"""A step below so many standard deviations is the last."""
+_CONVERGED = 0.02  # a step below so many standard deviations is the last
 
 TURN, CENTRE, BENDS = slice(0, 3), slice(3, 6), slice(6, 6 + 2 * _BENDS)
 

@@ -30,11 +30,12 @@ STEEP_RAD = np.deg2rad(10)
 """A camera that looks down less shows too short a stretch of ground: focal length and height are a product,
 and a bent lens looks like a bent road."""
 
+# Axis of the centre, and how far from its survey it may be, m.
 _FREE_CENTRE = {"forward_m": (0, 2.0), "left_m": (1, 2.0), "up_m": (2, 0.3)}
-"""Axis of the centre, and how far from its survey it may be, m."""
-
 _STRAIGHT = "the vehicle drives straight: drive a turn"
 _FEW = "too few matches: drive further"
+# Standard deviation above which a value says nothing, a third of the smallest fault worth reporting, and
+# which drive would make it smaller.
 _OBSERVABLE = {
     "clock_s": (0.015, "speed and direction hardly change: drive a turn"),
     "focal_scale": (0.01, "the camera looks too level and the vehicle drives straight: drive a turn"),
@@ -46,33 +47,19 @@ _OBSERVABLE = {
     "forward_m": (0.1, _STRAIGHT),
     "left_m": (0.1, _STRAIGHT),
 }  # fmt: skip
-"""Standard deviation above which a value says nothing, a third of the smallest fault worth reporting, and
-which drive would make it smaller."""
 
+# Change of the yaw rate within a pair's length that shows 15 ms over the noise of 20 pairs.
 _LEAST_TURN_RADPS = 0.05
-"""Change of the yaw rate within a pair's length that shows 15 ms over the noise of 20 pairs."""
-
-_STRETCHES = 8
-"""Enough to estimate a spread, few enough that each has several pairs."""
-
-_WELL_KNOWN = [0, 1, 2, 5]
-"""Roll, pitch, yaw and height: the other two are mostly the survey's."""
-
+_STRETCHES = 8  # enough to estimate a spread, few enough that each has several pairs
+_WELL_KNOWN = [0, 1, 2, 5]  # roll, pitch, yaw and height: the other two are mostly the survey's
+# Distance between the images of a pair that shows the clock: motion changes within it.
 _CLOCK_APART_M = (0.8, 4.0)
-"""Distance between the images of a pair that shows the clock: motion changes within it."""
-
-_CLOCK_LOOSENED = 2.0
-"""Factor on the stated noise of headings up to which a clock is told apart from them."""
-
-_LEAST_MATCHES = 60
-"""Ten for each of the six quantities of a mounting."""
-
+_CLOCK_LOOSENED = 2.0  # factor on the stated noise of headings up to which a clock is told apart from them
+_LEAST_MATCHES = 60  # ten for each of the six quantities of a mounting
+# How far a paved road departs from a plane, m: roads are laid to 3 to 5 mm under a straightedge, as EN
+# 13036-7 measures it.
 _FLATNESS_M = 0.003
-"""How far a paved road departs from a plane, m: roads are laid to 3 to 5 mm under a straightedge, as EN
-13036-7 measures it."""
-
-_LEAST_PATCHES = 200
-"""Fewer in view of all pairs say nothing, matched or not."""
+_LEAST_PATCHES = 200  # fewer in view of all pairs say nothing, matched or not
 
 
 @dataclass(frozen=True)
@@ -263,7 +250,7 @@ def _free_parameters(
             continue
         value, sigma = _free(name, observations, solved.stated, solved.adjusted)
         largest, why_not = _OBSERVABLE[name]
-        # A fault widens the scatter; that it shows must not hang on it.
+        # a fault widens the scatter; that it shows must not hang on it.
         observable = name != "clock_s" and sigma < largest
         if name == "focal_scale":
             observable = observable and (turns or solved.adjusted.mount.depression_rad > STEEP_RAD)

@@ -11,8 +11,7 @@ from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.rigid import hat, rotation_from_vector
 from v2hdm.records import Camera, CameraInfo, FloatArray
 
-_LENS_STEP = 1e-5
-"""Of the differences by focal length, as a share of it, and by k1."""
+_LENS_STEP = 1e-5  # of the differences by focal length, as a share of it, and by k1
 
 
 @dataclass(frozen=True)
@@ -80,7 +79,7 @@ class Mount:
         pinhole, depth_m = project_ground(self.info.intrinsic, cam_from_map, ground_map)
         size = np.array([self.info.width, self.info.height])
         with np.errstate(invalid="ignore"):
-            # A lens model bends back points far outside the view.
+            # a lens model bends back points far outside the view.
             low, high = -0.5 * size, 1.5 * size
             hidden = (depth_m <= 0) | ((pinhole < low) | (pinhole > high)).any(axis=1)
             pinhole[hidden] = size / 2

@@ -15,11 +15,8 @@ from v2hdm.records import Drive, FloatArray, IntArray, Trajectory
 SMOOTHING_S = 0.5
 """Half width of the parabola fitted to the poses: steering and pedals change the motion no faster."""
 
-_STANDING_MPS = 0.3
-"""Below this a path has no direction: receivers wander by centimetres."""
-
-_ARM_M = 10.0
-"""A turn by one radian moves the ground in view by about this."""
+_STANDING_MPS = 0.3  # below this a path has no direction: receivers wander by centimetres
+_ARM_M = 10.0  # a turn by one radian moves the ground in view by about this
 
 
 @dataclass(frozen=True)
@@ -131,7 +128,7 @@ def spread_pairs(path_m: FloatArray, count: int, shortest_m: float, longest_m: f
         fitting = np.flatnonzero((away >= shortest_m) & (away <= longest_m)).tolist()
         if fitting:
             free = [k for k in fitting if k not in used] or fitting
-            pair = first, min(free, key=lambda k, away=away: abs(float(away[k]) - middle))
+            pair = first, free[int(np.argmin(np.abs(away[free] - middle)))]
             chosen.append(pair)
             used.update(pair)
     return np.array(chosen, dtype=np.int64).reshape(-1, 2)

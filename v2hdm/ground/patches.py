@@ -21,37 +21,21 @@ from v2hdm.records import BoolArray, Drive, FloatArray, IntArray
 ImageArray = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
 
-_LEAST_CORRELATION = 0.5
-"""Normalised cross-correlation below which two patches are not the same ground."""
-
+_LEAST_CORRELATION = 0.5  # normalised cross-correlation below which two patches are not the same ground
+# Ratio of a peak's curvatures; below it the patch holds one straight edge, which slides along itself.
 _LEAST_ROUNDNESS = 0.1
-"""Ratio of a peak's curvatures; below it the patch holds one straight edge, which slides along itself."""
-
-_LEAST_LEAD = 0.1
-"""A second peak, elsewhere in the search, must stay so much below the best one."""
-
-_PEAK_CELLS = 3
-"""Half width of what belongs to a peak, in cells of the grid."""
-
+_LEAST_LEAD = 0.1  # a second peak, elsewhere in the search, must stay so much below the best one
+_PEAK_CELLS = 3  # half width of what belongs to a peak, in cells of the grid
+# Standard deviation of the blur that is taken away: highlights, shadows and wet sheens are wider, and stay
+# with the light or the camera instead of the ground, m.
 _COARSEST_M = 0.1
-"""Standard deviation of the blur that is taken away: highlights, shadows and wet sheens are wider, and stay
-with the light or the camera instead of the ground, m."""
-
-_LEAST_CONTRAST = 1.0
-"""Grey levels; less than this is the noise of an even surface."""
-
-_ALL = 0.9999
-"""Mean of flags that are all set, but for rounding."""
-
+_LEAST_CONTRAST = 1.0  # grey levels; less than this is the noise of an even surface
+_ALL = 0.9999  # mean of flags that are all set, but for rounding
+# Matches of a pair lie on one plane to within this: off it are kerbs, shadows and moving things.
 _HOMOGRAPHY_PX = 2.0
-"""Matches of a pair lie on one plane to within this: off it are kerbs, shadows and moving things."""
-
-_LEAST_OF_A_PAIR = 8
-"""Twice the four that a homography takes."""
-
+_LEAST_OF_A_PAIR = 8  # twice the four that a homography takes
 _PATH_STEP_M = 0.5
-_BEYOND_M = 30.0
-"""How far the path is continued straight beyond the drive's ends: as far as regions reach."""
+_BEYOND_M = 30.0  # how far the path is continued straight beyond the drive's ends: as far as regions reach
 
 
 @dataclass(frozen=True)
@@ -282,9 +266,9 @@ class Matcher:
         found: list[Matches] = []
         for first, second in pairs.tolist():
             centres = patch_centres((poses[first], poses[second]), self._roi, self._path, options)
-            views = [View(self._read(k), mount, poses[k]) for k in (first, second)]
-            matches = match_pair(*views, centres, search_m, options) if len(centres) else Matches.none_of(0)
-            found.append(matches)
+            one, other = (View(self._read(k), mount, poses[k]) for k in (first, second))
+            pair_found = match_pair(one, other, centres, search_m, options) if len(centres) else None
+            found.append(pair_found or Matches.none_of(0))
         counts = [len(each.correlation) for each in found]
         pair = np.repeat(np.arange(len(pairs)), counts)
         sought = sum(each.sought for each in found)

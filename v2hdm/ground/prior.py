@@ -16,17 +16,12 @@ HEAVE_SIGMA_M = 0.01
 STATES = ("roll", "pitch", "yaw", "forward", "left", "up")
 """Errors of a pose, rad and m, in vehicle axes."""
 
-_LEAST_POSE_SIGMA = 1e-6
-"""Poses stated to be exact would make the covariance singular: m or rad."""
-
+_LEAST_POSE_SIGMA = 1e-6  # poses stated to be exact would make the covariance singular: m or rad
+# Largest factor on the error along the path: with more, distance and height slide together.
 _FORWARD_LOOSENED = 2.0
-"""Largest factor on the error along the path: with more, distance and height slide together."""
-
-_UNSURVEYED_M = 0.5
-"""How far the centre that follows from a guess may be off, m."""
-
+_UNSURVEYED_M = 0.5  # how far the centre that follows from a guess may be off, m
+# The ground shows the height to millimetres; a survey's own sigma would only bias it, m.
 _HEIGHT_SIGMA_M = 0.2
-"""The ground shows the height to millimetres; a survey's own sigma would only bias it, m."""
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from v2hdm.records import Calibration, Camera, Drive, FloatArray, IntArray
 GROUND_IPM = "ground"
 """Name of the IPM that the ground gives, beside those of the drive."""
 
-_SURE_RAD = np.deg2rad(0.5)
-"""An estimate with a larger standard deviation is no better than a guess."""
+_SURE_RAD = np.deg2rad(0.5)  # an estimate with a larger standard deviation is no better than a guess
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,6 +14,7 @@ from v2hdm.ground.patches import Sheet, View, read_grey
 from v2hdm.ground.results import GroundEstimate, GroundStatus, MatchedGround, Reading
 from v2hdm.records import Drive, FloatArray
 
+# Each parameter's name, and the factor and unit that people read it in.
 _NAMES = {
     "clock_s": ("clock", 1e3, "ms"),
     "focal_scale": ("focal length", 1e2, "%"),
@@ -23,7 +24,6 @@ _NAMES = {
     "forward_m": ("centre forward", 1e2, "cm"),
     "left_m": ("centre left", 1e2, "cm"),
 }
-"""Each parameter's name, and the factor and unit that people read it in."""
 
 _WHY = {
     GroundStatus.NO_MATCH: "the ground does not match between images: check poses, clock and guess",
@@ -32,9 +32,7 @@ _WHY = {
 
 _GRID_M = 0.02
 _MARGIN_M = 0.6
-_LONGER = 5
-"""Arrows are drawn so many times as long as what they show."""
-
+_LONGER = 5  # arrows are drawn so many times as long as what they show
 _ARROW = (60, 60, 230)
 _GAP_PX = 12
 _TITLE_PX = 30

@@ -16,43 +16,24 @@ from v2hdm.ground.prior import Stated
 from v2hdm.ground.results import Reading
 from v2hdm.records import Drive, FloatArray, IntArray
 
-_PAIRS = 10
-_GRID_M = 0.06
-
+_PAIRS, _GRID_M = 10, 0.06
+# Distance between the images of a pair that a start is found by: a wrong guess shifts the ground by a part
+# of it.
 _SHORT_M = (0.3, 1.6)
-"""Distance between the images of a pair that a start is found by: a wrong guess shifts the ground by a part
-of it."""
-
-_TOLERANCE = 8.0
-"""Factor on the residual from which on a match loses its weight: the guess is degrees off."""
-
+_TOLERANCE = 8.0  # factor on the residual from which on a match loses its weight: the guess is degrees off
 _SEARCH_M = (0.9, 0.5)
-_LEAST_SHARE = 0.15
-"""Share of patches that must find a partner; a fifth do on the even asphalt of real roads."""
-
-_TURNS_DEG = (0.0, 3.0, -3.0, 6.0, -6.0, 9.0, -9.0, 12.0, -12.0)
-"""Pitches that are tried in turn."""
-
-_FARTHEST_DEG = 20.0
-"""A start further off its guess is none."""
-
-_LEAST_MATCHES = 30
-"""Ten for each angle of the mounting."""
-
+_LEAST_SHARE = 0.15  # share of patches that must find a partner; a fifth do on the even asphalt of real roads
+_TURNS_DEG = (0.0, 3.0, -3.0, 6.0, -6.0, 9.0, -9.0, 12.0, -12.0)  # pitches that are tried in turn
+_FARTHEST_DEG = 20.0  # a start further off its guess is none
+_LEAST_MATCHES = 30  # ten for each angle of the mounting
+# Distance between the images of a pair that tells readings apart: poses read wrongly move the ground further
+# than the search.
 _APART_M = (1.2, 2.8)
-"""Distance between the images of a pair that tells readings apart: poses read wrongly move the ground
-further than the search."""
-
-_TURN_RAD = np.deg2rad(2)
-"""A turn between the images of a pair that is no noise of the path."""
-
+_TURN_RAD = np.deg2rad(2)  # a turn between the images of a pair that is no noise of the path
 _READING_SEARCH_M = 0.6
-
-_RIVAL = 0.5
-"""As given, the share of matching patches must not fall below this part of another reading's."""
-
+_RIVAL = 0.5  # as given, the share of matching patches must not fall below this part of another reading's
+# Share from which on another reading is one: on even asphalt of real roads a fifth of the patches match.
 _CLEAR_SHARE = 0.2
-"""Share from which on another reading is one: on even asphalt of real roads a fifth of the patches match."""
 
 
 @dataclass(frozen=True)

@@ -24,35 +24,22 @@ TURN_ACCELERATION_RAD_S2 = 0.3
 SLIP_M_S = 0.05
 """Standard deviation of the sideways speed: tyres slip, and the poses' origin may lie off the rear axle."""
 
+# Sigmas of speed and yaw rate before the first frame: anything that a vehicle does in a yard.
 _START_SPEED_M_S, _START_TURN_RAD_S = 5.0, 0.3
-"""Sigmas of speed and yaw rate before the first frame: anything that a vehicle does in a yard."""
-
+# Squared distance, in sigmas, up to which a detection fits: one in a thousand is farther.
 _LARGEST_SQUARE = float(chi2.isf(1e-3, 8))
-"""Squared distance, in sigmas, up to which a detection fits: one in a thousand is farther."""
-
-_CLEARER_BY = 9.0
-"""How much worse, in the same unit, any other marking must fit: odds of ninety to one."""
-
-_REACH_SIGMAS = 4.0
-_LEAST_REACH_M = 1.5
-"""How far from where a detection seems to lie its marking is looked for, in sigmas of the place, and at
-least: the far corners of a cut marking are not where they seem."""
-
-_UNKNOWN_SIGMA_M = 0.02
-"""Sigma of a corner of a map that states none."""
-
+_CLEARER_BY = 9.0  # how much worse, in the same unit, any other marking must fit: odds of ninety to one
+# How far from where a detection seems to lie its marking is looked for, in sigmas of the place, and at
+# least: the far corners of a cut marking are not where they seem.
+_REACH_SIGMAS, _LEAST_REACH_M = 4.0, 1.5
+_UNKNOWN_SIGMA_M = 0.02  # sigma of a corner of a map that states none
+# Factor of a detection's covariance: an edge that shadow or wear misplaces stays so in the next images.
+# Errors of one corner correlate by about .2 from image to image, over the ten frames that the filter
+# remembers that is 1 + 9 x .2.
 _REPEATS = 2.8
-"""Factor of a detection's covariance: an edge that shadow or wear misplaces stays so in the next images.
-
-Errors of one corner correlate by about .2 from image to image (:mod:`v2hdm.mapping.site_model.places`); over
-the ten frames that the filter remembers that is 1 + 9 x .2.
-"""
-
-_ITERATIONS = 3
-"""Of an update; half a metre off at the first, a few millimetres at the third."""
-
+_ITERATIONS = 3  # of an update; half a metre off at the first, a few millimetres at the third
+# Change of a state, m or rad, after which the next iteration would change no pixel by a tenth.
 _SETTLED = 1e-3
-"""Change of a state, m or rad, after which the next iteration would change no pixel by a tenth."""
 
 X, Y, HEADING, SPEED, TURN, ROLL, PITCH = range(7)
 """The states: place, m, heading, rad, speed, m/s, yaw rate, rad/s; roll and pitch of one frame, rad."""
@@ -60,11 +47,9 @@ X, Y, HEADING, SPEED, TURN, ROLL, PITCH = range(7)
 POSE = [X, Y, HEADING, ROLL, PITCH]
 """The states that an image depends on."""
 
-_STEP = np.array([1e-4, 1e-4, 1e-5, 1e-5, 1e-5])
-"""Steps of the differences by :data:`POSE`: m and rad."""
-
+_STEP = np.array([1e-4, 1e-4, 1e-5, 1e-5, 1e-5])  # steps of the differences by POSE: m and rad
+# Rows (4, 8) of the stacked corners of a detection, for each corner that may be the marking's first.
 _SHIFT_ROWS = (2 * SHIFTS[..., None] + np.arange(2)).reshape(4, 8)
-"""Rows (4, 8) of the stacked corners of a detection, for each corner that may be the marking's first."""
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,7 @@ from v2hdm.settings import check_workers
 from v2hdm.verdict.inputs.drive import check_drive
 from v2hdm.verdict.verdict import Status
 
-_PICTURES = 3
-"""Sample images of each camera: near the start, in the middle and near the end."""
+_PICTURES = 3  # sample images of each camera: near the start, in the middle and near the end
 
 
 def check_up(parsed: argparse.Namespace) -> bool:

@@ -13,45 +13,24 @@ from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import Camera, CameraInfo, CentrePrior, FloatArray
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
+# Lenses sit over their sensor to a few percent of the image's width; cropped images are rare beyond this.
 _OFF_CENTRE = 0.15
-"""Lenses sit over their sensor to a few percent of the image's width; cropped images are rare beyond this."""
-
+# A principal point in the middle of an image smaller or larger by this is that of another resolution.
 _OTHER_SIZE = 0.15
-"""A principal point in the middle of an image smaller or larger by this is that of another resolution."""
-
+# Focal lengths, in image widths, of lenses that map roads: 118 deg wide (fisheyes more) to 11 deg.
 _SHORTEST, _LONGEST = 0.3, 5.0
-"""Focal lengths, in image widths, of lenses that map roads: 118 deg wide (fisheyes more) to 11 deg."""
-
-_SQUARE = 0.03
-"""Pixels are square to far less than this."""
-
-_MISSHAPEN = 0.03
-"""Clicked homographies depart from K [r1 r2 t] by about one percent."""
-
-_BORROWED_M = 1.0
-"""A guess borrowed from another vehicle of the kind, or from a drawing, is decimetres off."""
-
-_NEAR_SURVEY_M = 0.6
-"""Survey and guess that come so close once a sign or a unit is changed show the cause."""
-
+_SQUARE = 0.03  # pixels are square to far less than this
+_MISSHAPEN = 0.03  # clicked homographies depart from K [r1 r2 t] by about one percent
+_BORROWED_M = 1.0  # a guess borrowed from another vehicle of the kind, or from a drawing, is decimetres off
+_NEAR_SURVEY_M = 0.6  # survey and guess that come so close once a sign or a unit is changed show the cause
+# Units that surveys come in, in 1/m.
 _SURVEY_UNITS = {"centimetres": 1e2, "millimetres": 1e3, "feet": 1 / 0.3048, "inches": 1 / 0.0254}
-"""Units that surveys come in, in 1/m."""
-
-_ROI_IN_VIEW = 0.5
-"""At least this share of the ROI must be in the image."""
-
-_ROI_AREA_M2 = 4.0
-"""A smaller ROI holds no whole marking: a dash alone is 3 m long."""
-
+_ROI_IN_VIEW = 0.5  # at least this share of the ROI must be in the image
+_ROI_AREA_M2 = 4.0  # a smaller ROI holds no whole marking: a dash alone is 3 m long
+# Ground per pixel, along the view, at the ROI's far end: beyond, a pixel of noise is half a metre.
 _COARSEST_M = 0.5
-"""Ground per pixel, along the view, at the ROI's far end: beyond, a pixel of noise is half a metre."""
-
-_TILTED_DEG = 30.0
-"""Cameras for roads are mounted upright."""
-
-_HIGHEST_M = 12.0
-_LOWEST_M = 0.3
-"""Heights of cameras on vehicles, cranes' straddle carriers included."""
+_TILTED_DEG = 30.0  # cameras for roads are mounted upright
+_LOWEST_M, _HIGHEST_M = 0.3, 12.0  # heights of cameras on vehicles, cranes' straddle carriers included
 
 
 def check_camera(name: str, camera: Camera) -> list[Finding]:

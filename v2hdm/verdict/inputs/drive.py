@@ -19,13 +19,10 @@ from v2hdm.verdict.inputs.poses import Motion, check_attitude, check_jumps, chec
 from v2hdm.verdict.inputs.recording import check_clocks, check_images
 from v2hdm.verdict.verdict import Finding, Status, Verdict, judge, passed
 
+# Sigmas of roll and pitch that the mapping takes for noise, ground that leans more is bent; and sigmas
+# beyond which markings on it are wrong by many times what the map states.
 _ROAD_SIGMAS, _ROAD_BENT = 3.0, 10.0
-"""Sigmas of roll and pitch that the mapping takes for noise, ground that leans more is bent; and sigmas
-beyond which markings on it are wrong by many times what the map states."""
-
-_LEAST_SWAY_RAD = 0.003
-"""Roll and pitch that every vehicle sways by, whatever pose_noise says."""
-
+_LEAST_SWAY_RAD = 0.003  # roll and pitch that every vehicle sways by, whatever pose_noise says
 _STEPS = ("position jumps", "height jumps", "pose scatter", "image spacing", "pose gaps", "pose rate")
 _MOUNTING = ("roi", "roi range", "ipm against camera matrix", "camera height", "survey against guess")
 _SURVEY = ("survey height", "survey forward", "survey left")

@@ -24,47 +24,26 @@ from v2hdm.records import Camera, Drive, FloatArray, Trajectory
 from v2hdm.verdict.inputs.heading import Path
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
-_SURE = 5.0
-"""Sigmas that a quantity must be off."""
-
-_CLOCK_S = 0.015
-"""Clocks of clean drives were found right to 7 ms; 15 ms at 5 m/s are 7 cm."""
-
-_CORRECTABLE_S = 0.25
-"""A clock found off by more may lie beyond the search; it is not corrected."""
-
+_SURE = 5.0  # sigmas that a quantity must be off
+_CLOCK_S = 0.015  # clocks of clean drives were found right to 7 ms; 15 ms at 5 m/s are 7 cm
+_CORRECTABLE_S = 0.25  # a clock found off by more may lie beyond the search; it is not corrected
+# Focal lengths of clean drives were found right to .8 %; confusion with the pitch costs 1 to 2 %.
 _FOCAL = 0.025
-"""Focal lengths of clean drives were found right to .8 %; confusion with the pitch costs 1 to 2 %."""
-
+# Change of k1 that moves the corner of a lens 74 deg wide by 3 px; clean drives stay below .001.
 _DISTORTION = 0.02
-"""Change of k1 that moves the corner of a lens 74 deg wide by 3 px; clean drives stay below .001."""
-
-_GRADE = 0.001
-"""Rise of the poses over the ground, m per m: clean drives stay below .0003."""
-
-_UP_M = 0.08
-"""Heights of clean drives were found right to 6 cm, mostly to 1."""
-
-_ALONG_M = 0.15
-"""Places in the plane of clean drives were found right to 8 cm."""
-
-_VAGUE_M = 0.1
-"""A place in the plane that is known worse than this says nothing of a survey."""
-
+_GRADE = 0.001  # rise of the poses over the ground, m per m: clean drives stay below .0003
+_UP_M = 0.08  # heights of clean drives were found right to 6 cm, mostly to 1
+_ALONG_M = 0.15  # places in the plane of clean drives were found right to 8 cm
+_VAGUE_M = 0.1  # a place in the plane that is known worse than this says nothing of a survey
+# Median residual of matched patches: .23 to .46 on clean drives, 1.1 to 1.5 without a lens' distortion.
 _RESIDUAL = 0.8
-"""Median residual of matched patches: .23 to .46 on clean drives, 1.1 to 1.5 without a lens' distortion."""
-
-_PULL = 3.0
-"""Root mean square of the poses' errors in their stated sigmas: up to 2.2 on clean drives."""
-
+_PULL = 3.0  # root mean square of the poses' errors in their stated sigmas: up to 2.2 on clean drives
+# More patches match under another reading than as given by this share: they lie .1 to .2 below on clean
+# turning drives, and differ by .03 from pair to pair of images.
 _LEADS = 0.05
-"""More patches match under another reading than as given by this share: they lie .1 to .2 below on clean
-turning drives, and differ by .03 from pair to pair of images."""
-
 _FOOT_M = 0.3048
-
+# A third of the usual pairs: whether the ground matches shows at once.
 _QUICK = GroundOptions(pairs=12, free=(), readings=False)
-"""A third of the usual pairs: whether the ground matches shows at once."""
 
 CHECKS = (
     "ground match", "path", "clock", "focal length from ground", "distortion", "grade", "survey height",
@@ -384,6 +363,8 @@ def _turned(camera: Camera) -> Camera:
     )
 
 
+# The mistakes that are tried, the likelier first, with how to undo them; each costs some seconds on a drive
+# that fails anyway.
 _MISTAKES: tuple[tuple[Callable[[Drive], Drive], str], ...] = (
     (
         lambda drive: scaled(drive, _FOOT_M),
@@ -395,5 +376,3 @@ _MISTAKES: tuple[tuple[Callable[[Drive], Drive], str], ...] = (
         "calibration",
     ),
 )
-"""The mistakes that are tried, the likelier first, with how to undo them; each costs some seconds on a drive
-that fails anyway."""

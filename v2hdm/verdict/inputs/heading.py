@@ -18,26 +18,18 @@ from v2hdm.records import BoolArray, FloatArray
 from v2hdm.verdict.inputs.poses import STEEPEST_DEG, Chords, Motion, angle_between
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
+# Course and heading agree within this: an origin 1.5 m ahead of the axle errs so on a circle of 6 m.
 _AGREES_RAD = np.deg2rad(15)
-"""Course and heading agree within this: an origin 1.5 m ahead of the axle errs so on a circle of 6 m."""
-
+# A convention fits if this share of the chords agrees: the rest may be wheel spin, ferries, bad fixes.
 _FITS = 0.8
-"""A convention fits if this share of the chords agrees: the rest may be wheel spin, ferries, bad fixes."""
-
+# A heading that is off by this moves a camera 3.4 m ahead of the axle by 6 cm, three sigmas of a survey.
 _MISALIGNED_RAD = np.deg2rad(1.0)
-"""A heading that is off by this moves a camera 3.4 m ahead of the axle by 6 cm, three sigmas of a survey."""
-
+# A chord on which the heading turns less is straight: where the origin sits does not matter there.
 _STRAIGHT_RAD = np.deg2rad(2.0)
-"""A chord on which the heading turns less is straight: where the origin sits does not matter there."""
-
-_LEVER_M = 0.3
-"""Origin this far from the axle, along the vehicle: 15 sigmas of a surveyed camera centre."""
-
+_LEVER_M = 0.3  # origin this far from the axle, along the vehicle: 15 sigmas of a surveyed camera centre
+# Sigmas beyond which an offset is reported: the poses' drift makes sigmas optimistic by up to two.
 _SURE = 5.0
-"""Sigmas beyond which an offset is reported: the poses' drift makes sigmas optimistic by up to two."""
-
-_CURVED_PER_M = 0.02
-"""Curvature of a turn that shows where the origin sits."""
+_CURVED_PER_M = 0.02  # curvature of a turn that shows where the origin sits
 
 Undo = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 """Takes positions (P, 3) and rotations (P, 3, 3) to what they should be."""

@@ -21,49 +21,29 @@ SLOWEST_MPS = 0.5
 STEEPEST_DEG = 15.0
 """No road that is mapped is steeper, nor rolls a vehicle farther."""
 
+# Chords per drive: enough for medians to a hundredth of a degree, and a tenth of a second of work.
 _MOST_STARTS = 4000
-"""Chords per drive: enough for medians to a hundredth of a degree, and a tenth of a second of work."""
-
-_FASTEST_MPS = 40.0
-"""No vehicle maps markings faster (144 km/h): its images would be metres apart."""
-
-_HARDEST_MPS2 = 9.0
-"""No tyre turns or brakes a road vehicle harder."""
-
+_FASTEST_MPS = 40.0  # no vehicle maps markings faster (144 km/h): its images would be metres apart
+_HARDEST_MPS2 = 9.0  # no tyre turns or brakes a road vehicle harder
+# A second difference of noisy positions has sqrt(6) sigmas; five of those are never reached by chance.
 _EXTREME = 12.0
-"""A second difference of noisy positions has sqrt(6) sigmas; five of those are never reached by chance."""
-
-_HEIGHT_NOISE = 2.0
-"""RTK heights are about twice as noisy as positions in the plane."""
-
+_HEIGHT_NOISE = 2.0  # RTK heights are about twice as noisy as positions in the plane
+# Metres in a unit that positions may be in by mistake; of an angle on the earth at the equator.
 _TOO_LARGE: Mapping[str, float] = {"centimetres": 1e2, "millimetres": 1e3}
 _TOO_SMALL: Mapping[str, float] = {"kilometres": 1e3, "degrees": 1.113e5, "radians": 6.378e6}
-"""Metres in a unit that positions may be in by mistake; of an angle on the earth at the equator."""
-
-_GRADE_CHANGE_RAD = 0.02
-"""Grades must spread over this (2 %) before the sign of the pitch is observable."""
-
-_RTK_M = 0.3
-"""A position that is worse than this is no RTK, not even with a float solution."""
-
+_GRADE_CHANGE_RAD = 0.02  # grades must spread over this (2 %) before the sign of the pitch is observable
+_RTK_M = 0.3  # a position that is worse than this is no RTK, not even with a float solution
+# Two degrees: worse than any heading from two antennas a metre apart, or from a gyro compass.
 _HEADING_RAD = 0.035
-"""Two degrees: worse than any heading from two antennas a metre apart, or from a gyro compass."""
-
-_ROLL_PITCH_RAD = 0.05
-"""Three degrees: a vehicle that sways more than this on its suspension overturns."""
-
+_ROLL_PITCH_RAD = 0.05  # three degrees: a vehicle that sways more than this on its suspension overturns
+# Poses that scatter so many times more than stated make every sigma of the map wrong by as much, and beyond
+# the second the map itself.
 _UNDERSTATED, _USELESS = 3.0, 10.0
-"""Poses that scatter so many times more than stated make every sigma of the map wrong by as much, and beyond
-the second the map itself."""
-
+# The fourth difference: driving at 10 Hz leaves millimetres in it, white noise sqrt(70) sigmas.
 _DIFFERENCES = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
-"""The fourth difference: driving at 10 Hz leaves millimetres in it, white noise sqrt(70) sigmas."""
-
+# Poses whose intervals vary less than this share are evenly spaced, as a fourth difference needs.
 _REGULAR = 0.2
-"""Poses whose intervals vary less than this share are evenly spaced, as a fourth difference needs."""
-
-_SLOWEST_HZ = 8.0
-"""Below this rate driving itself shows in a fourth difference."""
+_SLOWEST_HZ = 8.0  # below this rate driving itself shows in a fourth difference
 
 
 @dataclass(frozen=True)
@@ -216,7 +196,7 @@ def _jump(which: str, motion: Motion, values: FloatArray, limit: FloatArray) -> 
     size = np.linalg.norm(off, axis=1)
     worst = int(np.argmax(size / limit))
     count = int((size > limit).sum())
-    # A step shows as half of it before and minus half of it behind.
+    # a step shows as half of it before and minus half of it behind.
     beside = off[max(worst - 1, 0) : worst + 2]
     step_m = float(np.linalg.norm(beside - off[worst], axis=1).max())
     return judge(

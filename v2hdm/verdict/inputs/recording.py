@@ -19,44 +19,22 @@ from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
 _Item = TypeVar("_Item")
 
+# Acceleration and turning of ordinary driving: between poses t apart a line errs by this times t^2 / 8.
 _DRIVEN_MPS2 = 2.0
-"""Acceleration and turning of ordinary driving: between poses t apart a line errs by this times t^2 / 8."""
-
-_WITHOUT_POSE = 0.1
-"""More than this share of images without a pose is no brief loss at the ends of a drive."""
-
-_HALF = 0.5
-"""Beyond this share of the recording the drive is not the one that was meant."""
-
-_HELD = 0.02
-"""More than this share of repeated poses on the way is a receiver slower than its log."""
-
-_VIEWS = 2.0
-"""A marking must be in the ROI of at least two images to be placed and checked."""
-
-_SAMPLES = 12
-"""Pairs of consecutive images looked at in each camera; each costs about 15 ms."""
-
-_REDUCED = 4
-"""Images are decoded at a quarter of their size."""
-
-_MOVED_M = 0.2
-"""Between images that far apart the near road moves by tens of pixels."""
-
+_WITHOUT_POSE = 0.1  # more than this share of images without a pose is no brief loss at the ends of a drive
+_HALF = 0.5  # beyond this share of the recording the drive is not the one that was meant
+_HELD = 0.02  # more than this share of repeated poses on the way is a receiver slower than its log
+_VIEWS = 2.0  # a marking must be in the ROI of at least two images to be placed and checked
+_SAMPLES = 12  # pairs of consecutive images looked at in each camera; each costs about 15 ms
+_REDUCED = 4  # images are decoded at a quarter of their size
+_MOVED_M = 0.2  # between images that far apart the near road moves by tens of pixels
+# Mean difference in grey values below which two images are one, encoded twice; noise alone makes more.
 _SAME_GREY = 0.5
-"""Mean difference in grey values below which two images are one, encoded twice; noise alone makes more."""
-
+# Share of repeated images on the way that passes: a dropped frame now and then, filled by the one before.
 _FROZEN = 0.02
-"""Share of repeated images on the way that passes: a dropped frame now and then, filled by the one before."""
-
-_STUCK = 3
-"""Repeats in a row that no single dropped frame makes."""
-
-_BRIGHTEST, _DARKEST = 250, 5
-"""Grey values at which an image of 8 bits is clipped."""
-
-_CLIPPED = 0.25
-"""Share of clipped road that hides markings; paint itself takes a few percent."""
+_STUCK = 3  # repeats in a row that no single dropped frame makes
+_BRIGHTEST, _DARKEST = 250, 5  # grey values at which an image of 8 bits is clipped
+_CLIPPED = 0.25  # share of clipped road that hides markings; paint itself takes a few percent
 
 
 def check_clocks(drive: Drive, motion: Motion) -> Iterator[Finding]:

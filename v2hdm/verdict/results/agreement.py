@@ -43,8 +43,8 @@ OVERLAP = 0.1
 DOUBLES_LIMIT = 0.02
 """Share of markings that overlap another: clean drives have none, one in a hundred may be on old paint."""
 
+# Added to a covariance's diagonal (m^2, rad^2): a tenth of a millimetre, a thousandth of a degree.
 _LEAST_VARIANCE = np.array([1e-8] * 3 + [1e-10] * 3)
-"""Added to a covariance's diagonal (m^2, rad^2): a tenth of a millimetre, a thousandth of a degree."""
 
 
 def mounting_sigmas(one: Calibration, other: Calibration, of_both: bool = False) -> float:

@@ -51,6 +51,7 @@ JUMP_LIMIT = 9.0
 LEVER_OBSERVABLE_M = 0.15
 """Sigma of the point that the poses are of, m, up to which a drive makes it observable."""
 
+# The check that reports each fault, and the recovery.
 _CHECKS: Mapping[Fault, tuple[str, str]] = {
     Fault.CLOCK: (
         "clock", "synchronise the clocks of cameras and receiver, or shift the stamps by as much",
@@ -80,13 +81,12 @@ _CHECKS: Mapping[Fault, tuple[str, str]] = {
     Fault.CONTROL: ("surveyed points", "measure it anew, or leave it out of mapping.survey"),
     Fault.DATUM: ("surveyed points", "check that survey and poses have the same datum and origin"),
 }  # fmt: skip
-"""The check that reports each fault, and the recovery."""
 
+# How an input was corrected, where it was not just left out.
 _CORRECTED_BY = {
     Fault.CLOCK: "the images were posed anew",
     Fault.SIZE: "all known sizes were left out of the result",
 }
-"""How an input was corrected, where it was not just left out."""
 
 _POSE_KEYS = {"roll": "roll_pitch_rad", "pitch": "roll_pitch_rad", "heading": "heading_rad"}
 _WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))
@@ -278,7 +278,7 @@ def _poses(evidence: SolveEvidence) -> Iterator[Finding]:
 
 
 def _excluded(best: MethodResult) -> Finding:
-    # A merely uncertain candidate was too far off, or too briefly in view: it contradicts nothing.
+    # a merely uncertain candidate was too far off, or too briefly in view: it contradicts nothing.
     left_out = sum(one.reason != TOO_UNCERTAIN for one in best.excluded)
     count = left_out + len(best.hd_map.markings)
     share = left_out / max(count, 1)
