@@ -1,9 +1,11 @@
-"""The ground of a small drive tells its mounting and what is wrong with its poses, clock and lens."""
+"""The ground of a small drive shows its mounting and what is wrong with its poses, clock and lens."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from tests.ground.scene import CENTRE, INFO, extrinsic, make_drive, with_guess, 
 from v2hdm.geometry.mounting import mounting_angles
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.ground import GroundOptions, GroundStatus, Reading, better_start, estimate, estimate_ground
+from v2hdm.ground.patches import read_grey
 from v2hdm.records import Drive, FloatArray, Trajectory
 
 TRUE = extrinsic(roll_deg=0.5, pitch_deg=20.0, yaw_deg=-1.0)
@@ -132,3 +135,11 @@ def test_the_mapper_starts_from_the_ground_only_where_it_was_found(straight, tmp
     assert started.initial_ipm == "ground"
     nothing = replace(found, status=GroundStatus.NO_MATCH, calibration=None)
     assert better_start(straight, {"front": nothing}).cameras["front"].initial_ipm == "estimated"
+
+
+def test_the_grey_of_an_image_is_the_same_from_a_jpeg_and_from_its_pixels_as_png(tmp_path: Path) -> None:
+    colours = np.random.default_rng(2).integers(0, 256, (60, 80, 3), dtype=np.uint8)
+    jpeg, png = tmp_path / "a.jpg", tmp_path / "a.png"
+    cv2.imwrite(str(jpeg), cv2.resize(colours, (320, 240)))
+    cv2.imwrite(str(png), cv2.imread(str(jpeg)))
+    np.testing.assert_array_equal(read_grey(str(jpeg)), read_grey(str(png)))
