@@ -16,9 +16,7 @@ from v2hdm.records import Calibration, FloatArray
 FALSE_ALARM = 1e-3
 """Probability that a camera which has not moved is said to have: an alarm in 20 years of weekly checks."""
 
-MISSED = 0.05
-"""Probability with which a movement of the size reported as detectable would be missed."""
-
+_MISSED = 0.05  # probability with which a movement of the size reported as detectable would be missed
 # Difference of the intrinsics, as a share of focal length or width, up to which they are of one lens: more of
 # it turns into pitch, yaw and height.
 _SAME_LENS = 2e-3
@@ -47,7 +45,7 @@ class Movement:
     def detectable(self) -> FloatArray:
         """The least shifts, m, and turns, rad, each alone (6,), that would hardly be missed."""
         limit = chi2.isf(FALSE_ALARM, 6)
-        needed = brentq(lambda offset: ncx2.sf(limit, 6, offset) - (1 - MISSED), 1.0, 1e3)
+        needed = brentq(lambda offset: ncx2.sf(limit, 6, offset) - (1 - _MISSED), 1.0, 1e3)
         return np.asarray(np.sqrt(needed / np.diag(np.linalg.inv(self.covariance))))
 
     @property

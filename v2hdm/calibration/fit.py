@@ -34,8 +34,7 @@ from v2hdm.geometry.rigid import exp, hat
 from v2hdm.geometry.tensors import inverse_depth
 from v2hdm.records import BoolArray, CameraInfo, FloatArray
 
-WRONG_SHARE = 0.02
-"""Prior probability that a point is wrong altogether: one slip in five tables of ten."""
+_WRONG_SHARE = 0.02  # prior probability that a point is wrong altogether: one slip in five tables of ten
 
 STATED_AS = 4.0
 """Observations that the stated errors count for: people know theirs to a factor of about 1.4."""
@@ -150,8 +149,8 @@ class Seen:
         """
         q = np.asarray(factor)[..., None]
         log_right = -square / (2 * q) - np.log(2 * np.pi * q * np.sqrt(np.linalg.det(covariance)))
-        right = np.log1p(-WRONG_SHARE) + log_right
-        total = np.logaddexp(right, np.log(WRONG_SHARE) + self.log_anywhere)
+        right = np.log1p(-_WRONG_SHARE) + log_right
+        total = np.logaddexp(right, np.log(_WRONG_SHARE) + self.log_anywhere)
         return total, np.asarray(np.exp(right - total))
 
     def log_posterior(

@@ -25,9 +25,8 @@ from v2hdm.verdict.verdict import Finding, Status, judge, passed
 CHANCE = 1e-3
 """Probability with which a right calibration raises a finding."""
 
-WELL_KNOWN_M = 0.3
-"""Standard deviation up to which a start serves the mapping, which copes with IPMs decimetres off, m."""
-
+# Standard deviation up to which a start serves the mapping, which copes with IPMs decimetres off, m.
+_WELL_KNOWN_M = 0.3
 # Error of the focal length from which it is another lens or image size, rather than a poor calibration.
 _FOCAL_OFF = 0.05
 _RIVAL = float(np.log(100.0))  # log odds up to which another mounting explains the points nearly as well
@@ -232,7 +231,7 @@ def judge_fit(points: SurveyedPoints, fits: Sequence[Fit], residuals: Residuals)
     yield _intrinsics(fit, about)
     worst = known_around(fit)
     yield judge(
-        "known ground", about, min(worst, 1e6), WELL_KNOWN_M, "m",
+        "known ground", about, min(worst, 1e6), _WELL_KNOWN_M, "m",
         fine=f"the IPM is known to {100 * worst:.1f} cm or better around the points",
         wrong=f"the IPM is known to {worst:.2g} m only around the points: survey more of them, near and far, "
         "left and right; points along one line fix no camera",

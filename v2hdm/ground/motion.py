@@ -12,9 +12,8 @@ from v2hdm.ground.results import Reading
 from v2hdm.io.drive.trajectory import interpolate
 from v2hdm.records import Drive, FloatArray, IntArray, Trajectory
 
-SMOOTHING_S = 0.5
-"""Half width of the parabola fitted to the poses: steering and pedals change the motion no faster."""
-
+# Half width of the parabola fitted to the poses: steering and pedals change the motion no faster.
+_SMOOTHING_S = 0.5
 _STANDING_MPS = 0.3  # below this a path has no direction: receivers wander by centimetres
 _ARM_M = 10.0  # a turn by one radian moves the ground in view by about this
 
@@ -92,10 +91,10 @@ def _velocity(trajectory: Trajectory) -> FloatArray:
 
 
 def _slopes(at: FloatArray, values: FloatArray) -> FloatArray:
-    """Derivatives (P, K) of values (P, K): of parabolas fitted within :data:`SMOOTHING_S` of each time."""
+    """Derivatives (P, K) of values (P, K): of parabolas fitted within :data:`_SMOOTHING_S` of each time."""
     out = np.zeros_like(values)
-    first = np.searchsorted(at, at - SMOOTHING_S - 1e-9)
-    last = np.searchsorted(at, at + SMOOTHING_S + 1e-9)
+    first = np.searchsorted(at, at - _SMOOTHING_S - 1e-9)
+    last = np.searchsorted(at, at + _SMOOTHING_S + 1e-9)
     for k in range(len(at)):
         # Three poses at least, even where they are further apart.
         low, high = max(min(first[k], k - 1), 0), min(max(last[k], k + 2), len(at))

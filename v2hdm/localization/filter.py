@@ -15,15 +15,12 @@ from v2hdm.geometry.quadrilateral import SHIFTS, align, block_diagonal
 from v2hdm.geometry.rigid import inverse, rotation_from_euler
 from v2hdm.records import BoolArray, FloatArray, HdMap, IntArray, Marking
 
-ACCELERATION_M_S2 = 1.5
-"""Standard deviation of the acceleration that holds for a second: a yard truck brakes with 2 to 3 m/s^2."""
-
-TURN_ACCELERATION_RAD_S2 = 0.3
-"""The same of the yaw rate: full lock within about two seconds at walking pace."""
-
-SLIP_M_S = 0.05
-"""Standard deviation of the sideways speed: tyres slip, and the poses' origin may lie off the rear axle."""
-
+# Standard deviation of the acceleration that holds for a second: a yard truck brakes with 2 to 3 m/s^2.
+_ACCELERATION_M_S2 = 1.5
+# The same of the yaw rate: full lock within about two seconds at walking pace.
+_TURN_ACCELERATION_RAD_S2 = 0.3
+# Standard deviation of the sideways speed: tyres slip, and the poses' origin may lie off the rear axle.
+_SLIP_M_S = 0.05
 # Sigmas of speed and yaw rate before the first frame: anything that a vehicle does in a yard.
 _START_SPEED_M_S, _START_TURN_RAD_S = 5.0, 0.3
 # Squared distance, in sigmas, up to which a detection fits: one in a thousand is farther.
@@ -110,9 +107,9 @@ def predict(state: State, step_s: float, attitude_rad: float) -> State:
     pushed[:2, 0], pushed[SPEED, 0] = step_s**2 / 2 * ahead, step_s
     pushed[:2, 1] = speed * step_s**3 / 6 * left
     pushed[HEADING, 1], pushed[TURN, 1] = step_s**2 / 2, step_s
-    noise = np.square([ACCELERATION_M_S2, TURN_ACCELERATION_RAD_S2])
+    noise = np.square([_ACCELERATION_M_S2, _TURN_ACCELERATION_RAD_S2])
     covariance = change @ state.covariance @ change.T + (pushed * noise) @ pushed.T
-    covariance[:2, :2] += (SLIP_M_S * step_s) ** 2 * np.outer(left, left)
+    covariance[:2, :2] += (_SLIP_M_S * step_s) ** 2 * np.outer(left, left)
     covariance[[ROLL, PITCH], [ROLL, PITCH]] += attitude_rad**2
     return State(mean, covariance)
 

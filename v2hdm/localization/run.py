@@ -40,18 +40,13 @@ from v2hdm.records import (
 from v2hdm.report.outputs import result_folder, write_json
 from v2hdm.settings import check_workers
 
-START_SIGMA_M, START_SIGMA_RAD = 0.5, float(np.deg2rad(3.0))
-"""How well the first pose is known: a coordinate of a place that RTK has once fixed, and a compass."""
-
-LOST_M = 0.3
-"""With a larger standard deviation of the place the vehicle does not know where it is: half a dash's gap."""
-
-LEAST_MATCHED = 0.5
-"""Share of the detections that a map of the site explains at least: one explained .86, another site's .04."""
-
-IN_VIEW_M = 15.0
-"""A marking is in view whose corners are all in an image and no farther from the camera."""
-
+# How well the first pose is known: a coordinate of a place that RTK has once fixed, and a compass.
+_START_SIGMA_M, _START_SIGMA_RAD = 0.5, float(np.deg2rad(3.0))
+# With a larger standard deviation of the place the vehicle does not know where it is: half a dash's gap.
+_LOST_M = 0.3
+# Share of the detections that a map of the site explains at least: one explained .86, another site's .04.
+_LEAST_MATCHED = 0.5
+_IN_VIEW_M = 15.0  # A marking is in view whose corners are all in an image and no farther from the camera
 _PANELS = (("ahead", 100.0, "cm"), ("to the left", 100.0, "cm"), ("heading", float(np.degrees(1.0)), "deg"))
 _KNOWN, _LOST, _BAND = "#0072b2", "#d55e00", "#bbbbbb"
 
@@ -86,7 +81,7 @@ class Localised:
     @property
     def known(self) -> BoolArray:
         """In which frames (F,) the vehicle knows where it is."""
-        return np.array([state.sigma_m < LOST_M for state in self.states])
+        return np.array([state.sigma_m < _LOST_M for state in self.states])
 
     @property
     def error(self) -> FloatArray:
@@ -113,7 +108,7 @@ class Localised:
     @property
     def explained(self) -> bool:
         """Whether the map explains the drive; where it does not, no figure can be relied on."""
-        return bool(self.matched.sum() / max(self.detections, 1) >= LEAST_MATCHED)
+        return bool(self.matched.sum() / max(self.detections, 1) >= _LEAST_MATCHED)
 
     def figures(self) -> dict[str, float | int]:
         """The figures of ``localization.json``, errors over the frames with a marking in view."""
@@ -164,7 +159,7 @@ def localize(
     sightings = collect_sightings(drive, detections, names)
     attitude_rad = drive.pose_noise.roll_pitch_rad
     markings = Markings(hd_map)
-    state = start(sightings.map_from_vehicle[0], START_SIGMA_M, START_SIGMA_RAD, attitude_rad)
+    state = start(sightings.map_from_vehicle[0], _START_SIGMA_M, _START_SIGMA_RAD, attitude_rad)
     states, matched = [], []
     for frame, stamp_s in enumerate(sightings.stamp_s):
         if frame:
@@ -242,7 +237,7 @@ def _in_view(
         cam_from_map = calibrations[image.camera].cam_from_vehicle @ np.linalg.inv(image.map_from_vehicle)
         pixels, depth_m = project_ground(info.intrinsic, cam_from_map, corners.reshape(-1, 2))
         inside = (pixels >= 0) & (pixels < [info.width, info.height])
-        near = inside.all(axis=1) & (depth_m > 0) & (depth_m < IN_VIEW_M)
+        near = inside.all(axis=1) & (depth_m > 0) & (depth_m < _IN_VIEW_M)
         out[times[image.taken_s]] |= bool(near.reshape(-1, 4).all(axis=1).any())
     return out
 

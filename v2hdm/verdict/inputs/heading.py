@@ -69,7 +69,8 @@ def _axes(matrix: list[list[float]]) -> Undo:
     return lambda position, rotation: (position, np.asarray(rotation @ np.array(matrix)))
 
 
-CONVENTIONS: Mapping[str, Convention] = {
+# The usual mistakes, the likelier first.
+_CONVENTIONS: Mapping[str, Convention] = {
     "quaternion order": Convention(
         _reordered, "the quaternions are in the order qw qx qy qz; write them as qx qy qz qw"
     ),
@@ -94,10 +95,9 @@ CONVENTIONS: Mapping[str, Convention] = {
     "south": Convention(_turned(-1, 180), "yaw counts clockwise from west; write yaw = 180 deg - it"),
     "from south": Convention(_turned(-1, -90), "yaw counts clockwise from south; write yaw = -90 deg - it"),
 }
-"""The usual mistakes, the likelier first."""
 
-REFLECTED = ("from north", "clockwise", "south", "from south")
-"""Conventions of yaw under which poses alone look like a path whose axes are swapped."""
+# Conventions of yaw under which poses alone look like a path whose axes are swapped.
+_REFLECTED = ("from north", "clockwise", "south", "from south")
 
 AXES_SWAPPED = (
     "x and y of the positions are swapped or one has the wrong sign, which mirrors the world; write x east "
@@ -204,10 +204,10 @@ def _cause(motion: Motion, path: Path | None) -> str | None:
     """The sentence that names what is wrong; None where it is not the heading."""
     if path is Path.MIRRORED:
         return AXES_SWAPPED
-    fitting = [name for name, one in CONVENTIONS.items() if _agreement(motion, one.undo)[0] >= _FITS]
+    fitting = [name for name, one in _CONVENTIONS.items() if _agreement(motion, one.undo)[0] >= _FITS]
     if fitting:
-        says = [CONVENTIONS[name].says for name in fitting[:2]]
-        if path is None and fitting[0] in REFLECTED:
+        says = [_CONVENTIONS[name].says for name in fitting[:2]]
+        if path is None and fitting[0] in _REFLECTED:
             says.insert(1, AXES_SWAPPED)
         return "; or ".join(says)
     if _upright(motion.rotation, motion.chords).mean() < _FITS:

@@ -12,11 +12,10 @@ from v2hdm.ground.motion import trajectory_of_images
 from v2hdm.records import BoolArray, Drive, FloatArray, IntArray, PoseNoise
 from v2hdm.verdict.verdict import Finding, Status, judge
 
-CHORD_M = 2.0
-"""Length of the chords whose direction is the course: RTK noise of 2 cm turns one by less than a degree."""
-
-SLOWEST_MPS = 0.5
-"""A vehicle that takes longer for a chord counts as standing: its path is then mostly noise."""
+# Length of the chords whose direction is the course: RTK noise of 2 cm turns one by less than a degree.
+_CHORD_M = 2.0
+# A vehicle that takes longer for a chord counts as standing: its path is then mostly noise.
+_SLOWEST_MPS = 0.5
 
 STEEPEST_DEG = 15.0
 """No road that is mapped is steeper, nor rolls a vehicle farther."""
@@ -48,7 +47,7 @@ _SLOWEST_HZ = 8.0  # below this rate driving itself shows in a fourth difference
 
 @dataclass(frozen=True)
 class Chords:
-    """Stretches of :data:`CHORD_M` that the vehicle moved: indices (N,) of their first and last pose."""
+    """Stretches of :data:`_CHORD_M` that the vehicle moved: indices (N,) of their first and last pose."""
 
     first: IntArray
     last: IntArray
@@ -121,9 +120,9 @@ class Motion:
 
     def _reached(self, start: int) -> int | None:
         """The first pose a chord away from ``start``, if the vehicle gets there at a moving speed."""
-        end = np.searchsorted(self.stamp_s, self.stamp_s[start] + CHORD_M / SLOWEST_MPS, side="right")
+        end = np.searchsorted(self.stamp_s, self.stamp_s[start] + _CHORD_M / _SLOWEST_MPS, side="right")
         offset = self.position[start + 1 : end, :2] - self.position[start, :2]
-        reached = np.flatnonzero((offset**2).sum(axis=1) >= CHORD_M**2)
+        reached = np.flatnonzero((offset**2).sum(axis=1) >= _CHORD_M**2)
         return start + 1 + int(reached[0]) if len(reached) else None
 
 
@@ -138,7 +137,7 @@ def check_path(motion: Motion) -> list[Finding]:
     if not len(motion.chords):
         return [_hardly_moves(motion)]
     speed = float(np.percentile(motion.speed_mps, 95))
-    units = [name for name, scale in _TOO_LARGE.items() if SLOWEST_MPS < speed / scale < _FASTEST_MPS / 2]
+    units = [name for name, scale in _TOO_LARGE.items() if _SLOWEST_MPS < speed / scale < _FASTEST_MPS / 2]
     cause = f"positions in {' or '.join(units)}" if units else "positions that are not in metres"
     return [
         judge(
@@ -153,8 +152,8 @@ def check_path(motion: Motion) -> list[Finding]:
 def _hardly_moves(motion: Motion) -> Finding:
     moved_m = float(np.linalg.norm(np.ptp(motion.position[:, :2], axis=0)))
     says = (
-        f"the vehicle nowhere moves {CHORD_M:g} m in {CHORD_M / SLOWEST_MPS:g} s: a drive that stands maps "
-        "nothing; check that positions are in metres and stamps in seconds"
+        f"the vehicle nowhere moves {_CHORD_M:g} m in {_CHORD_M / _SLOWEST_MPS:g} s: a drive that stands "
+        "maps nothing; check that positions are in metres and stamps in seconds"
     )
     for unit, scale in _TOO_SMALL.items():
         scaled = Motion(motion.stamp_s, motion.position * scale, motion.rotation)
@@ -164,7 +163,7 @@ def _hardly_moves(motion: Motion) -> Finding:
                 "metres east and north of the site"
             )
             break
-    return Finding("path length", Status.FAIL, moved_m, CHORD_M, "m", says, "poses")
+    return Finding("path length", Status.FAIL, moved_m, _CHORD_M, "m", says, "poses")
 
 
 def _is_smooth(motion: Motion) -> bool:

@@ -18,7 +18,6 @@ from v2hdm.verdict.inputs.poses import Motion
 from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
 _Item = TypeVar("_Item")
-
 # Acceleration and turning of ordinary driving: between poses t apart a line errs by this times t^2 / 8.
 _DRIVEN_MPS2 = 2.0
 _WITHOUT_POSE = 0.1  # more than this share of images without a pose is no brief loss at the ends of a drive

@@ -19,30 +19,20 @@ from v2hdm.verdict.verdict import Finding, judge
 SAME_M = 1.0
 """Centres of one marking in the maps of two cameras lie closer than this."""
 
-LEAST_SHARED = 8
-"""Markings that two maps must share for their offset to be observable."""
-
-OFFSET_LIMIT_SIGMAS = 5.0
-"""Offset of two cameras' maps in the sigmas of their centres and markings: clean drives stay below 3."""
-
-LEAST_OFFSET_M = 0.03
-"""An offset of less than this is no finding, however sure it is: corners are good to two centimetres."""
-
-MOUNTING_LIMIT_SIGMAS = 5.0
-"""A mounting by one camera alone against that by all, in the former's sigmas: below 2 on clean drives."""
-
-GROUND_LIMIT_SIGMAS = 4.0
-"""Root mean square of the six parameters' deviations, in the sigmas of both: one in a million by chance."""
-
-LEAST_TURN_DEG, LEAST_HEIGHT_M = 0.2, 0.04
-"""Where the mountings turn by less and their heights differ by less, the ground is no better judge."""
-
-OVERLAP = 0.1
-"""Share of the smaller of two markings of a class that both cover; paint does not lie on paint."""
-
-DOUBLES_LIMIT = 0.02
-"""Share of markings that overlap another: clean drives have none, one in a hundred may be on old paint."""
-
+_LEAST_SHARED = 8  # markings that two maps must share for their offset to be observable
+# Offset of two cameras' maps in the sigmas of their centres and markings: clean drives stay below 3.
+_OFFSET_LIMIT_SIGMAS = 5.0
+# An offset of less than this is no finding, however sure it is: corners are good to two centimetres.
+_LEAST_OFFSET_M = 0.03
+# A mounting by one camera alone against that by all, in the former's sigmas: below 2 on clean drives.
+_MOUNTING_LIMIT_SIGMAS = 5.0
+# Root mean square of the six parameters' deviations, in the sigmas of both: one in a million by chance.
+_GROUND_LIMIT_SIGMAS = 4.0
+# Where the mountings turn by less and their heights differ by less, the ground is no better judge.
+_LEAST_TURN_DEG, _LEAST_HEIGHT_M = 0.2, 0.04
+_OVERLAP = 0.1  # share of the smaller of two markings of a class that both cover; paint does not lie on paint
+# Share of markings that overlap another: clean drives have none, one in a hundred may be on old paint.
+_DOUBLES_LIMIT = 0.02
 # Added to a covariance's diagonal (m^2, rad^2): a tenth of a millimetre, a thousandth of a degree.
 _LEAST_VARIANCE = np.array([1e-8] * 3 + [1e-10] * 3)
 
@@ -76,7 +66,7 @@ def check_agreement(results: Mapping[str, MethodResult], drive: Drive) -> Iterat
     alone = {name: one for name, one in results.items() if len(one.cameras) == 1}
     for (first, a), (second, b) in combinations(alone.items(), 2):
         apart = shared_offsets(a, b, drive)
-        if len(apart) >= LEAST_SHARED:
+        if len(apart) >= _LEAST_SHARED:
             calibrations = a.calibrations[first], b.calibrations[second]
             yield _offset(first, second, apart, *(_centre_sigma_m(one) for one in calibrations))
     for name, one in alone.items():
@@ -84,7 +74,7 @@ def check_agreement(results: Mapping[str, MethodResult], drive: Drive) -> Iterat
             continue
         sigmas = mounting_sigmas(one.calibrations[name], together.calibrations[name])
         yield judge(
-            "alone and together", name, sigmas, MOUNTING_LIMIT_SIGMAS, "sigmas",
+            "alone and together", name, sigmas, _MOUNTING_LIMIT_SIGMAS, "sigmas",
             fine="mapped alone and with the others, it has the same mounting",
             wrong=f"mapped alone its mounting is {sigmas:.0f} sigmas from the one that it has with the others"
             ": cameras do not agree; check its clock, its survey and camera_info",
@@ -104,7 +94,7 @@ def _offset(
     middle = np.median(apart, axis=0)
     spread = 1.4826 * np.median(np.abs(apart - middle), axis=0) / np.sqrt(len(apart))
     sigma = np.hypot(sigma_m[:2], other_sigma_m[:2])
-    sigmas = np.where(np.abs(middle) > LEAST_OFFSET_M, np.abs(middle) / np.hypot(sigma, spread), 0.0)
+    sigmas = np.where(np.abs(middle) > _LEAST_OFFSET_M, np.abs(middle) / np.hypot(sigma, spread), 0.0)
     axis = int(np.argmax(sigmas))
     where = (("behind", "ahead of"), ("right of", "left of"))[axis][int(middle[axis] > 0)]
     cause = (
@@ -112,7 +102,7 @@ def _offset(
         "a heading or a lateral survey disagrees",
     )[axis]
     return judge(
-        "cameras apart", f"{first}, {second}", float(sigmas[axis]), OFFSET_LIMIT_SIGMAS, "sigmas",
+        "cameras apart", f"{first}, {second}", float(sigmas[axis]), _OFFSET_LIMIT_SIGMAS, "sigmas",
         fine=f"{len(apart)} markings that both saw lie in one place",
         wrong=f"{second} maps {len(apart)} markings {100 * abs(middle[axis]):.0f} cm {where} where {first} "
         f"does: {cause}; synchronise and measure anew",
@@ -164,11 +154,11 @@ def _compare(name: str, mapped: Calibration, ground: Calibration) -> Finding:
     turn_deg = np.rad2deg(mapped.cam_from_vehicle[:3, :3].T @ off[3:])
     up_m = float(camera_centre(mapped.cam_from_vehicle)[2] - camera_centre(ground.cam_from_vehicle)[2])
     most_deg = np.abs(turn_deg).max()
-    small = most_deg < LEAST_TURN_DEG and abs(up_m) < LEAST_HEIGHT_M
+    small = most_deg < _LEAST_TURN_DEG and abs(up_m) < _LEAST_HEIGHT_M
     sigmas = 0.0 if small else mounting_sigmas(ground, mapped, of_both=True)
     roll, pitch, yaw = turn_deg
     return judge(
-        "ground", name, sigmas, GROUND_LIMIT_SIGMAS, "sigmas",
+        "ground", name, sigmas, _GROUND_LIMIT_SIGMAS, "sigmas",
         fine=f"markings and bare ground agree on its mounting ({most_deg:.2f} deg at most)",
         wrong=f"markings and bare ground do not agree on its mounting (roll {roll:+.2f}, pitch {pitch:+.2f}, "
         f"yaw {yaw:+.2f} deg, height {100 * up_m:+.0f} cm): wrong associations, or ground that is not flat; "
@@ -189,7 +179,7 @@ def check_doubles(best: MethodResult) -> list[Finding]:
     says = f"{len(pairs)} of {len(markings)} markings overlap another of their class"
     return [
         judge(
-            "double markings", "map", len(pairs) / len(markings), DOUBLES_LIMIT, "",
+            "double markings", "map", len(pairs) / len(markings), _DOUBLES_LIMIT, "",
             fine=says,
             wrong=f"{says}{where}: laps or cameras do not agree; check clocks, the receiver's fix and the "
             "mountings",
@@ -198,7 +188,7 @@ def check_doubles(best: MethodResult) -> list[Finding]:
 
 
 def overlapping(markings: tuple[Marking, ...]) -> list[tuple[int, int]]:
-    """Pairs of markings of one class that share at least :data:`OVERLAP` of the smaller one."""
+    """Pairs of markings of one class that share at least :data:`_OVERLAP` of the smaller one."""
     if len(markings) < 2:
         return []
     corners = [np.ascontiguousarray(one.corners_map, dtype=np.float32) for one in markings]
@@ -208,7 +198,7 @@ def overlapping(markings: tuple[Marking, ...]) -> list[tuple[int, int]]:
     return [
         (int(a), int(b))
         for a, b in near
-        if markings[a].kind == markings[b].kind and _overlap(corners[a], corners[b]) > OVERLAP
+        if markings[a].kind == markings[b].kind and _overlap(corners[a], corners[b]) > _OVERLAP
     ]
 
 

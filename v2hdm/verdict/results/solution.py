@@ -26,30 +26,21 @@ from v2hdm.verdict.verdict import Finding, Status, judge, passed
 BEST = "Opt"
 """The method whose map is the result."""
 
-HELD_OUT_LIMIT = 4.0
-"""Mean robust loss of held-out observations: clean drives reach 1.9 to 2.3, wrong inputs begin at 6.5."""
-
-EXCLUDED_LIMIT = 0.2
-"""Share of candidate markings that were left out, but for those that are merely uncertain, two standard
-errors taken off it: clean drives reach .05 of hundreds and .13 of 26, swapped axes .75 of 200."""
-
-REJECTED_LIMIT = 0.06
-"""Share of corner observations that the rest contradicts: clean drives reach .02, no distortion .14."""
-
-VARIANCE_LIMIT = 3.0
-"""Variance of observations over the detector's statement: clean drives reach .2, no distortion 6."""
-
-WINDOW_LIMIT = 8.0
-"""The worst window of the route as a multiple of the median one: clean drives reach 2."""
-
-POSE_PULL_LIMIT = 1.4
-"""Root mean square of a recorded pose's corrections, in its sigmas: at most 1 where these are right."""
-
-JUMP_LIMIT = 9.0
-"""Largest single correction of a pose, in sigmas."""
-
-LEVER_OBSERVABLE_M = 0.15
-"""Sigma of the point that the poses are of, m, up to which a drive makes it observable."""
+# Mean robust loss of held-out observations: clean drives reach 1.9 to 2.3, wrong inputs begin at 6.5.
+_HELD_OUT_LIMIT = 4.0
+# Share of candidate markings that were left out, but for those that are merely uncertain, two standard
+# errors taken off it: clean drives reach .05 of hundreds and .13 of 26, swapped axes .75 of 200.
+_EXCLUDED_LIMIT = 0.2
+# Share of corner observations that the rest contradicts: clean drives reach .02, no distortion .14.
+_REJECTED_LIMIT = 0.06
+# Variance of observations over the detector's statement: clean drives reach .2, no distortion 6.
+_VARIANCE_LIMIT = 3.0
+_WINDOW_LIMIT = 8.0  # the worst window of the route as a multiple of the median one: clean drives reach 2
+# Root mean square of a recorded pose's corrections, in its sigmas: at most 1 where these are right.
+_POSE_PULL_LIMIT = 1.4
+_JUMP_LIMIT = 9.0  # largest single correction of a pose, in sigmas
+# Sigma of the point that the poses are of, m, up to which a drive makes it observable.
+_LEVER_OBSERVABLE_M = 0.15
 
 # The check that reports each fault, and the recovery.
 _CHECKS: Mapping[Fault, tuple[str, str]] = {
@@ -205,7 +196,7 @@ def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding
         )
         yield passed("clock", "all cameras", says)
     levers = _of_all(evidence, Fault.LEVER, Fault.SURVEY)
-    axes = sorted({one.axis for one in levers if one.axis < 2 and one.sigma > LEVER_OBSERVABLE_M})
+    axes = sorted({one.axis for one in levers if one.axis < 2 and one.sigma > _LEVER_OBSERVABLE_M})
     if axes and "survey" not in raised:
         names = " and ".join(("forward", "left")[axis] for axis in axes)
         says = (
@@ -226,7 +217,7 @@ def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
     factor = evidence.variance_factor
     scatter = "times the variance that the detector states"
     yield judge(
-        "fit", "map", factor, VARIANCE_LIMIT, "",
+        "fit", "map", factor, _VARIANCE_LIMIT, "",
         fine=f"corners scatter with {factor:.2f} {scatter}",
         wrong=f"corners scatter with {factor:.1f} {scatter}: poses, lens and images do not fit together; "
         "check camera_info and the pose_noise first",
@@ -234,7 +225,7 @@ def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
     worst = int(np.argmax(evidence.along_route))
     window = float(evidence.along_route[worst] / max(np.median(evidence.along_route), 1e-12))
     yield judge(
-        "fit along the route", "map", window, WINDOW_LIMIT, "",
+        "fit along the route", "map", window, _WINDOW_LIMIT, "",
         fine="the fit is even along the route",
         wrong=f"from {evidence.window_s[worst]:.1f} s on corners scatter with {window:.0f} times the usual "
         "variance: the position jumps there, or poses are missing; check the fix of the receiver",
@@ -242,14 +233,14 @@ def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
     for name, fit in evidence.fits.items():
         percent = 100 * fit.rejected_share
         yield judge(
-            "rejected", name, fit.rejected_share, REJECTED_LIMIT, "",
+            "rejected", name, fit.rejected_share, _REJECTED_LIMIT, "",
             fine=f"{percent:.1f} % of its corners contradict the rest",
             wrong=f"{percent:.0f} % of its corners contradict the rest: its lens, clock or mounting is not "
             "as stated",
         )  # fmt: skip
     if evidence.held_out_loss is not None:
         yield judge(
-            "held out", "map", evidence.held_out_loss, HELD_OUT_LIMIT, "",
+            "held out", "map", evidence.held_out_loss, _HELD_OUT_LIMIT, "",
             fine="the map predicts corners that it has not seen as well as the noise allows",
             wrong="the map mispredicts corners that it has not seen: an error of poses, clocks or lens is "
             "left",
@@ -262,14 +253,14 @@ def _poses(evidence: SolveEvidence) -> Iterator[Finding]:
     state = max(evidence.pose_pulls, key=lambda name: evidence.pose_pulls[name])
     pull = evidence.pose_pulls[state]
     yield judge(
-        "pose noise", "poses", pull, POSE_PULL_LIMIT, "sigmas",
+        "pose noise", "poses", pull, _POSE_PULL_LIMIT, "sigmas",
         fine="the poses are as good as pose_noise says, or better",
         wrong=f"the {state} of the poses errs {pull:.1f} times as much as pose_noise says: sigmas of the map "
         f"are too small; state a larger {_POSE_KEYS.get(state, 'position_m')}",
         status=Status.WARN,
     )  # fmt: skip
     yield judge(
-        "pose jump", "poses", evidence.worst_pull, JUMP_LIMIT, "sigmas",
+        "pose jump", "poses", evidence.worst_pull, _JUMP_LIMIT, "sigmas",
         fine="no pose stands out from the others",
         wrong=f"at {evidence.worst_pull_s:.1f} s the pose is {evidence.worst_pull:.0f} sigmas from where the "
         "markings put it: the position jumps, or the fix was lost; check the receiver's log there",
@@ -285,7 +276,7 @@ def _excluded(best: MethodResult) -> Finding:
     surely = share - 2 * float(np.sqrt(share * (1 - share) / max(count, 1)))
     says = f"{left_out} of {count} candidates were left out"
     return judge(
-        "excluded", "map", surely, EXCLUDED_LIMIT, "",
+        "excluded", "map", surely, _EXCLUDED_LIMIT, "",
         fine=f"{says}, those aside that are merely uncertain",
         wrong=f"{says}: markings are seen, but not where others put them; see excluded.geojson",
         status=Status.WARN,
