@@ -33,7 +33,7 @@ _HALO: Any = [patheffects.withStroke(linewidth=2.2, foreground="white")]
 
 @dataclass(frozen=True)
 class _Scene:
-    """What both panels show; ``low`` and ``high`` (2,) are the corners of the ground in them, m."""
+    """The content of both panels; ``low`` and ``high`` (2,) are the corners of the ground in them, m."""
 
     labels: Sequence[str]
     fit: Fit

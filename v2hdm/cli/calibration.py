@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _compare(parsed: argparse.Namespace) -> int:
-    from v2hdm.calibration.compare import movement, turned_alike
+    from v2hdm.calibration.compare import compare_calibrations, turned_alike
     from v2hdm.errors import MapFileError
     from v2hdm.io.calibration.document import trusted_calibrations
 
@@ -41,7 +41,7 @@ def _compare(parsed: argparse.Namespace) -> int:
             f"{parsed.before} has {', '.join(before)} and {parsed.after} has {', '.join(after)}: "
             "no camera in common"
         )
-    movements = [movement(before[name], after[name]) for name in common]
+    movements = compare_calibrations(before, after)
     if parsed.json:
         print(json.dumps([_as_json(one) for one in movements]))
     else:

@@ -39,13 +39,13 @@ class Observations:
     pair: IntArray
 
     def only(self, keep: BoolArray) -> Observations:
-        """Those of a mask (N,)."""
+        """The matches of a mask (N,)."""
         return Observations(*(values[keep] for values in vars(self).values()))
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What the drive states about I images and their camera.
+    """The statements of a drive about I images and their camera.
 
     Attributes:
         poses: (I, 4, 4) ``map_from_vehicle`` as recorded.
@@ -66,7 +66,7 @@ class Prior:
 
 @dataclass(frozen=True)
 class Stated:
-    """What a drive states of one camera, its poses under one reading.
+    """The statements of a drive about one camera, its poses under one reading.
 
     ``clock_s`` is added to the stamps of its images, ``centre_sigma_m`` replaces the survey's own along
     single axes, and without ``surveyed`` only the guess says where the centre is.

@@ -284,7 +284,7 @@ def _excluded(best: MethodResult) -> Finding:
 
 
 def _words(one: Contradiction) -> str:
-    """What is wrong by how much, as a clause."""
+    """The error and its size, as a clause."""
     whose, size = " and ".join(one.cameras), abs(one.value)
     cm = 100 * size
     way = f"{cm:.0f} cm {_WAYS[one.axis][one.value > 0]}"
