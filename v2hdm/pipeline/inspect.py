@@ -16,7 +16,7 @@ from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.pipeline.keys import Contents
 from v2hdm.records import Camera, Drive
 from v2hdm.store.cache.room import Room
-from v2hdm.verdict import Finding, Status, input_findings, clock_corrections
+from v2hdm.verdict import Finding, Status, clock_corrections, input_findings
 
 log = logging.getLogger(__name__)
 
