@@ -95,7 +95,9 @@ def print_faults(drive: Drive, camera: str) -> None:
     for name, (faulty, parameter) in faults.items():
         estimate = estimate_ground(faulty, camera)
         found = estimate.parameters.get(parameter)
-        value = "none" if found is None else f"{found.value:+.4f} +- {found.sigma:.4f} told {found.observable}"
+        value = (
+            "none" if found is None else f"{found.value:+.4f} +- {found.sigma:.4f} told {found.observable}"
+        )
         print(f"  {name:<14} {parameter:<14} {value}, residual {estimate.median_residual:.2f}", flush=True)
 
 
