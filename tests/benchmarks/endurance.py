@@ -40,7 +40,7 @@ from v2hdm.pipeline.write import write_results
 from v2hdm.store.cache.room import Room
 from v2hdm.store.cache.store import Store
 from v2hdm.verdict import Verdict
-from v2hdm.verdict.results.result import check_result
+from v2hdm.verdict.results.solution import check_result
 
 _FIRST = 0.1
 """Share of the whole after which memory must not grow."""

@@ -19,7 +19,7 @@ import numpy as np
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import rotation_from_vector
 from v2hdm.ground import GroundOptions, estimate_ground
-from v2hdm.ground.mount import guessed_mount
+from v2hdm.ground.model import guessed_mount
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.records import Calibration, Camera, Drive, FloatArray, Trajectory
@@ -95,7 +95,9 @@ def print_faults(drive: Drive, camera: str) -> None:
     for name, (faulty, parameter) in faults.items():
         estimate = estimate_ground(faulty, camera)
         found = estimate.parameters.get(parameter)
-        value = "none" if found is None else f"{found.value:+.4f} +- {found.sigma:.4f} told {found.told}"
+        value = (
+            "none" if found is None else f"{found.value:+.4f} +- {found.sigma:.4f} told {found.observable}"
+        )
         print(f"  {name:<14} {parameter:<14} {value}, residual {estimate.median_residual:.2f}", flush=True)
 
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from tests.calibration.site import INFO, PLACES, clicked, mounting, project
-from v2hdm.calibration.fit import Fit, fit_mountings
-from v2hdm.calibration.likelihood import Noise, Seen
+from v2hdm.calibration.fit import Fit, Noise, Seen, fit_mountings
 from v2hdm.calibration.points import SurveyedPoints
 from v2hdm.calibration.residuals import known_ground, lens, residuals
 from v2hdm.geometry.ipm import apply_in_front, facing_ipm, ipm_from_extrinsic

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from tests.calibration.site import INFO, PLACES, clicked, write_table
+from v2hdm.calibration.from_points import calibrate_from_points
 from v2hdm.calibration.points import check_points, read_points
 from v2hdm.errors import DriveError
+from v2hdm.verdict import Status
 
 
 @pytest.mark.parametrize("separator", [",", ";", "\t", " "])
@@ -83,3 +85,11 @@ def test_points_outside_the_image_and_repeated_ones_are_named(tmp_path, change, 
 def test_good_points_pass(tmp_path: Path) -> None:
     check_points(read_points(write_table(tmp_path, *clicked(seed=3))), INFO)
     assert len(PLACES) == 10
+
+
+def test_a_calibration_from_points_is_data_and_writes_nothing(tmp_path: Path) -> None:
+    found = calibrate_from_points(write_table(tmp_path, *clicked(seed=3)), INFO)
+    assert found.verdict.status is Status.PASS
+    assert found.calibration.covariance is not None
+    assert len(found.roi_vehicle) >= 3
+    assert [path.name for path in tmp_path.iterdir()] == ["points.csv"]

@@ -20,7 +20,7 @@ from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.importers.poses import Recorded, read_poses
 from v2hdm.io.importers.poses.table import read_table
 from v2hdm.records import FloatArray, GeodeticOrigin
-from v2hdm.verdict import check_drive
+from v2hdm.verdict import input_findings
 
 START_S = 1715934630.0
 """2024-05-17 08:30:30 UTC."""
@@ -407,7 +407,7 @@ def test_a_lever_arm_of_zero_that_should_not_be_is_named_by_the_check(
     content = yaml.safe_load((root / "drive.yaml").read_text())
     content["poses"] = {"csv": "route.csv", "lever_arm_m": list(stated_m)}
     (root / "drive.yaml").write_text(yaml.safe_dump(content))
-    (finding,) = [one for one in check_drive(read_drive(root), {}) if one.check == "origin"]
+    (finding,) = [one for one in input_findings(read_drive(root), {}) if one.check == "origin"]
     assert finding.status.name == status
     if status == "WARN":
         assert finding.value == pytest.approx(1.2, abs=0.03)

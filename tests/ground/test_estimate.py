@@ -1,9 +1,11 @@
-"""The ground of a small drive tells its mounting and what is wrong with its poses, clock and lens."""
+"""The ground of a small drive shows its mounting and what is wrong with its poses, clock and lens."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from tests.ground.scene import CENTRE, INFO, extrinsic, make_drive, with_guess, 
 from v2hdm.geometry.mounting import mounting_angles
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.ground import GroundOptions, GroundStatus, Reading, better_start, estimate, estimate_ground
+from v2hdm.ground.patches import read_grey
 from v2hdm.records import Drive, FloatArray, Trajectory
 
 TRUE = extrinsic(roll_deg=0.5, pitch_deg=20.0, yaw_deg=-1.0)
@@ -45,14 +48,14 @@ def test_a_clock_that_is_60_ms_late_is_found_on_a_turning_route(turning):
     early = Trajectory(turning.trajectory.stamp_s - 0.06, turning.trajectory.map_from_vehicle)
     estimate = estimate_ground(with_trajectory(turning, early), "front", replace(FEW, free=("clock_s",)))
     clock = estimate.parameters["clock_s"]
-    assert clock.told
+    assert clock.observable
     assert clock.value == pytest.approx(-0.06, abs=0.008)
     assert np.abs(angles_off_deg(estimate.calibration.cam_from_vehicle)).max() < 0.15
 
 
 def test_a_straight_route_at_constant_speed_cannot_tell_its_clock(straight):
     clock = estimate_ground(straight, "front", replace(FEW, free=("clock_s",))).parameters["clock_s"]
-    assert not clock.told
+    assert not clock.observable
     assert "drive a turn" in clock.why_not
 
 
@@ -74,7 +77,7 @@ def test_poses_that_rise_over_the_ground_are_told(straight):
     poses[:, 2, 3] += 0.01 * (poses[:, 0, 3] - 15.0)
     rising = with_trajectory(straight, Trajectory(straight.trajectory.stamp_s, poses))
     grade = estimate_ground(rising, "front", replace(FEW, free=("grade",))).parameters["grade"]
-    assert grade.told
+    assert grade.observable
     assert grade.value == pytest.approx(0.01, abs=0.001)
 
 
@@ -86,7 +89,7 @@ def test_a_focal_length_that_is_5_percent_too_long_is_told(turning):
     longer = with_guess(turning, TRUE)
     longer = replace(longer, cameras={"front": replace(camera, info=info)})
     focal = estimate_ground(longer, "front", replace(FEW, free=("focal_scale",))).parameters["focal_scale"]
-    assert focal.told
+    assert focal.observable
     assert focal.value == pytest.approx(1 / 1.05 - 1, abs=0.01)
 
 
@@ -132,3 +135,11 @@ def test_the_mapper_starts_from_the_ground_only_where_it_was_found(straight, tmp
     assert started.initial_ipm == "ground"
     nothing = replace(found, status=GroundStatus.NO_MATCH, calibration=None)
     assert better_start(straight, {"front": nothing}).cameras["front"].initial_ipm == "estimated"
+
+
+def test_the_grey_of_an_image_is_the_same_from_a_jpeg_and_from_its_pixels_as_png(tmp_path: Path) -> None:
+    colours = np.random.default_rng(2).integers(0, 256, (60, 80, 3), dtype=np.uint8)
+    jpeg, png = tmp_path / "a.jpg", tmp_path / "a.png"
+    cv2.imwrite(str(jpeg), cv2.resize(colours, (320, 240)))
+    cv2.imwrite(str(png), cv2.imread(str(jpeg)))
+    np.testing.assert_array_equal(read_grey(str(jpeg)), read_grey(str(png)))

@@ -7,8 +7,7 @@ import pytest
 
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.rigid import heading_rad
-from v2hdm.localization.match import Markings, Seen, locate
-from v2hdm.localization.motion import POSE, State, pose_of, predict, start
+from v2hdm.localization.filter import POSE, Markings, Seen, State, locate, pose_of, predict, start
 from v2hdm.records import HdMap, Marking
 
 INTRINSIC = np.array([[700.0, 0, 640], [0, 700, 360], [0, 0, 1]])

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import rotation_from_euler
+from v2hdm.ground.results import GroundEstimate, GroundStatus, Parameter, Reading
 from v2hdm.records import (
+    Calibration,
     Camera,
     CameraInfo,
     CentrePrior,
@@ -20,7 +24,7 @@ from v2hdm.records import (
     Trajectory,
 )
 from v2hdm.verdict import Finding, Status
-from v2hdm.verdict.inputs.motion import Motion
+from v2hdm.verdict.inputs.poses import Motion
 
 SPEED_MPS = 5.0
 RADIUS_M = 10.0
@@ -112,3 +116,46 @@ def drive(recorded: Trajectory, cameras: tuple[str, ...] = ("front",), every: in
 def raised(findings: list[Finding]) -> dict[str, str]:
     """What did not pass: sentence by check."""
     return {finding.check: finding.says for finding in findings if finding.status is not Status.PASS}
+
+
+def noisy(k: int) -> np.ndarray:
+    return np.random.default_rng(k).integers(60, 160, (720, 1280), dtype=np.uint8)
+
+
+def pictured(folder: Path, paint: Callable[[int], np.ndarray], suffix: str = ".png") -> Drive:
+    """A drive of nine images, 2.5 m apart."""
+    bare = drive(poses(straight_s=4.0, turn_s=0.5), every=10)
+    images = []
+    for k, image in enumerate(bare.images):
+        path = folder / f"{k}{suffix}"
+        cv2.imwrite(str(path), paint(k))
+        images.append(replace(image, path=path))
+    return replace(bare, images=images)
+
+
+SIGMA = {
+    "clock_s": 0.001, "focal_scale": 0.002, "distortion_k1": 0.001, "grade": 0.0002,
+    "up_m": 0.008, "forward_m": 0.04, "left_m": 0.04,
+}  # fmt: skip
+
+
+def estimate(name: str = "front", **values: float) -> GroundEstimate:
+    """A clean camera, apart from some parameters."""
+    parameters = {
+        key: Parameter(key, values.get(key, 0.0), sigma, observable=True) for key, sigma in SIGMA.items()
+    }
+    guess = np.eye(4)
+    guess[:3, :3] = [[0, -1, 0], [-0.26, 0, -0.966], [0.966, 0, -0.26]]  # 15 deg down
+    return GroundEstimate(
+        camera=name,
+        status=GroundStatus.FOUND,
+        shares={Reading.AS_GIVEN: 0.9, Reading.MIRRORED: 0.3},
+        reading=Reading.AS_GIVEN,
+        calibration=Calibration(camera().info, guess, np.eye(6)),
+        guess_cam_from_vehicle=guess,
+        parameters=parameters,
+        median_residual=0.35,
+        pulls={"heading": 1.2, "position": 1.0},
+        patches=None,
+        seconds=3.0,
+    )

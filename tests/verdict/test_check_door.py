@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.verdict.drives import drive, poses, with_yaw, yaw_of
-from tests.verdict.test_images import noisy
+from tests.verdict.drives import drive, noisy, poses, with_yaw, yaw_of
 from v2hdm.cli.check import main
 from v2hdm.io.drive import Trajectory, write_drive
 from v2hdm.records import Image

@@ -8,7 +8,7 @@ import pytest
 from tests.report.test_check_points import SURVEY_M, checked, point, yard
 from v2hdm.records import FloatArray
 from v2hdm.verdict import Finding, Status
-from v2hdm.verdict.results.check_points import SIGNIFICANCE, check_frame, check_points
+from v2hdm.verdict.results.survey import SIGNIFICANCE, check_frame, check_points
 
 COUNT = 12
 

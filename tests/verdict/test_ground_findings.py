@@ -1,4 +1,4 @@
-"""What bare ground says becomes one sentence a quantity, of the true cause."""
+"""Bare ground becomes one sentence a quantity, of the true cause; usual mistakes explain why none matches."""
 
 from __future__ import annotations
 
@@ -7,37 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.verdict.drives import CENTRE, camera, drive, poses, raised
-from v2hdm.ground.results import GroundEstimate, GroundStatus, Parameter, Reading
-from v2hdm.records import Calibration
+from tests.verdict.drives import CENTRE, camera, drive, estimate, poses, raised
+from v2hdm.geometry.ipm import apply_homography
+from v2hdm.geometry.lens import undistort_points
+from v2hdm.ground.results import GroundEstimate, GroundOptions, GroundStatus, Parameter, Reading
+from v2hdm.records import Calibration, Drive
 from v2hdm.verdict import Status, clock_corrections
-from v2hdm.verdict.inputs.ground import CHECKS, check_ground, path_of
+from v2hdm.verdict.inputs import ground as ground_checks
+from v2hdm.verdict.inputs.ground import CHECKS, check_ground, find_cause, path_of, scaled, upside_down
 from v2hdm.verdict.inputs.heading import Path
-
-SIGMA = {
-    "clock_s": 0.001, "focal_scale": 0.002, "distortion_k1": 0.001, "grade": 0.0002,
-    "up_m": 0.008, "forward_m": 0.04, "left_m": 0.04,
-}  # fmt: skip
-
-
-def estimate(name: str = "front", **values: float) -> GroundEstimate:
-    """A clean camera, apart from some parameters."""
-    parameters = {key: Parameter(key, values.get(key, 0.0), sigma, told=True) for key, sigma in SIGMA.items()}
-    guess = np.eye(4)
-    guess[:3, :3] = [[0, -1, 0], [-0.26, 0, -0.966], [0.966, 0, -0.26]]  # 15 deg down
-    return GroundEstimate(
-        camera=name,
-        status=GroundStatus.FOUND,
-        shares={Reading.AS_GIVEN: 0.9, Reading.MIRRORED: 0.3},
-        reading=Reading.AS_GIVEN,
-        calibration=Calibration(camera().info, guess, np.eye(6)),
-        guess_cam_from_vehicle=guess,
-        parameters=parameters,
-        median_residual=0.35,
-        pulls={"heading": 1.2, "position": 1.0},
-        patches=None,
-        seconds=3.0,
-    )
 
 
 def told(*estimates: GroundEstimate) -> dict[str, str]:
@@ -88,25 +66,28 @@ def test_a_clock_beyond_what_is_corrected_fails() -> None:
 
 def test_a_value_within_five_of_its_sigmas_passes() -> None:
     vague = estimate(clock_s=0.05)
-    parameters = {**vague.parameters, "clock_s": Parameter("clock_s", 0.05, 0.012, told=True)}
+    parameters = {**vague.parameters, "clock_s": Parameter("clock_s", 0.05, 0.012, observable=True)}
     assert not told(replace(vague, parameters=parameters))
 
 
 def test_what_a_drive_cannot_tell_is_said_with_what_would() -> None:
     straight = estimate()
     why = "constant speed on a straight road: drive a turn"
-    parameters = {**straight.parameters, "clock_s": Parameter("clock_s", 0.1, 0.01, told=False, why_not=why)}
+    parameters = {
+        **straight.parameters,
+        "clock_s": Parameter("clock_s", 0.1, 0.01, observable=False, why_not=why),
+    }
     findings = check_ground(drive(poses()), {"front": replace(straight, parameters=parameters)})
     (clock,) = [finding for finding in findings if finding.check == "clock"]
-    assert clock.is_untold
+    assert clock.is_unobservable
     assert why in clock.says
 
 
 def test_a_place_known_worse_than_a_decimetre_is_not_told() -> None:
     vague = estimate()
-    parameters = {**vague.parameters, "forward_m": Parameter("forward_m", 3.0, 0.5, told=True)}
+    parameters = {**vague.parameters, "forward_m": Parameter("forward_m", 3.0, 0.5, observable=True)}
     findings = check_ground(drive(poses()), {"front": replace(vague, parameters=parameters)})
-    assert [finding.check for finding in findings if finding.is_untold] == ["survey forward"]
+    assert [finding.check for finding in findings if finding.is_unobservable] == ["survey forward"]
 
 
 def test_a_camera_without_survey_has_none_to_contradict() -> None:
@@ -147,7 +128,7 @@ def test_too_little_ground_is_no_fault() -> None:
         estimate(), status=GroundStatus.TOO_LITTLE, shares={Reading.AS_GIVEN: 0.0}, parameters={}
     )
     (found,) = check_ground(drive(poses()), {"front": little})
-    assert found.is_untold
+    assert found.is_unobservable
 
 
 def test_residuals_without_another_cause_point_to_the_lens() -> None:
@@ -186,11 +167,11 @@ def test_a_clean_drive_that_matches_mirrored_as_well_is_taken_as_given() -> None
 
 def test_a_straight_road_cannot_tell_the_focal_length_from_the_height() -> None:
     straight = estimate(focal_scale=0.08)
-    ahead = Parameter("forward_m", 0.4, 0.8, told=False, why_not="the vehicle drives straight")
+    ahead = Parameter("forward_m", 0.4, 0.8, observable=False, why_not="the vehicle drives straight")
     straight = replace(straight, parameters={**straight.parameters, "forward_m": ahead})
     findings = check_ground(drive(poses()), {"front": straight})
     assert not raised(findings)
-    assert "focal length from ground" in {finding.check for finding in findings if finding.is_untold}
+    assert "focal length from ground" in {finding.check for finding in findings if finding.is_unobservable}
 
 
 def test_a_level_camera_cannot_tell_a_bent_lens_from_a_bent_road() -> None:
@@ -199,4 +180,48 @@ def test_a_level_camera_cannot_tell_a_bent_lens_from_a_bent_road() -> None:
     flat = replace(estimate(distortion_k1=-0.055), calibration=Calibration(camera().info, level, np.eye(6)))
     findings = check_ground(drive(poses()), {"front": flat})
     assert not raised(findings)
-    assert "distortion" in {finding.check for finding in findings if finding.is_untold}
+    assert "distortion" in {finding.check for finding in findings if finding.is_unobservable}
+
+
+LOST = replace(estimate(), status=GroundStatus.NO_MATCH, shares={Reading.AS_GIVEN: 0.0})
+
+
+def test_undoing_feet_shortens_the_path() -> None:
+    metres = scaled(drive(poses()), 0.3048)
+    assert metres.images[-1].map_from_vehicle[:3, 3] == pytest.approx(
+        0.3048 * drive(poses()).images[-1].map_from_vehicle[:3, 3]
+    )
+    assert metres.trajectory is not None
+    assert metres.trajectory.map_from_vehicle[-1, :3, :3] == pytest.approx(
+        poses().map_from_vehicle[-1, :3, :3]
+    )
+
+
+def test_a_pixel_of_an_image_upside_down_shows_the_ground_of_the_opposite_pixel() -> None:
+    lens = replace(camera().info, distortion=(-0.1, 0.02, 0.003, -0.002, 0.0))
+    one = replace(drive(poses()), cameras={"front": replace(camera(), info=lens)})
+    right, turned = one.cameras["front"], upside_down(one).cameras["front"]
+    points_px = np.array([[300.0, 500.0], [700.0, 650.0]])
+    opposite_px = np.array([1279.0, 719.0]) - points_px
+    seen = apply_homography(right.ipm["estimated"], undistort_points(right.info, points_px))
+    also = apply_homography(turned.ipm["estimated"], undistort_points(turned.info, opposite_px))
+    assert also == pytest.approx(seen, abs=1e-6)
+
+
+def test_the_first_mistake_whose_undoing_makes_the_ground_match_is_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def only_in_metres(tried: Drive, name: str, options: GroundOptions) -> GroundEstimate:
+        length_m = tried.images[-1].map_from_vehicle[0, 3]
+        return estimate() if length_m < 0.5 * drive(poses()).images[-1].map_from_vehicle[0, 3] else LOST
+
+    monkeypatch.setattr(ground_checks, "estimate_ground", only_in_metres)
+    says = find_cause(drive(poses()), {"front": LOST})
+    assert says is not None
+    assert "feet" in says
+
+
+def test_nothing_is_tried_where_a_camera_matches(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ground_checks, "estimate_ground", None)
+    assert find_cause(drive(poses()), {"front": LOST, "rear": estimate("rear")}) is None
+    assert find_cause(drive(poses()), {}) is None

@@ -12,7 +12,7 @@ from v2hdm.geometry.rigid import quaternion_from_rotation, rotation_from_euler, 
 from v2hdm.records import FloatArray, Trajectory
 from v2hdm.verdict import Status
 from v2hdm.verdict.inputs.heading import Path, check_heading
-from v2hdm.verdict.inputs.path import check_attitude
+from v2hdm.verdict.inputs.poses import check_attitude
 
 Spoil = Callable[[Trajectory], Trajectory]
 
@@ -122,8 +122,8 @@ def test_the_lever_from_the_axle_to_the_antenna_is_measured_in_turns(ahead_m: fl
 
 def test_a_straight_route_cannot_tell_where_the_origin_is() -> None:
     found = {finding.check: finding for finding in check_heading(motion(poses(turn_s=0.0)))}
-    assert found["origin"].is_untold
-    assert found["mirrored"].is_untold
+    assert found["origin"].is_unobservable
+    assert found["mirrored"].is_unobservable
 
 
 def test_roll_and_pitch_in_degrees_are_no_vehicle_s() -> None:

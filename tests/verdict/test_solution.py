@@ -90,7 +90,7 @@ def test_a_small_contradiction_is_none_however_sure_it_is() -> None:
 
 def test_a_straight_drive_says_what_it_cannot_tell() -> None:
     unsure = (replace(CLOCK, sigma=0.01), replace(LEVER, sigma=float("inf")))
-    untold = [f for f in check_inputs(replace(FINE, suspects=unsure)) if f.is_untold]
+    untold = [f for f in check_inputs(replace(FINE, suspects=unsure)) if f.is_unobservable]
     assert {f.check for f in untold} == {"clock", "survey"}
     assert all("drive a turn" in f.says for f in untold)
 

@@ -1,4 +1,4 @@
-"""From a drive to its cameras' mountings by bare ground: estimate, judge, write."""
+"""From a drive to its cameras' mountings by bare ground."""
 
 from __future__ import annotations
 
@@ -6,20 +6,53 @@ import argparse
 import json
 import os
 import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 
 from v2hdm.ground import GroundEstimate, estimate_cameras
-from v2hdm.ground.picture import draw_matched_ground
-from v2hdm.ground.say import lines
+from v2hdm.ground.show import draw_matched_ground, lines
 from v2hdm.io.calibration.document import Provenance, write_calibration
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.drive.lossless import png
-from v2hdm.records import Drive
+from v2hdm.records import Calibration, Drive
 from v2hdm.report.outputs import result_folder, write_json
 from v2hdm.settings import check_workers
 from v2hdm.verdict import Status, Verdict, check_drive
+
+
+@dataclass(frozen=True)
+class GroundCalibration:
+    """Cameras calibrated from bare ground: the estimates by camera, and the verdict on their drive."""
+
+    drive: Drive
+    estimates: Mapping[str, GroundEstimate]
+    verdict: Verdict
+
+    @property
+    def calibrations(self) -> dict[str, Calibration]:
+        """By camera, where the ground gave a mounting."""
+        found = {name: estimate.calibration for name, estimate in self.estimates.items()}
+        return {name: calibration for name, calibration in found.items() if calibration is not None}
+
+
+def calibrate_from_ground(
+    drive: Drive, *, workers: int = 1, progress: Callable[[int, int], None] | None = None
+) -> GroundCalibration:
+    """Find every camera's mounting from bare ground, without a marking, and check the drive by it.
+
+    Args:
+        drive: the drive.
+        workers: processes, one camera each at a time.
+        progress: called as ``progress(done, total)`` cameras.
+
+    Raises:
+        DriveError: an image cannot be read.
+    """
+    estimates = estimate_cameras(drive, workers, progress)
+    return GroundCalibration(drive, estimates, check_drive(drive, ground=estimates))
 
 
 def estimate_mountings(parsed: argparse.Namespace) -> bool:
@@ -39,32 +72,35 @@ def estimate_mountings(parsed: argparse.Namespace) -> bool:
     drive = read_drive(parsed.drive, ReadOptions(format=parsed.format, cameras=parsed.camera))
     folder = parsed.output or Path("outputs") / f"{drive.name}-extrinsic"
     with result_folder(folder, "--output") as unfinished:
-        ground = estimate_cameras(drive, parsed.workers or os.cpu_count() or 1, _tell)
-        verdict = Verdict.of(check_drive(drive, ground))
+        workers = parsed.workers or os.cpu_count() or 1
+        found = calibrate_from_ground(drive, workers=workers, progress=_report_progress)
         settings = {"drive": str(parsed.drive), "cameras": list(drive.cameras)}
         (unfinished / "config.yaml").write_text(json.dumps(settings) + "\n", encoding="utf-8")
-        write_json(unfinished / "verdict.json", verdict.as_json())
-        for estimate in ground.values():
-            _write(drive, estimate, unfinished, verdict)
-    for estimate in ground.values():
-        for line in lines(estimate):
-            print(line)
-    for line in (verdict.lines[0], *(finding.line for finding in verdict.raised)):
+        write_ground_calibration(found, unfinished)
+    for line in summary_lines(found):
         print(line)
     print(f"results in {folder}")
-    return verdict.status is Status.FAIL
+    return found.verdict.status is Status.FAIL
 
 
-def _tell(done: int, total: int) -> None:
+def summary_lines(found: GroundCalibration) -> list[str]:
+    """Every camera's mounting and the verdict, for a terminal."""
+    cameras = [line for estimate in found.estimates.values() for line in lines(estimate)]
+    return [*cameras, found.verdict.lines[0], *(finding.line for finding in found.verdict.raised)]
+
+
+def write_ground_calibration(found: GroundCalibration, folder: Path) -> None:
+    """Write the verdict, and the calibration and matched ground of each camera that has one."""
+    verdict = found.verdict.as_json()
+    write_json(folder / "verdict.json", verdict)
+    about = Provenance.today(found.drive.name, verdict)
+    for name, calibration in found.calibrations.items():
+        picture = draw_matched_ground(found.drive, found.estimates[name])
+        if picture is not None:
+            path = folder / f"calibration_{name}.yaml"
+            write_calibration(calibration, path, verdict=verdict, about=about)
+            (folder / f"ground_{name}.png").write_bytes(png(picture))
+
+
+def _report_progress(done: int, total: int) -> None:
     print(f"matched the ground of {done} of {total} cameras", file=sys.stderr, flush=True)
-
-
-def _write(drive: Drive, estimate: GroundEstimate, folder: Path, verdict: Verdict) -> None:
-    """One camera's calibration, and the picture of its matched ground; nothing where none was found."""
-    picture = draw_matched_ground(drive, estimate)
-    if estimate.calibration is None or picture is None:
-        return
-    path = folder / f"calibration_{estimate.camera}.yaml"
-    told = verdict.as_json()
-    write_calibration(estimate.calibration, path, verdict=told, about=Provenance.today(drive.name, told))
-    (folder / f"ground_{estimate.camera}.png").write_bytes(png(picture))

@@ -21,31 +21,19 @@ from v2hdm.report import style
 from v2hdm.report.camera_grid import project_line
 
 _HEIGHT_IN = 6.4
-
-_ARROW_SHARE = 0.06
-"""Length of the longest arrow of a right point, as a share of the picture's width."""
-
-_SHORTEST = 1e-4
-"""Arrows shorter than this share of the width are not magnified further."""
-
-_GRID_LINES = 14
-"""Grid lines at most each way; their spacing is the least of :data:`_SPACINGS_M` that needs no more."""
-
+_ARROW_SHARE = 0.06  # length of the longest arrow of a right point, as a share of the picture's width
+_SHORTEST = 1e-4  # arrows shorter than this share of the width are not magnified further
+_GRID_LINES = 14  # grid lines at most each way; their spacing is the least of _SPACINGS_M that needs no more
 _SPACINGS_M = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
-
-_MARGIN = 0.25
-"""How far the grid reaches beyond the points, as a share of their extent."""
-
-_LABELS_APART = 0.04
-"""Distance between labels of the grid, as a share of the image's width."""
-
+_MARGIN = 0.25  # how far the grid reaches beyond the points, as a share of their extent
+_LABELS_APART = 0.04  # distance between labels of the grid, as a share of the image's width
 _RIGHT, _WRONG, _GRID, _ROI = style.METHOD["Opt"], style.METHOD["ENI"], "#3b6fb6", style.METHOD["CNI"]
 _HALO: Any = [patheffects.withStroke(linewidth=2.2, foreground="white")]
 
 
 @dataclass(frozen=True)
 class _Scene:
-    """What both panels show; ``low`` and ``high`` (2,) are the corners of the ground in them, m."""
+    """The content of both panels; ``low`` and ``high`` (2,) are the corners of the ground in them, m."""
 
     labels: Sequence[str]
     fit: Fit
@@ -63,16 +51,7 @@ def save_picture(
     residuals: Residuals,
     roi_vehicle: FloatArray,
 ) -> None:
-    """Draw points and residuals in the image, on blank paper of its size without one, and on the ground.
-
-    Args:
-        path: where the PNG goes.
-        image: (H, W, 3) BGR as recorded, or None.
-        labels: of the points.
-        fit: the mounting.
-        residuals: of its points.
-        roi_vehicle: (M, 2) region of interest, m.
-    """
+    """Draw points and residuals on an image (H, W, 3) BGR, or blank paper of its size, and on the ground."""
     points = fit.seen.points_vehicle
     margin = _MARGIN * np.ptp(points, axis=0).max()
     scene = _Scene(

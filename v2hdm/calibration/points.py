@@ -4,31 +4,31 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.records import CameraInfo, FloatArray
+from v2hdm.records import BoolArray, CameraInfo, FloatArray
 from v2hdm.store.files import read_text
 
 COLUMNS = ("u", "v", "x", "y")
 """Pixel (centre of the first at 0, 0) and place in the vehicle frame (x forward, y left, m)."""
 
-_ALIASES: Mapping[str, str] = {"u_px": "u", "v_px": "v", "x_m": "x", "y_m": "y"}
-_NAME = "name"
 LEAST_POINTS = 4
 """A homography has eight degrees of freedom, a point two coordinates."""
+
+_ALIASES: Mapping[str, str] = {"u_px": "u", "v_px": "v", "x_m": "x", "y_m": "y"}
+_NAME = "name"
 
 
 @dataclass(frozen=True)
 class SurveyedPoints:
     """N ground points: ``points_px`` (N, 2) as recorded, ``points_vehicle`` (N, 2) m.
 
-    ``names`` say which point is meant in a message, by its name and the line of the file, ``labels`` in a
-    picture.
+    ``names`` identify points in messages, by name and line of the file, ``labels`` in a picture.
     """
 
     path: Path
@@ -36,10 +36,6 @@ class SurveyedPoints:
     labels: tuple[str, ...]
     points_px: FloatArray
     points_vehicle: FloatArray
-
-    def read_as(self, points_px: FloatArray, points_vehicle: FloatArray) -> SurveyedPoints:
-        """The same points with other coordinates."""
-        return replace(self, points_px=points_px, points_vehicle=points_vehicle)
 
 
 def read_points(path: Path) -> SurveyedPoints:
@@ -56,15 +52,15 @@ def read_points(path: Path) -> SurveyedPoints:
         raise DriveError(f"{path}: is empty; expected the columns {', '.join(COLUMNS)} and a line a point")
     title = lines[0][1].lstrip("\ufeff# ")
     separator = next((mark for mark in ";,\t" if mark in title), None)
-    places = _places(_split(title, separator), path)
+    columns = _columns(_split(title, separator), path)
     names, labels, rows = [], [], []
     for number, line in lines[1:]:
         cells = _split(line, separator)
-        if len(cells) != len(places):
+        if len(cells) != len(columns):
             raise DriveError(
-                f"{path}: line {number}: {len(cells)} cells under {len(places)} columns; mend that line"
+                f"{path}: line {number}: {len(cells)} cells under {len(columns)} columns; mend that line"
             )
-        row = dict(zip(places, cells, strict=True))
+        row = dict(zip(columns, cells, strict=True))
         name = row.get(_NAME, "")
         names.append(f"point {name} (line {number})" if name else f"the point of line {number}")
         labels.append(name or f"line {number}")
@@ -104,27 +100,27 @@ def check_points(points: SurveyedPoints, info: CameraInfo) -> None:
                 )
 
 
-def _inside(points_px: FloatArray, size: np.ndarray) -> np.ndarray:
+def _inside(points_px: FloatArray, size: np.ndarray) -> BoolArray:
     return np.asarray(((points_px > -0.5) & (points_px < size - 0.5)).all(axis=1))
 
 
-def _places(header: list[str], path: Path) -> list[str]:
+def _columns(header: list[str], path: Path) -> list[str]:
     """The columns' names as ours, in the order of the file."""
-    places = [_ALIASES.get(name.strip().lower(), name.strip().lower()) for name in header]
+    columns = [_ALIASES.get(name.strip().lower(), name.strip().lower()) for name in header]
     for column in COLUMNS:
-        if places.count(column) != 1:
+        if columns.count(column) != 1:
             raise DriveError(
-                f"{path}: {'no' if column not in places else 'more than one'} column '{column}'; the first "
+                f"{path}: {'no' if column not in columns else 'more than one'} column '{column}'; the first "
                 f"line must name {', '.join(COLUMNS)} (pixel right and down, m forward and left); it says: "
                 f"{', '.join(header)}"
             )
-    for name in places:
+    for name in columns:
         if name not in (*COLUMNS, _NAME):
             hint = "points must lie on the ground; drop it" if name in ("z", "z_m") else "drop it"
             raise DriveError(
                 f"{path}: column '{name}' is not known ({', '.join(COLUMNS)} and {_NAME} are); {hint}"
             )
-    return places
+    return columns
 
 
 def _split(line: str, separator: str | None) -> list[str]:

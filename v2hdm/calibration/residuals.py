@@ -1,14 +1,15 @@
-"""How well surveyed points agree with a mounting and with the intrinsics."""
+"""How well surveyed points agree with a mounting and the intrinsics, and the findings that follow."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2, f
 
-from v2hdm.calibration.fit import Fit, fit_mountings
-from v2hdm.calibration.likelihood import STATED_AS, Seen
+from v2hdm.calibration.fit import STATED_AS, UNKNOWNS, Fit, Seen, fit_mountings
+from v2hdm.calibration.points import LEAST_POINTS, SurveyedPoints
 from v2hdm.geometry.ipm import (
     apply_in_front,
     facing_ipm,
@@ -19,11 +20,18 @@ from v2hdm.geometry.ipm import (
 )
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.records import CameraInfo, FloatArray
+from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
-_UNKNOWNS = 6
+CHANCE = 1e-3
+"""Probability with which a right calibration raises a finding."""
+
+# Standard deviation up to which a start serves the mapping, which copes with IPMs decimetres off, m.
+_WELL_KNOWN_M = 0.3
+# Error of the focal length from which it is another lens or image size, rather than a poor calibration.
+_FOCAL_OFF = 0.05
+_RIVAL = float(np.log(100.0))  # log odds up to which another mounting explains the points nearly as well
 _FOCAL_ROUNDS = 3
-_AROUND = 12
-"""Places on the circle of :func:`known_around`."""
+_AROUND = 12  # places on the circle of known_around
 
 
 @dataclass(frozen=True)
@@ -33,7 +41,7 @@ class Residuals:
     Attributes:
         off_px: (N, 2) recorded less predicted pixel.
         off_m: (N, 2) where the IPM puts the pixel, less where the point was surveyed; nan above the horizon.
-        sigmas: (N,) distance of the point from what all others predict, in standard deviations.
+        sigmas: (N,) distance of the point from the prediction of all others, in standard deviations.
         probability: (N,) of a right point being as far off by chance.
         known_m: (N,) standard deviation of the IPM there, in the direction known worst.
     """
@@ -50,25 +58,11 @@ def residuals(fit: Fit) -> Residuals:
     seen, mounting = fit.seen, fit.cam_from_vehicle
     predicted, depth = project_ground(seen.info.intrinsic, mounting, seen.points_vehicle)
     off_px = np.where(depth[:, None] > 0, seen.points_px - distort_points(seen.info, predicted), np.nan)
-    ipm = facing_ipm(ipm_from_extrinsic(seen.info, mounting), _ground_in_view(fit))
+    in_view = seen.points_vehicle[int(np.argmax(np.where(depth > 0, fit.right, -1.0)))]
+    ipm = facing_ipm(ipm_from_extrinsic(seen.info, mounting), in_view)
     off_m = apply_in_front(ipm, undistort_points(seen.info, seen.points_px)) - seen.points_vehicle
-    slopes = seen.jacobian(mounting)
-    stated = seen.covariance(mounting)
-    by_mounting = slopes @ (fit.covariance / fit.factor) @ np.swapaxes(slopes, 1, 2)
-    sigmas, probability = _held_out(fit, stated, by_mounting)
-    return Residuals(
-        off_px=off_px,
-        off_m=np.asarray(off_m),
-        sigmas=sigmas,
-        probability=probability,
-        known_m=known_ground(fit, seen.points_vehicle),
-    )
-
-
-def _ground_in_view(fit: Fit) -> FloatArray:
-    """A right point, in front of the camera."""
-    _, depth = project_ground(fit.seen.info.intrinsic, fit.cam_from_vehicle, fit.seen.points_vehicle)
-    return np.asarray(fit.seen.points_vehicle[int(np.argmax(np.where(depth > 0, fit.right, -1.0)))])
+    sigmas, probability = _held_out(fit)
+    return Residuals(off_px, off_m, sigmas, probability, known_ground(fit, seen.points_vehicle))
 
 
 def known_ground(fit: Fit, places_vehicle: FloatArray) -> FloatArray:
@@ -86,8 +80,7 @@ def known_ground(fit: Fit, places_vehicle: FloatArray) -> FloatArray:
         points_vehicle=places_vehicle,
     )
     slopes = places.jacobian(mounting)
-    homography = pinhole_px_from_ground(seen.info.intrinsic, mounting)
-    by_ground = homography_jacobian(homography, places_vehicle)
+    by_ground = homography_jacobian(pinhole_px_from_ground(seen.info.intrinsic, mounting), places_vehicle)
     in_front = np.isfinite(by_ground).all(axis=(1, 2))
     out = np.full(count, np.inf)
     back = np.linalg.inv(by_ground[in_front]) @ slopes[in_front]
@@ -99,7 +92,7 @@ def known_ground(fit: Fit, places_vehicle: FloatArray) -> FloatArray:
 def known_around(fit: Fit) -> float:
     """The worst of :func:`known_ground` at the right points and on a circle around them, as wide as they are.
 
-    Points along a line know the ground on that line, and none beside it.
+    Points along a line determine the ground on that line, and none beside it.
     """
     right = fit.seen.points_vehicle[fit.is_right]
     radius = np.ptp(right, axis=0).max() / 2
@@ -111,12 +104,15 @@ def known_around(fit: Fit) -> float:
     return float(in_front.max()) if len(in_front) else np.inf
 
 
-def _held_out(fit: Fit, stated: FloatArray, by_mounting: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """How far each point is from what the others predict, under the noise that the others show.
+def _held_out(fit: Fit) -> tuple[FloatArray, FloatArray]:
+    """How far each point is from the others' prediction, under the noise that the others show.
 
     Of a point that took part, q V - J C J' is the covariance of its residual, of another q V + J C J': either
     way r' cov^-1 r is its squared distance from the others' prediction.
     """
+    slopes = fit.seen.jacobian(fit.cam_from_vehicle)
+    stated = fit.seen.covariance(fit.cam_from_vehicle)
+    by_mounting = slopes @ (fit.covariance / fit.factor) @ np.swapaxes(slopes, 1, 2)
     residual = fit.seen.residual_px(fit.cam_from_vehicle)
     took_part = np.where(fit.is_right, -1.0, 1.0)[:, None, None]
     inverse = np.linalg.pinv(stated + took_part * by_mounting, rcond=1e-9, hermitian=True)
@@ -124,7 +120,7 @@ def _held_out(fit: Fit, stated: FloatArray, by_mounting: FloatArray) -> tuple[Fl
     own = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(stated), residual)
     total = float(own[fit.is_right].sum())
     count = 2.0 * (fit.is_right.sum() - fit.is_right)
-    free = np.maximum(count - _UNKNOWNS, 0.0) + STATED_AS
+    free = np.maximum(count - UNKNOWNS, 0.0) + STATED_AS
     others = (np.maximum(total - np.where(fit.is_right, square, 0.0), 0.0) + STATED_AS) / free
     ratio = square / others
     return np.sqrt(ratio), np.asarray(f.sf(ratio / 2, 2, free))
@@ -144,7 +140,7 @@ def scatter(fit: Fit, chance: float) -> Scatter:
     residual = fit.seen.residual_px(fit.cam_from_vehicle)[fit.is_right]
     stated = fit.seen.covariance(fit.cam_from_vehicle)[fit.is_right]
     total = float(np.einsum("ni,nij,nj->", residual, np.linalg.inv(stated), residual))
-    free = max(2 * len(residual) - _UNKNOWNS, 1)
+    free = max(2 * len(residual) - UNKNOWNS, 1)
     return Scatter(
         float(np.sqrt(total / free)),
         float(np.sqrt(chi2.isf(chance, free) / free)),
@@ -158,7 +154,7 @@ class Lens:
 
     Attributes:
         probability: of as large a disagreement by chance, with both focal lengths freed.
-        focal: by what share the points want the focal length longer, and the standard deviation of that.
+        focal: by which share the points want the focal length longer, and the standard deviation of that.
     """
 
     probability: float
@@ -184,34 +180,119 @@ def _freed(fit: Fit) -> tuple[float, float, float]:
     """The chance of the disagreement, and the focal length's relative error with its sigma."""
     seen = fit.seen
     right = fit.is_right
-    stated = np.linalg.inv(seen.covariance(fit.cam_from_vehicle)[right])
+    stated = np.asarray(np.linalg.inv(seen.covariance(fit.cam_from_vehicle)[right]), dtype=np.float64)
     slopes = seen.jacobian(fit.cam_from_vehicle)[right]
     residual = seen.residual_px(fit.cam_from_vehicle)[right]
-    (cx, cy) = seen.info.intrinsic[:2, 2]
-    from_centre = seen.points_px[right] - (cx, cy)
+    from_centre = seen.points_px[right] - seen.info.intrinsic[:2, 2]
     # Longer by a share, a focal length moves the predicted pixel away from the centre by that share.
     each = np.zeros((len(residual), 2, 2))
     each[:, [0, 1], [0, 1]] = from_centre
-    gains = {}
-    for name, more in (("both", each), ("one", from_centre[..., None])):
-        own = np.einsum("nij,nik,njl->kl", stated, more, more)
-        shared = np.einsum("nij,nik,njl->kl", stated, more, slopes)
-        mounting = np.einsum("nij,nik,njl->kl", stated, slopes, slopes)
-        wanted = np.einsum("nij,nik,nj->k", stated, more, residual)
-        pull = np.einsum("nij,nik,nj->k", stated, slopes, residual)
-        through = shared @ np.linalg.pinv(mounting)
-        left, force = own - through @ shared.T, wanted - through @ pull
-        step = -np.linalg.pinv(left, hermitian=True) @ force
-        gains[name] = (float(-step @ force), step, left)
+    gain, _, _ = _gain_of(each, stated, slopes, residual)
     total = float(np.einsum("ni,nij,nj->", residual, stated, residual))
-    free = max(2 * len(residual) - _UNKNOWNS - 2, 0) + STATED_AS
-    gain, _, _ = gains["both"]
+    free = max(2 * len(residual) - UNKNOWNS - 2, 0) + STATED_AS
     noise = (max(total - gain, 0.0) + STATED_AS) / free
-    _, step, left = gains["one"]
+    _, step, left = _gain_of(from_centre[..., None], stated, slopes, residual)
     return float(f.sf(gain / 2 / noise, 2, free)), float(step[0]), float(np.sqrt(noise / left[0, 0]))
+
+
+def _gain_of(
+    more: FloatArray, stated: FloatArray, slopes: FloatArray, residual: FloatArray
+) -> tuple[float, FloatArray, FloatArray]:
+    """Decrease of the cost by unknowns with derivatives (N, 2, K), their values, their information."""
+    own = np.einsum("nij,nik,njl->kl", stated, more, more)
+    shared = np.einsum("nij,nik,njl->kl", stated, more, slopes)
+    mounting = np.einsum("nij,nik,njl->kl", stated, slopes, slopes)
+    wanted = np.einsum("nij,nik,nj->k", stated, more, residual)
+    pull = np.einsum("nij,nik,nj->k", stated, slopes, residual)
+    through = shared @ np.linalg.pinv(mounting)
+    left, force = own - through @ shared.T, wanted - through @ pull
+    step = -np.linalg.pinv(left, hermitian=True) @ force
+    return float(-step @ force), step, left
 
 
 def _longer(info: CameraInfo, factor: float) -> CameraInfo:
     intrinsic = info.intrinsic.copy()
     intrinsic[:2, :2] *= factor
     return replace(info, intrinsic=intrinsic)
+
+
+def judge_fit(points: SurveyedPoints, fits: Sequence[Fit], residuals: Residuals) -> Iterator[Finding]:
+    """The findings on the most likely of ``fits``."""
+    fit, about = fits[0], fits[0].seen.info.name
+    yield from _wrong_points(points, fits, residuals, about)
+    spread = scatter(fit, CHANCE)
+    says = f"the points scatter {spread.ratio:.2g} times as much as --pixel-sigma and --survey-sigma say"
+    yield judge(
+        "scatter", about, spread.ratio, spread.limit, "",
+        fine=says,
+        wrong=f"{says}, and the sigmas have grown by that: measure again, or state the errors as they are",
+        status=Status.WARN,
+    )  # fmt: skip
+    yield _intrinsics(fit, about)
+    worst = known_around(fit)
+    yield judge(
+        "known ground", about, min(worst, 1e6), _WELL_KNOWN_M, "m",
+        fine=f"the IPM is known to {100 * worst:.1f} cm or better around the points",
+        wrong=f"the IPM is known to {worst:.2g} m only around the points: survey more of them, near and far, "
+        "left and right; points along one line fix no camera",
+    )  # fmt: skip
+
+
+def _wrong_points(
+    points: SurveyedPoints, fits: Sequence[Fit], residuals: Residuals, about: str
+) -> Iterator[Finding]:
+    fit, total = fits[0], len(points.names)
+    named = np.flatnonzero(~fit.is_right | (residuals.probability < CHANCE / total)).tolist()
+    for k in named:
+        how_far = _how_far(residuals.off_px[k], residuals.off_m[k])
+        share = "counts for nothing" if not fit.is_right[k] else "still counts"
+        says = (
+            f"{points.names[k]} contradicts the others by {residuals.sigmas[k]:.0f} sigmas "
+            f"({how_far}) and {share}: check its pixel and its place"
+        )
+        yield Finding("point", Status.WARN, float(residuals.sigmas[k]), None, "sigma", says, about)
+    if not named:
+        yield passed("point", about, "no point contradicts the others", 0.0, "points")
+    count = int(fit.is_right.sum())
+    if count < max(LEAST_POINTS, (total + 1) // 2):
+        says = (
+            f"of {total} points only {count} agree on a mounting: check the columns, which pixel belongs to "
+            "which place, and the intrinsics"
+        )
+        yield Finding("agreement", Status.FAIL, float(count), None, "points", says, about)
+    rivals = [one for one in fits[1:] if fit.log_posterior - one.log_posterior < _RIVAL]
+    if rivals and named:
+        other = [points.names[k] for k in np.flatnonzero(~rivals[0].is_right)]
+        says = (
+            "which point is wrong cannot be told: another mounting explains the points as well, without "
+            f"{' and '.join(other) or 'leaving one out'}; survey more points"
+        )
+        yield Finding("rival", Status.FAIL, None, None, "", says, about)
+
+
+def _intrinsics(fit: Fit, about: str) -> Finding:
+    tested = lens(fit)
+    focal, sigma = tested.focal
+    far = abs(focal) > _FOCAL_OFF
+    recovery = (
+        "were the points clicked in an image of another size, or is this another camera's file?"
+        if far
+        else "calibrate the lens again, or check that the images were not resized"
+    )
+    size = f"{100 * focal:+.1f} +- {100 * sigma:.1f} %"
+    return judge(
+        "intrinsics", about, -np.log10(max(tested.probability, 1e-99)), -np.log10(CHANCE), "",
+        fine=f"the points agree with the intrinsics (focal length {size})",
+        wrong=f"the points contradict the intrinsics: they want the focal length {size} longer; {recovery}",
+        status=Status.FAIL if far else Status.WARN,
+    )  # fmt: skip
+
+
+def _how_far(off_px: FloatArray, off_m: FloatArray) -> str:
+    """How far a point (2,) is off in the image and on the ground."""
+    pixels, metres = float(np.hypot(*off_px)), float(np.hypot(*off_m))
+    if not np.isfinite(pixels):
+        return "its place is behind the camera"
+    if not np.isfinite(metres):
+        return f"{pixels:.1f} px, and its pixel is above the horizon"
+    return f"{pixels:.1f} px, {f'{metres:.2f} m' if metres >= 1 else f'{100 * metres:.1f} cm'} on the ground"

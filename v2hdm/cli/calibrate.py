@@ -24,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _calibrate(parsed: argparse.Namespace) -> int:
-    from v2hdm.calibration.run import calibrate_camera
+    from v2hdm.calibration.from_points import calibrate_camera
 
     return EXIT_FAILED_VERDICT if calibrate_camera(parsed) else 0
 

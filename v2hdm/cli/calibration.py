@@ -1,4 +1,4 @@
-"""The door to a drift alarm: ``python -m v2hdm.cli.calibration BEFORE AFTER`` tells whether a camera has moved.
+"""The door to a drift alarm: ``python -m v2hdm.cli.calibration BEFORE AFTER`` says what has moved.
 
 Both are results of ``python -m v2hdm.map`` or ``v2hdm.cli.extrinsic``: a folder, or one calibration file. One
 line a camera on stdout. docs/calibration.md describes it.
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from v2hdm.cli.door import EXIT_FAILED_VERDICT, ShowVersion, answer_signals, open_door
 
 if TYPE_CHECKING:
-    from v2hdm.verdict.movement import Movement
+    from v2hdm.calibration.compare import Movement
 
 
 _LEAST = 1e-12
@@ -30,9 +30,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _compare(parsed: argparse.Namespace) -> int:
+    from v2hdm.calibration.compare import compare_calibrations, turned_alike
     from v2hdm.errors import MapFileError
     from v2hdm.io.calibration.document import trusted_calibrations
-    from v2hdm.verdict.movement import movement, turned_alike
 
     before, after = (trusted_calibrations(path) for path in (parsed.before, parsed.after))
     common = [name for name in before if name in after]
@@ -41,7 +41,7 @@ def _compare(parsed: argparse.Namespace) -> int:
             f"{parsed.before} has {', '.join(before)} and {parsed.after} has {', '.join(after)}: "
             "no camera in common"
         )
-    movements = [movement(before[name], after[name]) for name in common]
+    movements = compare_calibrations(before, after)
     if parsed.json:
         print(json.dumps([_as_json(one) for one in movements]))
     else:

@@ -1,9 +1,10 @@
-"""How a camera is turned on its vehicle, as angles that people read."""
+"""How a camera sits on its vehicle, as angles and lengths that people read."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import FloatArray
 
 
@@ -42,3 +43,16 @@ def centre_sigmas(cam_from_vehicle: FloatArray, covariance: FloatArray) -> Float
     # A left perturbation (v, w) of cam_from_vehicle moves the centre by -R'v.
     to_vehicle = cam_from_vehicle[:3, :3].T
     return np.asarray(np.sqrt(np.diag(to_vehicle @ covariance[:3, :3] @ to_vehicle.T)))
+
+
+def mounting_words(cam_from_vehicle: FloatArray, covariance: FloatArray) -> tuple[list[str], list[str]]:
+    """Roll, pitch and yaw, and the place forward, left and height, each with its standard deviation."""
+    angles = np.degrees(mounting_angles(cam_from_vehicle))
+    angle_sigma = np.degrees(angle_sigmas(cam_from_vehicle, covariance))
+    centre, centre_sigma = camera_centre(cam_from_vehicle), centre_sigmas(cam_from_vehicle, covariance)
+    turned = zip(("roll", "pitch", "yaw"), angles, angle_sigma, strict=True)
+    placed = zip(("forward", "left", "height"), centre, centre_sigma, strict=True)
+    return (
+        [f"{word} {angle:.2f} +- {sigma:.2f} deg" for word, angle, sigma in turned],
+        [f"{word} {value:.3f} +- {sigma:.3f} m" for word, value, sigma in placed],
+    )

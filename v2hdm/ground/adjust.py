@@ -1,4 +1,4 @@
-"""Robust least squares: the mounting under which matched pixels show the same ground."""
+"""Robust least squares: the mounting under which matched pixels show the same ground, given a prior."""
 
 from __future__ import annotations
 
@@ -6,85 +6,29 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from v2hdm.geometry.least_squares import Normal, gauss_newton
 from v2hdm.geometry.rigid import rotation_from_vector
-from v2hdm.ground.model import GroundHits, by_lens, by_pixel, hit_ground
-from v2hdm.ground.mount import Mount
-from v2hdm.records import BoolArray, FloatArray, IntArray
+from v2hdm.ground.model import GroundHits, Mount, by_lens, by_pixel, hit_ground
+from v2hdm.ground.prior import Observations, Prior
+from v2hdm.records import FloatArray, IntArray
 
 PIXEL_SIGMA = 0.4
-"""What a patch's place in an image is off, px, at the most; the unit of the residuals."""
+"""Largest standard deviation of a patch's place in an image, px; the unit of the residuals."""
 
-_LEAST_PIXEL_SIGMA = 0.1
-"""Below this interpolation and the grid itself show, px."""
-
+_LEAST_PIXEL_SIGMA = 0.1  # interpolation and the grid itself limit the matches to this, px
+# Median length of a plane vector whose components have a standard deviation of one.
 _RAYLEIGH_MEDIAN = np.sqrt(2 * np.log(2))
-"""Median length of a plane vector whose components have a standard deviation of one."""
-
-_CAUCHY = 2.5
-"""Length of a whitened residual from which on it loses its weight."""
-
+_CAUCHY = 2.5  # length of a whitened residual from which on it loses its weight
+# How far a good lens model and the matching are off, px, smoothly over the image and alike in all: little
+# against a pixel, but thousands of matches share it.
 _LENS_SIGMA_PX = 0.1
-"""How far a good lens model and the matching are off, px, smoothly over the image and alike in all: little
-against a pixel, but thousands of matches share it."""
-
-_BENDS = 6
-"""Terms of a smooth error of each pixel coordinate: a polynomial of the second degree."""
-
-_LARGEST_TURN_RAD = 0.05
-_LARGEST_SHIFT_M = 0.2
-"""A step larger than these leaves what the equations are linear in."""
-
+_BENDS = 6  # terms of a smooth error of each pixel coordinate: a polynomial of the second degree
+# Longer steps leave the range in which the equations are linear.
+_LARGEST_TURN_RAD, _LARGEST_SHIFT_M = 0.05, 0.2
 _STEPS = 20
-_CONVERGED = 0.02
-"""A step below so many standard deviations is the last."""
+_CONVERGED = 0.02  # a step below so many standard deviations is the last
 
-CENTRE, TURN = slice(3, 6), slice(0, 3)
-
-
-@dataclass(frozen=True)
-class Observations:
-    """Matches of all pairs of one camera.
-
-    Attributes:
-        first: (N,) the image of each match's first pixel, a row of the poses below.
-        second: (N,) that of its second.
-        first_px: (N, 2) raw pixels.
-        second_px: (N, 2) raw pixels.
-        pair: (N,) the pair.
-    """
-
-    first: IntArray
-    second: IntArray
-    first_px: FloatArray
-    second_px: FloatArray
-    pair: IntArray
-
-    def only(self, keep: BoolArray) -> Observations:
-        """Those of a mask (N,)."""
-        return Observations(
-            self.first[keep], self.second[keep], self.first_px[keep], self.second_px[keep], self.pair[keep]
-        )
-
-
-@dataclass(frozen=True)
-class Believed:
-    """What is known before the ground is seen.
-
-    Attributes:
-        poses: (I, 4, 4) ``map_from_vehicle`` as recorded.
-        pose_information: (6, I, I) of the poses' errors; see :func:`v2hdm.ground.noise.pose_information`.
-        velocity: (I, 3) smoothed motion.
-        climb_m: (I,) what a grade of 1 has lifted the poses by, m.
-        centre_vehicle: (3,) surveyed camera centre.
-        centre_sigma_m: (3,) of it.
-    """
-
-    poses: FloatArray
-    pose_information: FloatArray
-    velocity: FloatArray
-    climb_m: FloatArray
-    centre_vehicle: FloatArray
-    centre_sigma_m: FloatArray
+TURN, CENTRE, BENDS = slice(0, 3), slice(3, 6), slice(6, 6 + 2 * _BENDS)
 
 
 @dataclass(frozen=True)
@@ -95,7 +39,7 @@ class Adjusted:
         mount: with the lens as freed.
         extra: the freed parameter's value, 0 without one.
         covariance: (K, K) of turn (3, rad), centre (3, m) and the freed parameter, if any.
-        pose_errors: (I, 6) estimated :data:`v2hdm.ground.noise.STATES`.
+        pose_errors: (I, 6) estimated :data:`~v2hdm.ground.prior.STATES`.
         bends: (12,) estimated smooth error of the pixels, px.
         poses: (I, 4, 4) ``map_from_vehicle`` with their errors, and the parameter, taken in.
         residual: (N,) lengths in units of :data:`PIXEL_SIGMA` over both pixels.
@@ -112,98 +56,196 @@ class Adjusted:
     weight: FloatArray
 
 
+@dataclass(frozen=True)
+class _Unknowns:
+    """The estimate: mounting, freed parameter, errors of the poses (I, 6) and of the pixels (12,)."""
+
+    mount: Mount
+    extra: float
+    errors: FloatArray
+    bends: FloatArray
+
+
+@dataclass(frozen=True)
+class _Weighted(Normal):
+    """The normal equations, with the lengths (N,) of the residuals and their weights (N,)."""
+
+    length: FloatArray
+    weight: FloatArray
+
+
 def adjust(
     observations: Observations,
-    believed: Believed,
+    prior: Prior,
     start: Mount,
     free: str | None = None,
     tolerance: float = 1.0,
     near: Adjusted | None = None,
 ) -> Adjusted:
-    """Find the mounting, beside one parameter ``free`` if any, by Gauss-Newton with Cauchy's weights.
+    """Find the mounting, beside one parameter ``free`` if any, with Cauchy's weights.
 
     Args:
         observations: the matches.
-        believed: poses, survey and their noise.
+        prior: poses, survey and their noise.
         start: where to start from.
         free: ``clock_s``, ``focal_scale``, ``distortion_k1`` or ``grade``, or None.
         tolerance: factor on the length of residual from which on a match loses its weight.
         near: a solution for the same images, without the parameter, to start from instead.
     """
-    mount, extra = start if near is None else near.mount, 0.0
-    errors = np.zeros((len(believed.poses), 6)) if near is None else near.pose_errors
-    bends = np.zeros(2 * _BENDS) if near is None else near.bends
-    sigma_px = PIXEL_SIGMA
-    for _ in range(_STEPS):
-        residual, jacobian, root = _linearised(observations, believed, mount, extra, errors, bends, free)
-        length = np.linalg.norm((root @ residual[:, :, None])[..., 0], axis=1)
-        usable = np.isfinite(length)
-        scale = float(np.median(length[usable])) / _RAYLEIGH_MEDIAN if usable.any() else 1.0
-        sigma_px = float(np.clip(PIXEL_SIGMA * scale, _LEAST_PIXEL_SIGMA, tolerance * PIXEL_SIGMA))
-        unit = PIXEL_SIGMA / sigma_px
-        weight = np.where(usable, 1 / (1 + (length * unit / (_CAUCHY * tolerance)) ** 2), 0.0)
-        system, gradient = _normal(
-            observations, believed, mount, errors, bends, residual, jacobian, root * unit, weight
-        )
-        step = _short(np.asarray(np.linalg.solve(system, -gradient)))
-        known = len(step) - errors.size
-        mount = mount.moved(step[TURN], step[CENTRE])
-        bends = bends + step[6 : 6 + 2 * _BENDS]
-        if free is not None:
-            change = float(step[known - 1])
-            extra += change
-            if free == "focal_scale":
-                mount = mount.with_focal_scale((1 + extra) / (1 + extra - change) - 1)
-            elif free == "distortion_k1":
-                mount = mount.with_k1(change)
-        errors = errors + step[known:].reshape(-1, 6)
-        if np.max(np.abs(step) * np.sqrt(np.diag(system))) < _CONVERGED:
-            break
-    wanted = [*range(6), *range(known - (free is not None), known)]
-    covariance = np.asarray(np.linalg.inv(system)[np.ix_(wanted, wanted)])
+    problem = _Problem(observations, prior, free, tolerance)
+    begin = _Unknowns(start, 0.0, np.zeros((len(prior.poses), 6)), np.zeros(2 * _BENDS))
+    if near is not None:
+        begin = _Unknowns(near.mount, 0.0, near.pose_errors, near.bends)
+    fit = gauss_newton(
+        problem.linearise, begin, retract=problem.moved, limit=_short, steps=_STEPS, tolerance=_CONVERGED
+    )
+    found, last = fit.x, fit.last
+    wanted = [*range(6), *range(BENDS.stop, problem.known)]
     return Adjusted(
-        mount, extra, covariance, errors, bends, moved_poses(believed, errors, extra, free), length, weight
+        mount=found.mount,
+        extra=found.extra,
+        covariance=np.asarray(np.linalg.inv(last.information)[np.ix_(wanted, wanted)]),
+        pose_errors=found.errors,
+        bends=found.bends,
+        poses=problem.poses(found),
+        residual=last.length,
+        weight=last.weight,
     )
 
 
 def _short(step: FloatArray) -> FloatArray:
-    """The step, shortened to what its linearisation holds for."""
+    """The step, shortened to the range in which the equations are linear."""
     turn, shift = np.abs(step[TURN]).max(), np.abs(step[CENTRE]).max()
-    return step / max(1.0, float(turn) / _LARGEST_TURN_RAD, float(shift) / _LARGEST_SHIFT_M)
+    return np.asarray(step / max(1.0, float(turn) / _LARGEST_TURN_RAD, float(shift) / _LARGEST_SHIFT_M))
 
 
-def _linearised(
-    observations: Observations,
-    believed: Believed,
-    mount: Mount,
-    extra: float,
-    errors: FloatArray,
-    bends: FloatArray,
-    free: str | None,
-) -> tuple[FloatArray, list[FloatArray], FloatArray]:
-    """Differences (N, 2) m, their derivatives by mount, parameter and both poses, whitening (N, 2, 2)."""
-    sides = []
-    spread = np.zeros((len(observations.first), 2, 2))
-    poses = moved_poses(believed, errors, extra, free)
-    for image, px in (
-        (observations.first, observations.first_px),
-        (observations.second, observations.second_px),
-    ):
-        hits = hit_ground(mount, px, poses[image])
-        by_px = by_pixel(mount, hits)
-        bending = _bending(mount, px, by_px)
-        by_known = np.concatenate([hits.by_mount(), bending], axis=2)
-        if free is not None:
-            column = _by_parameter(free, mount, hits, px, poses[image], believed, image)
-            by_known = np.concatenate([by_known, column[:, :, None]], axis=2)
-        sides.append((hits.points_map + bending @ bends, by_known, hits.by_pose()))
-        blur = PIXEL_SIGMA * by_px
-        spread = spread + blur @ np.swapaxes(blur, 1, 2)
-    (points, known, pose), (points_2, known_2, pose_2) = sides
-    usable = np.isfinite(spread).all(axis=(1, 2))
-    root = np.full(spread.shape, np.nan)
-    root[usable] = np.linalg.inv(np.linalg.cholesky(spread[usable]))
-    return points - points_2, [known - known_2, pose, -pose_2], root
+@dataclass(frozen=True)
+class _Problem:
+    """Unknowns, in order: turn, centre, bends, the freed parameter if any, and six errors of every pose."""
+
+    observations: Observations
+    prior: Prior
+    free: str | None
+    tolerance: float
+
+    @property
+    def known(self) -> int:
+        """The number of unknowns beside the poses' errors."""
+        return BENDS.stop + (self.free is not None)
+
+    def moved(self, now: _Unknowns, step: FloatArray) -> _Unknowns:
+        """The estimate after a step."""
+        mount, extra = now.mount.moved(step[TURN], step[CENTRE]), now.extra
+        if self.free is not None:
+            change = float(step[self.known - 1])
+            extra += change
+            if self.free == "focal_scale":
+                mount = mount.with_focal_scale((1 + extra) / (1 + now.extra) - 1)
+            elif self.free == "distortion_k1":
+                mount = mount.with_k1(change)
+        errors = now.errors + step[self.known :].reshape(-1, 6)
+        return _Unknowns(mount, extra, errors, now.bends + step[BENDS])
+
+    def poses(self, now: _Unknowns) -> FloatArray:
+        """The poses (I, 4, 4) with their estimated errors and the freed parameter taken in."""
+        prior = self.prior
+        turn, shift = now.errors[:, :3].copy(), now.errors[:, 3:].copy()
+        if self.free == "clock_s":
+            shift[:, :2] += now.extra * prior.velocity[:, :2]
+            turn[:, 2] += now.extra * prior.velocity[:, 2]
+        if self.free == "grade":
+            shift[:, 2] -= now.extra * prior.climb_m
+        out = prior.poses.copy()
+        out[:, :3, 3] += (prior.poses[:, :3, :3] @ shift[:, :, None])[..., 0]
+        out[:, :3, :3] = prior.poses[:, :3, :3] @ np.array([rotation_from_vector(vector) for vector in turn])
+        return out
+
+    def linearise(self, now: _Unknowns) -> _Weighted:
+        """The normal equations, the scale of the pixels' errors estimated from the residuals."""
+        residual, jacobian, root = self._differences(now)
+        length = np.linalg.norm((root @ residual[:, :, None])[..., 0], axis=1)
+        usable = np.isfinite(length)
+        scale = float(np.median(length[usable])) / _RAYLEIGH_MEDIAN if usable.any() else 1.0
+        sigma_px = float(np.clip(PIXEL_SIGMA * scale, _LEAST_PIXEL_SIGMA, self.tolerance * PIXEL_SIGMA))
+        unit = PIXEL_SIGMA / sigma_px
+        weight = np.where(usable, 1 / (1 + (length * unit / (_CAUCHY * self.tolerance)) ** 2), 0.0)
+        good = weight > 0
+        scaled = np.sqrt(weight[good])[:, None, None] * (root * unit)[good]
+        rows, value = scaled @ jacobian[good], (scaled @ residual[good][:, :, None])[..., 0]
+        information, gradient = self._sum_pairs(rows, value, self.observations.only(good))
+        cost = 0.5 * float(np.sum(value**2)) + self._add_priors(now, information, gradient)
+        return _Weighted(information, gradient, cost, length, weight)
+
+    def _differences(self, now: _Unknowns) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Differences (N, 2) m, their derivatives by the unknowns and by both poses, whitening (N, 2, 2)."""
+        seen, poses = self.observations, self.poses(now)
+        points, known, pose = [], [], []
+        spread = np.zeros((len(seen.first), 2, 2))
+        for image, px in ((seen.first, seen.first_px), (seen.second, seen.second_px)):
+            hits = hit_ground(now.mount, px, poses[image])
+            by_px = by_pixel(now.mount, hits)
+            bending = _bending(now.mount, px, by_px)
+            columns = [hits.by_mount(), bending]
+            if self.free is not None:
+                columns.append(self._by_parameter(now.mount, hits, px, poses[image], image)[:, :, None])
+            points.append(hits.points_map + bending @ now.bends)
+            known.append(np.concatenate(columns, axis=2))
+            pose.append(hits.by_pose())
+            blur = PIXEL_SIGMA * by_px
+            spread = spread + blur @ np.swapaxes(blur, 1, 2)
+        usable = np.isfinite(spread).all(axis=(1, 2))
+        root = np.full(spread.shape, np.nan)
+        root[usable] = np.linalg.inv(np.linalg.cholesky(spread[usable]))
+        jacobian = np.concatenate([known[0] - known[1], pose[0], -pose[1]], axis=2)
+        return points[0] - points[1], jacobian, root
+
+    def _by_parameter(
+        self, mount: Mount, hits: GroundHits, px: FloatArray, poses: FloatArray, image: IntArray
+    ) -> FloatArray:
+        """Derivative (N, 2) of ground points by the freed parameter."""
+        if self.free == "clock_s":
+            return hits.by_motion(self.prior.velocity[image])
+        if self.free == "grade":
+            return np.asarray(-hits.plane[:, :, 2] * self.prior.climb_m[image][:, None])
+        return by_lens(mount, px, poses, str(self.free))
+
+    def _sum_pairs(
+        self, rows: FloatArray, value: FloatArray, seen: Observations
+    ) -> tuple[FloatArray, FloatArray]:
+        """Information (U, U) and gradient (U,) of the matches, a block of two poses per pair."""
+        known = self.known
+        size = known + 6 * len(self.prior.poses)
+        information, gradient = np.zeros((size, size)), np.zeros(size)
+        cuts = np.flatnonzero(np.diff(seen.pair)) + 1
+        for low, high in zip([0, *cuts], [*cuts, len(seen.pair)], strict=True):
+            if high == low:
+                continue
+            block = rows[low:high].reshape(-1, known + 12)
+            images = (int(seen.first[low]), int(seen.second[low]))
+            at = np.concatenate([np.arange(known), *(known + 6 * image + np.arange(6) for image in images)])
+            information[np.ix_(at, at)] += block.T @ block
+            gradient[at] += block.T @ value[low:high].ravel()
+        return information, gradient
+
+    def _add_priors(self, now: _Unknowns, information: FloatArray, gradient: FloatArray) -> float:
+        """Add what is stated to the normal equations, in place; returns its cost."""
+        cost = 0.0
+        for state in range(6):
+            at = self.known + 6 * np.arange(len(self.prior.poses)) + state
+            pull = self.prior.pose_information[state] @ now.errors[:, state]
+            information[np.ix_(at, at)] += self.prior.pose_information[state]
+            gradient[at] += pull
+            cost += 0.5 * float(now.errors[:, state] @ pull)
+        stiffness = np.zeros(self.known)
+        # Too few matches must not make it singular: an angle is known to a radian, a parameter to ten units.
+        stiffness[TURN], stiffness[BENDS.stop :] = 1.0, 0.01
+        stiffness[CENTRE], stiffness[BENDS] = self.prior.centre_sigma_m**-2, _LENS_SIGMA_PX**-2
+        off = np.zeros(self.known)
+        off[CENTRE], off[BENDS] = now.mount.centre_vehicle - self.prior.centre_vehicle, now.bends
+        place = np.arange(self.known)
+        information[place, place] += stiffness
+        gradient[place] += stiffness * off
+        return cost + 0.5 * float(stiffness @ off**2)
 
 
 def _bending(mount: Mount, px: FloatArray, by_px: FloatArray) -> FloatArray:
@@ -211,84 +253,6 @@ def _bending(mount: Mount, px: FloatArray, by_px: FloatArray) -> FloatArray:
     u, v = (2 * px / [mount.info.width, mount.info.height] - 1).T
     terms = np.stack([np.ones(len(u)), u, v, u * u, u * v, v * v], axis=1)
     return np.concatenate([by_px[:, :, k, None] * terms[:, None] for k in (0, 1)], axis=2)
-
-
-def _by_parameter(
-    free: str,
-    mount: Mount,
-    hits: GroundHits,
-    px: FloatArray,
-    poses: FloatArray,
-    believed: Believed,
-    image: IntArray,
-) -> FloatArray:
-    if free == "clock_s":
-        return hits.by_motion(believed.velocity[image])
-    if free == "grade":
-        return np.asarray(-hits.plane[:, :, 2] * believed.climb_m[image][:, None])
-    return by_lens(mount, px, poses, free)
-
-
-def moved_poses(believed: Believed, errors: FloatArray, extra: float, free: str | None) -> FloatArray:
-    """The poses (I, 4, 4) with their estimated ``errors`` (I, 6) taken in, and the freed parameter."""
-    shift = errors[:, 3:].copy()
-    turn = errors[:, :3].copy()
-    if free == "clock_s":
-        shift[:, :2] += extra * believed.velocity[:, :2]
-        turn[:, 2] += extra * believed.velocity[:, 2]
-    if free == "grade":
-        shift[:, 2] -= extra * believed.climb_m
-    out = believed.poses.copy()
-    turns = np.array([rotation_from_vector(vector) for vector in turn])
-    out[:, :3, 3] += (believed.poses[:, :3, :3] @ shift[:, :, None])[..., 0]
-    out[:, :3, :3] = believed.poses[:, :3, :3] @ turns
-    return out
-
-
-def _normal(
-    observations: Observations,
-    believed: Believed,
-    mount: Mount,
-    errors: FloatArray,
-    bends: FloatArray,
-    residual: FloatArray,
-    jacobian: list[FloatArray],
-    root: FloatArray,
-    weight: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """The normal equations over mount, parameter and the six errors of every pose."""
-    known = jacobian[0].shape[2]
-    count = len(believed.poses)
-    size = known + 6 * count
-    system, gradient = np.zeros((size, size)), np.zeros(size)
-    good = weight > 0
-    scaled = np.sqrt(weight[good])[:, None, None] * root[good]
-    rows = scaled @ np.concatenate([part[good] for part in jacobian], axis=2)
-    value = (scaled @ residual[good][:, :, None])[..., 0]
-    first, second = observations.first[good], observations.second[good]
-    cuts = np.flatnonzero(np.diff(observations.pair[good])) + 1
-    for low, high in zip([0, *cuts], [*cuts, len(first)], strict=True):
-        if high == low:
-            continue
-        block = rows[low:high].reshape(-1, known + 12)
-        at = np.concatenate(
-            [np.arange(known)] + [known + 6 * int(image[low]) + np.arange(6) for image in (first, second)]
-        )
-        system[np.ix_(at, at)] += block.T @ block
-        gradient[at] += block.T @ value[low:high].ravel()
-    for state in range(6):
-        at = known + 6 * np.arange(count) + state
-        system[np.ix_(at, at)] += believed.pose_information[state]
-        gradient[at] += believed.pose_information[state] @ errors[:, state]
-    information = believed.centre_sigma_m**-2
-    system[range(3, 6), range(3, 6)] += information
-    gradient[CENTRE] += information * (mount.centre_vehicle - believed.centre_vehicle)
-    system[range(6, 6 + 2 * _BENDS), range(6, 6 + 2 * _BENDS)] += _LENS_SIGMA_PX**-2
-    gradient[6 : 6 + 2 * _BENDS] += bends / _LENS_SIGMA_PX**2
-    # Hardly any matches must not make it singular: an angle is known to a radian, a parameter to ten units.
-    system[range(3), range(3)] += 1.0
-    system[range(6 + 2 * _BENDS, known), range(6 + 2 * _BENDS, known)] += 0.01
-    return system, gradient
 
 
 def tangent_covariance(mount: Mount, covariance: FloatArray) -> FloatArray:

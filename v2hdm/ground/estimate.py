@@ -1,26 +1,65 @@
-"""From a drive to what its bare ground says of one camera."""
+"""From a drive to what its bare ground says of its cameras: mounting, further parameters, their errors."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
-from v2hdm.ground.adjust import Adjusted, adjust, tangent_covariance
-from v2hdm.ground.beliefs import Beliefs
-from v2hdm.ground.matcher import Matcher, Round
-from v2hdm.ground.motion import motion_of
-from v2hdm.ground.mount import Mount, guessed_mount
-from v2hdm.ground.noise import state_sigmas
-from v2hdm.ground.options import GroundOptions
-from v2hdm.ground.pairs import changing_pairs, spread_pairs
-from v2hdm.ground.parameters import clock_shows, free_parameters
-from v2hdm.ground.readings import Readings, try_readings
-from v2hdm.ground.results import GroundEstimate, GroundStatus, MatchedGround, Parameter, Reading
-from v2hdm.ground.scatter import scatter
+from v2hdm.ground.adjust import CENTRE, Adjusted, adjust, tangent_covariance
+from v2hdm.ground.model import Mount, guessed_mount
+from v2hdm.ground.motion import Motion, changing_pairs, motion_of, spread_pairs
+from v2hdm.ground.patches import Matcher, Round
+from v2hdm.ground.prior import Observations, Stated, state_sigmas
+from v2hdm.ground.results import (
+    GroundEstimate,
+    GroundOptions,
+    GroundStatus,
+    MatchedGround,
+    Parameter,
+    Reading,
+)
+from v2hdm.ground.start import Readings, try_readings
 from v2hdm.records import Calibration, Drive, FloatArray, IntArray, PoseNoise
+from v2hdm.workers import share_out
+
+STEEP_RAD = np.deg2rad(10)
+"""A camera that looks down less shows too short a stretch of ground: focal length and height are a product,
+and a bent lens looks like a bent road."""
+
+# Axis of the centre, and how far from its survey it may be, m.
+_FREE_CENTRE = {"forward_m": (0, 2.0), "left_m": (1, 2.0), "up_m": (2, 0.3)}
+_STRAIGHT = "the vehicle drives straight: drive a turn"
+_FEW = "too few matches: drive further"
+# Standard deviation above which a value says nothing, a third of the smallest fault worth reporting, and
+# which drive would make it smaller.
+_OBSERVABLE = {
+    "clock_s": (0.015, "speed and direction hardly change: drive a turn"),
+    "focal_scale": (0.01, "the camera looks too level and the vehicle drives straight: drive a turn"),
+    "distortion_k1": (
+        0.03, "too little ground is matched away from the image's middle: drive on rougher ground",
+    ),
+    "grade": (0.001, _FEW),
+    "up_m": (0.03, _FEW),
+    "forward_m": (0.1, _STRAIGHT),
+    "left_m": (0.1, _STRAIGHT),
+}  # fmt: skip
+
+# Change of the yaw rate within a pair's length that shows 15 ms over the noise of 20 pairs.
+_LEAST_TURN_RADPS = 0.05
+_STRETCHES = 8  # enough to estimate a spread, few enough that each has several pairs
+_WELL_KNOWN = [0, 1, 2, 5]  # roll, pitch, yaw and height: the other two are mostly the survey's
+# Distance between the images of a pair that shows the clock: motion changes within it.
+_CLOCK_APART_M = (0.8, 4.0)
+_CLOCK_LOOSENED = 2.0  # factor on the stated noise of headings up to which a clock is told apart from them
+_LEAST_MATCHES = 60  # ten for each of the six quantities of a mounting
+# How far a paved road departs from a plane, m: roads are laid to 3 to 5 mm under a straightedge, as EN
+# 13036-7 measures it.
+_FLATNESS_M = 0.003
+_LEAST_PATCHES = 200  # fewer in view of all pairs say nothing, matched or not
 
 
 @dataclass(frozen=True)
@@ -44,23 +83,6 @@ _STAGES = (
     _Stage(0.12, 1.0, 1, 1.0),
 )
 
-_CLOCK_APART_M = (0.8, 4.0)
-"""Distance between the images of a pair that shows the clock: motion changes within it."""
-
-_CLOCK_LOOSENED = 2.0
-"""Factor on the stated noise of headings up to which a clock is told apart from them."""
-
-_LEAST_MATCHES = 60
-"""Ten for each of the six quantities of a mounting."""
-
-_FLATNESS_M = 0.003
-"""How far a paved road departs from a plane, m: roads are laid to 3 to 5 mm under a straightedge.
-
-EN 13036-7 measures it."""
-
-_LEAST_PATCHES = 200
-"""Fewer in view of all pairs tell nothing, matched or not."""
-
 
 def estimate_ground(drive: Drive, camera: str, options: GroundOptions | None = None) -> GroundEstimate:
     """Estimate the mounting of ``camera`` and what contradicts the drive, from bare ground alone.
@@ -71,86 +93,97 @@ def estimate_ground(drive: Drive, camera: str, options: GroundOptions | None = N
     began_s = time.perf_counter()
     options = options or GroundOptions()
     motion = motion_of(drive, camera, Reading.AS_GIVEN)
-    beliefs = Beliefs(drive, drive.cameras[camera], motion, guessed_mount(drive.cameras[camera]))
+    stated = Stated(drive, drive.cameras[camera], motion, guessed_mount(drive.cameras[camera]))
     matcher = Matcher(drive, camera, motion, options)
-    readings = try_readings(drive, camera, matcher, beliefs, options.readings)
-    solved = None
+    readings = try_readings(drive, camera, matcher, stated, options.readings)
+    out = _nothing(camera, stated, readings)
     if readings.start.mount is not None and readings.best is Reading.AS_GIVEN:
-        solved = _solve(matcher, beliefs, readings.start.mount, options)
-    out = _nothing(camera, beliefs, readings) if solved is None else _found(camera, solved, readings, options)
+        solved = _solve(matcher, stated, readings.start.mount, options)
+        out = out if solved is None else _found(out, solved, options)
     return replace(out, seconds=time.perf_counter() - began_s)
 
 
 @dataclass(frozen=True)
 class _Solved:
-    """The last round's matches, what was believed of them, the solution and its poses of all images."""
+    """The last round's matches, what the drive states of them, the solution and its poses of all images."""
 
     pairs: IntArray
     matched: Round
-    beliefs: Beliefs
+    stated: Stated
     adjusted: Adjusted
     poses: FloatArray
     clock: Parameter | None
 
 
-def _solve(matcher: Matcher, beliefs: Beliefs, mount: Mount, options: GroundOptions) -> _Solved | None:
+def _solve(matcher: Matcher, stated: Stated, mount: Mount, options: GroundOptions) -> _Solved | None:
     """Match and adjust in turn, each round from the last one's solution; None without enough matches."""
-    path_m = beliefs.path_m()
+    path_m = stated.path_m()
     pairs = spread_pairs(path_m, options.pairs, options.shortest_m, options.longest_m)
-    free = "clock_s" if "clock_s" in options.free and clock_shows(beliefs.motion) else None
+    free = "clock_s" if "clock_s" in options.free and clock_shows(stated.motion) else None
     if free is not None:
-        velocity = beliefs.motion.velocity_at_images()
+        velocity = stated.motion.velocity_at_images()
         pairs = np.vstack([pairs, changing_pairs(path_m, velocity, options.clock_pairs, *_CLOCK_APART_M)])
-    poses = beliefs.poses()
+    poses = stated.poses()
     for stage in _STAGES:
         matched = matcher.match(
             mount, poses, pairs[:: stage.every], stage.search_m, stage.grids * options.grid_m
         )
         if len(matched.correlation) < _LEAST_MATCHES:
             return None
-        used, believed, rows = beliefs.about(matched.observations, stage.loosened)
+        used, prior, rows = stated.prior_of(matched.observations, stage.loosened)
         # Where headings may be far off, so may the clock: nothing would hold the camera's yaw.
         freed = free if stage.loosened <= _CLOCK_LOOSENED else None
-        adjusted = adjust(used, believed, mount, freed, max(stage.loosened / 2, 1.0))
+        adjusted = adjust(used, prior, mount, freed, max(stage.loosened / 2, 1.0))
         if np.count_nonzero(adjusted.weight) < _LEAST_MATCHES:  # rays that miss the ground fix nothing
             return None
         mount = adjusted.mount
         if freed is not None:
-            beliefs = beliefs.at_clock(beliefs.clock_s + adjusted.extra)
-        poses = beliefs.poses()
+            stated = replace(stated, clock_s=stated.clock_s + adjusted.extra)
+        poses = stated.poses()
         poses[rows] = adjusted.poses
     clock = None
     if free is not None:
         sigma = float(np.sqrt(adjusted.covariance[6, 6]))
-        clock = Parameter("clock_s", beliefs.clock_s, sigma, told=True)
-    return _Solved(pairs, matched, beliefs, adjusted, poses, clock)
+        clock = Parameter("clock_s", stated.clock_s, sigma, observable=True)
+    return _Solved(pairs, matched, stated, adjusted, poses, clock)
 
 
-def _found(camera: str, solved: _Solved, readings: Readings, options: GroundOptions) -> GroundEstimate:
-    mount, matched = solved.adjusted.mount, solved.matched
+def _found(nothing: GroundEstimate, solved: _Solved, options: GroundOptions) -> GroundEstimate:
+    mount, matched, adjusted = solved.adjusted.mount, solved.matched, solved.adjusted
     seen = matched.observations
-    factor = scatter(seen, solved.beliefs, solved.adjusted)
-    own = factor * solved.adjusted.covariance[:6, :6] + _flatness(options)
-    covariance = tangent_covariance(mount, own)
-    image = solved.beliefs.motion.image
-    return GroundEstimate(
-        camera=camera,
+    factor = _scatter(seen, solved.stated, adjusted)
+    covariance = tangent_covariance(mount, factor * adjusted.covariance[:6, :6] + _flatness(options))
+    return replace(
+        nothing,
         status=GroundStatus.FOUND,
-        shares=readings.shares,
-        reading=readings.best,
         calibration=Calibration(mount.info, mount.cam_from_vehicle, covariance),
-        guess_cam_from_vehicle=solved.beliefs.guess.cam_from_vehicle,
-        parameters=free_parameters(options.free, seen, solved.beliefs, solved.adjusted, solved.clock, factor),
-        median_residual=float(np.median(solved.adjusted.residual)),
-        pulls=_pulls(solved.adjusted, solved.beliefs.drive.pose_noise),
+        parameters=_free_parameters(options.free, seen, solved, factor),
+        median_residual=float(np.median(adjusted.residual)),
+        pulls=_pulls(adjusted, solved.stated.drive.pose_noise),
         patches=MatchedGround(
-            image[solved.pairs],
+            solved.stated.motion.image[solved.pairs],
             solved.poses[solved.pairs],
             seen.pair,
             seen.first_px,
             seen.second_px,
             matched.correlation,
         ),
+    )
+
+
+def _nothing(camera: str, stated: Stated, readings: Readings) -> GroundEstimate:
+    little = readings.start.sought < _LEAST_PATCHES and readings.best is Reading.AS_GIVEN
+    return GroundEstimate(
+        camera=camera,
+        status=GroundStatus.TOO_LITTLE if little else GroundStatus.NO_MATCH,
+        shares=readings.shares,
+        reading=readings.best,
+        calibration=None,
+        guess_cam_from_vehicle=stated.guess.cam_from_vehicle,
+        parameters={},
+        median_residual=float("nan"),
+        pulls={},
+        patches=None,
         seconds=0.0,
     )
 
@@ -172,18 +205,117 @@ def _pulls(adjusted: Adjusted, noise: PoseNoise) -> Mapping[str, float]:
     }
 
 
-def _nothing(camera: str, beliefs: Beliefs, readings: Readings) -> GroundEstimate:
-    little = readings.start.sought < _LEAST_PATCHES and readings.best is Reading.AS_GIVEN
-    return GroundEstimate(
-        camera=camera,
-        status=GroundStatus.TOO_LITTLE if little else GroundStatus.NO_MATCH,
-        shares=readings.shares,
-        reading=readings.best,
-        calibration=None,
-        guess_cam_from_vehicle=beliefs.guess.cam_from_vehicle,
-        parameters={},
-        median_residual=float("nan"),
-        pulls={},
-        patches=None,
-        seconds=0.0,
-    )
+def _scatter(observations: Observations, stated: Stated, solved: Adjusted) -> float:
+    """The factor, at least 1, by which the variances of ``solved`` are too small.
+
+    A road is no plane, poses err otherwise than stated, and neighbouring matches share their errors. All that
+    makes stretches disagree. Each is left out in turn (Efron and Stein, The jackknife estimate of variance,
+    1981); the variance of the answers, over the one that they should have, is averaged over the angles and
+    the height.
+    """
+    pairs, at = np.unique(observations.pair, return_index=True)
+    ordered = pairs[np.argsort(observations.first[at], kind="stable")]
+    stretches = [part for part in np.array_split(ordered, _STRETCHES) if len(part)]
+    free = "clock_s" if len(solved.covariance) > 6 else None
+    answers = []
+    for part in stretches:
+        used, prior, _ = stated.prior_of(observations.only(~np.isin(observations.pair, part)))
+        mount = adjust(used, prior, solved.mount, free).mount
+        turn = mount.vehicle_from_cam_rotation @ solved.mount.vehicle_from_cam_rotation.T
+        small = [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+        answers.append([*(np.array(small) / 2), *(mount.centre_vehicle - solved.mount.centre_vehicle)])
+    count = len(stretches)
+    if count < 2:
+        return 1.0
+    spread = (count - 1) * np.var(np.array(answers), axis=0)
+    return max(1.0, float(np.mean(spread[_WELL_KNOWN] / np.diag(solved.covariance)[_WELL_KNOWN])))
+
+
+def clock_shows(motion: Motion) -> bool:
+    """Whether the yaw rate really changes along the drive, beyond the noise of smoothed poses."""
+    low, high = np.percentile(motion.velocity_at_images()[:, 2], (3, 97))
+    return bool(high - low > _LEAST_TURN_RADPS)
+
+
+def _free_parameters(
+    names: tuple[str, ...], observations: Observations, solved: _Solved, factor: float
+) -> Mapping[str, Parameter]:
+    """Each of ``names`` freed alone; ``factor`` is that of all variances, see :func:`_scatter`."""
+    turns = clock_shows(solved.stated.motion)
+    widened = float(np.sqrt(factor))
+    out = {}
+    for name in names:
+        if name == "clock_s" and solved.clock is not None:
+            out[name] = replace(solved.clock, sigma=solved.clock.sigma * widened)
+            continue
+        value, sigma = _free(name, observations, solved.stated, solved.adjusted)
+        largest, why_not = _OBSERVABLE[name]
+        # a fault widens the scatter; that it shows must not hang on it.
+        observable = name != "clock_s" and sigma < largest
+        if name == "focal_scale":
+            observable = observable and (turns or solved.adjusted.mount.depression_rad > STEEP_RAD)
+        out[name] = Parameter(name, value, sigma * widened, observable, "" if observable else why_not)
+    return out
+
+
+def _free(name: str, observations: Observations, stated: Stated, solved: Adjusted) -> tuple[float, float]:
+    if name in _FREE_CENTRE:
+        axis, sigma_m = _FREE_CENTRE[name]
+        wider = replace(stated, centre_sigma_m={**stated.centre_sigma_m, axis: sigma_m})
+        used, prior, _ = wider.prior_of(observations)
+        adjusted = adjust(used, prior, solved.mount, near=solved)
+        value = adjusted.mount.centre_vehicle[axis] - prior.centre_vehicle[axis]
+        return float(value), float(np.sqrt(adjusted.covariance[CENTRE, CENTRE][axis, axis]))
+    held = stated.with_surveyed_height() if name == "focal_scale" else stated
+    used, prior, _ = held.prior_of(observations)
+    adjusted = adjust(used, prior, solved.mount, free=name, near=solved)
+    return adjusted.extra, float(np.sqrt(adjusted.covariance[6, 6]))
+
+
+_worker: tuple[Drive, GroundOptions | None] | None = None
+
+
+def estimate_cameras(
+    drive: Drive,
+    workers: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+    options: GroundOptions | None = None,
+) -> dict[str, GroundEstimate]:
+    """Estimate every camera's mounting from bare ground, each in a process of its own.
+
+    Args:
+        drive: the drive.
+        workers: processes, one thread each; 1 stays in this process.
+        progress: called as ``progress(done, total)`` after each camera.
+        options: of :func:`estimate_ground`.
+
+    Raises:
+        DriveError: an image cannot be read.
+        WorkerError: a process died.
+    """
+    found: dict[str, GroundEstimate] = {}
+
+    def take(estimate: GroundEstimate) -> None:
+        found[estimate.camera] = estimate
+        if progress:
+            progress(len(found), len(drive.cameras))
+
+    names = list(drive.cameras)
+    if workers <= 1 or len(names) == 1:
+        for name in names:
+            take(estimate_ground(drive, name, options))
+    else:
+        share_out(_work, names, workers, _start_worker, (drive, options), take)
+    return found
+
+
+def _start_worker(drive: Drive, options: GroundOptions | None) -> None:
+    global _worker
+    cv2.setNumThreads(1)
+    _worker = drive, options
+
+
+def _work(camera: str) -> GroundEstimate:
+    assert _worker is not None
+    drive, options = _worker
+    return estimate_ground(drive, camera, options)

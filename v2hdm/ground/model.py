@@ -1,16 +1,97 @@
-"""Where matched pixels meet the ground, and how that changes with everything that may be wrong."""
+"""Where a mounted camera's pixels meet the ground, and the derivatives by all that may be wrong."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from v2hdm.ground.mount import Mount
-from v2hdm.records import FloatArray
+from v2hdm.geometry.ipm import extrinsic_from_ipm, project_ground
+from v2hdm.geometry.lens import distort_points, undistort_points
+from v2hdm.geometry.rigid import hat, rotation_from_vector
+from v2hdm.records import Camera, CameraInfo, FloatArray
 
-_FOCAL_STEP = 1e-5
-_K1_STEP = 1e-5
+_LENS_STEP = 1e-5  # of the differences by focal length, as a share of it, and by k1
+
+
+@dataclass(frozen=True)
+class Mount:
+    """A camera with its lens: ``vehicle_from_cam_rotation`` (3, 3) and ``centre_vehicle`` (3,) m."""
+
+    info: CameraInfo
+    vehicle_from_cam_rotation: FloatArray
+    centre_vehicle: FloatArray
+
+    @classmethod
+    def at(cls, info: CameraInfo, cam_from_vehicle: FloatArray) -> Mount:
+        """A camera at an extrinsic (4, 4)."""
+        turn = cam_from_vehicle[:3, :3].T
+        return cls(info, turn, -turn @ cam_from_vehicle[:3, 3])
+
+    @property
+    def cam_from_vehicle(self) -> FloatArray:
+        """The extrinsic (4, 4)."""
+        out = np.eye(4)
+        out[:3, :3] = self.vehicle_from_cam_rotation.T
+        out[:3, 3] = -self.vehicle_from_cam_rotation.T @ self.centre_vehicle
+        return out
+
+    @property
+    def depression_rad(self) -> float:
+        """How far the optical axis points below the horizon."""
+        return float(np.arcsin(-self.vehicle_from_cam_rotation[2, 2]))
+
+    def moved(self, turn_rad: FloatArray, shift_m: FloatArray) -> Mount:
+        """Turned about its centre by a rotation vector (3,) in vehicle axes, and shifted (3,) m."""
+        return replace(
+            self,
+            vehicle_from_cam_rotation=rotation_from_vector(turn_rad) @ self.vehicle_from_cam_rotation,
+            centre_vehicle=self.centre_vehicle + shift_m,
+        )
+
+    def turned_around(self) -> Mount:
+        """The same camera at the vehicle's other end, looking the other way."""
+        half = np.diag([-1.0, -1.0, 1.0])
+        turn = half @ self.vehicle_from_cam_rotation
+        return replace(self, vehicle_from_cam_rotation=turn, centre_vehicle=half @ self.centre_vehicle)
+
+    def with_focal_scale(self, scale: float) -> Mount:
+        """With focal lengths larger by the fraction ``scale``."""
+        intrinsic = self.info.intrinsic.copy()
+        intrinsic[0, :2] *= 1 + scale
+        intrinsic[1, 1] *= 1 + scale
+        return replace(self, info=replace(self.info, intrinsic=intrinsic))
+
+    def with_k1(self, change: float) -> Mount:
+        """With ``change`` added to the first coefficient of its distortion."""
+        first, *rest = self.info.distortion
+        return replace(self, info=replace(self.info, distortion=(first + change, *rest)))
+
+    def rays(self, points_px: FloatArray) -> FloatArray:
+        """Viewing directions (N, 3) in the vehicle frame of recorded pixels (N, 2)."""
+        pinhole = undistort_points(self.info, points_px)
+        cam = np.column_stack([pinhole, np.ones(len(pinhole))]) @ np.linalg.inv(self.info.intrinsic).T
+        return np.asarray(cam @ self.vehicle_from_cam_rotation.T)
+
+    def project_ground(self, ground_map: FloatArray, map_from_vehicle: FloatArray) -> FloatArray:
+        """Recorded pixels (N, 2) of ground points (N, 2) of the map; nan where they are out of view."""
+        cam_from_map = self.cam_from_vehicle @ np.linalg.inv(map_from_vehicle)
+        pinhole, depth_m = project_ground(self.info.intrinsic, cam_from_map, ground_map)
+        size = np.array([self.info.width, self.info.height])
+        with np.errstate(invalid="ignore"):
+            # a lens model bends back points far outside the view.
+            low, high = -0.5 * size, 1.5 * size
+            hidden = (depth_m <= 0) | ((pinhole < low) | (pinhole > high)).any(axis=1)
+            pinhole[hidden] = size / 2
+            px = distort_points(self.info, pinhole)
+            outside = ((px < 0) | (px > size - 1)).any(axis=1)
+        px[hidden | outside] = np.nan
+        return px
+
+
+def guessed_mount(camera: Camera) -> Mount:
+    """The mounting that a camera's initial IPM stands for."""
+    return Mount.at(camera.info, extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm]))
 
 
 @dataclass(frozen=True)
@@ -31,11 +112,11 @@ class GroundHits:
 
     def by_mount(self) -> FloatArray:
         """Derivative (N, 2, 6) by the mount's turn (3, rad) and its centre (3, m), in vehicle axes."""
-        return np.concatenate([self.plane @ _cross(self.arm), self.plane], axis=2)
+        return np.concatenate([self.plane @ -hat(self.arm), self.plane], axis=2)
 
     def by_pose(self) -> FloatArray:
         """Derivative (N, 2, 6) by the vehicle's turn (3, rad) and shift (3, m), in vehicle axes."""
-        return np.concatenate([self.plane @ _cross(self.point_vehicle), self.plane], axis=2)
+        return np.concatenate([self.plane @ -hat(self.point_vehicle), self.plane], axis=2)
 
     def by_motion(self, velocity: FloatArray) -> FloatArray:
         """Derivative (N, 2) by time, the vehicle moving at ``velocity`` (N, 3): m/s, m/s, rad/s."""
@@ -47,10 +128,7 @@ class GroundHits:
 
 def hit_ground(mount: Mount, points_px: FloatArray, poses: FloatArray) -> GroundHits:
     """The ground that pixels (N, 2) show, the vehicle being at ``poses`` (N, 4, 4)."""
-    return _hit(mount, mount.rays(points_px), poses)
-
-
-def _hit(mount: Mount, rays_vehicle: FloatArray, poses: FloatArray) -> GroundHits:
+    rays_vehicle = mount.rays(points_px)
     turn, position = poses[:, :3, :3], poses[:, :3, 3]
     rays_map = (turn @ rays_vehicle[:, :, None])[..., 0]
     centre_map = turn @ mount.centre_vehicle + position
@@ -66,16 +144,9 @@ def _hit(mount: Mount, rays_vehicle: FloatArray, poses: FloatArray) -> GroundHit
 
 def by_lens(mount: Mount, points_px: FloatArray, poses: FloatArray, name: str) -> FloatArray:
     """Derivative (N, 2) of the ground points by ``focal_scale`` or ``distortion_k1``, by differences."""
-    if name == "focal_scale":
-        step, low, high = (
-            _FOCAL_STEP,
-            mount.with_focal_scale(-_FOCAL_STEP),
-            mount.with_focal_scale(_FOCAL_STEP),
-        )
-    else:
-        step, low, high = _K1_STEP, mount.with_k1(-_K1_STEP), mount.with_k1(_K1_STEP)
-    ends = [hit_ground(each, points_px, poses).points_map for each in (low, high)]
-    return np.asarray((ends[1] - ends[0]) / (2 * step))
+    change = mount.with_focal_scale if name == "focal_scale" else mount.with_k1
+    low, high = (hit_ground(change(step), points_px, poses) for step in (-_LENS_STEP, _LENS_STEP))
+    return np.asarray((high.points_map - low.points_map) / (2 * _LENS_STEP))
 
 
 def by_pixel(mount: Mount, hits: GroundHits) -> FloatArray:
@@ -86,13 +157,3 @@ def by_pixel(mount: Mount, hits: GroundHits) -> FloatArray:
     depth = np.linalg.norm(hits.arm @ mount.vehicle_from_cam_rotation[:, 2:], axis=1)
     across = mount.vehicle_from_cam_rotation @ np.linalg.inv(mount.info.intrinsic)[:, :2]
     return np.asarray(hits.plane @ (depth[:, None, None] * across))
-
-
-def _cross(points: FloatArray) -> FloatArray:
-    """Matrices (N, 3, 3) that take a rotation vector to how it moves ``points`` (N, 3)."""
-    x, y, z = points.T
-    out = np.zeros((len(points), 3, 3))
-    out[:, 0, 1], out[:, 0, 2] = z, -y
-    out[:, 1, 0], out[:, 1, 2] = -z, x
-    out[:, 2, 0], out[:, 2, 1] = y, -x
-    return out

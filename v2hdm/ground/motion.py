@@ -1,7 +1,8 @@
-"""Where the vehicle was at each image and how it moved, under each reading of its poses."""
+"""Where the vehicle was at each image and how it moved, and which images are compared with each other."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,11 +12,10 @@ from v2hdm.ground.results import Reading
 from v2hdm.io.drive.trajectory import interpolate
 from v2hdm.records import Drive, FloatArray, IntArray, Trajectory
 
-SMOOTHING_S = 0.5
-"""Half width of the parabola fitted to the poses: steering and pedals change the motion no faster."""
-
-_STANDING_MPS = 0.3
-"""Below this a path has no direction: receivers wander by centimetres."""
+# Half width of the parabola fitted to the poses: steering and pedals change the motion no faster.
+_SMOOTHING_S = 0.5
+_STANDING_MPS = 0.3  # below this a path has no direction: receivers wander by centimetres
+_ARM_M = 10.0  # a turn by one radian moves the ground in view by about this
 
 
 @dataclass(frozen=True)
@@ -54,13 +54,14 @@ def motion_of(drive: Drive, camera: str, reading: Reading) -> Motion:
     """The motion of ``drive`` at the images of ``camera``, its poses read as ``reading`` says."""
     image = np.array([k for k, entry in enumerate(drive.images) if entry.camera == camera], dtype=np.int64)
     stamp_s = np.array([drive.images[k].stamp_s for k in image])
-    trajectory = _read_as(drive.trajectory or _of_images(drive), reading)
+    trajectory = _read_as(drive.trajectory or trajectory_of_images(drive), reading)
     position = trajectory.map_from_vehicle[:, :2, 3]
     path_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))])
     return Motion(image, stamp_s, trajectory, path_m, _velocity(trajectory))
 
 
-def _of_images(drive: Drive) -> Trajectory:
+def trajectory_of_images(drive: Drive) -> Trajectory:
+    """The poses of a drive's images, for drives of which nothing else is kept."""
     stamp_s, first = np.unique([image.stamp_s for image in drive.images], return_index=True)
     return Trajectory(stamp_s, np.array([drive.images[k].map_from_vehicle for k in first]))
 
@@ -90,10 +91,10 @@ def _velocity(trajectory: Trajectory) -> FloatArray:
 
 
 def _slopes(at: FloatArray, values: FloatArray) -> FloatArray:
-    """Derivatives (P, K) of values (P, K): of parabolas fitted within :data:`SMOOTHING_S` of each time."""
+    """Derivatives (P, K) of values (P, K): of parabolas fitted within :data:`_SMOOTHING_S` of each time."""
     out = np.zeros_like(values)
-    first = np.searchsorted(at, at - SMOOTHING_S - 1e-9)
-    last = np.searchsorted(at, at + SMOOTHING_S + 1e-9)
+    first = np.searchsorted(at, at - _SMOOTHING_S - 1e-9)
+    last = np.searchsorted(at, at + _SMOOTHING_S + 1e-9)
     for k in range(len(at)):
         # Three poses at least, even where they are further apart.
         low, high = max(min(first[k], k - 1), 0), min(max(last[k], k + 2), len(at))
@@ -103,3 +104,71 @@ def _slopes(at: FloatArray, values: FloatArray) -> FloatArray:
         terms = np.vander(lag, 3 if high - low >= 4 else 2, increasing=True)
         out[k] = np.linalg.lstsq(terms, values[low:high] - values[k], rcond=None)[0][1]
     return out
+
+
+def spread_pairs(path_m: FloatArray, count: int, shortest_m: float, longest_m: float) -> IntArray:
+    """Pairs (P, 2) of images, spread evenly along the path, no image used twice where that is possible.
+
+    Args:
+        path_m: (I,) distance driven at each image, not falling.
+        count: how many pairs are wanted.
+        shortest_m: distance between the images of a pair, at least.
+        longest_m: and at most.
+    """
+    chosen: list[tuple[int, int]] = []
+    used: set[int] = set()
+    middle = (shortest_m + longest_m) / 2
+    for start_m in np.linspace(path_m[0], max(path_m[-1] - longest_m, path_m[0]), count):
+        start = min(int(np.searchsorted(path_m, start_m)), len(path_m) - 1)
+        first = next((k for k in range(start, len(path_m)) if k not in used), None)
+        if first is None:
+            continue
+        away = path_m - path_m[first]
+        fitting = np.flatnonzero((away >= shortest_m) & (away <= longest_m)).tolist()
+        if fitting:
+            free = [k for k in fitting if k not in used] or fitting
+            pair = first, free[int(np.argmin(np.abs(away[free] - middle)))]
+            chosen.append(pair)
+            used.update(pair)
+    return np.array(chosen, dtype=np.int64).reshape(-1, 2)
+
+
+def changing_pairs(
+    path_m: FloatArray, velocity: FloatArray, count: int, shortest_m: float, longest_m: float
+) -> IntArray:
+    """Pairs (P, 2) of images between which the velocity (I, 3) changes most, so that a clock shows."""
+
+    def worth(first: int, second: int) -> float:
+        change = velocity[second] - velocity[first]
+        return float(np.hypot(np.hypot(change[0], change[1]), _ARM_M * change[2]))
+
+    return _best_pairs(path_m, worth, count, shortest_m, longest_m)
+
+
+def turning_pairs(
+    path_m: FloatArray, yaw_rad: FloatArray, count: int, shortest_m: float, longest_m: float
+) -> IntArray:
+    """Pairs (P, 2) of images between which the unwrapped heading (I,) turns most: a mirrored path shows."""
+
+    def worth(first: int, second: int) -> float:
+        return abs(float(yaw_rad[second] - yaw_rad[first]))
+
+    return _best_pairs(path_m, worth, count, shortest_m, longest_m)
+
+
+def _best_pairs(
+    path_m: FloatArray, worth: Callable[[int, int], float], count: int, shortest_m: float, longest_m: float
+) -> IntArray:
+    """The pairs of most worth, no image used twice."""
+    found: list[tuple[float, int, int]] = []
+    for first in range(len(path_m)):
+        away = path_m - path_m[first]
+        for second in np.flatnonzero((away >= shortest_m) & (away <= longest_m)).tolist():
+            found.append((worth(first, second), first, second))
+    used: set[int] = set()
+    chosen: list[tuple[int, int]] = []
+    for _, first, second in sorted(found, reverse=True):
+        if first not in used and second not in used and len(chosen) < count:
+            chosen.append((first, second))
+            used.update((first, second))
+    return np.array(chosen, dtype=np.int64).reshape(-1, 2)

@@ -1,8 +1,9 @@
-"""Patches of ground that two images share: laid out from above, matched, and turned back into raw pixels."""
+"""Patches of ground that two images share: resampled from above, matched, and turned back into raw pixels."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,40 +11,31 @@ from numpy.typing import NDArray
 
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.rigid import ground_in_vehicle
-from v2hdm.ground.mount import Mount
-from v2hdm.ground.options import GroundOptions
-from v2hdm.records import BoolArray, FloatArray
+from v2hdm.ground.model import Mount
+from v2hdm.ground.motion import Motion
+from v2hdm.ground.prior import Observations
+from v2hdm.ground.results import GroundOptions
+from v2hdm.io.pixels import read_pixels
+from v2hdm.records import BoolArray, Drive, FloatArray, IntArray
 
 ImageArray = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
 
-_LEAST_CORRELATION = 0.5
-"""Normalised cross-correlation below which two patches are not the same ground."""
-
+_LEAST_CORRELATION = 0.5  # normalised cross-correlation below which two patches are not the same ground
+# Ratio of a peak's curvatures; below it the patch holds one straight edge, which slides along itself.
 _LEAST_ROUNDNESS = 0.1
-"""Ratio of a peak's curvatures; below it the patch holds one straight edge, which slides along itself."""
-
-_LEAST_LEAD = 0.1
-"""A second peak, elsewhere in the search, must stay so much below the best one."""
-
-_PEAK_CELLS = 3
-"""Half width of what belongs to a peak, in cells of the grid."""
-
+_LEAST_LEAD = 0.1  # a second peak, elsewhere in the search, must stay so much below the best one
+_PEAK_CELLS = 3  # half width of what belongs to a peak, in cells of the grid
+# Standard deviation of the blur that is taken away: highlights, shadows and wet sheens are wider, and stay
+# with the light or the camera instead of the ground, m.
 _COARSEST_M = 0.1
-"""Standard deviation of the blur that is taken away: highlights, shadows and wet sheens are wider, and stay
-with the light or the camera instead of the ground, m."""
-
-_LEAST_CONTRAST = 1.0
-"""Grey levels; less than this is the noise of an even surface."""
-
-_ALL = 0.9999
-"""Mean of flags that are all set, but for rounding."""
-
+_LEAST_CONTRAST = 1.0  # grey levels; less than this is the noise of an even surface
+_ALL = 0.9999  # mean of flags that are all set, but for rounding
+# Matches of a pair lie on one plane to within this: off it are kerbs, shadows and moving things.
 _HOMOGRAPHY_PX = 2.0
-"""Matches of a pair lie on one plane to within this: off it are kerbs, shadows and what moves."""
-
-_LEAST_OF_A_PAIR = 8
-"""Twice the four that a homography takes."""
+_LEAST_OF_A_PAIR = 8  # twice the four that a homography takes
+_PATH_STEP_M = 0.5
+_BEYOND_M = 30.0  # how far the path is continued straight beyond the drive's ends: as far as regions reach
 
 
 @dataclass(frozen=True)
@@ -68,6 +60,11 @@ class Matches:
     correlation: FloatArray
     sought: int
 
+    @classmethod
+    def none_of(cls, sought: int) -> Matches:
+        """No matches at all."""
+        return cls(np.empty((0, 2)), np.empty((0, 2)), np.empty(0), sought)
+
 
 @dataclass(frozen=True)
 class Sheet:
@@ -77,6 +74,15 @@ class Sheet:
     axes: FloatArray
     grid_m: float
     shape: tuple[int, int]
+
+    @classmethod
+    def around(cls, points_map: FloatArray, pose: FloatArray, margin_m: float, grid_m: float) -> Sheet:
+        """A sheet around points (N, 2), aligned with a pose (4, 4): rows ahead, columns to the left."""
+        axes = _axes(pose)
+        along = points_map @ axes.T
+        low, high = np.nanmin(along, axis=0) - margin_m, np.nanmax(along, axis=0) + margin_m
+        rows, columns = np.ceil((high - low) / grid_m).astype(int)
+        return cls(low @ axes, axes, grid_m, (int(rows), int(columns)))
 
     def points(self) -> FloatArray:
         """All grid points (rows * columns, 2) in the map."""
@@ -88,7 +94,7 @@ class Sheet:
         """Map points (N, 2) of grid places (N, 2): rows, columns."""
         return np.asarray(self.corner_map + self.grid_m * np.asarray(cells, dtype=np.float64) @ self.axes)
 
-    def lay(self, view: View) -> tuple[Float32Array, BoolArray]:
+    def resample(self, view: View) -> tuple[Float32Array, BoolArray]:
         """The ground as ``view`` shows it (rows, columns), float32, and where it does."""
         px = view.pixels(self.points()).astype(np.float32).reshape(*self.shape, 2)
         seen = ~np.isnan(px[..., 0])
@@ -97,8 +103,8 @@ class Sheet:
         return grey, seen
 
     def texture(self, view: View) -> tuple[Float32Array, BoolArray]:
-        """The same without what is wider than the texture of the ground."""
-        grey, seen = self.lay(view)
+        """The same without anything wider than the texture of the ground."""
+        grey, seen = self.resample(view)
         return grey - cv2.GaussianBlur(grey, (0, 0), _COARSEST_M / self.grid_m), seen
 
 
@@ -123,7 +129,6 @@ def patch_centres(
     centres = centres[inside]
     if not len(centres):
         return centres
-    # The path goes on straight beyond the drive's ends.
     near = np.linalg.norm(centres[:, None] - path_map[None], axis=2).min(axis=1) <= options.strip_m
     return np.asarray(centres[near])
 
@@ -147,16 +152,13 @@ def match_pair(
         row, column = cells[number]
         own = np.s_[row - half : row + half + 1, column - half : column + half + 1]
         area = np.s_[row - wide : row + wide + 1, column - wide : column + wide + 1]
-        peak = _peak(
-            np.asarray(
-                cv2.matchTemplate(second_grey[area], first_grey[own], cv2.TM_CCOEFF_NORMED), np.float32
-            )
-        )
+        score = cv2.matchTemplate(second_grey[area], first_grey[own], cv2.TM_CCOEFF_NORMED)
+        peak = _peak(np.asarray(score, np.float32))
         if peak is not None:
             found.append((number, *peak))
     sought = int(in_view.sum())
     if len(found) < _LEAST_OF_A_PAIR:
-        return _no_matches(sought)
+        return Matches.none_of(sought)
     table = np.array(found)
     at = cells[table[:, 0].astype(np.int64)]
     first_px = first.pixels(sheet.at(at))
@@ -169,16 +171,17 @@ def _mean(values: Float32Array | BoolArray, half: int) -> Float32Array:
     return np.asarray(cv2.blur(values.astype(np.float32), (2 * half + 1, 2 * half + 1)))
 
 
-def _no_matches(sought: int) -> Matches:
-    return Matches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0), sought)
+def _axes(pose: FloatArray) -> FloatArray:
+    """Unit vectors (2, 2) of the map ahead and to the left of a pose, as rows."""
+    forward = pose[:2, 0] / np.linalg.norm(pose[:2, 0])
+    return np.array([forward, [-forward[1], forward[0]]])
 
 
 def _sheet_around(
     centres_map: FloatArray, pose: FloatArray, margin: int, grid_m: float
 ) -> tuple[Sheet, FloatArray]:
     """A sheet that holds all centres with a ``margin`` of cells, and the centres' cells (N, 2) in it."""
-    axes = pose[:2, :2].T / np.linalg.norm(pose[:2, :2], axis=0)[:, None]
-    axes[1] = [-axes[0, 1], axes[0, 0]]
+    axes = _axes(pose)
     along = centres_map @ axes.T
     low = along.min(axis=0)
     cells = np.round((along - low) / grid_m).astype(np.int64) + margin
@@ -206,23 +209,99 @@ def _peak(score: Float32Array) -> tuple[float, float, float] | None:
     if abs(down) > 1 or abs(right) > 1:
         return None
     rest = score.copy()
-    rest[
-        max(row - _PEAK_CELLS, 0) : row + _PEAK_CELLS + 1,
-        max(column - _PEAK_CELLS, 0) : column + _PEAK_CELLS + 1,
-    ] = -1
+    top, left = max(row - _PEAK_CELLS, 0), max(column - _PEAK_CELLS, 0)
+    rest[top : row + _PEAK_CELLS + 1, left : column + _PEAK_CELLS + 1] = -1
     if rest.max() > best - _LEAST_LEAD:
         return None
     return row + float(down), column + float(right), float(best)
 
 
 def _on_one_plane(matches: Matches) -> Matches:
-    """Those that one homography of the two images explains: a plane seen twice."""
+    """The matches that one homography of the two images explains: a plane seen twice."""
     known = ~(np.isnan(matches.first_px) | np.isnan(matches.second_px)).any(axis=1)
     first, second = matches.first_px[known], matches.second_px[known]
     if len(first) < _LEAST_OF_A_PAIR:
-        return _no_matches(matches.sought)
+        return Matches.none_of(matches.sought)
     _, inlier = cv2.findHomography(first, second, cv2.RANSAC, _HOMOGRAPHY_PX)
     if inlier is None or inlier.sum() < _LEAST_OF_A_PAIR:
-        return _no_matches(matches.sought)
+        return Matches.none_of(matches.sought)
     keep = inlier.ravel().astype(np.bool_)
     return Matches(first[keep], second[keep], matches.correlation[known][keep], matches.sought)
+
+
+@dataclass(frozen=True)
+class Round:
+    """Matches of all pairs of one round; ``share`` of the patches in view that found a partner."""
+
+    observations: Observations
+    correlation: FloatArray
+    sought: int
+    share: float
+
+
+class Matcher:
+    """Matches ground between images of one camera; images are read once and kept."""
+
+    def __init__(self, drive: Drive, camera: str, motion: Motion, options: GroundOptions):
+        self._drive = drive
+        self._image = motion.image
+        self._roi = np.asarray(drive.cameras[camera].roi_vehicle, dtype=np.float64)
+        self._path = _path_of(motion)
+        self._options = options
+        self._grey: dict[int, ImageArray] = {}
+
+    def under(self, motion: Motion, turned: bool = False) -> Matcher:
+        """The same images under another reading of the poses, the region ``turned`` to the other end."""
+        other = object.__new__(Matcher)
+        other.__dict__.update(self.__dict__)
+        other._path = _path_of(motion)
+        other._roi = -self._roi if turned else self._roi
+        return other
+
+    def match(
+        self, mount: Mount, poses: FloatArray, pairs: IntArray, search_m: float, grid_m: float
+    ) -> Round:
+        """Match every pair (P, 2) of rows of ``poses`` on a grid that is laid out from ``mount``."""
+        options = replace(self._options, grid_m=grid_m)
+        found: list[Matches] = []
+        for first, second in pairs.tolist():
+            centres = patch_centres((poses[first], poses[second]), self._roi, self._path, options)
+            one, other = (View(self._read(k), mount, poses[k]) for k in (first, second))
+            pair_found = match_pair(one, other, centres, search_m, options) if len(centres) else None
+            found.append(pair_found or Matches.none_of(0))
+        counts = [len(each.correlation) for each in found]
+        pair = np.repeat(np.arange(len(pairs)), counts)
+        sought = sum(each.sought for each in found)
+        none = Matches.none_of(0)
+        first_px, second_px, correlation = (
+            np.concatenate([getattr(each, name) for each in (none, *found)])
+            for name in ("first_px", "second_px", "correlation")
+        )
+        observations = Observations(pairs[pair, 0], pairs[pair, 1], first_px, second_px, pair)
+        return Round(observations, correlation, sought, sum(counts) / sought if sought else 0.0)
+
+    def _read(self, row: int) -> ImageArray:
+        """The image of a row of the motion, as grey values."""
+        if row not in self._grey:
+            self._grey[row] = read_grey(str(self._drive.images[int(self._image[row])].path))
+        return self._grey[row]
+
+
+def _path_of(motion: Motion) -> FloatArray:
+    """Places (N, 2) of the driven path, half a metre apart, continued straight at both ends."""
+    poses = motion.trajectory.map_from_vehicle
+    at = np.arange(0.0, motion.path_m[-1] + _PATH_STEP_M, _PATH_STEP_M)
+    keep = np.concatenate([[True], np.diff(motion.path_m) > 1e-9])
+    path = np.column_stack([np.interp(at, motion.path_m[keep], poses[keep, axis, 3]) for axis in (0, 1)])
+    beyond = np.arange(_PATH_STEP_M, _BEYOND_M, _PATH_STEP_M)[:, None]
+    return np.vstack([path, path[:1] - beyond * poses[0, :2, 0], path[-1:] + beyond * poses[-1, :2, 0]])
+
+
+def read_grey(path: str) -> ImageArray:
+    """The image file at ``path`` as grey values (H, W), uint8.
+
+    Raises:
+        DriveError: it cannot be read.
+    """
+    # A JPEG decoded as grey is its luma, a level or two off the grey of the same pixels stored as PNG.
+    return np.asarray(cv2.cvtColor(read_pixels(Path(path), cv2.IMREAD_COLOR), cv2.COLOR_BGR2GRAY))

@@ -1,14 +1,51 @@
-"""What the ground says of one camera."""
+"""Options and results of the ground's estimate, and the better start that they give the mapper."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
-from v2hdm.records import Calibration, FloatArray, IntArray
+import numpy as np
 
-"""Indices."""
+from v2hdm.geometry.ipm import ipm_from_extrinsic
+from v2hdm.records import Calibration, Camera, Drive, FloatArray, IntArray
+
+GROUND_IPM = "ground"
+"""Name of the IPM that the ground gives, beside those of the drive."""
+
+_SURE_RAD = np.deg2rad(0.5)  # an estimate with a larger standard deviation is no better than a guess
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroundOptions:
+    """How the ground is matched.
+
+    Attributes:
+        pairs: image pairs that the mounting is found from.
+        clock_pairs: further pairs, where speed or yaw rate change, for the clock.
+        shortest_m: distance between the images of a pair; the error of a position weighs the less the longer.
+        longest_m: beyond this the ground changes its looks and leaves the region that both images show.
+        strip_m: ground so far to either side of the driven path is taken for road.
+        patch_m: side of a square patch.
+        step_m: distance of neighbouring patches, which share a third of their sides.
+        grid_m: spacing of the resampled ground.
+        free: names of the parameters to free, one at a time, beside the mounting; see :class:`Parameter`.
+        readings: whether to try how else the poses could be read.
+    """
+
+    pairs: int = 36
+    clock_pairs: int = 16
+    shortest_m: float = 2.0
+    longest_m: float = 4.0
+    strip_m: float = 2.0
+    patch_m: float = 0.9
+    step_m: float = 0.6
+    grid_m: float = 0.04
+    free: tuple[str, ...] = (
+        "clock_s", "focal_scale", "distortion_k1", "grade", "up_m", "forward_m", "left_m",
+    )  # fmt: skip
+    readings: bool = True
 
 
 class GroundStatus(Enum):
@@ -40,13 +77,13 @@ class Parameter:
     ``name`` is one of: ``clock_s`` (an image was taken so much later on the poses' clock than its stamp
     says), ``focal_scale`` (focal length / given one - 1), ``distortion_k1`` (k1 - given one), ``grade`` (rise
     of the poses over the ground, m per m driven), ``up_m``, ``forward_m`` and ``left_m`` (camera centre -
-    stated one). ``told`` says whether this drive can tell it at all; else ``why_not`` says which drive would.
+    stated one). Where this drive does not make it ``observable``, ``why_not`` says which drive would.
     """
 
     name: str
     value: float
     sigma: float
-    told: bool
+    observable: bool
     why_not: str = ""
 
 
@@ -69,7 +106,7 @@ class MatchedGround:
 
 @dataclass(frozen=True)
 class GroundEstimate:
-    """What bare ground says of one camera's mounting and of what the drive states.
+    """The mounting of one camera and the errors of a drive's statements, from bare ground.
 
     ``shares``: of the patches, how many find a partner under each reading of the poses; ``reading`` is the
     best one. ``calibration`` has ``cam_from_vehicle`` with its covariance, None unless ``status`` is FOUND.
@@ -88,3 +125,24 @@ class GroundEstimate:
     pulls: Mapping[str, float]
     patches: MatchedGround | None
     seconds: float
+
+
+def better_start(drive: Drive, estimates: Mapping[str, GroundEstimate]) -> Drive:
+    """The drive with its cameras started from the ground's mounting, where that is found and sure."""
+    cameras = {
+        name: _started(camera, estimates[name]) if name in estimates else camera
+        for name, camera in drive.cameras.items()
+    }
+    return replace(drive, cameras=cameras)
+
+
+def _started(camera: Camera, estimate: GroundEstimate) -> Camera:
+    calibration = estimate.calibration
+    if estimate.status is not GroundStatus.FOUND or estimate.reading is not Reading.AS_GIVEN:
+        return camera
+    if calibration is None or calibration.covariance is None:
+        return camera
+    if np.sqrt(np.diag(calibration.covariance)[3:].max()) > _SURE_RAD:
+        return camera
+    ipm = {**camera.ipm, GROUND_IPM: ipm_from_extrinsic(camera.info, calibration.cam_from_vehicle)}
+    return replace(camera, ipm=ipm, initial_ipm=GROUND_IPM)

@@ -1,38 +1,39 @@
-"""A first mounting that lets the ground match: the guess, or one that looks further up or down."""
+"""A first mounting under which the ground matches, and the reading of the poses that fits the ground."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from v2hdm.geometry.rigid import heading_rad
 from v2hdm.ground.adjust import adjust
-from v2hdm.ground.beliefs import Beliefs
-from v2hdm.ground.matcher import Matcher
-from v2hdm.ground.mount import Mount
-from v2hdm.ground.pairs import spread_pairs
-from v2hdm.records import FloatArray, IntArray
+from v2hdm.ground.model import Mount
+from v2hdm.ground.motion import motion_of, spread_pairs, turning_pairs
+from v2hdm.ground.patches import Matcher
+from v2hdm.ground.prior import Stated
+from v2hdm.ground.results import Reading
+from v2hdm.records import Drive, FloatArray, IntArray
 
-_PAIRS = 10
+_PAIRS, _GRID_M = 10, 0.06
+# Distance between the images of a pair that a start is found by: a wrong guess shifts the ground by a part
+# of it.
 _SHORT_M = (0.3, 1.6)
-"""Distance between the images of a pair: a wrong guess shifts the ground by a part of it."""
-
-_TOLERANCE = 8.0
-"""Factor on the residual from which on a match loses its weight: the guess is degrees off."""
-
+_TOLERANCE = 8.0  # factor on the residual from which on a match loses its weight: the guess is degrees off
 _SEARCH_M = (0.9, 0.5)
-_GRID_M = 0.06
-_PASSES = 0.15
-"""Share of patches that must find a partner; a fifth do on the even asphalt of real roads."""
-
-_TURNS_DEG = (0.0, 3.0, -3.0, 6.0, -6.0, 9.0, -9.0, 12.0, -12.0)
-"""Pitches that are tried in turn."""
-
-_FARTHEST_DEG = 20.0
-"""A start further off its guess is none."""
-
-_LEAST_MATCHES = 30
-"""Ten for each angle of the mounting."""
+_LEAST_SHARE = 0.15  # share of patches that must find a partner; a fifth do on the even asphalt of real roads
+_TURNS_DEG = (0.0, 3.0, -3.0, 6.0, -6.0, 9.0, -9.0, 12.0, -12.0)  # pitches that are tried in turn
+_FARTHEST_DEG = 20.0  # a start further off its guess is none
+_LEAST_MATCHES = 30  # ten for each angle of the mounting
+# Distance between the images of a pair that tells readings apart: poses read wrongly move the ground further
+# than the search.
+_APART_M = (1.2, 2.8)
+_TURN_RAD = np.deg2rad(2)  # a turn between the images of a pair that is no noise of the path
+_READING_SEARCH_M = 0.6
+_RIVAL = 0.5  # as given, the share of matching patches must not fall below this part of another reading's
+# Share from which on another reading is one: on even asphalt of real roads a fifth of the patches match.
+_CLEAR_SHARE = 0.2
 
 
 @dataclass(frozen=True)
@@ -44,29 +45,22 @@ class Start:
     sought: int
 
 
-def find_start(matcher: Matcher, beliefs: Beliefs, guess: Mount) -> Start:
-    """The first of the guess and its turned copies from which the ground matches.
-
-    Args:
-        matcher: of the camera.
-        beliefs: of its images.
-        guess: the mounting as stated.
-    """
-    pairs = short_pairs(beliefs.path_m())
+def find_start(matcher: Matcher, stated: Stated, guess: Mount) -> Start:
+    """The first of the guess and copies that look further up or down from which the ground matches."""
+    pairs = _short_pairs(stated.path_m())
     best = Start(None, 0.0, 0)
     for turn_deg in _TURNS_DEG:
         # Pitch is about the camera's own sideways axis: a camera may look anywhere.
         sideways = guess.vehicle_from_cam_rotation[:, 0]
-        tried = _settle(
-            matcher, beliefs, pairs, guess.moved(np.deg2rad(turn_deg) * sideways, np.zeros(3)), guess
-        )
+        turned = guess.moved(np.deg2rad(turn_deg) * sideways, np.zeros(3))
+        tried = _settle(matcher, stated, pairs, turned, guess)
         if tried.mount is not None:
             return tried
         best = max(best, tried, key=lambda start: start.share)
     return best
 
 
-def short_pairs(path_m: FloatArray) -> IntArray:
+def _short_pairs(path_m: FloatArray) -> IntArray:
     """Pairs of neighbouring images, or of those next to each other where images are rarer."""
     pairs = spread_pairs(path_m, _PAIRS, *_SHORT_M)
     if len(pairs) < _PAIRS // 2:
@@ -74,19 +68,70 @@ def short_pairs(path_m: FloatArray) -> IntArray:
     return pairs
 
 
-def _settle(matcher: Matcher, beliefs: Beliefs, pairs: IntArray, mount: Mount, guess: Mount) -> Start:
+def _settle(matcher: Matcher, stated: Stated, pairs: IntArray, mount: Mount, guess: Mount) -> Start:
+    surveyed = stated.with_surveyed_height()
     share, sought = 0.0, 0
-    prior = beliefs.camera.centre_prior
-    # Between neighbouring images a higher camera and a longer way look alike; the survey tells them apart.
-    surveyed = beliefs if prior is None else replace(beliefs, centre_sigma_m={2: float(prior.sigma_m[2])})
     for search_m in _SEARCH_M:
-        matched = matcher.match(mount, beliefs.poses(), pairs, search_m, _GRID_M)
+        matched = matcher.match(mount, stated.poses(), pairs, search_m, _GRID_M)
         share, sought = matched.share, matched.sought
-        if len(matched.correlation) < _LEAST_MATCHES or share < _PASSES:
+        if len(matched.correlation) < _LEAST_MATCHES or share < _LEAST_SHARE:
             return Start(None, share, sought)
-        used, believed, _ = surveyed.about(matched.observations)
-        mount = adjust(used, believed, mount, tolerance=_TOLERANCE).mount
+        used, prior, _ = surveyed.prior_of(matched.observations)
+        mount = adjust(used, prior, mount, tolerance=_TOLERANCE).mount
         away = guess.vehicle_from_cam_rotation.T @ mount.vehicle_from_cam_rotation
         if np.trace(away) < 1 + 2 * np.cos(np.deg2rad(_FARTHEST_DEG)):
             return Start(None, 0.0, sought)
     return Start(mount, share, sought)
+
+
+@dataclass(frozen=True)
+class Readings:
+    """The start as given, the shares of all readings and the best one."""
+
+    start: Start
+    shares: Mapping[Reading, float]
+    best: Reading
+
+
+def try_readings(drive: Drive, camera: str, matcher: Matcher, stated: Stated, others: bool) -> Readings:
+    """Find a start and compare the readings of the poses; without ``others`` only the one as given."""
+    start = find_start(matcher, stated, stated.guess)
+    pairs = _distinctive_pairs(drive, camera)
+    shares = {Reading.AS_GIVEN: 0.0}
+    if start.mount is not None:
+        shares[Reading.AS_GIVEN] = _share(matcher, stated, start.mount, pairs)
+    if others:
+        for reading in Reading:
+            if reading is not Reading.AS_GIVEN:
+                shares[reading] = _share_under(reading, camera, matcher, stated, start.mount, pairs)
+    best = max(shares, key=lambda reading: shares[reading])
+    if shares[best] < _CLEAR_SHARE or shares[Reading.AS_GIVEN] >= _RIVAL * shares[best]:
+        best = Reading.AS_GIVEN
+    return Readings(start, shares, best)
+
+
+def _share_under(
+    reading: Reading, camera: str, matcher: Matcher, stated: Stated, found: Mount | None, pairs: IntArray
+) -> float:
+    motion = motion_of(stated.drive, camera, reading)
+    backwards = reading is Reading.BACKWARDS
+    guess = stated.guess if found is None else found
+    guess = guess.turned_around() if backwards else guess
+    other = matcher.under(motion, turned=backwards)
+    read = replace(stated, motion=motion, guess=guess, surveyed=not backwards)
+    mount = guess if found is not None else find_start(other, read, guess).mount
+    return 0.0 if mount is None else _share(other, read, mount, pairs)
+
+
+def _distinctive_pairs(drive: Drive, camera: str) -> IntArray:
+    """Pairs between which the vehicle turns most along its path; evenly spread ones on a straight route."""
+    motion = motion_of(drive, camera, Reading.HEADING_FROM_PATH)
+    yaw = np.unwrap(heading_rad(motion.poses()))
+    pairs = turning_pairs(motion.path_at_images(), yaw, _PAIRS, *_APART_M)
+    if len(pairs) and np.median(np.abs(yaw[pairs[:, 1]] - yaw[pairs[:, 0]])) > _TURN_RAD:
+        return pairs
+    return spread_pairs(motion.path_at_images(), _PAIRS, *_APART_M)
+
+
+def _share(matcher: Matcher, stated: Stated, mount: Mount, pairs: IntArray) -> float:
+    return matcher.match(mount, stated.poses(), pairs, _READING_SEARCH_M, _GRID_M).share

@@ -7,12 +7,14 @@ import json
 import logging
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
@@ -23,52 +25,68 @@ from v2hdm.io.calibration.document import trusted_calibrations
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.drive.tum import write_tum
 from v2hdm.io.maps.geojson import read_geojson
-from v2hdm.localization.figure import save_errors
-from v2hdm.localization.match import Markings, Seen, locate
-from v2hdm.localization.motion import State, predict, start
+from v2hdm.localization.filter import Markings, Seen, State, locate, predict, start
 from v2hdm.mapping.sightings.table import Sightings, collect_sightings
-from v2hdm.records import Calibration, Drive, FloatArray, HdMap, ImageDetections, Trajectory
+from v2hdm.records import (
+    BoolArray,
+    Calibration,
+    Drive,
+    FloatArray,
+    HdMap,
+    ImageDetections,
+    IntArray,
+    Trajectory,
+)
 from v2hdm.report.outputs import result_folder, write_json
 from v2hdm.settings import check_workers
 
-START_SIGMA_M, START_SIGMA_RAD = 0.5, float(np.deg2rad(3.0))
-"""How well the first pose is known: a coordinate of a place that RTK has once fixed, and a compass."""
-
-LOST_M = 0.3
-"""With a larger standard deviation of the place the vehicle does not know where it is: half a dash's gap."""
-
-LEAST_MATCHED = 0.5
-"""Share of the detections that a map of the site explains at least: one explained .86, another site's .04."""
-
-IN_VIEW_M = 15.0
-"""A marking is in view whose corners are all in an image and no farther from the camera."""
+# How well the first pose is known: a coordinate of a place that RTK has once fixed, and a compass.
+_START_SIGMA_M, _START_SIGMA_RAD = 0.5, float(np.deg2rad(3.0))
+# With a larger standard deviation of the place the vehicle does not know where it is: half a dash's gap.
+_LOST_M = 0.3
+# Share of the detections that a map of the site explains at least: one explained .86, another site's .04.
+_LEAST_MATCHED = 0.5
+_IN_VIEW_M = 15.0  # A marking is in view whose corners are all in an image and no farther from the camera
+_PANELS = (("ahead", 100.0, "cm"), ("to the left", 100.0, "cm"), ("heading", float(np.degrees(1.0)), "deg"))
+_KNOWN, _LOST, _BAND = "#0072b2", "#d55e00", "#bbbbbb"
 
 
 @dataclass(frozen=True)
 class Localised:
-    """F frames: ``states`` after each, the markings ``matched`` (F,), and which have one ``in_view`` (F,).
+    """A vehicle followed through F frames.
 
-    ``detections`` counts those of all frames. ``shared`` (3,) are the variances of ahead, left and heading
-    that map and calibration have in common for all frames.
+    Attributes:
+        stamp_s: (F,) time of each frame.
+        recorded: (F, 4, 4) ``map_from_vehicle`` as recorded.
+        states: after each frame.
+        matched: (F,) markings matched.
+        in_view: (F,) whether a marking was in view.
+        shared: (3,) variances of ahead, left and heading that map and calibration share among all frames.
+        detections: number of all frames together.
     """
 
     stamp_s: FloatArray
     recorded: FloatArray
     states: tuple[State, ...]
-    matched: np.ndarray
-    in_view: np.ndarray
+    matched: IntArray
+    in_view: BoolArray
     shared: FloatArray
     detections: int
 
     @property
-    def known(self) -> np.ndarray:
+    def poses(self) -> Trajectory:
+        """The localised ``map_from_vehicle`` (F, 4, 4) over time."""
+        return Trajectory(self.stamp_s, np.stack([state.map_from_vehicle for state in self.states]))
+
+    @property
+    def known(self) -> BoolArray:
         """In which frames (F,) the vehicle knows where it is."""
-        return np.array([state.sigma_m < LOST_M for state in self.states])
+        return np.array([state.sigma_m < _LOST_M for state in self.states])
 
     @property
     def error(self) -> FloatArray:
         """Estimate less recorded pose (F, 3): ahead, m, to the left, m, and heading, rad."""
-        estimate = np.stack([state.map_from_vehicle for state in self.states])
+        estimate = self.poses.map_from_vehicle
         off = estimate[:, :2, 3] - self.recorded[:, :2, 3]
         heading = heading_rad(self.recorded)
         turn = (heading_rad(estimate) - heading + np.pi) % (2 * np.pi) - np.pi
@@ -87,43 +105,61 @@ class Localised:
             out.append(np.sqrt(variance + self.shared))
         return np.stack(out)
 
+    @property
+    def explained(self) -> bool:
+        """Whether the map explains the drive; where it does not, no figure can be relied on."""
+        return bool(self.matched.sum() / max(self.detections, 1) >= _LEAST_MATCHED)
+
     def figures(self) -> dict[str, float | int]:
-        """What the door reports, over the frames with a marking in view."""
+        """The figures of ``localization.json``, errors over the frames with a marking in view."""
         kept = self.in_view & self.known
-        error = self.error[kept]
+        error = self.error[kept] if kept.any() else np.full((1, 3), np.nan)
         return {
             "frames": len(self.states),
             "frames_with_a_marking_in_view": int(self.in_view.sum()),
             "localised_share": float(kept.sum() / max(self.in_view.sum(), 1)),
-            "position_rmse_m": float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean()))
-            if len(error)
-            else np.nan,
-            "heading_rmse_deg": float(np.degrees(np.sqrt((error[:, 2] ** 2).mean())))
-            if len(error)
-            else np.nan,
-            "worst_position_m": float(np.hypot(*error[:, :2].T).max()) if len(error) else np.nan,
+            "position_rmse_m": float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean())),
+            "heading_rmse_deg": float(np.degrees(np.sqrt((error[:, 2] ** 2).mean()))),
+            "worst_position_m": float(np.hypot(*error[:, :2].T).max()),
             "median_sigma_m": float(np.median(np.hypot(*self.sigma[:, :2].T))),
             "detections": self.detections,
             "matched_share": float(self.matched.sum() / max(self.detections, 1)),
         }
 
 
-def localise(
-    drive: Drive,
-    detections: Sequence[ImageDetections],
+def localize(
     hd_map: HdMap,
+    drive: Drive,
     calibrations: Mapping[str, Calibration],
+    *,
+    detections: Sequence[ImageDetections] | None = None,
+    workers: int = 1,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Localised:
     """Follow the vehicle through a drive by the map's markings; of the recorded poses only the first is used.
 
+    Args:
+        hd_map: in the frame of the drive's poses.
+        drive: with the images.
+        calibrations: of the map's cameras, by name.
+        detections: of the drive's images, made here if not given.
+        workers: processes that detect.
+        progress: called as ``progress(done, total)`` images.
+
     Raises:
+        MapFileError: map, calibrations and drive do not belong together.
         MappingError: the images hold no marking.
     """
+    _check_together(hd_map, calibrations, drive)
+    if detections is None:
+        detections = detect_all(
+            drive, DetectorOptions.for_mapping(), workers, progress or (lambda done, total: None)
+        )
     names = [name for name in drive.cameras if name in calibrations]
     sightings = collect_sightings(drive, detections, names)
     attitude_rad = drive.pose_noise.roll_pitch_rad
     markings = Markings(hd_map)
-    state = start(sightings.map_from_vehicle[0], START_SIGMA_M, START_SIGMA_RAD, attitude_rad)
+    state = start(sightings.map_from_vehicle[0], _START_SIGMA_M, _START_SIGMA_RAD, attitude_rad)
     states, matched = [], []
     for frame, stamp_s in enumerate(sightings.stamp_s):
         if frame:
@@ -132,47 +168,64 @@ def localise(
         states.append(state)
         matched.append(len(found))
     return Localised(
-        sightings.stamp_s,
-        sightings.map_from_vehicle,
-        tuple(states),
-        np.array(matched),
-        _in_view(drive, sightings, hd_map, calibrations),
-        np.array([markings.shared_m2, markings.shared_m2, _yaw_variance(calibrations)]),
-        len(sightings),
+        stamp_s=sightings.stamp_s,
+        recorded=sightings.map_from_vehicle,
+        states=tuple(states),
+        matched=np.array(matched),
+        in_view=_in_view(drive, sightings, hd_map, calibrations),
+        shared=np.array([markings.shared_m2, markings.shared_m2, _yaw_variance(calibrations)]),
+        detections=len(sightings),
     )
+
+
+def _check_together(hd_map: HdMap, calibrations: Mapping[str, Calibration], drive: Drive) -> None:
+    if not hd_map.markings:
+        raise MapFileError("the map has no markings; nothing can be localised in it")
+    if not set(drive.cameras) & set(calibrations):
+        raise MapFileError(
+            f"drive {drive.name} has the cameras {', '.join(drive.cameras)}, the map was made with "
+            f"{', '.join(calibrations)}; no camera is calibrated"
+        )
+    if hd_map.origin != drive.origin:
+        raise MapFileError(
+            f"the map's origin is {hd_map.origin} and that of drive {drive.name} {drive.origin}: their "
+            "coordinates differ; bring the drive's poses into the map's frame"
+        )
 
 
 def _yaw_variance(calibrations: Mapping[str, Calibration]) -> float:
     """Variance, rad^2, of the cameras' common turn about the vertical: that of their mean."""
-    up = [one.cam_from_vehicle[:3, 2] for one in calibrations.values()]
-    of_each = [
-        0.0 if one.covariance is None else float(axis @ one.covariance[3:, 3:] @ axis)
-        for axis, one in zip(up, calibrations.values(), strict=True)
-    ]
-    return float(np.mean(of_each))
+    variances = []
+    for one in calibrations.values():
+        up = one.cam_from_vehicle[:3, 2]
+        variances.append(0.0 if one.covariance is None else float(up @ one.covariance[3:, 3:] @ up))
+    return float(np.mean(variances))
 
 
 def _seen(
     drive: Drive, sightings: Sightings, frame: int, names: list[str], calibrations: Mapping[str, Calibration]
 ) -> list[Seen]:
-    rows = np.flatnonzero(sightings.frame == frame)
+    """The detections of one frame."""
     informs = sightings.informs
-    return [
-        Seen(
-            sightings.kinds[sightings.kind[row]],
-            drive.cameras[names[sightings.camera[row]]].info.intrinsic,
-            calibrations[names[sightings.camera[row]]].cam_from_vehicle,
-            sightings.corners_pinhole_px[row],
-            sightings.covariance_px[row],
-            informs[row],
+    out = []
+    for row in np.flatnonzero(sightings.frame == frame).tolist():
+        camera = names[sightings.camera[row]]
+        out.append(
+            Seen(
+                sightings.kinds[sightings.kind[row]],
+                drive.cameras[camera].info.intrinsic,
+                calibrations[camera].cam_from_vehicle,
+                sightings.corners_pinhole_px[row],
+                sightings.covariance_px[row],
+                informs[row],
+            )
         )
-        for row in rows.tolist()
-    ]
+    return out
 
 
 def _in_view(
     drive: Drive, sightings: Sightings, hd_map: HdMap, calibrations: Mapping[str, Calibration]
-) -> np.ndarray:
+) -> BoolArray:
     """In which frames (F,) a whole marking of the map is near and within an image, by the recorded poses."""
     corners = np.stack([marking.corners_map for marking in hd_map.markings])
     out = np.zeros(len(sightings.stamp_s), dtype=bool)
@@ -184,7 +237,7 @@ def _in_view(
         cam_from_map = calibrations[image.camera].cam_from_vehicle @ np.linalg.inv(image.map_from_vehicle)
         pixels, depth_m = project_ground(info.intrinsic, cam_from_map, corners.reshape(-1, 2))
         inside = (pixels >= 0) & (pixels < [info.width, info.height])
-        near = inside.all(axis=1) & (depth_m > 0) & (depth_m < IN_VIEW_M)
+        near = inside.all(axis=1) & (depth_m > 0) & (depth_m < _IN_VIEW_M)
         out[times[image.taken_s]] |= bool(near.reshape(-1, 4).all(axis=1).any())
     return out
 
@@ -210,51 +263,70 @@ def localise_drive(parsed: argparse.Namespace) -> bool:
     _check_together(hd_map, calibrations, drive)
     folder = parsed.output or Path("outputs") / f"{drive.name}-localized"
     with result_folder(folder, "--output") as unfinished:
-        detections = detect_all(
-            drive, DetectorOptions.for_mapping(), parsed.workers or os.cpu_count() or 1, _tell
-        )
-        found = localise(drive, detections, hd_map, calibrations)
-        figures = found.figures()
+        workers = parsed.workers or os.cpu_count() or 1
+        found = localize(hd_map, drive, calibrations, workers=workers, progress=_report_progress)
         settings = {"map": str(parsed.map), "drive": str(parsed.drive), "cameras": list(drive.cameras)}
         (unfinished / "config.yaml").write_text(json.dumps(settings) + "\n", encoding="utf-8")
-        write_json(unfinished / "localization.json", figures)
-        poses = np.stack([state.map_from_vehicle for state in found.states])
-        write_tum(Trajectory(found.stamp_s, poses), unfinished / "localized.tum")
-        noise = drive.pose_noise
-        recorded = [noise.position_m, noise.position_m, noise.heading_rad]
-        sigma = np.hypot(found.sigma, recorded)
-        save_errors(unfinished / "errors.png", found.stamp_s, found.error, sigma, found.known)
-    print(
+        write_localised(found, drive, unfinished)
+    for line in summary_lines(found):
+        print(line)
+    print(f"results in {folder}")
+    return found.explained
+
+
+def write_localised(found: Localised, drive: Drive, folder: Path) -> None:
+    """Write figures, poses and the picture of the errors into a folder."""
+    write_json(folder / "localization.json", found.figures())
+    write_tum(found.poses, folder / "localized.tum")
+    noise = drive.pose_noise
+    sigma = np.hypot(found.sigma, [noise.position_m, noise.position_m, noise.heading_rad])
+    save_errors(folder / "errors.png", found, sigma)
+
+
+def summary_lines(found: Localised) -> list[str]:
+    """The figures for a terminal, with a FAIL where the map does not explain the drive."""
+    figures = found.figures()
+    lines = [
         f"{figures['localised_share']:.1%} of {figures['frames_with_a_marking_in_view']} frames with a "
         f"marking in view localised; position {100 * figures['position_rmse_m']:.1f} cm, heading "
         f"{figures['heading_rmse_deg']:.2f} deg from the recorded poses (RMSE)"
-    )
-    explained = float(figures["matched_share"]) >= LEAST_MATCHED
-    if not explained:
-        print(
+    ]
+    if not found.explained:
+        lines.append(
             f"FAIL: the map explains {figures['matched_share']:.0%} of the detections, so that the figures "
             "above cannot be relied on: is it of this site, as it is painted today, and does the drive begin "
             "where its first pose says?"
         )
-    print(f"results in {folder}")
-    return explained
+    return lines
 
 
-def _check_together(hd_map: HdMap, calibrations: Mapping[str, Calibration], drive: Drive) -> None:
-    if not hd_map.markings:
-        raise MapFileError("the map has no markings; nothing can be localised in it")
-    if not set(drive.cameras) & set(calibrations):
-        raise MapFileError(
-            f"drive {drive.name} has the cameras {', '.join(drive.cameras)}, the map was made with "
-            f"{', '.join(calibrations)}; no camera is calibrated"
-        )
-    if hd_map.origin != drive.origin:
-        raise MapFileError(
-            f"the map's origin is {hd_map.origin} and that of drive {drive.name} {drive.origin}: their "
-            "coordinates differ; bring the drive's poses into the map's frame"
-        )
-
-
-def _tell(done: int, total: int) -> None:
+def _report_progress(done: int, total: int) -> None:
     if done == total or done % 50 == 0:
         print(f"looked at {done} of {total} images", file=sys.stderr, flush=True)
+
+
+def save_errors(path: Path, found: Localised, sigma: FloatArray) -> None:
+    """Draw the errors beside the recorded poses as PNG.
+
+    Bands are two standard deviations (F, 3) of estimate and recorded pose together; frames in which the
+    vehicle does not know where it is are crosses.
+    """
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    FigureCanvasAgg(figure)
+    time_s, error, known = found.stamp_s - found.stamp_s[0], found.error, found.known
+    axes = figure.subplots(3, 1, sharex=True)
+    for k, (axis, (name, factor, unit)) in enumerate(zip(axes, _PANELS, strict=True)):
+        band = 2 * factor * sigma[:, k]
+        axis.fill_between(time_s, -band, band, color=_BAND, alpha=0.6, lw=0, label="two sigmas, of both")
+        axis.plot(time_s[known], factor * error[known, k], ".", ms=3, color=_KNOWN, label="localised")
+        if not known.all():
+            axis.plot(time_s[~known], factor * error[~known, k], "x", ms=4, color=_LOST, label="lost")
+        limit = 1.2 * float(np.percentile(np.abs(factor * error[:, k]), 99)) + 1e-9
+        limit = max(limit, 2 * float(np.median(band)))
+        axis.set_ylim(-limit, limit)
+        axis.set_ylabel(f"{name}, {unit}")
+        axis.grid(alpha=0.3)
+    axes[0].legend(loc="upper right", ncols=3, fontsize=8)
+    axes[0].set_title("Localised by the map's markings, less the recorded pose")
+    axes[-1].set_xlabel("time, s")
+    figure.savefig(path, dpi=110)

@@ -7,16 +7,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+from v2hdm.calibration.compare import movement
 from v2hdm.errors import MapFileError
 from v2hdm.ground import GroundEstimate, GroundStatus, better_start, estimate_cameras
-from v2hdm.ground.better import GROUND_IPM
+from v2hdm.ground.results import GROUND_IPM
 from v2hdm.io.drive import join_drives, with_clock_offsets
 from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.pipeline.keys import Contents
 from v2hdm.records import Camera, Drive
 from v2hdm.store.cache.room import Room
-from v2hdm.verdict import Finding, Status, check_drive, clock_corrections
-from v2hdm.verdict.movement import movement
+from v2hdm.verdict import Finding, Status, clock_corrections, input_findings
 
 log = logging.getLogger(__name__)
 
@@ -58,11 +58,11 @@ def inspect(drive: Drive, max_gap_s: float, workers: int, progress: Callable[[in
         progress: told how many cameras are done, and of how many.
     """
     ground = estimate_cameras(drive, workers, progress)
-    findings = tuple(check_drive(drive, ground))
+    findings = tuple(input_findings(drive, ground))
     for finding in findings:
         if finding.status is not Status.PASS:
             log.warning("%s", finding.line)
-        elif finding.is_untold:
+        elif finding.is_unobservable:
             log.info("%s", finding.line)
     offset_s = clock_corrections(ground)
     corrected = better_start(with_clock_offsets(drive, offset_s, max_gap_s), ground)

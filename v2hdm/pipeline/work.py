@@ -44,8 +44,8 @@ from v2hdm.store.cache.pruning import make_room
 from v2hdm.store.cache.room import Room
 from v2hdm.store.cache.store import Store
 from v2hdm.verdict import Finding, Status, Verdict
-from v2hdm.verdict.results.known_sizes import check_known_sizes
-from v2hdm.verdict.results.result import check_result
+from v2hdm.verdict.results.solution import check_result
+from v2hdm.verdict.results.survey import check_known_sizes
 
 log = logging.getLogger(__name__)
 

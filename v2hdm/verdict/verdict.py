@@ -1,4 +1,4 @@
-"""The findings of all checks and the verdict that follows from them."""
+"""The findings of all checks, how one follows from a measured value, and the verdict on all of them."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ class Status(Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check found.
+    """The result of one check.
 
     Attributes:
         check: name of the check, stable from version to version, such as ``clock``.
         status: PASS within the limit. WARN where the result still holds, or was corrected. FAIL where the
             result is wrong or cannot be relied on.
-        value: what was measured, in ``unit``; None where this drive cannot tell.
+        value: the measured value, in ``unit``; None where this drive does not make it observable.
         limit: the largest ``value`` that passes, in ``unit``; None where there is none.
         unit: of ``value`` and ``limit``, such as ``ms``; empty for a ratio or a count.
-        says: one sentence that names the cause and the remedy.
-        about: what the finding is about: a camera's name, ``poses``, a setting, ``map``.
+        says: one sentence that names the cause and the recovery.
+        about: a camera's name, ``poses``, a setting, ``map``.
     """
 
     check: str
@@ -46,25 +46,17 @@ class Finding:
 
     def as_json(self) -> dict[str, Any]:
         """The finding as an object of ``metrics.json``."""
-        return {
-            "check": self.check,
-            "status": self.status.value,
-            "value": self.value,
-            "limit": self.limit,
-            "unit": self.unit,
-            "says": self.says,
-            "about": self.about,
-        }
+        return {**vars(self), "status": self.status.value}
 
     @property
-    def is_untold(self) -> bool:
+    def is_unobservable(self) -> bool:
         """Whether this drive cannot tell: nothing speaks against it, and nothing for it."""
         return self.status is Status.PASS and self.value is None
 
     @property
     def line(self) -> str:
         """The finding as one line for the terminal and the log."""
-        outcome = "cannot tell" if self.is_untold else self.status.value
+        outcome = "cannot tell" if self.is_unobservable else self.status.value
         return f"{outcome} {self.check} ({self.about}): {self.says}"
 
 
@@ -90,30 +82,30 @@ class Verdict:
         return tuple(finding for finding in self.findings if finding.status is not Status.PASS)
 
     @property
-    def untold(self) -> tuple[Finding, ...]:
+    def unobservable(self) -> tuple[Finding, ...]:
         """The checks that this drive gives no answer to."""
-        return tuple(finding for finding in self.findings if finding.is_untold)
+        return tuple(finding for finding in self.findings if finding.is_unobservable)
 
     @property
     def passed(self) -> tuple[Finding, ...]:
         """The checks that were answered, within their limits."""
-        return tuple(f for f in self.findings if f.status is Status.PASS and not f.is_untold)
+        return tuple(f for f in self.findings if f.status is Status.PASS and not f.is_unobservable)
 
     def as_json(self) -> dict[str, Any]:
-        """The verdict as an object of ``metrics.json``: raised, untold and passed checks apart."""
+        """The verdict as an object of ``metrics.json``: raised, unobservable and passed checks apart."""
         return {
             "status": self.status.value,
             "findings": [finding.as_json() for finding in self.raised],
-            "untold": [finding.as_json() for finding in self.untold],
+            "untold": [finding.as_json() for finding in self.unobservable],
             "passed": [finding.as_json() for finding in self.passed],
         }
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """The verdict, what was raised and what this drive cannot tell, one line each, for a terminal."""
+        """The verdict, raised findings and unobservable checks, one line each, for a terminal."""
         raised = {0: "nothing raised", 1: "1 finding"}.get(len(self.raised), f"{len(self.raised)} findings")
         summary = f"verdict: {self.status.value} ({raised}, {len(self.passed)} checks passed)"
-        return (summary, *(finding.line for finding in _joined((*self.raised, *self.untold))))
+        return (summary, *(finding.line for finding in _joined((*self.raised, *self.unobservable))))
 
 
 def _joined(findings: Iterable[Finding]) -> list[Finding]:
@@ -124,3 +116,41 @@ def _joined(findings: Iterable[Finding]) -> list[Finding]:
         same = joined.get(key)
         joined[key] = replace(same, about=f"{same.about}, {finding.about}") if same else finding
     return list(joined.values())
+
+
+def judge(
+    check: str,
+    about: str,
+    value: float,
+    limit: float,
+    unit: str,
+    *,
+    fine: str,
+    wrong: str,
+    status: Status = Status.FAIL,
+    least: float | None = None,
+) -> Finding:
+    """A finding that passes where the size of ``value`` is at most ``limit``.
+
+    Args:
+        check: name of the check.
+        about: a camera's name, ``poses``, a setting, ``map``.
+        value: the measured value, in ``unit``.
+        limit: the largest size of ``value`` that passes.
+        unit: of both.
+        fine: the sentence where it passes.
+        wrong: the sentence where it does not: cause and recovery.
+        status: the status where it does not.
+        least: if given, ``value`` itself passes from this to ``limit``, and the finding holds the nearer one.
+    """
+    inside = abs(value) <= limit
+    if least is not None:
+        inside = least <= value <= limit
+        limit = least if abs(value - least) < abs(value - limit) else limit
+    outcome = Status.PASS if inside else status
+    return Finding(check, outcome, float(value), float(limit), unit, fine if inside else wrong, about)
+
+
+def passed(check: str, about: str, says: str, value: float | None = None, unit: str = "") -> Finding:
+    """A finding that passes and has no limit, such as one that is not observable on this drive."""
+    return Finding(check, Status.PASS, value, None, unit, says, about)

@@ -2,69 +2,52 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from v2hdm.geometry.ipm import apply_homography, extrinsic_from_ipm
-from v2hdm.geometry.lens import distort_points, undistort_points
+from v2hdm.geometry.lens import distort_points, has_distortion, undistort_points
 from v2hdm.geometry.planar import inside_convex, signed_area
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import Camera, CameraInfo, CentrePrior, FloatArray
-from v2hdm.verdict.judgement import judge, judge_between, passed
-from v2hdm.verdict.verdict import Finding, Status
+from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
+# Lenses sit over their sensor to a few percent of the image's width; cropped images are rare beyond this.
 _OFF_CENTRE = 0.15
-"""Lenses sit over their sensor to a few percent of the image's width; cropped images are rare beyond this."""
-
+# A principal point in the middle of an image smaller or larger by this is that of another resolution.
 _OTHER_SIZE = 0.15
-"""A principal point in the middle of an image smaller or larger by this is that of another resolution."""
-
+# Focal lengths, in image widths, of lenses that map roads: 118 deg wide (fisheyes more) to 11 deg.
 _SHORTEST, _LONGEST = 0.3, 5.0
-"""Focal lengths, in image widths, of lenses that map roads: 118 deg wide (fisheyes more) to 11 deg."""
-
-_SQUARE = 0.03
-"""Pixels are square to far less than this."""
-
-_MISSHAPEN = 0.03
-"""Clicked homographies depart from K [r1 r2 t] by about one percent."""
-
-_BORROWED_M = 1.0
-"""A guess borrowed from another vehicle of the kind, or from a drawing, is decimetres off."""
-
-_NEAR_SURVEY_M = 0.6
-"""Survey and guess that come so close once a sign or a unit is changed show the cause."""
-
-_ROI_SEEN = 0.5
-"""At least this share of the ROI must be in the image."""
-
-_ROI_AREA_M2 = 4.0
-"""A smaller ROI holds no whole marking: a dash alone is 3 m long."""
-
+_SQUARE = 0.03  # pixels are square to far less than this
+_MISSHAPEN = 0.03  # clicked homographies depart from K [r1 r2 t] by about one percent
+_BORROWED_M = 1.0  # a guess borrowed from another vehicle of the kind, or from a drawing, is decimetres off
+_NEAR_SURVEY_M = 0.6  # survey and guess that come so close once a sign or a unit is changed show the cause
+# Units that surveys come in, in 1/m.
+_SURVEY_UNITS = {"centimetres": 1e2, "millimetres": 1e3, "feet": 1 / 0.3048, "inches": 1 / 0.0254}
+_ROI_IN_VIEW = 0.5  # at least this share of the ROI must be in the image
+_ROI_AREA_M2 = 4.0  # a smaller ROI holds no whole marking: a dash alone is 3 m long
+# Ground per pixel, along the view, at the ROI's far end: beyond, a pixel of noise is half a metre.
 _COARSEST_M = 0.5
-"""Ground per pixel, along the view, at the ROI's far end: beyond, a pixel of noise is half a metre."""
-
-_TILTED_DEG = 30.0
-"""Cameras for roads are mounted upright."""
-
-_HIGHEST_M = 12.0
-_LOWEST_M = 0.3
-"""Heights of cameras on vehicles, cranes' straddle carriers included."""
+_TILTED_DEG = 30.0  # cameras for roads are mounted upright
+_LOWEST_M, _HIGHEST_M = 0.3, 12.0  # heights of cameras on vehicles, cranes' straddle carriers included
 
 
 def check_camera(name: str, camera: Camera) -> list[Finding]:
     """All checks of one camera's description."""
-    findings = check_intrinsics(name, camera.info)
     cam_from_vehicle = extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm])
-    findings += check_roi(name, camera, cam_from_vehicle)
-    findings += [
+    findings = [
+        *check_intrinsics(name, camera.info),
+        *check_roi(name, camera, cam_from_vehicle),
         _shape(name, camera.info, camera.ipm[camera.initial_ipm]),
         *_mounting(name, cam_from_vehicle),
     ]
     if camera.centre_prior is not None:
-        findings += check_survey(name, camera.centre_prior, camera_centre(cam_from_vehicle))
+        findings.append(check_survey(name, camera.centre_prior, camera_centre(cam_from_vehicle)))
     return findings
 
 
-def check_intrinsics(name: str, info: CameraInfo) -> list[Finding]:
+def check_intrinsics(name: str, info: CameraInfo) -> Iterator[Finding]:
     """Camera matrix against image size."""
     (fx, _, cx), (_, fy, cy), _ = info.intrinsic
     off = max(abs(cx + 0.5 - info.width / 2), abs(cy + 0.5 - info.height / 2)) / info.width
@@ -77,70 +60,70 @@ def check_intrinsics(name: str, info: CameraInfo) -> list[Finding]:
         if other
         else f"the principal point is {100 * off:.0f} % of the width off the image's centre; check cx and cy"
     )
+    yield judge(
+        "principal point", name, off, _OFF_CENTRE, "",
+        fine="the principal point is near the image's centre",
+        wrong=cause,
+        status=Status.FAIL if other else Status.WARN,
+    )  # fmt: skip
     focal = fx / info.width
-    fitting = judge_between(
-        "focal length", name, focal, (_SHORTEST, _LONGEST), "image widths",
+    yield judge(
+        "focal length", name, focal, _LONGEST, "image widths", least=_SHORTEST,
         fine="the focal length is one of a lens for roads",
         wrong=f"fx is {focal:.2g} image widths, no lens for roads; give it in px of these images, not in mm",
     )  # fmt: skip
-    square = judge(
+    yield judge(
         "square pixels", name, fx / fy - 1, _SQUARE, "",
         fine="fx and fy agree",
         wrong=f"the focal lengths fx {fx:.0f} and fy {fy:.0f} differ by {100 * abs(fx / fy - 1):.0f} %, but "
         "pixels are square; check both in camera_info",
         status=Status.WARN,
     )  # fmt: skip
-    centre = judge(
-        "principal point", name, off, _OFF_CENTRE, "",
-        fine="the principal point is near the image's centre",
-        wrong=cause,
-        status=Status.FAIL if other else Status.WARN,
-    )  # fmt: skip
-    return [centre, fitting, square, *_lens(name, info)]
+    yield _lens(name, info)
 
 
 def check_roi(name: str, camera: Camera, cam_from_vehicle: FloatArray) -> list[Finding]:
     """Whether the ROI lies before the camera, in its image, and neither too far nor too small."""
-    roi = camera.roi_vehicle
-    grid = _grid(roi)
+
+    def failed(value: float, limit: float, unit: str, says: str) -> list[Finding]:
+        return [Finding("roi", Status.FAIL, value, limit, unit, says, name)]
+
+    grid = _grid(camera.roi_vehicle)
     depth = np.column_stack([grid, np.zeros(len(grid)), np.ones(len(grid))]) @ cam_from_vehicle[2]
-    behind = float((depth <= 0).mean())
-    if behind > 1 - _ROI_SEEN:
+    before = 1 - float((depth <= 0).mean())
+    if before < _ROI_IN_VIEW:
         says = (
             "roi_vehicle lies behind the camera: its x, or the guess, has the wrong sign (x is forward, a "
             "rear camera's ROI has negative x); mend one of them"
         )
-        return [Finding("roi", Status.FAIL, 1 - behind, _ROI_SEEN, "", says, name)]
+        return failed(before, _ROI_IN_VIEW, "", says)
     seen = _share_in_image(camera, grid, depth)
-    if seen < _ROI_SEEN:
+    if seen < _ROI_IN_VIEW:
         says = (
             f"only {100 * seen:.0f} % of roi_vehicle is in the image, as the guess of the mounting says: "
             "mend roi_vehicle or the guess"
         )
-        return [Finding("roi", Status.FAIL, seen, _ROI_SEEN, "", says, name)]
-    area = abs(float(signed_area(roi)))
+        return failed(seen, _ROI_IN_VIEW, "", says)
+    area = abs(float(signed_area(camera.roi_vehicle)))
     if area < _ROI_AREA_M2:
         says = f"roi_vehicle covers {area:.2g} m2, less than a marking; enlarge it (metres, not kilometres)"
-        return [Finding("roi", Status.FAIL, area, _ROI_AREA_M2, "m2", says, name)]
+        return failed(area, _ROI_AREA_M2, "m2", says)
     return [
         passed("roi", name, "the ROI is in the image", seen),
         _farthest(name, camera, cam_from_vehicle, grid[depth > 0]),
     ]
 
 
-def check_survey(name: str, prior: CentrePrior, guess_vehicle: FloatArray) -> list[Finding]:
+def check_survey(name: str, prior: CentrePrior, guess_vehicle: FloatArray) -> Finding:
     """The surveyed centre against the one that the guess implies, which may be borrowed."""
     survey = prior.centre_vehicle
-    limit = _BORROWED_M + 3 * float(np.linalg.norm(prior.sigma_m))
     away = float(np.linalg.norm(survey - guess_vehicle))
-    return [
-        judge(
-            "survey against guess", name, away, limit, "m",
-            fine="survey and guess put the camera at about the same place",
-            wrong=f"centre_prior puts the camera {away:.1f} m away from where its guess does: "
-            f"{_survey_cause(survey, guess_vehicle)}",
-        )
-    ]  # fmt: skip
+    return judge(
+        "survey against guess", name, away, _BORROWED_M + 3 * float(np.linalg.norm(prior.sigma_m)), "m",
+        fine="survey and guess put the camera at about the same place",
+        wrong=f"centre_prior puts the camera {away:.1f} m away from where its guess does: "
+        f"{_survey_cause(survey, guess_vehicle)}",
+    )  # fmt: skip
 
 
 def _survey_cause(survey: FloatArray, guess: FloatArray) -> str:
@@ -151,39 +134,31 @@ def _survey_cause(survey: FloatArray, guess: FloatArray) -> str:
             return f"its {letter} has the wrong sign; write {flipped[axis]:.2f}"
     if np.linalg.norm(survey[[1, 0, 2]] - guess) < _NEAR_SURVEY_M:
         return "its x and y are swapped; x is forward, y left"
-    for unit, scale in {
-        "centimetres": 1e2,
-        "millimetres": 1e3,
-        "feet": 1 / 0.3048,
-        "inches": 1 / 0.0254,
-    }.items():
+    for unit, scale in _SURVEY_UNITS.items():
         if np.linalg.norm(survey / scale - guess) < _NEAR_SURVEY_M:
             return f"it is in {unit}; write it in metres"
     offset = ", ".join(f"{value:+.1f}" for value in survey - guess)
     return f"by {offset} m in x, y, z; survey it from the vehicle's origin on the ground, or mend the guess"
 
 
-def _mounting(name: str, cam_from_vehicle: FloatArray) -> list[Finding]:
+def _mounting(name: str, cam_from_vehicle: FloatArray) -> Iterator[Finding]:
     """Height, tilt and direction of the guess."""
     height = float(camera_centre(cam_from_vehicle)[2])
-    right = cam_from_vehicle[0, :3]
-    tilt_deg = float(np.rad2deg(np.arcsin(np.clip(-right[2], -1, 1))))
-    upside_down = cam_from_vehicle[1, 2] > 0
-    if upside_down:
-        tilt_deg = 180.0 - tilt_deg
-    of_vehicle = judge_between(
-        "camera height", name, height, (_LOWEST_M, _HIGHEST_M), "m",
+    yield judge(
+        "camera height", name, height, _HIGHEST_M, "m", least=_LOWEST_M,
         fine="the guess puts the camera at the height of a vehicle",
         wrong=f"the guess puts the camera {height:.2f} m above the ground; mend the IPM (in metres) or the "
         "guess",
     )  # fmt: skip
-    upright = judge(
+    tilt_deg = float(np.rad2deg(np.arcsin(np.clip(-cam_from_vehicle[0, 2], -1, 1))))
+    if cam_from_vehicle[1, 2] > 0:  # upside down
+        tilt_deg = 180.0 - tilt_deg
+    yield judge(
         "camera tilt", name, tilt_deg, _TILTED_DEG, "deg",
         fine="the guess holds the camera upright",
         wrong=f"the guess tilts the camera by {tilt_deg:.0f} deg about its axis: its axes are x right, y "
         "down, z forward, and v counts downwards; mend the guess, or turn the images",
     )  # fmt: skip
-    return [of_vehicle, upright]
 
 
 def _shape(name: str, info: CameraInfo, ipm: FloatArray) -> Finding:
@@ -205,14 +180,17 @@ def _shape(name: str, info: CameraInfo, ipm: FloatArray) -> Finding:
     )  # fmt: skip
 
 
-def _lens(name: str, info: CameraInfo) -> list[Finding]:
+def _lens(name: str, info: CameraInfo) -> Finding:
     """How wide the lens is, and whether it has distortion; only the images tell whether that is right."""
     corners = np.array([[0.0, info.height / 2], [info.width - 1.0, info.height / 2]])
     pinhole = (undistort_points(info, corners) - info.intrinsic[:2, 2]) / np.diag(info.intrinsic)[:2]
     width_deg = float(np.rad2deg(np.arctan(np.abs(pinhole[:, 0])).sum()))
-    bent = any(info.distortion) or info.distortion_model == "equidistant"
-    says = "the lens is undistorted by its coefficients" if bent else "the images count as free of distortion"
-    return [passed("field of view", name, f"{width_deg:.0f} deg wide; {says}", width_deg, "deg")]
+    says = (
+        "the lens is undistorted by its coefficients"
+        if has_distortion(info)
+        else "the images count as free of distortion"
+    )
+    return passed("field of view", name, f"{width_deg:.0f} deg wide; {says}", width_deg, "deg")
 
 
 def _farthest(name: str, camera: Camera, cam_from_vehicle: FloatArray, grid: FloatArray) -> Finding:

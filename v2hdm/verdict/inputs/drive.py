@@ -1,70 +1,93 @@
-"""All checks before a run: poses, clocks, noise, cameras, images, and what the ground says."""
+"""All checks before a run: poses, clocks, noise, road, cameras, images, and bare ground."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 
+import numpy as np
+
+from v2hdm.ground.estimate import estimate_cameras
 from v2hdm.ground.results import GroundEstimate
+from v2hdm.io.drive.unevenness import unevenness
 from v2hdm.records import Drive
 from v2hdm.verdict.inputs import ground as ground_checks
 from v2hdm.verdict.inputs.cameras import check_camera
-from v2hdm.verdict.inputs.clocks import check_clocks
-from v2hdm.verdict.inputs.ground import check_ground, path_of
+from v2hdm.verdict.inputs.ground import check_ground, find_cause, path_of
 from v2hdm.verdict.inputs.heading import check_heading
-from v2hdm.verdict.inputs.images import check_images
-from v2hdm.verdict.inputs.motion import Motion
-from v2hdm.verdict.inputs.noise import check_noise
-from v2hdm.verdict.inputs.path import check_attitude, check_jumps, check_path
-from v2hdm.verdict.inputs.road import check_road
-from v2hdm.verdict.inputs.suspects import find_suspect
-from v2hdm.verdict.verdict import Finding, Status
+from v2hdm.verdict.inputs.poses import Motion, check_attitude, check_jumps, check_noise, check_path
+from v2hdm.verdict.inputs.recording import check_clocks, check_images
+from v2hdm.verdict.verdict import Finding, Status, Verdict, judge, passed
 
+# Sigmas of roll and pitch that the mapping takes for noise, ground that leans more is bent; and sigmas
+# beyond which markings on it are wrong by many times what the map states.
+_ROAD_SIGMAS, _ROAD_BENT = 3.0, 10.0
+_LEAST_SWAY_RAD = 0.003  # roll and pitch that every vehicle sways by, whatever pose_noise says
 _STEPS = ("position jumps", "height jumps", "pose scatter", "image spacing", "pose gaps", "pose rate")
 _MOUNTING = ("roi", "roi range", "ipm against camera matrix", "camera height", "survey against guess")
-
 _SURVEY = ("survey height", "survey forward", "survey left")
+_GROUND = ground_checks.CHECKS
 
 HIDES: Mapping[str, tuple[str, ...]] = {
-    "path length": (*_STEPS, *ground_checks.CHECKS),
-    "speed": (*_STEPS, *ground_checks.CHECKS),
-    "heading": ("heading offset", "attitude", "pitch sign", "road", "origin", *_STEPS, *ground_checks.CHECKS),
-    "attitude": ("pitch sign", "road", *ground_checks.CHECKS),
-    "repeated poses": (*_STEPS, *ground_checks.CHECKS),
-    "pose scatter": ("position jumps", *ground_checks.CHECKS),
-    "position jumps": ground_checks.CHECKS,
-    "pose noise": ground_checks.CHECKS,
+    "path length": (*_STEPS, *_GROUND),
+    "speed": (*_STEPS, *_GROUND),
+    "heading": ("heading offset", "attitude", "pitch sign", "road", "origin", *_STEPS, *_GROUND),
+    "attitude": ("pitch sign", "road", *_GROUND),
+    "repeated poses": (*_STEPS, *_GROUND),
+    "pose scatter": ("position jumps", *_GROUND),
+    "position jumps": _GROUND,
+    "pose noise": _GROUND,
     "height jumps": ("road", "grade", "ground match", "ground residual", "poses against ground"),
     "origin": ("survey forward", "poses against ground"),
-    "own images": ("frozen images", *ground_checks.CHECKS),
+    "own images": ("frozen images", *_GROUND),
     "bright images": ("frozen images", "ground match"),
     "dark images": ("frozen images", "ground match"),
-    "frozen images": ground_checks.CHECKS,
-    "principal point": ("focal length", *_MOUNTING, *ground_checks.CHECKS),
-    "focal length": (*_MOUNTING, *ground_checks.CHECKS),
+    "frozen images": _GROUND,
+    "principal point": ("focal length", *_MOUNTING, *_GROUND),
+    "focal length": (*_MOUNTING, *_GROUND),
     "square pixels": (
-        "ipm against camera matrix",
-        "ground residual",
-        "focal length from ground",
-        "distortion",
+        "ipm against camera matrix", "ground residual", "focal length from ground", "distortion",
     ),
     "camera tilt": ("roi", "ground match"),
     "camera height": ("survey against guess", "ground match"),
     "roi": ("image spacing", "roi range", "ground match"),
-    "survey against guess": ground_checks.CHECKS,
+    "survey against guess": _GROUND,
     "distortion": ("focal length from ground", "ground residual", *_SURVEY),
     "focal length from ground": ("ipm against camera matrix", "ground residual", *_SURVEY),
     "clock": ("survey forward", "survey left", "poses against ground"),
-}
-"""Checks that fail because another one did: the cause is told, its consequences are not."""
+}  # fmt: skip
+"""Checks that fail because another one did: the cause is reported, its consequences are not."""
 
 
-def check_drive(drive: Drive, ground: Mapping[str, GroundEstimate] | None = None) -> list[Finding]:
-    """Everything that can be said of a drive before any long work; causes without their consequences.
+def check_drive(
+    drive: Drive,
+    *,
+    ground: bool | Mapping[str, GroundEstimate] = True,
+    workers: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> Verdict:
+    """Check a drive before any long work: poses, clocks, noise, cameras, images, and bare ground.
 
     Args:
         drive: the drive.
-        ground: what bare ground says, by camera; cameras that it leaves out are checked without.
+        ground: whether to match bare ground (seconds a camera), or the estimates where they are at hand.
+        workers: processes that match ground.
+        progress: called as ``progress(done, total)`` cameras.
+
+    Raises:
+        DriveError: an image cannot be read.
+    """
+    if isinstance(ground, bool):
+        ground = estimate_cameras(drive, workers, progress) if ground else {}
+    return Verdict.of(input_findings(drive, ground))
+
+
+def input_findings(drive: Drive, ground: Mapping[str, GroundEstimate] | None = None) -> list[Finding]:
+    """The findings of :func:`check_drive`; causes without their consequences.
+
+    Args:
+        drive: the drive.
+        ground: estimates of bare ground by camera; cameras that it leaves out are checked without.
 
     Raises:
         DriveError: a sampled image cannot be decoded.
@@ -83,15 +106,32 @@ def check_drive(drive: Drive, ground: Mapping[str, GroundEstimate] | None = None
     for name, camera in drive.cameras.items():
         findings += check_camera(name, camera)
     findings += check_images(drive)
-    return causes([*findings, *_of_ground(drive, ground, findings)])
-
-
-def _of_ground(
-    drive: Drive, ground: Mapping[str, GroundEstimate], findings: Iterable[Finding]
-) -> list[Finding]:
-    """What the ground says; where it never matches and nothing else explains that, suspects are tried."""
     explained = any("ground match" in HIDES.get(f.check, ()) for f in findings if f.status is not Status.PASS)
-    return check_ground(drive, ground, None if explained else find_suspect(drive, ground))
+    # Where the ground never matches and nothing else explains that, usual mistakes are tried.
+    findings += check_ground(drive, ground, None if explained else find_cause(drive, ground))
+    return causes(findings)
+
+
+def check_road(drive: Drive) -> Iterator[Finding]:
+    """How far the ground deviates from the plane beneath the vehicle, within the ROIs' reach."""
+    if drive.road is None or len(drive.road.points_map) < 2:
+        yield passed("road", "poses", "the ground was recorded as the plane z = 0", 0.0, "deg")
+        return
+    reach_m = max(
+        float(np.linalg.norm(camera.roi_vehicle, axis=1).max()) for camera in drive.cameras.values()
+    )
+    worst = unevenness(drive.road, reach_m)
+    lean_rad = worst.value_m / worst.distance_m
+    sigma_rad = max(drive.pose_noise.roll_pitch_rad, _LEAST_SWAY_RAD)
+    x, y = worst.at_map
+    yield judge(
+        "road", "poses", float(np.rad2deg(lean_rad)), float(np.rad2deg(_ROAD_SIGMAS * sigma_rad)), "deg",
+        fine="the ground is plane as far as the cameras look",
+        wrong=f"{worst.station_m:.0f} m along the route, at x {x:.0f} m, y {y:.0f} m, the ground bends "
+        f"by {worst.value_m:.2f} m over {worst.distance_m:.0f} m (a ramp, a crest or a banked curve): "
+        "markings there are off; leave that stretch out, or end roi_vehicle nearer",
+        status=Status.FAIL if lean_rad > _ROAD_BENT * sigma_rad else Status.WARN,
+    )  # fmt: skip
 
 
 def causes(findings: Iterable[Finding]) -> list[Finding]:

@@ -1,56 +1,49 @@
-"""What bare ground, matched between images, says against a drive: one finding for each quantity.
+"""Findings from bare ground, matched between images: one for each quantity that the drive states.
 
-The limits are above everything seen on twelve clean camera-drives and below the smallest fault that harms a
-map; a quantity must also be five of its own sigmas off.
+The limits are above everything measured on twelve clean camera-drives and below the smallest fault that harms
+a map; a quantity must also be five of its own sigmas off.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from v2hdm.ground.results import GroundEstimate, GroundStatus, Parameter, Reading
-from v2hdm.records import Drive
+from v2hdm.ground import (
+    GroundEstimate,
+    GroundOptions,
+    GroundStatus,
+    Parameter,
+    Reading,
+    estimate_ground,
+)
+from v2hdm.ground.estimate import STEEP_RAD
+from v2hdm.records import Camera, Drive, FloatArray, Trajectory
 from v2hdm.verdict.inputs.heading import Path
-from v2hdm.verdict.judgement import judge
-from v2hdm.verdict.verdict import Finding, Status
+from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
-_SURE = 5.0
-"""Sigmas that a quantity must be off."""
-
-_CLOCK_S = 0.015
-"""Clocks of clean drives were found right to 7 ms; 15 ms at 5 m/s are 7 cm."""
-
-_CORRECTABLE_S = 0.25
-"""A clock found off by more may lie beyond the search; it is not corrected."""
-
+_SURE = 5.0  # sigmas that a quantity must be off
+_CLOCK_S = 0.015  # clocks of clean drives were found right to 7 ms; 15 ms at 5 m/s are 7 cm
+_CORRECTABLE_S = 0.25  # a clock found off by more may lie beyond the search; it is not corrected
+# Focal lengths of clean drives were found right to .8 %; confusion with the pitch costs 1 to 2 %.
 _FOCAL = 0.025
-"""Focal lengths of clean drives were found right to .8 %; confusion with the pitch costs 1 to 2 %."""
-
+# Change of k1 that moves the corner of a lens 74 deg wide by 3 px; clean drives stay below .001.
 _DISTORTION = 0.02
-"""Change of k1 that moves the corner of a lens 74 deg wide by 3 px; clean drives stay below .001."""
-
-_STEEP_RAD = np.deg2rad(10)
-"""A camera that looks down by less sees too short a stretch of ground well to tell a bent lens."""
-
-_GRADE = 0.001
-"""Rise of the poses over the ground, m per m: clean drives stay below .0003."""
-
-_UP_M = 0.08
-"""Heights of clean drives were found right to 6 cm, mostly to 1."""
-
-_ALONG_M = 0.15
-"""Places in the plane of clean drives were found right to 8 cm."""
-
-_VAGUE_M = 0.1
-"""A place in the plane that is known worse than this says nothing of a survey."""
-
+_GRADE = 0.001  # rise of the poses over the ground, m per m: clean drives stay below .0003
+_UP_M = 0.08  # heights of clean drives were found right to 6 cm, mostly to 1
+_ALONG_M = 0.15  # places in the plane of clean drives were found right to 8 cm
+_VAGUE_M = 0.1  # a place in the plane that is known worse than this says nothing of a survey
+# Median residual of matched patches: .23 to .46 on clean drives, 1.1 to 1.5 without a lens' distortion.
 _RESIDUAL = 0.8
-"""Median residual of matched patches: .23 to .46 on clean drives, 1.1 to 1.5 without a lens' distortion."""
-
-_PULL = 3.0
-"""Root mean square of the poses' errors in their stated sigmas: up to 2.2 on clean drives."""
+_PULL = 3.0  # root mean square of the poses' errors in their stated sigmas: up to 2.2 on clean drives
+# More patches match under another reading than as given by this share: they lie .1 to .2 below on clean
+# turning drives, and differ by .03 from pair to pair of images.
+_LEADS = 0.05
+_FOOT_M = 0.3048
+# A third of the usual pairs: whether the ground matches shows at once.
+_QUICK = GroundOptions(pairs=12, free=(), readings=False)
 
 CHECKS = (
     "ground match", "path", "clock", "focal length from ground", "distortion", "grade", "survey height",
@@ -67,10 +60,69 @@ _READ_AS: Mapping[Reading, str] = {
     "images of front and rear are swapped, or yaw is off by 180 deg; mend one of them",
 }
 
+NO_MATCH = (
+    "bare ground does not match between the images as stamps, poses, lens and guess say: check the clock, "
+    "the unit of the positions (feet?), whether the images are upside down, and the guess of the mounting"
+)
+"""The sentence where no cause is known."""
 
-_LEADS = 0.05
-"""More patches match under another reading than as given by this share: they lie .1 to .2 below on clean
-turning drives, and differ by .03 from pair to pair of images."""
+
+@dataclass(frozen=True)
+class _Check:
+    """The check of one parameter: its limit in the parameter's own unit, ``scale`` to ``unit``.
+
+    ``wrong`` is filled with the ``{size}`` and with one of the ``ways`` that a value can be positive or
+    negative.
+    """
+
+    name: str
+    limit: float
+    unit: str
+    scale: float
+    status: Status
+    ways: tuple[str, str]
+    fine: str
+    wrong: str
+
+
+_CHECKS: Mapping[str, _Check] = {
+    "focal_scale": _Check(
+        "focal length from ground", _FOCAL, "%", 100.0, Status.FAIL, ("too short", "too long"),
+        "the ground fits the focal length",
+        "the focal length in camera_info is {size:.1f} % {way} for what the ground shows; calibrate the "
+        "camera anew",
+    ),
+    "distortion_k1": _Check(
+        "distortion", _DISTORTION, "", 1.0, Status.FAIL, ("larger", "smaller"),
+        "the ground fits the lens' distortion",
+        "the lens bends otherwise than distortion_coefficients say: k1 should be {size:.2f} {way}; "
+        "calibrate the camera (are they left at zero, or those of another lens?)",
+    ),
+    "grade": _Check(
+        "grade", _GRADE, "%", 100.0, Status.WARN, ("rise", "fall"),
+        "the recorded heights and pitch fit the ground",
+        "the poses {way} over the ground by {size:.2f} %: heights and pitch contradict each other; "
+        "mend the receiver's pitch, or write both as 0",
+    ),
+    "up_m": _Check(
+        "survey height", _UP_M, "m", 1.0, Status.WARN, ("low", "high"),
+        "the ground fits the camera's surveyed height",
+        "centre_prior is {size:.2f} m too {way} for what the ground shows; survey the camera's height above "
+        "the road anew, or widen its sigma_m",
+    ),
+    "forward_m": _Check(
+        "survey forward", _ALONG_M, "m", 1.0, Status.WARN, ("far behind", "far ahead"),
+        "the ground fits the camera's surveyed place along the vehicle",
+        "centre_prior puts the camera {size:.1f} m too {way}: poses and survey have different origins (the "
+        "antenna instead of the axle?), or its x is wrong; give both for one origin",
+    ),
+    "left_m": _Check(
+        "survey left", _ALONG_M, "m", 1.0, Status.WARN, ("far to the right", "far to the left"),
+        "the ground fits the camera's surveyed place across the vehicle",
+        "centre_prior puts the camera {size:.1f} m too {way}: poses and survey have different origins (an "
+        "antenna at the side?), or its y is wrong; give both for one origin",
+    ),
+}  # fmt: skip
 
 
 def rival_of(ground: Mapping[str, GroundEstimate]) -> Reading | None:
@@ -94,49 +146,47 @@ def rival_of(ground: Mapping[str, GroundEstimate]) -> Reading | None:
 
 
 def _is_bent(estimate: GroundEstimate) -> bool:
-    clock, focal = estimate.parameters.get("clock_s"), estimate.parameters.get("focal_scale")
+    focal = estimate.parameters.get("focal_scale")
     return (
-        (clock is not None and _is_off(clock))
-        or (focal is not None and focal.told and abs(focal.value) > _FOCAL)
+        _is_off(estimate.parameters.get("clock_s"))
+        or (focal is not None and focal.observable and abs(focal.value) > _FOCAL)
         or max(estimate.pulls.values(), default=0.0) > _PULL
     )
 
 
 def path_of(ground: Mapping[str, GroundEstimate]) -> Path | None:
-    """What all cameras' ground says of the recorded path; None where they do not agree or do not say."""
+    """The recorded path, judged by all cameras' ground; None where they do not agree or do not say."""
     rival = rival_of(ground)
     readings = {
         rival or estimate.reading
         for estimate in ground.values()
         if estimate.status is not GroundStatus.TOO_LITTLE and max(estimate.shares.values(), default=0.0) > 0
     }
-    if len(readings) != 1:
-        return None
     known = {
         Reading.AS_GIVEN: Path.AS_GIVEN,
         Reading.HEADING_FROM_PATH: Path.RIGHT_YAW_WRONG,
         Reading.MIRRORED: Path.MIRRORED,
     }
-    return known.get(readings.pop())
+    return known.get(readings.pop()) if len(readings) == 1 else None
 
 
 def check_ground(
-    drive: Drive, ground: Mapping[str, GroundEstimate], suspect: str | None = None
+    drive: Drive, ground: Mapping[str, GroundEstimate], cause: str | None = None
 ) -> list[Finding]:
-    """All that the cameras' ground says.
+    """All findings from the cameras' ground.
 
     Args:
         drive: the drive.
         ground: by camera.
-        suspect: the sentence that says why no ground matches, where that is known.
+        cause: the sentence that says why no ground matches, where that is known.
     """
     rival = rival_of(ground)
     if rival is not None:
         return [_read_as(name, estimate, rival) for name, estimate in ground.items()]
     findings = [
-        finding for name, estimate in ground.items() for finding in _camera(drive, name, estimate, suspect)
+        finding for name, estimate in ground.items() for finding in _camera(drive, name, estimate, cause)
     ]
-    return findings + _clocks(ground)
+    return [*findings, *_clocks(ground)]
 
 
 def _read_as(name: str, estimate: GroundEstimate, reading: Reading) -> Finding:
@@ -144,32 +194,23 @@ def _read_as(name: str, estimate: GroundEstimate, reading: Reading) -> Finding:
     return Finding("path", Status.FAIL, as_given, best, "", _READ_AS[reading], name)
 
 
-def _camera(drive: Drive, name: str, estimate: GroundEstimate, suspect: str | None) -> list[Finding]:
+def _camera(drive: Drive, name: str, estimate: GroundEstimate, cause: str | None) -> list[Finding]:
     as_given = estimate.shares.get(Reading.AS_GIVEN, 0.0)
     if estimate.reading is not Reading.AS_GIVEN:
         return [_read_as(name, estimate, estimate.reading)]
     if estimate.status is GroundStatus.TOO_LITTLE:
         says = "too little ground with texture, or too little motion, to check lens, clock and mounting by it"
-        return [Finding("ground match", Status.PASS, None, None, "", says, name)]
+        return [passed("ground match", name, says)]
     if estimate.status is GroundStatus.NO_MATCH:
-        return [Finding("ground match", Status.FAIL, as_given, None, "", suspect or NO_MATCH, name)]
-    matched = Finding(
-        "ground match", Status.PASS, as_given, None, "", "bare ground matches between the images", name
-    )
+        return [Finding("ground match", Status.FAIL, as_given, None, "", cause or NO_MATCH, name)]
+    matched = passed("ground match", name, "bare ground matches between the images", as_given)
+    surveyed = drive.cameras[name].centre_prior is not None
     own = [
         _judge_parameter(name, parameter, _confounded(estimate, key))
         for key, parameter in estimate.parameters.items()
-        if key in _PARAMETERS and (drive.cameras[name].centre_prior is not None or not key.endswith("_m"))
+        if key in _CHECKS and (surveyed or not key.endswith("_m"))
     ]
-    own = [finding for finding in own if finding.about == name]
     return [matched, *own, *_fit(name, estimate, own)]
-
-
-NO_MATCH = (
-    "bare ground does not match between the images as stamps, poses, lens and guess say: check the clock, "
-    "the unit of the positions (feet?), whether the images are upside down, and the guess of the mounting"
-)
-"""The sentence where no cause can be told."""
 
 
 def _confounded(estimate: GroundEstimate, key: str) -> str:
@@ -179,116 +220,55 @@ def _confounded(estimate: GroundEstimate, key: str) -> str:
     focal length slide together; with a level camera, k1 came out .05 wrong at 10 sigmas.
     """
     ahead = estimate.parameters.get("forward_m")
-    if key == "focal_scale" and ahead is not None and not ahead.told:
+    if key == "focal_scale" and ahead is not None and not ahead.observable:
         return "on a straight road focal length and height slide together: drive a turn"
     calibration = estimate.calibration
     if key == "distortion_k1" and calibration is not None:
         down_rad = np.arcsin(-calibration.cam_from_vehicle[2, 2])
-        if down_rad < _STEEP_RAD:
+        if down_rad < STEEP_RAD:
             return "the camera looks too level, and a bent lens looks like a bent road"
     return ""
 
 
 def _judge_parameter(name: str, parameter: Parameter, confounded: str) -> Finding:
-    check, limit, unit, scale, status, fine, wrong = _PARAMETERS[parameter.name]
+    one = _CHECKS[parameter.name]
     vague = parameter.name in ("forward_m", "left_m") and parameter.sigma > _VAGUE_M
-    if not parameter.told or vague or confounded:
+    if not parameter.observable or vague or confounded:
         why = parameter.why_not or confounded or "the route turns too little; drive a turn"
-        return Finding(
-            check, Status.PASS, None, scale * limit, unit, f"this drive cannot tell it: {why}", name
-        )
-    return judge(
-        check, name, scale * parameter.value, scale * max(limit, _SURE * parameter.sigma), unit,
-        fine=fine,
-        wrong=wrong.format(size=abs(scale * parameter.value), way=_WAYS[parameter.name][parameter.value < 0]),
-        status=status,
+        says = f"this drive cannot tell it: {why}"
+        return Finding(one.name, Status.PASS, None, one.scale * one.limit, one.unit, says, name)
+    value, limit = one.scale * parameter.value, one.scale * max(one.limit, _SURE * parameter.sigma)
+    wrong = one.wrong.format(size=abs(value), way=one.ways[parameter.value < 0])
+    return judge(one.name, name, value, limit, one.unit, fine=one.fine, wrong=wrong, status=one.status)
+
+
+def _fit(name: str, estimate: GroundEstimate, own: list[Finding]) -> Iterator[Finding]:
+    """Residuals and errors of poses: they show that something is wrong where nothing above says what."""
+    yield judge(
+        "ground residual", name, estimate.median_residual, _RESIDUAL, "",
+        fine="matched ground lies where lens and mounting put it",
+        wrong="matched ground does not lie where any mounting puts it: the lens' distortion or focal "
+        "length in camera_info is wrong, or the road in the ROI is no plane",
     )  # fmt: skip
-
-
-_WAYS: Mapping[str, tuple[str, str]] = {
-    "focal_scale": ("too short", "too long"),
-    "distortion_k1": ("larger", "smaller"),
-    "grade": ("rise", "fall"),
-    "up_m": ("low", "high"),
-    "forward_m": ("far behind", "far ahead"),
-    "left_m": ("far to the right", "far to the left"),
-}
-"""How to say a positive and a negative value."""
-
-_PARAMETERS: Mapping[str, tuple[str, float, str, float, Status, str, str]] = {
-    "focal_scale": (
-        "focal length from ground", _FOCAL, "%", 100.0, Status.FAIL,
-        "the ground fits the focal length",
-        "the focal length in camera_info is {size:.1f} % {way} for what the ground shows; calibrate the "
-        "camera anew",
-    ),
-    "distortion_k1": (
-        "distortion", _DISTORTION, "", 1.0, Status.FAIL,
-        "the ground fits the lens' distortion",
-        "the lens bends otherwise than distortion_coefficients say: k1 should be {size:.2f} {way}; "
-        "calibrate the camera (are they left at zero, or those of another lens?)",
-    ),
-    "grade": (
-        "grade", _GRADE, "%", 100.0, Status.WARN,
-        "the recorded heights and pitch fit the ground",
-        "the poses {way} over the ground by {size:.2f} %: heights and pitch contradict each other; "
-        "mend the receiver's pitch, or write both as 0",
-    ),
-    "up_m": (
-        "survey height", _UP_M, "m", 1.0, Status.WARN,
-        "the ground fits the camera's surveyed height",
-        "centre_prior is {size:.2f} m too {way} for what the ground shows; survey the camera's height above "
-        "the road anew, or widen its sigma_m",
-    ),
-    "forward_m": (
-        "survey forward", _ALONG_M, "m", 1.0, Status.WARN,
-        "the ground fits the camera's surveyed place along the vehicle",
-        "centre_prior puts the camera {size:.1f} m too {way}: poses and survey have different origins (the "
-        "antenna instead of the axle?), or its x is wrong; give both for one origin",
-    ),
-    "left_m": (
-        "survey left", _ALONG_M, "m", 1.0, Status.WARN,
-        "the ground fits the camera's surveyed place across the vehicle",
-        "centre_prior puts the camera {size:.1f} m too {way}: poses and survey have different origins (an "
-        "antenna at the side?), or its y is wrong; give both for one origin",
-    ),
-}  # fmt: skip
-"""Of each parameter: check, limit, unit, factor to that unit, status, sentences where it passes and fails."""
-
-
-def _fit(name: str, estimate: GroundEstimate, own: list[Finding]) -> list[Finding]:
-    """Residuals and pulls: they tell that something is wrong where nothing above tells what."""
     raised = any(finding.status is not Status.PASS for finding in own)
     pulls = {part: pull for part, pull in estimate.pulls.items() if np.isfinite(pull)}
-    part = max(pulls, key=lambda key: pulls[key], default="")
-    clock = estimate.parameters.get("clock_s")
-    late = clock is not None and _is_off(clock)
-    findings = [
-        judge(
-            "ground residual", name, estimate.median_residual, _RESIDUAL, "",
-            fine="matched ground lies where lens and mounting put it",
-            wrong="matched ground does not lie where any mounting puts it: the lens' distortion or focal "
-            "length in camera_info is wrong, or the road in the ROI is no plane",
-        )
-    ]  # fmt: skip
-    if pulls and not raised and not late:
-        findings.append(
-            judge(
-                "poses against ground", name, pulls[part], _PULL, "",
-                fine="the images move as the poses do, within pose_noise",
-                wrong=f"the images move otherwise than the poses: their {part} is {pulls[part]:.0f} times "
-                "pose_noise off; state the noise as it is, or check the clock",
-                status=Status.WARN,
-            )
+    if pulls and not raised and not _is_off(estimate.parameters.get("clock_s")):
+        part = max(pulls, key=lambda key: pulls[key])
+        yield judge(
+            "poses against ground", name, pulls[part], _PULL, "",
+            fine="the images move as the poses do, within pose_noise",
+            wrong=f"the images move otherwise than the poses: their {part} is {pulls[part]:.0f} times "
+            "pose_noise off; state the noise as it is, or check the clock",
+            status=Status.WARN,
         )  # fmt: skip
-    return findings
 
 
 def clock_corrections(ground: Mapping[str, GroundEstimate]) -> dict[str, float]:
     """By camera, how much later than stamped its images were taken, s, where that is sure and correctable."""
     if rival_of(ground) is not None:
         return {}
-    return {name: clock.value for name, clock in _late(ground).items() if abs(clock.value) <= _CORRECTABLE_S}
+    clocks = {name: clock for name, clock in _asked_clocks(ground).items() if _is_off(clock)}
+    return {name: clock.value for name, clock in clocks.items() if abs(clock.value) <= _CORRECTABLE_S}
 
 
 def _asked_clocks(ground: Mapping[str, GroundEstimate]) -> dict[str, Parameter]:
@@ -299,35 +279,100 @@ def _asked_clocks(ground: Mapping[str, GroundEstimate]) -> dict[str, Parameter]:
     }
 
 
-def _late(ground: Mapping[str, GroundEstimate]) -> dict[str, Parameter]:
-    """The clocks that are off beyond doubt."""
-    return {name: clock for name, clock in _asked_clocks(ground).items() if _is_off(clock)}
+def _is_off(clock: Parameter | None) -> bool:
+    """Whether a clock is off beyond doubt."""
+    return clock is not None and clock.observable and abs(clock.value) > max(_CLOCK_S, _SURE * clock.sigma)
 
 
-def _is_off(clock: Parameter) -> bool:
-    return clock.told and abs(clock.value) > max(_CLOCK_S, _SURE * clock.sigma)
-
-
-def _clocks(ground: Mapping[str, GroundEstimate]) -> list[Finding]:
+def _clocks(ground: Mapping[str, GroundEstimate]) -> Iterator[Finding]:
     """Each camera's clock; one sentence for all where they are off alike."""
-    clocks, late = _asked_clocks(ground), _late(ground)
-    common = len(late) == len(clocks) > 1 and np.ptp([clock.value for clock in late.values()]) < _CLOCK_S
-    findings = []
+    clocks = _asked_clocks(ground)
+    late = [clock.value for clock in clocks.values() if _is_off(clock)]
+    common = len(late) == len(clocks) > 1 and np.ptp(late) < _CLOCK_S
     for name, clock in clocks.items():
-        if not clock.told:
+        if not clock.observable:
             says = f"this drive cannot tell whether the clock is right: {clock.why_not}"
-            findings.append(Finding("clock", Status.PASS, None, 1e3 * _CLOCK_S, "ms", says, name))
+            yield Finding("clock", Status.PASS, None, 1e3 * _CLOCK_S, "ms", says, name)
             continue
         size, way = abs(1e3 * clock.value), "later" if clock.value > 0 else "earlier"
         correctable = abs(clock.value) <= _CORRECTABLE_S
-        remedy = "the map is corrected by it; mend the stamps" if correctable else "mend the stamps"
+        recovery = "the map is corrected by it; mend the stamps" if correctable else "mend the stamps"
         whose = "all cameras alike: the poses' clock is off" if common else "this camera's clock is off"
-        findings.append(
-            judge(
-                "clock", name, 1e3 * clock.value, 1e3 * max(_CLOCK_S, _SURE * clock.sigma), "ms",
-                fine="images and poses are on one clock",
-                wrong=f"the images were taken {size:.0f} ms {way} than their stamps say ({whose}); {remedy}",
-                status=Status.WARN if correctable else Status.FAIL,
-            )
+        yield judge(
+            "clock", name, 1e3 * clock.value, 1e3 * max(_CLOCK_S, _SURE * clock.sigma), "ms",
+            fine="images and poses are on one clock",
+            wrong=f"the images were taken {size:.0f} ms {way} than their stamps say ({whose}); {recovery}",
+            status=Status.WARN if correctable else Status.FAIL,
         )  # fmt: skip
-    return findings
+
+
+def find_cause(drive: Drive, ground: Mapping[str, GroundEstimate]) -> str | None:
+    """The usual mistake after whose undoing the ground of a camera that never matched does.
+
+    None where a camera matches, or no mistake explains it.
+
+    Raises:
+        DriveError: an image cannot be read.
+    """
+    lost = [
+        name
+        for name, estimate in ground.items()
+        if estimate.status is GroundStatus.NO_MATCH and estimate.reading is Reading.AS_GIVEN
+    ]
+    if not lost or len(lost) < len(ground):
+        return None
+    for undo, says in _MISTAKES:
+        if estimate_ground(undo(drive), lost[0], _QUICK).status is GroundStatus.FOUND:
+            return says
+    return None
+
+
+def scaled(drive: Drive, factor: float) -> Drive:
+    """The drive with all positions multiplied by ``factor``."""
+
+    def moved(map_from_vehicle: FloatArray) -> FloatArray:
+        matrices = map_from_vehicle.copy()
+        matrices[..., :3, 3] *= factor
+        return matrices
+
+    def along(path: Trajectory | None) -> Trajectory | None:
+        return None if path is None else replace(path, map_from_vehicle=moved(path.map_from_vehicle))
+
+    images = [replace(image, map_from_vehicle=moved(image.map_from_vehicle)) for image in drive.images]
+    trajectory, recorded = along(drive.trajectory), along(drive.recorded)
+    return replace(drive, images=images, trajectory=trajectory, recorded=recorded, road=None)
+
+
+def upside_down(drive: Drive) -> Drive:
+    """The drive as if all its images had been turned by 180 deg: their lenses and IPMs turned instead."""
+    return replace(drive, cameras={name: _turned(camera) for name, camera in drive.cameras.items()})
+
+
+def _turned(camera: Camera) -> Camera:
+    info = camera.info
+    turn = np.array([[-1.0, 0, info.width - 1], [0, -1.0, info.height - 1], [0, 0, 1]])
+    intrinsic = info.intrinsic.copy()
+    intrinsic[:2, 2] = np.array([info.width - 1, info.height - 1]) - intrinsic[:2, 2]
+    distortion = list(info.distortion)
+    if info.distortion_model != "equidistant":
+        distortion[2:4] = [-distortion[2], -distortion[3]]  # p1 and p2 are even in the point, k1 ... odd
+    return replace(
+        camera,
+        info=replace(info, intrinsic=intrinsic, distortion=tuple(distortion)),
+        ipm={name: ipm @ turn for name, ipm in camera.ipm.items()},  # turn is its own inverse
+    )
+
+
+# The mistakes that are tried, the likelier first, with how to undo them; each costs some seconds on a drive
+# that fails anyway.
+_MISTAKES: tuple[tuple[Callable[[Drive], Drive], str], ...] = (
+    (
+        lambda drive: scaled(drive, _FOOT_M),
+        "the ground matches once positions are taken for feet; multiply them by 0.3048 to give metres",
+    ),
+    (
+        upside_down,
+        "the ground matches once the images are turned by 180 deg: they are upside down; turn them, or the "
+        "calibration",
+    ),
+)

@@ -1,4 +1,4 @@
-"""Course over ground against the recorded attitude: the conventions that users mix up, told by name.
+"""Course over ground against the recorded attitude: the conventions that users mix up, reported by name.
 
 A vehicle goes where it points. For each chord of the path its direction is compared with the vehicle's x
 axis midway; where they disagree, each usual mistake is undone in turn, and the one after which they agree
@@ -7,40 +7,106 @@ is the cause.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 
+from v2hdm.geometry.rigid import quaternion_from_rotation, rotation_from_euler, rotation_from_quaternion
 from v2hdm.records import BoolArray, FloatArray
-from v2hdm.verdict.inputs.conventions import AXES_SWAPPED, CONVENTIONS, REFLECTED
-from v2hdm.verdict.inputs.motion import Chords, Motion, angle_between
-from v2hdm.verdict.judgement import judge, passed
-from v2hdm.verdict.verdict import Finding, Status
+from v2hdm.verdict.inputs.poses import STEEPEST_DEG, Chords, Motion, angle_between
+from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
+# Course and heading agree within this: an origin 1.5 m ahead of the axle errs so on a circle of 6 m.
 _AGREES_RAD = np.deg2rad(15)
-"""Course and heading agree within this: an origin 1.5 m ahead of the axle errs so on a circle of 6 m."""
-
-_UPRIGHT_RAD = np.deg2rad(15)
-"""No road that a vehicle maps is steeper, nor rolls it farther."""
-
+# A convention fits if this share of the chords agrees: the rest may be wheel spin, ferries, bad fixes.
 _FITS = 0.8
-"""A convention fits if this share of the chords agrees: the rest may be wheel spin, ferries, bad fixes."""
-
+# A heading that is off by this moves a camera 3.4 m ahead of the axle by 6 cm, three sigmas of a survey.
 _MISALIGNED_RAD = np.deg2rad(1.0)
-"""A heading that is off by this moves a camera 3.4 m ahead of the axle by 6 cm, three sigmas of a survey."""
-
+# A chord on which the heading turns less is straight: where the origin sits does not matter there.
 _STRAIGHT_RAD = np.deg2rad(2.0)
-"""A chord on which the heading turns less is straight: where the origin sits does not matter there."""
-
-_LEVER_M = 0.3
-"""Origin this far from the axle, along the vehicle: 15 sigmas of a surveyed camera centre."""
-
+_LEVER_M = 0.3  # origin this far from the axle, along the vehicle: 15 sigmas of a surveyed camera centre
+# Sigmas beyond which an offset is reported: the poses' drift makes sigmas optimistic by up to two.
 _SURE = 5.0
-"""Sigmas beyond which a measured offset is told: the poses' drift makes sigmas optimistic by up to two."""
+_CURVED_PER_M = 0.02  # curvature of a turn that shows where the origin sits
+
+Undo = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+"""Takes positions (P, 3) and rotations (P, 3, 3) to what they should be."""
+
+
+@dataclass(frozen=True)
+class Convention:
+    """A usual mistake, how to undo it and what to write instead."""
+
+    undo: Undo
+    says: str
+
+
+def _turned(sign: float, offset_deg: float) -> Undo:
+    """Undo a yaw that is ``sign`` times the true one plus an offset: true yaw = sign * yaw + offset."""
+
+    def undo(position: FloatArray, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
+        forward = rotation[:, :2, 0]
+        yaw = sign * np.arctan2(forward[:, 1], forward[:, 0]) + np.deg2rad(offset_deg)
+        zero = np.zeros(len(yaw))
+        return position, rotation_from_euler(zero, zero, yaw)
+
+    return undo
+
+
+def _reordered(position: FloatArray, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
+    quaternion = quaternion_from_rotation(rotation)
+    return position, rotation_from_quaternion(quaternion[:, [1, 2, 3, 0]])
+
+
+def _inverted(position: FloatArray, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
+    back = np.swapaxes(rotation, 1, 2)
+    return -(back @ position[:, :, None])[:, :, 0], back
+
+
+def _axes(matrix: list[list[float]]) -> Undo:
+    return lambda position, rotation: (position, np.asarray(rotation @ np.array(matrix)))
+
+
+# The usual mistakes, the likelier first.
+_CONVENTIONS: Mapping[str, Convention] = {
+    "quaternion order": Convention(
+        _reordered, "the quaternions are in the order qw qx qy qz; write them as qx qy qz qw"
+    ),
+    "z down": Convention(
+        _axes([[1, 0, 0], [0, -1, 0], [0, 0, -1]]),
+        "the vehicle's z axis points down (x forward, y right); turn the attitude to x forward, y left, z up",
+    ),
+    "optical frame": Convention(
+        _axes([[0, -1, 0], [0, 0, -1], [1, 0, 0]]),
+        "the poses are those of a camera (z forward); give those of the vehicle (x forward, y left, z up)",
+    ),
+    "from north": Convention(
+        _turned(-1, 90),
+        "yaw counts clockwise from north; write yaw = 90 deg - it, counter-clockwise from east",
+    ),
+    "clockwise": Convention(_turned(-1, 0), "yaw counts clockwise; write it with the other sign"),
+    "90 ahead": Convention(_turned(1, -90), "yaw is 90 deg too large, as if y were forward; subtract 90 deg"),
+    "90 behind": Convention(_turned(1, 90), "yaw is 90 deg too small, counted from north; add 90 deg"),
+    "inverse": Convention(
+        _inverted, "the poses are vehicle_from_map; write their inverse, the vehicle in the map"
+    ),
+    "south": Convention(_turned(-1, 180), "yaw counts clockwise from west; write yaw = 180 deg - it"),
+    "from south": Convention(_turned(-1, -90), "yaw counts clockwise from south; write yaw = -90 deg - it"),
+}
+
+# Conventions of yaw under which poses alone look like a path whose axes are swapped.
+_REFLECTED = ("from north", "clockwise", "south", "from south")
+
+AXES_SWAPPED = (
+    "x and y of the positions are swapped or one has the wrong sign, which mirrors the world; write x east "
+    "and y north"
+)
 
 
 class Path(Enum):
-    """What the images' ground says of the recorded path."""
+    """The recorded path, judged by the images' ground."""
 
     AS_GIVEN = "path and yaw are as the images show them"
     RIGHT_YAW_WRONG = "the path is right, the yaw is not"
@@ -52,27 +118,21 @@ def check_heading(motion: Motion, path: Path | None = None) -> list[Finding]:
 
     Args:
         motion: the recorded poses.
-        path: what the images' ground says of the recorded path; None where it was not asked or does not say.
+        path: the verdict of the images' ground on the path; None where it was not asked or has none.
     """
-    chords = motion.chords
-    if not len(chords):
+    if not len(motion.chords):
         return []  # the check of the path's length says so
-    _, either = _agreement(motion.position, motion.rotation, chords)
+    _, either = _agreement(motion)
     if either >= _FITS:
         return [_as_given(motion, either, path), *_alignment(motion)]
-    says = _cause(motion, _fitting(motion), path)
+    says = _cause(motion, path)
     if says is None:
         return []  # the check of the attitude says so
     return [Finding("heading", Status.FAIL, 1 - either, 1 - _FITS, "", says, "poses")]
 
 
-def backwards_share(motion: Motion) -> float:
-    """The share of chords on which the vehicle drives backwards, if its heading is right."""
-    return float((np.abs(_course_minus_yaw(motion)) > np.pi / 2).mean()) if len(motion.chords) else 0.0
-
-
 def _as_given(motion: Motion, agrees: float, path: Path | None) -> Finding:
-    back = backwards_share(motion)
+    back = float((np.abs(_course_minus_yaw(motion)) > np.pi / 2).mean())
     if back > _FITS and path is Path.RIGHT_YAW_WRONG:
         says = "yaw points backwards although the images drive forwards; turn yaw by 180 deg"
         return Finding("heading", Status.FAIL, back, _FITS, "", says, "poses")
@@ -86,19 +146,17 @@ def _as_given(motion: Motion, agrees: float, path: Path | None) -> Finding:
     return passed("heading", "poses", f"the vehicle goes where its heading points; {how}", 1 - agrees)
 
 
-def _alignment(motion: Motion) -> list[Finding]:
+def _alignment(motion: Motion) -> Iterator[Finding]:
     """The constant angle between course and heading, and the lever from the axle to the origin."""
     offset = _course_minus_yaw(motion)
     reverse = np.abs(offset) > np.pi / 2
-    offset = np.where(reverse, angle_of(offset + np.pi), offset)
-    length = np.linalg.norm(
-        motion.position[motion.chords.last, :2] - motion.position[motion.chords.first, :2], axis=1
-    )
-    curvature = motion.turn_rad / length * np.where(reverse, -1.0, 1.0)
+    offset = np.where(reverse, wrapped(offset + np.pi), offset)
+    curvature = motion.turn_rad / np.linalg.norm(motion.course, axis=1) * np.where(reverse, -1.0, 1.0)
     keep = np.abs(offset) < _AGREES_RAD
-    findings = [_constant_offset(offset[keep], np.abs(motion.turn_rad[keep]), _overlap(motion))]
-    findings += _lever(offset[keep], curvature[keep], _overlap(motion))
-    return findings
+    # Neighbouring chords share their poses: so many count as one.
+    overlap = float(max(1.0, np.median(motion.chords.last - motion.chords.first)))
+    yield _constant_offset(offset[keep], np.abs(motion.turn_rad[keep]), overlap)
+    yield from _lever(offset[keep], curvature[keep], overlap)
 
 
 def _constant_offset(offset_rad: FloatArray, turn_rad: FloatArray, overlap: float) -> Finding:
@@ -119,11 +177,11 @@ def _constant_offset(offset_rad: FloatArray, turn_rad: FloatArray, overlap: floa
 
 def _lever(offset_rad: FloatArray, curvature: FloatArray, overlap: float) -> list[Finding]:
     """How far ahead of the axle, which does not slip sideways, the origin is: tan(offset) / curvature."""
-    turns = np.abs(curvature) > 0.02
+    turns = np.abs(curvature) > _CURVED_PER_M
     if turns.sum() < 30:
         same = "a straight route looks the same in a mirrored world (x and y swapped, NED): drive a turn"
-        untold = "straight poses do not tell how far the origin (antenna?) is from the axle: drive a turn"
-        return [passed("mirrored", "poses", same), passed("origin", "poses", untold)]
+        unknown = "straight poses do not tell how far the origin (antenna?) is from the axle: drive a turn"
+        return [passed("mirrored", "poses", same), passed("origin", "poses", unknown)]
     centred = offset_rad - np.median(offset_rad[~turns]) if (~turns).any() else offset_rad
     lever = np.tan(centred[turns]) / curvature[turns]
     weight = curvature[turns] ** 2
@@ -142,34 +200,21 @@ def _lever(offset_rad: FloatArray, curvature: FloatArray, overlap: float) -> lis
     ]  # fmt: skip
 
 
-def _overlap(motion: Motion) -> float:
-    """How many neighbouring chords share their poses and count as one."""
-    return float(max(1.0, np.median(motion.chords.last - motion.chords.first)))
-
-
-def _fitting(motion: Motion) -> list[str]:
-    """The names of the conventions under which the vehicle drives ahead."""
-    return [
-        name
-        for name, convention in CONVENTIONS.items()
-        if _agreement(*convention.undo(motion.position, motion.rotation), motion.chords)[0] >= _FITS
-    ]
-
-
-def _cause(motion: Motion, fitting: list[str], path: Path | None) -> str | None:
+def _cause(motion: Motion, path: Path | None) -> str | None:
     """The sentence that names what is wrong; None where it is not the heading."""
     if path is Path.MIRRORED:
         return AXES_SWAPPED
+    fitting = [name for name, one in _CONVENTIONS.items() if _agreement(motion, one.undo)[0] >= _FITS]
     if fitting:
-        told = [CONVENTIONS[name].says for name in fitting[:2]]
-        if path is None and fitting[0] in REFLECTED:
-            told.insert(1, AXES_SWAPPED)
-        return "; or ".join(told)
-    offset = _course_minus_yaw(motion)
-    if not _is_upright(motion):
+        says = [_CONVENTIONS[name].says for name in fitting[:2]]
+        if path is None and fitting[0] in _REFLECTED:
+            says.insert(1, AXES_SWAPPED)
+        return "; or ".join(says)
+    if _upright(motion.rotation, motion.chords).mean() < _FITS:
         return None
+    offset = _course_minus_yaw(motion)
     offset_rad = _circular_median(offset)
-    if (np.abs(angle_of(offset - offset_rad)) < _AGREES_RAD).mean() >= _FITS:
+    if (np.abs(wrapped(offset - offset_rad)) < _AGREES_RAD).mean() >= _FITS:
         return (
             f"the vehicle drives {abs(np.rad2deg(offset_rad)):.0f} deg to the "
             f"{'left' if offset_rad > 0 else 'right'} of its heading all the time; subtract that offset of "
@@ -182,33 +227,32 @@ def _cause(motion: Motion, fitting: list[str], path: Path | None) -> str | None:
     return "heading and path have nothing to do with each other; check that both are of one drive"
 
 
-def _is_upright(motion: Motion) -> bool:
-    return bool((motion.rotation[motion.chords.first, 2, 2] > np.cos(_UPRIGHT_RAD)).mean() >= _FITS)
+def _upright(rotation: FloatArray, chords: Chords) -> BoolArray:
+    """On which chords (N,) the vehicle stands upright."""
+    return np.asarray(rotation[chords.first, 2, 2] > np.cos(np.deg2rad(STEEPEST_DEG)))
 
 
 def _turns_too_fast(motion: Motion) -> bool:
     """Whether the heading turns about 180 / pi times as much as the path."""
-    course = np.unwrap(np.arctan2(*_course(motion.position, motion.chords).T[::-1]))
+    course = np.unwrap(np.arctan2(*motion.course.T[::-1]))
     path_turn = np.abs(np.diff(course)).sum()
     steps = angle_between(motion.rotation[:-1, :2, 0], motion.rotation[1:, :2, 0])
     return bool(np.abs(steps).sum() > 10 * max(path_turn, 0.1))
 
 
-def _agreement(position: FloatArray, rotation: FloatArray, chords: Chords) -> tuple[float, float]:
+def _agreement(motion: Motion, undo: Undo | None = None) -> tuple[float, float]:
     """The shares of chords along which the vehicle stands upright and points ahead, and ahead or back."""
-    angle = angle_between(_forward(rotation, chords), _course(position, chords))
-    upright: BoolArray = rotation[chords.first, 2, 2] > np.cos(_UPRIGHT_RAD)
-    along = (np.abs(np.sin(angle)) < np.sin(_AGREES_RAD)) & upright
+    position, rotation, chords = motion.position, motion.rotation, motion.chords
+    if undo is not None:
+        position, rotation = undo(position, rotation)
+    angle = angle_between(_forward(rotation, chords), position[chords.last, :2] - position[chords.first, :2])
+    along = (np.abs(np.sin(angle)) < np.sin(_AGREES_RAD)) & _upright(rotation, chords)
     return float((along & (np.cos(angle) > 0)).mean()), float(along.mean())
 
 
 def _course_minus_yaw(motion: Motion) -> FloatArray:
-    chords = motion.chords
-    return angle_between(_forward(motion.rotation, chords), _course(motion.position, chords))
-
-
-def _course(position: FloatArray, chords: Chords) -> FloatArray:
-    return np.asarray(position[chords.last, :2] - position[chords.first, :2])
+    """Angles (N,) from the vehicle's x axis, midway on each chord, to the chord."""
+    return angle_between(_forward(motion.rotation, motion.chords), motion.course)
 
 
 def _forward(rotation: FloatArray, chords: Chords) -> FloatArray:
@@ -216,11 +260,11 @@ def _forward(rotation: FloatArray, chords: Chords) -> FloatArray:
     return np.asarray(rotation[chords.first, :2, 0] + rotation[chords.last, :2, 0])
 
 
-def angle_of(angle_rad: FloatArray) -> FloatArray:
+def wrapped(angle_rad: FloatArray) -> FloatArray:
     """Angles wrapped to +-pi."""
     return np.asarray((angle_rad + np.pi) % (2 * np.pi) - np.pi)
 
 
 def _circular_median(angles_rad: FloatArray) -> float:
     mean = np.arctan2(np.sin(angles_rad).mean(), np.cos(angles_rad).mean())
-    return float(angle_of(np.array([mean + np.median(angle_of(angles_rad - mean))]))[0])
+    return float(wrapped(np.array([mean + np.median(wrapped(angles_rad - mean))]))[0])

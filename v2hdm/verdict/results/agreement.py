@@ -1,37 +1,61 @@
-"""Each camera alone against all together: markings that several saw, and the mountings."""
+"""Results against each other: cameras alone and together, markings and bare ground, markings that overlap."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from itertools import combinations
 
+import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
+from v2hdm.geometry.mounting import centre_sigmas
+from v2hdm.geometry.rigid import camera_centre, inverse, log
+from v2hdm.ground import GroundEstimate, GroundStatus
 from v2hdm.mapping.results import MethodResult
-from v2hdm.records import Drive, FloatArray
-from v2hdm.verdict.judgement import judge
-from v2hdm.verdict.results.mountings import centre_sigma_m, mounting_sigmas
-from v2hdm.verdict.verdict import Finding
+from v2hdm.records import Calibration, Drive, FloatArray, Marking
+from v2hdm.verdict.verdict import Finding, judge
 
 SAME_M = 1.0
 """Centres of one marking in the maps of two cameras lie closer than this."""
 
-LEAST_SHARED = 8
-"""Markings that two maps must share for their offset to be told."""
+_LEAST_SHARED = 8  # markings that two maps must share for their offset to be observable
+# Offset of two cameras' maps in the sigmas of their centres and markings: clean drives stay below 3.
+_OFFSET_LIMIT_SIGMAS = 5.0
+# An offset of less than this is no finding, however sure it is: corners are good to two centimetres.
+_LEAST_OFFSET_M = 0.03
+# A mounting by one camera alone against that by all, in the former's sigmas: below 2 on clean drives.
+_MOUNTING_LIMIT_SIGMAS = 5.0
+# Root mean square of the six parameters' deviations, in the sigmas of both: one in a million by chance.
+_GROUND_LIMIT_SIGMAS = 4.0
+# Where the mountings turn by less and their heights differ by less, the ground is no better judge.
+_LEAST_TURN_DEG, _LEAST_HEIGHT_M = 0.2, 0.04
+_OVERLAP = 0.1  # share of the smaller of two markings of a class that both cover; paint does not lie on paint
+# Share of markings that overlap another: clean drives have none, one in a hundred may be on old paint.
+_DOUBLES_LIMIT = 0.02
+# Added to a covariance's diagonal (m^2, rad^2): a tenth of a millimetre, a thousandth of a degree.
+_LEAST_VARIANCE = np.array([1e-8] * 3 + [1e-10] * 3)
 
-OFFSET_LIMIT_SIGMAS = 5.0
-"""Offset of two cameras' maps in the sigmas of their centres and markings: clean drives stay below 3."""
 
-LEAST_OFFSET_M = 0.03
-"""An offset of less than this is no finding, however sure it is: corners are good to two centimetres."""
+def mounting_sigmas(one: Calibration, other: Calibration, of_both: bool = False) -> float:
+    """Distance of two mountings: root of the mean squared deviation of their six parameters, in sigmas.
 
-MOUNTING_LIMIT_SIGMAS = 5.0
-"""A mounting by one camera alone against that by all, in the sigmas of the former: clean drives stay below
-2."""
+    The sigmas are those of ``one``, which is known less; where the two are independent, ``of_both``.
+    """
+    assert one.covariance is not None
+    covariance = one.covariance + np.diag(_LEAST_VARIANCE)
+    if of_both and other.covariance is not None:
+        covariance = covariance + other.covariance
+    off = _difference(one, other)
+    return float(np.sqrt(off @ np.linalg.solve(covariance, off) / len(off)))
 
 
-def check_agreement(results: Mapping[str, MethodResult], drive: Drive) -> list[Finding]:
+def _difference(one: Calibration, other: Calibration) -> FloatArray:
+    """The left tangent (6,) from ``other`` to ``one``: translation m, rotation rad."""
+    return log(one.cam_from_vehicle @ inverse(other.cam_from_vehicle))
+
+
+def check_agreement(results: Mapping[str, MethodResult], drive: Drive) -> Iterator[Finding]:
     """Single cameras against one another and against all of them.
 
     Args:
@@ -40,60 +64,53 @@ def check_agreement(results: Mapping[str, MethodResult], drive: Drive) -> list[F
     """
     together = list(results.values())[-1]
     alone = {name: one for name, one in results.items() if len(one.cameras) == 1}
-    findings = [
-        finding
-        for (first, a), (second, b) in combinations(alone.items(), 2)
-        if (finding := _offset(first, a, second, b, drive)) is not None
-    ]
+    for (first, a), (second, b) in combinations(alone.items(), 2):
+        apart = shared_offsets(a, b, drive)
+        if len(apart) >= _LEAST_SHARED:
+            calibrations = a.calibrations[first], b.calibrations[second]
+            yield _offset(first, second, apart, *(_centre_sigma_m(one) for one in calibrations))
     for name, one in alone.items():
         if one.calibrations[name].covariance is None or together.calibrations[name].covariance is None:
             continue
         sigmas = mounting_sigmas(one.calibrations[name], together.calibrations[name])
-        findings.append(
-            judge(
-                "alone and together",
-                name,
-                sigmas,
-                MOUNTING_LIMIT_SIGMAS,
-                "sigmas",
-                fine="mapped alone and with the others, it has the same mounting",
-                wrong=f"mapped alone its mounting is {sigmas:.0f} sigmas from the one that it has with "
-                f"the others: "
-                "cameras do not agree; check its clock, its survey and camera_info",
-            )
-        )
-    return findings
+        yield judge(
+            "alone and together", name, sigmas, _MOUNTING_LIMIT_SIGMAS, "sigmas",
+            fine="mapped alone and with the others, it has the same mounting",
+            wrong=f"mapped alone its mounting is {sigmas:.0f} sigmas from the one that it has with the others"
+            ": cameras do not agree; check its clock, its survey and camera_info",
+        )  # fmt: skip
 
 
-def _offset(first: str, a: MethodResult, second: str, b: MethodResult, drive: Drive) -> Finding | None:
+def _centre_sigma_m(calibration: Calibration) -> FloatArray:
+    if calibration.covariance is None:
+        return np.zeros(3)
+    return centre_sigmas(calibration.cam_from_vehicle, calibration.covariance)
+
+
+def _offset(
+    first: str, second: str, apart: FloatArray, sigma_m: FloatArray, other_sigma_m: FloatArray
+) -> Finding:
     """How far two cameras' maps are apart in the driving direction and across."""
-    apart = shared_offsets(a, b, drive)
-    if len(apart) < LEAST_SHARED:
-        return None
     middle = np.median(apart, axis=0)
     spread = 1.4826 * np.median(np.abs(apart - middle), axis=0) / np.sqrt(len(apart))
-    sigma = np.hypot(centre_sigma_m(a.calibrations[first])[:2], centre_sigma_m(b.calibrations[second])[:2])
-    sigmas = np.where(np.abs(middle) > LEAST_OFFSET_M, np.abs(middle) / np.hypot(sigma, spread), 0.0)
+    sigma = np.hypot(sigma_m[:2], other_sigma_m[:2])
+    sigmas = np.where(np.abs(middle) > _LEAST_OFFSET_M, np.abs(middle) / np.hypot(sigma, spread), 0.0)
     axis = int(np.argmax(sigmas))
     where = (("behind", "ahead of"), ("right of", "left of"))[axis][int(middle[axis] > 0)]
     cause = (
         "their clocks or the forward survey of a centre disagree",
         "a heading or a lateral survey disagrees",
-    )
+    )[axis]
     return judge(
-        "cameras apart",
-        f"{first}, {second}",
-        float(sigmas[axis]),
-        OFFSET_LIMIT_SIGMAS,
-        "sigmas",
+        "cameras apart", f"{first}, {second}", float(sigmas[axis]), _OFFSET_LIMIT_SIGMAS, "sigmas",
         fine=f"{len(apart)} markings that both saw lie in one place",
         wrong=f"{second} maps {len(apart)} markings {100 * abs(middle[axis]):.0f} cm {where} where {first} "
-        f"does: {cause[axis]}; synchronise and measure anew",
-    )
+        f"does: {cause}; synchronise and measure anew",
+    )  # fmt: skip
 
 
 def shared_offsets(a: MethodResult, b: MethodResult, drive: Drive) -> FloatArray:
-    """Offsets (N, 2), forward and left, of the markings of ``b`` from those of ``a`` that they are.
+    """Offsets (N, 2), forward and left, of the markings of ``b`` from the same ones of ``a``.
 
     A marking is that of the other map that is nearest to it, of its class, both ways.
     """
@@ -118,3 +135,76 @@ def shared_offsets(a: MethodResult, b: MethodResult, drive: Drive) -> FloatArray
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     left = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
     return np.stack([(apart * forward).sum(1), (apart * left).sum(1)], axis=1)
+
+
+def check_against_ground(
+    calibrations: Mapping[str, Calibration], ground: Mapping[str, GroundEstimate]
+) -> Iterator[Finding]:
+    """Each camera's mounting from markings against that from bare ground, where there is one."""
+    for name, mapped in calibrations.items():
+        estimate = ground.get(name)
+        if estimate is None or estimate.status is not GroundStatus.FOUND or estimate.calibration is None:
+            continue
+        if mapped.covariance is not None and estimate.calibration.covariance is not None:
+            yield _compare(name, mapped, estimate.calibration)
+
+
+def _compare(name: str, mapped: Calibration, ground: Calibration) -> Finding:
+    off = _difference(ground, mapped)
+    turn_deg = np.rad2deg(mapped.cam_from_vehicle[:3, :3].T @ off[3:])
+    up_m = float(camera_centre(mapped.cam_from_vehicle)[2] - camera_centre(ground.cam_from_vehicle)[2])
+    most_deg = np.abs(turn_deg).max()
+    small = most_deg < _LEAST_TURN_DEG and abs(up_m) < _LEAST_HEIGHT_M
+    sigmas = 0.0 if small else mounting_sigmas(ground, mapped, of_both=True)
+    roll, pitch, yaw = turn_deg
+    return judge(
+        "ground", name, sigmas, _GROUND_LIMIT_SIGMAS, "sigmas",
+        fine=f"markings and bare ground agree on its mounting ({most_deg:.2f} deg at most)",
+        wrong=f"markings and bare ground do not agree on its mounting (roll {roll:+.2f}, pitch {pitch:+.2f}, "
+        f"yaw {yaw:+.2f} deg, height {100 * up_m:+.0f} cm): wrong associations, or ground that is not flat; "
+        "look at the overlay",
+    )  # fmt: skip
+
+
+def check_doubles(best: MethodResult) -> list[Finding]:
+    """Markings mapped twice beside themselves, as clocks, drift and mountings that disagree map them."""
+    markings = best.hd_map.markings
+    if not markings:
+        return []
+    pairs = overlapping(markings)
+    where = ""
+    if pairs:
+        x, y = markings[pairs[0][0]].corners_map.mean(axis=0)
+        where = f", first at ({x:.1f}, {y:.1f})"
+    says = f"{len(pairs)} of {len(markings)} markings overlap another of their class"
+    return [
+        judge(
+            "double markings", "map", len(pairs) / len(markings), _DOUBLES_LIMIT, "",
+            fine=says,
+            wrong=f"{says}{where}: laps or cameras do not agree; check clocks, the receiver's fix and the "
+            "mountings",
+        )
+    ]  # fmt: skip
+
+
+def overlapping(markings: tuple[Marking, ...]) -> list[tuple[int, int]]:
+    """Pairs of markings of one class that share at least :data:`_OVERLAP` of the smaller one."""
+    if len(markings) < 2:
+        return []
+    corners = [np.ascontiguousarray(one.corners_map, dtype=np.float32) for one in markings]
+    centres = np.array([one.mean(axis=0) for one in corners])
+    longest_m = max(float(np.ptp(one, axis=0).max()) for one in corners)
+    near = KDTree(centres).query_pairs(longest_m, output_type="ndarray")
+    return [
+        (int(a), int(b))
+        for a, b in near
+        if markings[a].kind == markings[b].kind and _overlap(corners[a], corners[b]) > _OVERLAP
+    ]
+
+
+def _overlap(first: FloatArray, second: FloatArray) -> float:
+    area = min(abs(cv2.contourArea(first)), abs(cv2.contourArea(second)))
+    # About an origin of their own: in map coordinates single precision would not do.
+    origin = first.mean(axis=0)
+    shared, _ = cv2.intersectConvexConvex(first - origin, second - origin)
+    return float(shared) / max(area, 1e-6)

@@ -1,67 +1,112 @@
-"""After the solve: what the drive says of its own inputs, and how well everything fits.
+"""After the solve: contradicted inputs, how well everything fits, and whether results agree.
 
-The inputs are tested one at a time (:mod:`v2hdm.adjust.suspect`); what was contradicted and could be done
-without has been dropped (:mod:`v2hdm.mapping.remedy`) and is told here. Everything else that a wrong input
-shows in is measured as well, so that a fault that nobody thought of is not silent. docs/verdict.md has what
-clean and spoilt drives measure.
+The inputs are tested one at a time (:mod:`v2hdm.adjust.suspect`); an input that was contradicted and could be
+done without has been dropped (:mod:`v2hdm.mapping.remedy`) and is reported here. Every other sign of a wrong
+input is measured as well, so that a fault that nobody thought of is not silent. docs/verdict.md has the
+figures of clean and spoilt drives.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from v2hdm.adjust import Fault
+from v2hdm.ground import GroundEstimate
 from v2hdm.mapping.evidence import Contradiction, SolveEvidence
 from v2hdm.mapping.remedy import CLOCK_TOLD_S, CONTRADICTED_SIGMAS, TOLD_SIGMA, is_contradicted
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.site_model.verdict import TOO_UNCERTAIN
 from v2hdm.records import Drive
-from v2hdm.verdict.judgement import judge, passed
-from v2hdm.verdict.results.agreement import check_agreement
-from v2hdm.verdict.results.doubles import check_doubles
-from v2hdm.verdict.results.fault_words import CHECKS, remedy_of, wrong_as
-from v2hdm.verdict.verdict import Finding, Status
+from v2hdm.verdict.results.agreement import check_against_ground, check_agreement, check_doubles
+from v2hdm.verdict.verdict import Finding, Status, judge, passed
 
 BEST = "Opt"
 """The method whose map is the result."""
 
-HELD_OUT_LIMIT = 4.0
-"""Mean robust loss of held-out observations: clean drives reach 1.9 to 2.3, wrong inputs begin at 6.5."""
+# Mean robust loss of held-out observations: clean drives reach 1.9 to 2.3, wrong inputs begin at 6.5.
+_HELD_OUT_LIMIT = 4.0
+# Share of candidate markings that were left out, but for those that are merely uncertain, two standard
+# errors taken off it: clean drives reach .05 of hundreds and .13 of 26, swapped axes .75 of 200.
+_EXCLUDED_LIMIT = 0.2
+# Share of corner observations that the rest contradicts: clean drives reach .02, no distortion .14.
+_REJECTED_LIMIT = 0.06
+# Variance of observations over the detector's statement: clean drives reach .2, no distortion 6.
+_VARIANCE_LIMIT = 3.0
+_WINDOW_LIMIT = 8.0  # the worst window of the route as a multiple of the median one: clean drives reach 2
+# Root mean square of a recorded pose's corrections, in its sigmas: at most 1 where these are right.
+_POSE_PULL_LIMIT = 1.4
+_JUMP_LIMIT = 9.0  # largest single correction of a pose, in sigmas
+# Sigma of the point that the poses are of, m, up to which a drive makes it observable.
+_LEVER_OBSERVABLE_M = 0.15
 
-EXCLUDED_LIMIT = 0.2
-"""Share of candidate markings that were left out, but for those that are merely uncertain, two standard
-errors taken off it: clean drives reach .05 of hundreds and .13 of 26, swapped axes .75 of 200."""
+# The check that reports each fault, and the recovery.
+_CHECKS: Mapping[Fault, tuple[str, str]] = {
+    Fault.CLOCK: (
+        "clock", "synchronise the clocks of cameras and receiver, or shift the stamps by as much",
+    ),
+    Fault.FOCAL: (
+        "focal length",
+        "check fx and fy in camera_info against the resolution, or calibrate the lens anew",
+    ),
+    Fault.DISTORTION: (
+        "distortion",
+        "check distortion_coefficients (and the focal length) in camera_info, or calibrate anew",
+    ),
+    Fault.PRINCIPAL: (
+        "principal point",
+        "check cx and cy in camera_info against the image's size and crop, or calibrate anew",
+    ),
+    Fault.SLOPE: ("slope", "record the height of the poses, or roll and pitch against the road"),
+    Fault.SURVEY: (
+        "survey",
+        "measure the camera's centre anew, mind signs, axes and the origin on the ground under the axle",
+    ),
+    Fault.LEVER: (
+        "survey",
+        "state the centres from the point that the poses are of, such as the antenna, or move the poses",
+    ),
+    Fault.SIZE: ("known_sizes", "measure the paint, or leave it out of mapping.known_sizes"),
+    Fault.CONTROL: ("surveyed points", "measure it anew, or leave it out of mapping.survey"),
+    Fault.DATUM: ("surveyed points", "check that survey and poses have the same datum and origin"),
+}  # fmt: skip
 
-REJECTED_LIMIT = 0.06
-"""Share of corner observations that the rest contradicts: clean drives reach .02, no distortion .14."""
+# How an input was corrected, where it was not just left out.
+_CORRECTED_BY = {
+    Fault.CLOCK: "the images were posed anew",
+    Fault.SIZE: "all known sizes were left out of the result",
+}
 
-VARIANCE_LIMIT = 3.0
-"""Variance of observations as a multiple of the detector's statement: clean drives reach .2, no distortion
-6."""
+_POSE_KEYS = {"roll": "roll_pitch_rad", "pitch": "roll_pitch_rad", "heading": "heading_rad"}
+_WAYS = (("behind", "ahead of"), ("to the right of", "to the left of"), ("below", "above"))
+_MAP_AXES = ("east", "north")
 
-WINDOW_LIMIT = 8.0
-"""The worst window of the route as a multiple of the median one: clean drives reach 2."""
 
-POSE_PULL_LIMIT = 1.4
-"""Root mean square of what is taken off a recorded pose, in its sigmas: at most 1 where these are right."""
+def check_result(
+    drive: Drive,
+    methods: Mapping[str, Mapping[str, MethodResult]],
+    ground: Sequence[Mapping[str, GroundEstimate]] = (),
+) -> list[Finding]:
+    """The checks after the solve, and the mapper's mountings against those of bare ground.
 
-JUMP_LIMIT = 9.0
-"""Largest single pull on a pose, in sigmas."""
-
-LEVER_TOLD_M = 0.15
-"""Sigma of the point that the poses are of, m, up to which a drive tells it."""
+    Args:
+        drive: the mapped drive.
+        methods: results by camera set, the one of all cameras last, then by method.
+        ground: of each session, by camera, the estimates of bare ground; empty where it was not asked.
+    """
+    best = list(methods.values())[-1][BEST]
+    findings = check_solution(drive, methods)
+    for visit, estimates in zip(drive.visits, ground, strict=False):
+        own = check_against_ground(best.calibrations, estimates)
+        suffix = f" of {visit.name}" if drive.joined else ""
+        findings += [replace(finding, about=f"{finding.about}{suffix}") for finding in own]
+    return findings
 
 
 def check_solution(drive: Drive, methods: Mapping[str, Mapping[str, MethodResult]]) -> list[Finding]:
-    """All checks after the solve.
-
-    Args:
-        drive: what was mapped.
-        methods: results by camera set, the one of all cameras last, then by method.
-    """
+    """All checks after the solve; arguments as for :func:`check_result`."""
     best = list(methods.values())[-1][BEST]
     causes: list[Finding] = []
     symptoms: list[Finding] = []
@@ -78,7 +123,7 @@ def check_solution(drive: Drive, methods: Mapping[str, Mapping[str, MethodResult
 def _explained(finding: Finding, named: Finding | None) -> Finding:
     """A symptom that points to the cause which the tests of the inputs have named, if they have.
 
-    What is wrong stands before the colon of its sentence, and the causes that are likely otherwise after it.
+    The colon of its sentence divides the symptom from the causes that are likely otherwise.
     """
     if named is None or finding.status is Status.PASS:
         return finding
@@ -86,7 +131,7 @@ def _explained(finding: Finding, named: Finding | None) -> Finding:
 
 
 def check_inputs(evidence: SolveEvidence) -> list[Finding]:
-    """What was dropped, what is contradicted still, and what this drive cannot tell."""
+    """Inputs that were dropped, inputs that are contradicted still, and what is not observable."""
     findings = [_corrected(one) for one in evidence.corrected]
     raised = {finding.check for finding in findings}
     still = [one for one in evidence.suspects if is_contradicted(one)]
@@ -96,89 +141,69 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
         raised.add(findings[-1].check)
     by_check: dict[str, list[Contradiction]] = {}
     for one in evidence.suspects:
-        by_check.setdefault(CHECKS[one.fault], []).append(one)
-    untold = _untold(evidence, raised)
-    said = raised | {finding.check for finding in untold if not _is_told(by_check[finding.check])}
+        by_check.setdefault(_CHECKS[one.fault][0], []).append(one)
+    unobservable = list(_unobservable(evidence, raised))
+    said = raised | {one.check for one in unobservable if not _observable(by_check[one.check])}
     findings += [_agrees(check, tested) for check, tested in by_check.items() if check not in said]
-    return [*findings, *untold]
+    return [*findings, *unobservable]
 
 
-def _is_told(tested: list[Contradiction]) -> bool:
-    return any(one.sigma <= TOLD_SIGMA[one.fault] for one in tested)
+def _observable(tested: list[Contradiction]) -> list[Contradiction]:
+    return [one for one in tested if one.sigma <= TOLD_SIGMA[one.fault]]
 
 
 def _corrected(one: Contradiction) -> Finding:
-    done = _DONE.get(one.fault, "it was left out of the result")
-    says = f"{wrong_as(one)} ({one.sigmas:.0f} sigmas); {done}: {remedy_of(one)}"
-    return Finding(
-        CHECKS[one.fault],
-        Status.WARN,
-        one.sigmas,
-        CONTRADICTED_SIGMAS,
-        "sigmas",
-        says,
-        ", ".join(one.cameras),
+    done = _CORRECTED_BY.get(one.fault, "it was left out of the result")
+    return _input(
+        one, Status.WARN, f"{_words(one)} ({one.sigmas:.0f} sigmas); {done}: {_CHECKS[one.fault][1]}"
     )
-
-
-_DONE = {
-    Fault.CLOCK: "the images were posed anew",
-    Fault.SIZE: "all known sizes were left out of the result",
-}
-"""How an input was corrected, where it was not just left out."""
 
 
 def _contradicted(one: Contradiction, others: list[Contradiction]) -> Finding:
-    rivals = [wrong_as(other) for other in others if other.sigmas > 0.8 * one.sigmas]
-    instead = f" or {rivals[0]}" if rivals else ""
-    says = f"{wrong_as(one)}{instead} ({one.sigmas:.0f} sigmas), and the map is wrong by it: {remedy_of(one)}"
-    return Finding(
-        CHECKS[one.fault],
-        Status.FAIL,
-        one.sigmas,
-        CONTRADICTED_SIGMAS,
-        "sigmas",
-        says,
-        ", ".join(one.cameras),
-    )
+    rivals = [_words(other) for other in others if other.sigmas > 0.8 * one.sigmas]
+    says = f"{_words(one)}{f' or {rivals[0]}' if rivals else ''} ({one.sigmas:.0f} sigmas)"
+    return _input(one, Status.FAIL, f"{says}, and the map is wrong by it: {_CHECKS[one.fault][1]}")
+
+
+def _input(one: Contradiction, status: Status, says: str) -> Finding:
+    """The finding on a tested input."""
+    check, about = _CHECKS[one.fault][0], ", ".join(one.cameras)
+    return Finding(check, status, one.sigmas, CONTRADICTED_SIGMAS, "sigmas", says, about)
 
 
 def _agrees(check: str, tested: list[Contradiction]) -> Finding:
-    if not _is_told(tested):
+    observable = _observable(tested)
+    if not observable:
         says = "the markings of this drive do not tell it: drive a turn, and past more of them"
         return passed(check, ", ".join(tested[0].cameras), says)
-    told = [one for one in tested if one.sigma <= TOLD_SIGMA[one.fault]]
-    worst = max(told, key=lambda one: one.sigmas)
-    names = ", ".join(worst.cameras)
+    worst = max(observable, key=lambda one: one.sigmas)
     if is_contradicted(worst):
-        return passed(check, names, "not told apart from what is named as wrong: mend that first")
+        says = "not told apart from what is named as wrong: mend that first"
+        return passed(check, ", ".join(worst.cameras), says)
     says = f"the markings agree with what is stated, to {worst.sigmas:.1f} sigmas"
-    return Finding(check, Status.PASS, worst.sigmas, CONTRADICTED_SIGMAS, "sigmas", says, names)
+    return _input(worst, Status.PASS, says)
 
 
-def _untold(evidence: SolveEvidence, raised: set[str]) -> list[Finding]:
-    """What no drive of this kind can tell of all cameras together, and what would."""
-    findings = []
+def _unobservable(evidence: SolveEvidence, raised: set[str]) -> Iterator[Finding]:
+    """Errors of all cameras together that no drive of this kind shows, and the drive that would."""
     clocks = _of_all(evidence, Fault.CLOCK, Fault.CLOCK)
     loosest_s = max((one.sigma for one in clocks), default=0.0)
     if loosest_s > CLOCK_TOLD_S and "clock" not in raised:
-        sigma_ms = 1e3 * loosest_s
-        sure = f"better than {2 * sigma_ms:.0f} ms" if np.isfinite(sigma_ms) else "at all"
+        sure = f"better than {2e3 * loosest_s:.0f} ms" if np.isfinite(loosest_s) else "at all"
         says = (
             f"the markings do not tell {sure} whether all clocks are late alike: drive a turn, or change the "
             "speed"
         )
-        findings.append(passed("clock", "all cameras", says))
+        yield passed("clock", "all cameras", says)
     levers = _of_all(evidence, Fault.LEVER, Fault.SURVEY)
-    axes = sorted({one.axis for one in levers if one.axis < 2 and one.sigma > LEVER_TOLD_M})
+    axes = sorted({one.axis for one in levers if one.axis < 2 and one.sigma > _LEVER_OBSERVABLE_M})
     if axes and "survey" not in raised:
         names = " and ".join(("forward", "left")[axis] for axis in axes)
         says = (
             f"this drive does not tell how far {names} the cameras sit of the point that the poses are of: "
             "the survey of centre and antenna is relied on; drive a turn"
         )
-        findings.append(passed("survey", "all cameras", says))
-    return findings
+        yield passed("survey", "all cameras", says)
 
 
 def _of_all(evidence: SolveEvidence, shared: Fault, single: Fault) -> list[Contradiction]:
@@ -187,116 +212,113 @@ def _of_all(evidence: SolveEvidence, shared: Fault, single: Fault) -> list[Contr
     return together or [one for one in evidence.suspects if one.fault is single]
 
 
-def check_fit(evidence: SolveEvidence) -> list[Finding]:
+def check_fit(evidence: SolveEvidence) -> Iterator[Finding]:
     """How well observations and poses fit, before any variance was adapted to them."""
     factor = evidence.variance_factor
+    scatter = "times the variance that the detector states"
+    yield judge(
+        "fit", "map", factor, _VARIANCE_LIMIT, "",
+        fine=f"corners scatter with {factor:.2f} {scatter}",
+        wrong=f"corners scatter with {factor:.1f} {scatter}: poses, lens and images do not fit together; "
+        "check camera_info and the pose_noise first",
+    )  # fmt: skip
     worst = int(np.argmax(evidence.along_route))
     window = float(evidence.along_route[worst] / max(np.median(evidence.along_route), 1e-12))
-    findings = [
-        judge(
-            "fit",
-            "map",
-            factor,
-            VARIANCE_LIMIT,
-            "",
-            fine=f"corners scatter with {factor:.2f} times the variance that the detector states",
-            wrong=f"corners scatter with {factor:.1f} times the variance that the detector states: poses, "
-            f"lens and "
-            "images do not fit together; check camera_info and the pose_noise first",
-        ),
-        judge(
-            "fit along the route",
-            "map",
-            window,
-            WINDOW_LIMIT,
-            "",
-            fine="the fit is even along the route",
-            wrong=f"from {evidence.window_s[worst]:.1f} s on corners scatter with {window:.0f} times the "
-            f"usual "
-            "variance: the position jumps there, or poses are missing; check the fix of the receiver",
-        ),
-    ]
+    yield judge(
+        "fit along the route", "map", window, _WINDOW_LIMIT, "",
+        fine="the fit is even along the route",
+        wrong=f"from {evidence.window_s[worst]:.1f} s on corners scatter with {window:.0f} times the usual "
+        "variance: the position jumps there, or poses are missing; check the fix of the receiver",
+    )  # fmt: skip
     for name, fit in evidence.fits.items():
-        findings.append(
-            judge(
-                "rejected",
-                name,
-                fit.rejected_share,
-                REJECTED_LIMIT,
-                "",
-                fine=f"{100 * fit.rejected_share:.1f} % of its corners contradict the rest",
-                wrong=f"{100 * fit.rejected_share:.0f} % of its corners contradict the rest: its lens, "
-                f"clock or "
-                "mounting is not as stated",
-            )
-        )
-    loss = evidence.held_out_loss
-    if loss is not None:
-        findings.append(
-            judge(
-                "held out",
-                "map",
-                loss,
-                HELD_OUT_LIMIT,
-                "",
-                fine="the map predicts corners that it has not seen as well as the noise allows",
-                wrong="the map mispredicts corners that it has not seen: an error of poses, clocks or "
-                "lens is left",
-            )
-        )
-    return [*findings, *_poses(evidence)]
+        percent = 100 * fit.rejected_share
+        yield judge(
+            "rejected", name, fit.rejected_share, _REJECTED_LIMIT, "",
+            fine=f"{percent:.1f} % of its corners contradict the rest",
+            wrong=f"{percent:.0f} % of its corners contradict the rest: its lens, clock or mounting is not "
+            "as stated",
+        )  # fmt: skip
+    if evidence.held_out_loss is not None:
+        yield judge(
+            "held out", "map", evidence.held_out_loss, _HELD_OUT_LIMIT, "",
+            fine="the map predicts corners that it has not seen as well as the noise allows",
+            wrong="the map mispredicts corners that it has not seen: an error of poses, clocks or lens is "
+            "left",
+        )  # fmt: skip
+    if evidence.pose_pulls:
+        yield from _poses(evidence)
 
 
-def _poses(evidence: SolveEvidence) -> list[Finding]:
-    if not evidence.pose_pulls:
-        return []
+def _poses(evidence: SolveEvidence) -> Iterator[Finding]:
     state = max(evidence.pose_pulls, key=lambda name: evidence.pose_pulls[name])
     pull = evidence.pose_pulls[state]
-    key = {"roll": "roll_pitch_rad", "pitch": "roll_pitch_rad", "heading": "heading_rad"}.get(
-        state, "position_m"
-    )
-    return [
-        judge(
-            "pose noise",
-            "poses",
-            pull,
-            POSE_PULL_LIMIT,
-            "sigmas",
-            fine="the poses are as good as pose_noise says, or better",
-            wrong=f"the {state} of the poses errs {pull:.1f} times as much as pose_noise says: sigmas of "
-            f"the map are "
-            f"too small; state a larger {key}",
-            status=Status.WARN,
-        ),
-        judge(
-            "pose jump",
-            "poses",
-            evidence.worst_pull,
-            JUMP_LIMIT,
-            "sigmas",
-            fine="no pose stands out from the others",
-            wrong=f"at {evidence.worst_pull_s:.1f} s the pose is {evidence.worst_pull:.0f} sigmas from "
-            f"where the "
-            "markings put it: the position jumps, or the fix was lost; check the receiver's log there",
-            status=Status.WARN,
-        ),
-    ]
+    yield judge(
+        "pose noise", "poses", pull, _POSE_PULL_LIMIT, "sigmas",
+        fine="the poses are as good as pose_noise says, or better",
+        wrong=f"the {state} of the poses errs {pull:.1f} times as much as pose_noise says: sigmas of the map "
+        f"are too small; state a larger {_POSE_KEYS.get(state, 'position_m')}",
+        status=Status.WARN,
+    )  # fmt: skip
+    yield judge(
+        "pose jump", "poses", evidence.worst_pull, _JUMP_LIMIT, "sigmas",
+        fine="no pose stands out from the others",
+        wrong=f"at {evidence.worst_pull_s:.1f} s the pose is {evidence.worst_pull:.0f} sigmas from where the "
+        "markings put it: the position jumps, or the fix was lost; check the receiver's log there",
+        status=Status.WARN,
+    )  # fmt: skip
 
 
 def _excluded(best: MethodResult) -> Finding:
-    # A place that is merely uncertain was seen too far off, or too briefly: it contradicts nothing.
+    # a merely uncertain candidate was too far off, or too briefly in view: it contradicts nothing.
     left_out = sum(one.reason != TOO_UNCERTAIN for one in best.excluded)
     count = left_out + len(best.hd_map.markings)
     share = left_out / max(count, 1)
     surely = share - 2 * float(np.sqrt(share * (1 - share) / max(count, 1)))
+    says = f"{left_out} of {count} candidates were left out"
     return judge(
-        "excluded",
-        "map",
-        surely,
-        EXCLUDED_LIMIT,
-        "",
-        fine=f"{left_out} of {count} candidates were left out, those aside that are merely uncertain",
-        wrong=f"{left_out} of {count} candidates were left out: markings are seen, but not where others put "
-        "them; see excluded.geojson",
+        "excluded", "map", surely, _EXCLUDED_LIMIT, "",
+        fine=f"{says}, those aside that are merely uncertain",
+        wrong=f"{says}: markings are seen, but not where others put them; see excluded.geojson",
         status=Status.WARN,
-    )
+    )  # fmt: skip
+
+
+def _words(one: Contradiction) -> str:
+    """The error and its size, as a clause."""
+    whose, size = " and ".join(one.cameras), abs(one.value)
+    cm = 100 * size
+    way = f"{cm:.0f} cm {_WAYS[one.axis][one.value > 0]}"
+    match one.fault:
+        case Fault.CLOCK:
+            late = "later" if one.value > 0 else "earlier"
+            where = f" {one.about}" if one.about else ""
+            return (
+                f"the images of {whose}{where} were taken {1e3 * size:.0f} ms {late} than stamped: their "
+                "clock is off"
+            )
+        case Fault.FOCAL:
+            longer = "longer" if one.value > 0 else "shorter"
+            return f"the focal length of {whose} is {100 * size:.1f} % {longer} than camera_info says"
+        case Fault.DISTORTION:
+            return f"the lens distortion of {whose} is not that of camera_info (k1 off by {one.value:+.3f})"
+        case Fault.PRINCIPAL:
+            axis = ("right", "down")[one.axis]
+            return f"the principal point of {whose} lies {one.value:+.0f} px {axis} of where camera_info says"
+        case Fault.SLOPE:
+            axis = _MAP_AXES[one.axis]
+            return f"the ground rises by {100 * one.value:+.1f} % to the {axis} under the poses"
+        case Fault.SURVEY:
+            return f"the centre of {whose} lies {way} its survey"
+        case Fault.LEVER:
+            return (
+                f"the centres of {whose} all lie {way} their surveys, as if the poses were of another "
+                "point of the vehicle (antenna instead of axle)"
+            )
+        case Fault.SIZE:
+            longer = "longer" if one.value > 0 else "shorter"
+            return f"paint that known_sizes states as {one.about} is {cm:.1f} cm {longer}"
+        case Fault.CONTROL:
+            return f"the surveyed point {one.about} is {cm:.0f} cm off the marking's corner"
+        case Fault.DATUM:
+            axis = _MAP_AXES[one.axis]
+            return f"the surveyed points all lie {100 * one.value:+.0f} cm {axis} of the markings"

@@ -1,4 +1,4 @@
-"""All checks together: the cause is told, its consequences are not."""
+"""All checks together: the cause is reported, its consequences are not; and ground that is no plane."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
-from tests.verdict.drives import poses, raised, with_yaw, yaw_of
-from tests.verdict.test_ground_findings import estimate
-from tests.verdict.test_images import noisy, pictured
+from tests.verdict.drives import drive, estimate, noisy, pictured, poses, raised, with_yaw, yaw_of
 from v2hdm.ground.results import GroundStatus, Reading
-from v2hdm.verdict import Finding, Status, check_drive
-from v2hdm.verdict.inputs.drive import HIDES, causes
+from v2hdm.records import FloatArray, Road
+from v2hdm.verdict import Finding, Status, input_findings
+from v2hdm.verdict.inputs.drive import HIDES, causes, check_road
 
 
 def finding(check: str, about: str, status: Status = Status.FAIL) -> Finding:
@@ -21,8 +21,8 @@ def finding(check: str, about: str, status: Status = Status.FAIL) -> Finding:
 
 def test_a_clean_drive_passes_with_and_without_ground(tmp_path: Path) -> None:
     clean = pictured(tmp_path, noisy)
-    assert not raised(check_drive(clean))
-    assert not raised(check_drive(clean, {"front": estimate()}))
+    assert not raised(input_findings(clean))
+    assert not raised(input_findings(clean, {"front": estimate()}))
 
 
 def test_a_yaw_from_north_is_told_once_although_the_ground_does_not_match_either(tmp_path: Path) -> None:
@@ -36,7 +36,7 @@ def test_a_yaw_from_north_is_told_once_although_the_ground_does_not_match_either
         reading=Reading.HEADING_FROM_PATH,
         shares={Reading.AS_GIVEN: 0.0, Reading.HEADING_FROM_PATH: 0.85},
     )
-    told = raised(check_drive(spoilt, {"front": ground}))
+    told = raised(input_findings(spoilt, {"front": ground}))
     assert list(told) == ["heading"]
     assert told["heading"].startswith("yaw counts clockwise from north")
 
@@ -64,3 +64,27 @@ def test_what_passed_hides_nothing() -> None:
 def test_no_two_checks_hide_each_other() -> None:
     for check, hidden in HIDES.items():
         assert all(check not in HIDES.get(other, ()) for other in hidden), check
+
+
+def road(height_m: FloatArray) -> Road:
+    """A road of 60 m eastwards with heights at every metre."""
+    slope = np.column_stack([np.gradient(height_m), np.zeros(61)])
+    return Road(np.column_stack([np.arange(61.0), np.zeros(61)]), height_m, slope)
+
+
+def test_a_long_grade_is_plane() -> None:
+    assert not raised(check_road(replace(drive(poses()), road=road(46.2 + 0.05 * np.arange(61.0)))))
+
+
+def test_a_drive_recorded_as_plane_passes() -> None:
+    assert not raised(check_road(drive(poses())))
+
+
+@pytest.mark.parametrize(("grade", "status"), [(0.015, Status.WARN), (0.12, Status.FAIL)])
+def test_the_foot_of_a_ramp_is_told_with_its_place(grade: float, status: Status) -> None:
+    ramp = road(grade * np.maximum(np.arange(61.0) - 30, 0))
+    (found,) = check_road(replace(drive(poses()), road=ramp))
+    assert found.status is status
+    assert found.value == pytest.approx(np.rad2deg(grade), rel=0.2)
+    place_m = float(found.says.split(" m along")[0])
+    assert 15 < place_m < 45

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,14 +16,10 @@ from v2hdm.records import Calibration, FloatArray
 FALSE_ALARM = 1e-3
 """Probability that a camera which has not moved is said to have: an alarm in 20 years of weekly checks."""
 
-MISSED = 0.05
-"""Probability with which a movement of the size told as detectable would be missed."""
-
+_MISSED = 0.05  # probability with which a movement of the size reported as detectable would be missed
+# Difference of the intrinsics, as a share of focal length or width, up to which they are of one lens: more of
+# it turns into pitch, yaw and height.
 _SAME_LENS = 2e-3
-"""Difference of the intrinsics, as a share of focal length or width, up to which they are of one lens.
-
-More of it turns into pitch, yaw and height.
-"""
 
 
 @dataclass(frozen=True)
@@ -49,13 +45,29 @@ class Movement:
     def detectable(self) -> FloatArray:
         """The least shifts, m, and turns, rad, each alone (6,), that would hardly be missed."""
         limit = chi2.isf(FALSE_ALARM, 6)
-        needed = brentq(lambda offset: ncx2.sf(limit, 6, offset) - (1 - MISSED), 1.0, 1e3)
+        needed = brentq(lambda offset: ncx2.sf(limit, 6, offset) - (1 - _MISSED), 1.0, 1e3)
         return np.asarray(np.sqrt(needed / np.diag(np.linalg.inv(self.covariance))))
 
     @property
     def moved(self) -> bool:
         """Whether the difference is more than the two calibrations' own errors."""
         return self.probability < FALSE_ALARM
+
+
+def compare_calibrations(
+    before: Mapping[str, Calibration], after: Mapping[str, Calibration]
+) -> list[Movement]:
+    """The movements of the cameras, by name, that both hold.
+
+    Raises:
+        MapFileError: they have no camera in common, or see :func:`movement`.
+    """
+    common = [name for name in before if name in after]
+    if not common:
+        raise MapFileError(
+            f"the cameras {', '.join(before)} and {', '.join(after)} are compared: no camera in common"
+        )
+    return [movement(before[name], after[name]) for name in common]
 
 
 def movement(before: Calibration, after: Calibration) -> Movement:
@@ -101,18 +113,15 @@ def _check_comparable(before: Calibration, after: Calibration) -> None:
     who = f"camera '{first.name}'"
     if first.name != second.name:
         raise MapFileError(f"{who} and '{second.name}': these are two cameras; give two calibrations of one")
-    if (first.width, first.height, first.distortion_model) != (
-        second.width,
-        second.height,
-        second.distortion_model,
-    ):
+    kinds = [(info.width, info.height, info.distortion_model) for info in (first, second)]
+    if kinds[0] != kinds[1]:
         raise MapFileError(
             f"{who}: image sizes or lens models differ; calibrate with the same intrinsics both times"
         )
-    off = np.abs(first.intrinsic - second.intrinsic)
-    if off.max() > _SAME_LENS * max(first.intrinsic[0, 0], first.width):
+    off = np.abs(first.intrinsic - second.intrinsic).max()
+    if off > _SAME_LENS * max(first.intrinsic[0, 0], first.width):
         raise MapFileError(
-            f"{who}: the intrinsics differ by {off.max():.1f} px, which looks like a movement; calibrate "
+            f"{who}: the intrinsics differ by {off:.1f} px, which looks like a movement; calibrate "
             "with the same intrinsics both times"
         )
     for calibration, which in ((before, "first"), (after, "second")):

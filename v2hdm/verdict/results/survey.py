@@ -1,16 +1,19 @@
-"""What check points say of the map: whether it is as good as it states, and if not, what explains it."""
+"""The map against surveyed check points and known sizes: whether it is as good as stated, and why not."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2
 
+from v2hdm.mapping.known_sizes import known_lengths
+from v2hdm.mapping.options import SizeOptions
+from v2hdm.mapping.results import MethodResult
 from v2hdm.records import FloatArray
 from v2hdm.report.check_points import CheckTable, squared
-from v2hdm.verdict.judgement import passed
-from v2hdm.verdict.verdict import Finding, Status
+from v2hdm.verdict.verdict import Finding, Status, passed
 
 CHECK = "check points"
 FRAME = "survey frame"
@@ -23,7 +26,7 @@ def check_points(table: CheckTable) -> Finding:
 
     All differences together are tested by their chi-square (:mod:`v2hdm.report.check_points`). Where that is
     too large, two simpler faults are tried in the same way: one point that is off, and all that are off
-    alike. What then leaves the rest as good as stated is named.
+    alike. The fault that leaves the rest as good as stated is named.
     """
     total = len(table.compared) + len(table.unmatched)
     if not table.compared:
@@ -31,13 +34,15 @@ def check_points(table: CheckTable) -> Finding:
         return Finding(CHECK, Status.WARN, None, None, "", says, "map")
     off_m, covariance = table.off_m.ravel(), table.covariance_m2
     value, limit = _ratio(table.squared, len(off_m)), _limit(len(off_m))
-    if value <= limit:
-        says = (
+    status, says = (
+        Status.PASS,
+        (
             f"{len(table.compared)} of {total} lie {100 * table.rmse_m:.1f} cm off the map (RMSE), as far as "
             "map and survey state"
-        )
-        return Finding(CHECK, Status.PASS, value, limit, "", says, "map")
-    status, says = _explained(table, off_m, covariance)
+        ),
+    )
+    if value > limit:
+        status, says = _explained(table, off_m, covariance)
     return Finding(CHECK, status, value, limit, "", says, "map")
 
 
@@ -49,24 +54,23 @@ def check_frame(found: Mapping[str, int]) -> list[Finding]:
     """
     others = {says: count for says, count in found.items() if says}
     likeliest = max(others, key=lambda says: others[says], default="")
-    stated = found.get("", 0)
-    if not stated and not others.get(likeliest, 0):
+    stated, most = found.get("", 0), others.get(likeliest, 0)
+    if stated and most <= stated:
+        return [passed(FRAME, "survey", f"{stated} corners of the map have a point within reach", stated)]
+    says = (
+        f"{stated} corners of the map have a point within reach, and {most} would {likeliest}: "
+        "mend the file or mapping.survey.crs"
+    )
+    if not stated and not most:
         says = (
             "no corner of the map has a surveyed point within reach: mind datum, zone and units, and "
             "mapping.survey.reach_m"
         )
-        return [Finding(FRAME, Status.WARN, 0.0, None, "", says, "survey")]
-    if others.get(likeliest, 0) <= stated:
-        return [passed(FRAME, "survey", f"{stated} corners of the map have a point within reach", stated)]
-    says = (
-        f"{stated} corners of the map have a point within reach, and {others[likeliest]} would {likeliest}: "
-        "mend the file or mapping.survey.crs"
-    )
     return [Finding(FRAME, Status.WARN, float(stated), None, "", says, "survey")]
 
 
 def _explained(table: CheckTable, off_m: FloatArray, covariance: FloatArray) -> tuple[Status, str]:
-    """What is wrong, by the simplest fault that leaves the rest as good as stated."""
+    """The simplest fault that leaves the rest as good as stated."""
     rest, cause = min(
         [_all_alike(off_m, covariance), *(_without(table, k) for k in range(len(table.compared)))],
         key=lambda fault: fault[0],
@@ -117,3 +121,21 @@ def _ratio(value: float, degrees: int) -> float:
 
 def _limit(degrees: int) -> float:
     return _ratio(float(chi2.isf(SIGNIFICANCE, degrees)), degrees)
+
+
+def check_known_sizes(sizes: SizeOptions, best: MethodResult) -> list[Finding]:
+    """A finding for each known size that no marking of the map is near to, and so was not used."""
+    found = []
+    for name, size in sizes.by_class_m.items():
+        markings = [one for one in best.hd_map.markings if one.kind == name]
+        corners_map = np.array([one.corners_map for one in markings]).reshape(-1, 4, 2)
+        numbers = np.arange(4 * len(markings)).reshape(-1, 4)
+        alone = replace(sizes, by_class_m={name: size})
+        if not known_lengths(alone, [name] * len(markings), corners_map, numbers):
+            says = (
+                f"none of the {len(markings)} markings of class {name} is about {size[0]:g} m by "
+                f"{size[1]:g} m, so that the size was not used; mend or drop it"
+            )
+            about = f"mapping.known_sizes.by_class_m.{name}"
+            found.append(Finding("known size", Status.WARN, 0.0, None, "", says, about))
+    return found

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from v2hdm.calibration.compare import FALSE_ALARM, movement
 from v2hdm.cli import calibration as door
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.rigid import exp
 from v2hdm.io.calibration.document import write_calibration
 from v2hdm.records import Calibration, CameraInfo
-from v2hdm.verdict.movement import FALSE_ALARM, movement
 
 INFO = CameraInfo("front", 1280, 720, np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]))
 SIGMA = np.array([0.006, 0.002, 0.007, 0.0003, 0.0006, 0.0003])

@@ -1,0 +1,334 @@
+"""From a table of surveyed points to a calibration, a camera's entry for ``drive.yaml`` and a verdict.
+
+A table that fits no mounting is read in other ways: columns exchanged, axes reversed, another unit, another
+image size. Each reading is a hypothesis with a prior; the mounting that it leads to counts by how well it
+explains the points and by where cameras sit on vehicles. The likeliest one is named in the error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from v2hdm.calibration.fit import Fit, Noise, Seen, fit_mountings
+from v2hdm.calibration.picture import save_picture
+from v2hdm.calibration.points import LEAST_POINTS, SurveyedPoints, check_points, read_points
+from v2hdm.calibration.residuals import CHANCE, Residuals, judge_fit, residuals, scatter
+from v2hdm.detection.image_file import read_bgr
+from v2hdm.errors import ConfigError, DriveError
+from v2hdm.geometry.ipm import ipm_from_extrinsic
+from v2hdm.geometry.mounting import centre_sigmas, mounting_angles, mounting_words
+from v2hdm.geometry.rigid import camera_centre
+from v2hdm.io.calibration.camera_info import write_camera_info
+from v2hdm.io.calibration.document import Provenance, write_calibration
+from v2hdm.io.calibration.intrinsics import read_intrinsics
+from v2hdm.records import Calibration, CameraInfo, FloatArray
+from v2hdm.report.outputs import result_folder, write_json
+from v2hdm.store.files import dump_yaml
+from v2hdm.verdict.verdict import Status, Verdict
+
+ENTRY_FILE = "drive_camera.yaml"
+POINTS_FILE = "points.csv"
+PICTURE_FILE = "points.png"
+
+UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "kilometres": 1e3}
+"""Units other than metres, in m."""
+
+_MISREAD = 0.01  # prior probability of each way to write the table wrongly
+_SURE = np.log(1e3)  # log odds from which a reading is reported as the cause
+_ROLL_RAD = np.radians(15.0)  # standard deviation of the roll of cameras on vehicles
+_BESIDE_M = 1.5  # standard deviation of their place to the left
+_UNUSUAL = 8.0  # log odds at most against an unusual mounting: some cameras hang on their side or head
+# Median height of cameras on vehicles, m, and the standard deviation of its logarithm.
+_HEIGHT_M, _LOG_HEIGHT = 2.0, 0.7
+_SCALES = (0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0)  # usual ratios of the sizes of one camera's images
+_STARTS, _ROUNDS = 1, 6  # enough to tell a reading that explains the points from one that does not
+
+
+@dataclass(frozen=True)
+class PointCalibration:
+    """A camera calibrated from surveyed points.
+
+    Attributes:
+        points: the table.
+        fit: the mounting, its covariance, and the probability of each point to be right.
+        residuals: of the points.
+        verdict: whether points, intrinsics and mounting agree.
+    """
+
+    points: SurveyedPoints
+    fit: Fit
+    residuals: Residuals
+    verdict: Verdict
+
+    @property
+    def calibration(self) -> Calibration:
+        """Intrinsics, ``cam_from_vehicle`` (4, 4) and the covariance (6, 6) of its left tangent."""
+        return Calibration(self.fit.seen.info, self.fit.cam_from_vehicle, self.fit.covariance)
+
+    @property
+    def roi_vehicle(self) -> FloatArray:
+        """The convex hull (M, 2) of the right points, counter-clockwise, m."""
+        right = self.fit.seen.points_vehicle[self.fit.is_right]
+        return np.asarray(right[ConvexHull(right).vertices])
+
+    def camera_entry(self, info_file: str) -> dict[str, Any]:
+        """The camera's entry for ``drive.yaml``, but for the file names of a real drive."""
+        info, mounting = self.fit.seen.info, self.fit.cam_from_vehicle
+        sigma = centre_sigmas(mounting, self.fit.covariance)
+        return {
+            "camera_info": info_file,
+            "images": f"{info.name}/images.txt",
+            "ipm": {"calibrated": ipm_from_extrinsic(info, mounting).tolist()},
+            "roi_vehicle": self.roi_vehicle.tolist(),
+            "centre_prior": {"xyz": camera_centre(mounting).tolist(), "sigma_m": sigma.tolist()},
+        }
+
+
+def calibrate_from_points(
+    points: SurveyedPoints | Path | str,
+    info: CameraInfo,
+    *,
+    pixel_sigma: float = Noise.pixel_px,
+    survey_sigma: float = Noise.survey_m,
+) -> PointCalibration:
+    """Find a camera's mounting from surveyed ground points and their pixels.
+
+    Args:
+        points: N points, or a CSV file with the columns u, v (recorded px), x, y (vehicle frame, m).
+        info: the camera's intrinsics.
+        pixel_sigma: standard deviation of clicking, px a coordinate.
+        survey_sigma: standard deviation of surveying, m a coordinate.
+
+    Raises:
+        DriveError: a point is impossible, or the points fit no mounting; the message names the cause.
+    """
+    table = points if isinstance(points, SurveyedPoints) else read_points(Path(points))
+    check_points(table, info)
+    fits = solve(table, info, Noise(pixel_sigma, survey_sigma))
+    off = residuals(fits[0])
+    return PointCalibration(table, fits[0], off, Verdict.of(judge_fit(table, fits, off)))
+
+
+def solve(points: SurveyedPoints, info: CameraInfo, noise: Noise) -> list[Fit]:
+    """The mountings that explain the points, the most likely first.
+
+    Raises:
+        DriveError: none does: they lie on a line, or the table is written otherwise than its columns say.
+    """
+    fits = fit_mountings(Seen.of(points, info, noise))
+    if _doubtful(fits):
+        cause = _misreading(points, info, noise, fits[0] if fits else None)
+        if cause is not None:
+            raise DriveError(f"{points.path}: the points fit no mounting of this camera: {cause}")
+    if not fits or not np.isfinite(fits[0].covariance).all() or _height_m(fits[0]) <= 0:
+        raise DriveError(
+            f"{points.path}: the points fix no camera: they lie about on a line, or all but one do; "
+            "survey some to the left and to the right of it"
+        )
+    unit, height = _unit_of(fits[0]), _height_m(fits[0])
+    if unit is not None:
+        raise DriveError(
+            f"{points.path}: the camera comes out {height:.4g} m above the ground: x and y look like {unit}; "
+            f"write metres, in which that is {height * UNITS[unit]:.2f} m"
+        )
+    return fits
+
+
+def _height_m(fit: Fit) -> float:
+    return float(camera_centre(fit.cam_from_vehicle)[2])
+
+
+def _doubtful(fits: list[Fit]) -> bool:
+    """Whether the points explain no mounting well, so that other readings of the table are worth a look."""
+    if not fits:
+        return True
+    right = int(fits[0].is_right.sum())
+    if right < LEAST_POINTS or 2 * right <= fits[0].seen.count:
+        return True
+    return scatter(fits[0], CHANCE).probability < CHANCE
+
+
+def _misreading(points: SurveyedPoints, info: CameraInfo, noise: Noise, given: Fit | None) -> str | None:
+    """The cause under which the points make sense, if they make none as they are."""
+    cause, highest = None, -np.inf
+    for words, points_px, points_vehicle in _readings(points, info):
+        seen = Seen.of_pixels(points_px, points_vehicle, info, noise)
+        for fit in fit_mountings(seen, _STARTS, _ROUNDS):
+            if _score(fit) > highest:
+                cause, highest = words, _score(fit)
+    as_given = -np.inf if given is None else _score(given)
+    return cause if highest > -np.inf and highest + np.log(_MISREAD) - as_given > _SURE else None
+
+
+def _unit_of(fit: Fit) -> str | None:
+    """The unit of the ground points where it is not the metre, by the height that the camera comes out at."""
+
+    def log_odds(metres: float, prior: float) -> float:
+        return float(-0.5 * (np.log(_height_m(fit) * metres / _HEIGHT_M) / _LOG_HEIGHT) ** 2 + np.log(prior))
+
+    scores = {unit: log_odds(metres, _MISREAD) for unit, metres in UNITS.items()}
+    best = max(scores, key=lambda unit: scores[unit])
+    return best if scores[best] > log_odds(1.0, 1.0) else None
+
+
+def _score(fit: Fit) -> float:
+    """Log posterior, with how usual the mounting is."""
+    roll = mounting_angles(fit.cam_from_vehicle)[0]
+    beside = camera_centre(fit.cam_from_vehicle)[1]
+    unusual = 0.5 * ((roll / _ROLL_RAD) ** 2 + (beside / _BESIDE_M) ** 2)
+    return fit.log_posterior - min(float(unusual), _UNUSUAL)
+
+
+def _readings(points: SurveyedPoints, info: CameraInfo) -> Iterator[tuple[str, FloatArray, FloatArray]]:
+    """Causes, and the pixels and places without them."""
+    px, ground = points.points_px, points.points_vehicle
+    mirrored = "y is counted to the right, or x backward; write y positive to the left, x forward"
+    yield mirrored, px, ground * [1.0, -1.0]
+    yield "x and y are exchanged; x is forward, y to the left", px, ground[:, ::-1].copy()
+    swapped = px[:, ::-1].copy()
+    yield "u and v are exchanged; u counts columns to the right, v rows down", swapped, ground
+    upward = np.column_stack([px[:, 0], info.height - 1 - px[:, 1]])
+    yield "v is counted upward from the image's lower edge; count it down from the upper one", upward, ground
+    for scale in _SCALES:
+        size = f"the pixels are of an image {1 / scale:.3g} times as large as that of the intrinsics"
+        yield f"{size}; give both for one size", (px + 0.5) * scale - 0.5, ground
+
+
+def calibrate_camera(parsed: argparse.Namespace) -> bool:
+    """Calibrate, print the result with the verdict on it, and write it.
+
+    Args:
+        parsed: the arguments of :mod:`v2hdm.cli.calibrate`.
+
+    Returns:
+        Whether the verdict is FAIL.
+
+    Raises:
+        V2hdmError: the points or the intrinsics cannot be used, or the results cannot be written.
+    """
+    cv2.setNumThreads(1)
+    _check_sigmas(parsed.pixel_sigma, parsed.survey_sigma)
+    info = read_intrinsics(parsed.intrinsics, parsed.camera_name, "--camera-name")
+    info = replace(info, name=parsed.name or info.name)
+    if "/" in info.name or info.name in ("", ".", ".."):
+        raise ConfigError(f"the camera is called {info.name!r}, which is no file name; give another --name")
+    points = read_points(parsed.points)
+    image = None if parsed.image is None else _image(parsed.image, info)
+    sigmas = {"pixel_sigma": parsed.pixel_sigma, "survey_sigma": parsed.survey_sigma}
+    found = calibrate_from_points(points, info, **sigmas)
+    folder = parsed.output or Path("outputs") / f"{info.name}-calibrate"
+    with result_folder(folder) as unfinished:
+        settings = {
+            "points": str(parsed.points),
+            "intrinsics": str(parsed.intrinsics),
+            "image": None if parsed.image is None else str(parsed.image),
+            **sigmas,
+        }
+        (unfinished / "config.yaml").write_text(json.dumps(settings) + "\n", encoding="utf-8")
+        write_point_calibration(found, unfinished, image)
+    for line in summary_lines(found):
+        print(line)
+    print(f"results in {folder}")
+    return found.verdict.status is Status.FAIL
+
+
+def _check_sigmas(pixel_sigma: float, survey_sigma: float) -> None:
+    for option, value in (("--pixel-sigma", pixel_sigma), ("--survey-sigma", survey_sigma)):
+        if not (np.isfinite(value) and value >= 0):
+            raise ConfigError(f"{option} {value:g}: give a standard deviation, 0 or more")
+    if pixel_sigma == survey_sigma == 0:
+        raise ConfigError("--pixel-sigma and --survey-sigma are both 0: nothing is measured without error")
+
+
+def _image(path: Path, info: CameraInfo) -> np.ndarray:
+    image = read_bgr(path)
+    rows, columns = image.shape[:2]
+    if (columns, rows) != (info.width, info.height):
+        raise DriveError(
+            f"{path}: the image is {columns} x {rows}, but the intrinsics of '{info.name}' are for "
+            f"{info.width} x {info.height}; give both for one size"
+        )
+    return image
+
+
+_COLUMNS = (
+    "point", "u", "v", "x", "y", "off_u_px", "off_v_px", "off_x_m", "off_y_m", "sigmas", "probability_right",
+    "known_m",
+)  # fmt: skip
+
+
+def write_point_calibration(found: PointCalibration, folder: Path, image: np.ndarray | None = None) -> None:
+    """Write calibration, drive entry, table, verdict and picture, in the image (H, W, 3) BGR if given."""
+    info, verdict = found.fit.seen.info, found.verdict.as_json()
+    write_json(folder / "verdict.json", verdict)
+    path = folder / f"calibration_{info.name}.yaml"
+    about = Provenance.today(found.points.path.stem, verdict)
+    write_calibration(found.calibration, path, verdict=verdict, about=about)
+    write_camera_info(info, folder / info.name / "camera_info.yaml")
+    entry = dump_yaml({"cameras": {info.name: found.camera_entry(f"{info.name}/camera_info.yaml")}})
+    (folder / ENTRY_FILE).write_text(
+        "# For drive.yaml. images: name the list of your images (docs/drive-format.md).\n" + entry,
+        encoding="utf-8",
+    )
+    with (folder / POINTS_FILE).open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow(_COLUMNS)
+        table.writerows(_rows(found))
+    labels = found.points.labels
+    save_picture(folder / PICTURE_FILE, image, labels, found.fit, found.residuals, found.roi_vehicle)
+
+
+def _rows(found: PointCalibration) -> list[list[object]]:
+    points, off = found.points, found.residuals
+    return [
+        [
+            points.names[k],
+            *points.points_px[k].tolist(),
+            *points.points_vehicle[k].tolist(),
+            *(f"{value:.3f}" for value in off.off_px[k]),
+            *(f"{value:.4f}" for value in off.off_m[k]),
+            f"{off.sigmas[k]:.2f}",
+            f"{found.fit.right[k]:.3g}",
+            f"{off.known_m[k]:.4f}",
+        ]
+        for k in range(len(points.names))
+    ]
+
+
+def summary_lines(found: PointCalibration) -> list[str]:
+    """The mounting, every point's residual and the verdict, for a terminal."""
+    fit, off, verdict = found.fit, found.residuals, found.verdict
+    turned, placed = mounting_words(fit.cam_from_vehicle, fit.covariance)
+    right = fit.is_right
+    off_px, off_cm = (np.hypot(*part.T) for part in (off.off_px, 100 * off.off_m))
+    px, cm = (float(np.sqrt(np.mean(part[right] ** 2))) for part in (off_px, off_cm))
+    known = 100 * off.known_m[right]
+    width = max(len(name) for name in found.points.names)
+    return [
+        f"{fit.seen.info.name}: {', '.join(turned)}",
+        f"  centre {', '.join(placed)}",
+        f"  {right.sum()} of {len(right)} points agree: {px:.2f} px and {cm:.1f} cm on the ground rms; "
+        f"IPM known to {known.min():.1f} cm at the best of them, {known.max():.1f} cm at the worst",
+        *(
+            f"  {name:{width}}  off {_number(off_px[k], 6, 2)} px {_number(off_cm[k], 7, 1)} cm "
+            f"{off.sigmas[k]:6.1f} sigmas"
+            for k, name in enumerate(found.points.names)
+        ),
+        verdict.lines[0],
+        *(finding.line for finding in verdict.raised),
+    ]
+
+
+def _number(value: float, width: int, digits: int) -> str:
+    """The number; a dash where there is none, as for points behind the camera."""
+    return f"{value:{width}.{digits}f}" if np.isfinite(value) else f"{'-':>{width}}"

@@ -1,0 +1,165 @@
+"""Gauss-Newton with Levenberg's damping, for least-squares problems of a few dozen to a few hundred unknowns.
+
+A problem is a function that linearises it: it returns its :class:`Normal` equations at an estimate of any
+type. Steps live in the tangent space of that estimate and ``retract`` applies them, so that rotations, lenses
+and lists of poses need no common vector. Robust problems put their weights into the equations and so are
+iteratively reweighted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from v2hdm.records import FloatArray
+
+X = TypeVar("X")
+N = TypeVar("N", bound="Normal")
+
+_RANK = 1e-12
+"""Relative size below which an eigenvalue of the scaled information is rounding: nothing observes it."""
+
+_GIVE_UP = 1e8
+"""Damping from which a cost that still grows is at its minimum but for rounding."""
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations at an estimate.
+
+    ``information`` (U, U) is J'WJ and ``gradient`` (U,) J'Wr of residuals r with the derivative J and the
+    inverse covariance W; ``cost`` is r'Wr / 2, or that of a robust loss.
+    """
+
+    information: FloatArray
+    gradient: FloatArray
+    cost: float
+
+
+def normal_equations(residual: FloatArray, jacobian: FloatArray, weight: FloatArray | None = None) -> Normal:
+    """The equations of residuals (N, D), their derivatives (N, D, U) and weights (N, D, D), by default 1."""
+    weighted = jacobian if weight is None else weight @ jacobian
+    moved = residual if weight is None else (weight @ residual[..., None])[..., 0]
+    return Normal(
+        np.einsum("nij,nik->jk", jacobian, weighted),
+        np.einsum("nij,ni->j", weighted, residual),
+        0.5 * float(np.sum(residual * moved)),
+    )
+
+
+@dataclass(frozen=True)
+class Fit(Generic[X, N]):
+    """Where an iteration ended.
+
+    Attributes:
+        x: the estimate after the last step.
+        last: the normal equations that this step was taken from.
+        step: that step (U,), as limited.
+        converged: whether it was short enough to be the last; if not, the steps were used up, or the
+            problem was not finite.
+        steps: how many were taken.
+    """
+
+    x: X
+    last: N
+    step: FloatArray
+    converged: bool
+    steps: int
+
+    @property
+    def predicted_cost(self) -> float:
+        """The cost at :attr:`x` that the linearisation predicts; infinite where the problem is not finite."""
+        last, step = self.last, self.step
+        cost = last.cost + float(last.gradient @ step) + 0.5 * float(step @ last.information @ step)
+        return cost if np.isfinite(cost) else np.inf
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance (U, U) of the tangent; infinite variances where the problem is rank deficient."""
+        return covariance_of(self.last.information)
+
+
+def gauss_newton(
+    linearise: Callable[[X], N],
+    x0: X,
+    *,
+    retract: Callable[[X, FloatArray], X] | None = None,
+    steps: int = 20,
+    tolerance: float = 1e-8,
+    damping: float = 0.0,
+    limit: Callable[[FloatArray], FloatArray] | None = None,
+    settled: Callable[[FloatArray], bool] | None = None,
+) -> Fit[X, N]:
+    """Minimise a sum of squares from ``x0``.
+
+    Args:
+        linearise: the normal equations at an estimate.
+        x0: where to start.
+        retract: an estimate moved by a step (U,); addition if not given.
+        steps: at most so many.
+        tolerance: a step below so many conditional standard deviations, of every unknown, is the last.
+        damping: of the first step, as a share of the information's diagonal. Above 0, steps that raise the
+            cost are undone and taken again with ten times the damping; at 0 every step is taken whole.
+        limit: shortens a step to what the linearisation holds for.
+        settled: whether a step is the last, in place of ``tolerance``.
+    """
+    move: Callable[[X, FloatArray], X] = retract or _add
+    x, last, damped = x0, linearise(x0), damping
+    step, taken = np.zeros(len(last.gradient)), 0
+    while taken < steps:
+        if not (np.isfinite(last.gradient).all() and np.isfinite(last.information).all()):
+            return Fit(x, last, np.full(len(last.gradient), np.nan), False, taken)
+        step = solve_normal(last, damped)
+        step = step if limit is None else limit(step)
+        moved, taken = move(x, step), taken + 1
+        if settled(step) if settled else _is_short(step, last, tolerance):
+            return Fit(moved, last, step, True, taken)
+        if damping == 0 and taken == steps:
+            return Fit(moved, last, step, False, taken)
+        after = linearise(moved)
+        if damping > 0 and not after.cost <= last.cost:
+            if damped > _GIVE_UP:
+                return Fit(x, last, np.zeros(len(step)), True, taken)
+            damped *= 10.0
+        else:
+            x, last, damped = moved, after, damped / 10.0
+    return Fit(x, last, step, False, taken)
+
+
+def _add(x: Any, step: FloatArray) -> Any:
+    return np.asarray(x) + step
+
+
+def _is_short(step: FloatArray, last: Normal, tolerance: float) -> bool:
+    return bool(np.max(np.abs(step) * np.sqrt(np.diag(last.information)), initial=0.0) < tolerance)
+
+
+def solve_normal(equations: Normal, damping: float = 0.0) -> FloatArray:
+    """The step (U,) to the minimum; the shortest, in scaled unknowns, of a rank-deficient problem."""
+    scale, scaled = _scaled(equations.information)
+    scaled = scaled + damping * np.eye(len(scale))
+    pull = -equations.gradient / scale
+    try:
+        np.linalg.cholesky(scaled)
+        return np.asarray(np.linalg.solve(scaled, pull) / scale)
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.pinv(scaled, rcond=_RANK, hermitian=True) @ pull / scale)
+
+
+def covariance_of(information: FloatArray) -> FloatArray:
+    """The inverse (U, U) of an information; infinite variances, all of them, where it is singular."""
+    scale, scaled = _scaled(information)
+    values, axes = np.linalg.eigh(scaled)
+    if not (np.diag(information) > 0).all() or values[0] < _RANK * values[-1]:
+        return np.diag(np.full(len(scale), np.inf))
+    return np.asarray((axes / values) @ axes.T / np.outer(scale, scale))
+
+
+def _scaled(information: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Scales (U,), and the information with them divided out: its diagonal is 1, or 0."""
+    diagonal = np.diag(information)
+    scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    return scale, information / np.outer(scale, scale)

@@ -1,0 +1,154 @@
+"""Matches of the ground, and what a drive states about the images that they are in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from v2hdm.ground.model import Mount
+from v2hdm.ground.motion import Motion
+from v2hdm.records import BoolArray, Camera, Drive, FloatArray, IntArray, PoseNoise
+
+HEAVE_SIGMA_M = 0.01
+"""How far a vehicle's body moves up and down on its suspension on paved ground; the mapper's figure."""
+
+STATES = ("roll", "pitch", "yaw", "forward", "left", "up")
+"""Errors of a pose, rad and m, in vehicle axes."""
+
+_LEAST_POSE_SIGMA = 1e-6  # poses stated to be exact would make the covariance singular: m or rad
+# Largest factor on the error along the path: with more, distance and height slide together.
+_FORWARD_LOOSENED = 2.0
+_UNSURVEYED_M = 0.5  # how far the centre that follows from a guess may be off, m
+# The ground shows the height to millimetres; a survey's own sigma would only bias it, m.
+_HEIGHT_SIGMA_M = 0.2
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Matches of all pairs of one camera.
+
+    ``first`` and ``second`` (N,) are the images of each match, rows of the poses; ``first_px`` and
+    ``second_px`` (N, 2) its raw pixels there; ``pair`` (N,) the pair that it belongs to.
+    """
+
+    first: IntArray
+    second: IntArray
+    first_px: FloatArray
+    second_px: FloatArray
+    pair: IntArray
+
+    def only(self, keep: BoolArray) -> Observations:
+        """The matches of a mask (N,)."""
+        return Observations(*(values[keep] for values in vars(self).values()))
+
+
+@dataclass(frozen=True)
+class Prior:
+    """The statements of a drive about I images and their camera.
+
+    Attributes:
+        poses: (I, 4, 4) ``map_from_vehicle`` as recorded.
+        pose_information: (6, I, I) of the poses' errors; see :func:`pose_information`.
+        velocity: (I, 3) smoothed motion.
+        climb_m: (I,) by how much a grade of 1 has lifted the poses, m.
+        centre_vehicle: (3,) surveyed camera centre, m.
+        centre_sigma_m: (3,) its standard deviations.
+    """
+
+    poses: FloatArray
+    pose_information: FloatArray
+    velocity: FloatArray
+    climb_m: FloatArray
+    centre_vehicle: FloatArray
+    centre_sigma_m: FloatArray
+
+
+@dataclass(frozen=True)
+class Stated:
+    """The statements of a drive about one camera, its poses under one reading.
+
+    ``clock_s`` is added to the stamps of its images, ``centre_sigma_m`` replaces the survey's own along
+    single axes, and without ``surveyed`` only the guess says where the centre is.
+    """
+
+    drive: Drive
+    camera: Camera
+    motion: Motion
+    guess: Mount
+    clock_s: float = 0.0
+    centre_sigma_m: dict[int, float] = field(default_factory=dict)
+    surveyed: bool = True
+
+    def with_surveyed_height(self) -> Stated:
+        """The same with the surveyed height as stated, which distance and focal length look like."""
+        prior = self.camera.centre_prior
+        return self if prior is None else replace(self, centre_sigma_m={2: float(prior.sigma_m[2])})
+
+    def poses(self) -> FloatArray:
+        """``map_from_vehicle`` (I, 4, 4) at all images."""
+        return self.motion.poses(self.clock_s)
+
+    def path_m(self) -> FloatArray:
+        """Distance driven (I,) at all images."""
+        return self.motion.path_at_images(self.clock_s)
+
+    def prior_of(
+        self, observations: Observations, loosened: float = 1.0
+    ) -> tuple[Observations, Prior, IntArray]:
+        """The observations with their images renumbered, the prior of these images, and their rows.
+
+        Args:
+            observations: matches between rows of the motion.
+            loosened: factor on the stated errors of headings and of places across the path.
+        """
+        rows, place = np.unique(
+            np.concatenate([observations.first, observations.second]), return_inverse=True
+        )
+        count = len(observations.first)
+        path_m = self.path_m()[rows]
+        survey = self.camera.centre_prior if self.surveyed else None
+        sigma_m = np.full(3, _UNSURVEYED_M) if survey is None else survey.sigma_m.copy()
+        sigma_m[2] = max(sigma_m[2], _HEIGHT_SIGMA_M)
+        for axis, wider_m in self.centre_sigma_m.items():
+            sigma_m[axis] = wider_m
+        factors = np.array([1.0, 1.0, loosened, min(loosened, _FORWARD_LOOSENED), loosened, 1.0])
+        prior = Prior(
+            poses=self.poses()[rows],
+            pose_information=pose_information(self.drive.pose_noise, path_m, factors),
+            velocity=self.motion.velocity_at_images(self.clock_s)[rows],
+            climb_m=path_m - path_m.mean(),
+            centre_vehicle=self.guess.centre_vehicle if survey is None else survey.centre_vehicle,
+            centre_sigma_m=sigma_m,
+        )
+        return replace(observations, first=place[:count], second=place[count:]), prior, rows
+
+
+def state_sigmas(noise: PoseNoise) -> FloatArray:
+    """Standard deviations (6,) of a pose's :data:`STATES`."""
+    tilt, position = noise.roll_pitch_rad, noise.position_m
+    sigmas = [tilt, tilt, noise.heading_rad, position, position, HEAVE_SIGMA_M]
+    return np.asarray(np.maximum(np.array(sigmas), _LEAST_POSE_SIGMA))
+
+
+def pose_information(noise: PoseNoise, path_m: FloatArray, loosened: FloatArray) -> FloatArray:
+    """Inverse covariance (6, I, I) of each state's errors at the images.
+
+    Args:
+        noise: as the drive states it; drifts tie images together that are near to each other on the path.
+        path_m: (I,) distance driven at each image.
+        loosened: (6,) factors on the standard deviations.
+    """
+    apart_m = np.abs(path_m[:, None] - path_m[None])
+    drifts = (
+        [(noise.roll_pitch_drift_rad, noise.roll_pitch_drift_over_m)] * 2
+        + [(noise.heading_drift_rad, noise.heading_drift_over_m)]
+        + [(noise.position_drift_m, noise.position_drift_over_m)] * 2
+        + [(0.0, 1.0)]
+    )
+    out = []
+    for sigma, (drift, over_m), factor in zip(state_sigmas(noise), drifts, loosened, strict=True):
+        white = np.sqrt(max(sigma**2 - drift**2, _LEAST_POSE_SIGMA**2))
+        covariance = white**2 * np.eye(len(path_m)) + drift**2 * np.exp(-apart_m / over_m)
+        out.append(np.linalg.inv(factor**2 * covariance))
+    return np.array(out)

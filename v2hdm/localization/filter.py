@@ -1,0 +1,292 @@
+"""The filter behind localisation: the vehicle's state, its motion, and what a matched marking says of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.stats import chi2
+
+from v2hdm.geometry.ipm import homography_jacobian, pinhole_px_from_ground, project_ground
+from v2hdm.geometry.least_squares import Normal, gauss_newton
+from v2hdm.geometry.quadrilateral import SHIFTS, align, block_diagonal
+from v2hdm.geometry.rigid import inverse, rotation_from_euler
+from v2hdm.records import BoolArray, FloatArray, HdMap, IntArray, Marking
+
+# Standard deviation of the acceleration that holds for a second: a yard truck brakes with 2 to 3 m/s^2.
+_ACCELERATION_M_S2 = 1.5
+# The same of the yaw rate: full lock within about two seconds at walking pace.
+_TURN_ACCELERATION_RAD_S2 = 0.3
+# Standard deviation of the sideways speed: tyres slip, and the poses' origin may lie off the rear axle.
+_SLIP_M_S = 0.05
+# Sigmas of speed and yaw rate before the first frame: anything that a vehicle does in a yard.
+_START_SPEED_M_S, _START_TURN_RAD_S = 5.0, 0.3
+# Squared distance, in sigmas, up to which a detection fits: one in a thousand is farther.
+_LARGEST_SQUARE = float(chi2.isf(1e-3, 8))
+_CLEARER_BY = 9.0  # how much worse, in the same unit, any other marking must fit: odds of ninety to one
+# How far from where a detection seems to lie its marking is looked for, in sigmas of the place, and at
+# least: the far corners of a cut marking are not where they seem.
+_REACH_SIGMAS, _LEAST_REACH_M = 4.0, 1.5
+_UNKNOWN_SIGMA_M = 0.02  # sigma of a corner of a map that states none
+# Factor of a detection's covariance: an edge that shadow or wear misplaces stays so in the next images.
+# Errors of one corner correlate by about .2 from image to image, over the ten frames that the filter
+# remembers that is 1 + 9 x .2.
+_REPEATS = 2.8
+_ITERATIONS = 3  # of an update; half a metre off at the first, a few millimetres at the third
+# Change of a state, m or rad, after which the next iteration would change no pixel by a tenth.
+_SETTLED = 1e-3
+
+X, Y, HEADING, SPEED, TURN, ROLL, PITCH = range(7)
+"""The states: place, m, heading, rad, speed, m/s, yaw rate, rad/s; roll and pitch of one frame, rad."""
+
+POSE = [X, Y, HEADING, ROLL, PITCH]
+"""The states that an image depends on."""
+
+_STEP = np.array([1e-4, 1e-4, 1e-5, 1e-5, 1e-5])  # steps of the differences by POSE: m and rad
+# Rows (4, 8) of the stacked corners of a detection, for each corner that may be the marking's first.
+_SHIFT_ROWS = (2 * SHIFTS[..., None] + np.arange(2)).reshape(4, 8)
+
+
+@dataclass(frozen=True)
+class State:
+    """Mean (7,) and covariance (7, 7) of the states."""
+
+    mean: FloatArray
+    covariance: FloatArray
+
+    @property
+    def map_from_vehicle(self) -> FloatArray:
+        """The pose (4, 4)."""
+        return pose_of(self.mean[POSE])
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of the place, both directions together."""
+        return float(np.sqrt(np.trace(self.covariance[:2, :2])))
+
+
+def pose_of(parts: FloatArray) -> FloatArray:
+    """Poses (..., 4, 4) of x, y, heading, roll and pitch (..., 5)."""
+    out = np.zeros((*parts.shape[:-1], 4, 4))
+    flat = parts.reshape(-1, 5)
+    turned = rotation_from_euler(flat[:, 3], flat[:, 4], flat[:, 2])
+    out[..., :3, :3] = turned.reshape(*parts.shape[:-1], 3, 3)
+    out[..., :2, 3], out[..., 3, 3] = parts[..., :2], 1.0
+    return out
+
+
+def start(map_from_vehicle: FloatArray, sigma_m: float, sigma_rad: float, attitude_rad: float) -> State:
+    """The state at a pose that is known by ``sigma_m`` a coordinate and ``sigma_rad`` of heading."""
+    heading = np.arctan2(map_from_vehicle[1, 0], map_from_vehicle[0, 0])
+    mean = np.array([*map_from_vehicle[:2, 3], heading, 0.0, 0.0, 0.0, 0.0])
+    sigma = [sigma_m, sigma_m, sigma_rad, _START_SPEED_M_S, _START_TURN_RAD_S, attitude_rad, attitude_rad]
+    return State(mean, np.diag(np.square(sigma)))
+
+
+def predict(state: State, step_s: float, attitude_rad: float) -> State:
+    """The state ``step_s`` later: constant speed and yaw rate, disturbed by white accelerations.
+
+    Roll and pitch start afresh, with the standard deviation ``attitude_rad``: the road and the
+    springs are not modelled.
+    """
+    x, y, heading, speed, turn = state.mean[:5]
+    middle = heading + turn * step_s / 2
+    ahead = np.array([np.cos(middle), np.sin(middle)])
+    left = np.array([-ahead[1], ahead[0]])
+    place = np.array([x, y]) + speed * step_s * ahead
+    mean = np.array([*place, heading + turn * step_s, speed, turn, 0, 0])
+    change = np.eye(7)
+    change[:2, HEADING] = speed * step_s * left
+    change[:2, SPEED] = step_s * ahead
+    change[:2, TURN] = speed * step_s**2 / 2 * left
+    change[HEADING, TURN] = step_s
+    change[ROLL:, :] = 0.0
+    pushed = np.zeros((7, 2))
+    pushed[:2, 0], pushed[SPEED, 0] = step_s**2 / 2 * ahead, step_s
+    pushed[:2, 1] = speed * step_s**3 / 6 * left
+    pushed[HEADING, 1], pushed[TURN, 1] = step_s**2 / 2, step_s
+    noise = np.square([_ACCELERATION_M_S2, _TURN_ACCELERATION_RAD_S2])
+    covariance = change @ state.covariance @ change.T + (pushed * noise) @ pushed.T
+    covariance[:2, :2] += (_SLIP_M_S * step_s) ** 2 * np.outer(left, left)
+    covariance[[ROLL, PITCH], [ROLL, PITCH]] += attitude_rad**2
+    return State(mean, covariance)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One detection: its class, camera, and corners (4, 2) with covariances (4, 2, 2) in pinhole pixels.
+
+    ``informs`` (4,) says which corners say anything; a corner on a known line has a large sigma along it.
+    """
+
+    kind: str
+    intrinsic: FloatArray
+    cam_from_vehicle: FloatArray
+    corners_px: FloatArray
+    covariance_px: FloatArray
+    informs: BoolArray
+
+    def project(self, pose: FloatArray, corners_map: FloatArray) -> FloatArray:
+        """Pixels (..., 4, 2) of a marking (4, 2) from poses (..., 5)."""
+        cam_from_map = self.cam_from_vehicle @ inverse(pose_of(pose))
+        return project_ground(self.intrinsic, cam_from_map, corners_map)[0]
+
+    def by_state(self, mean: FloatArray, corners_map: FloatArray) -> FloatArray:
+        """Derivative (8, 7) of the pixels of a marking (4, 2) by a state (7,), by central differences."""
+        steps = np.diag(_STEP)
+        pixels = self.project(mean[POSE] + np.concatenate([steps, -steps]), corners_map).reshape(10, 8)
+        out = np.zeros((8, 7))
+        out[:, POSE] = ((pixels[:5] - pixels[5:]) / (2 * _STEP[:, None])).T
+        return out
+
+    def by_place(self, pose: FloatArray, corners_map: FloatArray) -> FloatArray:
+        """Derivative (8, 8) of a marking's pixels by its corners in the map."""
+        px_from_map = pinhole_px_from_ground(self.intrinsic, self.cam_from_vehicle @ inverse(pose_of(pose)))
+        return np.asarray(block_diagonal(homography_jacobian(px_from_map, corners_map)[None])[0])
+
+    def on_ground(self, pose: FloatArray) -> FloatArray:
+        """Where on the ground the corners (4, 2) lie; nan above the horizon."""
+        map_from_cam = pose_of(pose) @ inverse(self.cam_from_vehicle)
+        pixels = np.column_stack([self.corners_px, np.ones(4)])
+        rays = np.linalg.solve(self.intrinsic, pixels.T).T @ map_from_cam[:3, :3].T
+        down = np.where(rays[:, 2:] < 0, rays[:, 2:], np.nan)
+        return np.asarray((map_from_cam[:3, 3] - rays * map_from_cam[2, 3] / down)[:, :2])
+
+
+@dataclass(frozen=True)
+class Match:
+    """A detection and a marking of the map that it may show.
+
+    ``rows`` (2 K,) of the detection's stacked corners, those that say anything, are the rows ``kept`` of the
+    marking's. ``noise`` (2 K, 2 K) is the covariance of both, px^2.
+    """
+
+    seen: Seen
+    rows: IntArray
+    kept: BoolArray
+    noise: FloatArray
+    corners_map: FloatArray
+
+    def against(self, mean: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The residual (2 K,), px, at a state (7,), and the derivative (2 K, 7) of the expected pixels."""
+        expected = self.seen.project(mean[POSE], self.corners_map)
+        residual = self.seen.corners_px.reshape(8)[self.rows] - expected.reshape(8)[self.kept]
+        return residual, self.seen.by_state(mean, self.corners_map)[self.kept]
+
+
+class Markings:
+    """The map's markings, to be looked up by place.
+
+    Of their errors, a part that all share (drift, survey) shifts the vehicle with them: of variance
+    ``shared_m2`` a coordinate, it is no noise between two of them.
+    """
+
+    def __init__(self, hd_map: HdMap) -> None:
+        self._corners = np.stack([marking.corners_map for marking in hd_map.markings])
+        total = np.stack([_covariance(marking) for marking in hd_map.markings])
+        variance = np.einsum("nii->n", total) / 8
+        own = np.array([marking.relative_sigma_m or np.inf for marking in hd_map.markings]) ** 2
+        share = np.minimum(own / variance, 1.0)
+        self._covariance = share[:, None, None] * total
+        self.shared_m2 = float(np.median((1 - share) * variance))
+        self._kind = np.array([marking.kind for marking in hd_map.markings])
+        self._tree = cKDTree(self._corners.mean(axis=1))
+
+    def match(self, seen: Seen, state: State) -> tuple[int, State] | None:
+        """The one marking that fits a detection, and the state after it; None where not just one fits."""
+        ground = seen.on_ground(state.mean[POSE])
+        known = seen.informs & np.isfinite(ground).all(axis=1)
+        candidates = self._near(seen.kind, ground[known], state)
+        if not len(candidates):
+            return None
+        corners = self._corners[candidates]
+        shifts = align(corners, np.ones(corners.shape[:2], dtype=bool), ground, known).shift
+        fits: list[tuple[float, int, State]] = []
+        for marking, shift in zip(candidates.tolist(), shifts.tolist(), strict=True):
+            pair = self._pair(seen, state, marking, _SHIFT_ROWS[shift])
+            if not np.isfinite(pair.noise).all():  # a corner is behind the camera
+                continue
+            after, squared, worth = fit(state, pair)
+            if squared <= _LARGEST_SQUARE:
+                fits.append((worth, marking, after))
+        fits.sort(key=lambda one: one[0])
+        if not fits or (len(fits) > 1 and fits[1][0] < fits[0][0] + _CLEARER_BY):
+            return None
+        return fits[0][1:]
+
+    def _pair(self, seen: Seen, state: State, marking: int, order: IntArray) -> Match:
+        kept = np.repeat(seen.informs, 2)[order]
+        rows, corners = order[kept], self._corners[marking]
+        by_place = seen.by_place(state.mean[POSE], corners)[kept]
+        noise = _REPEATS * block_diagonal(seen.covariance_px[None])[0][np.ix_(rows, rows)]
+        return Match(seen, rows, kept, noise + by_place @ self._covariance[marking] @ by_place.T, corners)
+
+    def _near(self, kind: str, ground: FloatArray, state: State) -> IntArray:
+        """The markings of a class that lie about where corners (K, 2) seem to."""
+        if not len(ground):
+            return np.zeros(0, dtype=np.int64)
+        middle = ground.mean(axis=0)
+        arm_m = float(np.linalg.norm(middle - state.mean[:2]))
+        turned_m = arm_m * float(np.sqrt(state.covariance[HEADING, HEADING]))
+        reach_m = _LEAST_REACH_M + _REACH_SIGMAS * (state.sigma_m + turned_m)
+        near = np.array(sorted(self._tree.query_ball_point(middle, reach_m)), dtype=np.int64)
+        return near[self._kind[near] == kind] if len(near) else near
+
+
+def fit(state: State, match: Match) -> tuple[State, float, float]:
+    """The state after a match, its squared distance, in sigmas, and that less twice the log likelihood.
+
+    The iterated update of an extended Kalman filter as least squares over the state whitened by its own
+    covariance, which may be singular; the distance is the part of pixels and state that no state explains.
+    """
+    values, axes = np.linalg.eigh(state.covariance)
+    spread = axes * np.sqrt(np.maximum(values, 0.0))
+    weight = np.linalg.inv(match.noise)
+
+    def linearise(whitened: FloatArray) -> Normal:
+        residual, slope = match.against(state.mean + spread @ whitened)
+        slope = slope @ spread
+        weighed = slope.T @ weight
+        gradient = whitened - weighed @ residual
+        cost = 0.5 * float(whitened @ whitened + residual @ weight @ residual)
+        return Normal(np.eye(7) + weighed @ slope, gradient, cost)
+
+    def settled(step: FloatArray) -> bool:
+        return bool(np.abs(spread @ step)[POSE].max() < _SETTLED)
+
+    found = gauss_newton(linearise, np.zeros(7), steps=_ITERATIONS, settled=settled)
+    squared = 2 * found.predicted_cost
+    if not np.isfinite(squared):
+        return state, np.inf, np.inf
+    after = State(state.mean + spread @ found.x, spread @ found.covariance @ spread.T)
+    volume = np.linalg.slogdet(match.noise)[1] + np.linalg.slogdet(found.last.information)[1]
+    return after, squared, squared + float(volume)
+
+
+def locate(state: State, seen: Sequence[Seen], markings: Markings) -> tuple[State, list[int]]:
+    """The state after one frame's detections, and the markings matched.
+
+    Detections that only one marking explains are used first, near ones before far ones; then the rest is
+    tried again with the better state.
+    """
+    matched: list[int] = []
+    waiting = sorted(seen, key=lambda one: -float(one.corners_px[:, 1].max()))
+    while waiting:
+        later = []
+        for one in waiting:
+            found = markings.match(one, state)
+            if found is None or found[0] in matched:
+                later.append(one)
+                continue
+            matched.append(found[0])
+            state = found[1]
+        if len(later) == len(waiting):
+            break
+        waiting = later
+    return state, matched
+
+
+def _covariance(marking: Marking) -> FloatArray:
+    return np.eye(8) * _UNKNOWN_SIGMA_M**2 if marking.covariance_m2 is None else marking.covariance_m2

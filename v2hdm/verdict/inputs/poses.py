@@ -1,0 +1,310 @@
+"""The recorded poses: how the vehicle moved, units and jumps of the path, attitude, and stated noise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from v2hdm.ground.motion import trajectory_of_images
+from v2hdm.records import BoolArray, Drive, FloatArray, IntArray, PoseNoise
+from v2hdm.verdict.verdict import Finding, Status, judge
+
+# Length of the chords whose direction is the course: RTK noise of 2 cm turns one by less than a degree.
+_CHORD_M = 2.0
+# A vehicle that takes longer for a chord counts as standing: its path is then mostly noise.
+_SLOWEST_MPS = 0.5
+
+STEEPEST_DEG = 15.0
+"""No road that is mapped is steeper, nor rolls a vehicle farther."""
+
+# Chords per drive: enough for medians to a hundredth of a degree, and a tenth of a second of work.
+_MOST_STARTS = 4000
+_FASTEST_MPS = 40.0  # no vehicle maps markings faster (144 km/h): its images would be metres apart
+_HARDEST_MPS2 = 9.0  # no tyre turns or brakes a road vehicle harder
+# A second difference of noisy positions has sqrt(6) sigmas; five of those are never reached by chance.
+_EXTREME = 12.0
+_HEIGHT_NOISE = 2.0  # RTK heights are about twice as noisy as positions in the plane
+# Metres in a unit that positions may be in by mistake; of an angle on the earth at the equator.
+_TOO_LARGE: Mapping[str, float] = {"centimetres": 1e2, "millimetres": 1e3}
+_TOO_SMALL: Mapping[str, float] = {"kilometres": 1e3, "degrees": 1.113e5, "radians": 6.378e6}
+_GRADE_CHANGE_RAD = 0.02  # grades must spread over this (2 %) before the sign of the pitch is observable
+_RTK_M = 0.3  # a position that is worse than this is no RTK, not even with a float solution
+# Two degrees: worse than any heading from two antennas a metre apart, or from a gyro compass.
+_HEADING_RAD = 0.035
+_ROLL_PITCH_RAD = 0.05  # three degrees: a vehicle that sways more than this on its suspension overturns
+# Poses that scatter so many times more than stated make every sigma of the map wrong by as much, and beyond
+# the second the map itself.
+_UNDERSTATED, _USELESS = 3.0, 10.0
+# The fourth difference: driving at 10 Hz leaves millimetres in it, white noise sqrt(70) sigmas.
+_DIFFERENCES = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
+# Poses whose intervals vary less than this share are evenly spaced, as a fourth difference needs.
+_REGULAR = 0.2
+_SLOWEST_HZ = 8.0  # below this rate driving itself shows in a fourth difference
+
+
+@dataclass(frozen=True)
+class Chords:
+    """Stretches of :data:`_CHORD_M` that the vehicle moved: indices (N,) of their first and last pose."""
+
+    first: IntArray
+    last: IntArray
+
+    def __len__(self) -> int:
+        """The number of chords."""
+        return len(self.first)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The recorded trajectory: ``stamp_s`` (P,), ``position`` (P, 3), ``rotation`` (P, 3, 3)."""
+
+    stamp_s: FloatArray
+    position: FloatArray
+    rotation: FloatArray
+
+    @classmethod
+    def of(cls, drive: Drive) -> Motion:
+        """The poses of a drive as they were recorded; those of its images where nothing else is kept."""
+        poses = drive.recorded or drive.trajectory or trajectory_of_images(drive)
+        return cls(poses.stamp_s, poses.map_from_vehicle[:, :3, 3], poses.map_from_vehicle[:, :3, :3])
+
+    @cached_property
+    def chords(self) -> Chords:
+        """The chords of the stretches on which the vehicle moves."""
+        stride = -(-len(self.stamp_s) // _MOST_STARTS)
+        pairs = [
+            (start, end)
+            for start in range(0, len(self.stamp_s), stride)
+            if (end := self._reached(start)) is not None
+        ]
+        first, last = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
+        return Chords(first, last)
+
+    @cached_property
+    def interval_s(self) -> FloatArray:
+        """Time (P - 1,) from each pose to the next."""
+        return np.diff(self.stamp_s)
+
+    @cached_property
+    def step_m(self) -> FloatArray:
+        """Distance (P - 1,) in the plane from each pose to the next."""
+        return np.asarray(np.linalg.norm(np.diff(self.position[:, :2], axis=0), axis=1))
+
+    @cached_property
+    def moving(self) -> BoolArray:
+        """Which steps (P - 1,) from pose to pose lie on a chord."""
+        covered = np.zeros(len(self.stamp_s))
+        np.add.at(covered, self.chords.first, 1)
+        np.add.at(covered, self.chords.last, -1)
+        return np.asarray(np.cumsum(covered)[:-1] > 0)
+
+    @cached_property
+    def course(self) -> FloatArray:
+        """The vector (N, 2) in the plane from the first to the last pose of each chord, m."""
+        return np.asarray(self.position[self.chords.last, :2] - self.position[self.chords.first, :2])
+
+    @cached_property
+    def speed_mps(self) -> FloatArray:
+        """Speed (N,) on each chord."""
+        length = np.linalg.norm(self.course, axis=1)
+        return np.asarray(length / (self.stamp_s[self.chords.last] - self.stamp_s[self.chords.first]))
+
+    @cached_property
+    def turn_rad(self) -> FloatArray:
+        """By how much (N,) the recorded heading turns on each chord."""
+        first, last = self.rotation[self.chords.first, :2, 0], self.rotation[self.chords.last, :2, 0]
+        return angle_between(first, last)
+
+    def _reached(self, start: int) -> int | None:
+        """The first pose a chord away from ``start``, if the vehicle gets there at a moving speed."""
+        end = np.searchsorted(self.stamp_s, self.stamp_s[start] + _CHORD_M / _SLOWEST_MPS, side="right")
+        offset = self.position[start + 1 : end, :2] - self.position[start, :2]
+        reached = np.flatnonzero((offset**2).sum(axis=1) >= _CHORD_M**2)
+        return start + 1 + int(reached[0]) if len(reached) else None
+
+
+def angle_between(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Angles (N,), rad within +-pi, from plane vectors (N, 2) to others, counter-clockwise."""
+    cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+    return np.asarray(np.arctan2(cross, (first * second).sum(axis=1)))
+
+
+def check_path(motion: Motion) -> list[Finding]:
+    """Whether the path is one that a road vehicle drives in metres and seconds."""
+    if not len(motion.chords):
+        return [_hardly_moves(motion)]
+    speed = float(np.percentile(motion.speed_mps, 95))
+    units = [name for name, scale in _TOO_LARGE.items() if _SLOWEST_MPS < speed / scale < _FASTEST_MPS / 2]
+    cause = f"positions in {' or '.join(units)}" if units else "positions that are not in metres"
+    return [
+        judge(
+            "speed", "poses", speed, _FASTEST_MPS, "m/s",
+            fine="the vehicle's speed is one of a road vehicle",
+            wrong=f"the vehicle drives at {speed:.0f} m/s: {cause}, or stamps that are not seconds; convert "
+            "them",
+        )
+    ]  # fmt: skip
+
+
+def _hardly_moves(motion: Motion) -> Finding:
+    moved_m = float(np.linalg.norm(np.ptp(motion.position[:, :2], axis=0)))
+    says = (
+        f"the vehicle nowhere moves {_CHORD_M:g} m in {_CHORD_M / _SLOWEST_MPS:g} s: a drive that stands "
+        "maps nothing; check that positions are in metres and stamps in seconds"
+    )
+    for unit, scale in _TOO_SMALL.items():
+        scaled = Motion(motion.stamp_s, motion.position * scale, motion.rotation)
+        if len(scaled.chords) >= 0.2 * len(motion.stamp_s) and _is_smooth(scaled):
+            says = (
+                f"positions are in {unit}: the path is {moved_m:.2g} m long and smooth; convert them to "
+                "metres east and north of the site"
+            )
+            break
+    return Finding("path length", Status.FAIL, moved_m, _CHORD_M, "m", says, "poses")
+
+
+def _is_smooth(motion: Motion) -> bool:
+    """Whether most chords are driven at a vehicle's speed and about as long as the way between their ends."""
+    way = np.concatenate([[0.0], np.cumsum(motion.step_m)])
+    chords = motion.chords
+    straight = motion.speed_mps * (motion.stamp_s[chords.last] - motion.stamp_s[chords.first])
+    directed = straight > 0.8 * (way[chords.last] - way[chords.first])
+    return bool((directed & (motion.speed_mps < _FASTEST_MPS)).mean() > 0.8)
+
+
+def check_jumps(motion: Motion, noise: PoseNoise) -> list[Finding]:
+    """Whether positions and heights jump by more than noise and tyres allow."""
+    if len(motion.stamp_s) < 3 or not len(motion.chords):
+        return []
+    longest_s = np.maximum(motion.interval_s[:-1], motion.interval_s[1:])
+    spare = 0.5 * _HARDEST_MPS2 * longest_s**2
+    usual = _EXTREME * noise.position_m / 2
+    return [
+        _jump("position", motion, motion.position[:, :2], usual + spare),
+        _jump("height", motion, motion.position[:, 2:], _HEIGHT_NOISE * usual + spare),
+    ]
+
+
+def _jump(which: str, motion: Motion, values: FloatArray, limit: FloatArray) -> Finding:
+    """The worst of all offsets of values (P, D), m, from the line between their neighbours, by its limit."""
+    part = (motion.interval_s[:-1] / (motion.interval_s[:-1] + motion.interval_s[1:]))[:, None]
+    off = values[1:-1] - (values[:-2] + part * (values[2:] - values[:-2]))
+    size = np.linalg.norm(off, axis=1)
+    worst = int(np.argmax(size / limit))
+    count = int((size > limit).sum())
+    # a step shows as half of it before and minus half of it behind.
+    beside = off[max(worst - 1, 0) : worst + 2]
+    step_m = float(np.linalg.norm(beside - off[worst], axis=1).max())
+    return judge(
+        f"{which} jumps", "poses", float(size[worst]), float(limit[worst]), "m",
+        fine=f"the {which} never jumps",
+        wrong=f"the {which} jumps by {step_m:.2f} m at {motion.stamp_s[worst + 1]:.2f} s ({count} such "
+        "records): the receiver lost its RTK fix; leave that stretch out, or state its noise in pose_noise",
+    )  # fmt: skip
+
+
+def check_attitude(motion: Motion) -> Iterator[Finding]:
+    """Whether roll and pitch are those of a road vehicle, and pitch has the sign of the grade."""
+    pitch_rad = -np.arcsin(np.clip(motion.rotation[:, 2, 0], -1, 1))
+    roll_rad = np.arctan2(motion.rotation[:, 2, 1], motion.rotation[:, 2, 2])
+    largest_rad = max(np.percentile(np.abs(angle), 95) for angle in (roll_rad, pitch_rad))
+    largest_deg = float(np.rad2deg(largest_rad))
+    yield judge(
+        "attitude", "poses", largest_deg, STEEPEST_DEG, "deg",
+        fine="roll and pitch are those of a vehicle on a road",
+        wrong=f"roll or pitch reach {largest_deg:.0f} deg, no vehicle's on a road: were degrees taken "
+        f"for radians (then it is {np.deg2rad(largest_deg):.1f} deg), or the quaternions not in the "
+        "order qx qy qz qw?",
+    )  # fmt: skip
+    yield from _pitch_sign(motion, pitch_rad)
+
+
+def _pitch_sign(motion: Motion, pitch_rad: FloatArray) -> Iterator[Finding]:
+    """Compare the pitch (positive nose down) with the recorded grade, where both change enough."""
+    chords = motion.chords
+    if not len(chords):
+        return
+    along = (motion.course * motion.rotation[chords.first, :2, 0]).sum(axis=1)
+    rise_m = motion.position[chords.last, 2] - motion.position[chords.first, 2]
+    grade_rad = np.arctan2(rise_m * np.sign(along), np.abs(along))
+    middle = (pitch_rad[chords.first] + pitch_rad[chords.last]) / 2
+    spread = np.subtract(*np.percentile(grade_rad, [95, 5]))
+    if spread < _GRADE_CHANGE_RAD or np.std(middle) < 0.3 * np.std(grade_rad):
+        return
+    slope = float(np.cov(middle, -grade_rad)[0, 1] / np.var(grade_rad))
+    yield judge(
+        "pitch sign", "poses", 1 - slope, 1.0, "",
+        fine="the pitch follows the grade",
+        wrong="the recorded pitch goes against the grade: it counts nose up; write pitch positive nose "
+        "down (a rotation about y, which points left)",
+    )  # fmt: skip
+
+
+def check_noise(motion: Motion, noise: PoseNoise) -> list[Finding]:
+    """Whether the stated noise has the right units and the poses' own scatter."""
+    position_m, heading_rad = _white_noise(motion)
+    measured = "" if position_m is None else f"; from pose to pose they scatter by {position_m:.3f} m"
+    if noise.position_m > 1:
+        measured += f"; if millimetres were meant, it is {noise.position_m / 1e3:g} m"
+    findings = [_unit("position_m", noise.position_m, _RTK_M, "m", f"no RTK position{measured}", "metres")]
+    for key, limit in (("heading_rad", _HEADING_RAD), ("roll_pitch_rad", _ROLL_PITCH_RAD)):
+        value = getattr(noise, key)
+        means = f"{np.rad2deg(value):.1f} deg; if degrees were meant, it is {np.deg2rad(value):.4f} rad"
+        findings.append(_unit(key, value, limit, "rad", means, "radians"))
+    if position_m is not None and noise.position_m > 0:
+        findings.append(_against("position_m", position_m, noise.position_m, "m"))
+    if heading_rad is not None and noise.heading_rad > 0:
+        findings.append(_against("heading_rad", heading_rad, noise.heading_rad, "rad"))
+    return findings
+
+
+def _unit(key: str, value: float, limit: float, unit: str, means: str, wanted: str) -> Finding:
+    if value == 0:
+        says = f"{key} is 0, which no receiver reaches; state its standard deviation in {wanted}"
+        return Finding("pose noise", Status.WARN, value, limit, unit, says, f"pose_noise.{key}")
+    return judge(
+        "pose noise", f"pose_noise.{key}", value, limit, unit,
+        fine=f"{key} is that of a good receiver",
+        wrong=f"{key} {value:g} is {means}; state it in {wanted}, as a standard deviation",
+        status=Status.WARN,
+    )  # fmt: skip
+
+
+def _against(key: str, measured: float, stated: float, unit: str) -> Finding:
+    ratio = measured / stated
+    degrees = " (degrees taken for radians would do that)" if unit == "rad" and ratio > _USELESS else ""
+    return judge(
+        "pose scatter", "poses", ratio, _UNDERSTATED, "",
+        fine="the poses scatter no more than stated",
+        wrong=f"from pose to pose they scatter by {measured:.2g} {unit}, {ratio:.0f} times pose_noise.{key} "
+        f"{stated:.2g}{degrees}; state {key} as it is, or find out why the receiver is worse than it says",
+        status=Status.FAIL if ratio > _USELESS else Status.WARN,
+    )  # fmt: skip
+
+
+def _white_noise(motion: Motion) -> tuple[float, float] | tuple[None, None]:
+    """Standard deviations of a coordinate, m, and of the heading, rad, from pose to pose.
+
+    None where the poses are too rare or uneven, so that driving would hide the noise.
+    """
+    if len(motion.stamp_s) < 50:
+        return None, None
+    interval_s = float(np.median(motion.interval_s))
+    uneven = np.abs(motion.interval_s / interval_s - 1) > _REGULAR
+    if interval_s > 1 / _SLOWEST_HZ or uneven.mean() >= _REGULAR:
+        return None, None
+    forward = motion.rotation[:, :2, 0]
+    heading = np.concatenate([[0.0], np.cumsum(angle_between(forward[:-1], forward[1:]))])
+    position = np.column_stack([_fourth(axis) for axis in motion.position[:, :2].T])
+    return _robust_sigma(position.ravel()), _robust_sigma(_fourth(heading))
+
+
+def _fourth(values: FloatArray) -> FloatArray:
+    return np.convolve(values, _DIFFERENCES, mode="valid") / float(np.linalg.norm(_DIFFERENCES))
+
+
+def _robust_sigma(values: FloatArray) -> float:
+    return float(1.4826 * np.median(np.abs(values)))
