@@ -28,10 +28,9 @@ from tests.drive.bags import (
 from tests.drive.example import make_drive
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import ReadOptions, drive_name, read_drive
-from v2hdm.io.importers.bag.bare import list_topics
-from v2hdm.io.importers.bag.importing import import_streams
-from v2hdm.io.importers.bag.pixels import file_of
-from v2hdm.io.importers.bag.streams import ImageStream
+from v2hdm.io.importers.bag.describe import list_topics
+from v2hdm.io.importers.bag.messages import file_of
+from v2hdm.io.importers.bag.streams import ImageStream, import_streams
 from v2hdm.records import Drive
 
 

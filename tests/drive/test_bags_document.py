@@ -16,9 +16,8 @@ from tests.drive.example import make_drive
 from v2hdm.cli import check
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.drive.sources import IMAGE_SOURCES
-from v2hdm.io.importers.poses import POSE_FORMATS, TOPIC_KEYS
-from v2hdm.io.importers.poses.settings import COMMON_KEYS
-from v2hdm.io.importers.poses.table import NAMES
+from v2hdm.io.importers.poses import COMMON_KEYS, POSE_FORMATS, TOPIC_KEYS
+from v2hdm.io.importers.tables import NAMES
 
 TEXT = document("docs/bags.md")
 

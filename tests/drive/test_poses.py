@@ -18,7 +18,7 @@ from tests.drive.example import ORIGIN, make_drive
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.importers.poses import Recorded, read_poses
-from v2hdm.io.importers.poses.table import read_table
+from v2hdm.io.importers.tables import read_table
 from v2hdm.records import FloatArray, GeodeticOrigin
 from v2hdm.verdict import check_drive
 

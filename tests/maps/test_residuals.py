@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 
 from v2hdm.errors import MapFileError
-from v2hdm.io.maps.exclusions import ExcludedMarking, read_exclusions, write_exclusions
-from v2hdm.io.maps.residuals import Residuals, read_residuals, write_residuals
+from v2hdm.io.maps.evidence import (
+    ExcludedMarking,
+    Residuals,
+    read_exclusions,
+    read_residuals,
+    write_exclusions,
+    write_residuals,
+)
 from v2hdm.records import GeodeticOrigin
 
 

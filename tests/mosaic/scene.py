@@ -17,8 +17,8 @@ from v2hdm.geometry.rigid import exp, inverse
 from v2hdm.io.calibration.document import write_calibration
 from v2hdm.io.drive import ReadOptions, write_drive
 from v2hdm.io.drive.of_result import METRICS, told_of
-from v2hdm.io.drive.tum import write_tum
 from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.io.trajectory import write_tum
 from v2hdm.records import (
     Calibration,
     Camera,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from tests.verdict.drives import drive, motion, poses, raised
-from v2hdm.io.importers.stamp_units import why_no_pose
+from v2hdm.io.trajectory import why_no_pose
 from v2hdm.records import Trajectory
 from v2hdm.verdict import Status
 from v2hdm.verdict.inputs.clocks import check_clocks

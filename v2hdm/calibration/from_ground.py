@@ -15,7 +15,7 @@ from v2hdm.ground.picture import draw_matched_ground
 from v2hdm.ground.say import lines
 from v2hdm.io.calibration.document import Provenance, write_calibration
 from v2hdm.io.drive import ReadOptions, read_drive
-from v2hdm.io.drive.lossless import png
+from v2hdm.io.safe.pixels import png
 from v2hdm.records import Drive
 from v2hdm.report.outputs import result_folder, write_json
 from v2hdm.settings import check_workers

@@ -13,7 +13,7 @@ from v2hdm.ground.motion import Motion
 from v2hdm.ground.mount import Mount
 from v2hdm.ground.options import GroundOptions
 from v2hdm.ground.patches import ImageArray, Matches, View, match_pair, patch_centres
-from v2hdm.io.pixels import read_pixels
+from v2hdm.io.safe.pixels import read_pixels
 from v2hdm.records import Drive, FloatArray, IntArray
 
 _PATH_STEP_M = 0.5

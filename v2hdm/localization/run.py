@@ -21,8 +21,8 @@ from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.io.calibration.document import trusted_calibrations
 from v2hdm.io.drive import ReadOptions, read_drive
-from v2hdm.io.drive.tum import write_tum
 from v2hdm.io.maps.geojson import read_geojson
+from v2hdm.io.trajectory import write_tum
 from v2hdm.localization.figure import save_errors
 from v2hdm.localization.match import Markings, Seen, locate
 from v2hdm.localization.motion import State, predict, start

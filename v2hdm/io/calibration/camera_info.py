@@ -8,7 +8,7 @@ from typing import Any
 
 from v2hdm.errors import DriveError
 from v2hdm.io.calibration.formats import camera_info_content
-from v2hdm.io.fields import check_camera, take_size_px
+from v2hdm.io.safe.fields import check_camera, take_size_px
 from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo, FloatArray
 from v2hdm.store.files import (
     check_keys,

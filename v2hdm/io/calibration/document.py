@@ -12,8 +12,8 @@ import numpy as np
 
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
-from v2hdm.io.fields import check_camera, take_covariance, take_size_px
-from v2hdm.io.texts import take_camera_name
+from v2hdm.io.safe.fields import check_camera, take_covariance, take_size_px
+from v2hdm.io.safe.texts import take_camera_name
 from v2hdm.records import DISTORTION_COEFFICIENTS, Calibration, CameraInfo
 from v2hdm.store.files import check_keys, dump_yaml, load_yaml, replace_text, take_array, take_text
 

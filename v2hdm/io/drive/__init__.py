@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from v2hdm.errors import DriveError
-from v2hdm.io.drive.clock import with_clock_offsets
 from v2hdm.io.drive.folder import (
     folder_drive_name,
     is_folder_drive,
@@ -15,13 +14,12 @@ from v2hdm.io.drive.folder import (
     read_folder_drive,
     write_drive,
 )
+from v2hdm.io.drive.images import KittiOptions, ReadOptions, part_of, with_clock_offsets
 from v2hdm.io.drive.join import join_drives
 from v2hdm.io.drive.kitti import is_kitti_drive, read_kitti_drive
-from v2hdm.io.drive.options import KittiOptions, ReadOptions
-from v2hdm.io.drive.part import part_of
-from v2hdm.io.importers.bag.bare import describe_bag
+from v2hdm.io.drive.nuscenes import is_nuscenes_drive, read_nuscenes_drive
+from v2hdm.io.importers.bag.describe import describe_bag
 from v2hdm.io.importers.bag.reading import is_bag
-from v2hdm.io.importers.nuscenes import is_nuscenes_drive, read_nuscenes_drive
 from v2hdm.records import Drive, Trajectory
 
 __all__ = [

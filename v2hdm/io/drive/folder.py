@@ -15,8 +15,7 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.io.calibration.camera_info import write_camera_info
-from v2hdm.io.drive.images import ImageFiles, check_image_files, count_unposed, pose_images, select_cameras
-from v2hdm.io.drive.mounting import (
+from v2hdm.io.calibration.mounting import (
     IPM_NAMES,
     check_roi_in_view,
     choose_initial,
@@ -26,15 +25,21 @@ from v2hdm.io.drive.mounting import (
     take_ipm,
     take_roi,
 )
-from v2hdm.io.drive.options import ReadOptions
+from v2hdm.io.drive.images import (
+    ImageFiles,
+    ReadOptions,
+    check_image_files,
+    count_unposed,
+    pose_images,
+    select_cameras,
+)
 from v2hdm.io.drive.road import lay_flat, tell
 from v2hdm.io.drive.sources import Sources, plan_images, plan_info, plan_topic_poses
-from v2hdm.io.drive.trajectory import check_trajectory
-from v2hdm.io.drive.tum import write_image_list, write_tum
-from v2hdm.io.fields import take_origin
 from v2hdm.io.importers.poses import read_poses
-from v2hdm.io.pixels import read_pixels
-from v2hdm.io.texts import shown, take_camera_name, take_name
+from v2hdm.io.safe.fields import take_origin
+from v2hdm.io.safe.pixels import read_pixels
+from v2hdm.io.safe.texts import shown, take_camera_name, take_name
+from v2hdm.io.trajectory import check_trajectory, write_image_list, write_tum
 from v2hdm.records import DRIFTS, BoolArray, Camera, CameraInfo, Drive, PoseNoise, Trajectory
 from v2hdm.store.files import (
     check_keys,

@@ -9,7 +9,7 @@ from typing import Any
 
 from v2hdm.errors import DriveError, MapFileError
 from v2hdm.io.drive import join_drives, read_drive
-from v2hdm.io.drive.options import KittiOptions, ReadOptions
+from v2hdm.io.drive.images import KittiOptions, ReadOptions
 from v2hdm.records import Drive
 from v2hdm.store.files import load_json
 

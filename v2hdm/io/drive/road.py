@@ -8,6 +8,10 @@ The recorded up-axis, smoothed over a few metres, gives the road's slope. The he
 integrated along the path, that slope must give them. What it lacks, a sensor that is not level or a vehicle
 that squats as it speeds up, is the vehicle's and not the road's. Only this difference is smoothed over a
 longer way, so that a short ramp, of which both know, is not blurred.
+
+A route in steps of a metre, and lines and planes fitted there under a Gaussian along the path.
+
+Where along a route the ground is no plane as far as a camera reaches: crests, dips, banked ramps.
 """
 
 from __future__ import annotations
@@ -19,8 +23,6 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.geometry.rigid import heading_rad, rotation_from_euler
-from v2hdm.io.drive.stations import STATION_M, Stations, along_route, local_lines, local_planes
-from v2hdm.io.drive.unevenness import Unevenness, unevenness
 from v2hdm.records import BoolArray, FloatArray, Road, Trajectory
 
 __all__ = ["Laid", "Unevenness", "lay_flat", "tell", "unevenness"]
@@ -229,3 +231,167 @@ def _turned(vectors: FloatArray, angle_rad: FloatArray) -> FloatArray:
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     x, y = vectors.T
     return np.column_stack([c * x - s * y, s * x + c * y])
+
+
+STATION_M = 1.0
+"""Poses nearer together than this are one station: a vehicle that stands drives no path in its noise."""
+
+_WINDOW_SIGMAS = 3.0
+"""A Gaussian is cut off here; 0.3 % of it lies beyond."""
+
+_END_RIDGE = 0.2
+"""Keeps lines through few or near stations from being steep, as a share of the Gaussian's width."""
+
+
+@dataclass(frozen=True)
+class Stations:
+    """Places along a route, each the mean of the successive poses within a metre.
+
+    Attributes:
+        first: (N + 1,) index of each station's first pose, and the number of poses at the end.
+        points_map: (N, 2) m.
+        path_m: (N,) way driven to each.
+    """
+
+    first: np.ndarray
+    points_map: FloatArray
+    path_m: FloatArray
+
+    def mean(self, values: FloatArray) -> FloatArray:
+        """Means (N, ...) over the poses of each station of their ``values`` (P, ...)."""
+        return _means(values, self.first)
+
+    def at_poses(self, values: FloatArray) -> FloatArray:
+        """Values (P, C) at the poses, between those (N, C) of the stations."""
+        centre = 0.5 * (self.first[:-1] + self.first[1:] - 1)
+        poses = np.arange(self.first[-1])
+        return np.column_stack([np.interp(poses, centre, column) for column in values.T])
+
+    def around(self, k: int, width_m: float) -> tuple[slice, FloatArray]:
+        """The stations within reach of a Gaussian around station ``k``, and their weights."""
+        reach = _WINDOW_SIGMAS * width_m
+        low, high = np.searchsorted(self.path_m, [self.path_m[k] - reach, self.path_m[k] + reach])
+        near = slice(int(low), max(int(high), k + 1))
+        weight = np.exp(-0.5 * ((self.path_m[near] - self.path_m[k]) / width_m) ** 2)
+        return near, weight
+
+
+def along_route(points_map: FloatArray) -> Stations:
+    """The stations of poses at ``points_map`` (P, 2)."""
+    first = [0]
+    x0, y0 = points_map[0].tolist()
+    for p, (x, y) in enumerate(points_map.tolist()):
+        if (x - x0) ** 2 + (y - y0) ** 2 >= STATION_M**2:
+            first.append(p)
+            x0, y0 = x, y
+    starts = np.array([*first, len(points_map)])
+    centres = _means(points_map, starts)
+    steps_m = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    return Stations(starts, centres, np.concatenate([[0.0], np.cumsum(steps_m)]))
+
+
+def local_lines(stations: Stations, values: FloatArray, width_m: float) -> FloatArray:
+    """``values`` (N, C) smoothed by the line fitted around each station."""
+    smooth = np.empty_like(values)
+    for k, here in enumerate(stations.path_m):
+        near, weight = stations.around(k, width_m)
+        weight = weight / weight.sum()
+        offset = stations.path_m[near] - here
+        centred = offset - weight @ offset
+        spread = weight @ centred**2 + (_END_RIDGE * width_m) ** 2
+        mean = weight @ values[near]
+        smooth[k] = mean - (weight @ offset) * ((weight * centred) @ values[near]) / spread
+    return smooth
+
+
+def local_planes(
+    stations: Stations, height: FloatArray, slope: FloatArray, width_m: float, trust_m2: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The plane around each station that fits heights and slopes there.
+
+    Args:
+        stations: the N places.
+        height: (N, C) m, C sets of them.
+        slope: (N, 2, C) what is known of the planes' slope apart from the heights.
+        width_m: standard deviation of the Gaussian.
+        trust_m2: (N,) mean squared leverage, m^2, at which heights say as much as these slopes.
+
+    Returns:
+        Heights (N, C) and slopes (N, 2, C) of the planes at the stations.
+    """
+    fitted, inclined = np.empty_like(height), np.empty_like(slope)
+    for k in range(len(height)):
+        near, weight = stations.around(k, width_m)
+        weight = weight / weight.sum()
+        offset = stations.points_map[near] - stations.points_map[k]
+        mean = weight @ offset
+        lever = (offset - mean) * weight[:, None]
+        normal = lever.T @ offset + trust_m2[k] * np.eye(2)
+        known = np.tensordot(weight, slope[near], axes=1)
+        inclined[k] = np.linalg.solve(normal, lever.T @ height[near] + trust_m2[k] * known)
+        fitted[k] = weight @ height[near] - mean @ inclined[k]
+    return fitted, inclined
+
+
+def _means(values: FloatArray, first: np.ndarray) -> FloatArray:
+    count = np.diff(first).reshape(-1, *[1] * (values.ndim - 1))
+    return np.asarray(np.add.reduceat(values, first[:-1], axis=0) / count)
+
+
+_HALF_WIDTH_M = 3.5
+"""How far to either side of the path the ground counts, m: a lane's width."""
+
+
+@dataclass(frozen=True)
+class Unevenness:
+    """The ground's worst deviation from the plane beneath the vehicle.
+
+    Attributes:
+        value_m: height of the ground above or below that plane.
+        distance_m: from the vehicle to where it is so. A vehicle that rolls and pitches by ``sigma`` rad has
+            ``sigma * distance_m`` there, too.
+        at_map: (2,) m, where the vehicle is then.
+        station_m: its way along the route.
+    """
+
+    value_m: float
+    distance_m: float
+    at_map: FloatArray
+    station_m: float
+
+
+def unevenness(road: Road, reach_m: float) -> Unevenness:
+    """Where the ground between half of ``reach_m`` and all of it is worst, by deviation over distance.
+
+    The ground is known along the path by its heights, beside it by its slope; it counts to 3.5 m on either
+    side, so a road whose cross-fall changes deviates, too.
+    """
+    steps_m = np.linalg.norm(np.diff(road.points_map, axis=0), axis=1)
+    station_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    left = _left(road.points_map)
+    worst = Unevenness(0.0, reach_m, road.points_map[0], 0.0)
+    for k, here_m in enumerate(station_m):
+        low, high = np.searchsorted(station_m, [here_m - reach_m, here_m + reach_m])
+        near = slice(int(low), int(high))
+        offset = road.points_map[near] - road.points_map[k]
+        distance_m = np.linalg.norm(offset, axis=1)
+        far = distance_m >= 0.5 * reach_m
+        if not far.any():
+            continue
+        change = road.slope[near] - road.slope[k]
+        along_m = road.height_m[near] - road.height_m[k] - offset @ road.slope[k]
+        across_m = _HALF_WIDTH_M * np.einsum("ni,ni->n", change, left[near])
+        deviation_m = np.where(far, np.abs(along_m) + np.abs(across_m), 0.0)
+        j = int(np.argmax(deviation_m / np.maximum(distance_m, 0.5 * reach_m)))
+        if deviation_m[j] * worst.distance_m > worst.value_m * distance_m[j]:
+            worst = Unevenness(float(deviation_m[j]), float(distance_m[j]), road.points_map[k], float(here_m))
+    return worst
+
+
+def _left(points_map: FloatArray) -> FloatArray:
+    """Unit vectors (P, 2) to the left of the path, zero where it is a point."""
+    if len(points_map) < 2:
+        return np.zeros_like(points_map)
+    ahead = np.gradient(points_map, axis=0)
+    length = np.linalg.norm(ahead, axis=1, keepdims=True)
+    return np.asarray(np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.maximum(length, 1e-9))

@@ -16,8 +16,6 @@ from v2hdm.errors import DriveError
 from v2hdm.io.calibration.camera_info import read_camera_info
 from v2hdm.io.calibration.intrinsics import read_intrinsics
 from v2hdm.io.drive.images import ImageFiles
-from v2hdm.io.drive.tum import read_image_list
-from v2hdm.io.importers.bag.importing import import_streams
 from v2hdm.io.importers.bag.streams import (
     IMAGE_LIST,
     INFO_FILE,
@@ -27,13 +25,13 @@ from v2hdm.io.importers.bag.streams import (
     PoseStream,
     Stream,
     TfStream,
+    import_streams,
 )
 from v2hdm.io.importers.bag.tf import TF_TOPIC
-from v2hdm.io.importers.poses.kitti_rows import read_stamps
-from v2hdm.io.importers.poses.readings import Attitudes, Readings
-from v2hdm.io.importers.stamp_units import UNITS
+from v2hdm.io.importers.tables import Attitudes, Readings, read_stamps
 from v2hdm.io.importers.video import IMAGE_LIST as VIDEO_LIST
 from v2hdm.io.importers.video import import_video
+from v2hdm.io.trajectory import UNITS, read_image_list
 from v2hdm.records import CameraInfo
 from v2hdm.store.files import check_keys, take_choice, take_mapping, take_number, take_text
 

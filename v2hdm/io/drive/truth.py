@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.io.drive.mounting import take_rigid
-from v2hdm.io.drive.tum import read_tum, write_tum
+from v2hdm.io.calibration.mounting import take_rigid
 from v2hdm.io.maps import read_geojson, write_geojson
+from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.records import BoolArray, Drive, FloatArray, HdMap, Image, Trajectory, Truth
 from v2hdm.store.files import (
     check_keys,

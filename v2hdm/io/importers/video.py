@@ -13,8 +13,6 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.extras import need
-from v2hdm.io.drive.lossless import png
-from v2hdm.io.drive.tum import write_image_list
 from v2hdm.io.importers.imported import (
     begin_entry,
     cannot_write,
@@ -23,6 +21,8 @@ from v2hdm.io.importers.imported import (
     finish_entry,
     is_whole,
 )
+from v2hdm.io.safe.pixels import png
+from v2hdm.io.trajectory import write_image_list
 
 _log = logging.getLogger(__name__)
 

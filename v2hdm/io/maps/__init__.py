@@ -1,9 +1,9 @@
 """A map or a calibration to files and back: one format a file."""
 
 from v2hdm.io.calibration.document import read_calibration, write_calibration
+from v2hdm.io.maps.features import ground_height_m, with_heights
 from v2hdm.io.maps.formats import FORMATS, check_formats, read_map, write_map
 from v2hdm.io.maps.geojson import read_geojson, write_geojson
-from v2hdm.io.maps.heights import ground_height_m, with_heights
 
 __all__ = [
     "FORMATS",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.io.drive.unevenness import unevenness
+from v2hdm.io.drive.road import unevenness
 from v2hdm.records import Drive
 from v2hdm.verdict.judgement import judge, passed
 from v2hdm.verdict.verdict import Finding, Status

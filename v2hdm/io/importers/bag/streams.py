@@ -1,6 +1,8 @@
 """What of a bag is kept as files: images, intrinsics, poses, frames; one class a kind of stream.
 
 A stream writes as messages come, so that its memory grows with the bag by its list of images only.
+
+A bag's streams as entries of the cache: one pass over the bag for all that are not there yet.
 """
 
 from __future__ import annotations
@@ -17,15 +19,22 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.io.calibration.camera_info import write_camera_info
-from v2hdm.io.drive.lossless import png
-from v2hdm.io.drive.tum import write_image_list
-from v2hdm.io.fields import check_camera
-from v2hdm.io.importers.bag import poses
-from v2hdm.io.importers.bag.encoded_video import VIDEO, VideoDecoder
-from v2hdm.io.importers.bag.pixels import IMAGE_KINDS, file_of
-from v2hdm.io.importers.bag.reading import Bag, Message
+from v2hdm.io.importers.bag import messages as poses
+from v2hdm.io.importers.bag.messages import IMAGE_KINDS, VIDEO, VideoDecoder, file_of
+from v2hdm.io.importers.bag.reading import Bag, Message, bag_files, open_bag
 from v2hdm.io.importers.bag.tf import TF_STATIC, TF_TOPIC, Edge, Frames, frame_name, transform_rows
-from v2hdm.io.importers.poses.readings import Readings
+from v2hdm.io.importers.imported import (
+    begin_entry,
+    cannot_write,
+    drop_entry,
+    entry_folder,
+    finish_entry,
+    is_whole,
+)
+from v2hdm.io.importers.tables import Readings
+from v2hdm.io.safe.fields import check_camera
+from v2hdm.io.safe.pixels import png
+from v2hdm.io.trajectory import write_image_list
 from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo, FloatArray
 
 _log = logging.getLogger(__name__)
@@ -328,3 +337,45 @@ def _write_row(file: TextIO, stamp_s: float, row: Sequence[float]) -> None:
 def _read_rows(path: Path, columns: int) -> tuple[FloatArray, FloatArray]:
     table = np.loadtxt(path, ndmin=2).reshape(-1, columns)
     return table[:, 0], table[:, 1:]
+
+
+_log = logging.getLogger(__name__)
+
+
+def import_streams(path: Path, streams: Sequence[Stream], cache: Path) -> list[Path]:
+    """The folders of ``streams`` of the bag at ``path``, imported now unless they were before.
+
+    Raises:
+        DriveError: the bag is damaged, lacks a topic, or the cache cannot be written.
+    """
+    files = bag_files(path)
+    folders = [entry_folder(cache, files, stream.label, stream.settings) for stream in streams]
+    missing = {
+        folder: stream for folder, stream in zip(folders, streams, strict=True) if not is_whole(folder)
+    }
+    if not missing:
+        return folders
+    size_mb = sum(file.stat().st_size for file in files) / 1e6
+    labels = ", ".join(stream.label for stream in missing.values())
+    _log.info("%s: importing %s from %.0f MB into %s, once", path, labels, size_mb, cache)
+    try:
+        with open_bag(path) as bag:
+            takers: dict[str, list[Stream]] = defaultdict(list)
+            for folder, stream in missing.items():
+                for topic in stream.topics(bag):
+                    takers[topic].append(stream)
+                stream.begin(begin_entry(folder))
+            for message in bag.messages(takers):
+                for stream in takers[message.topic]:
+                    stream.take(message)
+            for folder, stream in missing.items():
+                stream.finish()
+                stream.close()
+                finish_entry(folder)
+    except OSError as failure:
+        raise cannot_write(cache, failure) from None
+    finally:
+        for folder, stream in missing.items():
+            stream.close()
+            drop_entry(folder)
+    return folders

@@ -9,7 +9,7 @@ import numpy as np
 from v2hdm.errors import DriveError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.io.fields import recorded_distance
+from v2hdm.io.safe.fields import recorded_distance
 from v2hdm.records import BoolArray, CameraInfo, CentrePrior, FloatArray
 from v2hdm.store.files import take_array, take_mapping, take_text
 

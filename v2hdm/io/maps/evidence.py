@@ -1,17 +1,31 @@
-"""The corner observations that a map rests on, and how far each lies from where the map puts it, as CSV."""
+"""The corner observations that a map rests on, and how far each lies from where the map puts it, as CSV.
+
+Candidates that did not enter the map, as GeoJSON points.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from v2hdm.errors import MapFileError
-from v2hdm.records import BoolArray, FloatArray, IntArray
-from v2hdm.store.files import read_text, replace_text
+from v2hdm.io.maps.features import ground_height_m
+from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_features
+from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, IntArray, Road
+from v2hdm.store.files import (
+    load_json,
+    read_text,
+    replace_text,
+    take_array,
+    take_mapping,
+    take_number,
+    take_text,
+)
 
 FILE = "residuals.csv"
 """Name of the file in a result folder."""
@@ -122,3 +136,64 @@ def read_residuals(path: Path) -> Residuals:
         residual_px=table[:, 5:7],
         distance_sigma=table[:, 7],
     )
+
+
+@dataclass(frozen=True)
+class ExcludedMarking:
+    """A candidate that the map of ``cameras`` left out: its class, where (2,) in the map, and why."""
+
+    kind: str
+    position_map: FloatArray
+    sightings: int
+    reason: str
+    cameras: str
+
+
+def write_exclusions(
+    excluded: Sequence[ExcludedMarking], path: Path, origin: GeodeticOrigin | None, road: Road | None
+) -> None:
+    """Write a FeatureCollection of points, atomically; ``cameras`` names the camera set of each."""
+    features = []
+    for number, one in enumerate(excluded):
+        place = one.position_map.reshape(1, 2)
+        heights = None if road is None else ground_height_m(road, place)
+        properties = {
+            "id": number,
+            "class": one.kind,
+            "reason": one.reason,
+            "sightings": one.sightings,
+            "cameras": one.cameras,
+            "position_map": one.position_map.tolist(),
+        }
+        (position,) = geojson_positions(place, heights, origin)
+        features.append(geojson_feature(f"excluded/{number}", "Point", position, properties))
+    write_features(path, features, origin, {})
+
+
+def read_exclusions(path: Path) -> list[ExcludedMarking]:
+    """Read what :func:`write_exclusions` wrote.
+
+    Raises:
+        MapFileError: the file is missing, damaged or not of this format.
+    """
+    features = load_json(path, MapFileError).get("features")
+    if not isinstance(features, list):
+        raise MapFileError(f"{path}: no 'features'; give what v2hdm.map wrote")
+    excluded = []
+    for number, feature in enumerate(features):
+        where = f"{path}: feature {number}"
+        entry = take_mapping(
+            take_mapping(feature, where, MapFileError).get("properties"), where, MapFileError
+        )
+        excluded.append(
+            ExcludedMarking(
+                kind=take_text(entry.get("class"), f"{where}: class", MapFileError),
+                position_map=take_array(
+                    entry.get("position_map", np.nan), (2,), f"{where}: position_map", MapFileError
+                ),
+                sightings=int(take_number(entry.get("sightings"), f"{where}: sightings", MapFileError)),
+                reason=take_text(entry.get("reason"), f"{where}: reason", MapFileError),
+                cameras=take_text(entry.get("cameras"), f"{where}: cameras", MapFileError),
+            )
+        )
+    return excluded

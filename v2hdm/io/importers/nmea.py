@@ -16,9 +16,9 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.rigid import rotation_from_euler
-from v2hdm.io.importers.poses.readings import SIGMA_OF_QUALITY_M, Attitudes, Readings
-from v2hdm.io.importers.poses.rising import in_order
-from v2hdm.io.texts import read_bytes, shown
+from v2hdm.io.importers.tables import SIGMA_OF_QUALITY_M, Attitudes, Readings
+from v2hdm.io.safe.texts import read_bytes, shown
+from v2hdm.io.trajectory import in_order
 from v2hdm.records import FloatArray
 from v2hdm.store.files import take_text
 

@@ -16,13 +16,12 @@ import yaml
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.rigid import inverse
-from v2hdm.io.drive.mounting import roi_ahead
-from v2hdm.io.importers.bag import poses
-from v2hdm.io.importers.bag.encoded_video import VIDEO
-from v2hdm.io.importers.bag.importing import import_streams
-from v2hdm.io.importers.bag.pixels import IMAGE_KINDS as PICTURES
+from v2hdm.io.calibration.mounting import roi_ahead
+from v2hdm.io.importers.bag import messages as poses
+from v2hdm.io.importers.bag.messages import IMAGE_KINDS as PICTURES
+from v2hdm.io.importers.bag.messages import VIDEO
 from v2hdm.io.importers.bag.reading import Bag, Topic, bag_files, open_bag
-from v2hdm.io.importers.bag.streams import INFO_KIND, TfStream, frame_of
+from v2hdm.io.importers.bag.streams import INFO_KIND, TfStream, frame_of, import_streams
 from v2hdm.io.importers.bag.tf import TF_STATIC, TF_TOPIC, Frames, frame_name
 from v2hdm.io.importers.imported import (
     begin_entry,

@@ -1,4 +1,6 @@
-"""Readings of positions and attitudes to poses of the vehicle in the map.
+"""What ``poses`` in ``drive.yaml`` may say beside its file or topic, the same for every format.
+
+Readings of positions and attitudes to poses of the vehicle in the map.
 
 Antenna and vehicle: ``vehicle = position - rotation @ lever_arm``. True and grid north: the attitude at a
 place is relative to that place's east and north; the map's axes are those at its origin, and both differences
@@ -8,8 +10,10 @@ are taken exactly, over the earth's centre.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,11 +28,83 @@ from v2hdm.geometry.geodetic import (
     is_geographic,
 )
 from v2hdm.geometry.rigid import rotation_from_euler
-from v2hdm.io.drive.trajectory import check_geodetic, interpolate
-from v2hdm.io.importers.poses.readings import Readings
-from v2hdm.io.importers.poses.settings import PoseSettings
-from v2hdm.io.importers.stamp_units import why_no_pose
+from v2hdm.io.importers import nmea, tables
+from v2hdm.io.importers.tables import Attitudes, Readings
+from v2hdm.io.trajectory import check_geodetic, interpolate, read_tum, why_no_pose
 from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, Trajectory
+from v2hdm.store.files import check_keys, take_array, take_choice, take_mapping, take_number, take_text
+
+HEADINGS = ("true", "grid")
+COMMON_KEYS = (
+    "crs", "heading", "lever_arm_m", "mounting_rpy_deg", "max_sigma_m", "geoid_m", "epoch", "offset_s",
+)  # fmt: skip
+
+_MAX_SIGMA_M = 0.1
+"""Positions that are stated to be less sure than this, m, are left out: RTK fixed is 0.02, float about "
+"0.5."""
+
+
+@dataclass(frozen=True)
+class PoseSettings:
+    """How poses are to be understood.
+
+    Attributes:
+        crs: system of the coordinates, such as EPSG:25832; None for the map's own, or WGS84.
+        heading: north that headings count from, ``true`` or ``grid``; None where it is not said.
+        lever_arm_m: (3,) the point that positions are of, in the vehicle frame; None where it is not said.
+        vehicle_from_sensor: (3, 3) how the attitude's sensor is turned on the vehicle.
+        max_sigma_m: positions stated to be less sure are left out.
+        geoid_m: height of the geoid above the ellipsoid, for heights above the sea; None if not said.
+        epoch: of the coordinates, in years; None if not said.
+        offset_s: what is added to the recorded times.
+    """
+
+    crs: str | None
+    heading: str | None
+    lever_arm_m: FloatArray | None
+    vehicle_from_sensor: FloatArray
+    max_sigma_m: float
+    geoid_m: float | None
+    epoch: float | None
+    offset_s: float
+
+
+def take_pose_settings(entry: Mapping[str, Any], where: str) -> PoseSettings:
+    """The settings of ``entry``, whose keys have been checked.
+
+    Raises:
+        DriveError: a value is of the wrong type or out of range.
+    """
+
+    def number(key: str) -> float | None:
+        return None if key not in entry else take_number(entry[key], f"{where}, {key}", DriveError)
+
+    def three(key: str) -> FloatArray | None:
+        return None if key not in entry else take_array(entry[key], (3,), f"{where}, {key}", DriveError)
+
+    heading = entry.get("heading")
+    if heading is not None:
+        take_choice(heading, HEADINGS, f"{where}, heading", DriveError)
+    max_sigma_m = number("max_sigma_m") if "max_sigma_m" in entry else _MAX_SIGMA_M
+    assert max_sigma_m is not None
+    if max_sigma_m <= 0:
+        raise DriveError(f"{where}, max_sigma_m: give a positive number of metres")
+    rpy = three("mounting_rpy_deg")
+    roll, pitch, yaw = np.radians(np.zeros(3) if rpy is None else rpy)[:, None]
+    crs = entry.get("crs")
+    if isinstance(crs, int) and not isinstance(crs, bool):
+        crs = f"EPSG:{crs}"
+    return PoseSettings(
+        crs=None if crs is None else take_text(crs, f"{where}, crs", DriveError),
+        heading=heading,
+        lever_arm_m=three("lever_arm_m"),
+        vehicle_from_sensor=rotation_from_euler(roll, pitch, yaw)[0],
+        max_sigma_m=max_sigma_m,
+        geoid_m=number("geoid_m"),
+        epoch=number("epoch"),
+        offset_s=number("offset_s") or 0.0,
+    )
+
 
 _log = logging.getLogger(__name__)
 
@@ -208,3 +284,72 @@ def _noise(sigma_m: FloatArray, readings: Readings) -> dict[str, float]:
         for key, values in noise.items()
         if len(stated := values[np.isfinite(values) & (values > 0)])
     }
+
+
+@dataclass(frozen=True)
+class PoseFormat:
+    """One format: ``read(path, entry, root, where)`` and the ``keys`` that it has of its own."""
+
+    read: Callable[[Path, dict[str, Any], Path, str], Readings]
+    keys: tuple[str, ...] = ()
+
+
+def _read_tum(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
+    trajectory = read_tum(path)
+    unknown = np.full(len(trajectory.stamp_s), np.nan)
+    poses = trajectory.map_from_vehicle
+    attitudes = Attitudes(trajectory.stamp_s, poses[:, :3, :3], unknown)
+    return Readings(trajectory.stamp_s, poses[:, :3, 3], False, unknown, attitudes)
+
+
+POSE_FORMATS: Mapping[str, PoseFormat] = {
+    "tum": PoseFormat(_read_tum),
+    "kitti": PoseFormat(tables.read_kitti_rows, tables.KITTI_KEYS),
+    "csv": PoseFormat(tables.read_table, tables.TABLE_KEYS),
+    "nmea": PoseFormat(nmea.read_nmea, nmea.KEYS),
+}
+"""Formats of files by the key that names the file; ``topic`` names one of a bag instead."""
+
+ReadTopic = Callable[[dict[str, Any], str], Readings]
+TOPIC_KEYS = ("heading_topic", "frame", "vehicle", "stamps")
+
+
+def read_poses(
+    content: object,
+    root: Path,
+    origin: GeodeticOrigin | None,
+    max_gap_s: float,
+    where: str,
+    read_topic: ReadTopic,
+) -> Recorded:
+    """The poses that ``poses`` in ``drive.yaml`` names.
+
+    Args:
+        content: a TUM file's name, or a mapping that begins with a format of ``POSE_FORMATS`` or a topic.
+        root: folder that file names are relative to.
+        origin: the map's place on the earth as the drive states it.
+        max_gap_s: attitudes further apart are not interpolated across.
+        where: the key, for errors.
+        read_topic: reads a topic of the drive's bag.
+
+    Raises:
+        DriveError: of the file or of how it is described.
+    """
+    if isinstance(content, str):
+        return Recorded(read_tum(root / content), {}, origin)
+    entry = take_mapping(content, where, DriveError)
+    named = [key for key in (*POSE_FORMATS, "topic") if key in entry]
+    if len(named) != 1:
+        raise DriveError(
+            f"{where}: name one source, a file of poses by its format ({', '.join(POSE_FORMATS)}) or a topic "
+            f"of the bag; got {', '.join(named) or 'none'}"
+        )
+    (kind,) = named
+    keys = TOPIC_KEYS if kind == "topic" else POSE_FORMATS[kind].keys
+    check_keys(entry, (kind,), (*keys, *COMMON_KEYS), where, DriveError)
+    settings = take_pose_settings(entry, where)
+    name = take_text(entry[kind], f"{where}, {kind}", DriveError)
+    if kind == "topic":
+        return assemble(read_topic(entry, where), settings, origin, max_gap_s, f"{where}, topic {name}")
+    readings = POSE_FORMATS[kind].read(root / name, entry, root, where)
+    return assemble(readings, settings, origin, max_gap_s, str(root / name))

@@ -1,4 +1,8 @@
-"""Poses in a CSV file with named columns.
+"""What a pose file or topic states, before frames, antenna and noise are made of it.
+
+Poses as KITTI's odometry benchmark writes them: twelve numbers a row, and a file of times beside it.
+
+Poses in a CSV file with named columns.
 
 A column's name says what it holds and in which unit; ``columns`` in ``drive.yaml`` says what the file calls
 it.
@@ -8,6 +12,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -16,12 +21,137 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.rigid import rotation_from_euler, rotation_from_quaternion
-from v2hdm.io.importers.poses.readings import SIGMA_OF_QUALITY_M, Attitudes, Readings
-from v2hdm.io.importers.poses.rising import in_order
+from v2hdm.io.trajectory import in_order
 from v2hdm.records import FloatArray
-from v2hdm.store.files import check_keys, read_text, take_mapping, take_text
+from v2hdm.store.files import check_keys, read_text, take_choice, take_mapping, take_text
 
-KEYS = ("columns",)
+SIGMA_OF_QUALITY_M: Mapping[int, float] = {
+    0: np.inf,  # no fix
+    1: 3.0,  # single
+    2: 1.0,  # differential
+    3: 3.0,  # PPS
+    4: 0.02,  # RTK, fixed
+    5: 0.5,  # RTK, float
+    6: np.inf,  # dead reckoning
+    7: np.inf,  # typed in
+    8: np.inf,  # simulated
+    9: 1.0,  # satellite-based augmentation, as some receivers number it
+}
+"""Standard deviation of a position, a coordinate, m, by the quality of NMEA's GGA (0183, 4.11)."""
+
+
+@dataclass(frozen=True)
+class Attitudes:
+    """Attitudes over time.
+
+    Attributes:
+        stamp_s: (A,) strictly rising.
+        rotation: (A, 3, 3) reference from sensor; the reference is x east, y north, z up of the true or grid
+            north at the place, or the map itself.
+        sigma_rad: (A,) standard deviation of the heading, nan where it is not stated.
+    """
+
+    stamp_s: FloatArray
+    rotation: FloatArray
+    sigma_rad: FloatArray
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Positions over time, and attitudes, perhaps at other times.
+
+    Attributes:
+        stamp_s: (P,) strictly rising.
+        points: (P, 3): x, y, z in m of the map or a projected system, or latitude and longitude in degrees
+            and height above the ellipsoid in m.
+        geodetic: whether they are latitudes and longitudes.
+        sigma_m: (P,) standard deviation of a horizontal coordinate, nan where it is not stated, infinite
+            where there was no fix.
+        attitudes: None where the source has none.
+        antenna: whether they are an antenna's, which seldom sits at the vehicle's origin.
+    """
+
+    stamp_s: FloatArray
+    points: FloatArray
+    geodetic: bool
+    sigma_m: FloatArray
+    attitudes: Attitudes | None
+    antenna: bool = field(default=False)
+
+
+KITTI_KEYS = ("stamps", "axes")
+
+_VEHICLE_FROM_CAMERA_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""x right, y down, z forward to x forward, y left, z up."""
+
+_UPRIGHT = 0.5
+"""Least cosine between the poses' z axis and up for poses of a ground vehicle."""
+
+_ROTATION_TOLERANCE = 1e-3
+
+
+def read_kitti_rows(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
+    """Read rows of 3 x 4 matrices.
+
+    ``axes: camera`` are those of the benchmark, x right, y down, z forward, in the map as on the vehicle;
+    ``axes: vehicle`` x forward, y left, z up.
+
+    Raises:
+        DriveError: a row is no pose, the times do not fit, or the axes are the other ones.
+    """
+    if "stamps" not in entry:
+        raise DriveError(f"{where}: KITTI's rows have no times: add stamps, a file with one time in s a line")
+    axes = take_choice(entry.get("axes", "vehicle"), ("vehicle", "camera"), f"{where}, axes", DriveError)
+    poses = _numbers(path, 12).reshape(-1, 3, 4)
+    stamp_s = read_stamps(root / take_text(entry["stamps"], f"{where}, stamps", DriveError))
+    if len(stamp_s) != len(poses):
+        raise DriveError(f"{path}: {len(poses)} poses, but {len(stamp_s)} times; give one time a pose")
+    rotation, points = poses[:, :, :3], poses[:, :, 3]
+    wrong = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max(axis=(1, 2)) > _ROTATION_TOLERANCE
+    if wrong.any():
+        raise DriveError(f"{path}: line {int(np.argmax(wrong)) + 1}: its 3 x 3 part is no rotation; mend it")
+    if axes == "camera":
+        turn = _VEHICLE_FROM_CAMERA_AXES
+        rotation, points = turn @ rotation @ turn.T, points @ turn.T
+    elif np.median(rotation[:, 2, 2]) < _UPRIGHT:
+        raise DriveError(
+            f"{path}: the poses' z axis does not point up; say axes: camera if they are KITTI's own"
+        )
+    rows = in_order(stamp_s, str(path))
+    unknown = np.full(len(rows), np.nan)
+    stamps = stamp_s[rows]
+    return Readings(stamps, points[rows], False, unknown, Attitudes(stamps, rotation[rows], unknown))
+
+
+def read_stamps(path: Path) -> FloatArray:
+    """One time in s a line (N,).
+
+    Raises:
+        DriveError: a line is not one finite number.
+    """
+    return _numbers(path, 1)[:, 0]
+
+
+def _numbers(path: Path, columns: int) -> FloatArray:
+    rows = []
+    for number, line in enumerate(read_text(path, DriveError).splitlines(), start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        try:
+            row = [float(part) for part in line.replace(",", " ").split()]
+        except ValueError:
+            row = []
+        if len(row) != columns or not np.isfinite(row).all():
+            raise DriveError(
+                f"{path}: line {number}: expected {columns} finite numbers, got '{line[:60]}'; mend it"
+            )
+        rows.append(row)
+    if not rows:
+        raise DriveError(f"{path}: holds no numbers; expected {columns} a line")
+    return np.array(rows)
+
+
+TABLE_KEYS = ("columns",)
 
 _STAMPS: Mapping[str, float] = {"stamp_s": 1.0, "stamp_ms": 1e3, "stamp_us": 1e6, "stamp_ns": 1e9}
 _MAP = ("x_m", "y_m", "z_m")

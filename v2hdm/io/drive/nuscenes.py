@@ -12,14 +12,19 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.rigid import inverse, rotation_from_quaternion
-from v2hdm.io.drive.images import ImageFiles, check_image_files, count_unposed, pose_images, select_cameras
-from v2hdm.io.drive.mounting import ipm_from_guess, roi_ahead
-from v2hdm.io.drive.options import ReadOptions
+from v2hdm.io.calibration.mounting import ipm_from_guess, roi_ahead
+from v2hdm.io.drive.images import (
+    ImageFiles,
+    ReadOptions,
+    check_image_files,
+    count_unposed,
+    pose_images,
+    select_cameras,
+)
 from v2hdm.io.drive.road import lay_flat, tell
-from v2hdm.io.drive.trajectory import check_trajectory
-from v2hdm.io.fields import check_camera, take_size_px
-from v2hdm.io.importers.poses.rising import in_order
-from v2hdm.io.texts import read_json, take_camera_name
+from v2hdm.io.safe.fields import check_camera, take_size_px
+from v2hdm.io.safe.texts import read_json, take_camera_name
+from v2hdm.io.trajectory import check_trajectory, in_order
 from v2hdm.records import Camera, CameraInfo, Drive, FloatArray, PoseNoise, Trajectory
 from v2hdm.store.files import take_array, take_number, take_text
 
