@@ -63,10 +63,7 @@ def make_drive(folder: Path, stamps: tuple[float, ...] = (100.05, 100.95, 101.25
         ipm = ipm_from_extrinsic(info, looking_forward(2.0 + number))
         cameras[name] = Camera(
             info=info,
-            ipm={
-                "calibrated": ipm,
-                "estimated": ipm_from_extrinsic(info, looking_forward(2.2)),
-            },
+            ipm={"calibrated": ipm, "estimated": ipm_from_extrinsic(info, looking_forward(2.2))},
             initial_ipm="estimated",
             roi_vehicle=np.array([[3.0, -3.0], [9.0, -3.0], [9.0, 3.0], [3.0, 3.0]]),
             centre_prior=CentrePrior(np.array([0.0, 0.0, 2.0]), np.full(3, 0.02)),

@@ -272,8 +272,7 @@ def test_poses_on_another_clock_than_images_are_named(folder: Path, tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("encoding", "channels"),
-    [("mono8", 1), ("bgr8", 3), ("rgb8", 3), ("bgra8", 4), ("rgba8", 4)],
+    ("encoding", "channels"), [("mono8", 1), ("bgr8", 3), ("rgb8", 3), ("bgra8", 4), ("rgba8", 4)]
 )
 def test_raw_images_keep_every_bit(encoding: str, channels: int) -> None:
     made = Messages()

@@ -53,10 +53,7 @@ def test_an_edited_geopackage_becomes_the_geojson_again(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            ["map.geojson", "--format", "shp"],
-            "--format: unknown format 'shp'; choose from: geojson, csv",
-        ),
+        (["map.geojson", "--format", "shp"], "--format: unknown format 'shp'; choose from: geojson, csv"),
         (["calibration_front.yaml", "--format", "gpkg"], "unknown format 'gpkg' of a calibration"),
         (["map.geojson", "--format", "geojson"], "map.geojson would be written over"),
         (["map.csv", "--format", "gpkg"], "map.csv: no map that can be read"),

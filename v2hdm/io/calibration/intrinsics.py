@@ -266,11 +266,7 @@ def _lines(document: Document) -> list[tuple[int, str]]:
     return [(number, line) for number, line in lines if line and not line.startswith("#")]
 
 
-_MODELS = {
-    "omni": "omnidirectional (omni)",
-    "ds": "double sphere (ds)",
-    "eucm": "extended unified (eucm)",
-}
+_MODELS = {"omni": "omnidirectional (omni)", "ds": "double sphere (ds)", "eucm": "extended unified (eucm)"}
 """Projections of Kalibr's that are none of ours."""
 
 _EQUIDISTANT = ("equidistant", "equi")

@@ -21,14 +21,7 @@ import numpy as np
 
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.geodetic import geodetic_from_enu
-from v2hdm.io.maps.features import (
-    LARGEST_ID,
-    Feature,
-    FeatureReader,
-    Geometry,
-    features_of,
-    properties_of,
-)
+from v2hdm.io.maps.features import LARGEST_ID, Feature, FeatureReader, Geometry, features_of, properties_of
 from v2hdm.io.safe.fields import take_origin, take_whole
 from v2hdm.records import FloatArray, GeodeticOrigin, HdMap
 from v2hdm.store.files import load_json, replace_text, take_array, take_mapping, take_number

@@ -219,11 +219,7 @@ class _Content:
 
 
 def _write_layer(
-    raw: Any,
-    path: Path,
-    shape: str,
-    features: Sequence[Feature],
-    origin: GeodeticOrigin | None,
+    raw: Any, path: Path, shape: str, features: Sequence[Feature], origin: GeodeticOrigin | None
 ) -> None:
     told = [properties_of(feature) for feature in features]
     layer, geometry_type = _LAYERS[shape]

@@ -115,10 +115,7 @@ _NOWHERE = GeodeticOrigin(0.0, 0.0, 0.0)
 
 
 def write_lanelet2(
-    hd_map: HdMap,
-    path: Path,
-    verdict: Mapping[str, Any] | None = None,
-    projector: str | None = None,
+    hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None, projector: str | None = None
 ) -> None:
     """Write ``hd_map`` to ``path`` and ``map_projector_info.yaml`` beside it, each atomically.
 

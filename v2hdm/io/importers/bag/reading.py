@@ -16,11 +16,7 @@ from v2hdm.store.files import load_yaml, take_mapping
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
-_MEND = {
-    ".bag": "rosbag reindex",
-    ".mcap": "mcap recover",
-    ".db3": "ros2 bag reindex",
-}
+_MEND = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "ros2 bag reindex"}
 
 
 @dataclass(frozen=True)
