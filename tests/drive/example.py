@@ -9,8 +9,8 @@ import numpy as np
 
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import rotation_from_euler
-from v2hdm.io.drive import Trajectory, write_drive
-from v2hdm.io.drive.truth import write_truth
+from v2hdm.io.drive import Trajectory
+from v2hdm.io.drive.writing import write_drive, write_truth
 from v2hdm.records import (
     Camera,
     CameraInfo,

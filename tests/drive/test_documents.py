@@ -7,7 +7,7 @@ import numpy as np
 
 from tests.docs.blocks import blocks
 from tests.drive.example import make_drive
-from v2hdm.io.calibration.camera_info import read_camera_info
+from v2hdm.io.calibration import read_camera_info
 from v2hdm.io.drive import read_drive
 
 BLOCKS = [block.text for block in blocks("docs/drive-format.md", "yaml")]

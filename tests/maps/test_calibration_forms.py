@@ -16,9 +16,15 @@ from tests.drive.example import camera_info, looking_forward
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import exp
-from v2hdm.io.calibration.camera_info import read_camera_info
-from v2hdm.io.calibration.document import Provenance, read_calibration, read_provenance, write_calibration
-from v2hdm.io.calibration.formats import CALIBRATION_FORMATS, write_calibration_as
+from v2hdm.io.calibration import (
+    CALIBRATION_FORMATS,
+    Provenance,
+    read_calibration,
+    read_camera_info,
+    read_provenance,
+    write_calibration,
+    write_calibration_as,
+)
 from v2hdm.records import Calibration
 
 SIGMAS = [0.01, 0.02, 0.03, *np.radians([0.1, 0.2, 0.3])]

@@ -13,7 +13,8 @@ from tests.docs.blocks import ROOT, blocks
 from tests.drive.example import camera_info, looking_forward
 from tests.maps.gis import street
 from v2hdm.cli import export
-from v2hdm.io.maps import read_geojson, write_calibration, write_geojson
+from v2hdm.io.calibration import write_calibration
+from v2hdm.io.maps import read_geojson, write_geojson
 from v2hdm.io.maps.formats import FORMATS
 from v2hdm.io.maps.geopackage import read_geopackage_verdict, write_geopackage
 from v2hdm.records import Calibration

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from v2hdm.errors import MapFileError
-from v2hdm.io.calibration.document import read_calibration, write_calibration
+from v2hdm.io.calibration import read_calibration, write_calibration
 from v2hdm.io.maps.evidence import ExcludedMarking, write_exclusions
 from v2hdm.io.maps.geojson import read_geojson, read_verdict, write_geojson
 from v2hdm.records import Calibration, CameraInfo, GeodeticOrigin, HdMap, Marking, Road

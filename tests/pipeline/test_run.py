@@ -15,8 +15,7 @@ import yaml
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError, DetectorError, DriveError, V2hdmError
 from v2hdm.geometry.rigid import rotation_from_euler
-from v2hdm.io.calibration.document import read_calibration
-from v2hdm.io.calibration.formats import CALIBRATION_FORMATS
+from v2hdm.io.calibration import CALIBRATION_FORMATS, read_calibration
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.maps.evidence import read_residuals
 from v2hdm.io.maps.formats import FORMATS

@@ -16,7 +16,8 @@ import pytest
 from tests.verdict.drives import drive, poses, with_yaw, yaw_of
 from tests.verdict.test_images import noisy
 from v2hdm.cli.check import main
-from v2hdm.io.drive import Trajectory, write_drive
+from v2hdm.io.drive import Trajectory
+from v2hdm.io.drive.writing import write_drive
 from v2hdm.records import Image
 
 

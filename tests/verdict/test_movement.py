@@ -11,7 +11,7 @@ import pytest
 from v2hdm.cli import calibration as door
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.rigid import exp
-from v2hdm.io.calibration.document import write_calibration
+from v2hdm.io.calibration import write_calibration
 from v2hdm.records import Calibration, CameraInfo
 from v2hdm.verdict.movement import FALSE_ALARM, movement
 

@@ -13,7 +13,7 @@ import cv2
 from v2hdm.ground import GroundEstimate, estimate_cameras
 from v2hdm.ground.picture import draw_matched_ground
 from v2hdm.ground.say import lines
-from v2hdm.io.calibration.document import Provenance, write_calibration
+from v2hdm.io.calibration import Provenance, write_calibration
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.safe.pixels import png
 from v2hdm.records import Drive

@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _compare(parsed: argparse.Namespace) -> int:
     from v2hdm.errors import MapFileError
-    from v2hdm.io.calibration.document import trusted_calibrations
+    from v2hdm.io.calibration import trusted_calibrations
     from v2hdm.verdict.movement import movement, turned_alike
 
     before, after = (trusted_calibrations(path) for path in (parsed.before, parsed.after))

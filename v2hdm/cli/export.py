@@ -60,8 +60,12 @@ def _export_map(parsed: argparse.Namespace, folder: Path) -> list[Path]:
 
 def _export_calibration(parsed: argparse.Namespace, folder: Path) -> list[Path]:
     from v2hdm.errors import ConfigError
-    from v2hdm.io.calibration.document import read_calibration, read_provenance
-    from v2hdm.io.calibration.formats import CALIBRATION_FORMATS, write_calibration_as
+    from v2hdm.io.calibration import (
+        CALIBRATION_FORMATS,
+        read_calibration,
+        read_provenance,
+        write_calibration_as,
+    )
 
     for name in parsed.format:
         if name not in CALIBRATION_FORMATS:

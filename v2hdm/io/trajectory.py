@@ -1,12 +1,7 @@
-"""The vehicle's pose at any time within a recorded trajectory.
+"""Poses over time: their text files, the order and unit of their stamps, and the pose at any time.
 
-Trajectories in the format of the TUM RGB-D benchmark: ``timestamp tx ty tz qx qy qz qw`` a line.
-
-Its sibling, ``timestamp filename`` a line, lists the images of a camera. ``#`` begins a comment.
-
-Times that must rise, brought into order where a recorder or network has mixed neighbours.
-
-Why images find no pose at their time: other units, another epoch, or poses too far apart.
+Trajectories are files in the format of the TUM RGB-D benchmark, ``timestamp tx ty tz qx qy qz qw`` per line;
+``timestamp filename`` lines list the images of a camera. ``#`` begins a comment.
 """
 
 from __future__ import annotations
@@ -21,48 +16,26 @@ from v2hdm.geometry.rigid import quaternion_from_rotation, rotation_from_quatern
 from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, IntArray, Trajectory
 from v2hdm.store.files import read_text, replace_text
 
-_FARTHEST_M = 1e8
-"""Coordinates on the earth end at ten thousand kilometres."""
+UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}  # and how many of each make a second
 
-_FARTHEST_FROM_ORIGIN_M = 1e5
-"""A map is flat: a hundred kilometres from its origin the ground is 800 m below it."""
+_COLUMNS = "timestamp tx ty tz qx qy qz qw"
+_NORM_TOLERANCE = 1e-3  # files with four decimals pass, a forgotten component does not
+_FARTHEST_M = 1e8  # coordinates on the earth end at ten thousand kilometres
+_FARTHEST_FROM_ORIGIN_M = 1e5  # a map is flat, and there the ground is 800 m below it
+_LATE_S = 1.0  # a reading that comes later than this after its successor is of another clock or recording
 
-
-def check_trajectory(trajectory: Trajectory, origin: GeodeticOrigin | None, where: str) -> None:
-    """Refuse poses that lie where no drive of this map can be.
-
-    Raises:
-        DriveError: a coordinate is of no place on the earth, or far from the map's ``origin`` on it.
-    """
-    farthest_m = float(np.abs(trajectory.map_from_vehicle[:, :3, 3]).max())
-    if not farthest_m <= _FARTHEST_M:
-        raise DriveError(
-            f"{where}: a position is {farthest_m:.3g} m from zero, off the earth; mend the poses"
-        )
-    if origin is not None and farthest_m > _FARTHEST_FROM_ORIGIN_M:
-        raise DriveError(
-            f"{where}: the poses lie {farthest_m / 1e3:.0f} km from the map's origin, which is at latitude "
-            f"{origin.latitude_deg:.4f}, longitude {origin.longitude_deg:.4f}: are they coordinates of a "
-            "grid "
-            "such as UTM? Then say so under poses with crs, or give the origin that they count from"
-        )
+_UNITS: Mapping[str, float] = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
+_LONGEST_S, _QUICKEST_S = 5.0, 5e-4  # limits of the time between two poses, or images, of a drive
+_ALIKE = 5.0  # poses and images of one drive last equally long to within this factor
+_LATEST_S = 1e11  # stamps in s since 1970 stay below this for three thousand years
 
 
-def check_geodetic(geodetic: FloatArray, where: str) -> None:
-    """Refuse latitudes, longitudes (degrees) and heights (m) (N, 3) that are of no place near the ground.
-
-    Raises:
-        DriveError: names the first such position.
-    """
-    off = (np.abs(geodetic) > [90.0, 180.0, 1e5]).any(axis=1)
-    if off.any():
-        row = int(np.argmax(off))
-        latitude, longitude, height_m = geodetic[row]
-        raise DriveError(
-            f"{where}: position {row + 1}: latitude {latitude:g}, longitude {longitude:g}, height "
-            f"{height_m:g} m: "
-            "latitude must lie within +-90 and longitude within +-180 degrees; mend them"
-        )
+def pose_matrices(rotation: FloatArray, points: FloatArray) -> FloatArray:
+    """Poses (N, 4, 4) of rotations (N, 3, 3) and positions (N, 3)."""
+    poses = np.tile(np.eye(4), (len(points), 1, 1))
+    poses[:, :3, :3] = rotation
+    poses[:, :3, 3] = points
+    return poses
 
 
 def interpolate(
@@ -70,10 +43,9 @@ def interpolate(
 ) -> tuple[FloatArray, BoolArray]:
     """The poses at ``stamp_s`` (N,): position linear, rotation by slerp, never extrapolated.
 
-    Returns:
-        ``map_from_vehicle`` (N, 4, 4) and a flag per time. The flag is False, and the pose that of
-        the nearest recorded one, before the first pose, after the last and between two poses that
-        are more than ``max_gap_s`` apart; the time of a recorded pose itself is never in a gap.
+    Returns ``map_from_vehicle`` (N, 4, 4) and flags (N,). A flag is False, and the pose the nearest recorded
+    one, before the first pose, after the last, and in a gap longer than ``max_gap_s``; the time of a recorded
+    pose itself is never in a gap.
     """
     recorded = trajectory.stamp_s
     stamp_s = np.asarray(stamp_s, dtype=np.float64)
@@ -86,32 +58,48 @@ def interpolate(
     fraction = np.clip(np.where(inside, linear, np.round(linear)), 0.0, 1.0)
 
     first, second = trajectory.map_from_vehicle[before], trajectory.map_from_vehicle[after]
-    poses = np.tile(np.eye(4), (len(stamp_s), 1, 1))
-    poses[:, :3, 3] = first[:, :3, 3] + fraction[:, None] * (second[:, :3, 3] - first[:, :3, 3])
-    poses[:, :3, :3] = rotation_from_quaternion(
-        slerp(
-            quaternion_from_rotation(first[:, :3, :3]), quaternion_from_rotation(second[:, :3, :3]), fraction
+    points = first[:, :3, 3] + fraction[:, None] * (second[:, :3, 3] - first[:, :3, 3])
+    turns = [quaternion_from_rotation(poses[:, :3, :3]) for poses in (first, second)]
+    return pose_matrices(rotation_from_quaternion(slerp(*turns, fraction)), points), inside
+
+
+def check_trajectory(trajectory: Trajectory, origin: GeodeticOrigin | None, where: str) -> None:
+    """Refuse poses off the earth, or far from the map's ``origin`` on it."""
+    farthest_m = float(np.abs(trajectory.map_from_vehicle[:, :3, 3]).max())
+    if not farthest_m <= _FARTHEST_M:
+        raise DriveError(
+            f"{where}: a position is {farthest_m:.3g} m from zero, off the earth; mend the poses"
         )
-    )
-    return poses, inside
+    if origin is not None and farthest_m > _FARTHEST_FROM_ORIGIN_M:
+        raise DriveError(
+            f"{where}: the poses lie {farthest_m / 1e3:.0f} km from the map's origin, which is at latitude "
+            f"{origin.latitude_deg:.4f}, longitude {origin.longitude_deg:.4f}: are they coordinates of a "
+            "grid such as UTM? Then say so under poses with crs, or give the origin that they count from"
+        )
 
 
-_COLUMNS = "timestamp tx ty tz qx qy qz qw"
-_NORM_TOLERANCE = 1e-3  # files with four decimals pass, a forgotten component does not
+def check_geodetic(geodetic: FloatArray, where: str) -> None:
+    """Refuse latitudes, longitudes (degrees) and heights (m) (N, 3) that are not near the ground."""
+    off = (np.abs(geodetic) > [90.0, 180.0, 1e5]).any(axis=1)
+    if off.any():
+        row = int(np.argmax(off))
+        latitude, longitude, height_m = geodetic[row]
+        raise DriveError(
+            f"{where}: position {row + 1}: latitude {latitude:g}, longitude {longitude:g}, height "
+            f"{height_m:g} m: latitude must lie within +-90 and longitude within +-180 degrees; mend them"
+        )
 
 
 def read_tum(path: Path) -> Trajectory:
-    """Read the trajectory at ``path``: stamps in s, poses ``map_from_vehicle`` in m.
-
-    Raises:
-        DriveError: when the file is missing or empty, a line is not eight finite numbers, a
-            quaternion is not of unit norm, or the times are not strictly rising; with the line.
-    """
+    """Read the trajectory at ``path``: stamps in s, strictly rising, and poses ``map_from_vehicle`` in m."""
     numbers: list[int] = []
     rows: list[list[float]] = []
     for number, line in _content_lines(path):
+        where, parts = f"{path}: line {number}", line.replace(",", " ").split()
+        if len(parts) != 8:
+            raise DriveError(f"{where}: expected 8 columns '{_COLUMNS}', got {len(parts)}; mend that line")
         numbers.append(number)
-        rows.append(_parse_row(line, f"{path}: line {number}"))
+        rows.append([_parse_float(part, where) for part in parts])
     if not rows:
         raise DriveError(f"{path}: holds no pose; expected lines '{_COLUMNS}'")
     table = np.array(rows)
@@ -123,42 +111,33 @@ def read_tum(path: Path) -> Trajectory:
             f"{path}: line {numbers[wrong[0]]}: quaternion of norm {norm[wrong[0]]:.6g} instead of 1; "
             f"normalise it, order qx qy qz qw"
         )
-    poses = np.tile(np.eye(4), (len(table), 1, 1))
-    poses[:, :3, :3] = rotation_from_quaternion(table[:, 4:] / norm[:, None])
-    poses[:, :3, 3] = table[:, 1:4]
-    return Trajectory(stamp_s=table[:, 0], map_from_vehicle=poses)
+    return Trajectory(
+        table[:, 0], pose_matrices(rotation_from_quaternion(table[:, 4:] / norm[:, None]), table[:, 1:4])
+    )
 
 
 def write_tum(trajectory: Trajectory, path: Path) -> None:
     """Write ``trajectory`` to ``path`` with nanoseconds and nanometres, atomically."""
-    quaternion = quaternion_from_rotation(trajectory.map_from_vehicle[:, :3, :3])
+    poses = trajectory.map_from_vehicle
+    quaternion = quaternion_from_rotation(poses[:, :3, :3])
     lines = [f"# {_COLUMNS}"]
-    for stamp_s, position, xyzw in zip(
-        trajectory.stamp_s, trajectory.map_from_vehicle[:, :3, 3], quaternion, strict=True
-    ):
+    for stamp_s, position, xyzw in zip(trajectory.stamp_s, poses[:, :3, 3], quaternion, strict=True):
         values = " ".join([*(f"{value:.9f}" for value in position), *(f"{value:.12f}" for value in xyzw)])
         lines.append(f"{stamp_s:.9f} {values}")
     replace_text(path, "\n".join(lines) + "\n")
 
 
 def read_image_list(path: Path) -> tuple[FloatArray, list[str]]:
-    """Read ``timestamp filename`` lines: stamps (N,) in s, strictly rising, and the file names.
-
-    Raises:
-        DriveError: when the file is missing or empty, a line does not parse, or the times are not
-            strictly rising; with the line.
-    """
+    """Read ``timestamp filename`` lines: stamps (N,) in s, strictly rising, and the file names."""
     numbers: list[int] = []
     stamps: list[float] = []
     names: list[str] = []
     for number, line in _content_lines(path):
-        parts = line.split(maxsplit=1)
+        where, parts = f"{path}: line {number}", line.split(maxsplit=1)
         if len(parts) != 2:
-            raise DriveError(
-                f"{path}: line {number}: expected 'timestamp filename', got '{line}'; mend that line"
-            )
+            raise DriveError(f"{where}: expected 'timestamp filename', got '{line}'; mend that line")
         numbers.append(number)
-        stamps.append(_parse_float(parts[0], f"{path}: line {number}"))
+        stamps.append(_parse_float(parts[0], where))
         names.append(parts[1])
     if not names:
         raise DriveError(f"{path}: lists no image; expected lines 'timestamp filename'")
@@ -178,13 +157,6 @@ def _content_lines(path: Path) -> Iterator[tuple[int, str]]:
         line = raw.strip()
         if line and not line.startswith("#"):
             yield number, line
-
-
-def _parse_row(line: str, where: str) -> list[float]:
-    parts = line.replace(",", " ").split()
-    if len(parts) != 8:
-        raise DriveError(f"{where}: expected 8 columns '{_COLUMNS}', got {len(parts)}; mend that line")
-    return [_parse_float(part, where) for part in parts]
 
 
 def _parse_float(text: str, where: str) -> float:
@@ -208,15 +180,10 @@ def _check_rising(stamp_s: FloatArray, numbers: Sequence[int], path: Path) -> No
         )
 
 
-_LATE_S = 1.0
-"""A reading that comes later than this after its successor is of another clock or recording."""
-
-
 def in_order(stamp_s: FloatArray, where: str, what: str = "line") -> IntArray:
-    """Rows (K,) by time, of equal times the first.
+    """Rows (K,) by time, the first of equal times; refuses stamps a second or more behind an earlier one.
 
-    Raises:
-        DriveError: there is none, one is not finite, or one is a second or more behind an earlier one.
+    Recorders and networks swap neighbours; a longer way back in time is a second clock or recording.
     """
     if not len(stamp_s):
         raise DriveError(f"{where}: holds no pose; record some, or check what it is")
@@ -234,24 +201,6 @@ def in_order(stamp_s: FloatArray, where: str, what: str = "line") -> IntArray:
     return np.unique(stamp_s, return_index=True)[1]
 
 
-_UNITS: Mapping[str, float] = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
-
-UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
-"""Units of times as files name them, and how many of each make a second."""
-
-_LONGEST_S = 5.0
-"""Poses and images of a drive are never recorded more seldom than this."""
-
-_QUICKEST_S = 5e-4
-"""Nor more often."""
-
-_ALIKE = 5.0
-"""Poses and images of one drive last equally long to within this factor."""
-
-_LATEST_S = 1e11
-"""Seconds since 1970 stay below this for three thousand years; larger stamps are in a smaller unit."""
-
-
 def why_no_pose(
     image_stamp_s: FloatArray,
     pose_stamp_s: FloatArray,
@@ -259,22 +208,14 @@ def why_no_pose(
     asking: str = "images",
     asked: str = "poses",
 ) -> str:
-    """The likely reason, and the remedy, that no image has a pose.
+    """The likely cause, and its remedy, why no image (N,) finds a pose (P,): units, epochs, or gaps.
 
-    Args:
-        image_stamp_s: (N,) as they were read.
-        pose_stamp_s: (P,) as they were read.
-        max_gap_s: poses further apart are not interpolated across.
-        asking: what is called images here.
-        asked: what is called poses here.
+    ``asking`` and ``asked`` are the words for images and poses.
     """
     images, poses = unit_of(image_stamp_s), unit_of(pose_stamp_s)
-    if images is not None and images == poses:
-        return f"all stamps are in {images}: divide them by {_UNITS[images]:g} to give seconds"
-    if images is not None:
-        return f"the {asking}' stamps are in {images}: divide them by {_UNITS[images]:g} to give seconds"
-    if poses is not None:
-        return f"the {asked}' stamps are in {poses}: divide them by {_UNITS[poses]:g} to give seconds"
+    if unit := images or poses:
+        whose = "all stamps" if images == poses else f"the {asking if images else asked}' stamps"
+        return f"{whose} are in {unit}: divide them by {_UNITS[unit]:g} to give seconds"
     for unit, scale in _UNITS.items():
         ratio = np.ptp(image_stamp_s) / max(np.ptp(pose_stamp_s), 1e-9)
         for longer, size in ((asking, ratio), (asked, 1 / max(ratio, 1e-12))):
@@ -285,8 +226,7 @@ def why_no_pose(
         when = "later" if offset_s > 0 else "earlier"
         return (
             f"the {asked} begin {abs(offset_s):.0f} s {when} than the {asking}: one of them is of another "
-            "drive, "
-            "or counts from another epoch (GPS time, time since start); put both on one clock"
+            "drive, or counts from another epoch (GPS time, time since start); put both on one clock"
         )
     apart_s = float(np.median(np.diff(pose_stamp_s))) if len(pose_stamp_s) > 1 else np.inf
     return (
@@ -296,7 +236,7 @@ def why_no_pose(
 
 
 def unit_of(stamp_s: FloatArray) -> str | None:
-    """The unit that stamps (N,) are in if they cannot be seconds, None where they can."""
+    """The unit of stamps (N,) that cannot be seconds, None where they can."""
     apart = float(np.median(np.diff(stamp_s))) if len(stamp_s) > 1 else 0.0
     if apart <= _LONGEST_S and stamp_s[-1] < _LATEST_S:
         return None

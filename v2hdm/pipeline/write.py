@@ -14,8 +14,7 @@ from v2hdm.detection.batch import read_image
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import facing_ipm, flat_motion, pinhole_px_from_ground
 from v2hdm.geometry.rigid import inverse
-from v2hdm.io.calibration.document import Provenance, write_calibration
-from v2hdm.io.calibration.formats import CALIBRATION_FORMATS, write_calibration_as
+from v2hdm.io.calibration import CALIBRATION_FORMATS, Provenance, write_calibration, write_calibration_as
 from v2hdm.io.maps.evidence import FILE as RESIDUALS
 from v2hdm.io.maps.evidence import ExcludedMarking, write_exclusions, write_residuals
 from v2hdm.io.maps.features import with_heights

@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 
 from v2hdm.geometry.ipm import ipm_from_extrinsic, project_ground
-from v2hdm.io.calibration.document import write_calibration
-from v2hdm.io.drive import Trajectory, write_drive
+from v2hdm.io.calibration import write_calibration
+from v2hdm.io.drive import Trajectory
+from v2hdm.io.drive.writing import write_drive
 from v2hdm.io.maps.evidence import ExcludedMarking, Residuals, write_exclusions, write_residuals
 from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.trajectory import write_tum

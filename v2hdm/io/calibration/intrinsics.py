@@ -1,18 +1,6 @@
-"""A calibration file as its text and, where it is YAML, JSON or XML, as entries.
+"""Intrinsics of a camera from the files of the tools that calibrate: one registry of formats.
 
-What the readers of intrinsics share: the lens by its coefficients, the matrix by its four numbers.
-
-COLMAP: ``cameras.txt``, a line a camera: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[].
-
-COLMAP counts pixels from the corner of the image: the centre of the first is at (0.5, 0.5).
-
-Kalibr: ``camchain.yaml``, a camera under each of cam0, cam1, ...
-
-OpenCV: what its calibration programs write through ``cv2.FileStorage``, as YAML, JSON or XML.
-
-Our own ``calibration_<camera>.yaml``, for its intrinsics.
-
-ROS: ``camera_info`` files, and messages as ``ros2 topic echo`` writes them.
+COLMAP counts pixels from the corner of the image: the centre of the first one is at (0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -28,13 +16,30 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError, MapFileError
-from v2hdm.io.calibration.camera_info import take_camera_info, take_matrix
-from v2hdm.io.calibration.document import read_calibration
-from v2hdm.io.importers.bag.streams import info_of
+from v2hdm.io.calibration.reading import info_of, read_calibration, take_camera_info, take_matrix
 from v2hdm.io.safe.fields import check_camera, take_size_px
 from v2hdm.io.safe.texts import parse_json, parse_yaml, read_text
 from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo, FloatArray
 from v2hdm.store.files import take_array, take_text
+
+_XML = re.compile(r"<[?!\w]")  # YAML may begin with ``<<``
+_END_OF_MESSAGE = re.compile(r"\n---\s*$")  # ``ros2 topic echo`` ends with a second, empty document
+_BROWN_CONRADY = {
+    4: "plumb_bob",
+    5: "plumb_bob",
+    8: "rational_polynomial",
+}  # by OpenCV's number of coefficients
+_BEYOND = {
+    14: (12, "tilted sensor"),
+    12: (8, "thin prism"),
+}  # lenses of OpenCV, unless all further ones are zero
+_COLMAP_LINE = re.compile(r"^\d+\s+[A-Z][A-Z0-9_]+\s+\d+\s+\d+(\s|$)")
+_KALIBR_KEYS = ("camera_model", "intrinsics", "distortion_model", "resolution")
+_KALIBR_PROJECTIONS = {
+    "omni": "omnidirectional (omni)", "ds": "double sphere (ds)", "eucm": "extended unified (eucm)",
+}  # fmt: skip
+
+_Lens = tuple[str, tuple[float, ...]]
 
 
 @dataclass(frozen=True)
@@ -45,43 +50,74 @@ class Document:
     text: str
     entries: dict[str, Any]
 
+    @property
+    def lower(self) -> dict[str, Any]:
+        """The entries by their names in small letters: OpenCV 2 wrote Camera_Matrix and image_Width."""
+        return {str(key).lower(): value for key, value in self.entries.items()}
 
-_XML = re.compile(r"<[?!\w]")
-"""How XML begins; YAML may begin with ``<<``."""
-
-_END_OF_MESSAGE = re.compile(r"\n---\s*$")
-"""What ``ros2 topic echo`` writes ends with a second, empty document."""
+    def only_camera(self) -> list[str]:
+        """The name of its camera, the file's where it names none."""
+        return [str(self.entries.get("camera_name", self.path.stem))]
 
 
-def read_document(path: Path) -> Document:
-    """Read the file at ``path``.
+@dataclass(frozen=True)
+class IntrinsicsFormat:
+    """One format: ``accepts`` a file by a look at it, ``names`` its cameras, ``read`` one of them."""
+
+    accepts: Callable[[Document], bool]
+    names: Callable[[Document], list[str]]
+    read: Callable[[Document, str], CameraInfo]
+
+
+def read_intrinsics(path: Path, camera: str | None = None, name_by: str = "its name") -> CameraInfo:
+    """The intrinsics of one camera, from a file of any format of :data:`INTRINSICS`.
+
+    Args:
+        path: the file.
+        camera: which of its cameras; needed where it holds several.
+        name_by: how the user names it, for errors.
 
     Raises:
-        DriveError: it is missing, no text, or damaged.
+        DriveError: the file is missing, damaged or of no known format, the camera is not in it or not named
+            among several, or its lens is beyond ours.
     """
+    if path.suffix.lower() == ".bin":
+        raise DriveError(
+            f"{path}: is binary; write COLMAP's model as text (model_converter --output_type TXT)"
+        )
+    document = _read_document(path)
+    chosen = next((one for one in INTRINSICS.values() if one.accepts(document)), None)
+    if chosen is None:
+        raise DriveError(f"{path}: no intrinsics of a known format ({', '.join(INTRINSICS)}) in this file")
+    names = chosen.names(document)
+    if camera is None and len(names) > 1:
+        raise DriveError(f"{path}: holds the cameras {', '.join(names)}; name one by {name_by}")
+    if camera is not None and camera not in names:
+        raise DriveError(f"{path}: no camera '{camera}' in this file; it holds: {', '.join(names)}")
+    return chosen.read(document, names[0] if camera is None else camera)
+
+
+def is_calibration(path: Path) -> bool:
+    """Whether the file is a calibration of ours, which says where the camera sits, too."""
+    return _is_own(_read_document(path))
+
+
+def _read_document(path: Path) -> Document:
     if path.is_dir():
         raise DriveError(f"{path}: is a folder; name the calibration file in it")
     text = read_text(path, DriveError)
     start = text.lstrip("\ufeff \t\r\n")
+    content: object = {}
     if _XML.match(start):
-        return Document(path, text, _of_xml(path, start))
-    if start.startswith("{"):
-        return Document(path, text, _of_json(path, start))
-    if path.suffix.lower() == ".txt" or not start:
-        return Document(path, text, {})
-    return Document(path, text, _of_yaml(path, start))
-
-
-def _of_yaml(path: Path, text: str) -> dict[str, Any]:
-    # OpenCV 4 begins its files with a directive that YAML 1.1 refuses; its tag says no more than the keys.
-    plain = text.removeprefix("%YAML:1.0").replace("!!opencv-matrix", "")
-    content = parse_yaml(_END_OF_MESSAGE.sub("\n", plain), str(path), DriveError)
-    return content if isinstance(content, dict) else {}
-
-
-def _of_json(path: Path, text: str) -> dict[str, Any]:
-    content = parse_json(text, str(path), DriveError)
-    return content if isinstance(content, dict) else {}
+        content = _of_xml(path, start)
+    elif start.startswith("{"):
+        content = parse_json(start, str(path), DriveError)
+    elif path.suffix.lower() != ".txt" and start:
+        # OpenCV 4 begins its files with a directive that YAML 1.1 refuses; its tag says no more than the
+        # keys.
+        plain = start.removeprefix("%YAML:1.0").replace("!!opencv-matrix", "")
+        content = parse_yaml(_END_OF_MESSAGE.sub("\n", plain), str(path), DriveError)
+    return Document(path, text, content if isinstance(content, dict) else {})
 
 
 def _of_xml(path: Path, text: str) -> dict[str, Any]:
@@ -113,124 +149,96 @@ def _scalar(text: str | None) -> object:
         return words.strip('"')
 
 
-BROWN_CONRADY = {4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial"}
-"""OpenCV's lens models by their number of coefficients."""
-
-
-def brown_conrady(coefficients: Sequence[float], where: str) -> tuple[str, tuple[float, ...]]:
-    """Our model for OpenCV's coefficients k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]].
-
-    Raises:
-        DriveError: a thin prism or a tilted sensor, or another number of coefficients.
-    """
-    values = list(coefficients)
-    for count, lens in ((14, "tilted sensor"), (12, "thin prism")):
-        first = {14: 12, 12: 8}[count]
-        if len(values) != count:
-            continue
+def _brown_conrady(coefficients: Sequence[float], where: str) -> _Lens:
+    """Our model for OpenCV's coefficients k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]]."""
+    values = list(coefficients) or [0.0] * 5
+    while len(values) in _BEYOND:
+        count = len(values)
+        first, lens = _BEYOND[count]
         if any(values[first:]):
             raise DriveError(
                 f"{where}: a {lens} ({count} coefficients) is beyond our lens models; calibrate again with "
                 "5 or 8 coefficients"
             )
         values = values[:first]
-    if not values:
-        values = [0.0] * 5
-    if len(values) not in BROWN_CONRADY:
+    if len(values) not in _BROWN_CONRADY:
         raise DriveError(f"{where}: {len(values)} distortion coefficients; expected 4, 5 or 8")
-    model = BROWN_CONRADY[len(values)]
-    return model, complete(model, values)
+    return _complete(_BROWN_CONRADY[len(values)], values)
 
 
-def complete(model: str, coefficients: Sequence[float]) -> tuple[float, ...]:
-    """All coefficients of ``model``; those that are not given are zero."""
+def _complete(model: str, coefficients: Sequence[float]) -> _Lens:
+    """A lens whose further coefficients are zero."""
     missing = DISTORTION_COEFFICIENTS[model] - len(coefficients)
-    return (*map(float, coefficients), *(0.0,) * missing)
+    return model, (*map(float, coefficients), *(0.0,) * missing)
 
 
-def matrix(fx: float, fy: float, cx: float, cy: float) -> FloatArray:
-    """K (3, 3) of focal lengths and principal point, px."""
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-
-def checked(info: CameraInfo, where: str) -> CameraInfo:
-    """``info`` itself.
-
-    Raises:
-        DriveError: its matrix is none, or its lens cannot be undone within the image.
-    """
+def _camera(
+    name: str, size: Sequence[object], size_at: Sequence[str], matrix: FloatArray, lens: _Lens, where: str
+) -> CameraInfo:
+    """The checked camera; ``size_at`` names width and height in errors."""
+    width, height = (take_size_px(one, at, DriveError) for one, at in zip(size, size_at, strict=True))
+    info = CameraInfo(name, width, height, matrix, *lens)
     check_camera(info, where, DriveError)
     return info
 
 
-_CORNER_PX = 0.5
-"""COLMAP's coordinate of the first pixel's centre, which is 0 with us."""
-
-_LINE = re.compile(r"^\d+\s+[A-Z][A-Z0-9_]+\s+\d+\s+\d+(\s|$)")
+def _matrix(fx: float, fy: float, cx: float, cy: float) -> FloatArray:
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
-class _Model:
-    """A lens model of COLMAP's.
-
-    Attributes:
-        focals: number of focal lengths, before the principal point.
-        coefficients: number of coefficients, after it.
-        lens: our model and its coefficients.
-    """
+class _ColmapModel:
+    """A model of COLMAP's: its numbers of focal lengths and coefficients, and the lens of ours that it is."""
 
     focals: int
     coefficients: int
-    lens: Callable[[Sequence[float]], tuple[str, tuple[float, ...]]]
+    lens: Callable[[Sequence[float]], _Lens]
 
 
-def _polynomial(coefficients: Sequence[float]) -> tuple[str, tuple[float, ...]]:
-    """Radial coefficients, of which the first two come before the tangential ones of OpenCV."""
-    return "plumb_bob", complete("plumb_bob", coefficients)
+def _radial(coefficients: Sequence[float]) -> _Lens:
+    return _complete("plumb_bob", coefficients)
 
 
-def _opencv(coefficients: Sequence[float]) -> tuple[str, tuple[float, ...]]:
-    return brown_conrady(coefficients, "COLMAP")
+def _opencv_lens(coefficients: Sequence[float]) -> _Lens:
+    return _brown_conrady(coefficients, "COLMAP")
 
 
-def _equidistant(coefficients: Sequence[float]) -> tuple[str, tuple[float, ...]]:
-    return "equidistant", complete("equidistant", coefficients)
+def _equidistant(coefficients: Sequence[float]) -> _Lens:
+    return _complete("equidistant", coefficients)
 
 
-COLMAP_MODELS: Mapping[str, _Model] = {
-    "SIMPLE_PINHOLE": _Model(1, 0, _polynomial),
-    "PINHOLE": _Model(2, 0, _polynomial),
-    "SIMPLE_RADIAL": _Model(1, 1, _polynomial),
-    "RADIAL": _Model(1, 2, _polynomial),
-    "OPENCV": _Model(2, 4, _opencv),
-    "FULL_OPENCV": _Model(2, 8, _opencv),
-    "OPENCV_FISHEYE": _Model(2, 4, _equidistant),
-    "SIMPLE_RADIAL_FISHEYE": _Model(1, 1, _equidistant),
-    "RADIAL_FISHEYE": _Model(1, 2, _equidistant),
+COLMAP_MODELS: Mapping[str, _ColmapModel] = {
+    "SIMPLE_PINHOLE": _ColmapModel(1, 0, _radial),
+    "PINHOLE": _ColmapModel(2, 0, _radial),
+    "SIMPLE_RADIAL": _ColmapModel(1, 1, _radial),
+    "RADIAL": _ColmapModel(1, 2, _radial),
+    "OPENCV": _ColmapModel(2, 4, _opencv_lens),
+    "FULL_OPENCV": _ColmapModel(2, 8, _opencv_lens),
+    "OPENCV_FISHEYE": _ColmapModel(2, 4, _equidistant),
+    "SIMPLE_RADIAL_FISHEYE": _ColmapModel(1, 1, _equidistant),
+    "RADIAL_FISHEYE": _ColmapModel(1, 2, _equidistant),
 }
 """COLMAP's models that are lenses of ours."""
 
 
-def is_colmap(document: Document) -> bool:
-    """Whether the first line with data is that of a camera."""
-    lines = _lines(document)
-    return bool(lines) and bool(_LINE.match(lines[0][1]))
+def _colmap_lines(document: Document) -> list[tuple[int, str]]:
+    lines = ((number, line.strip()) for number, line in enumerate(document.text.splitlines(), 1))
+    return [(number, line) for number, line in lines if line and not line.startswith("#")]
 
 
-def colmap_names(document: Document) -> list[str]:
-    """The cameras by their numbers."""
-    return [line.split()[0] for _, line in _lines(document)]
+def _is_colmap(document: Document) -> bool:
+    lines = _colmap_lines(document)
+    return bool(lines) and bool(_COLMAP_LINE.match(lines[0][1]))
 
 
-def read_colmap(document: Document, name: str) -> CameraInfo:
-    """The intrinsics of the camera of the number ``name``.
+def _colmap_names(document: Document) -> list[str]:
+    return [line.split()[0] for _, line in _colmap_lines(document)]
 
-    Raises:
-        DriveError: its line is damaged, or its lens none of ours.
-    """
-    number, line = next(one for one in _lines(document) if one[1].split()[0] == name)
+
+def _read_colmap(document: Document, name: str) -> CameraInfo:
+    number, line = next(one for one in _colmap_lines(document) if one[1].split()[0] == name)
     where = f"{document.path}: line {number}"
-    if not _LINE.match(line):
+    if not _COLMAP_LINE.match(line):
         raise DriveError(f"{where}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS; restore the file")
     _, kind, width, height, *words = line.split()
     model = COLMAP_MODELS.get(kind)
@@ -246,40 +254,18 @@ def read_colmap(document: Document, name: str) -> CameraInfo:
     expected = model.focals + 2 + model.coefficients
     if len(values) != expected or not np.isfinite(values).all():
         raise DriveError(f"{where}: {kind} has {expected} parameters; restore the file")
-    fx, fy = values[0], values[model.focals - 1]
-    cx, cy = values[model.focals : model.focals + 2] - _CORNER_PX
-    return checked(
-        CameraInfo(
-            name,
-            take_size_px(int(width), f"{where}: WIDTH", DriveError),
-            take_size_px(int(height), f"{where}: HEIGHT", DriveError),
-            matrix(fx, fy, cx, cy),
-            *model.lens(values[model.focals + 2 :].tolist()),
-        ),
+    cx, cy = values[model.focals : model.focals + 2] - 0.5
+    return _camera(
+        name,
+        (int(width), int(height)),
+        (f"{where}: WIDTH", f"{where}: HEIGHT"),
+        _matrix(values[0], values[model.focals - 1], cx, cy),
+        model.lens(values[model.focals + 2 :].tolist()),
         where,
     )
 
 
-def _lines(document: Document) -> list[tuple[int, str]]:
-    """The lines with data, by their numbers."""
-    lines = ((number, line.strip()) for number, line in enumerate(document.text.splitlines(), 1))
-    return [(number, line) for number, line in lines if line and not line.startswith("#")]
-
-
-_MODELS = {"omni": "omnidirectional (omni)", "ds": "double sphere (ds)", "eucm": "extended unified (eucm)"}
-"""Projections of Kalibr's that are none of ours."""
-
-_EQUIDISTANT = ("equidistant", "equi")
-_NEEDED = ("camera_model", "intrinsics", "distortion_model", "resolution")
-
-
-def is_kalibr(document: Document) -> bool:
-    """Whether some entry at the top of the file is a camera of Kalibr's."""
-    return bool(kalibr_names(document))
-
-
-def kalibr_names(document: Document) -> list[str]:
-    """The cameras of the chain."""
+def _kalibr_names(document: Document) -> list[str]:
     return [
         str(name)
         for name, entry in document.entries.items()
@@ -287,62 +273,43 @@ def kalibr_names(document: Document) -> list[str]:
     ]
 
 
-def read_kalibr(document: Document, name: str) -> CameraInfo:
-    """The intrinsics of one camera of the chain.
-
-    Raises:
-        DriveError: an entry is missing or damaged, or the lens is none of ours.
-    """
+def _read_kalibr(document: Document, name: str) -> CameraInfo:
     where, entry = f"{document.path}: {name}", document.entries[name]
-    for key in _NEEDED:
+    for key in _KALIBR_KEYS:
         if key not in entry:
             raise DriveError(f"{where}: missing key '{key}'; take the camchain that Kalibr wrote")
     projection = take_text(entry["camera_model"], f"{where}, camera_model", DriveError)
     if projection != "pinhole":
         raise DriveError(
-            f"{where}: its lens is {_MODELS.get(projection, repr(projection))}, which is beyond our models; "
-            "calibrate with pinhole-radtan or pinhole-equi"
+            f"{where}: its lens is {_KALIBR_PROJECTIONS.get(projection, repr(projection))}, which is beyond "
+            "our models; calibrate with pinhole-radtan or pinhole-equi"
         )
     model = take_text(entry["distortion_model"], f"{where}, distortion_model", DriveError)
-    given = entry.get("distortion_coeffs")
-    values: list[float] = []
-    if given not in (None, []):
-        values = take_array(given, (-1,), f"{where}, distortion_coeffs", DriveError).tolist()
-    if model in _EQUIDISTANT:
+    given, at = entry.get("distortion_coeffs"), f"{where}, distortion_coeffs"
+    values = [] if given in (None, []) else take_array(given, (-1,), at, DriveError).tolist()
+    if model in ("equidistant", "equi"):
         if len(values) != 4:
-            raise DriveError(f"{where}, distortion_coeffs: {model} has 4 coefficients, got {len(values)}")
-        lens = ("equidistant", complete("equidistant", values))
+            raise DriveError(f"{at}: {model} has 4 coefficients, got {len(values)}")
+        lens = _equidistant(values)
     elif model in ("radtan", "none"):
-        lens = brown_conrady([] if model == "none" else values, f"{where}, distortion_coeffs")
+        lens = _brown_conrady([] if model == "none" else values, at)
     else:
         raise DriveError(
             f"{where}: its lens is '{model}', which is beyond our models; calibrate with pinhole-radtan or "
             "pinhole-equi"
         )
-    size = take_array(entry["resolution"], (2,), f"{where}, resolution", DriveError)
-    width, height = (take_size_px(value, f"{where}, resolution", DriveError) for value in size.tolist())
+    size = take_array(entry["resolution"], (2,), f"{where}, resolution", DriveError).tolist()
     numbers = take_array(entry["intrinsics"], (4,), f"{where}, intrinsics", DriveError)
-    return checked(CameraInfo(name, width, height, matrix(*numbers.tolist()), *lens), where)
+    return _camera(name, size, [f"{where}, resolution"] * 2, _matrix(*numbers.tolist()), lens, where)
 
 
-def is_opencv(document: Document) -> bool:
-    """Whether the camera matrix in the file is one of OpenCV's."""
-    entry = _lower(document).get("camera_matrix")
+def _is_opencv(document: Document) -> bool:
+    entry = document.lower.get("camera_matrix")
     return isinstance(entry, dict) and "dt" in entry
 
 
-def opencv_names(document: Document) -> list[str]:
-    """Its only camera; OpenCV names none, so that the file's name is taken."""
-    return [str(document.entries.get("camera_name", document.path.stem))]
-
-
-def read_opencv(document: Document, name: str) -> CameraInfo:
-    """The intrinsics in the file.
-
-    Raises:
-        DriveError: an entry is missing or damaged, or the lens is none of ours.
-    """
-    where, entries = str(document.path), _lower(document)
+def _read_opencv(document: Document, name: str) -> CameraInfo:
+    where, entries = str(document.path), document.lower
     if "xi" in entries:
         raise DriveError(
             f"{where}: its lens is omnidirectional (xi), which is beyond our models; calibrate with "
@@ -352,7 +319,8 @@ def read_opencv(document: Document, name: str) -> CameraInfo:
         raise DriveError(
             f"{where}: missing key 'distortion_coefficients'; add it, zeros for a pinhole camera"
         )
-    for key in ("image_width", "image_height"):
+    sides = ("image_width", "image_height")
+    for key in sides:
         if key not in entries:
             raise DriveError(f"{where}: missing key '{key}'; add the size of the images it was made from")
     intrinsic = take_matrix(entries["camera_matrix"], f"{where}: camera_matrix")
@@ -365,32 +333,18 @@ def read_opencv(document: Document, name: str) -> CameraInfo:
             raise DriveError(
                 f"{at}: OpenCV's fisheye has 4 coefficients, got {len(values)}; restore the file"
             )
-        lens = ("equidistant", complete("equidistant", values))
+        lens = _equidistant(values)
     else:
-        lens = brown_conrady(values, at)
-    width, height = (
-        take_size_px(entries[key], f"{where}: {key}", DriveError) for key in ("image_width", "image_height")
-    )
-    return checked(CameraInfo(name, width, height, intrinsic, *lens), where)
+        lens = _brown_conrady(values, at)
+    size = [entries[key] for key in sides]
+    return _camera(name, size, [f"{where}: {key}" for key in sides], intrinsic, lens, where)
 
 
-def _lower(document: Document) -> dict[str, Any]:
-    """The entries by their names in small letters: OpenCV 2 wrote Camera_Matrix and image_Width."""
-    return {str(key).lower(): value for key, value in document.entries.items()}
-
-
-def is_own(document: Document) -> bool:
-    """Whether the file is one that :func:`v2hdm.io.maps.write_calibration` wrote."""
+def _is_own(document: Document) -> bool:
     return isinstance(document.entries.get("camera_matrix"), list)
 
 
-def names_of_own(document: Document) -> list[str]:
-    """Its only camera."""
-    return [str(document.entries.get("camera_name", document.path.stem))]
-
-
-def read_own(document: Document, name: str) -> CameraInfo:
-    """The intrinsics of our calibration."""
+def _read_own(document: Document, name: str) -> CameraInfo:
     try:
         info = read_calibration(document.path).info
     except MapFileError as error:
@@ -403,108 +357,51 @@ def read_own(document: Document, name: str) -> CameraInfo:
     return info
 
 
-def is_message(document: Document) -> bool:
-    """Whether the file holds a ``CameraInfo`` message."""
+def _is_message(document: Document) -> bool:
     return {"height", "width", "distortion_model"} <= set(document.entries)
 
 
-def names_of_message(document: Document) -> list[str]:
+def _message_names(document: Document) -> list[str]:
     """Its only camera, by the frame of its header."""
     header = document.entries.get("header")
     frame = header.get("frame_id") if isinstance(header, dict) else None
     return [str(frame or document.path.stem)]
 
 
-def read_message(document: Document, name: str) -> CameraInfo:
-    """The intrinsics of a ``CameraInfo`` message."""
-    where, content = str(document.path), document.entries
-    lower = {key.lower(): value for key, value in content.items() if isinstance(key, str)}
+def _read_message(document: Document, name: str) -> CameraInfo:
+    where, entries = str(document.path), document.lower
     for key in ("k", "d"):
-        if key not in lower:
+        if key not in entries:
             raise DriveError(f"{where}: missing key '{key}'; write the message to the file again")
-    region = lower.get("roi")
+    region = entries.get("roi")
+    region = region if isinstance(region, dict) else {}
     fields = SimpleNamespace(
-        k=take_array(lower["k"], (9,), f"{where}: k", DriveError),
-        d=take_array(lower["d"], (-1,), f"{where}: d", DriveError) if lower["d"] else np.empty(0),
-        distortion_model=take_text(lower["distortion_model"], f"{where}: distortion_model", DriveError),
-        width=take_size_px(lower["width"], f"{where}: width", DriveError),
-        height=take_size_px(lower["height"], f"{where}: height", DriveError),
-        binning_x=lower.get("binning_x") or 0,
-        binning_y=lower.get("binning_y") or 0,
-        roi=SimpleNamespace(
-            **{key: region.get(key, 0) if isinstance(region, dict) else 0 for key in ("width", "height")}
-        ),
+        k=take_array(entries["k"], (9,), f"{where}: k", DriveError),
+        d=take_array(entries["d"], (-1,), f"{where}: d", DriveError) if entries["d"] else np.empty(0),
+        distortion_model=take_text(entries["distortion_model"], f"{where}: distortion_model", DriveError),
+        width=take_size_px(entries["width"], f"{where}: width", DriveError),
+        height=take_size_px(entries["height"], f"{where}: height", DriveError),
+        binning_x=entries.get("binning_x") or 0,
+        binning_y=entries.get("binning_y") or 0,
+        roi=SimpleNamespace(width=region.get("width", 0), height=region.get("height", 0)),
     )
     return info_of(fields, name, where)
 
 
-def is_camera_info(document: Document) -> bool:
-    """Whether the file is one of ``camera_calibration_parsers``."""
+def _is_camera_info(document: Document) -> bool:
     return bool({"camera_name", "distortion_model", "camera_matrix"} & set(document.entries))
 
 
-def names_of_camera_info(document: Document) -> list[str]:
-    """Its only camera."""
-    return [str(document.entries.get("camera_name", document.path.stem))]
-
-
-def read_camera_info_file(document: Document, name: str) -> CameraInfo:
-    """The intrinsics of a ``camera_info`` file."""
+def _read_camera_info(document: Document, name: str) -> CameraInfo:
     return take_camera_info(document.entries, str(document.path))
 
 
-@dataclass(frozen=True)
-class IntrinsicsFormat:
-    """One format: ``accepts`` a file by a look at it, ``names`` its cameras, ``read`` one of them."""
-
-    accepts: Callable[[Document], bool]
-    names: Callable[[Document], list[str]]
-    read: Callable[[Document, str], CameraInfo]
-
-
 INTRINSICS: Mapping[str, IntrinsicsFormat] = {
-    "COLMAP cameras.txt": IntrinsicsFormat(is_colmap, colmap_names, read_colmap),
-    "Kalibr camchain": IntrinsicsFormat(is_kalibr, kalibr_names, read_kalibr),
-    "V2HDM calibration": IntrinsicsFormat(is_own, names_of_own, read_own),
-    "OpenCV": IntrinsicsFormat(is_opencv, opencv_names, read_opencv),
-    "ROS CameraInfo message": IntrinsicsFormat(is_message, names_of_message, read_message),
-    "ROS camera_info": IntrinsicsFormat(is_camera_info, names_of_camera_info, read_camera_info_file),
+    "COLMAP cameras.txt": IntrinsicsFormat(_is_colmap, _colmap_names, _read_colmap),
+    "Kalibr camchain": IntrinsicsFormat(lambda one: bool(_kalibr_names(one)), _kalibr_names, _read_kalibr),
+    "V2HDM calibration": IntrinsicsFormat(_is_own, Document.only_camera, _read_own),
+    "OpenCV": IntrinsicsFormat(_is_opencv, Document.only_camera, _read_opencv),
+    "ROS CameraInfo message": IntrinsicsFormat(_is_message, _message_names, _read_message),
+    "ROS camera_info": IntrinsicsFormat(_is_camera_info, Document.only_camera, _read_camera_info),
 }
 """The formats, by name; the first that accepts a file reads it."""
-
-
-def read_intrinsics(path: Path, camera: str | None = None, name_by: str = "its name") -> CameraInfo:
-    """The intrinsics of one camera, from a file of any format of :data:`INTRINSICS`.
-
-    Args:
-        path: the file.
-        camera: which of its cameras; needed where it holds several.
-        name_by: how the user names it, for errors.
-
-    Raises:
-        DriveError: the file is missing, damaged or of no known format, the camera is not in it or is not
-            named among several, or its lens is beyond ours.
-    """
-    if path.suffix.lower() == ".bin":
-        raise DriveError(
-            f"{path}: is binary; write COLMAP's model as text (model_converter --output_type TXT)"
-        )
-    document = read_document(path)
-    chosen = next((one for one in INTRINSICS.values() if one.accepts(document)), None)
-    if chosen is None:
-        raise DriveError(f"{path}: no intrinsics of a known format ({', '.join(INTRINSICS)}) in this file")
-    names = chosen.names(document)
-    if camera is None and len(names) > 1:
-        raise DriveError(f"{path}: holds the cameras {', '.join(names)}; name one by {name_by}")
-    if camera is not None and camera not in names:
-        raise DriveError(f"{path}: no camera '{camera}' in this file; it holds: {', '.join(names)}")
-    return chosen.read(document, names[0] if camera is None else camera)
-
-
-def is_calibration(path: Path) -> bool:
-    """Whether the file is a calibration of ours, which says where the camera sits, too.
-
-    Raises:
-        DriveError: the file is missing or damaged.
-    """
-    return is_own(read_document(path))

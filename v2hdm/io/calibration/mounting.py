@@ -1,8 +1,6 @@
-"""What is roughly known of a camera's mounting: IPM matrices or an extrinsic guess, ROI, survey."""
+"""First guesses of a camera's mounting: IPM matrices or an extrinsic, region of interest, survey."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 
@@ -11,28 +9,19 @@ from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.io.safe.fields import recorded_distance
 from v2hdm.records import BoolArray, CameraInfo, CentrePrior, FloatArray
-from v2hdm.store.files import take_array, take_mapping, take_text
+from v2hdm.store.files import check_keys, take_array, take_mapping, take_text
 
 IPM_NAMES = ("calibrated", "estimated")
 
 _SINGULAR = 1e-12  # reciprocal condition number, rows and columns scaled to unit norm
 _ROTATION_TOLERANCE = 1e-4
-_ROI_SAMPLES = 8
-"""Points along each edge of a region of interest that are looked for in the image."""
-
-_ROI_M = (2.0, 20.0)
-"""Ground in front of a camera that a map is made of where nobody says: from, and to, m."""
-
-_ROI_HALF_WIDTH_M = 5.0
+_ROI_SAMPLES = 8  # points along each edge of a region of interest that are looked for in the image
+_ROI_M, _ROI_HALF_WIDTH_M = (2.0, 20.0), 5.0  # default region of interest, ahead of a camera: from, to
 _STEEPEST_RAY = 0.999
 
 
 def take_ipm(content: object, where: str) -> FloatArray:
-    """An invertible 3 x 3 homography ``vehicle_from_pinhole_px``, scaled to unit norm.
-
-    Raises:
-        DriveError: when it is shaped otherwise or not invertible.
-    """
+    """An invertible 3 x 3 homography ``vehicle_from_pinhole_px``, scaled to unit norm."""
     ipm = take_array(content, (3, 3), where, DriveError)
     rows, columns = np.linalg.norm(ipm, axis=1, keepdims=True), np.linalg.norm(ipm, axis=0)
     if not rows.all() or not columns.all() or 1.0 / np.linalg.cond(_balanced(ipm)) < _SINGULAR:
@@ -43,11 +32,7 @@ def take_ipm(content: object, where: str) -> FloatArray:
 
 
 def ipm_from_guess(info: CameraInfo, cam_from_vehicle: object, where: str) -> FloatArray:
-    """The IPM of a camera at the guessed ``cam_from_vehicle`` (4 x 4).
-
-    Raises:
-        DriveError: when the guess is no rigid transform or puts the camera on the ground.
-    """
+    """The IPM of a camera at the guessed rigid ``cam_from_vehicle`` (4 x 4), which is above the ground."""
     guess = take_rigid(cam_from_vehicle, where)
     centre_vehicle = camera_centre(guess)
     if centre_vehicle[2] < 0.05:
@@ -59,11 +44,7 @@ def ipm_from_guess(info: CameraInfo, cam_from_vehicle: object, where: str) -> Fl
 
 
 def take_rigid(content: object, where: str) -> FloatArray:
-    """A rigid transform (4 x 4).
-
-    Raises:
-        DriveError: when it is shaped otherwise or its rotation part is none.
-    """
+    """``content`` as a rigid transform (4 x 4)."""
     transform = take_array(content, (4, 4), where, DriveError)
     rotation = transform[:3, :3]
     orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=_ROTATION_TOLERANCE)
@@ -73,11 +54,7 @@ def take_rigid(content: object, where: str) -> FloatArray:
 
 
 def take_roi(content: object, where: str) -> FloatArray:
-    """A convex polygon (N, 2) on the ground, counter-clockwise.
-
-    Raises:
-        DriveError: when it has less than three points or is not convex.
-    """
+    """``content`` as a convex polygon (N, 2) on the ground, counter-clockwise, of three points or more."""
     roi = take_array(content, (-1, 2), where, DriveError)
     if len(roi) < 3:
         raise DriveError(f"{where}: a polygon needs at least 3 points, got {len(roi)}; add points")
@@ -93,11 +70,7 @@ def take_roi(content: object, where: str) -> FloatArray:
 
 
 def check_roi_in_view(info: CameraInfo, ipm: FloatArray, roi_vehicle: FloatArray, where: str) -> None:
-    """Refuse a region of interest that a camera of this IPM does not see at all.
-
-    Raises:
-        DriveError: when all of it lies behind the camera or outside the image.
-    """
+    """Refuse a region of interest that lies behind a camera of this IPM, or outside its image."""
     centre = roi_vehicle.mean(axis=0)
     edge = np.linspace(roi_vehicle, np.roll(roi_vehicle, -1, axis=0), _ROI_SAMPLES).reshape(-1, 2)
     points = np.vstack([centre + share * (edge - centre) for share in (0.0, 0.5, 1.0)])
@@ -119,7 +92,7 @@ def check_roi_in_view(info: CameraInfo, ipm: FloatArray, roi_vehicle: FloatArray
 
 
 def _in_image(info: CameraInfo, rays_cam: FloatArray) -> BoolArray:
-    """Which rays (N, 3) the image shows."""
+    """Flags (N,) of the rays (N, 3) in the image."""
     across = np.linalg.norm(rays_cam[:, :2], axis=1)
     recorded = recorded_distance(info, np.arctan2(across, rays_cam[:, 2]))
     scale = np.where(across > 0, recorded / np.maximum(across, 1e-12), 0.0)
@@ -141,31 +114,21 @@ def roi_ahead(vehicle_from_cam: FloatArray) -> FloatArray:
 
 
 def take_centre_prior(content: object, where: str) -> CentrePrior:
-    """A surveyed camera centre: ``xyz`` in the vehicle frame and ``sigma_m``, for each axis or for all.
-
-    Raises:
-        DriveError: when a number is missing or a sigma is not positive.
-    """
+    """A surveyed camera centre: ``xyz`` in the vehicle frame and ``sigma_m``, for each axis or for all."""
     entry = take_mapping(content, where, DriveError)
+    check_keys(entry, ("xyz", "sigma_m"), (), where, DriveError)
     sigma = entry["sigma_m"]
-    sigma_m = take_array(
-        sigma if isinstance(sigma, list) else [sigma] * 3, (3,), f"{where}, sigma_m", DriveError
-    )
+    sigmas = sigma if isinstance(sigma, list) else [sigma] * 3
+    sigma_m = take_array(sigmas, (3,), f"{where}, sigma_m", DriveError)
     if (sigma_m <= 0).any():
         raise DriveError(
             f"{where}, sigma_m: must be positive; give the survey's standard deviation in metres"
         )
-    return CentrePrior(
-        centre_vehicle=take_array(entry["xyz"], (3,), f"{where}, xyz", DriveError), sigma_m=sigma_m
-    )
+    return CentrePrior(take_array(entry["xyz"], (3,), f"{where}, xyz", DriveError), sigma_m)
 
 
 def choose_initial(name: object, ipm: dict[str, FloatArray], where: str) -> str:
-    """The name of the IPM to start from: the one asked for, or the only one there is.
-
-    Raises:
-        DriveError: when the one asked for is not given, or none is asked for among several.
-    """
+    """The name of the IPM to start from: the one asked for, or the only one there is."""
     if name is None and len(ipm) == 1:
         return next(iter(ipm))
     if name is None:
@@ -176,11 +139,6 @@ def choose_initial(name: object, ipm: dict[str, FloatArray], where: str) -> str:
             f"{where}: initial_ipm '{initial}' is not given under ipm; choose from: {', '.join(ipm)}"
         )
     return initial
-
-
-def describe_prior(prior: CentrePrior) -> dict[str, Any]:
-    """``prior`` as :func:`take_centre_prior` reads it."""
-    return {"xyz": prior.centre_vehicle.tolist(), "sigma_m": prior.sigma_m.tolist()}
 
 
 def _balanced(matrix: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""A drive on disk to records: one reader a format, one registry of readers."""
+"""Reading a drive on disk: one registry of formats."""
 
 from __future__ import annotations
 
@@ -7,13 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from v2hdm.errors import DriveError
-from v2hdm.io.drive.folder import (
-    folder_drive_name,
-    is_folder_drive,
-    read_description,
-    read_folder_drive,
-    write_drive,
-)
+from v2hdm.io.drive.folder import folder_drive_name, is_folder_drive, read_description, read_folder_drive
 from v2hdm.io.drive.images import KittiOptions, ReadOptions, part_of, with_clock_offsets
 from v2hdm.io.drive.join import join_drives
 from v2hdm.io.drive.kitti import is_kitti_drive, read_kitti_drive
@@ -32,7 +26,6 @@ __all__ = [
     "join_drives",
     "read_drive",
     "with_clock_offsets",
-    "write_drive",
 ]
 
 
@@ -88,11 +81,7 @@ def read_drive(path: Path, options: ReadOptions | None = None) -> Drive:
 
 
 def drive_name(path: Path) -> str:
-    """What the drive at ``path`` is called: by its ``drive.yaml``, else like its folder.
-
-    Raises:
-        DriveError: when ``drive.yaml`` cannot be read or names it otherwise than by text.
-    """
+    """The name of the drive at ``path``: that in its ``drive.yaml``, else its folder's."""
     if is_folder_drive(path):
         return folder_drive_name(path)
     return path.resolve().stem if is_bag(path) else path.resolve().name

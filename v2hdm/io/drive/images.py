@@ -1,11 +1,4 @@
-"""What a user may choose about reading a drive.
-
-Images and a trajectory to posed images; the same for every format of drive.
-
-Part of a drive, for trying things: some of its images, with all of its poses.
-
-Images of a camera whose clock is off, posed anew.
-"""
+"""Images and a trajectory to a drive of posed images, the same for every format; and parts of a drive."""
 
 from __future__ import annotations
 
@@ -18,14 +11,17 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.errors import DriveError
+from v2hdm.io.drive.road import lay_flat, log_road
 from v2hdm.io.safe.pixels import read_header
-from v2hdm.io.trajectory import interpolate, why_no_pose
-from v2hdm.records import Camera, Drive, FloatArray, Image, Trajectory
+from v2hdm.io.trajectory import check_trajectory, interpolate, why_no_pose
+from v2hdm.records import Camera, Drive, FloatArray, GeodeticOrigin, Image, PoseNoise, Trajectory
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(kw_only=True)
 class KittiOptions:
-    """What the KITTI raw format does not say about a drive.
+    """Facts about a drive that the KITTI raw format does not say.
 
     Attributes:
         camera_height_m: height of the camera above the road (KITTI's nominal 1.65 m).
@@ -68,9 +64,6 @@ class ReadOptions:
     kitti: KittiOptions = field(default_factory=KittiOptions)
 
 
-_log = logging.getLogger(__name__)
-
-
 @dataclass(frozen=True)
 class ImageFiles:
     """The images of one camera: ``stamp_s`` (N,) and as many ``paths``."""
@@ -80,17 +73,57 @@ class ImageFiles:
     paths: Sequence[Path]
 
 
-def pose_images(
+def select_cameras(available: Sequence[str], wanted: Sequence[str], where: Path) -> list[str]:
+    """The ``available`` cameras that are ``wanted``, all where none is named; refuses unknown ones."""
+    for name in wanted:
+        if name not in available:
+            raise DriveError(f"{where}: no camera '{name}'; choose from: {', '.join(available)}")
+    return [name for name in available if not wanted or name in wanted]
+
+
+def assemble_drive(
+    name: str,
+    root: Path,
+    cameras: Mapping[str, Camera],
+    files: Sequence[ImageFiles],
+    recorded: Trajectory,
+    pose_noise: PoseNoise,
+    max_gap_s: float,
+    where: str,
+    *,
+    origin: GeodeticOrigin | None = None,
+    truth_dir: Path | None = None,
+    mount_rad: FloatArray | None = None,
+) -> Drive:
+    """The drive of ``recorded`` poses, with the road laid flat and every image posed and checked.
+
+    ``where`` names the poses in errors; ``mount_rad`` is the sensor's turn where the poses have lost it.
+    """
+    check_trajectory(recorded, origin, where)
+    laid = lay_flat(recorded, pose_noise.position_m)
+    log_road(laid if mount_rad is None else replace(laid, mount_rad=mount_rad), root)
+    images = _pose_images(files, laid.trajectory, max_gap_s, root)
+    _check_image_files(images, cameras)
+    posed = Counter(image.camera for image in images)
+    return Drive(
+        name=name,
+        root=root,
+        cameras=cameras,
+        images=images,
+        pose_noise=pose_noise,
+        origin=origin,
+        truth_dir=truth_dir,
+        unposed={entry.camera: len(entry.paths) - posed[entry.camera] for entry in files},
+        trajectory=laid.trajectory,
+        recorded=recorded,
+        road=laid.road,
+    )
+
+
+def _pose_images(
     files: Sequence[ImageFiles], trajectory: Trajectory, max_gap_s: float, where: Path
 ) -> tuple[Image, ...]:
-    """Give every image the vehicle's pose at its time; images without one are dropped with a warning.
-
-    Returns:
-        The images by time, then camera.
-
-    Raises:
-        DriveError: when no image of some camera has a pose.
-    """
+    """Images by time, then camera, each with the pose at its time; those without one are dropped."""
     images: list[Image] = []
     for entry in files:
         poses, inside = interpolate(trajectory, entry.stamp_s, max_gap_s)
@@ -106,29 +139,14 @@ def pose_images(
                 where, int((~inside).sum()), len(inside), entry.camera,
             )  # fmt: skip
         images += [
-            Image(
-                camera=entry.camera,
-                stamp_s=float(entry.stamp_s[n]),
-                path=entry.paths[n],
-                map_from_vehicle=poses[n],
-            )
+            Image(entry.camera, float(entry.stamp_s[n]), entry.paths[n], map_from_vehicle=poses[n])
             for n in np.flatnonzero(inside).tolist()
         ]
-    return tuple(sorted(images, key=lambda image: (image.stamp_s, image.camera)))
+    return tuple(sorted(images, key=in_order))
 
 
-def count_unposed(files: Sequence[ImageFiles], images: Sequence[Image]) -> dict[str, int]:
-    """How many images of each camera are not among the posed ``images``."""
-    posed = Counter(image.camera for image in images)
-    return {entry.camera: len(entry.paths) - posed[entry.camera] for entry in files}
-
-
-def check_image_files(images: Sequence[Image], cameras: Mapping[str, Camera]) -> None:
-    """Refuse missing, truncated and wrongly sized images before any long work begins.
-
-    Raises:
-        DriveError: naming the first such image.
-    """
+def _check_image_files(images: Sequence[Image], cameras: Mapping[str, Camera]) -> None:
+    """Refuse missing, truncated and wrongly sized images before any long work begins."""
     for image in images:
         header = read_header(image.path)
         info = cameras[image.camera].info
@@ -144,48 +162,33 @@ def check_image_files(images: Sequence[Image], cameras: Mapping[str, Camera]) ->
             )
 
 
-def select_cameras(available: Sequence[str], wanted: Sequence[str], where: Path) -> list[str]:
-    """The ``available`` cameras that are ``wanted``, all when nothing in particular is.
-
-    Raises:
-        DriveError: when a wanted camera is not available.
-    """
-    for name in wanted:
-        if name not in available:
-            raise DriveError(f"{where}: no camera '{name}'; choose from: {', '.join(available)}")
-    return [name for name in available if not wanted or name in wanted]
-
-
 def _span(stamp_s: FloatArray) -> str:
     return f"{stamp_s[0]:.3f} to {stamp_s[-1]:.3f} s"
 
 
+def in_order(image: Image) -> tuple[int, float, str]:
+    """Key by which a drive's images are sorted."""
+    return image.visit, image.taken_s, image.camera
+
+
 def part_of(drive: Drive, options: ReadOptions) -> Drive:
-    """The images of a drive between two times, and of each camera so many at most.
-
-    Args:
-        drive: as it was recorded.
-        options: ``start_s`` and ``end_s``, seconds after the drive's first image, and ``limit``.
-
-    Raises:
-        DriveError: no image of some camera is left.
-    """
+    """The images between ``start_s`` and ``end_s`` after the first, at most ``limit`` of each camera."""
     if options.limit is None and options.end_s is None and options.start_s <= 0:
         return drive
     if options.limit is not None and options.limit < 1:
         raise DriveError(f"drive.limit is {options.limit}: give 1 or more images of each camera")
     first_s = min(image.stamp_s for image in drive.images)
     end_s = float("inf") if options.end_s is None else options.end_s
-    taken: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
     images = []
     for image in drive.images:
         if not options.start_s <= image.stamp_s - first_s <= end_s:
             continue
-        taken[image.camera] += 1
-        if options.limit is None or taken[image.camera] <= options.limit:
+        counts[image.camera] += 1
+        if options.limit is None or counts[image.camera] <= options.limit:
             images.append(image)
     for name in drive.cameras:
-        if not taken[name]:
+        if not counts[name]:
             lasts_s = max(image.stamp_s for image in drive.images) - first_s
             raise DriveError(
                 f"{drive.root}: no image of camera '{name}' is left from {options.start_s:g} to {end_s:g} s; "
@@ -194,24 +197,19 @@ def part_of(drive: Drive, options: ReadOptions) -> Drive:
     return replace(drive, images=tuple(images))
 
 
-def in_order(image: Image) -> tuple[int, float, str]:
-    """Key by which a drive's images are sorted."""
-    return image.visit, image.taken_s, image.camera
-
-
 def with_clock_offsets(
     drive: Drive, offset_s: Mapping[str, float], max_gap_s: float, visit: int = 0
 ) -> Drive:
-    """The drive with the images of some cameras posed for when they were taken.
+    """The drive with the images of one session posed for when they were taken.
 
     Args:
         drive: a drive that holds its trajectory.
         offset_s: by camera, how much later than stamped its images were taken, s.
         max_gap_s: longest gap between two poses that is interpolated across, s.
-        visit: of which visit; images of others stay as they are.
+        visit: number of the session; images of others stay as they are.
 
     Returns:
-        The drive; images whose time the trajectory does not cover are left out.
+        The drive without images whose time the trajectory does not cover.
 
     Raises:
         DriveError: the drive holds no trajectory, or no image of some camera is left.
@@ -222,11 +220,12 @@ def with_clock_offsets(
     images: list[Image] = [image for image in drive.images if image.visit != visit]
     for name in dict.fromkeys(image.camera for image in drive.images if image.visit == visit):
         own = [image for image in drive.images if (image.visit, image.camera) == (visit, name)]
-        if offset_s.get(name):
-            taken_s = np.array([image.stamp_s + offset_s[name] for image in own])
-            poses, inside = interpolate(trajectory, taken_s, max_gap_s)
+        if offset := offset_s.get(name):
+            poses, inside = interpolate(
+                trajectory, np.array([one.stamp_s for one in own]) + offset, max_gap_s
+            )
             own = [
-                replace(own[n], map_from_vehicle=poses[n], clock_offset_s=offset_s[name])
+                replace(own[n], map_from_vehicle=poses[n], clock_offset_s=offset)
                 for n in np.flatnonzero(inside).tolist()
             ]
         if not own:

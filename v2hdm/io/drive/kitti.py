@@ -1,18 +1,15 @@
-"""The calibration files of a KITTI raw date folder: intrinsics and the chain IMU to camera.
+"""A KITTI raw drive: ``<date>/<date>_drive_<number>_sync`` with its calibration in ``<date>``.
 
-Geiger, Lenz, Stiller and Urtasun, Vision meets robotics: the KITTI dataset, IJRR 2013, section IV.
-
-A KITTI raw drive: ``<date>/<date>_drive_<number>_sync`` with its calibration in ``<date>``.
-
-The vehicle frame has its origin on the road under the IMU, which sits near the rear axle. The map
-is the local tangent plane at the first pose, with the road laid flat into z = 0. docs/kitti.md
-gives the reasons for what the format leaves open.
+Geiger, Lenz, Stiller and Urtasun, Vision meets robotics: the KITTI dataset, IJRR 2013, section IV. The
+vehicle frame has its origin on the road under the IMU, which sits near the rear axle. The map is the local
+tangent plane at the first pose, with the road laid flat into z = 0. docs/kitti.md gives the reasons for what
+the format leaves open.
 """
 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -22,17 +19,9 @@ from v2hdm.errors import DriveError
 from v2hdm.geometry.geodetic import enu_from_geodetic, geodetic_from_enu
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import rotation_from_euler
-from v2hdm.io.drive.images import (
-    ImageFiles,
-    KittiOptions,
-    ReadOptions,
-    check_image_files,
-    count_unposed,
-    pose_images,
-    select_cameras,
-)
-from v2hdm.io.drive.road import lay_flat, tell
-from v2hdm.io.trajectory import check_geodetic, check_trajectory
+from v2hdm.io.drive.images import ImageFiles, KittiOptions, ReadOptions, assemble_drive, select_cameras
+from v2hdm.io.drive.road import lay_flat
+from v2hdm.io.trajectory import check_geodetic, pose_matrices
 from v2hdm.records import (
     Camera,
     CameraInfo,
@@ -42,8 +31,10 @@ from v2hdm.records import (
     GeodeticOrigin,
     PoseNoise,
     Trajectory,
-)
+)  # fmt: skip
 from v2hdm.store.files import read_text
+
+_log = logging.getLogger(__name__)
 
 _CAM_TO_CAM = "calib_cam_to_cam.txt"
 _VELO_TO_CAM = "calib_velo_to_cam.txt"
@@ -59,11 +50,7 @@ class KittiCamera:
 
 
 def read_kitti_camera(folder: Path, name: str) -> KittiCamera:
-    """Read the rectified camera ``name`` (``image_00`` to ``image_03``) from the date folder.
-
-    Raises:
-        DriveError: when a calibration file or an entry in it is missing or damaged.
-    """
+    """Read the rectified camera ``name`` (``image_00`` to ``image_03``) from the date folder."""
     number = name.removeprefix("image_")
     cameras = _Entries(folder / _CAM_TO_CAM)
     projection = cameras.matrix(f"P_rect_{number}", 3, 4)
@@ -110,8 +97,6 @@ class _Entries:
         return transform
 
 
-_log = logging.getLogger(__name__)
-
 _CAMERAS = ("image_00", "image_01", "image_02", "image_03")
 _SUFFIXES = (".png", ".jpg", ".jpeg")
 _OXTS_COLUMNS = 30
@@ -124,11 +109,10 @@ _POSE_NOISE = PoseNoise(
     roll_pitch_rad=0.002,
     roll_pitch_drift_rad=0.0014,
 )
-"""Of the data sheet's 0.1 m and 0.1 deg most is drift that a stretch of road in view shares.
-
-What else there is wanders: steps of 1.1 m are 6 to 10 mm and 0.014 deg off the integrated velocity and turn
-rate (drive 0011), those of 3 cm and 0.05 deg that fade over 30 m. Errors drawn anew would step further.
-"""
+"""Most of the data sheet's 0.1 m and 0.1 deg is drift that a stretch of road in view shares. The rest
+wanders: steps of 1.1 m are 6 to 10 mm and 0.014 deg off the integrated velocity and turn rate (drive 0011),
+    as
+3 cm and 0.05 deg that fade over 30 m are."""
 
 
 def is_kitti_drive(path: Path) -> bool:
@@ -150,34 +134,26 @@ def read_kitti_drive(path: Path, options: ReadOptions) -> Drive:
     check_geodetic(oxts[:, :3], f"{path / 'oxts'}")
     origin_imu = GeodeticOrigin(float(oxts[0, 0]), float(oxts[0, 1]), float(oxts[0, 2]))
     position_enu = enu_from_geodetic(origin_imu, oxts[:, :3])
-    enu_from_imu = np.tile(np.eye(4), (len(oxts), 1, 1))
-    enu_from_imu[:, :3, :3] = rotation_from_euler(*oxts[:, 3:6].T)
-    enu_from_imu[:, :3, 3] = position_enu
+    enu_from_imu = pose_matrices(rotation_from_euler(*oxts[:, 3:6].T), position_enu)
     by_imu = lay_flat(Trajectory(stamp_s, enu_from_imu), _POSE_NOISE.position_m)
     vehicle_from_imu = _level_mount(calibrations[names[0]], by_imu.mount_rad, options.kitti.camera_height_m)
     enu_from_vehicle = enu_from_imu @ np.linalg.inv(vehicle_from_imu)
     enu_from_vehicle[:, 2, 3] += vehicle_from_imu[2, 3]  # the map's origin is on the road
-    recorded = Trajectory(stamp_s, enu_from_vehicle)
-    check_trajectory(recorded, origin_imu, f"{path / 'oxts'}")
-    laid = lay_flat(recorded, _POSE_NOISE.position_m)
     cameras = {
         name: _mount(calibration, vehicle_from_imu, options.kitti)
         for name, calibration in calibrations.items()
     }
-    tell(replace(laid, mount_rad=by_imu.mount_rad), path)
-    images = pose_images(files, laid.trajectory, options.max_gap_s, path)
-    check_image_files(images, cameras)
-    return Drive(
-        name=path.name,
-        root=path,
-        cameras=cameras,
-        images=images,
-        pose_noise=_POSE_NOISE,
+    return assemble_drive(
+        path.name,
+        path,
+        cameras,
+        files,
+        Trajectory(stamp_s, enu_from_vehicle),
+        _POSE_NOISE,
+        options.max_gap_s,
+        f"{path / 'oxts'}",
         origin=_lower(origin_imu, float(vehicle_from_imu[2, 3])),
-        unposed=count_unposed(files, images),
-        trajectory=laid.trajectory,
-        recorded=recorded,
-        road=laid.road,
+        mount_rad=by_imu.mount_rad,
     )
 
 
@@ -251,7 +227,7 @@ def _read_stamps(path: Path) -> FloatArray:
 
 
 def _level_mount(calibration: KittiCamera, mount_rad: FloatArray, camera_height_m: float) -> FloatArray:
-    """``vehicle_from_imu``: how the IMU sits on the vehicle, and its height from that of the camera."""
+    """``vehicle_from_imu``: the IMU's turn on the vehicle, and its height from that of the camera."""
     vehicle_from_imu = np.eye(4)
     roll, pitch = mount_rad[:, None]
     vehicle_from_imu[:3, :3] = rotation_from_euler(roll, pitch, np.zeros(1))[0]

@@ -13,18 +13,10 @@ import numpy as np
 from v2hdm.errors import DriveError
 from v2hdm.geometry.rigid import inverse, rotation_from_quaternion
 from v2hdm.io.calibration.mounting import ipm_from_guess, roi_ahead
-from v2hdm.io.drive.images import (
-    ImageFiles,
-    ReadOptions,
-    check_image_files,
-    count_unposed,
-    pose_images,
-    select_cameras,
-)
-from v2hdm.io.drive.road import lay_flat, tell
+from v2hdm.io.drive.images import ImageFiles, ReadOptions, assemble_drive, select_cameras
 from v2hdm.io.safe.fields import check_camera, take_size_px
 from v2hdm.io.safe.texts import read_json, take_camera_name
-from v2hdm.io.trajectory import check_trajectory, in_order
+from v2hdm.io.trajectory import in_order
 from v2hdm.records import Camera, CameraInfo, Drive, FloatArray, PoseNoise, Trajectory
 from v2hdm.store.files import take_array, take_number, take_text
 
@@ -63,23 +55,9 @@ def read_nuscenes_drive(path: Path, options: ReadOptions) -> Drive:
         if (np.diff(stamp_s) <= 0).any():
             raise DriveError(f"{folder}: two images of {name} at one time; give one recording, not several")
         files.append(ImageFiles(name, stamp_s, [path / _file(row, folder) for row in rows]))
-    recorded = _trajectory(egos, folder)
-    check_trajectory(recorded, None, f"{folder}: ego_pose")
-    noise = PoseNoise.as_far_as_stated()
-    laid = lay_flat(recorded, noise.position_m)
-    tell(laid, path)
-    images = pose_images(files, laid.trajectory, options.max_gap_s, path)
-    check_image_files(images, cameras)
-    return Drive(
-        name=path.resolve().name,
-        root=path,
-        cameras=cameras,
-        images=images,
-        pose_noise=noise,
-        unposed=count_unposed(files, images),
-        trajectory=laid.trajectory,
-        recorded=recorded,
-        road=laid.road,
+    name, noise, where = path.resolve().name, PoseNoise.as_far_as_stated(), f"{folder}: ego_pose"
+    return assemble_drive(
+        name, path, cameras, files, _trajectory(egos, where), noise, options.max_gap_s, where
     )
 
 
@@ -127,17 +105,11 @@ def _camera(name: str, rows: list[Row], calibrated: dict[str, Row], folder: Path
     info = CameraInfo(name, size[0], size[1], intrinsic)
     check_camera(info, where, DriveError)
     vehicle_from_cam = _pose(row, where)
-    guess = inverse(vehicle_from_cam)
-    return Camera(
-        info=info,
-        ipm={"estimated": ipm_from_guess(info, guess, where)},
-        initial_ipm="estimated",
-        roi_vehicle=roi_ahead(vehicle_from_cam),
-    )
+    ipm = {"estimated": ipm_from_guess(info, inverse(vehicle_from_cam), where)}
+    return Camera(info, ipm, "estimated", roi_ahead(vehicle_from_cam))
 
 
-def _trajectory(egos: dict[str, Row], folder: Path) -> Trajectory:
-    where = f"{folder}: ego_pose"
+def _trajectory(egos: dict[str, Row], where: str) -> Trajectory:
     rows = sorted(egos.values(), key=lambda row: _stamp(row, where))
     stamp_s = np.array([_stamp(row, where) for row in rows])
     order = in_order(stamp_s, where, "row")

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.io.calibration.camera_info import read_camera_info
+from v2hdm.io.calibration import read_camera_info
 from v2hdm.io.calibration.intrinsics import read_intrinsics
 from v2hdm.io.drive.images import ImageFiles
 from v2hdm.io.importers.bag.streams import (

@@ -1,4 +1,4 @@
-"""What several file formats hold, read with the same checks: cameras, covariances, the map's origin."""
+"""Fields of several file formats, read with the same checks: cameras, covariances, the map's origin."""
 
 from __future__ import annotations
 
@@ -14,14 +14,9 @@ _log = logging.getLogger(__name__)
 
 _LARGEST_PX = 65535
 _LONGEST_FOCAL_PX = 1e6
-_ROUNDING = 1e-3
-"""Parts of a covariance by which it may be off for having been rounded."""
-
-_MIDDLE = 1.0
-"""Focal lengths from the axis to 45 degrees from it: farther out radial terms prevail."""
-
-_WIDEST_RAD = np.deg2rad(89.5)
-"""Rays farther from the axis have no pixel in the pinhole image."""
+_ROUNDING = 1e-3  # share by which a covariance may be off for having been rounded
+_MIDDLE = 1.0  # focal lengths from the axis to 45 degrees from it: farther out radial terms prevail
+_WIDEST_RAD = np.deg2rad(89.5)  # rays farther from the axis have no pixel in the pinhole image
 
 
 def take_size_px(content: object, where: str, error: type[V2hdmError]) -> int:
@@ -68,10 +63,10 @@ def take_covariance(content: object, size: int, where: str, error: type[V2hdmErr
 
 
 def check_camera(info: CameraInfo, where: str, error: type[V2hdmError]) -> None:
-    """Refuse a camera matrix that is none and a lens that cannot be undone within the image.
+    """Refuse an impossible camera matrix and a lens that cannot be undone within the image.
 
-    Many a calibration folds over itself in the image's corners only, where its target never was: that is a
-    warning. The number of coefficients must be the model's.
+    A lens that folds over itself in the image's corners only, where its target never was, is a warning. The
+    number of coefficients must be the model's.
     """
     (fx, skew, cx), (zero, fy, cy), last = info.intrinsic
     if min(fx, fy) <= 0 or zero or list(last) != [0, 0, 1]:
@@ -95,27 +90,21 @@ def check_camera(info: CameraInfo, where: str, error: type[V2hdmError]) -> None:
 
 
 def _check_tangential(info: CameraInfo, where: str, error: type[V2hdmError]) -> None:
-    """Refuse a lens off its axis by so much that the image's middle is turned over or torn.
-
-    The tangential part moves a point at r focal lengths by up to 3 p r^2, so that neighbours change places
-    where 6 p r reaches 1; every real lens is below a tenth of that.
-    """
+    """Refuse a lens so far off its axis that the image's middle is turned over or torn."""
+    # The tangential part moves a point at r focal lengths by up to 3 p r^2, so that neighbours change places
+    # where 6 p r reaches 1; every real lens is below a tenth of that.
     if info.distortion_model == "equidistant" or len(info.distortion) < 4:
         return
     tangential = float(np.hypot(info.distortion[2], info.distortion[3]))
     if 6 * tangential * min(max(_sides(info)), _MIDDLE) >= 1:
         raise error(
             f"{where}: distortion_coefficients: p1 and p2 of {info.distortion[2]:g} and "
-            f"{info.distortion[3]:g} "
-            "turn the image over; their order is k1 k2 p1 p2 k3, mend them"
+            f"{info.distortion[3]:g} turn the image over; their order is k1 k2 p1 p2 k3, mend them"
         )
 
 
 def lens_reach(info: CameraInfo) -> float:
-    """How far from the axis recorded points have one ray each, as a share of the focal length.
-
-    Infinity for a lens that keeps order up to the widest rays that a pinhole image can show.
-    """
+    """The radius within which recorded points have one ray each, in focal lengths; infinite for most."""
     angles = np.linspace(0, _WIDEST_RAD, 4096)
     with np.errstate(all="ignore"):  # absurd coefficients do not rise
         recorded = recorded_distance(info, angles)
@@ -138,7 +127,7 @@ def recorded_distance(info: CameraInfo, angles: FloatArray) -> FloatArray:
 
 
 def _sides(info: CameraInfo) -> tuple[float, float]:
-    """How far the image reaches from the axis to a side and up or down, as shares of the focal lengths."""
+    """The image's reach from the axis to a side, and up or down, in focal lengths."""
     (fx, _, cx), (_, fy, cy), _ = info.intrinsic
     across = max(abs(cx + 0.5), abs(info.width - 0.5 - cx)) / fx
     down = max(abs(cy + 0.5), abs(info.height - 0.5 - cy)) / fy

@@ -1,9 +1,7 @@
-"""The gate for images from outside: every image file that others wrote is looked at and decoded here.
+"""Validation of images from outside: every image file that others wrote is checked and decoded here.
 
 The size is read from the header before anything is decoded, so that a small file cannot ask for all of the
-memory. What decoders only complain about, half an image or grey blocks where data is damaged, is an error.
-
-Pixels as files without loss.
+memory. Damage that decoders only warn of, such as half an image or grey blocks, is an error.
 """
 
 from __future__ import annotations
@@ -31,12 +29,8 @@ from v2hdm.store.inputs import note_input
 
 _log = logging.getLogger(__name__)
 
-MOST_PX = 200_000_000
-"""Largest image that is decoded, px; the largest sensors of mapping cameras have 150 million."""
-
-LEAST_SIDE_PX = 16
-"""Narrower images show no marking, and not one cell of the network."""
-
+MOST_PX = 200_000_000  # the largest sensors of mapping cameras have 150 million
+LEAST_SIDE_PX = 16  # narrower images show no marking, and not one cell of the network
 _MOST_BYTES = 1 << 30
 _TAIL_BYTES = 4096
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -49,10 +43,11 @@ _APP1, _START_OF_SCAN = 0xE1, 0xDA
 _WIDTH_TAG, _HEIGHT_TAG, _ORIENTATION_TAG = 0x100, 0x101, 0x112
 _UPRIGHT = 1
 
+# Warnings of the libraries below OpenCV about an image that they decode all the same.
 _DAMAGE = re.compile(
     r"Corrupt JPEG|Premature end|libpng (error|warning: .*CRC)|Invalid SOS|bad Huffman", re.I
 )
-"""What the libraries below OpenCV print of an image that they decode all the same."""
+_QUICK = (cv2.IMWRITE_PNG_COMPRESSION, 1)
 
 
 @dataclass(frozen=True)
@@ -65,40 +60,38 @@ class Header:
 
 
 def read_header(path: Path) -> Header:
-    """The header of the PNG, JPEG, TIFF, BMP or WebP file at ``path``.
-
-    Raises:
-        DriveError: the file is missing, no image of these, truncated, or of a size that cannot be worked on.
-    """
+    """The header of a PNG, JPEG, TIFF, BMP or WebP file; refuses truncated, tiny and huge ones."""
     with _opened(path) as data:
         return _checked(data, path)
 
 
 def read_pixels(path: Path, flags: int) -> np.ndarray:
-    """The decoded pixels of the image file at ``path``; ``flags`` are OpenCV's.
-
-    Raises:
-        DriveError: as :func:`read_header`, or the file is damaged inside.
-    """
+    """The decoded pixels of an image, with OpenCV's ``flags``; errors as :func:`read_header`, or damage."""
     with _opened(path) as stored:
         data = stored[:]
     header = _checked(data, path)
     _check_sums(data, path)
     if header.orientation != _UPRIGHT and not flags & cv2.IMREAD_IGNORE_ORIENTATION:
-        _tell_turned(path.parent, header.orientation)
-    with _complaints() as told:
+        _warn_turned(path.parent, header.orientation)
+    with _complaints() as lines:
         try:
             pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
         except cv2.error:
             pixels = None
-    if pixels is None or any(_DAMAGE.search(line) for line in told):
+    if pixels is None or any(map(_DAMAGE.search, lines)):
         raise DriveError(f"{path}: the image is damaged; copy it again or drop it from the list")
     return np.asarray(pixels)
 
 
+def png(pixels: np.ndarray) -> bytes:
+    """The PNG file of an image, (H, W) or (H, W, 3) BGR uint8, quick rather than small."""
+    done, data = cv2.imencode(".png", pixels, _QUICK)
+    assert done
+    return data.tobytes()
+
+
 @lru_cache
-def _tell_turned(folder: Path, orientation: int) -> None:
-    """Say once for a folder that images are turned."""
+def _warn_turned(folder: Path, orientation: int) -> None:
     _log.warning(
         "%s: images are turned upright, as their EXIF orientation %d says; their calibration must be of the "
         "turned ones",
@@ -145,7 +138,9 @@ def _opened(path: Path) -> Iterator[_Stored]:
 def _checked(data: _Data, path: Path) -> Header:
     if not len(data):
         raise DriveError(f"{path}: image file is empty; restore it or drop it from the list")
-    if not _known(data):
+    begin = data[:12]
+    is_webp = begin[:4] == b"RIFF" and begin[8:] == b"WEBP"
+    if not (is_webp or begin.startswith((_PNG, _JPEG, b"BM", *_TIFF))):
         raise DriveError(f"{path}: not a PNG, JPEG, TIFF, BMP or WebP image; convert it, or drop it")
     try:
         header = _header(data)
@@ -161,20 +156,10 @@ def _checked(data: _Data, path: Path) -> Header:
     return header
 
 
-def _known(data: _Data) -> bool:
-    begin = data[:12]
-    is_webp = begin[:4] == b"RIFF" and begin[8:] == b"WEBP"
-    return begin.startswith((_PNG, _JPEG, b"BM", *_TIFF)) or is_webp
-
-
 def _is_whole(data: _Data) -> bool:
     """Whether a file has its end."""
-    begin, tail = data[:8], data[-_TAIL_BYTES:]
-    if begin.startswith(_JPEG):
-        return b"\xff\xd9" in tail
-    if begin == _PNG:
-        return b"IEND" in tail
-    return True
+    end = {_JPEG: b"\xff\xd9", _PNG[:2]: b"IEND"}.get(data[:2], b"")
+    return end in data[-_TAIL_BYTES:]
 
 
 def _header(data: _Data) -> Header | None:
@@ -196,7 +181,6 @@ def _header(data: _Data) -> Header | None:
 
 
 def _unpack(form: str, data: _Data, at: int) -> tuple[int, ...]:
-    """Whole numbers of a ``struct`` form that stand at a place in the file."""
     return struct.unpack(form, data[at : at + struct.calcsize(form)])
 
 
@@ -221,7 +205,6 @@ def _jpeg_header(data: _Data) -> Header | None:
 
 
 def _png_orientation(data: _Data) -> int:
-    """Of the EXIF chunk, where there is one before the pixels."""
     for kind, at, length in _png_chunks(data):
         if kind == b"eXIf":
             return _orientation(data[at : at + length])
@@ -242,11 +225,7 @@ def _png_chunks(data: _Data) -> Iterator[tuple[bytes, int, int]]:
 
 
 def _check_sums(data: bytes, path: Path) -> None:
-    """Hold every chunk of a PNG against its check sum, which decoders only warn of.
-
-    Raises:
-        DriveError: one is damaged.
-    """
+    """Compare every chunk of a PNG with its checksum, of which decoders only warn."""
     if not data.startswith(_PNG):
         return
     for kind, at, length in _png_chunks(data):
@@ -255,11 +234,10 @@ def _check_sums(data: bytes, path: Path) -> None:
 
 
 def _webp_header(data: bytes) -> Header:
-    """Of the first chunk (RFC 9649, section 2)."""
+    """The size in the first chunk (RFC 9649, section 2)."""
     kind = data[12:16]
     if kind == b"VP8X":
-        side = [int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27)]
-        return Header(side[0], side[1])
+        return Header(*(int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27)))
     if kind == b"VP8L":
         bits = int.from_bytes(data[21:25], "little")
         return Header((bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1)
@@ -268,16 +246,16 @@ def _webp_header(data: bytes) -> Header:
 
 
 def _orientation(exif: bytes) -> int:
-    """The orientation of an EXIF block; what is damaged there says nothing."""
+    """The orientation in an EXIF block, upright where that is damaged."""
     try:
-        told = _tiff_tags(exif).get(_ORIENTATION_TAG, _UPRIGHT) if exif.startswith(_TIFF) else _UPRIGHT
+        tag = _tiff_tags(exif).get(_ORIENTATION_TAG, _UPRIGHT) if exif.startswith(_TIFF) else _UPRIGHT
     except struct.error:
         return _UPRIGHT
-    return told if 1 <= told <= 8 else _UPRIGHT
+    return tag if 1 <= tag <= 8 else _UPRIGHT
 
 
 def _tiff_tags(data: _Data) -> dict[int, int]:
-    """Whole numbers of the first directory of a TIFF by their tags."""
+    """The whole numbers in the first directory of a TIFF, by tag."""
     order = "<" if data[:2] == b"II" else ">"
     (at,) = _unpack(f"{order}I", data, 4)
     (count,) = _unpack(f"{order}H", data, at)
@@ -293,34 +271,23 @@ def _tiff_tags(data: _Data) -> dict[int, int]:
 
 @contextmanager
 def _complaints() -> Iterator[list[str]]:
-    """Lines that libraries in C print on stderr meanwhile; those that are no complaint are printed after."""
-    told: list[str] = []
+    """Collect the lines that C libraries print on stderr; those that report no damage are printed after."""
+    complaints: list[str] = []
     sys.stderr.flush()
     try:
         kept = os.dup(2)
     except OSError:  # no stderr at all
-        yield told
+        yield complaints
         return
-    with tempfile.TemporaryFile() as taken:
-        os.dup2(taken.fileno(), 2)
+    with tempfile.TemporaryFile() as printed:
+        os.dup2(printed.fileno(), 2)
         try:
-            yield told
+            yield complaints
         finally:
             os.dup2(kept, 2)
             os.close(kept)
-            taken.seek(0)
-            lines = taken.read(1 << 20).decode("utf-8", "replace").splitlines()
-            told += lines
-            for line in lines:
+            printed.seek(0)
+            for line in printed.read(1 << 20).decode("utf-8", "replace").splitlines():
+                complaints.append(line)
                 if not _DAMAGE.search(line):
                     print(line, file=sys.stderr)
-
-
-_QUICK = (cv2.IMWRITE_PNG_COMPRESSION, 1)
-
-
-def png(pixels: np.ndarray) -> bytes:
-    """The PNG file of an image, (H, W) or (H, W, 3) BGR uint8, quick rather than small."""
-    done, data = cv2.imencode(".png", pixels, _QUICK)
-    assert done
-    return data.tobytes()

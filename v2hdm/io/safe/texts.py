@@ -1,8 +1,7 @@
-"""The gate for texts from outside: every YAML, JSON and plain text file that others wrote comes through here.
+"""Validation of texts from outside: every YAML, JSON and plain text file that others wrote is read here.
 
-What a reader takes from it has a bounded size, depth and number of entries, holds plain values only (texts,
-numbers, true and false, lists, mappings with texts for keys), and says nothing twice. Anything else is one
-line of the caller's own error, which names the file and, where there is one, the line.
+Readers get plain values (texts, numbers, booleans, lists, mappings with texts for keys) of bounded size and
+depth, without duplicate keys. Anything else is one line of the caller's own error, with file and line.
 """
 
 from __future__ import annotations
@@ -22,34 +21,22 @@ from v2hdm.errors import V2hdmError
 from v2hdm.store.inputs import note_input
 from v2hdm.store.listing import tell_if_changed
 
-MOST_BYTES = 1 << 30
-"""Largest text file that is read; an hour of poses at 100 Hz is 30 MB."""
-
-MOST_YAML_BYTES = 1 << 24
-"""Largest YAML file; ours have kilobytes, and PyYAML takes a second for half a megabyte."""
-
-MOST_DEPTH = 64
-"""Deepest nesting of lists and mappings; ours are 8 deep."""
-
-MOST_ENTRIES = 1_000_000
-"""Values in a YAML file, with everything that an alias repeats."""
-
-MOST_DIGITS = 64
-"""Longest whole number; doubles end at 309 digits, and nothing here counts beyond 2**64."""
-
-MOST_NAME_LETTERS = 64
-_MOST_NAME_BYTES = 200
-"""File systems end at 255 bytes, and a file's name has more than its camera's in it."""
-
+MOST_BYTES = 1 << 30  # of a text file; an hour of poses at 100 Hz is 30 MB
+MOST_YAML_BYTES = 1 << 24  # ours have kilobytes, and PyYAML takes a second for half a megabyte
+MOST_DEPTH = 64  # of nested lists and mappings; ours are 8 deep
+MOST_ENTRIES = 1_000_000  # values in a YAML file, with everything that an alias repeats
+MOST_DIGITS = 64  # of a whole number; doubles end at 309 digits, and nothing here counts beyond 2**64
+MOST_NAME_LETTERS, _MOST_NAME_BYTES = 64, 200  # file systems end at 255 bytes
 _SHORT, _FEW = 60, 4
+ALL_CAMERAS = ("both", "all")  # names of results of all cameras together
+_QUOTED = re.compile(r'"(?:[^"\\]|\\.)*"')
+_OPENING, _CLOSING = [ord("["), ord("{")], [ord("]"), ord("}")]
 
 
 def read_bytes(path: Path, error: type[V2hdmError], most: int = MOST_BYTES) -> bytes:
-    """The bytes of the plain file at ``path``; a warning says so where it is ours and was changed.
+    """The bytes of the plain file at ``path``, with a warning where it is ours and was changed.
 
-    Raises:
-        V2hdmError: of type ``error``, when it is missing, no plain file (a pipe would be waited for),
-            unreadable or larger than ``most`` bytes.
+    Raises ``error`` when it is missing, no plain file (a pipe would block), unreadable or too large.
     """
     try:
         about = path.stat()
@@ -72,11 +59,7 @@ def read_bytes(path: Path, error: type[V2hdmError], most: int = MOST_BYTES) -> b
 
 
 def read_text(path: Path, error: type[V2hdmError], most: int = MOST_BYTES) -> str:
-    """The text of ``path``, without a byte order mark.
-
-    Raises:
-        V2hdmError: of type ``error``, when :func:`read_bytes` fails or the file is not UTF-8.
-    """
+    """The UTF-8 text of ``path`` without a byte order mark; errors as :func:`read_bytes`."""
     data = read_bytes(path, error, most)
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise error(f"{path}: not a UTF-8 text file but UTF-16; save it as UTF-8")
@@ -92,19 +75,13 @@ def read_text(path: Path, error: type[V2hdmError], most: int = MOST_BYTES) -> st
 
 
 def read_yaml(path: Path, error: type[V2hdmError]) -> Any:
-    """What the YAML file at ``path`` holds.
-
-    Keys are texts as they are written (``1``, ``no``), dates are texts, and tags are refused.
-
-    Raises:
-        V2hdmError: of type ``error``, with the line.
-    """
+    """The content of a YAML file; keys (``1``, ``no``) and dates are texts, and tags are refused."""
     # OpenCV and old ROS tools begin their files with a directive that YAML 1.1 refuses.
     return parse_yaml(read_text(path, error, MOST_YAML_BYTES).removeprefix("%YAML:1.0"), str(path), error)
 
 
 def parse_yaml(text: str, where: str, error: type[V2hdmError]) -> Any:
-    """What a YAML text holds, as :func:`read_yaml`; ``where`` it is from, for errors."""
+    """The content of a YAML text from ``where``, as :func:`read_yaml`."""
     try:
         return _Loader(text).get_single_data()  # looks for letters that are none at once
     except yaml.YAMLError as failure:
@@ -114,22 +91,19 @@ def parse_yaml(text: str, where: str, error: type[V2hdmError]) -> Any:
         problem = getattr(failure, "problem", None) or getattr(failure, "reason", None) or "not readable"
         if "'\\t'" in problem:
             problem = "a tab where blanks must be"
-        raise error(f"{where}:{line} YAML syntax error: {_one_line(problem)}; mend that line") from None
+        reason = " ".join(str(problem).split())
+        raise error(f"{where}:{line} YAML syntax error: {reason}; mend that line") from None
     except RecursionError:  # the scanner's own
         raise error(f"{where}: YAML nested deeper than {MOST_DEPTH} levels; mend it") from None
 
 
 def read_json(path: Path, error: type[V2hdmError]) -> Any:
-    """What the JSON file at ``path`` holds.
-
-    Raises:
-        V2hdmError: of type ``error``, with the line.
-    """
+    """The content of the JSON file at ``path``."""
     return parse_json(read_text(path, error), str(path), error)
 
 
 def parse_json(text: str, where: str, error: type[V2hdmError]) -> Any:
-    """What a JSON text holds, as :func:`read_json`; ``where`` it is from, for errors."""
+    """The content of a JSON text from ``where``."""
     if json_depth(text) > MOST_DEPTH:
         raise error(f"{where}: JSON nested deeper than {MOST_DEPTH} levels; mend it")
 
@@ -156,25 +130,14 @@ def parse_json(text: str, where: str, error: type[V2hdmError]) -> Any:
 
 
 def json_depth(text: str) -> int:
-    """How deep lists and objects are nested in a JSON text."""
+    """The depth of nested lists and objects in a JSON text."""
     letters = np.frombuffer(_QUOTED.sub("", text).encode("utf-8", "replace"), dtype=np.uint8)
     steps = np.isin(letters, _OPENING).astype(np.int32) - np.isin(letters, _CLOSING)
     return int(np.cumsum(steps).max(initial=0))
 
 
-_QUOTED = re.compile(r'"(?:[^"\\]|\\.)*"')
-_OPENING, _CLOSING = [ord("["), ord("{")], [ord("]"), ord("}")]
-
-
 def take_name(content: object, where: str, error: type[V2hdmError]) -> str:
-    """``content`` as a name that files, lines of a log and lists may be called by.
-
-    Names of cameras, runs, drives and classes become parts of file names, whoever wrote them.
-
-    Raises:
-        V2hdmError: of type ``error``, when it is no text or number, is empty or too long, begins with a dot
-            or has a separator of folders, a letter that does not show, or a blank at an end.
-    """
+    """``content`` as the name of a camera, run, drive or class, which becomes part of file names."""
     if isinstance(content, int | float) and not isinstance(content, bool):
         content = f"{content}"
     if not isinstance(content, str):
@@ -198,17 +161,13 @@ def take_name(content: object, where: str, error: type[V2hdmError]) -> str:
 
 
 def take_camera_name(content: object, where: str, error: type[V2hdmError]) -> str:
-    """``content`` as the name of a camera: none that results of several cameras bear."""
+    """``content`` as the name of a camera, which none of :data:`ALL_CAMERAS` is."""
     name = take_name(content, where, error)
     if name.lower() in ALL_CAMERAS:
         raise error(
             f"{where}: a camera is called {shown(name)}, as results of all of them are; choose another"
         )
     return name
-
-
-ALL_CAMERAS = ("both", "all")
-"""What results of all cameras together are called."""
 
 
 def shown(content: object) -> str:
@@ -219,36 +178,28 @@ def shown(content: object) -> str:
         return str(content).lower()
     if isinstance(content, dict):
         return "a mapping with " + shown(next(iter(content))) if content else "an empty mapping"
-    if isinstance(content, list | tuple) and 1 < len(content) <= _FEW and not any(map(_has_parts, content)):
-        return f"[{', '.join(map(shown, content))}]"
     if isinstance(content, list | tuple):
+        if 1 < len(content) <= _FEW and not any(isinstance(one, dict | list | tuple) for one in content):
+            return f"[{', '.join(map(shown, content))}]"
         return f"a list of {len(content)}" if len(content) != 1 else "a list of one"
     if isinstance(content, int) and abs(content) >= 10**MOST_DIGITS:
         return "a number of very many digits"
-    text = "".join(
-        letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}"
-        for letter in str(content)[: _SHORT + 1]
-    )
+    letters = str(content)[: _SHORT + 1]
+    text = "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in letters)
     if len(text) > _SHORT:
         text = f"{text[: _SHORT - 3]}..."
     return f"'{text}'" if isinstance(content, str) else text
 
 
-def _has_parts(content: object) -> bool:
-    return isinstance(content, dict | list | tuple)
-
-
 class _Loader(yaml.SafeLoader):
-    """PyYAML's own, for plain values: it counts what it makes and refuses what hides more than it shows."""
+    """PyYAML's own, for plain values: it counts its nodes and refuses tags, duplicates and bombs."""
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
-        self._depth = 0
-        self._entries = 0
+        self._depth = self._entries = 0
         self._sizes: dict[int, int] = {}
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """The next node, with all that is in it."""
         event: yaml.Event = self.peek_event()  # type: ignore[no-untyped-call]
         self._depth += 1
         if self._depth > MOST_DEPTH:
@@ -267,14 +218,12 @@ class _Loader(yaml.SafeLoader):
         return node
 
     def construct_scalar(self, node: Any) -> Any:
-        """The text of a scalar."""
         value = super().construct_scalar(node)
         if node.tag == _INT and len(value) > MOST_DIGITS:
             _refuse(f"a number of {len(value)} digits", node.start_mark)
         return value
 
     def construct_object(self, node: Any, deep: bool = False) -> Any:
-        """The value of a node."""
         if node.tag not in _PLAIN:
             _refuse(f"the tag {shown(node.tag)}, where only plain values may be", node.start_mark)
         try:
@@ -283,7 +232,6 @@ class _Loader(yaml.SafeLoader):
             _refuse(f"{shown(node.value)} is not what its tag says", node.start_mark)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Hashable, Any]:
-        """A mapping, whose keys are the texts that are written there."""
         if not isinstance(node, yaml.MappingNode):
             _refuse("not the mapping that its tag says", node.start_mark)
         written = {}
@@ -299,20 +247,13 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _one_line(text: object) -> str:
-    return " ".join(str(text).split())
-
-
 def _refuse(problem: str, mark: Any) -> Never:
     raise yaml.constructor.ConstructorError(None, None, problem, mark)
 
 
-_TEXT, _INT = "tag:yaml.org,2002:str", "tag:yaml.org,2002:int"
-_MERGE = "tag:yaml.org,2002:merge"
-_DATE = "tag:yaml.org,2002:timestamp"
-_PLAIN = frozenset(
-    f"tag:yaml.org,2002:{kind}" for kind in ("null", "bool", "int", "float", "str", "seq", "map")
-)
+_TAG = "tag:yaml.org,2002:"
+_TEXT, _INT, _MERGE, _DATE = (f"{_TAG}{kind}" for kind in ("str", "int", "merge", "timestamp"))
+_PLAIN = frozenset(f"{_TAG}{kind}" for kind in ("null", "bool", "int", "float", "str", "seq", "map"))
 _Loader.yaml_implicit_resolvers = {
     first: [(tag, pattern) for tag, pattern in resolvers if tag != _DATE]
     for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()

@@ -13,7 +13,7 @@ import numpy as np
 
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.rigid import inverse
-from v2hdm.io.calibration.document import read_calibration
+from v2hdm.io.calibration import read_calibration
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.maps.evidence import FILE as RESIDUALS
 from v2hdm.io.maps.evidence import ExcludedMarking, Residuals, read_exclusions, read_residuals

@@ -18,7 +18,8 @@ from typing import Any, TextIO
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.io.calibration.camera_info import write_camera_info
+from v2hdm.io.calibration.reading import info_of
+from v2hdm.io.calibration.writing import write_camera_info
 from v2hdm.io.importers.bag import messages as poses
 from v2hdm.io.importers.bag.messages import IMAGE_KINDS, VIDEO, VideoDecoder, file_of
 from v2hdm.io.importers.bag.reading import Bag, Message, bag_files, open_bag
@@ -32,10 +33,9 @@ from v2hdm.io.importers.imported import (
     is_whole,
 )
 from v2hdm.io.importers.tables import Readings
-from v2hdm.io.safe.fields import check_camera
 from v2hdm.io.safe.pixels import png
 from v2hdm.io.trajectory import write_image_list
-from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo, FloatArray
+from v2hdm.records import FloatArray
 
 _log = logging.getLogger(__name__)
 
@@ -46,9 +46,6 @@ INFO_KIND = "sensor_msgs/msg/CameraInfo"
 
 IMAGE_LIST, INFO_FILE = "images.txt", "camera_info.yaml"
 _POSES, _HEADINGS, _KIND, _TRANSFORMS = "positions.txt", "headings.txt", "kind.txt", "transforms.txt"
-
-_MODELS = {"": "plumb_bob", "radtan": "plumb_bob", "fisheye": "equidistant"}
-"""Other names of distortion models."""
 
 
 class Stream(ABC):
@@ -290,39 +287,6 @@ def stamp_of(message: Message, stamps: str, first: bool, where: str) -> float:
             "by as much as the computer needed"
         )
     return float(stamp.sec + stamp.nanosec / 1e9)
-
-
-def info_of(fields: Any, name: str, where: str) -> CameraInfo:
-    """The intrinsics of a ``CameraInfo`` of ROS 1 or 2.
-
-    Raises:
-        DriveError: it is not calibrated, cut to a region, or of a model that is not known.
-    """
-    intrinsic = np.array(getattr(fields, "k", getattr(fields, "K", None)), dtype=np.float64).reshape(3, 3)
-    distortion = np.array(getattr(fields, "d", getattr(fields, "D", None)), dtype=np.float64).ravel()
-    model = _MODELS.get(fields.distortion_model, fields.distortion_model)
-    if not intrinsic.any():
-        raise DriveError(f"{where}: the camera is not calibrated (K is zero); give camera_info as a file")
-    if max(fields.binning_x, fields.binning_y) > 1 or fields.roi.width or fields.roi.height:
-        raise DriveError(
-            f"{where}: its images are binned or cut to a region; give their camera_info as a file"
-        )
-    if model not in DISTORTION_COEFFICIENTS:
-        raise DriveError(
-            f"{where}: unknown distortion_model '{model}'; give camera_info as a file with one of: "
-            f"{', '.join(DISTORTION_COEFFICIENTS)}"
-        )
-    count = DISTORTION_COEFFICIENTS[model]
-    if len(distortion) > count and distortion[count:].any():
-        raise DriveError(
-            f"{where}: {model} has {count} coefficients, got {len(distortion)}; give it as a file"
-        )
-    # k3 and those after it are zero where they are not given.
-    padded = np.zeros(count)
-    padded[: min(count, len(distortion))] = distortion[:count]
-    info = CameraInfo(name, int(fields.width), int(fields.height), intrinsic, model, tuple(padded.tolist()))
-    check_camera(info, where, DriveError)
-    return info
 
 
 def frame_of(message: Message) -> str:

@@ -1,10 +1,8 @@
-"""A camera's calibration in the forms that other tools read as they are: one function a form.
+"""Writing the calibration of one camera: our own YAML, and the formats that other tools read as they are.
 
-Comments at the beginning tell the camera, its sigmas, the drive and date that it comes from and the verdict
-on that run; without their ``#`` these lines are YAML.
-
-The vehicle's frame is that of ROS' ``base_link`` (REP 105), x forward and y left, the camera's that of its
-images (REP 103's ``_optical``), z forward and x right.
+Files for other tools begin with comments on the camera, its sigmas, its drive and date and the verdict on
+that run; without their ``#`` these lines are YAML. The vehicle's frame is ROS' ``base_link`` (REP 105), x
+forward and y left, the camera's that of its images (REP 103's ``_optical``), z forward and x right.
 """
 
 from __future__ import annotations
@@ -21,22 +19,71 @@ import numpy as np
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import inverse, quaternion_from_rotation
-from v2hdm.io.calibration.document import Provenance
+from v2hdm.io.calibration.reading import Provenance
 from v2hdm.records import Calibration, CameraInfo, FloatArray
 from v2hdm.store.files import dump_yaml, replace_text
 
 VEHICLE_FRAME = "base_link"
-_UNUSED = 1e-12
-"""Distortion coefficients and skews below this move no point of an image by a millionth of a pixel."""
+_UNUSED = 1e-12  # distortion coefficients and skews below this move no point by a millionth of a pixel
+
+
+def write_calibration(
+    calibration: Calibration,
+    path: Path,
+    *,
+    clock_s: tuple[float, float] | None = None,
+    verdict: Mapping[str, Any] | None = None,
+    about: Provenance | None = None,
+) -> None:
+    """Write our own calibration file, atomically.
+
+    The sigmas are of the left-perturbation tangent of ``cam_from_vehicle``, along the camera's own axes
+    (right, down, forward), and left out without a covariance.
+
+    Args:
+        calibration: the camera's.
+        path: of the file.
+        clock_s: delay of its images behind their stamps and its sigma (infinite where unknown).
+        verdict: on the run which found it, as JSON.
+        about: its drive and date.
+    """
+    info = calibration.info
+    content: dict[str, Any] = {
+        "camera_name": info.name,
+        "image_width": info.width,
+        "image_height": info.height,
+        "camera_matrix": info.intrinsic.tolist(),
+        "distortion_model": info.distortion_model,
+        "distortion_coefficients": list(info.distortion),
+        "cam_from_vehicle": calibration.cam_from_vehicle.tolist(),
+        "vehicle_from_pinhole_px": ipm_from_extrinsic(info, calibration.cam_from_vehicle).tolist(),
+        **_sigmas(calibration),
+    }
+    if calibration.covariance is not None:
+        content["covariance"] = calibration.covariance.tolist()
+    if clock_s is not None:
+        content["clock_offset_s"] = float(clock_s[0])
+        if np.isfinite(clock_s[1]):
+            content["clock_sigma_s"] = float(clock_s[1])
+    if about is not None:
+        known = {"drive": about.drive, "date": about.date}
+        content |= {key: value for key, value in known.items() if value is not None}
+    if verdict is not None:
+        content["verdict"] = dict(verdict)
+    replace_text(path, dump_yaml(content))
+
+
+def write_camera_info(info: CameraInfo, path: Path) -> None:
+    """Write ``info`` as ROS' ``camera_info`` with the identity as rectification, atomically."""
+    replace_text(path, dump_yaml(_camera_info(info)))
 
 
 def camera_info_yaml(calibration: Calibration, about: Provenance) -> str:
     """ROS' ``camera_info`` as ``camera_calibration_parsers`` reads it: the intrinsics alone."""
-    return _comments(calibration, about) + dump_yaml(camera_info_content(calibration.info))
+    return _comments(calibration, about) + dump_yaml(_camera_info(calibration.info))
 
 
-def camera_info_content(info: CameraInfo) -> dict[str, Any]:
-    """The entries of ROS' ``camera_info`` YAML, with the identity as rectification."""
+def _camera_info(info: CameraInfo) -> dict[str, Any]:
     return {
         "image_width": info.width,
         "image_height": info.height,
@@ -73,23 +120,15 @@ def urdf(calibration: Calibration, about: Provenance) -> str:
     joint = ET.SubElement(robot, "joint", name=f"{frame}_joint", type="fixed")
     ET.SubElement(joint, "parent", link=VEHICLE_FRAME)
     ET.SubElement(joint, "child", link=frame)
-    ET.SubElement(
-        joint,
-        "origin",
-        xyz=_spaced(vehicle_from_cam[:3, 3]),
-        rpy=_spaced(_fixed_axis_angles(vehicle_from_cam)),
-    )
+    rpy = _spaced(_fixed_axis_angles(vehicle_from_cam))
+    ET.SubElement(joint, "origin", xyz=_spaced(vehicle_from_cam[:3, 3]), rpy=rpy)
     ET.indent(robot, "  ")
     comment = _comments(calibration, about).replace("--", "- -")
     return f'<?xml version="1.0"?>\n<!--\n{comment}-->\n{ET.tostring(robot, encoding="unicode")}\n'
 
 
 def kalibr_yaml(calibration: Calibration, about: Provenance) -> str:
-    """A camera chain as Kalibr writes it, with ``T_cam_vehicle`` in the place of its ``T_cam_imu``.
-
-    Raises:
-        MapFileError: Kalibr has no such lens.
-    """
+    """A camera chain of Kalibr, with ``T_cam_vehicle`` for ``T_cam_imu``; refuses lenses that it lacks."""
     info = calibration.info
     (fx, skew, cx), (_, fy, cy), _ = info.intrinsic.tolist()
     models = {"plumb_bob": "radtan", "rational_polynomial": "radtan", "equidistant": "equidistant"}
@@ -110,7 +149,7 @@ def kalibr_yaml(calibration: Calibration, about: Provenance) -> str:
 
 
 def opencv_yaml(calibration: Calibration, about: Provenance) -> str:
-    """What ``cv2.FileStorage`` reads: intrinsics, extrinsic, the IPM from undistorted pixels to ground."""
+    """A file for ``cv2.FileStorage``: intrinsics, extrinsic, the IPM from undistorted pixels to ground."""
     info = calibration.info
     storage = cv2.FileStorage(".yml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
     storage.write("camera_name", info.name)
@@ -129,7 +168,7 @@ def opencv_yaml(calibration: Calibration, about: Provenance) -> str:
 
 @dataclass(frozen=True)
 class CalibrationFormat:
-    """The ending of a file's name, and what makes its text."""
+    """The ending of a file's name, and the function that makes its text."""
 
     ending: str
     text: Callable[[Calibration, Provenance], str]
@@ -142,7 +181,7 @@ CALIBRATION_FORMATS: Mapping[str, CalibrationFormat] = {
     "kalibr": CalibrationFormat("kalibr.yaml", kalibr_yaml),
     "opencv": CalibrationFormat("opencv.yaml", opencv_yaml),
 }
-"""Forms of a calibration besides our own, by name."""
+"""Formats of a calibration besides our own, by name."""
 
 
 def write_calibration_as(
@@ -150,8 +189,7 @@ def write_calibration_as(
 ) -> Path:
     """Write one of :data:`CALIBRATION_FORMATS` to ``<folder>/<stem>_<ending>``, atomically; returns the path.
 
-    Raises:
-        MapFileError: the form has no word for this camera.
+    Raises MapFileError when the format cannot describe this camera.
     """
     chosen = CALIBRATION_FORMATS[name]
     path = folder / f"{stem}_{chosen.ending}"
@@ -160,15 +198,22 @@ def write_calibration_as(
 
 
 def _comments(calibration: Calibration, about: Provenance) -> str:
-    told: dict[str, Any] = {"camera_name": calibration.info.name}
+    known: dict[str, Any] = {"camera_name": calibration.info.name}
     if calibration.covariance is not None:
-        sigma = np.sqrt(np.diag(calibration.covariance))
-        told["sigma_axes"] = "of the camera: right, down, forward"
-        told["translation_sigma_m"] = sigma[:3].tolist()
-        told["rotation_sigma_deg"] = np.degrees(sigma[3:]).tolist()
-    told |= {"drive": about.drive, "date": about.date, "verdict": about.verdict}
-    known = {key: value for key, value in told.items() if value is not None}
+        known["sigma_axes"] = "of the camera: right, down, forward"
+    known |= _sigmas(calibration) | {"drive": about.drive, "date": about.date, "verdict": about.verdict}
+    known = {key: value for key, value in known.items() if value is not None}
     return "".join(f"# {line}\n" for line in dump_yaml(known).splitlines())
+
+
+def _sigmas(calibration: Calibration) -> dict[str, Any]:
+    if calibration.covariance is None:
+        return {}
+    sigma = np.sqrt(np.diag(calibration.covariance))
+    return {
+        "translation_sigma_m": sigma[:3].tolist(),
+        "rotation_sigma_deg": np.degrees(sigma[3:]).tolist(),
+    }
 
 
 def _optical_frame(calibration: Calibration) -> str:
