@@ -197,7 +197,11 @@ def _check_overlap(drive: Drive) -> None:
     ]
     for number, own in enumerate(places):
         others = np.concatenate([one for k, one in enumerate(places) if k != number])
-        nearest_m = min(float(np.linalg.norm(others - place, axis=1).min()) for place in own)
+        nearest_m = np.inf
+        for place in own:
+            nearest_m = min(nearest_m, float(np.linalg.norm(others - place, axis=1).min()))
+            if nearest_m <= _REACH_M:
+                break
         if nearest_m > _REACH_M:
             raise DriveError(
                 f"{drive.joined[number].root}: comes no nearer than {nearest_m:.0f} m to the other drives, "

@@ -1,4 +1,4 @@
-"""The drive of a finished result: what ``metrics.json`` says of how it was read, and reading it so again."""
+"""The drive of a finished result, read again as ``metrics.json`` says that it was read."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ from v2hdm.io.drive.images import KittiOptions, ReadOptions
 from v2hdm.records import Drive
 from v2hdm.store.files import load_json
 
-METRICS = "metrics.json"
-"""Name of the file in a result folder that says it."""
+METRICS = "metrics.json"  # in a result folder
 
 
 def told_of(drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[str, Any]:
-    """What :func:`drive_of` needs, as plain values."""
+    """The plain values that :func:`drive_of` needs."""
     return {
         "name": drive.name,
         "paths": [str(path.resolve()) for path in paths],
@@ -35,11 +34,10 @@ def told_of(drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[s
 
 
 def drive_of(folder: Path, path: Path | None) -> Drive | None:
-    """The drive of the result in ``folder``: at ``path``, else where it was; None where it is there no more.
+    """The drive of the result in ``folder``: at ``path``, else where it was; None where it is gone.
 
-    Raises:
-        MapFileError: the folder is no result of a run.
-        DriveError: the drive cannot be read, or is not that of this result.
+    Raises MapFileError when the folder is no result of a run, DriveError when the drive cannot be read or is
+    another one.
     """
     if not (folder / METRICS).is_file():
         raise MapFileError(f"{folder}: no {METRICS} in it; give the result folder of v2hdm.map")
