@@ -19,26 +19,22 @@ from v2hdm.records import FloatArray, GeodeticOrigin
 
 _CARTESIAN = "+proj=cart +ellps=WGS84"
 _SEMI_MAJOR_M, _FLATTENING = 6378137.0, 1 / 298.257223563
-_SAME_ELLIPSOID_M = 1e-3
-"""GRS80's semi-minor axis is 0.1 mm longer than WGS84's, m."""
-
-_STEP_M = 50.0
-"""Half of the stretch along which the grid's north is measured, m."""
-
-_CONFORMAL_RAD = 1e-5
-"""Angle by which a grid's axes may be off a right angle; a conformal projection's are by rounding, rad."""
+_SAME_ELLIPSOID_M = 1e-3  # GRS80's semi-minor axis is 0.1 mm longer than WGS84's
+_STEP_M = 50.0  # half of the stretch along which the grid's north is measured
+_CONFORMAL_RAD = 1e-5  # by which a conformal grid's axes may be off a right angle, for rounding
 
 
 def geodetic_from_enu(origin: GeodeticOrigin, points_map: FloatArray) -> FloatArray:
     """Map points (N, 3) in m to (N, 3): latitude and longitude in degrees, ellipsoidal height in m."""
-    points_ecef = points_map @ enu_axes(_position(origin))[0].T + _ecef_from_geodetic(_position(origin))[0]
+    here = position_of(origin)
+    points_ecef = points_map @ enu_axes(here)[0].T + _ecef_from_geodetic(here)[0]
     lon, lat, height_m = _cartesian().transform(*points_ecef.T, direction="INVERSE")
     return np.column_stack([lat, lon, height_m])
 
 
 def enu_from_geodetic(origin: GeodeticOrigin, geodetic: FloatArray) -> FloatArray:
     """The inverse of :func:`geodetic_from_enu`: (N, 3) degrees, degrees, m to map points (N, 3) in m."""
-    here = _position(origin)
+    here = position_of(origin)
     return np.asarray((_ecef_from_geodetic(geodetic) - _ecef_from_geodetic(here)[0]) @ enu_axes(here)[0])
 
 
@@ -52,14 +48,10 @@ def enu_axes(geodetic: FloatArray) -> FloatArray:
 
 
 def geodetic_from_grid(crs: str, points: FloatArray, where: str, error: type[V2hdmError]) -> FloatArray:
-    """Points (N, 3) of a projected system: easting, northing in its unit, height in m above the ellipsoid.
+    """Geodetic (N, 3), in its own datum, of points (N, 3) of a projected system.
 
-    Returns:
-        Geodetic (N, 3) in the system's own datum.
-
-    Raises:
-        V2hdmError: of type ``error``, when the system is unknown, geographic, or of no satellite datum, or
-            the points lie outside of what it can represent.
+    The points are easting and northing in its unit and the height in m above the ellipsoid. Raises ``error``
+    when the system is unknown, geographic or of no satellite datum, or the points lie outside of it.
     """
     system = _system(crs, where, error)
     if not system.is_projected:
@@ -76,11 +68,8 @@ def geodetic_from_grid(crs: str, points: FloatArray, where: str, error: type[V2h
 def convergence_rad(crs: str, points: FloatArray, where: str, error: type[V2hdmError]) -> FloatArray:
     """The angles (N,), clockwise, from true north to the north of a projected system's grid at its points.
 
-    Measured along 100 m of the grid's lines.
-
-    Raises:
-        V2hdmError: of type ``error``, as :func:`geodetic_from_grid`, and when the projection is not
-            conformal: then a grid has no north that all directions turn with.
+    Measured along 100 m of the grid's lines. Raises ``error`` as :func:`geodetic_from_grid`, and when the
+    projection is not conformal: then a grid has no north that all directions turn with.
     """
     here = geodetic_from_grid(crs, points, where, error)
     axes = enu_axes(here)
@@ -99,11 +88,7 @@ def convergence_rad(crs: str, points: FloatArray, where: str, error: type[V2hdmE
 
 
 def datum_of(crs: str, where: str, error: type[V2hdmError]) -> str:
-    """Name of the satellite datum that coordinates of ``crs`` refer to, ``WGS84`` written like that.
-
-    Raises:
-        V2hdmError: of type ``error``, when the system is unknown or its datum is of another ellipsoid.
-    """
+    """Name of the satellite datum that coordinates of ``crs`` refer to, ``WGS84`` written like that."""
     name = str(_system(crs, where, error).geodetic_crs.name)
     return "WGS84" if name.replace(" ", "") == "WGS84" else name
 
@@ -147,7 +132,8 @@ def _inverse_of(crs: str) -> Any:
     return pyproj.Transformer.from_crs(horizontal, horizontal.geodetic_crs, always_xy=True)
 
 
-def _position(origin: GeodeticOrigin) -> FloatArray:
+def position_of(origin: GeodeticOrigin) -> FloatArray:
+    """Latitude and longitude in degrees and height in m of ``origin``, (1, 3)."""
     return np.array([[origin.latitude_deg, origin.longitude_deg, origin.altitude_m]])
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.geodetic import enu_axes, enu_from_geodetic
+from v2hdm.geometry.geodetic import enu_axes, enu_from_geodetic, position_of
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.geometry.rigid import camera_centre, log
 from v2hdm.io.drive.images import in_order
@@ -213,7 +213,7 @@ def _move(to: GeodeticOrigin | None, origin: GeodeticOrigin | None) -> _Move:
     """From the frame of one origin into that of another."""
     if to is None or origin is None or to == origin:
         return _Move(np.eye(4), np.eye(4))
-    place = np.array([[one.latitude_deg, one.longitude_deg, one.altitude_m] for one in (to, origin)])
+    place = np.concatenate([position_of(to), position_of(origin)])
     axes = enu_axes(place)
     whole = np.eye(4)
     whole[:3, :3] = axes[0].T @ axes[1]

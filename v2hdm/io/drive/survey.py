@@ -6,7 +6,6 @@ Coordinates are local metres, latitudes and longitudes, or eastings and northing
 
 from __future__ import annotations
 
-import csv
 import difflib
 import logging
 from collections.abc import Mapping, Sequence
@@ -25,8 +24,8 @@ from v2hdm.geometry.geodetic import (
     has_height_datum,
     is_geographic,
 )  # fmt: skip
+from v2hdm.io.importers.tables import read_rows
 from v2hdm.records import FloatArray, GeodeticOrigin
-from v2hdm.store.files import read_text
 
 _log = logging.getLogger(__name__)
 
@@ -280,31 +279,16 @@ class _Row:
 
 
 def _rows(path: Path) -> list[_Row]:
-    text = read_text(path, DriveError).removeprefix("\ufeff")
-    lines = [
-        (number, line)
-        for number, line in enumerate(text.splitlines(), 1)
-        if line.strip() and not (number > 1 and line.lstrip().startswith("#"))
+    header, lines = read_rows(path, ";\t,", "point")
+    columns = _columns(header, path)
+    return [
+        _Row(
+            number,
+            {name: cell for name, cell in zip(columns, cells, strict=True) if name is not None},
+            f"{path}: line {number}",
+        )
+        for number, cells in lines
     ]
-    if len(lines) < 2:
-        raise DriveError(f"{path}: holds no point; expected a line of column names and one line a point")
-    title = lines[0][1].lstrip("# ")
-    separator = next((mark for mark in ";\t," if mark in title), ",")
-    columns = _columns(_split(title, separator), path)
-    rows = []
-    for number, line in lines[1:]:
-        cells = _split(line, separator)
-        if len(cells) != len(columns):
-            raise DriveError(
-                f"{path}: line {number}: {len(cells)} cells under {len(columns)} columns; mend that line"
-            )
-        named = {name: cell for name, cell in zip(columns, cells, strict=True) if name is not None}
-        rows.append(_Row(number, named, f"{path}: line {number}"))
-    return rows
-
-
-def _split(line: str, separator: str) -> list[str]:
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
 
 
 def _columns(header: Sequence[str], path: Path) -> list[str | None]:

@@ -1,7 +1,8 @@
-"""Poses in a receiver's NMEA 0183 log: GGA, RMC, GST, HDT, THS and PASHR.
+"""Poses in a receiver's NMEA 0183 log.
 
-GGA gives positions and their quality, GST their standard deviations, RMC or ZDA the date; HDT and THS, which
-have no time, belong to the sentence with a time before them. A course over ground (RMC, VTG) is no heading.
+GGA gives positions and their quality, GST their standard deviations, RMC or ZDA the date, HDT, THS or PASHR
+the heading; HDT and THS, which have no time, belong to the sentence before them. A course over ground is no
+heading.
 """
 
 from __future__ import annotations
@@ -27,16 +28,11 @@ KEYS = ("date",)
 _log = logging.getLogger(__name__)
 
 _DAY_S = 86400.0
-_INVALID_HEADINGS = ("V",)
-"""Status of THS whose heading does not count; A, E, M and S are autonomous, estimated, manual, simulated."""
+_INVALID_HEADING = "V"  # of THS; A, E, M and S are autonomous, estimated, manual, simulated
 
 
 def read_nmea(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
-    """Read the log at ``path``; sentences whose checksum is wrong are left out and counted.
-
-    Raises:
-        DriveError: there is no position, no date, or most sentences are damaged.
-    """
+    """Read the log at ``path``; damaged sentences are left out and counted, and refused if they prevail."""
     lines = read_bytes(path, DriveError).decode("ascii", errors="replace").splitlines()
     first = None
     if "date" in entry:
@@ -49,10 +45,7 @@ def read_nmea(path: Path, entry: dict[str, Any], root: Path, where: str) -> Read
 
 
 def nmea_readings(lines: Iterable[str], where: str, first_day: date | None = None) -> Readings:
-    """Readings of sentences in the order of the log.
-
-    ``first_day`` counts where neither RMC nor ZDA tells the date.
-    """
+    """Readings of sentences in the order of the log, from ``first_day`` on where none has a date."""
     log = _Log(where)
     total = bad = 0
     for line in lines:
@@ -60,12 +53,8 @@ def nmea_readings(lines: Iterable[str], where: str, first_day: date | None = Non
         if start < 0:
             continue
         total += 1
-        fields = _fields(line[start:])
-        if fields is None:
-            bad += 1
-            continue
         try:
-            log.take(fields)
+            log.take(_fields(line[start:]))
         except (ValueError, IndexError):
             bad += 1
     if bad:
@@ -109,7 +98,7 @@ class _Log:
         elif kind == "GST":
             stamp = self._time(fields[1])
             self._sigma_m[stamp] = float(np.sqrt((float(fields[6]) ** 2 + float(fields[7]) ** 2) / 2))
-        elif kind == "HDT" or (kind == "THS" and fields[2] not in _INVALID_HEADINGS):
+        elif kind == "HDT" or (kind == "THS" and fields[2] != _INVALID_HEADING):
             if fields[1] and self._time_s is not None:
                 self._attitudes[self._time_s] = (float(fields[1]), 0.0, 0.0, np.nan)
         elif kind == "PASHR" and fields[2] and fields[3] == "T":
@@ -168,15 +157,15 @@ def _table(rows: dict[float, tuple[float, ...]], begin_s: float, where: str) -> 
     return begin_s + stamp_s[order], np.array(list(rows.values()))[order]
 
 
-def _fields(sentence: str) -> list[str] | None:
-    """The fields of a sentence, None where its checksum is wrong."""
+def _fields(sentence: str) -> list[str]:
+    """The fields of a sentence; ValueError where its checksum is wrong."""
     body, star, check = sentence[1:].strip().partition("*")
     if star:
         value = 0
         for character in body:
             value ^= ord(character)
         if f"{value & 0xFFFF:02X}" != check[:2].upper():
-            return None
+            raise ValueError(check)
     return body.split(",")
 
 

@@ -1,6 +1,4 @@
-"""What ``poses`` in ``drive.yaml`` may say beside its file or topic, the same for every format.
-
-Readings of positions and attitudes to poses of the vehicle in the map.
+"""Poses as people have them: one registry of formats, and poses of the vehicle in the map made of each.
 
 Antenna and vehicle: ``vehicle = position - rotation @ lever_arm``. True and grid north: the attitude at a
 place is relative to that place's east and north; the map's axes are those at its origin, and both differences
@@ -26,97 +24,56 @@ from v2hdm.geometry.geodetic import (
     geodetic_from_grid,
     has_height_datum,
     is_geographic,
-)
+    position_of,
+)  # fmt: skip
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.importers import nmea, tables
-from v2hdm.io.importers.tables import Attitudes, Readings
-from v2hdm.io.trajectory import check_geodetic, interpolate, read_tum, why_no_pose
+from v2hdm.io.importers.tables import Readings
+from v2hdm.io.trajectory import check_geodetic, interpolate, pose_matrices, read_tum, why_no_pose
 from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, Trajectory
 from v2hdm.store.files import check_keys, take_array, take_choice, take_mapping, take_number, take_text
+
+_log = logging.getLogger(__name__)
 
 HEADINGS = ("true", "grid")
 COMMON_KEYS = (
     "crs", "heading", "lever_arm_m", "mounting_rpy_deg", "max_sigma_m", "geoid_m", "epoch", "offset_s",
 )  # fmt: skip
-
-_MAX_SIGMA_M = 0.1
-"""Positions that are stated to be less sure than this, m, are left out: RTK fixed is 0.02, float about "
-"0.5."""
+TOPIC_KEYS = ("heading_topic", "frame", "vehicle", "stamps")
+ReadTopic = Callable[[dict[str, Any], str], Readings]
 
 
 @dataclass(frozen=True)
 class PoseSettings:
-    """How poses are to be understood.
+    """The keys of ``poses`` in ``drive.yaml`` that every format has.
 
     Attributes:
         crs: system of the coordinates, such as EPSG:25832; None for the map's own, or WGS84.
-        heading: north that headings count from, ``true`` or ``grid``; None where it is not said.
-        lever_arm_m: (3,) the point that positions are of, in the vehicle frame; None where it is not said.
-        vehicle_from_sensor: (3, 3) how the attitude's sensor is turned on the vehicle.
-        max_sigma_m: positions stated to be less sure are left out.
-        geoid_m: height of the geoid above the ellipsoid, for heights above the sea; None if not said.
-        epoch: of the coordinates, in years; None if not said.
-        offset_s: what is added to the recorded times.
+        heading: north that headings count from, ``true`` or ``grid``; None where it is not stated.
+        lever_arm_m: (3,) the point that positions are of, in the vehicle frame; None where it is not stated.
+        vehicle_from_sensor: (3, 3) turn of the attitude's sensor on the vehicle.
+        max_sigma_m: positions stated to be less sure are left out: RTK fixed is 0.02, float about 0.5.
+        geoid_m: height of the geoid above the ellipsoid, for heights above the sea; None if not stated.
+        epoch: of the coordinates, in years; None if not stated.
+        offset_s: added to the recorded times.
     """
 
-    crs: str | None
-    heading: str | None
-    lever_arm_m: FloatArray | None
     vehicle_from_sensor: FloatArray
-    max_sigma_m: float
-    geoid_m: float | None
-    epoch: float | None
-    offset_s: float
-
-
-def take_pose_settings(entry: Mapping[str, Any], where: str) -> PoseSettings:
-    """The settings of ``entry``, whose keys have been checked.
-
-    Raises:
-        DriveError: a value is of the wrong type or out of range.
-    """
-
-    def number(key: str) -> float | None:
-        return None if key not in entry else take_number(entry[key], f"{where}, {key}", DriveError)
-
-    def three(key: str) -> FloatArray | None:
-        return None if key not in entry else take_array(entry[key], (3,), f"{where}, {key}", DriveError)
-
-    heading = entry.get("heading")
-    if heading is not None:
-        take_choice(heading, HEADINGS, f"{where}, heading", DriveError)
-    max_sigma_m = number("max_sigma_m") if "max_sigma_m" in entry else _MAX_SIGMA_M
-    assert max_sigma_m is not None
-    if max_sigma_m <= 0:
-        raise DriveError(f"{where}, max_sigma_m: give a positive number of metres")
-    rpy = three("mounting_rpy_deg")
-    roll, pitch, yaw = np.radians(np.zeros(3) if rpy is None else rpy)[:, None]
-    crs = entry.get("crs")
-    if isinstance(crs, int) and not isinstance(crs, bool):
-        crs = f"EPSG:{crs}"
-    return PoseSettings(
-        crs=None if crs is None else take_text(crs, f"{where}, crs", DriveError),
-        heading=heading,
-        lever_arm_m=three("lever_arm_m"),
-        vehicle_from_sensor=rotation_from_euler(roll, pitch, yaw)[0],
-        max_sigma_m=max_sigma_m,
-        geoid_m=number("geoid_m"),
-        epoch=number("epoch"),
-        offset_s=number("offset_s") or 0.0,
-    )
-
-
-_log = logging.getLogger(__name__)
+    crs: str | None = None
+    heading: str | None = None
+    lever_arm_m: FloatArray | None = None
+    max_sigma_m: float = 0.1
+    geoid_m: float | None = None
+    epoch: float | None = None
+    offset_s: float = 0.0
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """Poses as a drive has them.
+    """Poses ``map_from_vehicle`` as a drive has them.
 
-    Attributes:
-        trajectory: ``map_from_vehicle``.
-        noise: those fields of :class:`PoseNoise` that the source states.
-        origin: the map's place on the earth; None where the poses are the map's own.
+    ``noise`` holds those fields of :class:`PoseNoise` that the source states; ``origin`` is the map's place
+    on the earth, None where the poses are the map's own.
     """
 
     trajectory: Trajectory
@@ -124,22 +81,94 @@ class Recorded:
     origin: GeodeticOrigin | None
 
 
+@dataclass(frozen=True)
+class PoseFormat:
+    """One format: ``read(path, entry, root, where)`` and the ``keys`` that it has of its own."""
+
+    read: Callable[[Path, dict[str, Any], Path, str], Readings]
+    keys: tuple[str, ...] = ()
+
+
+def _read_tum(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
+    return tables.readings_of_poses(read_tum(path))
+
+
+POSE_FORMATS: Mapping[str, PoseFormat] = {
+    "tum": PoseFormat(_read_tum),
+    "kitti": PoseFormat(tables.read_kitti_rows, tables.KITTI_KEYS),
+    "csv": PoseFormat(tables.read_table, tables.TABLE_KEYS),
+    "nmea": PoseFormat(nmea.read_nmea, nmea.KEYS),
+}
+"""Formats of files by the key that names the file; ``topic`` names one of a bag instead."""
+
+
+def read_poses(
+    content: object,
+    root: Path,
+    origin: GeodeticOrigin | None,
+    max_gap_s: float,
+    where: str,
+    read_topic: ReadTopic,
+) -> Recorded:
+    """The poses that ``poses`` in ``drive.yaml`` names.
+
+    Args:
+        content: a TUM file's name, or a mapping that begins with a format of ``POSE_FORMATS`` or a topic.
+        root: folder that file names are relative to.
+        origin: the map's place on the earth as the drive states it.
+        max_gap_s: attitudes further apart are not interpolated across.
+        where: the key, for errors.
+        read_topic: reads a topic of the drive's bag.
+    """
+    if isinstance(content, str):
+        return Recorded(read_tum(root / content), {}, origin)
+    entry = take_mapping(content, where, DriveError)
+    named = [key for key in (*POSE_FORMATS, "topic") if key in entry]
+    if len(named) != 1:
+        raise DriveError(
+            f"{where}: name one source, a file of poses by its format ({', '.join(POSE_FORMATS)}) or a topic "
+            f"of the bag; got {', '.join(named) or 'none'}"
+        )
+    (kind,) = named
+    keys = TOPIC_KEYS if kind == "topic" else POSE_FORMATS[kind].keys
+    check_keys(entry, (kind,), (*keys, *COMMON_KEYS), where, DriveError)
+    settings = _take_settings(entry, where)
+    name = take_text(entry[kind], f"{where}, {kind}", DriveError)
+    if kind == "topic":
+        return assemble(read_topic(entry, where), settings, origin, max_gap_s, f"{where}, topic {name}")
+    readings = POSE_FORMATS[kind].read(root / name, entry, root, where)
+    return assemble(readings, settings, origin, max_gap_s, str(root / name))
+
+
+def _take_settings(entry: Mapping[str, Any], where: str) -> PoseSettings:
+    given: dict[str, Any] = {}
+    for key in ("max_sigma_m", "geoid_m", "epoch", "offset_s"):
+        if key in entry:
+            given[key] = take_number(entry[key], f"{where}, {key}", DriveError)
+    for key in ("lever_arm_m", "mounting_rpy_deg"):
+        if key in entry:
+            given[key] = take_array(entry[key], (3,), f"{where}, {key}", DriveError)
+    if entry.get("heading") is not None:
+        given["heading"] = take_choice(entry["heading"], HEADINGS, f"{where}, heading", DriveError)
+    if given.get("max_sigma_m", 1.0) <= 0:
+        raise DriveError(f"{where}, max_sigma_m: give a positive number of metres")
+    crs = entry.get("crs")
+    if isinstance(crs, int) and not isinstance(crs, bool):
+        crs = f"EPSG:{crs}"
+    if crs is not None:
+        given["crs"] = take_text(crs, f"{where}, crs", DriveError)
+    roll, pitch, yaw = np.radians(given.pop("mounting_rpy_deg", np.zeros(3)))[:, None]
+    return PoseSettings(rotation_from_euler(roll, pitch, yaw)[0], **given)
+
+
 def assemble(
     readings: Readings, settings: PoseSettings, origin: GeodeticOrigin | None, max_gap_s: float, where: str
 ) -> Recorded:
-    """The vehicle's poses in the map.
+    """The vehicle's poses in the map, from the ``readings`` of the source ``where``.
 
-    Args:
-        readings: what the source states.
-        settings: how to understand it.
-        origin: the map's origin as the drive gives it; without one the first position is the origin of a
-            source that has a place on the earth.
-        max_gap_s: attitudes further apart are not interpolated across.
-        where: the source, for errors.
-
-    Raises:
-        DriveError: positions without a heading, of an antenna whose place is not said, of no sufficient fix,
-            or of a system that cannot be used.
+    Without an ``origin`` the first position is that of a source which has a place on the earth. Attitudes
+    further apart than ``max_gap_s`` are not interpolated across. Raises DriveError for positions without a
+    heading, of an antenna whose place is not stated, without a sufficient fix, or of an unsuitable system.
     """
     if readings.antenna and settings.lever_arm_m is None:
         raise DriveError(
@@ -168,23 +197,19 @@ def assemble(
         datum = "WGS84" if settings.crs is None else datum_of(settings.crs, where, DriveError)
         origin = _origin(origin, geodetic[0], datum, settings, where)
         zeros = np.zeros(len(points))
-        here = np.array([[origin.latitude_deg, origin.longitude_deg, origin.altitude_m]])
         # A grid whose north lies clockwise of true north turns all that is measured from it clockwise.
         rotation = rotation_from_euler(zeros, zeros, -north_rad) @ rotation
-        rotation = enu_axes(here)[0].T @ enu_axes(geodetic) @ rotation
+        rotation = enu_axes(position_of(origin))[0].T @ enu_axes(geodetic) @ rotation
         points = enu_from_geodetic(origin, geodetic)
     elif settings.heading is not None or settings.geoid_m is not None:
         key = "heading" if settings.heading is not None else "geoid_m"
         raise DriveError(
             f"{where}, {key}: only for coordinates with a place on the earth; add crs or drop it"
         )
-    poses = np.tile(np.eye(4), (len(points), 1, 1))
-    poses[:, :3, :3] = rotation
-    poses[:, :3, 3] = points
     if settings.lever_arm_m is not None:
-        poses[:, :3, 3] -= rotation @ settings.lever_arm_m
-    noise = _noise(sigma_m, readings)
-    return Recorded(Trajectory(stamp_s, poses), noise, origin)
+        points = points - rotation @ settings.lever_arm_m
+    noise = _noise({"position_m": sigma_m, "heading_rad": readings.attitudes.sigma_rad})
+    return Recorded(Trajectory(stamp_s, pose_matrices(rotation, points)), noise, origin)
 
 
 def _sure_enough(readings: Readings, max_sigma_m: float, where: str) -> BoolArray:
@@ -205,14 +230,15 @@ def _sure_enough(readings: Readings, max_sigma_m: float, where: str) -> BoolArra
 
 
 def _rotation_at(readings: Readings, max_gap_s: float, where: str) -> tuple[FloatArray, BoolArray]:
-    """Rotations (K, 3, 3) at the times of those positions that have one, and the flags (P,) of these."""
+    """Rotations (K, 3, 3) at the times of those positions that have one, and their flags (P,)."""
     attitudes = readings.attitudes
     assert attitudes is not None
-    poses = np.tile(np.eye(4), (len(attitudes.stamp_s), 1, 1))
-    poses[:, :3, :3] = attitudes.rotation
     if np.array_equal(attitudes.stamp_s, readings.stamp_s):
         return attitudes.rotation, np.ones(len(readings.stamp_s), dtype=bool)
-    found, known = interpolate(Trajectory(attitudes.stamp_s, poses), readings.stamp_s, max_gap_s)
+    turns = Trajectory(
+        attitudes.stamp_s, pose_matrices(attitudes.rotation, np.zeros((len(attitudes.stamp_s), 3)))
+    )
+    found, known = interpolate(turns, readings.stamp_s, max_gap_s)
     if not known.any():
         raise DriveError(
             f"{where}: no position ({readings.stamp_s[0]:.3f} to {readings.stamp_s[-1]:.3f} s) has a heading "
@@ -221,12 +247,8 @@ def _rotation_at(readings: Readings, max_gap_s: float, where: str) -> tuple[Floa
             f"{why_no_pose(readings.stamp_s, attitudes.stamp_s, max_gap_s, 'positions', 'headings')}"
         )
     if not known.all():
-        _log.warning(
-            "%s: left out %d of %d positions: no heading at their time",
-            where,
-            int((~known).sum()),
-            len(known),
-        )
+        lacking = int((~known).sum())
+        _log.warning("%s: left out %d of %d positions: no heading at their time", where, lacking, len(known))
     return found[known, :3, :3], known
 
 
@@ -275,81 +297,10 @@ def _origin(
     return given if given.epoch is not None else replace(given, epoch=settings.epoch)
 
 
-def _noise(sigma_m: FloatArray, readings: Readings) -> dict[str, float]:
-    """Root mean squares of what is stated of the positions that are left, and of headings."""
-    assert readings.attitudes is not None
-    noise = {"position_m": sigma_m, "heading_rad": readings.attitudes.sigma_rad}
+def _noise(sigmas: Mapping[str, FloatArray]) -> dict[str, float]:
+    """Root mean squares of the sigmas that are stated."""
     return {
         key: float(np.sqrt(np.mean(np.square(stated))))
-        for key, values in noise.items()
+        for key, values in sigmas.items()
         if len(stated := values[np.isfinite(values) & (values > 0)])
     }
-
-
-@dataclass(frozen=True)
-class PoseFormat:
-    """One format: ``read(path, entry, root, where)`` and the ``keys`` that it has of its own."""
-
-    read: Callable[[Path, dict[str, Any], Path, str], Readings]
-    keys: tuple[str, ...] = ()
-
-
-def _read_tum(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
-    trajectory = read_tum(path)
-    unknown = np.full(len(trajectory.stamp_s), np.nan)
-    poses = trajectory.map_from_vehicle
-    attitudes = Attitudes(trajectory.stamp_s, poses[:, :3, :3], unknown)
-    return Readings(trajectory.stamp_s, poses[:, :3, 3], False, unknown, attitudes)
-
-
-POSE_FORMATS: Mapping[str, PoseFormat] = {
-    "tum": PoseFormat(_read_tum),
-    "kitti": PoseFormat(tables.read_kitti_rows, tables.KITTI_KEYS),
-    "csv": PoseFormat(tables.read_table, tables.TABLE_KEYS),
-    "nmea": PoseFormat(nmea.read_nmea, nmea.KEYS),
-}
-"""Formats of files by the key that names the file; ``topic`` names one of a bag instead."""
-
-ReadTopic = Callable[[dict[str, Any], str], Readings]
-TOPIC_KEYS = ("heading_topic", "frame", "vehicle", "stamps")
-
-
-def read_poses(
-    content: object,
-    root: Path,
-    origin: GeodeticOrigin | None,
-    max_gap_s: float,
-    where: str,
-    read_topic: ReadTopic,
-) -> Recorded:
-    """The poses that ``poses`` in ``drive.yaml`` names.
-
-    Args:
-        content: a TUM file's name, or a mapping that begins with a format of ``POSE_FORMATS`` or a topic.
-        root: folder that file names are relative to.
-        origin: the map's place on the earth as the drive states it.
-        max_gap_s: attitudes further apart are not interpolated across.
-        where: the key, for errors.
-        read_topic: reads a topic of the drive's bag.
-
-    Raises:
-        DriveError: of the file or of how it is described.
-    """
-    if isinstance(content, str):
-        return Recorded(read_tum(root / content), {}, origin)
-    entry = take_mapping(content, where, DriveError)
-    named = [key for key in (*POSE_FORMATS, "topic") if key in entry]
-    if len(named) != 1:
-        raise DriveError(
-            f"{where}: name one source, a file of poses by its format ({', '.join(POSE_FORMATS)}) or a topic "
-            f"of the bag; got {', '.join(named) or 'none'}"
-        )
-    (kind,) = named
-    keys = TOPIC_KEYS if kind == "topic" else POSE_FORMATS[kind].keys
-    check_keys(entry, (kind,), (*keys, *COMMON_KEYS), where, DriveError)
-    settings = take_pose_settings(entry, where)
-    name = take_text(entry[kind], f"{where}, {kind}", DriveError)
-    if kind == "topic":
-        return assemble(read_topic(entry, where), settings, origin, max_gap_s, f"{where}, topic {name}")
-    readings = POSE_FORMATS[kind].read(root / name, entry, root, where)
-    return assemble(readings, settings, origin, max_gap_s, str(root / name))

@@ -1,11 +1,8 @@
-"""What a pose file or topic states, before frames, antenna and noise are made of it.
+"""Readings of a pose file or topic, before frames, antenna and noise; from KITTI's rows and from CSV files.
 
-Poses as KITTI's odometry benchmark writes them: twelve numbers a row, and a file of times beside it.
-
-Poses in a CSV file with named columns.
-
-A column's name says what it holds and in which unit; ``columns`` in ``drive.yaml`` says what the file calls
-it.
+KITTI's odometry benchmark writes twelve numbers per row, with a file of times beside it. The columns of a CSV
+file say by their names what they hold and in which unit; ``columns`` in ``drive.yaml`` translates their
+names.
 """
 
 from __future__ import annotations
@@ -21,9 +18,11 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.rigid import rotation_from_euler, rotation_from_quaternion
-from v2hdm.io.trajectory import in_order
-from v2hdm.records import FloatArray
+from v2hdm.io.trajectory import in_order, pose_matrices
+from v2hdm.records import FloatArray, Trajectory
 from v2hdm.store.files import check_keys, read_text, take_choice, take_mapping, take_text
+
+KITTI_KEYS, TABLE_KEYS = ("stamps", "axes"), ("columns",)
 
 SIGMA_OF_QUALITY_M: Mapping[int, float] = {
     0: np.inf,  # no fix
@@ -44,11 +43,9 @@ SIGMA_OF_QUALITY_M: Mapping[int, float] = {
 class Attitudes:
     """Attitudes over time.
 
-    Attributes:
-        stamp_s: (A,) strictly rising.
-        rotation: (A, 3, 3) reference from sensor; the reference is x east, y north, z up of the true or grid
-            north at the place, or the map itself.
-        sigma_rad: (A,) standard deviation of the heading, nan where it is not stated.
+    ``stamp_s`` (A,) rise strictly; ``rotation`` (A, 3, 3) leads from the sensor to x east, y north, z up of
+    the true or grid north at the place, or to the map itself; ``sigma_rad`` (A,) is the heading's, nan if not
+    stated.
     """
 
     stamp_s: FloatArray
@@ -79,15 +76,16 @@ class Readings:
     antenna: bool = field(default=False)
 
 
-KITTI_KEYS = ("stamps", "axes")
-
 _VEHICLE_FROM_CAMERA_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""x right, y down, z forward to x forward, y left, z up."""
+_UPRIGHT = 0.5  # least cosine between the poses' z axis and up for poses of a ground vehicle
+_ROTATION_TOLERANCE = _NORM_TOLERANCE = 1e-3
 
-_UPRIGHT = 0.5
-"""Least cosine between the poses' z axis and up for poses of a ground vehicle."""
 
-_ROTATION_TOLERANCE = 1e-3
+def readings_of_poses(poses: Trajectory) -> Readings:
+    """Poses in the map, whose sigmas nobody has stated, as readings."""
+    unknown = np.full(len(poses.stamp_s), np.nan)
+    attitudes = Attitudes(poses.stamp_s, poses.map_from_vehicle[:, :3, :3], unknown)
+    return Readings(poses.stamp_s, poses.map_from_vehicle[:, :3, 3], False, unknown, attitudes)
 
 
 def read_kitti_rows(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
@@ -95,9 +93,6 @@ def read_kitti_rows(path: Path, entry: dict[str, Any], root: Path, where: str) -
 
     ``axes: camera`` are those of the benchmark, x right, y down, z forward, in the map as on the vehicle;
     ``axes: vehicle`` x forward, y left, z up.
-
-    Raises:
-        DriveError: a row is no pose, the times do not fit, or the axes are the other ones.
     """
     if "stamps" not in entry:
         raise DriveError(f"{where}: KITTI's rows have no times: add stamps, a file with one time in s a line")
@@ -118,17 +113,11 @@ def read_kitti_rows(path: Path, entry: dict[str, Any], root: Path, where: str) -
             f"{path}: the poses' z axis does not point up; say axes: camera if they are KITTI's own"
         )
     rows = in_order(stamp_s, str(path))
-    unknown = np.full(len(rows), np.nan)
-    stamps = stamp_s[rows]
-    return Readings(stamps, points[rows], False, unknown, Attitudes(stamps, rotation[rows], unknown))
+    return readings_of_poses(Trajectory(stamp_s[rows], pose_matrices(rotation[rows], points[rows])))
 
 
 def read_stamps(path: Path) -> FloatArray:
-    """One time in s a line (N,).
-
-    Raises:
-        DriveError: a line is not one finite number.
-    """
+    """Times (N,) in s, one per line."""
     return _numbers(path, 1)[:, 0]
 
 
@@ -151,8 +140,6 @@ def _numbers(path: Path, columns: int) -> FloatArray:
     return np.array(rows)
 
 
-TABLE_KEYS = ("columns",)
-
 _STAMPS: Mapping[str, float] = {"stamp_s": 1.0, "stamp_ms": 1e3, "stamp_us": 1e6, "stamp_ns": 1e9}
 _MAP = ("x_m", "y_m", "z_m")
 _GEODETIC = ("latitude_deg", "longitude_deg", "altitude_m")
@@ -162,21 +149,12 @@ _ANGLES = (
 )  # fmt: skip
 _SURENESS = ("quality", "sigma_m", "heading_sigma_deg")
 NAMES = (*_STAMPS, "utc", *_MAP, *_GEODETIC, *_QUATERNION, *_ANGLES, *_SURENESS)
-"""Columns that are understood. ``heading_deg`` counts clockwise from north, ``yaw_...`` counter-clockwise
-from x or east; roll is positive with the left side up, ``pitch_...`` with the nose down, ``pitch_up_deg``
-up."""
-
-_NORM_TOLERANCE = 1e-3
+"""Columns that are understood. ``heading_deg`` counts clockwise from north, ``yaw_...`` counter-clockwise from x
+or east; roll is positive with the left side up, ``pitch_...`` with the nose down, ``pitch_up_deg`` up."""
 
 
 def read_table(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
-    """Read the CSV file at ``path``: names in its first line, then a pose a line.
-
-    Columns are parted by commas, semicolons, tabs or blanks.
-
-    Raises:
-        DriveError: columns are missing or say a thing twice, or a cell does not parse; with the line.
-    """
+    """Read the CSV file at ``path``, separated by commas, semicolons, tabs or blanks."""
     columns = _columns(path, _take_names(entry.get("columns"), f"{where}, columns"))
     stamp_s = _stamps(columns, path)
     rows = in_order(stamp_s, str(path), "pose")
@@ -210,12 +188,7 @@ def _take_names(content: object, where: str) -> dict[str, str]:
 
 def _columns(path: Path, names: Mapping[str, str]) -> dict[str, FloatArray]:
     """The columns of our ``NAMES`` that the file has, each (N,)."""
-    lines = [(n, line) for n, line in enumerate(read_text(path, DriveError).splitlines(), 1) if line.strip()]
-    if len(lines) < 2:
-        raise DriveError(f"{path}: holds no pose; expected a line of column names and one line a pose")
-    title = lines[0][1].lstrip("\ufeff# ")
-    separator = next((mark for mark in ",;\t" if mark in title), None)
-    header = [name.strip() for name in _split(title, separator)]
+    header, rows = read_rows(path, ",;\t", "pose")
     for ours, theirs in names.items():
         if header.count(theirs) != 1:
             raise DriveError(
@@ -226,21 +199,39 @@ def _columns(path: Path, names: Mapping[str, str]) -> dict[str, FloatArray]:
         if name in NAMES and place not in found.values() and name not in found:
             found[name] = place
     table: dict[str, list[float]] = {name: [] for name in found}
-    for number, line in lines[1:]:
-        if line.lstrip().startswith("#"):
-            continue
-        cells = _split(line, separator)
+    for number, cells in rows:
+        for name, place in found.items():
+            table[name].append(_parse(name, cells[place], f"{path}: line {number}: {header[place]}"))
+    return {name: np.array(values, dtype=np.float64) for name, values in table.items()}
+
+
+def read_rows(path: Path, separators: str, thing: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """The names in the first line of a CSV file, and the cells of each further line with its number.
+
+    The first of ``separators`` that the line of names holds separates the cells, else blanks do. ``#`` before
+    the names is dropped; further lines that begin with it are comments. A line is one ``thing``.
+    """
+    text = read_text(path, DriveError)
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    lines = [*lines[:1], *(one for one in lines[1:] if not one[1].lstrip().startswith("#"))]
+    if len(lines) < 2:
+        raise DriveError(f"{path}: holds no {thing}; expected a line of column names and one line a {thing}")
+    title = lines[0][1].lstrip("\ufeff# ")
+    separator = next((mark for mark in separators if mark in title), None)
+
+    def split(line: str) -> list[str]:
+        if separator is None:
+            return line.split()
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
+
+    header = split(title)
+    rows = [(number, split(line)) for number, line in lines[1:]]
+    for number, cells in rows:
         if len(cells) != len(header):
             raise DriveError(
                 f"{path}: line {number}: {len(cells)} cells under {len(header)} columns; mend that line"
             )
-        for name, place in found.items():
-            table[name].append(_parse(name, cells[place].strip(), f"{path}: line {number}: {header[place]}"))
-    return {name: np.array(values, dtype=np.float64) for name, values in table.items()}
-
-
-def _split(line: str, separator: str | None) -> Sequence[str]:
-    return line.split() if separator is None else next(csv.reader([line], delimiter=separator))
+    return header, rows
 
 
 def _parse(name: str, cell: str, where: str) -> float:

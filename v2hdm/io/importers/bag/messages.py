@@ -1,15 +1,9 @@
-"""Images of messages as bytes of image files: compressed ones as they are, raw ones as PNG.
-
-Video that a bag holds a packet a message (``foxglove_msgs/CompressedVideo``), decoded by PyAV.
-
-Messages that say where the vehicle was, as readings.
-"""
+"""Messages of bags: images and video as bytes of image files, poses and headings as readings."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from datetime import UTC, date, datetime
+from datetime import UTC, datetime
 from typing import Any
 
 import cv2
@@ -30,42 +24,31 @@ IMAGE_KINDS = (RAW, COMPRESSED)
 _PNG_SIGNATURE, _JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 
 
-@dataclass(frozen=True)
-class _Encoding:
-    channels: int
-    to_bgr: int | None = None
-
-
-_ENCODINGS: Mapping[str, _Encoding] = {
-    "mono8": _Encoding(1),
-    "8UC1": _Encoding(1),
-    "bgr8": _Encoding(3),
-    "8UC3": _Encoding(3),
-    "rgb8": _Encoding(3, cv2.COLOR_RGB2BGR),
-    "bgra8": _Encoding(4, cv2.COLOR_BGRA2BGR),
-    "rgba8": _Encoding(4, cv2.COLOR_RGBA2BGR),
+# Channels, and OpenCV's conversion to BGR.
+_ENCODINGS: Mapping[str, tuple[int, int | None]] = {
+    "mono8": (1, None),
+    "8UC1": (1, None),
+    "bgr8": (3, None),
+    "8UC3": (3, None),
+    "rgb8": (3, cv2.COLOR_RGB2BGR),
+    "bgra8": (4, cv2.COLOR_BGRA2BGR),
+    "rgba8": (4, cv2.COLOR_RGBA2BGR),
     # OpenCV names a Bayer pattern by its second row, ROS by its first.
-    "bayer_rggb8": _Encoding(1, cv2.COLOR_BayerBG2BGR),
-    "bayer_bggr8": _Encoding(1, cv2.COLOR_BayerRG2BGR),
-    "bayer_gbrg8": _Encoding(1, cv2.COLOR_BayerGR2BGR),
-    "bayer_grbg8": _Encoding(1, cv2.COLOR_BayerGB2BGR),
-    "yuv422": _Encoding(2, cv2.COLOR_YUV2BGR_UYVY),
-    "uyvy": _Encoding(2, cv2.COLOR_YUV2BGR_UYVY),
-    "yuv422_yuy2": _Encoding(2, cv2.COLOR_YUV2BGR_YUYV),
-    "yuyv": _Encoding(2, cv2.COLOR_YUV2BGR_YUYV),
+    "bayer_rggb8": (1, cv2.COLOR_BayerBG2BGR),
+    "bayer_bggr8": (1, cv2.COLOR_BayerRG2BGR),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGR2BGR),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGB2BGR),
+    "yuv422": (2, cv2.COLOR_YUV2BGR_UYVY),
+    "uyvy": (2, cv2.COLOR_YUV2BGR_UYVY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2BGR_YUYV),
+    "yuyv": (2, cv2.COLOR_YUV2BGR_YUYV),
 }
 
 
 def file_of(kind: str, fields: Any, where: str) -> tuple[str, bytes]:
-    """Suffix and content of the file of an image message.
-
-    Raises:
-        DriveError: the encoding is not known or the message holds too few bytes.
-    """
-    return _WRITERS[kind](fields, where)
-
-
-def _compressed(fields: Any, where: str) -> tuple[str, bytes]:
+    """Suffix and content of an image message's file: compressed ones as they are, raw ones as PNG."""
+    if kind == RAW:
+        return ".png", png(_pixels(fields, where))
     data = fields.data.tobytes()
     if data.startswith(_JPEG_START):
         return ".jpg", data
@@ -76,14 +59,14 @@ def _compressed(fields: Any, where: str) -> tuple[str, bytes]:
     )
 
 
-def _raw(fields: Any, where: str) -> tuple[str, bytes]:
-    encoding = _ENCODINGS.get(fields.encoding)
-    if encoding is None:
+def _pixels(fields: Any, where: str) -> np.ndarray:
+    if fields.encoding not in _ENCODINGS:
         raise DriveError(
             f"{where}: encoding '{fields.encoding}' is not known; record one of {', '.join(_ENCODINGS)}"
         )
+    channels, to_bgr = _ENCODINGS[fields.encoding]
     height, width, step = int(fields.height), int(fields.width), int(fields.step)
-    row = width * encoding.channels
+    row = width * channels
     if not height or not width or step < row or len(fields.data) < step * (height - 1) + row:
         raise DriveError(
             f"{where}: {len(fields.data)} bytes are no image of {width} x {height} in {fields.encoding} with "
@@ -91,33 +74,21 @@ def _raw(fields: Any, where: str) -> tuple[str, bytes]:
         )
     data = np.zeros(step * height, dtype=np.uint8)
     data[: len(fields.data)] = fields.data[: len(data)]
-    shape = (height, width) if encoding.channels == 1 else (height, width, encoding.channels)
+    shape = (height, width) if channels == 1 else (height, width, channels)
     pixels = data.reshape(height, step)[:, :row].reshape(shape)
-    if encoding.to_bgr is not None:
-        pixels = np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), encoding.to_bgr), dtype=np.uint8)
-    return ".png", png(pixels)
-
-
-_WRITERS: Mapping[str, Callable[[Any, str], tuple[str, bytes]]] = {RAW: _raw, COMPRESSED: _compressed}
+    if to_bgr is not None:
+        pixels = np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), to_bgr), dtype=np.uint8)
+    return pixels
 
 
 VIDEO = "foxglove_msgs/msg/CompressedVideo"
 
 _FORMATS = ("h264", "h265", "vp9", "av1")
-_CODECS = {"h265": "hevc"}
-"""FFmpeg's names of formats, where they are others."""
+_CODECS = {"h265": "hevc"}  # FFmpeg's other names of formats
 
 
 class VideoDecoder:
-    """Decodes the packets of one topic in their order.
-
-    Args:
-        form: format of the packets as messages name it.
-        where: the topic, for errors.
-
-    Raises:
-        DriveError: the format is not known, or PyAV is not installed.
-    """
+    """Decodes the packets of one topic in their order; ``form`` is their format as messages name it."""
 
     def __init__(self, form: str, where: str) -> None:
         self._av = need("av", "video", f"{where}: video in a bag", DriveError)
@@ -129,12 +100,9 @@ class VideoDecoder:
         self._context.thread_count = 1  # frames of several threads come late
 
     def frames(self, data: bytes | None, number: int) -> Iterator[tuple[int, np.ndarray]]:
-        """The frames that are whole once the packet ``number`` is there, with their packets' numbers.
+        """The frames that the packet ``number`` completes, with their packets' numbers; None ends the video.
 
-        Pixels are (H, W, 3) BGR. Frames before the first key frame never come. None ends the video.
-
-        Raises:
-            DriveError: the packet is damaged.
+        Pixels are (H, W, 3) BGR. Frames before the first key frame never come. Raises DriveError on damage.
         """
         packet = None
         if data is not None:
@@ -167,8 +135,7 @@ HEADING_KINDS = (IMU, QUATERNION, ODOMETRY, _WITH_COVARIANCE, _POSE)
 
 _NO_FIX = -1
 _NORM_TOLERANCE = 1e-2
-_YAW = 35
-"""Place of the variance of yaw among the 36 numbers of a pose's covariance (REP-103)."""
+_YAW = 35  # place of the variance of yaw among the 36 numbers of a pose's covariance (REP-103)
 
 Row = tuple[float, ...]
 
@@ -195,11 +162,7 @@ def readings_of(
     headings: tuple[FloatArray, FloatArray] | None,
     where: str,
 ) -> Readings:
-    """Readings of the rows (P, 9) of a topic at its stamps (P,), and of rows (A, 5) of a topic of headings.
-
-    Raises:
-        DriveError: times do not rise, or something is not finite.
-    """
+    """Readings of a topic's stamps (P,) and rows (P, 9), and of rows (A, 5) of a topic of headings."""
     stamp_s, rows = positions
     order = in_order(stamp_s, where, "message")
     stamp_s, rows = stamp_s[order], rows[order]
@@ -227,10 +190,9 @@ def readings_of(
     return Readings(stamp_s, rows[:, :3], geodetic, rows[:, 3], attitudes, antenna=geodetic)
 
 
-def readings_of_sentences(stamp_s: FloatArray, lines: list[str], where: str) -> Readings:
-    """Readings of NMEA sentences in messages; these also tell the day."""
-    day: date = datetime.fromtimestamp(float(stamp_s[0]), tz=UTC).date()
-    return nmea_readings(lines, where, day)
+def readings_of_sentences(first_s: float, lines: list[str], where: str) -> Readings:
+    """Readings of NMEA sentences in messages, the first of which was stamped ``first_s``."""
+    return nmea_readings(lines, where, datetime.fromtimestamp(first_s, tz=UTC).date())
 
 
 def _pose(pose: Any, covariance: Any) -> Row:
