@@ -123,8 +123,6 @@ def test_a_source_that_does_not_fit_is_named(folder: Path) -> None:
 def test_a_library_that_is_not_installed_is_named_with_its_extra(
     module: str, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from v2hdm.geometry import geodetic
-
     content = yaml.safe_load((folder / "drive.yaml").read_text())
     extra, images = {"rosbags": "ros", "av": "video", "pyproj": "map"}[module], "front/images.txt"
     if module == "rosbags":
@@ -138,7 +136,6 @@ def test_a_library_that_is_not_installed_is_named_with_its_extra(
         content["poses"] = {"csv": "route.csv", "crs": "EPSG:25832", "heading": "true"}
     (folder / "drive.yaml").write_text(yaml.safe_dump(content))
     monkeypatch.setitem(__import__("sys").modules, module, None)
-    geodetic._cartesian.cache_clear()
     with pytest.raises(
         DriveError, match=rf"needs {module}: install the {extra} extra, pip install 'v2hdm\[{extra}\]'"
     ):

@@ -19,7 +19,7 @@ from v2hdm.errors import DriveError, V2hdmError
 from v2hdm.io.calibration import read_calibration, read_camera_info, write_calibration, write_camera_info
 from v2hdm.io.importers.nmea import read_nmea
 from v2hdm.io.importers.tables import read_kitti_rows, read_table
-from v2hdm.io.maps.geojson import read_geojson, write_geojson
+from v2hdm.io.maps import read_geojson, write_geojson
 from v2hdm.io.safe.texts import parse_json, parse_yaml, shown, take_name
 from v2hdm.io.trajectory import read_image_list, read_tum
 from v2hdm.records import Calibration

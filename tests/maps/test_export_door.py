@@ -14,9 +14,7 @@ from tests.drive.example import camera_info, looking_forward
 from tests.maps.gis import street
 from v2hdm.cli import export
 from v2hdm.io.calibration import write_calibration
-from v2hdm.io.maps import read_geojson, write_geojson
-from v2hdm.io.maps.formats import FORMATS
-from v2hdm.io.maps.geopackage import read_geopackage_verdict, write_geopackage
+from v2hdm.io.maps import FORMATS, read_geojson, read_geopackage_verdict, write_geojson, write_geopackage
 from v2hdm.records import Calibration
 
 VERDICT = {"status": "PASS"}

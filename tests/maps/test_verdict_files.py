@@ -10,8 +10,8 @@ import pytest
 
 from v2hdm.errors import MapFileError
 from v2hdm.io.calibration import read_calibration, write_calibration
+from v2hdm.io.maps import read_geojson, read_verdict, write_geojson
 from v2hdm.io.maps.evidence import ExcludedMarking, write_exclusions
-from v2hdm.io.maps.geojson import read_geojson, read_verdict, write_geojson
 from v2hdm.records import Calibration, CameraInfo, GeodeticOrigin, HdMap, Marking, Road
 from v2hdm.store.files import load_yaml
 

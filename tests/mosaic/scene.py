@@ -18,7 +18,7 @@ from v2hdm.io.calibration import write_calibration
 from v2hdm.io.drive import ReadOptions
 from v2hdm.io.drive.of_result import METRICS, told_of
 from v2hdm.io.drive.writing import write_drive
-from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.io.maps import write_geojson
 from v2hdm.io.trajectory import write_tum
 from v2hdm.records import (
     Calibration,

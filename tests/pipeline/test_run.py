@@ -17,9 +17,8 @@ from v2hdm.errors import ConfigError, DetectorError, DriveError, V2hdmError
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.calibration import CALIBRATION_FORMATS, read_calibration
 from v2hdm.io.drive import ReadOptions, read_drive
+from v2hdm.io.maps import FORMATS, read_geojson
 from v2hdm.io.maps.evidence import read_residuals
-from v2hdm.io.maps.formats import FORMATS
-from v2hdm.io.maps.geojson import read_geojson
 from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.mapping.options import AcceptanceOptions, LaneOptions, MappingOptions
 from v2hdm.pipeline import DriveConfig, RunConfig, run

@@ -46,7 +46,7 @@ def _export(parsed: argparse.Namespace) -> None:
 
 def _export_map(parsed: argparse.Namespace, folder: Path) -> list[Path]:
     from v2hdm.errors import ConfigError
-    from v2hdm.io.maps.formats import FORMATS, check_formats, read_map, write_map
+    from v2hdm.io.maps import FORMATS, check_formats, read_map, write_map
 
     check_formats(parsed.format, "--format")
     name = parsed.source.stem

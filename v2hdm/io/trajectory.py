@@ -59,8 +59,8 @@ def interpolate(
 
     first, second = trajectory.map_from_vehicle[before], trajectory.map_from_vehicle[after]
     points = first[:, :3, 3] + fraction[:, None] * (second[:, :3, 3] - first[:, :3, 3])
-    turns = [quaternion_from_rotation(poses[:, :3, :3]) for poses in (first, second)]
-    return pose_matrices(rotation_from_quaternion(slerp(*turns, fraction)), points), inside
+    begin, end = (quaternion_from_rotation(poses[:, :3, :3]) for poses in (first, second))
+    return pose_matrices(rotation_from_quaternion(slerp(begin, end, fraction)), points), inside
 
 
 def check_trajectory(trajectory: Trajectory, origin: GeodeticOrigin | None, where: str) -> None:

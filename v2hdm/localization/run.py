@@ -21,7 +21,7 @@ from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.io.calibration import trusted_calibrations
 from v2hdm.io.drive import ReadOptions, read_drive
-from v2hdm.io.maps.geojson import read_geojson
+from v2hdm.io.maps import read_geojson
 from v2hdm.io.trajectory import write_tum
 from v2hdm.localization.figure import save_errors
 from v2hdm.localization.match import Markings, Seen, locate

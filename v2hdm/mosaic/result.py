@@ -15,7 +15,7 @@ from v2hdm.detection.batch import with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.errors import ConfigError, DriveError, MapFileError
 from v2hdm.io.calibration import read_calibration
-from v2hdm.io.maps.geojson import read_geojson
+from v2hdm.io.maps import read_geojson
 from v2hdm.io.trajectory import read_tum
 from v2hdm.mosaic.blend import Sheet, blend
 from v2hdm.mosaic.canvas import Canvas

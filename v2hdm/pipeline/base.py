@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from v2hdm.detection.batch import read_image
 from v2hdm.errors import MapFileError
 from v2hdm.io.drive.road import lay_flat
-from v2hdm.io.maps.geojson import (
+from v2hdm.io.maps import (
     geojson_feature,
     geojson_positions,
     read_geojson,

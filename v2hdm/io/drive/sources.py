@@ -58,7 +58,7 @@ class Sources:
 
 
 def plan_images(content: object, camera: str, sources: Sources, where: str) -> Callable[[], ImageFiles]:
-    """The function that lists the images of a camera's ``images``, to be called once all sources are planned."""
+    """The function that lists the images of a camera, to be called once all sources are planned."""
     if isinstance(content, str):
         path = sources.root / take_text(content, where, DriveError)
         if path.is_dir():

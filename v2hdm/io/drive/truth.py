@@ -12,7 +12,7 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.io.calibration.mounting import take_rigid
-from v2hdm.io.maps import read_geojson
+from v2hdm.io.maps.reading import read_geojson
 from v2hdm.io.trajectory import read_tum
 from v2hdm.records import BoolArray, Drive, FloatArray, HdMap, Image, Truth
 from v2hdm.store.files import check_keys, load_yaml, read_text, take_mapping, take_number

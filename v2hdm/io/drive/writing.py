@@ -12,7 +12,7 @@ import numpy as np
 from v2hdm.io.calibration.writing import write_camera_info
 from v2hdm.io.drive.folder import DRIVE_FILE, POSES_FILE
 from v2hdm.io.drive.truth import LANE_VISIBLE, SIGHTINGS
-from v2hdm.io.maps import write_geojson
+from v2hdm.io.maps.geojson import write_geojson
 from v2hdm.io.trajectory import write_image_list, write_tum
 from v2hdm.records import Camera, Drive, Image, Trajectory, Truth
 from v2hdm.store.files import dump_yaml, replace_text

@@ -182,6 +182,7 @@ def assemble(
             "turns, stands or reverses; add a heading (HDT, THS, PASHR, an Imu or dual-antenna topic, a "
             "column)"
         )
+    heading_sigma_rad = readings.attitudes.sigma_rad
     kept = _sure_enough(readings, settings.max_sigma_m, where)
     readings = replace(
         readings, stamp_s=readings.stamp_s[kept], points=readings.points[kept], sigma_m=readings.sigma_m[kept]
@@ -208,7 +209,7 @@ def assemble(
         )
     if settings.lever_arm_m is not None:
         points = points - rotation @ settings.lever_arm_m
-    noise = _noise({"position_m": sigma_m, "heading_rad": readings.attitudes.sigma_rad})
+    noise = _noise({"position_m": sigma_m, "heading_rad": heading_sigma_rad})
     return Recorded(Trajectory(stamp_s, pose_matrices(rotation, points)), noise, origin)
 
 

@@ -149,8 +149,9 @@ _ANGLES = (
 )  # fmt: skip
 _SURENESS = ("quality", "sigma_m", "heading_sigma_deg")
 NAMES = (*_STAMPS, "utc", *_MAP, *_GEODETIC, *_QUATERNION, *_ANGLES, *_SURENESS)
-"""Columns that are understood. ``heading_deg`` counts clockwise from north, ``yaw_...`` counter-clockwise from x
-or east; roll is positive with the left side up, ``pitch_...`` with the nose down, ``pitch_up_deg`` up."""
+"""Columns that are understood. ``heading_deg`` counts clockwise from north, ``yaw_...`` counter-clockwise
+from x or east; roll is positive with the left side up, ``pitch_...`` with the nose down, ``pitch_up_deg``
+up."""
 
 
 def read_table(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:

@@ -1,7 +1,4 @@
-"""The corner observations that a map rests on, and how far each lies from where the map puts it, as CSV.
-
-Candidates that did not enter the map, as GeoJSON points.
-"""
+"""Evidence beside a map: corner observations with residuals, as CSV, and rejected candidates."""
 
 from __future__ import annotations
 
@@ -27,8 +24,7 @@ from v2hdm.store.files import (
     take_text,
 )
 
-FILE = "residuals.csv"
-"""Name of the file in a result folder."""
+FILE = "residuals.csv"  # in a result folder
 
 COLUMNS = (
     *("image", "camera", "taken_s", "marking", "corner", "point"),
@@ -45,9 +41,9 @@ class Residuals:
     """K corner observations that an optimisation accepted.
 
     Attributes:
-        image: paths of the images, below the drive's folder; ``row_image`` (K,) says which of them.
-        camera: names of the cameras, one of each image.
-        taken_s: (I,) when each image was taken, on the clock of the poses.
+        image: paths of the images, below the drive's folder; ``row_image`` (K,) are indices into them.
+        camera: name of the camera of each image.
+        taken_s: (I,) times of the images, on the clock of the poses.
         marking: (K,) the id of the marking, 0 where its candidate was left out of the map.
         corner: (K,) 0 to 3, in the order of its corners.
         is_point: (K,) whether the observation says where the corner is, not only on which line.
@@ -71,12 +67,7 @@ class Residuals:
         return len(self.row_image)
 
     def renamed(self, marking: IntArray, corner: IntArray) -> Residuals:
-        """The same under other names of the M markings that are 1 to M here.
-
-        Args:
-            marking: (M,) ids, 0 where it is left out.
-            corner: (M, 4) the place of each corner in the other order.
-        """
+        """The same with other ids (M,) of markings 1 to M, 0 for none, and other corners (M, 4)."""
         known = self.marking > 0
         of = np.maximum(self.marking - 1, 0)
         return replace(
@@ -103,11 +94,7 @@ def write_residuals(residuals: Residuals, path: Path) -> None:
 
 
 def read_residuals(path: Path) -> Residuals:
-    """Read what :func:`write_residuals` wrote.
-
-    Raises:
-        MapFileError: the file is missing, damaged or has other columns.
-    """
+    """Read the file of :func:`write_residuals`; raises MapFileError where it is missing or damaged."""
     rows = list(csv.reader(io.StringIO(read_text(path, MapFileError))))
     if not rows or tuple(rows[0]) != COLUMNS:
         raise MapFileError(f"{path}: its columns are not {','.join(COLUMNS)}; map the drive again")
@@ -171,29 +158,20 @@ def write_exclusions(
 
 
 def read_exclusions(path: Path) -> list[ExcludedMarking]:
-    """Read what :func:`write_exclusions` wrote.
-
-    Raises:
-        MapFileError: the file is missing, damaged or not of this format.
-    """
+    """Read the file of :func:`write_exclusions`; raises MapFileError where it is missing or damaged."""
     features = load_json(path, MapFileError).get("features")
     if not isinstance(features, list):
         raise MapFileError(f"{path}: no 'features'; give what v2hdm.map wrote")
     excluded = []
     for number, feature in enumerate(features):
         where = f"{path}: feature {number}"
-        entry = take_mapping(
-            take_mapping(feature, where, MapFileError).get("properties"), where, MapFileError
+        feature = take_mapping(feature, where, MapFileError)
+        entry = take_mapping(feature.get("properties"), where, MapFileError)
+        kind, reason, cameras = (
+            take_text(entry.get(key), f"{where}: {key}", MapFileError)
+            for key in ("class", "reason", "cameras")
         )
-        excluded.append(
-            ExcludedMarking(
-                kind=take_text(entry.get("class"), f"{where}: class", MapFileError),
-                position_map=take_array(
-                    entry.get("position_map", np.nan), (2,), f"{where}: position_map", MapFileError
-                ),
-                sightings=int(take_number(entry.get("sightings"), f"{where}: sightings", MapFileError)),
-                reason=take_text(entry.get("reason"), f"{where}: reason", MapFileError),
-                cameras=take_text(entry.get("cameras"), f"{where}: cameras", MapFileError),
-            )
-        )
+        at = take_array(entry.get("position_map", np.nan), (2,), f"{where}: position_map", MapFileError)
+        sightings = take_number(entry.get("sightings"), f"{where}: sightings", MapFileError)
+        excluded.append(ExcludedMarking(kind, at, int(sightings), reason, cameras))
     return excluded
