@@ -24,15 +24,9 @@ from v2hdm.store.files import take_array, take_text
 
 _XML = re.compile(r"<[?!\w]")  # YAML may begin with ``<<``
 _END_OF_MESSAGE = re.compile(r"\n---\s*$")  # ``ros2 topic echo`` ends with a second, empty document
-_BROWN_CONRADY = {
-    4: "plumb_bob",
-    5: "plumb_bob",
-    8: "rational_polynomial",
-}  # by OpenCV's number of coefficients
-_BEYOND = {
-    14: (12, "tilted sensor"),
-    12: (8, "thin prism"),
-}  # lenses of OpenCV, unless all further ones are zero
+# OpenCV's lenses by their number of coefficients, and those beyond ours unless all further ones are zero.
+_BROWN_CONRADY = {4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial"}
+_BEYOND = {14: (12, "tilted sensor"), 12: (8, "thin prism")}
 _COLMAP_LINE = re.compile(r"^\d+\s+[A-Z][A-Z0-9_]+\s+\d+\s+\d+(\s|$)")
 _KALIBR_KEYS = ("camera_model", "intrinsics", "distortion_model", "resolution")
 _KALIBR_PROJECTIONS = {

@@ -83,12 +83,9 @@ def join_drives(drives: Sequence[Drive], apart: Collection[tuple[int, str]] = ()
             one = drive.cameras[camera]
             cameras.setdefault(joined, replace(one, info=replace(one.info, name=joined)))
         move = _move(drives[0].origin, drive.origin)
-        images += [
-            replace(
-                one, camera=own[one.camera], visit=number, map_from_vehicle=move.planar @ one.map_from_vehicle
-            )
-            for one in drive.images
-        ]
+        for one in drive.images:
+            pose = move.planar @ one.map_from_vehicle
+            images.append(replace(one, camera=own[one.camera], visit=number, map_from_vehicle=pose))
         visits.append(
             Visit(
                 name=name,
@@ -236,8 +233,5 @@ def _one_road(roads: Sequence[Road | None], visits: Sequence[Visit]) -> Road | N
         elif visit.recorded is not None:
             places = visit.recorded.map_from_vehicle[:, :3, 3]
             known.append(Road(places[:, :2], places[:, 2], np.zeros((len(places), 2))))
-    return Road(
-        np.concatenate([one.points_map for one in known]),
-        np.concatenate([one.height_m for one in known]),
-        np.concatenate([one.slope for one in known]),
-    )
+    columns = zip(*((one.points_map, one.height_m, one.slope) for one in known), strict=True)
+    return Road(*map(np.concatenate, columns))

@@ -9,6 +9,7 @@ the format leaves open.
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -160,18 +161,10 @@ def read_kitti_drive(path: Path, options: ReadOptions) -> Drive:
 def _list_images(path: Path, camera: str) -> ImageFiles:
     """The images of one camera; the file number k is the line number of its time stamp."""
     folder = path / camera
-    paths = sorted(
-        p for p in (folder / "data").glob("*") if p.suffix.lower() in _SUFFIXES and p.stem.isdecimal()
-    )
+    paths = [one for one in _numbered(folder) if one.suffix.lower() in _SUFFIXES]
     if not paths:
         raise DriveError(f"{folder / 'data'}: no PNG or JPEG image; restore KITTI's images")
-    stamps = _read_stamps(folder / "timestamps.txt")
-    last = int(paths[-1].stem)
-    if last >= len(stamps):
-        raise DriveError(
-            f"{folder / 'timestamps.txt'}: {len(stamps)} lines, but image {last} exists; restore the file"
-        )
-    stamp_s = stamps[[int(p.stem) for p in paths]]
+    stamp_s = _stamps_of(paths, folder / "timestamps.txt", "image")
     if (np.diff(stamp_s) <= 0).any():
         raise DriveError(f"{folder / 'timestamps.txt'}: times are not strictly rising; restore the file")
     return ImageFiles(camera=camera, stamp_s=stamp_s, paths=paths)
@@ -180,22 +173,33 @@ def _list_images(path: Path, camera: str) -> ImageFiles:
 def _read_oxts(path: Path, camera: str) -> tuple[FloatArray, FloatArray]:
     """Stamps (P,) and OXTS rows (P, 30); without stamps of its own, line k has those of image k."""
     folder = path / "oxts"
-    paths = sorted(p for p in (folder / "data").glob("*.txt") if p.stem.isdecimal())
+    paths = [one for one in _numbered(folder) if one.suffix == ".txt"]
     if not paths:
         raise DriveError(f"{folder / 'data'}: no OXTS file; restore KITTI's oxts folder")
     stamps_path = folder / "timestamps.txt"
     if not stamps_path.is_file():
         stamps_path = path / camera / "timestamps.txt"
-    stamps = _read_stamps(stamps_path)
-    last = int(paths[-1].stem)
-    if last >= len(stamps):
-        raise DriveError(f"{stamps_path}: {len(stamps)} lines, but OXTS file {last} exists; restore the file")
-    stamp_s = stamps[[int(p.stem) for p in paths]]
+    stamp_s = _stamps_of(paths, stamps_path, "OXTS file")
     oxts = np.array([_read_oxts_row(p) for p in paths])
     rising = np.concatenate([[True], stamp_s[1:] > np.maximum.accumulate(stamp_s)[:-1]])
     if not rising.all():
         _log.warning("%s: dropped %d poses whose time does not rise", stamps_path, int((~rising).sum()))
     return stamp_s[rising], oxts[rising]
+
+
+def _numbered(folder: Path) -> list[Path]:
+    return sorted(path for path in (folder / "data").glob("*") if path.stem.isdecimal())
+
+
+def _stamps_of(paths: Sequence[Path], stamps_path: Path, thing: str) -> FloatArray:
+    """The stamps (N,) of numbered files."""
+    stamps = _read_stamps(stamps_path)
+    numbers = [int(path.stem) for path in paths]
+    if numbers[-1] >= len(stamps):
+        raise DriveError(
+            f"{stamps_path}: {len(stamps)} lines, but {thing} {numbers[-1]} exists; restore the file"
+        )
+    return stamps[numbers]
 
 
 def _read_oxts_row(path: Path) -> FloatArray:

@@ -150,18 +150,9 @@ def in_map(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[SurveyedP
     positions, height_m = table.coordinates, table.height_m
     if table.frame is not Frame.MAP:
         positions, height_m = _on_earth(table, origin)
-    known = np.isfinite(height_m)
-    return tuple(
-        SurveyedPoint(
-            name,
-            positions[k],
-            table.sigma_m[k],
-            float(height_m[k]) if known[k] else None,
-            table.is_check[k],
-            table.descriptions[k],
-        )
-        for k, name in enumerate(table.ids)
-    )
+    heights = [float(height) if np.isfinite(height) else None for height in height_m]
+    columns = (table.ids, positions, table.sigma_m, heights, table.is_check, table.descriptions)
+    return tuple(SurveyedPoint(*row) for row in zip(*columns, strict=True))
 
 
 def misreadings(table: SurveyTable, origin: GeodeticOrigin | None) -> dict[str, FloatArray]:
@@ -216,11 +207,8 @@ def _on_earth(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[FloatA
                 "differ by decimetres; give the points in that of the origin"
             )
         if has_height_datum(crs, where, DriveError) and table.geoid_m is None:
-            _log.warning(
-                "%s: heights of %s count from the sea and are not used: set mapping.survey.geoid_m",
-                where,
-                crs,
-            )
+            unused = "%s: heights of %s count from the sea and are not used: set mapping.survey.geoid_m"
+            _log.warning(unused, where, crs)
             height_m = np.full_like(height_m, np.nan)
     known = np.isfinite(height_m)
     raised_m = np.where(known, height_m + (table.geoid_m or 0.0), origin.altitude_m)
@@ -281,14 +269,11 @@ class _Row:
 def _rows(path: Path) -> list[_Row]:
     header, lines = read_rows(path, ";\t,", "point")
     columns = _columns(header, path)
-    return [
-        _Row(
-            number,
-            {name: cell for name, cell in zip(columns, cells, strict=True) if name is not None},
-            f"{path}: line {number}",
-        )
-        for number, cells in lines
-    ]
+    rows = []
+    for number, cells in lines:
+        known = {name: cell for name, cell in zip(columns, cells, strict=True) if name is not None}
+        rows.append(_Row(number, known, f"{path}: line {number}"))
+    return rows
 
 
 def _columns(header: Sequence[str], path: Path) -> list[str | None]:

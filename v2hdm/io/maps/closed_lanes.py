@@ -104,7 +104,7 @@ class _Run:
 
 
 def _runs(lines_map: Sequence[FloatArray]) -> list[_Run]:
-    """Where two lines run beside each other for longer than they are apart, each pair once."""
+    """Stretches of two lines beside each other, longer than they are apart, each pair once."""
     segments = _Segments.of(lines_map)
     runs = []
     for number, line in enumerate(lines_map):

@@ -48,13 +48,13 @@ def write_features(
     path: Path, features: Sequence[Mapping[str, Any]], origin: GeodeticOrigin | None, about: Mapping[str, Any]
 ) -> None:
     """Write GeoJSON ``features`` a line each, atomically, with the frame and ``about`` under ``v2hdm``."""
-    told: dict[str, Any] = {"frame": "map", "coordinates": _LOCAL if origin is None else _WGS84}
+    frame: dict[str, Any] = {"frame": "map", "coordinates": _LOCAL if origin is None else _WGS84}
     if origin is not None:
-        told["origin"] = asdict(origin)
+        frame["origin"] = asdict(origin)
     decimals = (_DEGREE_DECIMALS, _HEIGHT_DECIMALS)
     resolution = {} if origin is None else {k: 10.0**-n for k, n in zip(RESOLUTION, decimals, strict=True)}
     head = json.dumps(
-        {"type": "FeatureCollection", **resolution, "v2hdm": told | dict(about)}, allow_nan=False
+        {"type": "FeatureCollection", **resolution, "v2hdm": frame | dict(about)}, allow_nan=False
     )
     lines = ",\n".join(json.dumps(feature, allow_nan=False) for feature in features)
     replace_text(path, f'{head[:-1]}, "features": [\n{lines}\n]}}\n')

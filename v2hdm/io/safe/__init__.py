@@ -1,1 +1,1 @@
-"""The gate for bytes of strangers: texts, images, and the fields that several formats share."""
+"""Validation of bytes from outside: texts, images, and the fields that several formats share."""

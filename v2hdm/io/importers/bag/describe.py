@@ -25,10 +25,7 @@ from v2hdm.io.importers.imported import entry_folder, is_whole
 from v2hdm.records import FloatArray
 from v2hdm.store.files import dump_yaml, load_yaml
 
-_VEHICLES = (
-    "base_footprint",
-    "base_link",
-)  # frames of a vehicle, the one on the ground first (REP-105, REP-120)
+_VEHICLES = ("base_footprint", "base_link")  # frames, the one on the ground first (REP-105, REP-120)
 _MAPS = ("map", "odom")
 _LEAST_MESSAGES = 2
 _IMAGE_WORDS = frozenset(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
@@ -142,7 +142,9 @@ Row = tuple[float, ...]
 
 def position_row(kind: str, fields: Any) -> Row:
     """Position (3), standard deviation (1, nan if not stated), quaternion (4, nan if none), its sigma (1)."""
-    return _POSITIONS[kind](fields)
+    if kind == FIX:
+        return _fix(fields)
+    return _pose(fields.pose, None) if kind == _POSE else _pose(fields.pose.pose, fields.pose.covariance)
 
 
 def heading_row(kind: str, fields: Any) -> Row:
@@ -219,11 +221,3 @@ def _quaternion(orientation: Any) -> Row:
 def _sigma(variance: float) -> float:
     """Standard deviation, nan of a variance that stands for "not known"."""
     return float(np.sqrt(variance)) if variance > 0 else np.nan
-
-
-_POSITIONS: Mapping[str, Callable[[Any], Row]] = {
-    ODOMETRY: lambda fields: _pose(fields.pose.pose, fields.pose.covariance),
-    _WITH_COVARIANCE: lambda fields: _pose(fields.pose.pose, fields.pose.covariance),
-    _POSE: lambda fields: _pose(fields.pose, None),
-    FIX: _fix,
-}

@@ -191,7 +191,7 @@ class TfStream(Stream):
         self._wanted = [TF_TOPIC, TF_STATIC] if moving else [TF_STATIC]
 
     def topics(self, bag: Bag) -> Sequence[str]:
-        """Those of its topics that are there, at least one."""
+        """Its topics in the bag, at least one."""
         there = [name for name in self._wanted if name in bag.topics]
         if not there:
             raise DriveError(f"{self.where}: {bag.path} has no topic {' or '.join(self._wanted)}")
