@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import yaml
 
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import rotation_from_euler
@@ -113,3 +117,11 @@ def make_truth(drive: Drive) -> Truth:
         lane_visible=(np.array([True, False, True]),),
         disturbances={"jitter_deg": 0.1},
     )
+
+
+@contextmanager
+def description(root: Path) -> Iterator[dict[str, Any]]:
+    """The content of the drive's ``drive.yaml``, which is written back as it was changed."""
+    content = yaml.safe_load((root / "drive.yaml").read_text())
+    yield content
+    (root / "drive.yaml").write_text(yaml.safe_dump(content))
