@@ -92,17 +92,15 @@ def check_geodetic(geodetic: FloatArray, where: str) -> None:
 
 def read_tum(path: Path) -> Trajectory:
     """Read the trajectory at ``path``: stamps in s, strictly rising, and poses ``map_from_vehicle`` in m."""
-    numbers: list[int] = []
-    rows: list[list[float]] = []
+    rows: dict[int, list[float]] = {}
     for number, line in _content_lines(path):
         where, parts = f"{path}: line {number}", line.replace(",", " ").split()
         if len(parts) != 8:
             raise DriveError(f"{where}: expected 8 columns '{_COLUMNS}', got {len(parts)}; mend that line")
-        numbers.append(number)
-        rows.append([_parse_float(part, where) for part in parts])
+        rows[number] = [_parse_float(part, where) for part in parts]
     if not rows:
         raise DriveError(f"{path}: holds no pose; expected lines '{_COLUMNS}'")
-    table = np.array(rows)
+    numbers, table = list(rows), np.array(list(rows.values()))
     _check_rising(table[:, 0], numbers, path)
     norm = np.linalg.norm(table[:, 4:], axis=1)
     wrong = np.flatnonzero(np.abs(norm - 1.0) > _NORM_TOLERANCE)
@@ -129,20 +127,18 @@ def write_tum(trajectory: Trajectory, path: Path) -> None:
 
 def read_image_list(path: Path) -> tuple[FloatArray, list[str]]:
     """Read ``timestamp filename`` lines: stamps (N,) in s, strictly rising, and the file names."""
-    numbers: list[int] = []
-    stamps: list[float] = []
+    stamps: dict[int, float] = {}
     names: list[str] = []
     for number, line in _content_lines(path):
         where, parts = f"{path}: line {number}", line.split(maxsplit=1)
         if len(parts) != 2:
             raise DriveError(f"{where}: expected 'timestamp filename', got '{line}'; mend that line")
-        numbers.append(number)
-        stamps.append(_parse_float(parts[0], where))
+        stamps[number] = _parse_float(parts[0], where)
         names.append(parts[1])
     if not names:
         raise DriveError(f"{path}: lists no image; expected lines 'timestamp filename'")
-    stamp_s = np.array(stamps)
-    _check_rising(stamp_s, numbers, path)
+    stamp_s = np.array(list(stamps.values()))
+    _check_rising(stamp_s, list(stamps), path)
     return stamp_s, names
 
 

@@ -66,14 +66,9 @@ class IntrinsicsFormat:
 def read_intrinsics(path: Path, camera: str | None = None, name_by: str = "its name") -> CameraInfo:
     """The intrinsics of one camera, from a file of any format of :data:`INTRINSICS`.
 
-    Args:
-        path: the file.
-        camera: which of its cameras; needed where it holds several.
-        name_by: how the user names it, for errors.
-
-    Raises:
-        DriveError: the file is missing, damaged or of no known format, the camera is not in it or not named
-            among several, or its lens is beyond ours.
+    ``camera`` is needed where the file holds several; ``name_by`` says in errors how the user names it.
+    Raises DriveError when the file is missing, damaged or of no known format, the camera is not in it or not
+    named among several, or its lens is beyond ours.
     """
     if path.suffix.lower() == ".bin":
         raise DriveError(

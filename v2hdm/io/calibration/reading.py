@@ -16,10 +16,8 @@ from v2hdm.io.safe.texts import take_camera_name
 from v2hdm.records import DISTORTION_COEFFICIENTS, Calibration, CameraInfo, FloatArray
 from v2hdm.store.files import check_keys, load_yaml, take_array, take_mapping, take_text
 
-_INFO = (
-    "camera_name", "image_width", "image_height", "camera_matrix", "distortion_model",
-    "distortion_coefficients",
-)  # fmt: skip
+_SIZE = ("image_width", "image_height")
+_INFO = ("camera_name", *_SIZE, "camera_matrix", "distortion_model", "distortion_coefficients")
 _OPTIONAL = (
     "vehicle_from_pinhole_px", "translation_sigma_m", "rotation_sigma_deg", "covariance", "clock_offset_s",
     "clock_sigma_s", "drive", "date", "verdict",
@@ -51,14 +49,11 @@ def read_calibration(path: Path) -> Calibration:
     def array(key: str, *shape: int) -> Any:
         return take_array(content[key], shape, f"{path}: {key}", MapFileError)
 
-    info = CameraInfo(
-        name=take_camera_name(content["camera_name"], f"{path}: camera_name", MapFileError),
-        width=take_size_px(content["image_width"], f"{path}: image_width", MapFileError),
-        height=take_size_px(content["image_height"], f"{path}: image_height", MapFileError),
-        intrinsic=array("camera_matrix", 3, 3),
-        distortion_model=take_text(content["distortion_model"], f"{path}: distortion_model", MapFileError),
-        distortion=tuple(array("distortion_coefficients", -1).tolist()),
-    )
+    name = take_camera_name(content["camera_name"], f"{path}: camera_name", MapFileError)
+    size = [take_size_px(content[key], f"{path}: {key}", MapFileError) for key in _SIZE]
+    model = take_text(content["distortion_model"], f"{path}: distortion_model", MapFileError)
+    distortion = tuple(array("distortion_coefficients", -1).tolist())
+    info = CameraInfo(name, size[0], size[1], array("camera_matrix", 3, 3), model, distortion)
     if len(info.distortion) == DISTORTION_COEFFICIENTS.get(info.distortion_model):
         check_camera(info, str(path), MapFileError)
     covariance = None
@@ -126,14 +121,10 @@ def take_camera_info(content: Mapping[str, Any], where: str) -> CameraInfo:
             f"{where}: distortion_coefficients: {model} has {expected} coefficients, got {len(distortion)}; "
             "complete them (zeros where unused) or name the right model"
         )
-    info = CameraInfo(
-        name=take_text(content["camera_name"], f"{where}: camera_name", DriveError),
-        width=take_size_px(content["image_width"], f"{where}: image_width", DriveError),
-        height=take_size_px(content["image_height"], f"{where}: image_height", DriveError),
-        intrinsic=_take_intrinsic(content["camera_matrix"], f"{where}: camera_matrix"),
-        distortion_model=model,
-        distortion=tuple(distortion.tolist()),
-    )
+    name = take_text(content["camera_name"], f"{where}: camera_name", DriveError)
+    size = [take_size_px(content[key], f"{where}: {key}", DriveError) for key in _SIZE]
+    intrinsic = _take_intrinsic(content["camera_matrix"], f"{where}: camera_matrix")
+    info = CameraInfo(name, size[0], size[1], intrinsic, model, tuple(distortion.tolist()))
     check_camera(info, where, DriveError)
     return info
 

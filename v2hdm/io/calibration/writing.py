@@ -38,14 +38,8 @@ def write_calibration(
     """Write our own calibration file, atomically.
 
     The sigmas are of the left-perturbation tangent of ``cam_from_vehicle``, along the camera's own axes
-    (right, down, forward), and left out without a covariance.
-
-    Args:
-        calibration: the camera's.
-        path: of the file.
-        clock_s: delay of its images behind their stamps and its sigma (infinite where unknown).
-        verdict: on the run which found it, as JSON.
-        about: its drive and date.
+    (right, down, forward), and left out without a covariance. ``clock_s`` is the delay of its images behind
+    their stamps and its sigma (infinite where unknown), ``verdict`` that on the run which found it, as JSON.
     """
     info = calibration.info
     content: dict[str, Any] = {

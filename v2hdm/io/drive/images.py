@@ -200,19 +200,11 @@ def part_of(drive: Drive, options: ReadOptions) -> Drive:
 def with_clock_offsets(
     drive: Drive, offset_s: Mapping[str, float], max_gap_s: float, visit: int = 0
 ) -> Drive:
-    """The drive with the images of one session posed for when they were taken.
+    """The drive with the images of the session ``visit`` posed for when they were taken.
 
-    Args:
-        drive: a drive that holds its trajectory.
-        offset_s: by camera, how much later than stamped its images were taken, s.
-        max_gap_s: longest gap between two poses that is interpolated across, s.
-        visit: number of the session; images of others stay as they are.
-
-    Returns:
-        The drive without images whose time the trajectory does not cover.
-
-    Raises:
-        DriveError: the drive holds no trajectory, or no image of some camera is left.
+    ``offset_s`` is, by camera, the delay of its images behind their stamps. Images are left out whose time
+    the trajectory does not cover, or where two poses are more than ``max_gap_s`` apart. Raises DriveError
+    when the drive holds no trajectory, or no image of some camera is left.
     """
     root, trajectory = drive.visits[visit].root, drive.visits[visit].trajectory
     if trajectory is None:

@@ -83,9 +83,9 @@ def join_drives(drives: Sequence[Drive], apart: Collection[tuple[int, str]] = ()
             one = drive.cameras[camera]
             cameras.setdefault(joined, replace(one, info=replace(one.info, name=joined)))
         move = _move(drives[0].origin, drive.origin)
-        for one in drive.images:
-            pose = move.planar @ one.map_from_vehicle
-            images.append(replace(one, camera=own[one.camera], visit=number, map_from_vehicle=pose))
+        for image in drive.images:
+            pose = move.planar @ image.map_from_vehicle
+            images.append(replace(image, camera=own[image.camera], visit=number, map_from_vehicle=pose))
         visits.append(
             Visit(
                 name=name,

@@ -37,10 +37,6 @@ from v2hdm.store.files import read_text
 
 _log = logging.getLogger(__name__)
 
-_CAM_TO_CAM = "calib_cam_to_cam.txt"
-_VELO_TO_CAM = "calib_velo_to_cam.txt"
-_IMU_TO_VELO = "calib_imu_to_velo.txt"
-
 
 @dataclass(frozen=True)
 class KittiCamera:
@@ -53,7 +49,7 @@ class KittiCamera:
 def read_kitti_camera(folder: Path, name: str) -> KittiCamera:
     """Read the rectified camera ``name`` (``image_00`` to ``image_03``) from the date folder."""
     number = name.removeprefix("image_")
-    cameras = _Entries(folder / _CAM_TO_CAM)
+    cameras = _Entries(folder / "calib_cam_to_cam.txt")
     projection = cameras.matrix(f"P_rect_{number}", 3, 4)
     width, height = cameras.matrix(f"S_rect_{number}", 1, 2)[0]
     intrinsic = projection[:, :3] / projection[2, 2]
@@ -62,8 +58,8 @@ def read_kitti_camera(folder: Path, name: str) -> KittiCamera:
     # P = K [I | b]: the rectified cameras share cam 0's axes and differ by the offset b.
     rectified_from_rectified0 = np.eye(4)
     rectified_from_rectified0[:3, 3] = np.linalg.solve(intrinsic, projection[:, 3])
-    cam0_from_velo = _Entries(folder / _VELO_TO_CAM).rigid()
-    velo_from_imu = _Entries(folder / _IMU_TO_VELO).rigid()
+    cam0_from_velo = _Entries(folder / "calib_velo_to_cam.txt").rigid()
+    velo_from_imu = _Entries(folder / "calib_imu_to_velo.txt").rigid()
     return KittiCamera(
         info=CameraInfo(name=name, width=round(width), height=round(height), intrinsic=intrinsic),
         cam_from_imu=rectified_from_rectified0 @ rectified0_from_cam0 @ cam0_from_velo @ velo_from_imu,
@@ -76,13 +72,13 @@ class _Entries:
     def __init__(self, path: Path) -> None:
         self._path = path
         lines = (line.partition(":") for line in read_text(path, DriveError).splitlines())
-        self._values = {key.strip(): value for key, _, value in lines}
+        self._values = {key.strip(): value.split() for key, _, value in lines}
 
     def matrix(self, key: str, rows: int, columns: int) -> FloatArray:
         if key not in self._values:
             raise DriveError(f"{self._path}: no entry '{key}'; restore KITTI's own file")
         try:
-            values = np.array(self._values[key].split(), dtype=np.float64)
+            values = np.array(self._values[key], dtype=np.float64)
         except ValueError:
             values = np.empty(0)
         if values.size != rows * columns or not np.isfinite(values).all():
@@ -92,10 +88,7 @@ class _Entries:
         return values.reshape(rows, columns)
 
     def rigid(self) -> FloatArray:
-        transform = np.eye(4)
-        transform[:3, :3] = self.matrix("R", 3, 3)
-        transform[:3, 3] = self.matrix("T", 1, 3)[0]
-        return transform
+        return np.vstack([np.hstack([self.matrix("R", 3, 3), self.matrix("T", 3, 1)]), [0.0, 0.0, 0.0, 1.0]])
 
 
 _CAMERAS = ("image_00", "image_01", "image_02", "image_03")

@@ -52,13 +52,11 @@ _HALF_WIDTH_M = 3.5  # ground to either side of the path that counts for unevenn
 
 @dataclass(frozen=True)
 class Laid:
-    """Poses with the road laid flat.
+    """Poses with the road laid flat: z = 0, plan and heading as recorded, roll, pitch relative to the road.
 
-    Attributes:
-        trajectory: z = 0, x, y and heading as recorded, roll and pitch relative to the road.
-        road: the recorded ground; None where it was recorded as the plane z = 0.
-        mount_rad: (2,) roll (positive: left side up) and pitch (positive: nose down) of the sensor on the
-            vehicle, which ``trajectory`` no longer has.
+    ``road`` is the recorded ground, None where it was recorded as the plane z = 0; ``mount_rad`` (2,) are
+    roll (left side up) and pitch (nose down) of the sensor on the vehicle, which ``trajectory`` no longer
+    has.
     """
 
     trajectory: Trajectory
@@ -67,13 +65,9 @@ class Laid:
 
 
 def lay_flat(recorded: Trajectory, position_sigma_m: float) -> Laid:
-    """Lay the road under ``recorded`` poses flat into z = 0.
+    """Lay the road under poses ``map_from_vehicle`` flat into z = 0, recorded with ``position_sigma_m``.
 
-    Roll, or pitch, that is zero throughout was not measured: the vehicle is taken to follow the road.
-
-    Args:
-        recorded: ``map_from_vehicle`` at the receiver's rate.
-        position_sigma_m: standard deviation of a recorded position.
+    Roll, or pitch, that is zero throughout was not measured: the vehicle is assumed to follow the road.
     """
     poses = recorded.map_from_vehicle
     slope = _slope_of_up_axis(poses)
@@ -204,12 +198,10 @@ def _turned(vectors: FloatArray, angle_rad: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Stations:
-    """Places along a route, each the mean of the successive poses within a metre.
+    """Places (N, 2) along a route, each the mean of the successive poses within a metre.
 
-    Attributes:
-        first: (N + 1,) index of each station's first pose, and the number of poses at the end.
-        points_map: (N, 2) m.
-        path_m: (N,) way driven to each.
+    ``first`` (N + 1,) are indices of the stations' first poses, and the number of poses; ``path_m`` (N,) the
+    way.
     """
 
     first: np.ndarray
@@ -292,14 +284,10 @@ def _means(values: FloatArray, first: np.ndarray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Unevenness:
-    """The ground's worst deviation from the plane beneath the vehicle.
+    """The ground's worst deviation ``value_m`` from the plane beneath the vehicle, ``distance_m`` away.
 
-    Attributes:
-        value_m: height of the ground above or below that plane.
-        distance_m: from the vehicle to there, where its roll and pitch of ``sigma`` rad are worth
-            ``sigma * distance_m``, too.
-        at_map: (2,) m, position of the vehicle.
-        station_m: its way along the route.
+    Roll and pitch of ``sigma`` rad are worth ``sigma * distance_m`` there, too. The vehicle is at ``at_map``
+    (2,), ``station_m`` along the route.
     """
 
     value_m: float

@@ -105,14 +105,10 @@ class SurveyTable:
 def read_survey(path: Path, crs: str | None, geoid_m: float | None, sigma_m: float) -> SurveyTable:
     """Read the CSV file at ``path``: names in its first line, then one point per line.
 
-    Args:
-        path: the file, separated by commas, semicolons or tabs.
-        crs: the projected system of eastings and northings, such as ``EPSG:32632``.
-        geoid_m: height of the geoid above the ellipsoid, where heights count from the sea.
-        sigma_m: of points of which the file does not state it.
-
-    Raises:
-        DriveError: with the line; a column is missing, misspelt or there twice, or a cell does not parse.
+    ``crs`` is the projected system of eastings and northings, such as ``EPSG:32632``, ``geoid_m`` the height
+    of the geoid above the ellipsoid, where heights count from the sea, and ``sigma_m`` that of points without
+    one. Raises DriveError, with the line, when a column is missing, misspelt or there twice, or a cell does
+    not parse.
     """
     rows = _rows(path)
     frame = _frame(rows[0].cells, crs, path)

@@ -68,14 +68,12 @@ class _Log:
     """Sentences so far; times are seconds of the day until the date is known."""
 
     def __init__(self, where: str) -> None:
-        self._where = where
-        self._day = 0
+        self._where, self._day, self._above_sea = where, 0, False
         self._time_s: float | None = None
         self._first_date: date | None = None
         self._fixes: dict[float, tuple[float, ...]] = {}
-        self._sigma_m: dict[float, float] = {}
-        self._above_sea = False
         self._attitudes: dict[float, tuple[float, ...]] = {}
+        self._sigma_m: dict[float, float] = {}
 
     def take(self, fields: list[str]) -> None:
         """One sentence, its fields without ``$`` and checksum."""

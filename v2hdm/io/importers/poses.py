@@ -110,15 +110,11 @@ def read_poses(
     where: str,
     read_topic: ReadTopic,
 ) -> Recorded:
-    """The poses that ``poses`` in ``drive.yaml`` names.
+    """The poses of ``poses`` in ``drive.yaml``: a TUM file's name, or a mapping with a format or a topic.
 
-    Args:
-        content: a TUM file's name, or a mapping that begins with a format of ``POSE_FORMATS`` or a topic.
-        root: folder that file names are relative to.
-        origin: the map's place on the earth as the drive states it.
-        max_gap_s: attitudes further apart are not interpolated across.
-        where: the key, for errors.
-        read_topic: reads a topic of the drive's bag.
+    File names are relative to ``root``, ``origin`` is the map's place on the earth as the drive states it,
+    attitudes further apart than ``max_gap_s`` are not interpolated across, ``where`` names the key in errors,
+    and ``read_topic`` reads a topic of the drive's bag.
     """
     if isinstance(content, str):
         return Recorded(read_tum(root / content), {}, origin)
@@ -183,9 +179,9 @@ def assemble(
             "column)"
         )
     heading_sigma_rad = readings.attitudes.sigma_rad
-    kept = _sure_enough(readings, settings.max_sigma_m, where)
+    sure = _sure_enough(readings, settings.max_sigma_m, where)
     readings = replace(
-        readings, stamp_s=readings.stamp_s[kept], points=readings.points[kept], sigma_m=readings.sigma_m[kept]
+        readings, stamp_s=readings.stamp_s[sure], points=readings.points[sure], sigma_m=readings.sigma_m[sure]
     )
     rotation, known = _rotation_at(readings, max_gap_s, where)
     points, sigma_m = readings.points[known], readings.sigma_m[known]

@@ -55,17 +55,12 @@ class Attitudes:
 
 @dataclass(frozen=True)
 class Readings:
-    """Positions over time, and attitudes, perhaps at other times.
+    """Positions over time, and attitudes, if any, perhaps at other times.
 
-    Attributes:
-        stamp_s: (P,) strictly rising.
-        points: (P, 3): x, y, z in m of the map or a projected system, or latitude and longitude in degrees
-            and height above the ellipsoid in m.
-        geodetic: whether they are latitudes and longitudes.
-        sigma_m: (P,) standard deviation of a horizontal coordinate, nan where it is not stated, infinite
-            where there was no fix.
-        attitudes: None where the source has none.
-        antenna: whether they are an antenna's, which seldom sits at the vehicle's origin.
+    ``points`` (P, 3) are x, y, z in m of the map or a projected system, or, where ``geodetic``, latitude and
+    longitude in degrees and height above the ellipsoid in m. ``stamp_s`` (P,) rise strictly. ``sigma_m`` (P,)
+    is a horizontal coordinate's, nan where it is not stated, infinite where there was no fix. ``antenna``
+    marks positions of an antenna, which seldom sits at the vehicle's origin.
     """
 
     stamp_s: FloatArray

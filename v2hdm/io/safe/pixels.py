@@ -275,7 +275,7 @@ def _complaints() -> Iterator[list[str]]:
     complaints: list[str] = []
     sys.stderr.flush()
     try:
-        kept = os.dup(2)
+        stderr = os.dup(2)
     except OSError:  # no stderr at all
         yield complaints
         return
@@ -284,8 +284,8 @@ def _complaints() -> Iterator[list[str]]:
         try:
             yield complaints
         finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+            os.dup2(stderr, 2)
+            os.close(stderr)
             printed.seek(0)
             for line in printed.read(1 << 20).decode("utf-8", "replace").splitlines():
                 complaints.append(line)
