@@ -7,7 +7,7 @@ import pytest
 
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.lens import distort_points, undistort_points
-from v2hdm.io.fields import check_camera, lens_reach
+from v2hdm.io.safe.fields import check_camera, lens_reach
 from v2hdm.records import CameraInfo
 
 INTRINSIC = np.array([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]])

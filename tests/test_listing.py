@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.drive.example import make_map
-from v2hdm.io.maps.geojson import read_geojson, write_geojson
+from v2hdm.io.maps import read_geojson, write_geojson
 from v2hdm.store.outputs import result_folder
 
 

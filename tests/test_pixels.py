@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from v2hdm.errors import DriveError
-from v2hdm.io.pixels import read_header, read_pixels
+from v2hdm.io.safe.pixels import read_header, read_pixels
 
 FORMS = [".png", ".tiff", ".bmp", ".webp", ".jpg"]
 

@@ -20,7 +20,7 @@ from train.targets import IGNORE, Targets, targets
 from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.detection.image_file import read_bgr
 from v2hdm.errors import ConfigError, DriveError, LabelError
-from v2hdm.io.pixels import read_header
+from v2hdm.io.safe.pixels import read_header
 
 _NEAR_A_LABEL = 0.75
 """How often a view is taken around something that is labelled; the rest is taken anywhere."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from train.labels_image import LabelledImage
 from v2hdm.errors import LabelError
-from v2hdm.io.texts import parse_json, shown
+from v2hdm.io.safe.texts import parse_json, shown
 from v2hdm.records import FloatArray
 from v2hdm.store.files import read_text
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from v2hdm.errors import ConfigError
-from v2hdm.io.texts import read_yaml, shown
+from v2hdm.io.safe.texts import read_yaml, shown
 from v2hdm.records import LANE_BOUNDARY
 
 CATALOGUE_FILE = Path(__file__).with_name("catalogue.yaml")

@@ -21,7 +21,7 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.geometry.rigid import rotation_from_euler
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.io.drive.tum import read_tum, write_tum
+from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.mapping.methods import run_methods
 from v2hdm.records import Drive, FloatArray, ImageDetections, Trajectory, Truth
 from v2hdm.report.metrics import driven_past, marking_metrics

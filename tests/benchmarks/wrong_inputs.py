@@ -28,7 +28,7 @@ from tests.benchmarks.wrong.fault import Fault, copy_of
 from tests.benchmarks.wrong.poses import poses_faults
 from v2hdm.cli import config as hydra_config
 from v2hdm.errors import V2hdmError
-from v2hdm.io.maps.geojson import read_geojson
+from v2hdm.io.maps import read_geojson
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline import DriveConfig, RunConfig, run
 from v2hdm.report.metrics import marking_metrics

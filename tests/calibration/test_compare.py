@@ -12,7 +12,7 @@ from v2hdm.calibration.compare import FALSE_ALARM, movement
 from v2hdm.cli import calibration as door
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.rigid import exp
-from v2hdm.io.calibration.document import write_calibration
+from v2hdm.io.calibration import write_calibration
 from v2hdm.records import Calibration, CameraInfo
 
 INFO = CameraInfo("front", 1280, 720, np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]))

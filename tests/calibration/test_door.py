@@ -22,8 +22,7 @@ from v2hdm.cli.calibrate import main
 from v2hdm.detection.camera.mounting import camera_from_calibration
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import undistort_points
-from v2hdm.io.calibration.camera_info import write_camera_info
-from v2hdm.io.calibration.document import read_calibration, read_provenance
+from v2hdm.io.calibration import read_calibration, read_provenance, write_camera_info
 from v2hdm.io.drive import read_drive
 from v2hdm.records import FloatArray
 

@@ -22,9 +22,7 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.draw import draw_detections
 from v2hdm.detection.road import RoadDetector
 from v2hdm.detection.stopwatch import Stopwatch, lap
-from v2hdm.io.calibration.document import Provenance
-from v2hdm.io.calibration.formats import write_calibration_as
-from v2hdm.io.maps import write_calibration
+from v2hdm.io.calibration import Provenance, write_calibration, write_calibration_as
 from v2hdm.pipeline import watch
 from v2hdm.records import Calibration, LaneDetection, MarkingDetection
 

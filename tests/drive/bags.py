@@ -20,11 +20,8 @@ from v2hdm.records import Drive, FloatArray
 
 VIDEO = "foxglove_msgs/msg/CompressedVideo"
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.LATEST)
-ROS2.register(
-    get_types_from_msg(
-        "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format", VIDEO
-    )
-)
+_PACKET = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format"
+ROS2.register(get_types_from_msg(_PACKET, VIDEO))
 ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
 
 Row = tuple[float, str, Any]
@@ -140,20 +137,11 @@ class Messages:
     def transforms(self, stamp_s: float, edges: Mapping[tuple[str, str], FloatArray]) -> Any:
         made = []
         for (parent, child), matrix in edges.items():
-            pose = self.pose(matrix)
-            place = pose.position
-            made.append(
-                self.make(
-                    "geometry_msgs/msg/TransformStamped",
-                    header=self.header(stamp_s, parent),
-                    child_frame_id=child,
-                    transform=self.make(
-                        "geometry_msgs/msg/Transform",
-                        translation=self.make("geometry_msgs/msg/Vector3", x=place.x, y=place.y, z=place.z),
-                        rotation=pose.orientation,
-                    ),
-                )
-            )
+            x, y, z = matrix[:3, 3].tolist()
+            move, turn = self.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z), self.pose(matrix).orientation
+            both = self.make("geometry_msgs/msg/Transform", translation=move, rotation=turn)
+            fields = {"header": self.header(stamp_s, parent), "child_frame_id": child, "transform": both}
+            made.append(self.make("geometry_msgs/msg/TransformStamped", **fields))
         return self.make("tf2_msgs/msg/TFMessage", transforms=made)
 
 
@@ -176,9 +164,8 @@ def messages_of(
             made.add(image.stamp_s, topic, made.raw_image(image.stamp_s, rgb, "rgb8", frame, pad=5))
         else:
             data = image.path.read_bytes()
-            made.add(
-                image.stamp_s, f"{topic}/compressed", made.compressed(image.stamp_s, data, "jpeg", frame)
-            )
+            packed = made.compressed(image.stamp_s, data, "jpeg", frame)
+            made.add(image.stamp_s, f"{topic}/compressed", packed)
         info = made.info(image.stamp_s, drive.cameras[image.camera].info, frame)
         made.add(image.stamp_s, f"/sensing/{image.camera}/camera_info", info)
     for stamp_s, pose in zip(drive.trajectory.stamp_s, drive.trajectory.map_from_vehicle, strict=True):
@@ -188,9 +175,8 @@ def messages_of(
             ("base_link", f"{name}_optical"): inverse(np.array(guess))
             for name, guess in (mounted or mountings()).items()
         }
-        made.add(
-            drive.trajectory.stamp_s[0], "/tf_static", made.transforms(drive.trajectory.stamp_s[0], edges)
-        )
+        first_s = drive.trajectory.stamp_s[0]
+        made.add(first_s, "/tf_static", made.transforms(first_s, edges))
     made.rows.sort(key=lambda row: row[0])
     return made
 
@@ -235,19 +221,15 @@ def _write(writer: Any, made: Messages, serialize: Callable[..., Any], store: An
 
 def assert_same_drive(got: Drive, expected: Drive) -> None:
     """Poses to a micrometre, pixels and times to the last bit."""
-    assert [(image.camera, image.stamp_s) for image in got.images] == [
-        (image.camera, image.stamp_s) for image in expected.images
-    ]
     for one, other in zip(got.images, expected.images, strict=True):
+        assert (one.camera, one.stamp_s) == (other.camera, other.stamp_s)
         np.testing.assert_allclose(one.map_from_vehicle, other.map_from_vehicle, rtol=0, atol=1e-6)
         np.testing.assert_array_equal(cv2.imread(str(one.path)), cv2.imread(str(other.path)))
     for name, camera in expected.cameras.items():
         info = got.cameras[name].info
-        assert (info.name, info.width, info.height) == (name, camera.info.width, camera.info.height)
-        assert (info.distortion_model, info.distortion) == (
-            camera.info.distortion_model,
-            camera.info.distortion,
-        )
+        assert info.name == name
+        for key in ("width", "height", "distortion_model", "distortion"):
+            assert getattr(info, key) == getattr(camera.info, key)
         np.testing.assert_array_equal(info.intrinsic, camera.info.intrinsic)
         np.testing.assert_allclose(
             got.cameras[name].ipm[camera.initial_ipm], camera.ipm[camera.initial_ipm], rtol=1e-12

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import yaml
 
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import rotation_from_euler
-from v2hdm.io.drive import Trajectory, write_drive
-from v2hdm.io.drive.truth import write_truth
+from v2hdm.io.drive import Trajectory
+from v2hdm.io.drive.writing import write_drive, write_truth
 from v2hdm.records import (
     Camera,
     CameraInfo,
@@ -63,10 +67,7 @@ def make_drive(folder: Path, stamps: tuple[float, ...] = (100.05, 100.95, 101.25
         ipm = ipm_from_extrinsic(info, looking_forward(2.0 + number))
         cameras[name] = Camera(
             info=info,
-            ipm={
-                "calibrated": ipm,
-                "estimated": ipm_from_extrinsic(info, looking_forward(2.2)),
-            },
+            ipm={"calibrated": ipm, "estimated": ipm_from_extrinsic(info, looking_forward(2.2))},
             initial_ipm="estimated",
             roi_vehicle=np.array([[3.0, -3.0], [9.0, -3.0], [9.0, 3.0], [3.0, 3.0]]),
             centre_prior=CentrePrior(np.array([0.0, 0.0, 2.0]), np.full(3, 0.02)),
@@ -116,3 +117,11 @@ def make_truth(drive: Drive) -> Truth:
         lane_visible=(np.array([True, False, True]),),
         disturbances={"jitter_deg": 0.1},
     )
+
+
+@contextmanager
+def description(root: Path) -> Iterator[dict[str, Any]]:
+    """The content of the drive's ``drive.yaml``, which is written back as it was changed."""
+    content = yaml.safe_load((root / "drive.yaml").read_text())
+    yield content
+    (root / "drive.yaml").write_text(yaml.safe_dump(content))

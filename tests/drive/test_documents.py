@@ -1,14 +1,26 @@
+"""docs/bags.md and docs/drive-format.md do what they say."""
+
 from __future__ import annotations
 
+import re
+import shutil
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import pytest
+import yaml
 
-from tests.docs.blocks import blocks
+from tests.docs.blocks import blocks, document
+from tests.drive.bags import messages_of, write_ros2
 from tests.drive.example import make_drive
-from v2hdm.io.calibration.camera_info import read_camera_info
-from v2hdm.io.drive import read_drive
+from v2hdm.cli import check
+from v2hdm.io.calibration import read_camera_info
+from v2hdm.io.drive import ReadOptions, read_drive
+from v2hdm.io.drive.sources import IMAGE_SOURCES
+from v2hdm.io.importers.poses import COMMON_KEYS, POSE_FORMATS, TOPIC_KEYS
+from v2hdm.io.importers.tables import NAMES
 
 BLOCKS = [block.text for block in blocks("docs/drive-format.md", "yaml")]
 
@@ -32,3 +44,41 @@ def test_the_documented_drive_reads_and_its_cameras_look_at_their_rois(tmp_path:
 def test_the_documented_camera_info_reads(tmp_path: Path) -> None:
     (tmp_path / "camera_info.yaml").write_text(BLOCKS[1])
     assert read_camera_info(tmp_path / "camera_info.yaml").width == 1280
+
+
+TEXT = document("docs/bags.md")
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Path:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    make_drive(folder)
+    return write_ros2(tmp_path / "site", messages_of(folder))
+
+
+def test_the_documented_listing_ends_in_a_description_that_is_read(
+    site: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(site.parent)
+    assert check.main(["site", "--list-topics"]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"/odom +21  nav_msgs/msg/Odometry", printed)
+    Path("drive.yaml").write_text(printed.split("# drive.yaml\n")[1])
+    assert len(read_drive(site.parent).images) == 6
+
+
+def test_the_documented_description_reads(site: Path) -> None:
+    (block,) = blocks("docs/bags.md", "yaml")
+    (site.parent / "drive.yaml").write_text(block.text)
+    shutil.rmtree(site.parent / "folder")
+    drive = read_drive(site.parent, ReadOptions(cache=str(site.parent / "cache")))
+    assert [image.camera for image in drive.images] == ["front"] * 3
+
+
+def test_every_key_and_column_is_documented() -> None:
+    described: list[Any] = [yaml.safe_load(text) for text in re.findall(r"`(\{.*?\})`", TEXT)]
+    used = {key for entry in described for key in entry}
+    assert {*POSE_FORMATS, *IMAGE_SOURCES, *TOPIC_KEYS} - {"stamps"} <= used
+    for name in (*COMMON_KEYS, *NAMES):
+        assert f"`{name}`" in TEXT, name

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from tests.drive.example import camera_info, looking_forward, straight_trajectory
 from v2hdm.errors import DriveError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
-from v2hdm.io.calibration.camera_info import read_camera_info, write_camera_info
-from v2hdm.io.drive.mounting import ipm_from_guess, take_ipm, take_roi
-from v2hdm.io.drive.tum import read_image_list, read_tum, write_tum
-from v2hdm.io.pixels import read_header
+from v2hdm.io.calibration import read_camera_info, write_camera_info
+from v2hdm.io.calibration.mounting import ipm_from_guess, take_ipm, take_roi
+from v2hdm.io.safe.pixels import read_header
+from v2hdm.io.trajectory import read_image_list, read_tum, write_tum
 from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo
 
 

@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.drive.example import camera_info, make_drive
+from tests.drive.example import camera_info, description, make_drive
 from v2hdm.errors import DriveError
 from v2hdm.geometry.lens import distort_points
-from v2hdm.io.calibration.document import Provenance, write_calibration
-from v2hdm.io.calibration.formats import write_calibration_as
+from v2hdm.io.calibration import Provenance, write_calibration, write_calibration_as
 from v2hdm.io.calibration.intrinsics import COLMAP_MODELS, read_intrinsics
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.records import Calibration, CameraInfo, FloatArray
@@ -378,9 +377,8 @@ def test_a_file_with_several_cameras_asks_for_the_name(tmp_path: Path) -> None:
 def drive_with(folder: Path, described: object) -> Path:
     """The example drive, its front camera's intrinsics described otherwise."""
     make_drive(folder)
-    content = yaml.safe_load((folder / "drive.yaml").read_text())
-    content["cameras"]["front"]["camera_info"] = described
-    (folder / "drive.yaml").write_text(yaml.safe_dump(content))
+    with description(folder) as content:
+        content["cameras"]["front"]["camera_info"] = described
     return folder
 
 

@@ -10,15 +10,14 @@ from typing import Any
 import numpy as np
 import pyproj
 import pytest
-import yaml
 from scipy.spatial.transform import Rotation
 
 from tests.drive.bags import Messages, write_ros2
-from tests.drive.example import ORIGIN, make_drive
+from tests.drive.example import ORIGIN, description, make_drive
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.io.importers.poses import Recorded, read_poses
-from v2hdm.io.importers.poses.table import read_table
+from v2hdm.io.importers.tables import read_table
 from v2hdm.records import FloatArray, GeodeticOrigin
 from v2hdm.verdict import input_findings
 
@@ -313,11 +312,10 @@ def test_rows_of_kitti_have_their_times_beside_them(axes: str, tmp_path: Path) -
 def with_topic(root: Path, made: Messages, poses: dict[str, Any], **changes: Any) -> Any:
     """A drive of a folder's images at times within the curve, with the poses of a bag."""
     make_drive(root, stamps=(START_S + 1.0, START_S + 2.0, START_S + 9.0))
-    content = yaml.safe_load((root / "drive.yaml").read_text())
-    content.pop("pose_noise")
-    content |= {"bag": "site", "poses": poses} | changes
+    with description(root) as content:
+        content.pop("pose_noise")
+        content |= {"bag": "site", "poses": poses} | changes
     write_ros2(root / "site", made)
-    (root / "drive.yaml").write_text(yaml.safe_dump(content))
     return read_drive(root, ReadOptions(cache=str(root / "cache")))
 
 
@@ -331,13 +329,8 @@ def test_fixes_and_an_imu_at_other_times_with_antenna_and_turned_sensor(tmp_path
     for t in np.arange(START_S - 0.01, START_S + 10.1, 0.02):
         turn = 0.4 + 5.0 * (t - START_S) / 30.0 + np.pi / 2
         made.add(t, "/imu", made.imu(t, Rotation.from_euler("z", turn).as_matrix(), "imu"))
-    poses = {
-        "topic": "/fix",
-        "heading_topic": "/imu",
-        "lever_arm_m": list(LEVER_M),
-        "mounting_rpy_deg": [0, 0, 90],
-    }
-    drive = with_topic(tmp_path, made, poses)
+    poses = {"topic": "/fix", "heading_topic": "/imu", "lever_arm_m": list(LEVER_M)}
+    drive = with_topic(tmp_path, made, poses | {"mounting_rpy_deg": [0, 0, 90]})
     keep = np.delete(np.arange(41), (3, 4))
     np.testing.assert_allclose(drive.recorded.stamp_s, stamp_s[keep], atol=1e-6)
     got = drive.recorded.map_from_vehicle
@@ -362,8 +355,8 @@ def test_covariances_become_the_noise_unless_the_drive_says_otherwise(tmp_path: 
     assert drive.pose_noise.position_m == pytest.approx(0.03)
     assert drive.pose_noise.position_drift_m == pytest.approx(0.03 / np.sqrt(2))
     assert drive.pose_noise.heading_rad == pytest.approx(0.004)
-    content = yaml.safe_load((tmp_path / "drive.yaml").read_text()) | {"pose_noise": {"position_m": 0.05}}
-    (tmp_path / "drive.yaml").write_text(yaml.safe_dump(content))
+    with description(tmp_path) as content:
+        content["pose_noise"] = {"position_m": 0.05}
     noise = read_drive(tmp_path, ReadOptions(cache=str(tmp_path / "cache"))).pose_noise
     assert (noise.position_m, noise.heading_rad) == (0.05, pytest.approx(0.004))
 
@@ -404,9 +397,8 @@ def test_a_lever_arm_of_zero_that_should_not_be_is_named_by_the_check(
     names = "stamp_s,latitude_deg,longitude_deg,altitude_m,heading_deg,quality"
     lines = [",".join(map(repr, row)) for row in rows.tolist()]
     (root / "route.csv").write_text("\n".join([names, *lines]))
-    content = yaml.safe_load((root / "drive.yaml").read_text())
-    content["poses"] = {"csv": "route.csv", "lever_arm_m": list(stated_m)}
-    (root / "drive.yaml").write_text(yaml.safe_dump(content))
+    with description(root) as content:
+        content["poses"] = {"csv": "route.csv", "lever_arm_m": list(stated_m)}
     (finding,) = [one for one in input_findings(read_drive(root), {}) if one.check == "origin"]
     assert finding.status.name == status
     if status == "WARN":

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from v2hdm.geometry.rigid import rotation_from_euler
-from v2hdm.io.drive.road import lay_flat, tell, unevenness
+from v2hdm.io.drive.road import lay_flat, log_road, unevenness
 from v2hdm.records import FloatArray, Road, Trajectory
 
 SIGMA_M = 0.02
@@ -106,7 +106,7 @@ def test_a_sensor_that_is_not_level_is_found_and_told(
     assert np.degrees(laid.mount_rad[1]) == pytest.approx(1.2, abs=0.03)
     assert tilt_deg(laid.trajectory).max() < 0.03
     with caplog.at_level(logging.INFO):
-        tell(laid, Path("drive"))
+        log_road(laid, Path("drive"))
     assert "1.2" in caplog.text
     assert "deg of pitch (nose down)" in caplog.text
 

@@ -11,10 +11,9 @@ import av
 import cv2
 import numpy as np
 import pytest
-import yaml
 
 from tests.drive.bags import assert_same_drive
-from tests.drive.example import make_drive
+from tests.drive.example import description, make_drive
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.records import Drive, Image
@@ -53,9 +52,8 @@ def write_video(folder: Path, path: Path, codec: str = "ffv1", keep: int | None 
 
 
 def read(root: Path, images: Any) -> Drive:
-    content = yaml.safe_load((root / "drive.yaml").read_text())
-    content["cameras"]["front"]["images"] = images
-    (root / "drive.yaml").write_text(yaml.safe_dump(content))
+    with description(root) as content:
+        content["cameras"]["front"]["images"] = images
     return read_drive(root, ReadOptions(cache=str(root / "cache")))
 
 
@@ -123,22 +121,18 @@ def test_a_source_that_does_not_fit_is_named(folder: Path) -> None:
 def test_a_library_that_is_not_installed_is_named_with_its_extra(
     module: str, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from v2hdm.geometry import geodetic
-
-    content = yaml.safe_load((folder / "drive.yaml").read_text())
     extra, images = {"rosbags": "ros", "av": "video", "pyproj": "map"}[module], "front/images.txt"
-    if module == "rosbags":
-        (folder / "site.bag").write_bytes(b"#ROSBAG")
-        content |= {"bag": "site.bag"}
-        images = {"topic": "/image"}
-    elif module == "av":
-        images = {"video": str(write_video(folder, folder / "front.mkv")), "start_s": 100.05}
-    else:
-        (folder / "route.csv").write_text("stamp_s,x_m,y_m,yaw_deg\n100,1,2,3\n103,1,2,3\n")
-        content["poses"] = {"csv": "route.csv", "crs": "EPSG:25832", "heading": "true"}
-    (folder / "drive.yaml").write_text(yaml.safe_dump(content))
+    with description(folder) as content:
+        if module == "rosbags":
+            (folder / "site.bag").write_bytes(b"#ROSBAG")
+            content["bag"] = "site.bag"
+            images = {"topic": "/image"}
+        elif module == "av":
+            images = {"video": str(write_video(folder, folder / "front.mkv")), "start_s": 100.05}
+        else:
+            (folder / "route.csv").write_text("stamp_s,x_m,y_m,yaw_deg\n100,1,2,3\n103,1,2,3\n")
+            content["poses"] = {"csv": "route.csv", "crs": "EPSG:25832", "heading": "true"}
     monkeypatch.setitem(__import__("sys").modules, module, None)
-    geodetic._cartesian.cache_clear()
     with pytest.raises(
         DriveError, match=rf"needs {module}: install the {extra} extra, pip install 'v2hdm\[{extra}\]'"
     ):

@@ -14,8 +14,8 @@ from tests.calibration.site import INFO, clicked, write_table
 from tests.faults.judge import Case, Outcome, Prepare
 from tests.ports import short_port
 from v2hdm.errors import DriveError
-from v2hdm.io.calibration.camera_info import write_camera_info
-from v2hdm.io.drive.tum import read_image_list, write_image_list
+from v2hdm.io.calibration import write_camera_info
+from v2hdm.io.trajectory import read_image_list, write_image_list
 from v2hdm.simulate import render_drive
 from v2hdm.store.cache.keys import code_key
 from v2hdm.store.cache.leases import STAGES

@@ -12,13 +12,12 @@ from tests.drive.example import camera_info, looking_forward, make_map
 from tests.faults.cases import picture
 from v2hdm.detection.image_file import read_bgr
 from v2hdm.errors import V2hdmError
-from v2hdm.io.calibration.camera_info import read_camera_info, write_camera_info
-from v2hdm.io.calibration.document import read_calibration, write_calibration
-from v2hdm.io.drive.tum import read_image_list, read_tum
-from v2hdm.io.importers.poses.kitti_rows import read_kitti_rows
-from v2hdm.io.importers.poses.nmea import read_nmea
-from v2hdm.io.importers.poses.table import read_table
-from v2hdm.io.maps.geojson import read_geojson, write_geojson
+from v2hdm.io.calibration import read_calibration, read_camera_info, write_calibration, write_camera_info
+from v2hdm.io.importers.nmea import read_nmea
+from v2hdm.io.importers.tables import read_kitti_rows, read_table
+from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.io.maps.reading import read_geojson
+from v2hdm.io.trajectory import read_image_list, read_tum
 from v2hdm.records import Calibration
 
 

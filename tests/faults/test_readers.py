@@ -14,7 +14,7 @@ from tests.faults.cases import JSON_TEXTS, YAML_TEXTS, damaged_inside
 from tests.faults.readers import READERS, refusal
 from v2hdm.detection.image_file import read_bgr
 from v2hdm.errors import DriveError, V2hdmError
-from v2hdm.io.texts import parse_json, parse_yaml, shown, take_name
+from v2hdm.io.safe.texts import parse_json, parse_yaml, shown, take_name
 
 PLAIN = st.recursive(
     st.none() | st.booleans() | st.integers(-(10**12), 10**12) | st.floats(allow_nan=False) | st.text(),

@@ -9,8 +9,8 @@ import pytest
 
 from tests.ground.scene import extrinsic, make_drive
 from v2hdm.cli.extrinsic import main
-from v2hdm.io.calibration.document import read_calibration
-from v2hdm.io.drive import write_drive
+from v2hdm.io.calibration import read_calibration
+from v2hdm.io.drive.writing import write_drive
 
 
 def test_the_door_writes_a_mounting_and_its_picture(

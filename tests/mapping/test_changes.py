@@ -13,7 +13,7 @@ from tests.mapping.test_methods import match
 from v2hdm.errors import MappingError
 from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
 from v2hdm.geometry.rigid import inverse
-from v2hdm.io.maps.geojson import read_geojson, write_geojson
+from v2hdm.io.maps import read_geojson, write_geojson
 from v2hdm.mapping.changes.decide import Decision, Watched, decide
 from v2hdm.mapping.changes.field import Errors
 from v2hdm.mapping.changes.fuse import fused_markings

@@ -16,9 +16,15 @@ from tests.drive.example import camera_info, looking_forward
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import exp
-from v2hdm.io.calibration.camera_info import read_camera_info
-from v2hdm.io.calibration.document import Provenance, read_calibration, read_provenance, write_calibration
-from v2hdm.io.calibration.formats import CALIBRATION_FORMATS, write_calibration_as
+from v2hdm.io.calibration import (
+    CALIBRATION_FORMATS,
+    Provenance,
+    read_calibration,
+    read_camera_info,
+    read_provenance,
+    write_calibration,
+    write_calibration_as,
+)  # fmt: skip
 from v2hdm.records import Calibration
 
 SIGMAS = [0.01, 0.02, 0.03, *np.radians([0.1, 0.2, 0.3])]
@@ -45,13 +51,9 @@ def test_every_form_tells_sigmas_drive_date_and_verdict(tmp_path: Path, form: st
 def test_camera_info_is_read_as_ros_does_and_as_a_drive_s(tmp_path: Path) -> None:
     path = written(tmp_path, "camera_info")
     content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    for key, shape in (
-        ("camera_matrix", (3, 3)),
-        ("projection_matrix", (3, 4)),
-        ("rectification_matrix", (3, 3)),
-    ):
-        assert (content[key]["rows"], content[key]["cols"]) == shape
-        assert len(content[key]["data"]) == shape[0] * shape[1]
+    for name, columns in (("camera", 3), ("projection", 4), ("rectification", 3)):
+        matrix = content[f"{name}_matrix"]
+        assert (matrix["rows"], matrix["cols"], len(matrix["data"])) == (3, columns, 3 * columns)
     info = read_camera_info(path)
     np.testing.assert_array_equal(info.intrinsic, CALIBRATION.info.intrinsic)
     assert (info.name, info.distortion) == ("front", CALIBRATION.info.distortion)

@@ -15,9 +15,7 @@ import pytest
 
 from tests.maps.gis import ORIGIN, move_feature, street
 from v2hdm.errors import MapFileError
-from v2hdm.io.maps import read_geojson, write_geojson
-from v2hdm.io.maps.formats import FORMATS, read_map
-from v2hdm.io.maps.geopackage import read_geopackage, write_geopackage
+from v2hdm.io.maps import FORMATS, read_geojson, read_geopackage, read_map, write_geojson, write_geopackage
 from v2hdm.records import GeodeticOrigin, HdMap, Lane, Marking
 
 EDITED = ["geojson", "gpkg"]

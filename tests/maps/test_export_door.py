@@ -13,9 +13,8 @@ from tests.docs.blocks import ROOT, blocks
 from tests.drive.example import camera_info, looking_forward
 from tests.maps.gis import street
 from v2hdm.cli import export
-from v2hdm.io.maps import read_geojson, write_calibration, write_geojson
-from v2hdm.io.maps.formats import FORMATS
-from v2hdm.io.maps.geopackage import read_geopackage_verdict, write_geopackage
+from v2hdm.io.calibration import write_calibration
+from v2hdm.io.maps import FORMATS, read_geojson, read_geopackage_verdict, write_geojson, write_geopackage
 from v2hdm.records import Calibration
 
 VERDICT = {"status": "PASS"}
@@ -53,10 +52,7 @@ def test_an_edited_geopackage_becomes_the_geojson_again(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            ["map.geojson", "--format", "shp"],
-            "--format: unknown format 'shp'; choose from: geojson, csv",
-        ),
+        (["map.geojson", "--format", "shp"], "--format: unknown format 'shp'; choose from: geojson, csv"),
         (["calibration_front.yaml", "--format", "gpkg"], "unknown format 'gpkg' of a calibration"),
         (["map.geojson", "--format", "geojson"], "map.geojson would be written over"),
         (["map.csv", "--format", "gpkg"], "map.csv: no map that can be read"),

@@ -11,6 +11,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import ezdxf
 import lanelet2
@@ -23,9 +24,9 @@ from lanelet2.projection import LocalCartesianProjector, UtmProjector
 
 from tests.maps.gis import ORIGIN, street
 from v2hdm.errors import ConfigError
+from v2hdm.io.maps import FORMATS, check_formats, write_map
 from v2hdm.io.maps.closed_lanes import closed_lanes
-from v2hdm.io.maps.formats import FORMATS, check_formats, write_map
-from v2hdm.io.maps.mgrs import grid_places
+from v2hdm.io.maps.lanelet2 import grid_places
 from v2hdm.records import GeodeticOrigin, HdMap, Lane, Marking
 
 TENTH_OF_A_MM = 1e-4
@@ -213,6 +214,13 @@ def points_of(line: object) -> np.ndarray:
     return np.array([[point.x, point.y, point.z] for point in line])  # type: ignore[attr-defined]
 
 
+def routing(loaded: LaneletMap) -> tuple[Any, Any]:
+    rules = lanelet2.traffic_rules.create(
+        lanelet2.traffic_rules.Locations.Germany, lanelet2.traffic_rules.Participants.Vehicle
+    )
+    return rules, lanelet2.routing.RoutingGraph(loaded, rules)
+
+
 @BOTH
 def test_every_marking_and_line_is_found_through_lanelet2(
     tmp_path: Path, origin: GeodeticOrigin | None
@@ -290,10 +298,7 @@ def test_a_stop_line_has_the_regulatory_element_that_the_map_validator_asks_for(
 def test_lanes_between_two_lines_make_a_routing_graph_with_a_lane_change(tmp_path: Path) -> None:
     loaded = load(exported(tmp_path, "lanelet2", street()), ORIGIN)
     assert len(loaded.laneletLayer) == 2
-    rules = lanelet2.traffic_rules.create(
-        lanelet2.traffic_rules.Locations.Germany, lanelet2.traffic_rules.Participants.Vehicle
-    )
-    graph = lanelet2.routing.RoutingGraph(loaded, rules)
+    rules, graph = routing(loaded)
     assert not list(graph.checkValidity())
     left, right = sorted(loaded.laneletLayer, key=lambda one: one.leftBound.id)
     assert (left.leftBound.id, left.rightBound.id) == (6, 7)
@@ -466,10 +471,7 @@ def test_a_lane_beside_which_another_begins_is_cut_there_so_that_one_can_change(
     before, beside, begun = sorted(
         loaded.laneletLayer, key=lambda one: points_of(one.centerline)[:, :2].mean(axis=0) @ [1.0, 10.0]
     )
-    rules = lanelet2.traffic_rules.create(
-        lanelet2.traffic_rules.Locations.Germany, lanelet2.traffic_rules.Participants.Vehicle
-    )
-    graph = lanelet2.routing.RoutingGraph(loaded, rules)
+    _, graph = routing(loaded)
     assert [one.id for one in graph.following(before)] == [beside.id]
     assert graph.left(beside).id == begun.id
     assert graph.right(begun).id == beside.id

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from tests.drive.example import ORIGIN, camera_info, looking_forward, make_map
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.geodetic import enu_from_geodetic, geodetic_from_enu
-from v2hdm.io.maps import read_calibration, read_geojson, with_heights, write_calibration, write_geojson
-from v2hdm.io.maps.formats import FORMATS
-from v2hdm.io.maps.geopackage import read_geopackage
+from v2hdm.io.calibration import read_calibration, write_calibration
+from v2hdm.io.maps import FORMATS, read_geojson, read_geopackage, with_heights, write_geojson
 from v2hdm.records import Calibration, GeodeticOrigin, HdMap, Lane, Marking, Road, Symbol
 
 LATITUDES, LONGITUDES = st.floats(-89.9, 89.9), st.floats(-180, 180)

@@ -18,8 +18,9 @@ from tests.mapping.scene import Scene, SceneOptions, make_scene
 from tests.mapping.test_changes import repainted
 from v2hdm import map as door
 from v2hdm.errors import MapFileError
-from v2hdm.io.drive import ReadOptions, read_drive, write_drive
-from v2hdm.io.maps.geojson import read_geojson, write_geojson
+from v2hdm.io.drive import ReadOptions, read_drive
+from v2hdm.io.drive.writing import write_drive
+from v2hdm.io.maps import read_geojson, write_geojson
 from v2hdm.pipeline import work
 from v2hdm.pipeline.base import check_together, read_base
 from v2hdm.records import Drive, Fate, GeodeticOrigin, ImageDetections, PoseNoise, Trajectory

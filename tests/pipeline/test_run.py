@@ -16,13 +16,11 @@ from tests.ports import run_config, short_port
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError, DetectorError, DriveError, V2hdmError
 from v2hdm.geometry.rigid import rotation_from_euler
-from v2hdm.io.calibration.document import read_calibration
-from v2hdm.io.calibration.formats import CALIBRATION_FORMATS
+from v2hdm.io.calibration import CALIBRATION_FORMATS, read_calibration
 from v2hdm.io.drive import ReadOptions, read_drive
-from v2hdm.io.drive.tum import read_tum, write_tum
-from v2hdm.io.maps.formats import FORMATS
-from v2hdm.io.maps.geojson import read_geojson
-from v2hdm.io.maps.residuals import read_residuals
+from v2hdm.io.maps import FORMATS, read_geojson
+from v2hdm.io.maps.evidence import read_residuals
+from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.mapping.options import AcceptanceOptions, LaneOptions, MappingOptions
 from v2hdm.pipeline import run
 from v2hdm.pipeline.camera_sets import camera_sets

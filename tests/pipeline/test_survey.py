@@ -22,7 +22,7 @@ from v2hdm.errors import DriveError
 from v2hdm.geometry.geodetic import geodetic_from_enu
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.io.drive.tum import read_tum, write_tum
+from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.mapping.options import MappingOptions, SurveyOptions
 from v2hdm.pipeline import DriveConfig, RunConfig, run
 from v2hdm.records import FloatArray, Trajectory

@@ -15,7 +15,8 @@ import pytest
 
 from tests.verdict.drives import drive, noisy, poses, with_yaw, yaw_of
 from v2hdm.cli.check import main
-from v2hdm.io.drive import Trajectory, write_drive
+from v2hdm.io.drive import Trajectory
+from v2hdm.io.drive.writing import write_drive
 from v2hdm.records import Image
 
 

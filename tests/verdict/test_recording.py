@@ -10,7 +10,7 @@ import pytest
 
 from tests.verdict.drives import drive, motion, noisy, pictured, poses, raised
 from v2hdm.errors import DriveError
-from v2hdm.io.importers.stamp_units import why_no_pose
+from v2hdm.io.trajectory import why_no_pose
 from v2hdm.records import Trajectory
 from v2hdm.verdict import Status
 from v2hdm.verdict.inputs.recording import check_clocks, check_images

@@ -16,7 +16,7 @@ import pytest
 
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError
-from v2hdm.io.calibration.document import read_calibration
+from v2hdm.io.calibration import read_calibration
 from v2hdm.io.drive import read_drive
 from v2hdm.io.maps import read_geojson
 from v2hdm.pipeline import DriveConfig, RunConfig, run

@@ -14,9 +14,9 @@ import cv2
 
 from v2hdm.ground import GroundEstimate, estimate_cameras
 from v2hdm.ground.show import draw_matched_ground, lines
-from v2hdm.io.calibration.document import Provenance, write_calibration
+from v2hdm.io.calibration import Provenance, write_calibration
 from v2hdm.io.drive import ReadOptions, read_drive
-from v2hdm.io.drive.lossless import png
+from v2hdm.io.safe.pixels import png
 from v2hdm.records import Calibration, Drive
 from v2hdm.report.outputs import result_folder, write_json
 from v2hdm.settings import check_workers

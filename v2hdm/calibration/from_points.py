@@ -28,8 +28,7 @@ from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.mounting import centre_sigmas, mounting_angles, mounting_words
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.io.calibration.camera_info import write_camera_info
-from v2hdm.io.calibration.document import Provenance, write_calibration
+from v2hdm.io.calibration import Provenance, write_calibration, write_camera_info
 from v2hdm.io.calibration.intrinsics import read_intrinsics
 from v2hdm.records import Calibration, CameraInfo, FloatArray
 from v2hdm.report.outputs import result_folder, write_json

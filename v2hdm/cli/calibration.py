@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _compare(parsed: argparse.Namespace) -> int:
     from v2hdm.calibration.compare import compare_calibrations, turned_alike
     from v2hdm.errors import MapFileError
-    from v2hdm.io.calibration.document import trusted_calibrations
+    from v2hdm.io.calibration import trusted_calibrations
 
     before, after = (trusted_calibrations(path) for path in (parsed.before, parsed.after))
     common = [name for name in before if name in after]

@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _check(parsed: argparse.Namespace) -> int:
     if parsed.list_topics:
         from v2hdm.io.drive import ReadOptions
-        from v2hdm.io.importers.bag.bare import list_topics
+        from v2hdm.io.importers.bag.describe import list_topics
 
         print(list_topics(parsed.drive, Path(ReadOptions().cache)))
         return 0

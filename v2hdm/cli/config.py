@@ -27,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from v2hdm.errors import ConfigError, V2hdmError
-from v2hdm.io.texts import read_yaml
+from v2hdm.io.safe.texts import read_yaml
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _Schema = TypeVar("_Schema")

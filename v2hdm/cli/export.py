@@ -46,7 +46,7 @@ def _export(parsed: argparse.Namespace) -> None:
 
 def _export_map(parsed: argparse.Namespace, folder: Path) -> list[Path]:
     from v2hdm.errors import ConfigError
-    from v2hdm.io.maps.formats import FORMATS, check_formats, read_map, write_map
+    from v2hdm.io.maps import FORMATS, check_formats, read_map, write_map
 
     check_formats(parsed.format, "--format")
     name = parsed.source.stem
@@ -60,8 +60,12 @@ def _export_map(parsed: argparse.Namespace, folder: Path) -> list[Path]:
 
 def _export_calibration(parsed: argparse.Namespace, folder: Path) -> list[Path]:
     from v2hdm.errors import ConfigError
-    from v2hdm.io.calibration.document import read_calibration, read_provenance
-    from v2hdm.io.calibration.formats import CALIBRATION_FORMATS, write_calibration_as
+    from v2hdm.io.calibration import (
+        CALIBRATION_FORMATS,
+        read_calibration,
+        read_provenance,
+        write_calibration_as,
+    )
 
     for name in parsed.format:
         if name not in CALIBRATION_FORMATS:

@@ -23,7 +23,7 @@ from v2hdm.detection.sight import Sight, look
 from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.weights import check_weights
 from v2hdm.errors import DetectorError
-from v2hdm.io.texts import shown
+from v2hdm.io.safe.texts import shown
 from v2hdm.records import BoolArray, Camera, LaneDetection, MarkingDetection
 
 _NO_PAINT = -20.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from v2hdm.errors import ConfigError
-from v2hdm.io.texts import shown
+from v2hdm.io.safe.texts import shown
 from v2hdm.settings import NOT_NEGATIVE, POSITIVE, check_settings
 
 _MOST_THREADS = 256

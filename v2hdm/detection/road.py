@@ -23,7 +23,7 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.stopwatch import lap
 from v2hdm.errors import MapFileError
-from v2hdm.io.maps import read_calibration
+from v2hdm.io.calibration import read_calibration
 from v2hdm.records import Camera, FloatArray, LaneDetection, MarkingDetection
 
 LANE_SIGMA_PX = 1.0

@@ -15,7 +15,7 @@ from v2hdm.ground.model import Mount
 from v2hdm.ground.motion import Motion
 from v2hdm.ground.prior import Observations
 from v2hdm.ground.results import GroundOptions
-from v2hdm.io.pixels import read_pixels
+from v2hdm.io.safe.pixels import read_pixels
 from v2hdm.records import BoolArray, Drive, FloatArray, IntArray
 
 ImageArray = NDArray[np.uint8]

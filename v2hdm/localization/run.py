@@ -21,10 +21,10 @@ from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.rigid import heading_rad
-from v2hdm.io.calibration.document import trusted_calibrations
+from v2hdm.io.calibration import trusted_calibrations
 from v2hdm.io.drive import ReadOptions, read_drive
-from v2hdm.io.drive.tum import write_tum
-from v2hdm.io.maps.geojson import read_geojson
+from v2hdm.io.maps import read_geojson
+from v2hdm.io.trajectory import write_tum
 from v2hdm.localization.filter import Markings, Seen, State, locate, predict, start
 from v2hdm.mapping.sightings.table import Sightings, collect_sightings
 from v2hdm.records import (

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.adjust import Fault
-from v2hdm.io.maps.residuals import Residuals
+from v2hdm.io.maps.evidence import Residuals
 from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.remedy import Outcome
 from v2hdm.mapping.results import AdjustedPoses, ClockOffset

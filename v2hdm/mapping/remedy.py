@@ -16,7 +16,7 @@ import numpy as np
 
 from v2hdm.adjust import Fault, Suspect, pose_pulls, suspects
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.io.drive.clock import with_clock_offsets
+from v2hdm.io.drive.images import with_clock_offsets
 from v2hdm.mapping.association.groups import Association
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.crew import ALONE, Crew

@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from v2hdm.io.maps.residuals import Residuals
+from v2hdm.io.maps.evidence import Residuals
 from v2hdm.mapping.evidence import SolveEvidence
 from v2hdm.records import BoolArray, Calibration, Changes, FloatArray, HdMap, Image, IntArray, Marking
 

@@ -14,9 +14,9 @@ import numpy as np
 from v2hdm.detection.batch import with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.errors import ConfigError, DriveError, MapFileError
-from v2hdm.io.calibration.document import read_calibration
-from v2hdm.io.drive.tum import read_tum
-from v2hdm.io.maps.geojson import read_geojson
+from v2hdm.io.calibration import read_calibration
+from v2hdm.io.maps import read_geojson
+from v2hdm.io.trajectory import read_tum
 from v2hdm.mosaic.blend import Sheet, blend
 from v2hdm.mosaic.canvas import Canvas
 from v2hdm.mosaic.comparison import richest_place, save_comparison

@@ -8,8 +8,8 @@ import torch
 
 from v2hdm.detection.detector import Detector
 from v2hdm.errors import ConfigError
-from v2hdm.io.maps.formats import check_formats
-from v2hdm.io.texts import shown, take_camera_name, take_name
+from v2hdm.io.maps import check_formats
+from v2hdm.io.safe.texts import shown, take_camera_name, take_name
 from v2hdm.mapping.options import INCREMENTAL, check_options
 from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.pipeline.survey import table_of

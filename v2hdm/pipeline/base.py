@@ -14,14 +14,14 @@ from scipy.spatial import cKDTree
 from v2hdm.detection.batch import read_image
 from v2hdm.errors import MapFileError
 from v2hdm.io.drive.road import lay_flat
-from v2hdm.io.drive.tum import read_tum
-from v2hdm.io.maps.geojson import (
+from v2hdm.io.maps import (
     geojson_feature,
     geojson_positions,
     read_geojson,
     read_verdict,
     write_features,
 )
+from v2hdm.io.trajectory import read_tum
 from v2hdm.mapping.changes.update import Base
 from v2hdm.pipeline.keys import base_files
 from v2hdm.records import Change, Changes, Drive, Fate, FloatArray, HdMap, Image

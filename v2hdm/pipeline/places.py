@@ -15,7 +15,7 @@ from pathlib import Path
 
 from v2hdm.errors import ConfigError, V2hdmError
 from v2hdm.io.importers.mirror import mirrored
-from v2hdm.io.texts import take_name
+from v2hdm.io.safe.texts import take_name
 from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.pipeline.finished import NOTHING_CHANGED, RunResult, finished, is_of, key_of_finished
 from v2hdm.pipeline.telling import Progress

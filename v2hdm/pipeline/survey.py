@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from v2hdm.errors import DriveError
 from v2hdm.io.drive.survey import SurveyedPoint, SurveyTable, in_map, misreadings, read_survey
-from v2hdm.io.maps.heights import with_heights
+from v2hdm.io.maps.features import with_heights
 from v2hdm.mapping.options import ControlOptions, MappingOptions, SurveyOptions
 from v2hdm.mapping.results import MethodResult
 from v2hdm.records import Drive, FloatArray

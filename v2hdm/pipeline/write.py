@@ -14,14 +14,11 @@ from v2hdm.detection.batch import read_image
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import facing_ipm, flat_motion, pinhole_px_from_ground
 from v2hdm.geometry.rigid import inverse
-from v2hdm.io.calibration.document import Provenance, write_calibration
-from v2hdm.io.calibration.formats import CALIBRATION_FORMATS, write_calibration_as
-from v2hdm.io.maps.exclusions import ExcludedMarking, write_exclusions
-from v2hdm.io.maps.formats import write_map
-from v2hdm.io.maps.geojson import write_geojson
-from v2hdm.io.maps.heights import with_heights
-from v2hdm.io.maps.residuals import FILE as RESIDUALS
-from v2hdm.io.maps.residuals import write_residuals
+from v2hdm.io.calibration import CALIBRATION_FORMATS, Provenance, write_calibration, write_calibration_as
+from v2hdm.io.maps import write_geojson, write_map
+from v2hdm.io.maps.evidence import FILE as RESIDUALS
+from v2hdm.io.maps.evidence import ExcludedMarking, write_exclusions, write_residuals
+from v2hdm.io.maps.features import with_heights
 from v2hdm.mapping.results import MethodResult
 from v2hdm.pipeline.base import write_changes
 from v2hdm.pipeline.evaluate import CameraSets, Judgement
@@ -59,7 +56,7 @@ def write_results(
         metrics: what goes into ``metrics.json``.
         verdict: on the run.
         all_maps: whether to write the map of every method and camera set as well.
-        formats: those of the map, of :data:`v2hdm.io.maps.formats.FORMATS`.
+        formats: those of the map, of :data:`v2hdm.io.maps.FORMATS`.
     """
     methods = list(sets.values())[-1]
     best, told = methods[BEST], verdict.as_json()

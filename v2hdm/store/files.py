@@ -20,7 +20,7 @@ import numpy as np
 import yaml
 
 from v2hdm.errors import ConfigError, V2hdmError
-from v2hdm.io.texts import read_json, read_text, read_yaml, shown
+from v2hdm.io.safe.texts import read_json, read_text, read_yaml, shown
 from v2hdm.records import FloatArray
 from v2hdm.store.inputs import refuse_input
 
@@ -111,7 +111,7 @@ def replace_text(path: Path, text: str) -> None:
 
 
 def load_yaml(path: Path, error: type[V2hdmError]) -> dict[str, Any]:
-    """The mapping at the top of a YAML file, whose keys are texts; see :func:`v2hdm.io.texts.read_yaml`.
+    """The mapping at the top of a YAML file, whose keys are texts; see :func:`v2hdm.io.safe.texts.read_yaml`.
 
     Raises:
         V2hdmError: of type ``error``, when the file is missing, has a syntax error (with its line)

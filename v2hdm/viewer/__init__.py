@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from v2hdm.errors import ConfigError
-from v2hdm.io.texts import shown
+from v2hdm.io.safe.texts import shown
 from v2hdm.viewer.recording import FILE, RerunViewer
 
 __all__ = ["FILE", "RerunViewer", "check_viewer"]

@@ -10,7 +10,7 @@ from typing import Any
 
 from v2hdm.errors import DriveError
 from v2hdm.io.drive.folder import DRIVE_FILE, POSES_FILE
-from v2hdm.io.drive.tum import read_tum, write_tum
+from v2hdm.io.trajectory import read_tum, write_tum
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.records import FloatArray, Trajectory
 from v2hdm.store.files import dump_yaml, load_yaml, replace_text

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 
 from v2hdm.geometry.ipm import ipm_from_extrinsic, project_ground
-from v2hdm.io.calibration.document import write_calibration
-from v2hdm.io.drive import Trajectory, write_drive
-from v2hdm.io.drive.tum import write_tum
-from v2hdm.io.maps.exclusions import ExcludedMarking, write_exclusions
-from v2hdm.io.maps.geojson import write_geojson
-from v2hdm.io.maps.residuals import Residuals, write_residuals
+from v2hdm.io.calibration import write_calibration
+from v2hdm.io.drive import Trajectory
+from v2hdm.io.drive.writing import write_drive
+from v2hdm.io.maps import write_geojson
+from v2hdm.io.maps.evidence import ExcludedMarking, Residuals, write_exclusions, write_residuals
+from v2hdm.io.trajectory import write_tum
 from v2hdm.records import (
     ARROW,
     DIAMOND,

@@ -15,7 +15,7 @@ from tests.report.page.folder import DIAMOND_M, INFO, NASTY_NAME, PLACES, SHIFT_
 from v2hdm.errors import DriveError, MapFileError
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.of_result import drive_of
-from v2hdm.io.maps.residuals import COLUMNS, read_residuals
+from v2hdm.io.maps.evidence import COLUMNS, read_residuals
 from v2hdm.records import DIAMOND, Drive, Marking
 from v2hdm.report.__main__ import main
 from v2hdm.report.outputs import write_json

@@ -1,4 +1,4 @@
-"""A drive on disk to records: one reader a format, one registry of readers."""
+"""Reading a drive on disk: one registry of formats."""
 
 from __future__ import annotations
 
@@ -7,35 +7,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from v2hdm.errors import DriveError
-from v2hdm.io.drive.clock import with_clock_offsets
-from v2hdm.io.drive.folder import (
-    folder_drive_name,
-    is_folder_drive,
-    read_description,
-    read_folder_drive,
-    write_drive,
-)
+from v2hdm.io.drive.folder import folder_drive_name, is_folder_drive, read_description, read_folder_drive
+from v2hdm.io.drive.images import KittiOptions, ReadOptions, part_of, with_clock_offsets
 from v2hdm.io.drive.join import join_drives
 from v2hdm.io.drive.kitti import is_kitti_drive, read_kitti_drive
-from v2hdm.io.drive.options import KittiOptions, ReadOptions
-from v2hdm.io.drive.part import part_of
-from v2hdm.io.importers.bag.bare import describe_bag
+from v2hdm.io.drive.nuscenes import is_nuscenes_drive, read_nuscenes_drive
+from v2hdm.io.importers.bag.describe import describe_bag
 from v2hdm.io.importers.bag.reading import is_bag
-from v2hdm.io.importers.nuscenes import is_nuscenes_drive, read_nuscenes_drive
 from v2hdm.records import Drive, Trajectory
 
 __all__ = [
-    "READERS",
-    "KittiOptions",
-    "ReadOptions",
-    "Reader",
-    "Trajectory",
-    "drive_name",
-    "join_drives",
-    "read_drive",
-    "with_clock_offsets",
-    "write_drive",
-]
+    "READERS", "KittiOptions", "ReadOptions", "Reader", "Trajectory", "drive_name", "join_drives",
+    "read_drive", "with_clock_offsets",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -62,27 +46,20 @@ READERS: Mapping[str, Reader] = {
 def read_drive(path: Path, options: ReadOptions | None = None) -> Drive:
     """Read the drive at ``path`` in whatever format it is.
 
-    Every image gets the vehicle's pose at its time: position linear, rotation slerp, never
-    extrapolated, not across a gap longer than ``options.max_gap_s``; images without a pose are
-    dropped with a logged count. All image files are checked for presence, completeness and size. Then
-    those are taken that ``options.start_s``, ``end_s`` and ``limit`` ask for.
-
-    Raises:
-        DriveError: naming what is wrong, where, and what to do about it.
+    Every image gets the vehicle's pose at its time: position linear, rotation slerp, never extrapolated, not
+    across a gap longer than ``options.max_gap_s``; images without a pose are dropped with a logged count. All
+    image files are checked for presence, completeness and size, then ``options.start_s``, ``end_s`` and
+    ``limit`` select some of them. Raises DriveError, with the place and the remedy.
     """
     options = options or ReadOptions()
     if not path.exists():
         raise DriveError(f"{path}: no such drive folder or bag; check drive.path")
     if options.max_gap_s <= 0:
         raise DriveError(f"max_gap_s is {options.max_gap_s:g}; give a positive number of seconds")
-    if options.format != "auto":
-        if options.format not in READERS:
-            raise DriveError(
-                f"unknown drive format '{options.format}'; choose from: auto, {', '.join(READERS)}"
-            )
-        return part_of(READERS[options.format].read(path, options), options)
-    for reader in READERS.values():
-        if reader.accepts(path):
+    if options.format not in ("auto", *READERS):
+        raise DriveError(f"unknown drive format '{options.format}'; choose from: auto, {', '.join(READERS)}")
+    for name, reader in READERS.items():
+        if options.format == name or (options.format == "auto" and reader.accepts(path)):
             return part_of(reader.read(path, options), options)
     raise DriveError(
         f"{path}: not a drive in any known format ({', '.join(READERS)}); see docs/drive-format.md"
@@ -90,11 +67,7 @@ def read_drive(path: Path, options: ReadOptions | None = None) -> Drive:
 
 
 def drive_name(path: Path) -> str:
-    """What the drive at ``path`` is called: by its ``drive.yaml``, else like its folder.
-
-    Raises:
-        DriveError: when ``drive.yaml`` cannot be read or names it otherwise than by text.
-    """
+    """The name of the drive at ``path``: that in its ``drive.yaml``, else its folder's."""
     if is_folder_drive(path):
         return folder_drive_name(path)
     return path.resolve().stem if is_bag(path) else path.resolve().name

@@ -6,7 +6,7 @@ docs/drive-format.md describes it for those who want to make one.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,37 +14,23 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.io.calibration.camera_info import write_camera_info
-from v2hdm.io.drive.images import ImageFiles, check_image_files, count_unposed, pose_images, select_cameras
-from v2hdm.io.drive.mounting import (
+from v2hdm.io.calibration.mounting import (
     IPM_NAMES,
     check_roi_in_view,
     choose_initial,
-    describe_prior,
     ipm_from_guess,
     take_centre_prior,
     take_ipm,
     take_roi,
-)
-from v2hdm.io.drive.options import ReadOptions
-from v2hdm.io.drive.road import lay_flat, tell
+)  # fmt: skip
+from v2hdm.io.drive.images import ImageFiles, ReadOptions, assemble_drive, select_cameras
 from v2hdm.io.drive.sources import Sources, plan_images, plan_info, plan_topic_poses
-from v2hdm.io.drive.trajectory import check_trajectory
-from v2hdm.io.drive.tum import write_image_list, write_tum
-from v2hdm.io.fields import take_origin
 from v2hdm.io.importers.poses import read_poses
-from v2hdm.io.pixels import read_pixels
-from v2hdm.io.texts import shown, take_camera_name, take_name
-from v2hdm.records import DRIFTS, BoolArray, Camera, CameraInfo, Drive, PoseNoise, Trajectory
-from v2hdm.store.files import (
-    check_keys,
-    dump_yaml,
-    load_yaml,
-    replace_text,
-    take_mapping,
-    take_number,
-    take_text,
-)
+from v2hdm.io.safe.fields import take_origin
+from v2hdm.io.safe.pixels import read_pixels
+from v2hdm.io.safe.texts import shown, take_camera_name, take_name
+from v2hdm.records import DRIFTS, BoolArray, Camera, CameraInfo, Drive, PoseNoise
+from v2hdm.store.files import check_keys, load_yaml, take_mapping, take_number, take_text
 
 DRIVE_FILE = "drive.yaml"
 POSES_FILE = "poses.tum"
@@ -69,16 +55,9 @@ def read_folder_drive(path: Path, options: ReadOptions) -> Drive:
 
 
 def read_description(content: dict[str, Any], path: Path, where: str, options: ReadOptions) -> Drive:
-    """Read the drive that the ``content`` of a ``drive.yaml`` describes.
+    """Read the drive that the ``content`` of a ``drive.yaml`` describes (docs/drive-format.md).
 
-    Args:
-        content: as in docs/drive-format.md.
-        path: folder that file names are relative to.
-        where: the description, for errors.
-        options: how to read it.
-
-    Raises:
-        DriveError: as :func:`v2hdm.io.drive.read_drive`.
+    File names are relative to ``path``; ``where`` names the description in errors.
     """
     check_keys(content, *_DRIVE_KEYS, where, DriveError)
     entries = take_mapping(content["cameras"], f"{where}: cameras", DriveError)
@@ -113,63 +92,24 @@ def read_description(content: dict[str, Any], path: Path, where: str, options: R
         cameras[name] = _read_camera(entry, named, path, f"{where}: camera '{name}'")
         files.append(list_images())
     recorded = read_poses(poses, path, origin, options.max_gap_s, poses_at, read_topic)
-    check_trajectory(recorded.trajectory, recorded.origin, poses_at)
     pose_noise = _read_pose_noise(content.get("pose_noise"), recorded.noise, f"{where}: pose_noise")
-    laid = lay_flat(recorded.trajectory, pose_noise.position_m)
-    tell(laid, path)
-    images = pose_images(files, laid.trajectory, options.max_gap_s, path)
-    check_image_files(images, cameras)
-    return Drive(
-        name=_name(content, path),
-        root=path,
-        cameras=cameras,
-        images=images,
-        pose_noise=pose_noise,
+    return assemble_drive(
+        _name(content, path),
+        path,
+        cameras,
+        files,
+        recorded.trajectory,
+        pose_noise,
+        options.max_gap_s,
+        poses_at,
         origin=recorded.origin,
         truth_dir=_find_truth(content.get("truth"), path, f"{where}: truth"),
-        unposed=count_unposed(files, images),
-        trajectory=laid.trajectory,
-        recorded=recorded.trajectory,
-        road=laid.road,
     )
 
 
 def folder_drive_name(path: Path) -> str:
     """The name that the drive at ``path`` gives itself."""
     return _name(load_yaml(path / DRIVE_FILE, DriveError), path)
-
-
-def write_drive(folder: Path, drive: Drive, trajectory: Trajectory) -> None:
-    """Write all of a drive but its images, which must lie in ``folder`` already, and its truth.
-
-    ``drive.yaml`` comes last: a folder without it is not a drive yet. Poses come from
-    ``trajectory``, as recorded; those of ``drive.images`` are what a reader will interpolate.
-
-    Args:
-        folder: where to write; image ``<camera>/...`` paths are written relative to its camera.
-        drive: cameras, image paths and times, noise, origin; ``truth_dir``, if any, names a folder
-            within ``folder`` (:func:`v2hdm.io.drive.truth.write_truth` fills it).
-        trajectory: the recorded poses, at any rate.
-    """
-    entries: dict[str, Any] = {}
-    for name, camera in drive.cameras.items():
-        write_camera_info(camera.info, folder / name / "camera_info.yaml")
-        mine = [image for image in drive.images if image.camera == name]
-        names = [image.path.relative_to(folder / name).as_posix() for image in mine]
-        write_image_list(np.array([image.stamp_s for image in mine]), names, folder / name / "images.txt")
-        entries[name] = _describe_camera(name, camera)
-    write_tum(trajectory, folder / POSES_FILE)
-    content: dict[str, Any] = {
-        "name": drive.name,
-        "poses": POSES_FILE,
-        "pose_noise": asdict(drive.pose_noise),
-    }
-    if drive.origin is not None:
-        content["origin"] = asdict(drive.origin)
-    if drive.truth_dir is not None:
-        content["truth"] = drive.truth_dir.relative_to(folder).as_posix()
-    content["cameras"] = entries
-    replace_text(folder / DRIVE_FILE, dump_yaml(content))
 
 
 def _name(content: dict[str, Any], path: Path) -> str:
@@ -191,11 +131,6 @@ def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str
     if not isinstance(linear, bool):
         raise DriveError(f"{where}, linear_response: expected true or false, got {shown(linear)}")
     prior = entry.get("centre_prior")
-    if prior is not None:
-        prior_where = f"{where}, centre_prior"
-        check_keys(
-            take_mapping(prior, prior_where, DriveError), ("xyz", "sigma_m"), (), prior_where, DriveError
-        )
     initial_ipm = choose_initial(entry.get("initial_ipm"), ipm, where)
     roi_vehicle = take_roi(entry["roi_vehicle"], f"{where}, roi_vehicle")
     check_roi_in_view(info, ipm[initial_ipm], roi_vehicle, f"{where}, roi_vehicle")
@@ -211,7 +146,7 @@ def _read_camera(entry: dict[str, Any], info: CameraInfo, root: Path, where: str
 
 
 def _read_mask(entry: dict[str, Any], root: Path, info: CameraInfo, where: str) -> BoolArray | None:
-    """Where images show the vehicle itself: not black in the file of the key ``mask``; None without."""
+    """Pixels that show the vehicle itself: not black in the file of the key ``mask``; None without."""
     if "mask" not in entry:
         return None
     path = root / take_text(entry["mask"], f"{where}, mask", DriveError)
@@ -225,7 +160,7 @@ def _read_mask(entry: dict[str, Any], root: Path, info: CameraInfo, where: str) 
 
 
 def _read_pose_noise(content: object, of_source: Mapping[str, float], where: str) -> PoseNoise:
-    """What the drive states; of what it does not, what the source of its poses states."""
+    """The noise as the drive states it, else as the source of its poses does."""
     entry = {} if content is None else take_mapping(content, where, DriveError)
     check_keys(entry, (), [field.name for field in fields(PoseNoise)], where, DriveError)
     values = {key: take_number(value, f"{where}, {key}", DriveError) for key, value in entry.items()}
@@ -251,17 +186,3 @@ def _find_truth(content: object, root: Path, where: str) -> Path | None:
     if not truth_dir.is_dir():
         raise DriveError(f"{where}: no such folder {truth_dir}; restore it or drop the key")
     return truth_dir
-
-
-def _describe_camera(name: str, camera: Camera) -> dict[str, Any]:
-    entry: dict[str, Any] = {
-        "camera_info": f"{name}/camera_info.yaml",
-        "images": f"{name}/images.txt",
-        "linear_response": camera.linear_response,
-        "initial_ipm": camera.initial_ipm,
-        "ipm": {key: matrix.tolist() for key, matrix in camera.ipm.items()},
-        "roi_vehicle": camera.roi_vehicle.tolist(),
-    }
-    if camera.centre_prior is not None:
-        entry["centre_prior"] = describe_prior(camera.centre_prior)
-    return entry

@@ -1,8 +1,8 @@
 """Several drives through one site as one drive, in the frame of the first.
 
-Each drive stays a visit of the joined one, with the noise of its own poses and its own clocks. A camera that
-two drives describe alike is one camera of the joined drive; otherwise both stay apart, the later one under a
-name such as ``front@tuesday``.
+Each drive is a session of the joined one, with its own pose noise and clocks. A camera that two drives
+describe alike is one camera of the joined drive; otherwise the later one gets a name such as
+``front@tuesday``.
 """
 
 from __future__ import annotations
@@ -12,13 +12,12 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from v2hdm.errors import DriveError
-from v2hdm.geometry.geodetic import enu_axes, enu_from_geodetic
+from v2hdm.geometry.geodetic import enu_axes, enu_from_geodetic, position_of
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.geometry.rigid import camera_centre, log
-from v2hdm.io.drive.clock import in_order
+from v2hdm.io.drive.images import in_order
 from v2hdm.records import (
     Camera,
     CameraInfo,
@@ -30,24 +29,15 @@ from v2hdm.records import (
     Trajectory,
     Visit,
     largest_noise,
-)
+)  # fmt: skip
 
 _log = logging.getLogger(__name__)
 
-GUESS_SIGMA_RAD = 0.015
-"""Sigma of the direction of a guessed mounting, rad: as ``mapping.association.ipm_sigma_rad``."""
-
-GUESS_SIGMA_M = 0.3
-"""Sigma of a guessed camera centre that nobody has surveyed, m a coordinate."""
-
-SAME_RIG_SIGMAS = 4.0
-"""Difference of two guesses, in the sigmas of both, from which they are of two mountings."""
-
-_SAME_LENS = 1e-3
-"""Difference of two intrinsics, px at the image's border, up to which they are one lens's."""
-
-_REACH_M = 40.0
-"""How far apart two routes may be that have seen a marking in common, m: twice what a camera reaches."""
+_GUESS_SIGMA_RAD = 0.015  # of the direction of a guessed mounting, as ``mapping.association.ipm_sigma_rad``
+_GUESS_SIGMA_M = 0.3  # of a coordinate of a guessed camera centre that nobody has surveyed
+_SAME_RIG_SIGMAS = 4.0  # guesses that differ by more, in the sigmas of both, are of two mountings
+_SAME_LENS = 1e-3  # intrinsics that differ by less, px at the image's border, are of one lens
+_REACH_M = 40.0  # routes with a marking in common are no further apart: twice a camera's reach
 
 
 @dataclass(frozen=True)
@@ -71,14 +61,10 @@ class _Move:
 
 
 def join_drives(drives: Sequence[Drive], apart: Collection[tuple[int, str]] = ()) -> Drive:
-    """The drives as visits of one drive; one alone stays as it is.
+    """The drives as sessions of one drive, in the frame of the first; one alone stays as it is.
 
-    Args:
-        drives: as they were read, the first of which gives the frame.
-        apart: (drive, camera) whose mounting is known to be another one than before.
-
-    Raises:
-        DriveError: they are not of one frame or site.
+    ``apart`` names (drive, camera) whose mounting is known to have changed. Raises DriveError when they are
+    not of one frame or site.
     """
     if len(drives) == 1:
         return drives[0]
@@ -97,15 +83,9 @@ def join_drives(drives: Sequence[Drive], apart: Collection[tuple[int, str]] = ()
             one = drive.cameras[camera]
             cameras.setdefault(joined, replace(one, info=replace(one.info, name=joined)))
         move = _move(drives[0].origin, drive.origin)
-        images += [
-            replace(
-                image,
-                camera=own[image.camera],
-                visit=number,
-                map_from_vehicle=move.planar @ image.map_from_vehicle,
-            )
-            for image in drive.images
-        ]
+        for image in drive.images:
+            pose = move.planar @ image.map_from_vehicle
+            images.append(replace(image, camera=own[image.camera], visit=number, map_from_vehicle=pose))
         visits.append(
             Visit(
                 name=name,
@@ -138,23 +118,20 @@ def same_rig(first: Camera, second: Camera) -> bool:
         return False
     guesses = [extrinsic_from_ipm(one.info, one.ipm[one.initial_ipm]) for one in (first, second)]
     turn_rad = float(np.linalg.norm(log(guesses[0] @ np.linalg.inv(guesses[1]))[3:]))
-    if turn_rad > SAME_RIG_SIGMAS * np.sqrt(2) * GUESS_SIGMA_RAD:
+    if turn_rad > _SAME_RIG_SIGMAS * np.sqrt(2) * _GUESS_SIGMA_RAD:
         return False
     priors = [one.centre_prior for one in (first, second)]
-    sigma = [np.full(3, GUESS_SIGMA_M) if prior is None else prior.sigma_m for prior in priors]
+    sigma = [np.full(3, _GUESS_SIGMA_M) if prior is None else prior.sigma_m for prior in priors]
     centre = [
         camera_centre(guess) if prior is None else prior.centre_vehicle
         for guess, prior in zip(guesses, priors, strict=True)
     ]
-    return bool((np.abs(centre[0] - centre[1]) <= SAME_RIG_SIGMAS * np.hypot(*sigma)).all())
+    return bool((np.abs(centre[0] - centre[1]) <= _SAME_RIG_SIGMAS * np.hypot(*sigma)).all())
 
 
 def _same_lens(first: CameraInfo, second: CameraInfo) -> bool:
-    if (first.width, first.height, first.distortion_model) != (
-        second.width,
-        second.height,
-        second.distortion_model,
-    ):
+    shapes = [(one.width, one.height, one.distortion_model) for one in (first, second)]
+    if shapes[0] != shapes[1]:
         return False
     return bool(
         np.allclose(first.intrinsic, second.intrinsic, rtol=0, atol=_SAME_LENS)
@@ -163,7 +140,7 @@ def _same_lens(first: CameraInfo, second: CameraInfo) -> bool:
 
 
 def _name_of(camera: str, one: Camera, visit: str, so_far: Mapping[str, Camera], apart: bool) -> str:
-    """The joined drive's name for a camera of a visit: that of the same rig, if there has been one."""
+    """The joined drive's name for a camera of a session: that of the same rig, if there has been one."""
     if camera not in so_far:
         return camera
     if not apart and same_rig(so_far[camera], one):
@@ -210,14 +187,18 @@ def _check(drives: Sequence[Drive]) -> None:
 
 
 def _check_overlap(drive: Drive) -> None:
-    """Refuse a visit that comes near to no other: nothing would be common to them."""
+    """Refuse a session that comes near to no other: they would have nothing in common."""
     places = [
         np.array([image.map_from_vehicle[:2, 3] for image in drive.images if image.visit == number])
         for number in range(len(drive.joined))
     ]
     for number, own in enumerate(places):
         others = np.concatenate([one for k, one in enumerate(places) if k != number])
-        nearest_m = float(cKDTree(others).query(own)[0].min())
+        nearest_m = np.inf
+        for place in own:
+            nearest_m = min(nearest_m, float(np.linalg.norm(others - place, axis=1).min()))
+            if nearest_m <= _REACH_M:
+                break
         if nearest_m > _REACH_M:
             raise DriveError(
                 f"{drive.joined[number].root}: comes no nearer than {nearest_m:.0f} m to the other drives, "
@@ -229,7 +210,7 @@ def _move(to: GeodeticOrigin | None, origin: GeodeticOrigin | None) -> _Move:
     """From the frame of one origin into that of another."""
     if to is None or origin is None or to == origin:
         return _Move(np.eye(4), np.eye(4))
-    place = np.array([[one.latitude_deg, one.longitude_deg, one.altitude_m] for one in (to, origin)])
+    place = np.concatenate([position_of(to), position_of(origin)])
     axes = enu_axes(place)
     whole = np.eye(4)
     whole[:3, :3] = axes[0].T @ axes[1]
@@ -242,7 +223,7 @@ def _move(to: GeodeticOrigin | None, origin: GeodeticOrigin | None) -> _Move:
 
 
 def _one_road(roads: Sequence[Road | None], visits: Sequence[Visit]) -> Road | None:
-    """The recorded ground of all visits; that of one recorded as z = 0 counts where others have heights."""
+    """The recorded ground of all sessions; one recorded as z = 0 counts where others have heights."""
     if all(road is None for road in roads):
         return None
     known: list[Road] = []
@@ -252,8 +233,5 @@ def _one_road(roads: Sequence[Road | None], visits: Sequence[Visit]) -> Road | N
         elif visit.recorded is not None:
             places = visit.recorded.map_from_vehicle[:, :3, 3]
             known.append(Road(places[:, :2], places[:, 2], np.zeros((len(places), 2))))
-    return Road(
-        np.concatenate([one.points_map for one in known]),
-        np.concatenate([one.height_m for one in known]),
-        np.concatenate([one.slope for one in known]),
-    )
+    columns = zip(*((one.points_map, one.height_m, one.slope) for one in known), strict=True)
+    return Road(*map(np.concatenate, columns))

@@ -1,4 +1,4 @@
-"""The drive of a finished result: what ``metrics.json`` says of how it was read, and reading it so again."""
+"""The drive of a finished result, read again as ``metrics.json`` says that it was read."""
 
 from __future__ import annotations
 
@@ -9,24 +9,19 @@ from typing import Any
 
 from v2hdm.errors import DriveError, MapFileError
 from v2hdm.io.drive import join_drives, read_drive
-from v2hdm.io.drive.options import KittiOptions, ReadOptions
+from v2hdm.io.drive.images import KittiOptions, ReadOptions
 from v2hdm.records import Drive
 from v2hdm.store.files import load_json
 
-METRICS = "metrics.json"
-"""Name of the file in a result folder that says it."""
+METRICS = "metrics.json"  # in a result folder
 
 
 def told_of(drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[str, Any]:
-    """What :func:`drive_of` needs, as plain values."""
+    """The plain values that :func:`drive_of` needs."""
     return {
         "name": drive.name,
         "paths": [str(path.resolve()) for path in paths],
-        "format": options.format,
-        "max_gap_s": options.max_gap_s,
-        "limit": options.limit,
-        "start_s": options.start_s,
-        "end_s": options.end_s,
+        **{key: getattr(options, key) for key in ("format", "max_gap_s", "limit", "start_s", "end_s")},
         "cache": str(Path(options.cache).resolve()),
         **({"kitti": asdict(options.kitti)} if options.format == "kitti" else {}),
         "cameras": list(drive.cameras),
@@ -35,25 +30,24 @@ def told_of(drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[s
 
 
 def drive_of(folder: Path, path: Path | None) -> Drive | None:
-    """The drive of the result in ``folder``: at ``path``, else where it was; None where it is there no more.
+    """The drive of the result in ``folder``: at ``path``, else where it was; None where it is gone.
 
-    Raises:
-        MapFileError: the folder is no result of a run.
-        DriveError: the drive cannot be read, or is not that of this result.
+    Raises MapFileError when the folder is no result of a run, DriveError when the drive cannot be read or is
+    another one.
     """
     if not (folder / METRICS).is_file():
         raise MapFileError(f"{folder}: no {METRICS} in it; give the result folder of v2hdm.map")
-    told = load_json(folder / METRICS, MapFileError).get("drive")
-    told = told if isinstance(told, dict) else {}
+    stated = load_json(folder / METRICS, MapFileError).get("drive")
+    stated = stated if isinstance(stated, dict) else {}
     try:
-        paths = [Path(str(one)) for one in told.get("paths") or []] if path is None else [path]
-        options = _options(told)
+        paths = [Path(str(one)) for one in stated.get("paths") or []] if path is None else [path]
+        options = _options(stated)
     except (TypeError, ValueError) as failure:
         raise MapFileError(f"{folder / METRICS}: what it says of the drive is damaged ({failure})") from None
     if not paths or not all(one.exists() for one in paths):
         return None
     drive = join_drives([read_drive(one, options) for one in paths])
-    expected = (told.get("name", drive.name), told.get("images", len(drive.images)))
+    expected = (stated.get("name", drive.name), stated.get("images", len(drive.images)))
     if expected != (drive.name, len(drive.images)):
         raise DriveError(
             f"{paths[0]}: drive {drive.name} of {len(drive.images)} images, but the result is of drive "
@@ -62,16 +56,16 @@ def drive_of(folder: Path, path: Path | None) -> Drive | None:
     return drive
 
 
-def _options(told: Mapping[str, Any]) -> ReadOptions:
-    limit, end_s = told.get("limit"), told.get("end_s")
-    kitti = dict(told.get("kitti") or {})
+def _options(stated: Mapping[str, Any]) -> ReadOptions:
+    limit, end_s = stated.get("limit"), stated.get("end_s")
+    kitti = dict(stated.get("kitti") or {})
     return ReadOptions(
-        format=str(told.get("format", "auto")),
-        cameras=[str(name) for name in told.get("cameras") or []],
-        max_gap_s=float(told.get("max_gap_s", ReadOptions.max_gap_s)),
+        format=str(stated.get("format", "auto")),
+        cameras=[str(name) for name in stated.get("cameras") or []],
+        max_gap_s=float(stated.get("max_gap_s", ReadOptions.max_gap_s)),
         limit=None if limit is None else int(limit),
-        start_s=float(told.get("start_s") or 0.0),
+        start_s=float(stated.get("start_s") or 0.0),
         end_s=None if end_s is None else float(end_s),
-        cache=str(told.get("cache", ReadOptions.cache)),
+        cache=str(stated.get("cache", ReadOptions.cache)),
         kitti=KittiOptions(**{str(key): float(value) for key, value in kitti.items()}),
     )

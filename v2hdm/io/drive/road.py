@@ -1,13 +1,13 @@
 """The road under a drive, and the drive's poses with that road laid flat into z = 0.
 
-The mapper's ground is the plane z = 0. A road has grade, cross-fall, ramps and a height above the sea; none
-of it concerns the markings' plan. The vehicle's attitude relative to the road before it does: one degree of
-pitch moves a ground point at 15 m by 2.4 m for a camera 1.65 m up.
+The mapper's ground is the plane z = 0. Grade, cross-fall, ramps and height do not concern the markings' plan,
+but the vehicle's attitude relative to the road does: one degree of pitch moves a ground point at 15 m by 2.4
+m for a camera 1.65 m up.
 
-The recorded up-axis, smoothed over a few metres, gives the road's slope. The heights tell where it does not:
-integrated along the path, that slope must give them. What it lacks, a sensor that is not level or a vehicle
-that squats as it speeds up, is the vehicle's and not the road's. Only this difference is smoothed over a
-longer way, so that a short ramp, of which both know, is not blurred.
+The recorded up-axis, smoothed over a few metres, gives the road's slope. Integrated along the path it must
+give the heights; where it does not, the sensor is not level or the vehicle squats, and the difference is the
+vehicle's and not the road's. Only this difference is smoothed over a longer way, so that short ramps are not
+blurred.
 """
 
 from __future__ import annotations
@@ -19,60 +19,44 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.geometry.rigid import heading_rad, rotation_from_euler
-from v2hdm.io.drive.stations import STATION_M, Stations, along_route, local_lines, local_planes
-from v2hdm.io.drive.unevenness import Unevenness, unevenness
 from v2hdm.records import BoolArray, FloatArray, Road, Trajectory
-
-__all__ = ["Laid", "Unevenness", "lay_flat", "tell", "unevenness"]
 
 _log = logging.getLogger(__name__)
 
-_ROAD_M = 5.0
-"""Standard deviation of the Gaussian along the path under which the recorded up-axis is the road's, m. What
-is shorter is the suspension, whose waves at 1.5 Hz are 3 to 10 m long at 5 to 15 m/s."""
+# Standard deviations of Gaussians along the path, m. Under the first the recorded up-axis is the road's:
+# shorter waves are the suspension's, which at 1.5 Hz are 3 to 10 m long at 5 to 15 m/s. Under the second
+# heights are compared with the up-axis: short enough for a vehicle's squat at a start or stop, long enough
+# for heights of 2 cm to show 1 mrad.
+_ROAD_M, _HEIGHTS_M = 5.0, 10.0
 
-_HEIGHTS_M = 10.0
-"""Standard deviation of the Gaussian along the path under which heights are held against the up-axis, m:
-short enough for a vehicle's squat at a start or stop, long enough for heights of 2 cm to tell 1 mrad."""
+# Slow sway of a vehicle by acceleration and in bends: 0.17 deg, as on KITTI drives, over a few seconds.
+_SWAY_RAD, _SWAY_M = 0.003, 10.0
+_HEIGHT_SIGMAS = (
+    1.5  # GNSS heights are half again as uncertain as positions: no satellite is below the antenna
+)
+_HEIGHT_M = 5.0  # way over which an error of the height is of one piece
+_CROSS_FALL = 0.02  # slope of a road that drains, expected where only heights along a line are known
 
-_SWAY_RAD = 0.003
-"""Slow sway of a vehicle relative to the road, by acceleration and in bends: 0.17 deg, as on KITTI drives."""
-
-_SWAY_M = 10.0
-"""Way over which that sway lasts, m: a few seconds of driving."""
-
-_HEIGHT_SIGMAS = 1.5
-"""Heights from GNSS are half again as uncertain as positions: no satellite is below the antenna."""
-
-_HEIGHT_M = 5.0
-"""Way over which an error of the height is of one piece, m."""
-
-_CROSS_FALL = 0.02
-"""Slope of a road that drains: what is expected of ground of which only heights along a line are known."""
-
+# How far off level on its vehicle a sensor may be, in pitch and roll. Heights show the pitch whatever is
+# expected; only turns separate roll from the road's cross-fall, which is no more than 1 deg.
 _MOUNT_RAD = (0.1, 0.02)
-"""How far off level on its vehicle a sensor may be, in pitch and roll. Heights tell the pitch whatever is
-expected. Only turns tell roll from the road's cross-fall: 1 deg, which is no more than cross-falls are."""
+_REPORTED_RAD = float(np.radians(0.3))  # a sensor that is further off level is reported
+_STEEPEST = 0.35  # no road has this slope; up-axes that lean further, in the median, are no ground vehicle's
+_ROUNDING = 1e-9  # slope below which a rotation that was made of the heading alone is level
 
-_TOLD_RAD = float(np.radians(0.3))
-"""A sensor that is further off level than this is told of."""
-
-_STEEPEST = 0.35
-"""Slope that no road has. Up-axes that lean further, in the median, are no ground vehicle's."""
-
-_ROUNDING = 1e-9
-"""Slope below which a rotation that was made of the heading alone is level."""
+STATION_M = 1.0  # nearer poses are one station: a vehicle that stands drives no path in its noise
+_WINDOW_SIGMAS = 3.0  # a Gaussian is cut off here; 0.3 % of it lies beyond
+_END_RIDGE = 0.2  # keeps lines through few stations from being steep, as a share of the Gaussian's width
+_HALF_WIDTH_M = 3.5  # ground to either side of the path that counts for unevenness: a lane's width
 
 
 @dataclass(frozen=True)
 class Laid:
-    """Poses with the road laid flat.
+    """Poses with the road laid flat: z = 0, plan and heading as recorded, roll, pitch relative to the road.
 
-    Attributes:
-        trajectory: z = 0, x, y and heading as recorded, roll and pitch relative to the road.
-        road: the recorded ground; None where it was recorded as the plane z = 0.
-        mount_rad: (2,) roll (positive: left side up) and pitch (positive: nose down) of the sensor on the
-            vehicle, which ``trajectory`` no longer has.
+    ``road`` is the recorded ground, None where it was recorded as the plane z = 0; ``mount_rad`` (2,) are
+    roll (left side up) and pitch (nose down) of the sensor on the vehicle, which ``trajectory`` no longer
+    has.
     """
 
     trajectory: Trajectory
@@ -81,13 +65,9 @@ class Laid:
 
 
 def lay_flat(recorded: Trajectory, position_sigma_m: float) -> Laid:
-    """Lay the road under ``recorded`` poses flat into z = 0.
+    """Lay the road under poses ``map_from_vehicle`` flat into z = 0, recorded with ``position_sigma_m``.
 
-    Roll, or pitch, that is zero throughout was not measured: the vehicle is taken to follow the road.
-
-    Args:
-        recorded: ``map_from_vehicle`` at the receiver's rate.
-        position_sigma_m: standard deviation of a recorded position.
+    Roll, or pitch, that is zero throughout was not measured: the vehicle is assumed to follow the road.
     """
     poses = recorded.map_from_vehicle
     slope = _slope_of_up_axis(poses)
@@ -117,8 +97,8 @@ def lay_flat(recorded: Trajectory, position_sigma_m: float) -> Laid:
     return Laid(Trajectory(recorded.stamp_s, flat), road, _roll_pitch(fit.mount[None])[0])
 
 
-def tell(laid: Laid, where: Path) -> None:
-    """Say in the log how the road lies that was laid flat, and how a sensor sits that is not level."""
+def log_road(laid: Laid, where: Path) -> None:
+    """Log the heights and slopes of the road that was laid flat, and a sensor that is not level."""
     if laid.road is None:
         return
     percent = 100.0 * np.linalg.norm(laid.road.slope, axis=1)
@@ -127,7 +107,7 @@ def tell(laid: Laid, where: Path) -> None:
         "to %.1f %%",
         where, laid.road.height_m.min(), laid.road.height_m.max(), np.median(percent), percent.max(),
     )  # fmt: skip
-    if np.abs(laid.mount_rad).max() > _TOLD_RAD:
+    if np.abs(laid.mount_rad).max() > _REPORTED_RAD:
         _log.info(
             "%s: on average the recorded attitude is off the road's by %.2f deg of roll (left side up), "
             "%.2f deg of pitch (nose down); this is taken off",
@@ -137,10 +117,7 @@ def tell(laid: Laid, where: Path) -> None:
 
 @dataclass(frozen=True)
 class _Fit:
-    """The ground at N stations and the sensor on the vehicle.
-
-    ``height_m`` (N,), ``slope`` (N, 2) by map x and y, ``mount`` (2,) slope of the sensor forward and left.
-    """
+    """Heights (N,) and slopes (N, 2) of the ground; slope of the sensor forward and left (2,)."""
 
     height_m: FloatArray
     slope: FloatArray
@@ -148,16 +125,7 @@ class _Fit:
 
 
 def _fit(stations: Stations, height_m: FloatArray, leans: FloatArray, height_sigma_m: float) -> _Fit:
-    """The ground that heights and up-axes agree upon, and how the sensor sits on the vehicle.
-
-    Everything is linear in the mount, so its effect is carried along in columns of its own.
-
-    Args:
-        stations: the N places.
-        height_m: (N,) recorded there.
-        leans: (N, 2, 3) of :func:`_with_mount`.
-        height_sigma_m: standard deviation of a height.
-    """
+    """The ground and mount that heights (N,) and up-axes (N, 2, 3) of :func:`_with_mount` agree upon."""
     road = local_lines(stations, leans.reshape(len(leans), 6), _ROAD_M).reshape(leans.shape)
     drawn = _integrated(stations, road)
     missing = np.column_stack([height_m, np.zeros((len(height_m), 2))]) - drawn
@@ -180,12 +148,9 @@ def _trust_m2(height_variance: FloatArray) -> FloatArray:
 def _mount(leans: FloatArray) -> FloatArray:
     """The sensor's slopes (2,) forward and left that leave least of ``leans`` (N, 2, 3)."""
     weight = STATION_M / (_SWAY_RAD**2 * _SWAY_M)
-    normal = weight * np.einsum("nim,nik->mk", leans[..., 1:], leans[..., 1:]) + np.diag(
-        1.0 / np.square(_MOUNT_RAD)
-    )
-    return np.asarray(
-        np.linalg.solve(normal, -weight * np.einsum("nim,ni->m", leans[..., 1:], leans[..., 0]))
-    )
+    recorded, by_mount = leans[..., 0], leans[..., 1:]
+    normal = weight * np.einsum("nim,nik->mk", by_mount, by_mount) + np.diag(1.0 / np.square(_MOUNT_RAD))
+    return np.asarray(np.linalg.solve(normal, -weight * np.einsum("nim,ni->m", by_mount, recorded)))
 
 
 def _integrated(stations: Stations, slope: FloatArray) -> FloatArray:
@@ -210,9 +175,9 @@ def _slope_of_heights(stations: Stations, height_m: FloatArray, height_sigma_m: 
 
 
 def _with_mount(lean: FloatArray, yaw: FloatArray, measured: BoolArray) -> FloatArray:
-    """Slopes (P, 2, 3) by map x and y: recorded, and what a unit of mount forward and left takes off them.
+    """Slopes (P, 2, 3) by map x and y: recorded, and the change by a unit of mount forward and left.
 
-    ``lean`` (P, 2) is the recorded floor's, forward and left; only what was ``measured`` (2,) has a mount.
+    ``lean`` (P, 2) is the recorded floor's, forward and left; only ``measured`` (2,) directions have a mount.
     """
     directions = (np.tile(unit, (len(yaw), 1)) for unit in np.diag(measured.astype(np.float64)))
     return np.stack([_turned(lean, yaw), *(-_turned(direction, yaw) for direction in directions)], axis=2)
@@ -229,3 +194,140 @@ def _turned(vectors: FloatArray, angle_rad: FloatArray) -> FloatArray:
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     x, y = vectors.T
     return np.column_stack([c * x - s * y, s * x + c * y])
+
+
+@dataclass(frozen=True)
+class Stations:
+    """Places (N, 2) along a route, each the mean of the successive poses within a metre.
+
+    ``first`` (N + 1,) are indices of the stations' first poses, and the number of poses; ``path_m`` (N,) the
+    way.
+    """
+
+    first: np.ndarray
+    points_map: FloatArray
+    path_m: FloatArray
+
+    def mean(self, values: FloatArray) -> FloatArray:
+        """Means (N, ...) over the poses of each station of their ``values`` (P, ...)."""
+        return _means(values, self.first)
+
+    def at_poses(self, values: FloatArray) -> FloatArray:
+        """Values (P, C) at the poses, between those (N, C) of the stations."""
+        centre = 0.5 * (self.first[:-1] + self.first[1:] - 1)
+        poses = np.arange(self.first[-1])
+        return np.column_stack([np.interp(poses, centre, column) for column in values.T])
+
+    def around(self, k: int, width_m: float) -> tuple[slice, FloatArray]:
+        """The stations within reach of a Gaussian around station ``k``, and their weights."""
+        reach = _WINDOW_SIGMAS * width_m
+        low, high = np.searchsorted(self.path_m, [self.path_m[k] - reach, self.path_m[k] + reach])
+        near = slice(int(low), max(int(high), k + 1))
+        weight = np.exp(-0.5 * ((self.path_m[near] - self.path_m[k]) / width_m) ** 2)
+        return near, weight
+
+
+def along_route(points_map: FloatArray) -> Stations:
+    """The stations of poses at ``points_map`` (P, 2)."""
+    first = [0]
+    x0, y0 = points_map[0].tolist()
+    for p, (x, y) in enumerate(points_map.tolist()):
+        if (x - x0) ** 2 + (y - y0) ** 2 >= STATION_M**2:
+            first.append(p)
+            x0, y0 = x, y
+    starts = np.array([*first, len(points_map)])
+    centres = _means(points_map, starts)
+    steps_m = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    return Stations(starts, centres, np.concatenate([[0.0], np.cumsum(steps_m)]))
+
+
+def local_lines(stations: Stations, values: FloatArray, width_m: float) -> FloatArray:
+    """``values`` (N, C) smoothed by the line fitted around each station."""
+    smooth = np.empty_like(values)
+    for k, here in enumerate(stations.path_m):
+        near, weight = stations.around(k, width_m)
+        weight = weight / weight.sum()
+        offset = stations.path_m[near] - here
+        centred = offset - weight @ offset
+        spread = weight @ centred**2 + (_END_RIDGE * width_m) ** 2
+        mean = weight @ values[near]
+        smooth[k] = mean - (weight @ offset) * ((weight * centred) @ values[near]) / spread
+    return smooth
+
+
+def local_planes(
+    stations: Stations, height: FloatArray, slope: FloatArray, width_m: float, trust_m2: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Heights (N, C) and slopes (N, 2, C) of the planes around the stations that fit C sets of both there.
+
+    ``slope`` (N, 2, C) is known apart from the heights; ``trust_m2`` (N,) is the mean squared leverage, m^2,
+    at which heights say as much as these slopes.
+    """
+    fitted, inclined = np.empty_like(height), np.empty_like(slope)
+    for k in range(len(height)):
+        near, weight = stations.around(k, width_m)
+        weight = weight / weight.sum()
+        offset = stations.points_map[near] - stations.points_map[k]
+        mean = weight @ offset
+        lever = (offset - mean) * weight[:, None]
+        normal = lever.T @ offset + trust_m2[k] * np.eye(2)
+        known = np.tensordot(weight, slope[near], axes=1)
+        inclined[k] = np.linalg.solve(normal, lever.T @ height[near] + trust_m2[k] * known)
+        fitted[k] = weight @ height[near] - mean @ inclined[k]
+    return fitted, inclined
+
+
+def _means(values: FloatArray, first: np.ndarray) -> FloatArray:
+    count = np.diff(first).reshape(-1, *[1] * (values.ndim - 1))
+    return np.asarray(np.add.reduceat(values, first[:-1], axis=0) / count)
+
+
+@dataclass(frozen=True)
+class Unevenness:
+    """The ground's worst deviation ``value_m`` from the plane beneath the vehicle, ``distance_m`` away.
+
+    Roll and pitch of ``sigma`` rad are worth ``sigma * distance_m`` there, too. The vehicle is at ``at_map``
+    (2,), ``station_m`` along the route.
+    """
+
+    value_m: float
+    distance_m: float
+    at_map: FloatArray
+    station_m: float
+
+
+def unevenness(road: Road, reach_m: float) -> Unevenness:
+    """The worst deviation of the ground, over distance, between half of ``reach_m`` and all of it.
+
+    The ground is known along the path by its heights, beside it by its slope, so that a change of cross-fall
+    deviates, too.
+    """
+    steps_m = np.linalg.norm(np.diff(road.points_map, axis=0), axis=1)
+    station_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    left = _left(road.points_map)
+    worst = Unevenness(0.0, reach_m, road.points_map[0], 0.0)
+    for k, here_m in enumerate(station_m):
+        low, high = np.searchsorted(station_m, [here_m - reach_m, here_m + reach_m])
+        near = slice(int(low), int(high))
+        offset = road.points_map[near] - road.points_map[k]
+        distance_m = np.linalg.norm(offset, axis=1)
+        far = distance_m >= 0.5 * reach_m
+        if not far.any():
+            continue
+        change = road.slope[near] - road.slope[k]
+        along_m = road.height_m[near] - road.height_m[k] - offset @ road.slope[k]
+        across_m = _HALF_WIDTH_M * np.einsum("ni,ni->n", change, left[near])
+        deviation_m = np.where(far, np.abs(along_m) + np.abs(across_m), 0.0)
+        j = int(np.argmax(deviation_m / np.maximum(distance_m, 0.5 * reach_m)))
+        if deviation_m[j] * worst.distance_m > worst.value_m * distance_m[j]:
+            worst = Unevenness(float(deviation_m[j]), float(distance_m[j]), road.points_map[k], float(here_m))
+    return worst
+
+
+def _left(points_map: FloatArray) -> FloatArray:
+    """Unit vectors (P, 2) to the left of the path, zero where it is a point."""
+    if len(points_map) < 2:
+        return np.zeros_like(points_map)
+    ahead = np.gradient(points_map, axis=0)
+    length = np.linalg.norm(ahead, axis=1, keepdims=True)
+    return np.asarray(np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.maximum(length, 1e-9))

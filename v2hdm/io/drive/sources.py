@@ -1,4 +1,4 @@
-"""Where a drive's images, intrinsics and poses come from: files, an image folder, a video, topics of a bag.
+"""Sources of a drive's images, intrinsics and poses: files, an image folder, a video, topics of a bag.
 
 All that a drive wants of its bag is gathered first and then imported in one pass.
 """
@@ -13,27 +13,14 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.io.calibration.camera_info import read_camera_info
 from v2hdm.io.calibration.intrinsics import read_intrinsics
+from v2hdm.io.calibration.reading import read_camera_info
 from v2hdm.io.drive.images import ImageFiles
-from v2hdm.io.drive.tum import read_image_list
-from v2hdm.io.importers.bag.importing import import_streams
-from v2hdm.io.importers.bag.streams import (
-    IMAGE_LIST,
-    INFO_FILE,
-    STAMPS,
-    ImageStream,
-    InfoStream,
-    PoseStream,
-    Stream,
-    TfStream,
-)
+from v2hdm.io.importers.bag import streams
 from v2hdm.io.importers.bag.tf import TF_TOPIC
-from v2hdm.io.importers.poses.kitti_rows import read_stamps
-from v2hdm.io.importers.poses.readings import Attitudes, Readings
-from v2hdm.io.importers.stamp_units import UNITS
-from v2hdm.io.importers.video import IMAGE_LIST as VIDEO_LIST
-from v2hdm.io.importers.video import import_video
+from v2hdm.io.importers.tables import Readings, read_stamps, readings_of_poses
+from v2hdm.io.importers.video import IMAGE_LIST, import_video
+from v2hdm.io.trajectory import UNITS, read_image_list
 from v2hdm.records import CameraInfo
 from v2hdm.store.files import check_keys, take_choice, take_mapping, take_number, take_text
 
@@ -42,24 +29,20 @@ _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 @dataclass
 class Sources:
-    """What a drive's sources are relative to.
+    """The folder that file names are relative to, the cache of imports, and the drive's bag, if any.
 
-    Attributes:
-        root: folder that file names are relative to.
-        cache: folder that keeps what was imported.
-        bag: the drive's bag; None where it has none.
-        max_gap_s: transforms further apart are not interpolated across.
+    Transforms further apart than ``max_gap_s`` are not interpolated across.
     """
 
     root: Path
     cache: Path
     bag: Path | None
     max_gap_s: float
-    _streams: list[Stream] = field(default_factory=list)
+    _streams: list[streams.Stream] = field(default_factory=list)
     _folders: list[Path] = field(default_factory=list)
 
-    def want(self, stream: Stream) -> Callable[[], Path]:
-        """Put ``stream`` on the list; what is returned gives its folder, and imports all that are on it."""
+    def want(self, stream: streams.Stream) -> Callable[[], Path]:
+        """Put ``stream`` on the list; the function returned imports all of the list and gives its folder."""
         if self.bag is None:
             raise DriveError(f"{stream.where}: names a topic, but the drive has no bag; add bag at the top")
         place = len(self._streams)
@@ -68,22 +51,18 @@ class Sources:
         def folder() -> Path:
             if len(self._folders) < len(self._streams):
                 assert self.bag is not None
-                self._folders = import_streams(self.bag, self._streams, self.cache)
+                self._folders = streams.import_streams(self.bag, self._streams, self.cache)
             return self._folders[place]
 
         return folder
 
 
 def plan_images(content: object, camera: str, sources: Sources, where: str) -> Callable[[], ImageFiles]:
-    """How to list the images that ``images`` of a camera names; called once all sources are planned.
-
-    Raises:
-        DriveError: it names no source, or a key is wrong.
-    """
+    """The function that lists the images of a camera, to be called once all sources are planned."""
     if isinstance(content, str):
         path = sources.root / take_text(content, where, DriveError)
         if path.is_dir():
-            return lambda: _of_folder({"folder": content}, camera, sources, where)()
+            return _of_folder({"folder": content}, camera, sources, where)
         return lambda: _of_list(camera, path, 0.0)
     entry = take_mapping(content, where, DriveError)
     named = [key for key in IMAGE_SOURCES if key in entry]
@@ -98,7 +77,7 @@ def plan_images(content: object, camera: str, sources: Sources, where: str) -> C
 
 
 def plan_info(content: object, camera: str, sources: Sources, where: str) -> Callable[[], CameraInfo]:
-    """How to read the intrinsics that ``camera_info`` of a camera names, a file or a topic."""
+    """The function that reads the intrinsics of a camera's ``camera_info``, a file or a topic."""
     if not isinstance(content, dict):
         path = sources.root / take_text(content, where, DriveError)
         return lambda: _read_info(path, None)
@@ -110,8 +89,9 @@ def plan_info(content: object, camera: str, sources: Sources, where: str) -> Cal
             chosen = take_text(chosen, f"{where}, camera", DriveError)
         return lambda: _read_info(named, None if chosen is None else str(chosen))
     check_keys(content, ("topic",), (), where, DriveError)
-    folder = sources.want(InfoStream(take_text(content["topic"], f"{where}, topic", DriveError), where))
-    return lambda: replace(read_camera_info(folder() / INFO_FILE), name=camera)
+    topic = take_text(content["topic"], f"{where}, topic", DriveError)
+    folder = sources.want(streams.InfoStream(topic, where))
+    return lambda: replace(read_camera_info(folder() / streams.INFO_FILE), name=camera)
 
 
 def _read_info(path: Path, camera: str | None) -> CameraInfo:
@@ -121,7 +101,7 @@ def _read_info(path: Path, camera: str | None) -> CameraInfo:
 def plan_topic_poses(
     content: object, sources: Sources, where: str
 ) -> Callable[[dict[str, Any], str], Readings]:
-    """How to read the poses of ``poses`` if they are a topic's: of messages of poses, or of transforms."""
+    """The function that reads the poses of a topic in ``poses``: messages of poses, or transforms."""
     if not isinstance(content, dict) or "topic" not in content:
         return _not_planned
     topic = take_text(content["topic"], f"{where}, topic", DriveError)
@@ -134,15 +114,12 @@ def plan_topic_poses(
         frame, vehicle = (
             take_text(content[key], f"{where}, {key}", DriveError) for key in ("frame", "vehicle")
         )
-        transforms = TfStream(True, where)
+        transforms = streams.TfStream(True, where)
         tf_folder = sources.want(transforms)
 
         def of_frames(entry: dict[str, Any], where: str) -> Readings:
-            found = transforms.frames(tf_folder()).moving(frame, vehicle, sources.max_gap_s, where)
-            unknown = np.full(len(found.stamp_s), np.nan)
-            poses = found.map_from_vehicle
-            attitudes = Attitudes(found.stamp_s, poses[:, :3, :3], unknown)
-            return Readings(found.stamp_s, poses[:, :3, 3], False, unknown, attitudes)
+            frames = transforms.frames(tf_folder())
+            return readings_of_poses(frames.moving(frame, vehicle, sources.max_gap_s, where))
 
         return of_frames
     for key in ("frame", "vehicle"):
@@ -151,7 +128,7 @@ def plan_topic_poses(
     heading = content.get("heading_topic")
     if heading is not None:
         heading = take_text(heading, f"{where}, heading_topic", DriveError)
-    stream = PoseStream(topic, heading, _take_stamps(content, where), where)
+    stream = streams.PoseStream(topic, heading, _take_stamps(content, where), where)
     folder = sources.want(stream)
     return lambda entry, where: stream.readings(folder())
 
@@ -205,7 +182,7 @@ def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) 
         )
 
     def images() -> ImageFiles:
-        frames = import_video(path, sources.cache, where) / VIDEO_LIST
+        frames = import_video(path, sources.cache, where) / IMAGE_LIST
         if "start_s" in entry:
             return _of_list(camera, frames, take_number(entry["start_s"], f"{where}, start_s", DriveError))
         listed = _of_list(camera, frames, 0.0)
@@ -222,12 +199,12 @@ def _of_video(entry: dict[str, Any], camera: str, sources: Sources, where: str) 
 
 def _of_topic(entry: dict[str, Any], camera: str, sources: Sources, where: str) -> Callable[[], ImageFiles]:
     topic = take_text(entry["topic"], f"{where}, topic", DriveError)
-    folder = sources.want(ImageStream(topic, _take_stamps(entry, where), where))
-    return lambda: _of_list(camera, folder() / IMAGE_LIST, 0.0)
+    folder = sources.want(streams.ImageStream(topic, _take_stamps(entry, where), where))
+    return lambda: _of_list(camera, folder() / streams.IMAGE_LIST, 0.0)
 
 
 def _take_stamps(entry: Mapping[str, Any], where: str) -> str:
-    return take_choice(entry.get("stamps", STAMPS[0]), STAMPS, f"{where}, stamps", DriveError)
+    return take_choice(entry.get("stamps", streams.STAMPS[0]), streams.STAMPS, f"{where}, stamps", DriveError)
 
 
 @dataclass(frozen=True)
@@ -241,4 +218,4 @@ IMAGE_SOURCES: Mapping[str, _ImageSource] = {
     "video": _ImageSource(_of_video, ("start_s", "stamps")),
     "topic": _ImageSource(_of_topic, ("stamps",)),
 }
-"""Sources of images that are no list file, by the key that names them."""
+"""Sources of images other than a list file, by the key that names them."""

@@ -1,15 +1,15 @@
-"""A survey's points in a CSV file with named columns: control points and check points.
+"""A survey's points in a CSV file with named columns (docs/survey.md): control points and check points.
 
 Coordinates are local metres, latitudes and longitudes, or eastings and northings of any projected system;
-what brings them into the map is :func:`in_map`. docs/survey.md describes the file.
+:func:`in_map` brings them into the map.
 """
 
 from __future__ import annotations
 
-import csv
 import difflib
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
@@ -23,25 +23,24 @@ from v2hdm.geometry.geodetic import (
     geodetic_from_grid,
     has_height_datum,
     is_geographic,
-)
+)  # fmt: skip
+from v2hdm.io.importers.tables import read_rows
 from v2hdm.records import FloatArray, GeodeticOrigin
-from v2hdm.store.files import read_text
 
 _log = logging.getLogger(__name__)
 
 
 class Frame(Enum):
-    """What a survey's coordinates count from."""
+    """The columns of a survey's coordinates, which say what they count from."""
 
     MAP = "x_m, y_m"
     GRID = "east_m, north_m"
     GEODETIC = "latitude_deg, longitude_deg"
 
     @property
-    def columns(self) -> tuple[str, str]:
+    def columns(self) -> list[str]:
         """The columns of its two coordinates."""
-        first, second = self.value.split(", ")
-        return first, second
+        return self.value.split(", ")
 
 
 _CALLED: Mapping[str, tuple[str, ...]] = {
@@ -59,25 +58,19 @@ _CALLED: Mapping[str, tuple[str, ...]] = {
     "role": (),
     "description": ("about", "comment"),
 }
-"""Columns that are understood, and what else they may be called."""
+"""Columns that are understood, and their other names."""
 
 NAMES: Mapping[str, str] = {name: ours for ours, others in _CALLED.items() for name in (ours, *others)}
 _CONTROL, _CHECK = "control", "check"
-_NEARLY = 0.8
-"""Likeness (:mod:`difflib`) from which an unknown column is taken for a misspelt one."""
+_NEARLY = 0.8  # likeness (:mod:`difflib`) from which an unknown column counts as misspelt
 
 
 @dataclass(frozen=True)
 class SurveyedPoint:
     """A point of a survey, in the map.
 
-    Attributes:
-        id: its name in the survey.
-        position_map: (2,) m.
-        sigma_m: (2,) standard deviations along the map's axes, m.
-        height_m: above the map's origin; None where it is not known.
-        is_check: whether it is held out of the adjustment, to check the map by.
-        description: what the survey says of it.
+    ``position_map`` (2,) m with ``sigma_m`` (2,) along the map's axes, and ``height_m`` above its origin,
+    None where unknown. ``is_check`` holds it out of the adjustment, to check the map by.
     """
 
     id: str
@@ -92,17 +85,9 @@ class SurveyedPoint:
 class SurveyTable:
     """N points as a file states them.
 
-    Attributes:
-        path: the file.
-        frame: what the coordinates count from.
-        coordinates: (N, 2) in the order of the frame's columns.
-        height_m: (N,) nan where none is stated.
-        sigma_m: (N, 2) east, north.
-        ids: their names.
-        is_check: which are held out.
-        descriptions: what the file says of each.
-        crs: the system of the coordinates; None for that of the drive.
-        geoid_m: of the geoid above the ellipsoid, where heights count from the sea.
+    ``coordinates`` (N, 2) are in the order of the frame's columns, ``height_m`` (N,) is nan where not stated,
+    ``sigma_m`` (N, 2) east and north. ``crs`` is None for the system of the drive; ``geoid_m`` is the geoid's
+    height above the ellipsoid, for heights that count from the sea.
     """
 
     path: Path
@@ -118,17 +103,12 @@ class SurveyTable:
 
 
 def read_survey(path: Path, crs: str | None, geoid_m: float | None, sigma_m: float) -> SurveyTable:
-    """Read the CSV file at ``path``: names in its first line, then a point a line.
+    """Read the CSV file at ``path``: names in its first line, then one point per line.
 
-    Args:
-        path: the file; its columns are parted by commas, semicolons or tabs.
-        crs: the projected system of eastings and northings, such as ``EPSG:32632``.
-        geoid_m: height of the geoid above the ellipsoid, where heights count from the sea.
-        sigma_m: how well points are known of which the file does not say it.
-
-    Raises:
-        DriveError: a column is missing, misspelt or says a thing twice, or a cell does not parse; with the
-            line.
+    ``crs`` is the projected system of eastings and northings, such as ``EPSG:32632``, ``geoid_m`` the height
+    of the geoid above the ellipsoid, where heights count from the sea, and ``sigma_m`` that of points without
+    one. Raises DriveError, with the line, when a column is missing, misspelt or there twice, or a cell does
+    not parse.
     """
     rows = _rows(path)
     frame = _frame(rows[0].cells, crs, path)
@@ -158,55 +138,41 @@ def read_survey(path: Path, crs: str | None, geoid_m: float | None, sigma_m: flo
 def in_map(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[SurveyedPoint, ...]:
     """The points of ``table`` in the map of a drive with that ``origin``.
 
-    Eastings and northings become latitudes and longitudes, and these local metres, over the earth's centre:
-    the grid's scale and convergence are gone with that. A point without a height is at the origin's. Sigmas
-    stay as they are: a grid's north is a few degrees off at most.
-
-    Raises:
-        DriveError: the coordinates need an origin that the drive does not have, are of another datum, or lie
-            outside of their system.
+    Eastings and northings become latitudes and longitudes, and these local metres, over the earth's centre,
+    without the grid's scale and convergence. A point without a height is at the origin's. Sigmas stay: a
+    grid's north is a few degrees off at most. Raises DriveError when the drive has no origin that the
+    coordinates need, they are of another datum, or outside of their system.
     """
     positions, height_m = table.coordinates, table.height_m
     if table.frame is not Frame.MAP:
         positions, height_m = _on_earth(table, origin)
-    known = np.isfinite(height_m)
-    return tuple(
-        SurveyedPoint(
-            name,
-            positions[k],
-            table.sigma_m[k],
-            float(height_m[k]) if known[k] else None,
-            table.is_check[k],
-            table.descriptions[k],
-        )
-        for k, name in enumerate(table.ids)
-    )
+    heights = [float(height) if np.isfinite(height) else None for height in height_m]
+    columns = (table.ids, positions, table.sigma_m, heights, table.is_check, table.descriptions)
+    return tuple(SurveyedPoint(*row) for row in zip(*columns, strict=True))
 
 
 def misreadings(table: SurveyTable, origin: GeodeticOrigin | None) -> dict[str, FloatArray]:
-    """Where the points (N, 2) would lie in the map, had the file meant something else; by what it meant."""
+    """Positions (N, 2) of the points in the map, had the file meant something else; by that meaning."""
     first, second = table.frame.columns
-    told = {f"with {first} and {second} swapped": replace(table, coordinates=table.coordinates[:, ::-1])}
+    others = {f"with {first} and {second} swapped": replace(table, coordinates=table.coordinates[:, ::-1])}
     if table.frame is not Frame.GEODETIC:
-        told["in feet"] = replace(table, coordinates=0.3048 * table.coordinates)
-        told["in millimetres"] = replace(table, coordinates=1e-3 * table.coordinates)
+        others["in feet"] = replace(table, coordinates=0.3048 * table.coordinates)
+        others["in millimetres"] = replace(table, coordinates=1e-3 * table.coordinates)
     if table.frame is Frame.GRID:
-        told["as local metres (columns x_m, y_m)"] = replace(table, frame=Frame.MAP)
+        others["as local metres (columns x_m, y_m)"] = replace(table, frame=Frame.MAP)
     if table.frame is Frame.MAP:
-        told["as latitude and longitude"] = replace(table, frame=Frame.GEODETIC)
+        others["as latitude and longitude"] = replace(table, frame=Frame.GEODETIC)
     for crs in _other_systems(table, origin):
-        told[f"in {crs}"] = replace(table, frame=Frame.GRID, crs=crs)
+        others[f"in {crs}"] = replace(table, frame=Frame.GRID, crs=crs)
     out = {}
-    for says, other in told.items():
-        try:
-            out[says] = np.array([point.position_map for point in in_map(other, origin)])
-        except DriveError:
-            continue
-    return {says: positions for says, positions in out.items() if np.isfinite(positions).all()}
+    for meaning, other in others.items():
+        with suppress(DriveError):
+            out[meaning] = np.array([point.position_map for point in in_map(other, origin)])
+    return {meaning: positions for meaning, positions in out.items() if np.isfinite(positions).all()}
 
 
 def _other_systems(table: SurveyTable, origin: GeodeticOrigin | None) -> list[str]:
-    """Systems that a survey's coordinates may be of: the neighbouring zones, or the UTM zone of the site."""
+    """Other systems of a survey's coordinates: the neighbouring zones, or the UTM zone of the site."""
     systems = []
     authority, _, code = (table.crs or "").partition(":")
     if authority.upper() == "EPSG" and code.isdecimal():
@@ -237,18 +203,16 @@ def _on_earth(table: SurveyTable, origin: GeodeticOrigin | None) -> tuple[FloatA
                 "differ by decimetres; give the points in that of the origin"
             )
         if has_height_datum(crs, where, DriveError) and table.geoid_m is None:
-            _log.warning(
-                "%s: heights of %s count from the sea and are not used: set mapping.survey.geoid_m",
-                where,
-                crs,
-            )
+            unused = "%s: heights of %s count from the sea and are not used: set mapping.survey.geoid_m"
+            _log.warning(unused, where, crs)
             height_m = np.full_like(height_m, np.nan)
     known = np.isfinite(height_m)
     raised_m = np.where(known, height_m + (table.geoid_m or 0.0), origin.altitude_m)
     points = np.column_stack([table.coordinates, raised_m])
     if table.frame is Frame.GEODETIC:
-        if (np.abs(table.coordinates) > [90, 180]).any():
-            k = int(np.argmax((np.abs(table.coordinates) > [90, 180]).any(axis=1)))
+        wrong = (np.abs(table.coordinates) > [90, 180]).any(axis=1)
+        if wrong.any():
+            k = int(np.argmax(wrong))
             latitude_deg, longitude_deg = table.coordinates[k]
             raise DriveError(
                 f"{where}: latitude {latitude_deg:g}, longitude {longitude_deg:g} of {table.ids[k]} is no "
@@ -299,31 +263,13 @@ class _Row:
 
 
 def _rows(path: Path) -> list[_Row]:
-    text = read_text(path, DriveError).removeprefix("\ufeff")
-    lines = [
-        (number, line)
-        for number, line in enumerate(text.splitlines(), 1)
-        if line.strip() and not (number > 1 and line.lstrip().startswith("#"))
-    ]
-    if len(lines) < 2:
-        raise DriveError(f"{path}: holds no point; expected a line of column names and one line a point")
-    title = lines[0][1].lstrip("# ")
-    separator = next((mark for mark in ";\t," if mark in title), ",")
-    columns = _columns(_split(title, separator), path)
+    header, lines = read_rows(path, ";\t,", "point")
+    columns = _columns(header, path)
     rows = []
-    for number, line in lines[1:]:
-        cells = _split(line, separator)
-        if len(cells) != len(columns):
-            raise DriveError(
-                f"{path}: line {number}: {len(cells)} cells under {len(columns)} columns; mend that line"
-            )
-        named = {name: cell for name, cell in zip(columns, cells, strict=True) if name is not None}
-        rows.append(_Row(number, named, f"{path}: line {number}"))
+    for number, cells in lines:
+        known = {name: cell for name, cell in zip(columns, cells, strict=True) if name is not None}
+        rows.append(_Row(number, known, f"{path}: line {number}"))
     return rows
-
-
-def _split(line: str, separator: str) -> list[str]:
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
 
 
 def _columns(header: Sequence[str], path: Path) -> list[str | None]:
@@ -345,7 +291,7 @@ def _columns(header: Sequence[str], path: Path) -> list[str | None]:
 
 
 def _frame(cells: Mapping[str, str], crs: str | None, path: Path) -> Frame:
-    """What the coordinates count from, by the columns that hold them."""
+    """The frame whose columns the file has, checked against ``crs``."""
     found = [frame for frame in Frame if any(name in cells for name in frame.columns)]
     if len(found) != 1:
         ways = " or ".join(frame.value for frame in Frame)

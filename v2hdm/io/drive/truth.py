@@ -1,4 +1,4 @@
-"""Ground truth beside a drive, for the report alone: the mapper never imports this module."""
+"""Reading ground truth beside a drive, for the report alone: the mapper never imports this module."""
 
 from __future__ import annotations
 
@@ -11,30 +11,20 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.io.drive.mounting import take_rigid
-from v2hdm.io.drive.tum import read_tum, write_tum
-from v2hdm.io.maps import read_geojson, write_geojson
-from v2hdm.records import BoolArray, Drive, FloatArray, HdMap, Image, Trajectory, Truth
-from v2hdm.store.files import (
-    check_keys,
-    dump_yaml,
-    load_yaml,
-    read_text,
-    replace_text,
-    take_mapping,
-    take_number,
-)
+from v2hdm.io.calibration.mounting import take_rigid
+from v2hdm.io.maps.reading import read_geojson
+from v2hdm.io.trajectory import read_tum
+from v2hdm.records import BoolArray, Drive, FloatArray, HdMap, Image, Truth
+from v2hdm.store.files import check_keys, load_yaml, read_text, take_mapping, take_number
 
-_SIGHTINGS = ("camera", "timestamp", "marking", "visible_fraction")
-_LANE_VISIBLE = ("lane", "vertex")
+SIGHTINGS = ("camera", "timestamp", "marking", "visible_fraction")
+LANE_VISIBLE = ("lane", "vertex")
 
 
 def read_truth(drive: Drive) -> Truth:
     """The ground truth of ``drive``, its rows in the order of ``drive.images``.
 
-    Raises:
-        DriveError: when the drive has none or it is damaged.
-        MapFileError: when its map is damaged.
+    Raises DriveError when the drive has none or it is damaged, MapFileError when its map is.
     """
     if drive.joined:
         return _joined_truth(drive)
@@ -53,30 +43,24 @@ def read_truth(drive: Drive) -> Truth:
 
 
 def has_truth(drive: Drive) -> bool:
-    """Whether there is a ground truth that holds for all of the drive.
-
-    That of joined drives has to be the same, in one frame: paint that was altered between them has none.
-    """
+    """Whether there is a ground truth that holds for all of the drive: joined ones must share it."""
     if not drive.joined:
         return drive.truth_dir is not None
-    folders = [visit.truth_dir for visit in drive.visits]
-    known = [folder for folder in folders if folder is not None]
-    if len(known) < len(folders):
+    folders = [visit.truth_dir for visit in drive.visits if visit.truth_dir is not None]
+    if len(folders) < len(drive.visits):
         return False
-    first, *others = (read_geojson(folder / "map.geojson") for folder in known)
+    first, *others = (read_geojson(folder / "map.geojson") for folder in folders)
+    corners = [one.corners_map for one in first.markings]
     return all(
         other.origin == first.origin
-        and len(other.markings) == len(first.markings)
-        and all(
-            np.array_equal(a.corners_map, b.corners_map)
-            for a, b in zip(first.markings, other.markings, strict=True)
-        )
+        and len(other.markings) == len(corners)
+        and np.array_equal(corners, [one.corners_map for one in other.markings])
         for other in others
     )
 
 
 def _joined_truth(drive: Drive) -> Truth:
-    """The truths of all visits as one, in the order of the joined drive's images."""
+    """The truths of all sessions as one, in the order of the joined drive's images."""
     parts, rows = [], []
     for number, visit in enumerate(drive.joined):
         own_name = {joined: own for own, joined in visit.cameras.items()}
@@ -105,44 +89,16 @@ def _joined_truth(drive: Drive) -> Truth:
     )
 
 
-def write_truth(folder: Path, truth: Truth, images: Sequence[Image]) -> None:
-    """Write ``truth``, whose rows belong to ``images``, into ``folder``; as :func:`read_truth` reads it."""
-    write_geojson(truth.map, folder / "map.geojson")
-    cameras = {name: {"cam_from_vehicle": matrix.tolist()} for name, matrix in truth.cam_from_vehicle.items()}
-    replace_text(folder / "cameras.yaml", dump_yaml(cameras))
-    stamp_s, first = np.unique([image.stamp_s for image in images], return_index=True)
-    write_tum(
-        Trajectory(stamp_s=stamp_s, map_from_vehicle=truth.map_from_vehicle[first]), folder / "poses.tum"
-    )
-    sightings = (
-        f"{images[i].camera},{images[i].stamp_s:.9f},{j},{truth.visibility[i, j]:.4f}"
-        for i, j in np.argwhere(truth.visibility > 0)
-    )
-    replace_text(folder / "sightings.csv", "\n".join([",".join(_SIGHTINGS), *sightings]) + "\n")
-    seen = (
-        f"{lane},{vertex}"
-        for lane, flags in enumerate(truth.lane_visible)
-        for vertex in np.flatnonzero(flags)
-    )
-    replace_text(folder / "lane_visible.csv", "\n".join([",".join(_LANE_VISIBLE), *seen]) + "\n")
-    replace_text(
-        folder / "disturbances.yaml", dump_yaml({k: float(v) for k, v in truth.disturbances.items()})
-    )
-
-
 def _read_cameras(path: Path, drive: Drive) -> Mapping[str, FloatArray]:
-    content = load_yaml(path, DriveError)
+    content, found = load_yaml(path, DriveError), {}
     for name in drive.cameras:
         where = f"{path}: camera '{name}'"
         if name not in content:
             raise DriveError(f"{where}: missing; add its cam_from_vehicle")
-        check_keys(
-            take_mapping(content[name], where, DriveError), ("cam_from_vehicle",), (), where, DriveError
-        )
-    return {
-        name: take_rigid(content[name]["cam_from_vehicle"], f"{path}: camera '{name}'")
-        for name in drive.cameras
-    }
+        entry = take_mapping(content[name], where, DriveError)
+        check_keys(entry, ("cam_from_vehicle",), (), where, DriveError)
+        found[name] = take_rigid(entry["cam_from_vehicle"], where)
+    return found
 
 
 def _read_poses(path: Path, images: Sequence[Image]) -> FloatArray:
@@ -156,14 +112,14 @@ def _read_poses(path: Path, images: Sequence[Image]) -> FloatArray:
 
 
 def _read_sightings(path: Path, images: Sequence[Image], markings: int) -> FloatArray:
-    """Fractions (I, J); sightings by images that the drive lacks (dropped, not selected) are passed over."""
+    """Fractions (I, J) without the sightings of images that were dropped or not selected."""
     row_of = {(image.camera, _microseconds(image.stamp_s)): i for i, image in enumerate(images)}
     visibility = np.zeros((len(images), markings))
-    for where, (camera, stamp, marking, fraction) in _rows(path, _SIGHTINGS):
+    for where, (camera, stamp, marking, fraction) in _rows(path, SIGHTINGS):
         try:
             key, j, value = (camera, _microseconds(float(stamp))), int(marking), float(fraction)
         except ValueError:
-            raise DriveError(f"{where}: not '{','.join(_SIGHTINGS)}'; mend that line") from None
+            raise DriveError(f"{where}: not '{','.join(SIGHTINGS)}'; mend that line") from None
         if not 0 <= j < markings or not 0.0 <= value <= 1.0:
             raise DriveError(
                 f"{where}: marking must be below {markings} and visible_fraction within 0 to 1; mend it"
@@ -175,7 +131,7 @@ def _read_sightings(path: Path, images: Sequence[Image], markings: int) -> Float
 
 def _read_lane_visible(path: Path, hd_map: HdMap) -> tuple[BoolArray, ...]:
     visible = tuple(np.zeros(len(lane.points_map), dtype=np.bool_) for lane in hd_map.lanes)
-    for where, (lane, vertex) in _rows(path, _LANE_VISIBLE):
+    for where, (lane, vertex) in _rows(path, LANE_VISIBLE):
         known = lane.isdecimal() and vertex.isdecimal()
         if not known or int(lane) >= len(visible) or int(vertex) >= len(visible[int(lane)]):
             raise DriveError(f"{where}: no vertex {vertex} of a lane {lane} in the true map; mend that line")
@@ -189,7 +145,7 @@ def _read_disturbances(path: Path) -> Mapping[str, float]:
 
 
 def _rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
-    """The rows of a CSV file below its header ``columns``, each with its place for messages."""
+    """The rows of a CSV file below its header, each with its place for messages."""
     reader = csv.reader(io.StringIO(read_text(path, DriveError)))
     if next(reader, None) != list(columns):
         raise DriveError(f"{path}: line 1: expected the header '{','.join(columns)}'; add it")
@@ -201,5 +157,4 @@ def _rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, list[str]]]
 
 
 def _microseconds(stamp_s: float) -> int:
-    """Times as exact keys: text with fewer decimals must still match."""
-    return round(stamp_s * 1e6)
+    return round(stamp_s * 1e6)  # text with fewer decimals must still match

@@ -17,7 +17,6 @@ from typing import Any
 
 from v2hdm.errors import DriveError
 from v2hdm.store.cache.folders import note_use
-from v2hdm.store.cache.keys import file_digest
 
 _VERSION = 2
 """Raised whenever an import comes out as other files."""
@@ -59,6 +58,8 @@ def is_whole(folder: Path) -> bool:
 
 def _told(path: Path) -> list[str]:
     """What the list of contents says of a file; a decoder tells of a damaged image."""
+    from v2hdm.store.cache.keys import file_digest  # of the map extra
+
     size = str(path.stat().st_size)
     return [size, "-" if path.suffix in _IMAGES else file_digest(path)]
 

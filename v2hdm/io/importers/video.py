@@ -13,16 +13,10 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.extras import need
-from v2hdm.io.drive.lossless import png
-from v2hdm.io.drive.tum import write_image_list
-from v2hdm.io.importers.imported import (
-    begin_entry,
-    cannot_write,
-    drop_entry,
-    entry_folder,
-    finish_entry,
-    is_whole,
-)
+from v2hdm.io.importers import new_entry
+from v2hdm.io.importers.imported import entry_folder, is_whole
+from v2hdm.io.safe.pixels import png
+from v2hdm.io.trajectory import write_image_list
 
 _log = logging.getLogger(__name__)
 
@@ -32,10 +26,8 @@ IMAGE_LIST = "images.txt"
 def import_video(path: Path, cache: Path, where: str) -> Path:
     """The folder of the frames of the video at ``path``, decoded now unless they were before.
 
-    Its list has the container's times, s since the first frame.
-
-    Raises:
-        DriveError: it is missing, damaged or without times, or PyAV is not installed.
+    Its list has the container's times, s since the first frame. Raises DriveError when the video is missing,
+    damaged or without times, or PyAV is not installed.
     """
     if not path.is_file():
         raise DriveError(f"{where}: {path}: no such video; check the path")
@@ -44,23 +36,20 @@ def import_video(path: Path, cache: Path, where: str) -> Path:
         return folder
     av = need("av", "video", f"{where}: a video", DriveError)
     _log.info("%s: decoding its frames into %s, once", path, cache)
-    partial = begin_entry(folder)
-    try:
+    with new_entry(folder) as partial:
         stamps: list[float] = []
+        names: list[str] = []
         try:
             with av.open(str(path)) as container:
                 for frame in container.decode(video=0):
-                    number = len(stamps)
+                    where = f"{path}: frame {len(stamps) + 1}"
                     if frame.pts is None:
-                        raise DriveError(
-                            f"{path}: frame {number + 1} has no time; give stamps, a time a line"
-                        )
-                    if number and float(frame.pts * frame.time_base) <= stamps[-1]:
-                        raise DriveError(
-                            f"{path}: frame {number + 1}: its time does not rise; convert the video"
-                        )
+                        raise DriveError(f"{where} has no time; give stamps, a time a line")
                     stamps.append(float(frame.pts * frame.time_base))
-                    (partial / f"{number:06d}.png").write_bytes(png(frame.to_ndarray(format="bgr24")))
+                    if len(stamps) > 1 and stamps[-1] <= stamps[-2]:
+                        raise DriveError(f"{where}: its time does not rise; convert the video")
+                    names.append(f"{len(names):06d}.png")
+                    (partial / names[-1]).write_bytes(png(frame.to_ndarray(format="bgr24")))
         except (av.error.FFmpegError, IndexError) as failure:
             reason = " ".join(str(failure).split())
             raise DriveError(
@@ -68,11 +57,5 @@ def import_video(path: Path, cache: Path, where: str) -> Path:
             ) from None
         if not stamps:
             raise DriveError(f"{path}: holds no frame; convert or copy it again")
-        names = [f"{number:06d}.png" for number in range(len(stamps))]
         write_image_list(np.array(stamps) - stamps[0], names, partial / IMAGE_LIST)
-        finish_entry(folder)
-    except OSError as failure:
-        raise cannot_write(folder, failure) from None
-    finally:
-        drop_entry(folder)
     return folder

@@ -1,19 +1,19 @@
-"""A map or a calibration to files and back: one format a file."""
+"""A map to files and back."""
 
-from v2hdm.io.calibration.document import read_calibration, write_calibration
-from v2hdm.io.maps.formats import FORMATS, check_formats, read_map, write_map
-from v2hdm.io.maps.geojson import read_geojson, write_geojson
-from v2hdm.io.maps.heights import ground_height_m, with_heights
+from v2hdm.io.maps.features import ground_height_m, with_heights
+from v2hdm.io.maps.formats import FORMATS, check_formats, write_map
+from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_features, write_geojson
+from v2hdm.io.maps.geopackage import write_geopackage
+from v2hdm.io.maps.reading import (
+    read_geojson,
+    read_geopackage,
+    read_geopackage_verdict,
+    read_map,
+    read_verdict,
+)
 
 __all__ = [
-    "FORMATS",
-    "check_formats",
-    "ground_height_m",
-    "read_calibration",
-    "read_geojson",
-    "read_map",
-    "with_heights",
-    "write_calibration",
-    "write_geojson",
-    "write_map",
-]
+    "FORMATS", "check_formats", "geojson_feature", "geojson_positions", "ground_height_m", "read_geojson",
+    "read_geopackage", "read_geopackage_verdict", "read_map", "read_verdict", "with_heights",
+    "write_features", "write_geojson", "write_geopackage", "write_map",
+]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Where two lane lines run beside each other and bound a lane."""
+"""Lanes between lane lines that run beside each other."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ LANE_WIDTH_M = (2.55, 5.1)
 """Lines that are closer have no room for a truck, 2.55 m wide (Directive 96/53/EC, annex I, 1.1), and those
 farther apart have room for two."""
 
-_AT_ONCE = 64
-"""Neighbouring vertices that are held against the segments around them together."""
+_AT_ONCE = 64  # neighbouring vertices that are compared with the segments around them together
 
 
 @dataclass(frozen=True)
@@ -32,9 +31,9 @@ class ClosedLane:
 def closed_lanes(lines_map: Sequence[FloatArray]) -> list[ClosedLane]:
     """The lanes between polylines (N, 2) m, in the order of their first line.
 
-    A lane lies between a line and the nearest one that is met across it, at a lane's width, for longer than
-    it is wide. Where one ends, those beside it are cut, too: neighbours then share a bound from end to end,
-    as a change between them needs.
+    A lane lies between a line and the nearest one across it, at a lane's width, for longer than it is wide.
+    Where one ends, those beside it are cut, too: neighbours share a bound from end to end, as lane changes
+    need.
     """
     runs = _runs(lines_map)
     cuts = [_Cuts(line) for line in lines_map]
@@ -66,10 +65,7 @@ class _Cuts:
 
 @dataclass(frozen=True)
 class _Run:
-    """Consecutive vertices ``own`` (N,) of a ``line`` that meet an ``other`` on one ``side``.
-
-    ``met`` (N,) are the vertices of the other that are nearest to where it is met.
-    """
+    """Vertices ``own`` (N,) of a ``line`` near those ``met`` (N,) of an ``other`` on one ``side``."""
 
     line: int
     own: IntArray
@@ -108,7 +104,7 @@ class _Run:
 
 
 def _runs(lines_map: Sequence[FloatArray]) -> list[_Run]:
-    """Where two lines run beside each other for longer than they are apart, each pair once."""
+    """Stretches of two lines beside each other, longer than they are apart, each pair once."""
     segments = _Segments.of(lines_map)
     runs = []
     for number, line in enumerate(lines_map):
@@ -149,9 +145,9 @@ class _Segments:
         )
 
     def across(self, number: int, line: FloatArray, side: int) -> tuple[IntArray, IntArray, FloatArray]:
-        """Of each vertex of a line (N,): the line met first on its left (1) or right (-1), -1 where none is.
+        """For each vertex (N,) of a line, the line met first on its left (1) or right (-1), -1 for none.
 
-        And the vertex of that line nearest to where it is met, and how far away that is, m.
+        With the vertex of that line nearest to the meeting, and its distance, m.
         """
         tangent = np.gradient(line, axis=0)
         normal = side * np.column_stack([-tangent[:, 1], tangent[:, 0]])
@@ -166,7 +162,7 @@ class _Segments:
     def _met(
         self, number: int, places: FloatArray, away: FloatArray
     ) -> tuple[IntArray, IntArray, FloatArray]:
-        """What :meth:`across` tells, of neighbouring places (N, 2) and the directions ``away`` (N, 2)."""
+        """The result of :meth:`across` for neighbouring places (N, 2) and directions ``away`` (N, 2)."""
         low, high = places.min(axis=0) - LANE_WIDTH_M[1], places.max(axis=0) + LANE_WIDTH_M[1]
         near = (np.maximum(self.start, self.end) >= low) & (np.minimum(self.start, self.end) <= high)
         candidates = np.flatnonzero(near.all(axis=1) & (self.line != number))

@@ -1,4 +1,4 @@
-"""An HD map as Lanelet2 OSM in the dialect of Autoware, with its ``map_projector_info.yaml``.
+"""Writing an HD map as Lanelet2 OSM in the dialect of Autoware, with its ``map_projector_info.yaml``.
 
 Every marking is a polygon ``pose_marker`` of four counter-clockwise vertices, a landmark for localisation; a
 stop line is a line string as well, with the regulatory element that Autoware's map validator asks for. Lane
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import xml.etree.ElementTree as ET
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,10 +23,10 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import ConfigError, MapFileError
-from v2hdm.geometry.geodetic import geodetic_from_enu
+from v2hdm.extras import need
+from v2hdm.geometry.geodetic import geodetic_from_enu, position_of
 from v2hdm.io.maps.closed_lanes import ClosedLane, closed_lanes
 from v2hdm.io.maps.features import Feature, features_of
-from v2hdm.io.maps.mgrs import GridPlaces, grid_places
 from v2hdm.records import LANE_DASH, STOP_LINE, FloatArray, GeodeticOrigin, HdMap, IntArray
 from v2hdm.store.files import dump_yaml, replace_text
 
@@ -33,40 +34,27 @@ PROJECTOR_FILE = "map_projector_info.yaml"
 LOCAL, LOCAL_CARTESIAN, MGRS = PROJECTORS = ("Local", "LocalCartesian", "MGRS")
 """Autoware's projectors that this format knows, by their names in ``map_projector_info.yaml``."""
 
-_FORMAT_VERSION = "1"
-_MAP_VERSION = "1"
-_DEGREE_DECIMALS = 12  # 1e-7 m; JOSM writes 11
-_HEIGHT_DECIMALS = 6
+_FORMAT_VERSION = _MAP_VERSION = "1"
+_DEGREE_DECIMALS, _HEIGHT_DECIMALS = 12, 6  # 1e-7 m; JOSM writes 11
+_SQUARE_M = 100_000.0
 
-_FIRST_PART = 1 << 40
-_PARTS = 1 << 20
-"""Ids that each feature has for its parts, above all ids of features and exact in every language."""
-
+# Ids of each feature's parts, above all ids of features and exact in every language; vertices take the lower
+# half.
+_FIRST_PART, _PARTS = 1 << 40, 1 << 20
 _MOST_VERTICES = _PARTS // 2
-"""Vertices take the lower half of a feature's parts; what follows the others."""
 
+# Lanelet2 reads no node without latitude and longitude: local maps lie where the equator meets Greenwich.
 _NOWHERE = GeodeticOrigin(0.0, 0.0, 0.0)
-"""Lanelet2 reads no node without latitude and longitude: local maps lie where the equator meets Greenwich."""
 
 
 def write_lanelet2(
-    hd_map: HdMap,
-    path: Path,
-    verdict: Mapping[str, Any] | None = None,
-    projector: str | None = None,
+    hd_map: HdMap, path: Path, verdict: Mapping[str, Any] | None = None, projector: str | None = None
 ) -> None:
     """Write ``hd_map`` to ``path`` and ``map_projector_info.yaml`` beside it, each atomically.
 
-    Args:
-        hd_map: what is written.
-        path: of the OSM file; Autoware looks for ``lanelet2_map.osm``.
-        verdict: not written, the format has no place for it.
-        projector: one of :data:`PROJECTORS`; None takes ``LocalCartesian`` for a map with an origin, else
-            ``Local``.
-
-    Raises:
-        ConfigError: the projector does not suit the map.
-        MapFileError: a line has too many vertices.
+    Autoware looks for ``lanelet2_map.osm``, which has no place for the ``verdict``. Without a ``projector``
+    of :data:`PROJECTORS` it is ``LocalCartesian`` for a map with an origin, else ``Local``. Raises
+    ConfigError when the projector does not suit the map, MapFileError when a line has too many vertices.
     """
     projector = projector or (LOCAL if hd_map.origin is None else LOCAL_CARTESIAN)
     if projector not in PROJECTORS:
@@ -87,11 +75,11 @@ def write_lanelet2(
         if feature.symbol:
             outline = document.nodes(feature, feature.xyz_map[feature.ring])
             tags = {"type": "road_symbol", "subtype": feature.kind, "area": "yes"}
-            document.way(feature.id, outline, tags | _told(feature))
+            document.way(feature.id, outline, tags | _more_tags(feature))
         elif feature.closed:
             _write_marking(document, feature, lanes)
         else:
-            document.way(feature.id, vertices[feature.id], _line_tags(feature) | _told(feature))
+            document.way(feature.id, vertices[feature.id], _line_tags(feature) | _more_tags(feature))
     lanes.write()
     square = document.place_nodes()
     replace_text(path, document.text())
@@ -101,7 +89,7 @@ def write_lanelet2(
 def _write_marking(document: _Document, feature: Feature, lanes: _Lanes) -> None:
     corners = feature.xyz_map[feature.ring]
     tags = {"type": "pose_marker", "subtype": feature.kind, "area": "yes", "marker_id": str(feature.id)}
-    document.way(feature.id, document.nodes(feature, corners), tags | _told(feature))
+    document.way(feature.id, document.nodes(feature, corners), tags | _more_tags(feature))
     if feature.kind != STOP_LINE:
         return
     middle = corners[:, :2].mean(axis=0)
@@ -119,16 +107,13 @@ def _write_marking(document: _Document, feature: Feature, lanes: _Lanes) -> None
 
 
 def _stop_edges(corners: FloatArray, direction: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-    """Where to stop, and the paint's other edge: lines (2, 3) along a stop line's ``corners`` (4, 3).
+    """The edge of a stop line's ``corners`` (4, 3) to stop at, and the other one, each (2, 3).
 
-    One stops at the edge that is met first (Autoware's requirement vm-02-01), along the middle of the paint
-    where the ``direction`` (2,) of travel is not known.
+    Vehicles stop at the edge that they meet first (Autoware's requirement vm-02-01), at the middle of the
+    paint where the ``direction`` (2,) of travel is not known.
     """
-    sides = np.roll(corners, -1, axis=0) - corners
-    start = int(
-        np.linalg.norm(sides[1]) + np.linalg.norm(sides[3])
-        > np.linalg.norm(sides[0]) + np.linalg.norm(sides[2])
-    )
+    length = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+    start = int(length[1] + length[3] > length[0] + length[2])
     one, two = corners[[start, start + 1]], corners[[(start + 3) % 4, (start + 2) % 4]]
     if direction is None:
         return (one + two) / 2, two
@@ -162,24 +147,22 @@ class _Lanes:
         return None
 
     def direction(self, lane: int, place_map: FloatArray) -> FloatArray:
-        """In which direction (2,) a lane passes a place (2,) of the map."""
+        """The direction (2,) in which a lane passes a place (2,) of the map."""
         left = self._points(*self._lanes[lane].left)
         nearest = int(np.argmin(((left - place_map) ** 2).sum(axis=1)))
         return np.asarray(np.gradient(left, axis=0)[nearest])
 
     def write(self) -> None:
         """Write a lanelet of each lane, with those lines of its own that it needs as bounds."""
-        counts: dict[int, int] = {}
+        counts: Counter[int] = Counter()
         for lane, rules in zip(self._lanes, self.rules, strict=True):
             owner = self._lines[lane.left[0]]
-            counts[owner.id] = counts.get(owner.id, 0) + 1
+            counts[owner.id] += 1
             lanelet_id = _part(owner, _MOST_VERTICES + _PARTS // 4 + counts[owner.id])
             members = [("way", self._bound(*lane.left), "left"), ("way", self._bound(*lane.right), "right")]
             members += [("relation", rule, "regulatory_element") for rule in rules]
-            tags = {"type": "lanelet", "subtype": "road", "location": "urban"}
-            self._document.relation(
-                lanelet_id, members, tags | {"one_way": "yes", "participant:vehicle": "yes"}
-            )
+            tags = {"type": "lanelet", "subtype": "road", "location": "urban", "one_way": "yes"}
+            self._document.relation(lanelet_id, members, tags | {"participant:vehicle": "yes"})
 
     def _points(self, line: int, order: IntArray) -> FloatArray:
         return self._lines[line].points_map[order]
@@ -200,9 +183,35 @@ class _Lanes:
 
 
 @dataclass(frozen=True)
-class _Node:
-    id: int
-    xyz_map: FloatArray
+class GridPlaces:
+    """Points of one grid square, as ``54SUE``: ``local`` (N, 2) m east and north of its south-west corner."""
+
+    square: str
+    local: FloatArray
+
+
+def grid_places(longitude_deg: FloatArray, latitude_deg: FloatArray) -> GridPlaces:
+    """Positions of points (N,) in the Military Grid Reference System: UTM within a square of 100 km.
+
+    Raises ConfigError when they lie in several squares or beyond the grid, or ``mgrs`` or ``pyproj`` is
+    missing.
+    """
+    pyproj, mgrs = (
+        need(one, "gis", "the format lanelet2 with MGRS", ConfigError) for one in ("pyproj", "mgrs")
+    )
+    if np.min(latitude_deg) < -80 or np.max(latitude_deg) >= 84:
+        raise ConfigError("MGRS ends at 80 degrees south and 84 north: choose the projector LocalCartesian")
+    grid = mgrs.MGRS()
+    places = zip(latitude_deg.tolist(), longitude_deg.tolist(), strict=True)
+    squares = {grid.toMGRS(*place, MGRSPrecision=0).lstrip("0") for place in places}
+    if len(squares) > 1:
+        raise ConfigError(
+            f"the map spans the MGRS squares {', '.join(sorted(squares))}, and Autoware's MGRS projector "
+            "takes one square: choose the projector LocalCartesian"
+        )
+    (square,) = squares
+    utm = pyproj.Proj(proj="utm", zone=int(square[:-3]), ellps="WGS84")
+    return GridPlaces(square, np.column_stack(utm(longitude_deg, latitude_deg)) % _SQUARE_M)
 
 
 class _Document:
@@ -213,15 +222,15 @@ class _Document:
         self._projector = projector
         self._root = ET.Element("osm", version="0.6", generator="v2hdm")
         ET.SubElement(self._root, "MetaInfo", format_version=_FORMAT_VERSION, map_version=_MAP_VERSION)
-        self._nodes: list[_Node] = []
+        self._nodes: dict[int, FloatArray] = {}
         self._ways: list[ET.Element] = []
         self._relations: list[ET.Element] = []
 
     def nodes(self, owner: Feature, xyz_map: FloatArray, first: int = 0) -> list[int]:
         """Ids of new nodes at places (N, 3) of the map, from part ``first`` of their owner on."""
-        made = [_Node(_part(owner, first + number), place) for number, place in enumerate(xyz_map)]
-        self._nodes += made
-        return [node.id for node in made]
+        made = {_part(owner, first + number): place for number, place in enumerate(xyz_map)}
+        self._nodes |= made
+        return list(made)
 
     def way(self, number: int, nodes: Sequence[int], tags: Mapping[str, str]) -> None:
         way = ET.Element("way", id=str(number))
@@ -239,26 +248,21 @@ class _Document:
 
     def place_nodes(self) -> str | None:
         """Write the nodes; returns the grid square where the projector has one."""
-        xyz_map = np.array([node.xyz_map for node in self._nodes]).reshape(-1, 3)
+        xyz_map = np.array(list(self._nodes.values())).reshape(-1, 3)
         degrees = geodetic_from_enu(self._origin or _NOWHERE, xyz_map)
         local, grid = xyz_map[:, :2], None
         if self._projector == MGRS:
             if self._origin is not None and not len(xyz_map):
-                degrees_of_origin = np.array([[self._origin.latitude_deg, self._origin.longitude_deg]])
-                return grid_places(degrees_of_origin[:, 1], degrees_of_origin[:, 0]).square
+                here = position_of(self._origin)
+                return grid_places(here[:, 1], here[:, 0]).square
             grid = grid_places(degrees[:, 1], degrees[:, 0])
             local = grid.local
         heights_m = xyz_map[:, 2] if self._projector == LOCAL else degrees[:, 2]
         for node, (latitude, longitude, _), (x, y), height in zip(
             self._nodes, degrees.tolist(), local.tolist(), heights_m.tolist(), strict=True
         ):
-            element = ET.SubElement(
-                self._root,
-                "node",
-                id=str(node.id),
-                lat=f"{latitude:.{_DEGREE_DECIMALS}f}",
-                lon=f"{longitude:.{_DEGREE_DECIMALS}f}",
-            )
+            lat, lon = (f"{degrees:.{_DEGREE_DECIMALS}f}" for degrees in (latitude, longitude))
+            element = ET.SubElement(self._root, "node", id=str(node), lat=lat, lon=lon)
             tags = {} if grid is None else {"mgrs_code": _mgrs_code(grid, x, y)}
             tags |= {"local_x": repr(x), "local_y": repr(y), "ele": f"{height:.{_HEIGHT_DECIMALS}f}"}
             _add_tags(element, tags)
@@ -282,23 +286,19 @@ def _part(owner: Feature, number: int) -> int:
 
 def _line_tags(feature: Feature) -> dict[str, str]:
     dashed = feature.kind == LANE_DASH
-    return {
-        "type": "line_thin",
-        "subtype": "dashed" if dashed else "solid",
-        "lane_change": "yes" if dashed else "no",
-    }
+    subtype, lane_change = ("dashed", "yes") if dashed else ("solid", "no")
+    return {"type": "line_thin", "subtype": subtype, "lane_change": lane_change}
 
 
-def _told(feature: Feature) -> dict[str, str]:
-    """What the map knows of a feature and Lanelet2 has no tag for."""
-    told = {"class": feature.kind, "sightings": str(feature.sightings)}
+def _more_tags(feature: Feature) -> dict[str, str]:
+    """Properties of a feature that Lanelet2 has no tags for."""
+    tags = {"class": feature.kind, "sightings": str(feature.sightings)}
     if feature.relative_sigma_m is not None:
-        told["relative_sigma_m"] = repr(feature.relative_sigma_m)
-    if feature.covariance_m2 is not None:
-        order = [2 * k + axis for k in feature.ring for axis in (0, 1)]
-        told["sigma_m"] = repr(feature.sigma_m)
-        told["covariance_m2"] = json.dumps(feature.covariance_m2[order][:, order].tolist())
-    return told
+        tags["relative_sigma_m"] = repr(feature.relative_sigma_m)
+    if (covariance := feature.ring_covariance_m2) is not None:
+        tags["sigma_m"] = repr(feature.sigma_m)
+        tags["covariance_m2"] = json.dumps(covariance.tolist())
+    return tags
 
 
 def _add_tags(element: ET.Element, tags: Mapping[str, str]) -> None:
@@ -312,9 +312,5 @@ def _projector_info(projector: str, origin: GeodeticOrigin | None, square: str |
     info: dict[str, Any] = {"projector_type": projector, "vertical_datum": "WGS84"}
     if square is not None:
         return info | {"mgrs_grid": square}
-    place = {
-        "latitude": origin.latitude_deg,
-        "longitude": origin.longitude_deg,
-        "altitude": origin.altitude_m,
-    }
-    return info | {"map_origin": place}
+    place = zip(("latitude", "longitude", "altitude"), position_of(origin)[0].tolist(), strict=True)
+    return info | {"map_origin": dict(place)}

@@ -1,15 +1,14 @@
-"""Which corner of a map a surveyed point is of, where the map may lie off by more than its paint is wide.
+"""Matching surveyed points with a map's corners, where the map may lie off by more than its paint is wide.
 
-A dash is 12 cm wide, and a receiver drifts by as much: the nearest corner may be the wrong one. But the
-errors of neighbouring corners are alike. What the corner of one point is off tells where those of the others
-will be (mean and covariance of a normal distribution, given part of it). So the match of one point that the
-others agree with most is found first, and then always the surest one.
+A dash is 12 cm wide, and a receiver drifts by as much: the nearest corner may be the wrong one. But
+neighbouring corners have like errors, so that one match predicts the others (mean and covariance of a normal
+distribution, given part of it). The match of one point that the others agree with most is found first, and
+then always the surest one.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from v2hdm.records import FloatArray, IntArray
 
@@ -17,17 +16,13 @@ from v2hdm.records import FloatArray, IntArray
 def match(
     points_map: FloatArray, corners_map: FloatArray, reach_m: float, covariance_m2: FloatArray
 ) -> IntArray:
-    """The corner (N,) of ``corners_map`` (M, 2) that each surveyed point (N, 2) is of, -1 for none.
+    """The corner (N,) of ``corners_map`` (M, 2) that each surveyed point (N, 2) is of, m, -1 for none.
 
     A point is of a corner within ``reach_m`` if there is one, however badly it fits, and no corner has two
-    points.
-
-    Args:
-        points_map: m.
-        corners_map: m.
-        reach_m: how far a corner may lie from its point.
-        covariance_m2: (2N, 2N) of corner minus point, stacked x0, y0, x1, ...
+    points. ``covariance_m2`` (2N, 2N) is of corner minus point, stacked x0, y0, x1, ...
     """
+    from scipy.spatial import KDTree  # of the map extra, as its callers are
+
     count = len(points_map)
     near = KDTree(corners_map).query_ball_point(points_map, reach_m)
     corner = np.full((count, max([len(one) for one in near], default=0)), -1, dtype=np.int64)

@@ -13,15 +13,13 @@ import numpy as np
 
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.rigid import inverse
-from v2hdm.io.calibration.document import read_calibration
-from v2hdm.io.drive.trajectory import interpolate
+from v2hdm.io.calibration import read_calibration
 from v2hdm.io.drive.truth import read_truth
-from v2hdm.io.drive.tum import read_tum
-from v2hdm.io.maps.exclusions import ExcludedMarking, read_exclusions
+from v2hdm.io.maps import read_geojson
+from v2hdm.io.maps.evidence import FILE as RESIDUALS
+from v2hdm.io.maps.evidence import ExcludedMarking, Residuals, read_exclusions, read_residuals
 from v2hdm.io.maps.features import features_of
-from v2hdm.io.maps.geojson import read_geojson
-from v2hdm.io.maps.residuals import FILE as RESIDUALS
-from v2hdm.io.maps.residuals import Residuals, read_residuals
+from v2hdm.io.trajectory import interpolate, read_tum
 from v2hdm.records import BoolArray, Calibration, Drive, FloatArray, HdMap, Trajectory, Truth
 from v2hdm.store.files import load_json, load_yaml, read_text
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from v2hdm.geometry.ipm import apply_in_front, ground_from_pinhole_px
 from v2hdm.geometry.rigid import camera_centre, inverse
-from v2hdm.io.maps.residuals import Residuals
+from v2hdm.io.maps.evidence import Residuals
 from v2hdm.records import BoolArray, Calibration, FloatArray, IntArray
 from v2hdm.report.page.facts import Facts, Route
 

@@ -18,11 +18,10 @@ import numpy as np
 from v2hdm.errors import DriveError
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.rigid import ground_in_vehicle
-from v2hdm.io.drive import write_drive
 from v2hdm.io.drive.folder import DRIVE_FILE, TRUTH_FOLDER
-from v2hdm.io.drive.truth import write_truth
-from v2hdm.io.drive.tum import read_image_list
-from v2hdm.io.pixels import read_header
+from v2hdm.io.drive.writing import write_drive, write_truth
+from v2hdm.io.safe.pixels import read_header
+from v2hdm.io.trajectory import read_image_list
 from v2hdm.records import Drive, Image, Truth
 from v2hdm.simulate.port.build import Port, build_port
 from v2hdm.simulate.port.config import AlteredConfig, PortConfig

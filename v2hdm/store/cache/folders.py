@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from v2hdm.errors import ConfigError
-from v2hdm.io.texts import read_json
+from v2hdm.io.safe.texts import read_json
 from v2hdm.store.cache.leases import hold_lease
 
 LIST = ".v2hdm-cache.json"

@@ -9,7 +9,7 @@ import numpy as np
 
 from v2hdm.ground.estimate import estimate_cameras
 from v2hdm.ground.results import GroundEstimate
-from v2hdm.io.drive.unevenness import unevenness
+from v2hdm.io.drive.road import unevenness
 from v2hdm.records import Drive
 from v2hdm.verdict.inputs import ground as ground_checks
 from v2hdm.verdict.inputs.cameras import check_camera

@@ -1,4 +1,4 @@
-"""A bag's topics and messages; whatever is wrong with its files ends in one line."""
+"""Topics and messages of ROS 1 and ROS 2 bags, through ``rosbags``; damage ends in one line."""
 
 from __future__ import annotations
 
@@ -16,11 +16,7 @@ from v2hdm.store.files import load_yaml, take_mapping
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
-_MEND = {
-    ".bag": "rosbag reindex",
-    ".mcap": "mcap recover",
-    ".db3": "ros2 bag reindex",
-}
+_MEND = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "ros2 bag reindex"}
 
 
 @dataclass(frozen=True)
@@ -48,11 +44,7 @@ def is_bag(path: Path) -> bool:
 
 
 def bag_files(path: Path) -> list[Path]:
-    """All files of the bag at ``path``.
-
-    Raises:
-        DriveError: there is none.
-    """
+    """All files of the bag at ``path``, at least one."""
     if path.is_file():
         return [path]
     if not path.is_dir():
@@ -72,8 +64,8 @@ def _parts(path: Path) -> list[Path]:
 class Bag:
     """An open bag: a reader for each of its files, in the order of time.
 
-    Types are taken from the bag as they are needed: a definition that is not understood, such as a service's,
-    does not concern the other topics.
+    Types are taken from the bag when needed: unknown definitions, such as services', do not concern other
+    topics.
     """
 
     def __init__(self, path: Path, readers: Sequence[Any]) -> None:
@@ -94,8 +86,7 @@ class Bag:
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         """The messages of some topics, those of each in the order in which they were received.
 
-        Raises:
-            DriveError: the bag is damaged, holds fewer messages than it says, or its types are not known.
+        Raises DriveError when the bag is damaged, holds fewer messages than it says, or lacks their types.
         """
         missing = sum(self.topics[name].messages for name in topics if name in self.topics)
         streams = (
@@ -149,11 +140,7 @@ class Bag:
         return store
 
     def need(self, name: str, kinds: Collection[str], where: str) -> Topic:
-        """The topic ``name``, which is of one of the types ``kinds``.
-
-        Raises:
-            DriveError: there is none such; names those that would do.
-        """
+        """The topic ``name``, of one of the types ``kinds``; else DriveError names those that would do."""
         fitting = ", ".join(topic.name for topic in self.topics.values() if topic.kind in kinds) or "none"
         wanted = ", ".join(sorted(kind.split("/")[-1] for kind in kinds))
         topic = self.topics.get(name)
@@ -171,11 +158,7 @@ class Bag:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """Open the bag at ``path``: a ROS 1 file, a ROS 2 folder, or one file of it.
-
-    Raises:
-        DriveError: it is none, damaged or cut off, or rosbags is not installed.
-    """
+    """Open the bag at ``path``: a ROS 1 file, a ROS 2 folder, or one file of it."""
     need("rosbags", "ros", f"{path}: a bag", DriveError)
     from rosbags import rosbag1, rosbag2
 
@@ -200,10 +183,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
 
 
 def _check_database(path: Path) -> None:
-    """Refuse an SQLite file whose end is missing or still in a journal: SQLite reads on without it.
-
-    The places in the header are those of https://www.sqlite.org/fileformat.html, 1.3.
-    """
+    """Refuse an SQLite file (https://www.sqlite.org/fileformat.html, 1.3) whose end SQLite would not miss."""
     with path.open("rb") as file:
         header = file.read(100)
     journal = path.with_name(f"{path.name}-wal")
@@ -219,10 +199,8 @@ def _check_database(path: Path) -> None:
     pages = int.from_bytes(header[28:32], "big")
     counts = header[24:28] == header[92:96]
     if counts and path.stat().st_size < pages * page_bytes:
-        raise DriveError(
-            f"{path}: is cut off: {path.stat().st_size} of {pages * page_bytes} bytes are there; copy it "
-            "again"
-        )
+        there = f"{path.stat().st_size} of {pages * page_bytes}"
+        raise DriveError(f"{path}: is cut off: {there} bytes are there; copy it again")
 
 
 def _is_compressed(path: Path) -> bool:

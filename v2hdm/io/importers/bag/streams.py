@@ -1,6 +1,7 @@
-"""What of a bag is kept as files: images, intrinsics, poses, frames; one class a kind of stream.
+"""Streams of a bag kept as files: images, intrinsics, poses, frames; one class per kind of stream.
 
-A stream writes as messages come, so that its memory grows with the bag by its list of images only.
+One pass over the bag imports all streams that the cache lacks. A stream writes as messages come, so that its
+memory grows with the bag by its list of images only.
 """
 
 from __future__ import annotations
@@ -9,24 +10,31 @@ import logging
 from abc import ABC, abstractmethod
 from array import array
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.io.calibration.camera_info import write_camera_info
-from v2hdm.io.drive.lossless import png
-from v2hdm.io.drive.tum import write_image_list
-from v2hdm.io.fields import check_camera
-from v2hdm.io.importers.bag import poses
-from v2hdm.io.importers.bag.encoded_video import VIDEO, VideoDecoder
-from v2hdm.io.importers.bag.pixels import IMAGE_KINDS, file_of
-from v2hdm.io.importers.bag.reading import Bag, Message
+from v2hdm.io.calibration.reading import info_of
+from v2hdm.io.calibration.writing import write_camera_info
+from v2hdm.io.importers.bag import messages as kinds
+from v2hdm.io.importers.bag.messages import IMAGE_KINDS, VIDEO, VideoDecoder, file_of
+from v2hdm.io.importers.bag.reading import Bag, Message, bag_files, open_bag
 from v2hdm.io.importers.bag.tf import TF_STATIC, TF_TOPIC, Edge, Frames, frame_name, transform_rows
-from v2hdm.io.importers.poses.readings import Readings
-from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo, FloatArray
+from v2hdm.io.importers.imported import (
+    begin_entry,
+    cannot_write,
+    drop_entry,
+    entry_folder,
+    finish_entry,
+    is_whole,
+)  # fmt: skip
+from v2hdm.io.importers.tables import Readings
+from v2hdm.io.safe.pixels import png
+from v2hdm.io.trajectory import write_image_list
+from v2hdm.records import FloatArray
 
 _log = logging.getLogger(__name__)
 
@@ -34,42 +42,26 @@ STAMPS = ("header", "received")
 """Times that count: those of the messages' headers, or those at which the recorder received them."""
 
 INFO_KIND = "sensor_msgs/msg/CameraInfo"
-
 IMAGE_LIST, INFO_FILE = "images.txt", "camera_info.yaml"
 _POSES, _HEADINGS, _KIND, _TRANSFORMS = "positions.txt", "headings.txt", "kind.txt", "transforms.txt"
 
-_MODELS = {"": "plumb_bob", "radtan": "plumb_bob", "fisheye": "equidistant"}
-"""Other names of distortion models."""
+Writer = Generator[None, Message | None, None]
+"""Is sent the messages of a stream, then None; closing it earlier closes its files."""
 
 
 class Stream(ABC):
-    """One stream: ``label`` and ``settings`` tell it from others of the bag."""
+    """One stream, which ``label`` and ``settings`` distinguish from others of the bag."""
 
     def __init__(self, label: str, settings: Any, where: str) -> None:
         self.label, self.settings, self.where = label, settings, where
 
     @abstractmethod
     def topics(self, bag: Bag) -> Sequence[str]:
-        """The topics to be read.
-
-        Raises:
-            DriveError: the bag does not have them, or they are of another type.
-        """
+        """The topics to be read; raises DriveError where the bag lacks them or they are of another type."""
 
     @abstractmethod
-    def begin(self, folder: Path) -> None:
-        """Make ready to write into ``folder``."""
-
-    @abstractmethod
-    def take(self, message: Message) -> None:
-        """Write one message."""
-
-    @abstractmethod
-    def finish(self) -> None:
-        """Write what comes last; called without an error only."""
-
-    def close(self) -> None:  # noqa: B027  # most hold nothing open
-        """Let go of open files, whatever has happened."""
+    def write(self, folder: Path) -> Writer:
+        """Write the messages into ``folder``."""
 
 
 class ImageStream(Stream):
@@ -80,84 +72,68 @@ class ImageStream(Stream):
         self._stamps = stamps
 
     def topics(self, bag: Bag) -> Sequence[str]:
-        """The topics of this stream, found and of a type that it understands."""
+        """Its topic, of a type of images."""
         return [bag.need(self.label, (*IMAGE_KINDS, VIDEO), self.where).name]
 
-    def begin(self, folder: Path) -> None:
-        """Make ready to write into ``folder``."""
-        self._folder = folder
-        self._taken_s = array("d")
-        self._names: dict[int, str] = {}
-        self._decoder: VideoDecoder | None = None
+    def write(self, folder: Path) -> Writer:
+        """Write an image file per message, or per frame of a video, and the list of them."""
+        stamp_s, names = array("d"), dict[int, str]()
+        topic = f"{self.where}: topic {self.label}"
+        decoder: VideoDecoder | None = None
 
-    def take(self, message: Message) -> None:
-        """Write one message."""
-        number = len(self._taken_s)
-        where = f"{self.where}: topic {self.label}, image {number + 1}"
-        stamp_s = stamp_of(message, self._stamps, not number, where)
-        if number and stamp_s <= self._taken_s[-1]:
-            raise DriveError(
-                f"{where}: its time {stamp_s:.6f} s is not after that of the one before "
-                f"({self._taken_s[-1]:.6f} s): two clocks or two recordings in one topic; keep one of them"
-            )
-        self._taken_s.append(stamp_s)
-        if message.kind == VIDEO:
-            if self._decoder is None:
-                self._decoder = VideoDecoder(message.fields.format, f"{self.where}: topic {self.label}")
-            self._decode(self._decoder, message.fields.data.tobytes())
-        else:
-            self._write(number, *file_of(message.kind, message.fields, where))
+        def put(number: int, suffix: str, data: bytes) -> None:
+            names[number] = f"{number:06d}{suffix}"
+            (folder / names[number]).write_bytes(data)
 
-    def _decode(self, decoder: VideoDecoder, data: bytes | None) -> None:
-        for number, pixels in decoder.frames(data, len(self._taken_s) - 1):
-            self._write(number, ".png", png(pixels))
+        def decode(decoder: VideoDecoder, data: bytes | None) -> None:
+            for number, pixels in decoder.frames(data, len(stamp_s) - 1):
+                put(number, ".png", png(pixels))
 
-    def _write(self, number: int, suffix: str, data: bytes) -> None:
-        self._names[number] = f"{number:06d}{suffix}"
-        (self._folder / self._names[number]).write_bytes(data)
-
-    def finish(self) -> None:
-        """Write what comes last."""
-        if self._decoder is not None:
-            self._decode(self._decoder, None)
-        if len(self._names) < len(self._taken_s):
+        while (message := (yield)) is not None:
+            number = len(stamp_s)
+            where = f"{topic}, image {number + 1}"
+            stamp_s.append(stamp_of(message, self._stamps, not number, where))
+            if number and stamp_s[-1] <= stamp_s[-2]:
+                raise DriveError(
+                    f"{where}: its time {stamp_s[-1]:.6f} s is not after that of the one before "
+                    f"({stamp_s[-2]:.6f} s): two clocks or two recordings in one topic; keep one of them"
+                )
+            if message.kind == VIDEO:
+                decoder = decoder or VideoDecoder(message.fields.format, topic)
+                decode(decoder, message.fields.data.tobytes())
+            else:
+                put(number, *file_of(message.kind, message.fields, where))
+        if decoder is not None:
+            decode(decoder, None)
+        if len(names) < len(stamp_s):
             _log.warning(
-                "%s: topic %s: left out %d of %d packets of video: no key frame before them",
-                self.where, self.label, len(self._taken_s) - len(self._names), len(self._taken_s),
+                "%s: left out %d of %d packets of video: no key frame before them",
+                topic, len(stamp_s) - len(names), len(stamp_s),
             )  # fmt: skip
-        if not self._names:
-            raise DriveError(f"{self.where}: topic {self.label}: its video has no key frame; record images")
-        numbers = sorted(self._names)
-        names = [self._names[number] for number in numbers]
-        write_image_list(np.array(self._taken_s)[numbers], names, self._folder / IMAGE_LIST)
+        if not names:
+            raise DriveError(f"{topic}: its video has no key frame; record images")
+        numbers = sorted(names)
+        write_image_list(np.array(stamp_s)[numbers], [names[k] for k in numbers], folder / IMAGE_LIST)
 
 
 class InfoStream(Stream):
-    """Intrinsics of the first message of a topic, and the frame of the camera."""
+    """Intrinsics of the first message of a topic."""
 
     def __init__(self, topic: str, where: str) -> None:
         super().__init__(topic, ["camera_info"], where)
 
     def topics(self, bag: Bag) -> Sequence[str]:
-        """The topics of this stream, found and of a type that it understands."""
+        """Its topic, of the type of intrinsics."""
         return [bag.need(self.label, [INFO_KIND], self.where).name]
 
-    def begin(self, folder: Path) -> None:
-        """Make ready to write into ``folder``."""
-        self._folder = folder
-        self._done = False
-
-    def take(self, message: Message) -> None:
-        """Write one message."""
-        if not self._done:
-            write_camera_info(
-                info_of(message.fields, self.label, f"{self.where}: topic {self.label}"),
-                self._folder / INFO_FILE,
-            )
-            self._done = True
-
-    def finish(self) -> None:
-        """All is written."""
+    def write(self, folder: Path) -> Writer:
+        """Write the first message as ``camera_info``."""
+        done = False
+        while (message := (yield)) is not None:
+            if not done:
+                info = info_of(message.fields, self.label, f"{self.where}: topic {self.label}")
+                write_camera_info(info, folder / INFO_FILE)
+                done = True
 
 
 class PoseStream(Stream):
@@ -166,57 +142,45 @@ class PoseStream(Stream):
     def __init__(self, topic: str, heading_topic: str | None, stamps: str, where: str) -> None:
         super().__init__(topic, ["poses", heading_topic, stamps], where)
         self._heading, self._stamps = heading_topic, stamps
-        self._files: list[TextIO] = []
 
     def topics(self, bag: Bag) -> Sequence[str]:
-        """The topics of this stream, found and of a type that it understands."""
-        names = [bag.need(self.label, poses.POSE_KINDS, self.where).name]
+        """Its topics, of types of poses and headings."""
+        names = [bag.need(self.label, kinds.POSE_KINDS, self.where).name]
         if self._heading is not None:
-            names.append(bag.need(self._heading, poses.HEADING_KINDS, f"{self.where}, heading_topic").name)
+            names.append(bag.need(self._heading, kinds.HEADING_KINDS, f"{self.where}, heading_topic").name)
         return names
 
-    def begin(self, folder: Path) -> None:
-        """Make ready to write into ``folder``."""
-        self._folder = folder
-        self._files = [(folder / name).open("w", encoding="utf-8") for name in (_POSES, _HEADINGS)]
-        self._kind = ""
-        self._begun: set[str] = set()
-
-    def take(self, message: Message) -> None:
-        """Write one message."""
-        first = message.topic not in self._begun
-        self._begun.add(message.topic)
-        stamp_s = stamp_of(message, self._stamps, first, f"{self.where}: topic {message.topic}")
-        if message.topic == self.label:
-            self._kind = message.kind
-            if message.kind == poses.NMEA:
-                self._files[0].write(f"{stamp_s!r} {message.fields.sentence.strip()}\n")
-            else:
-                _write_row(self._files[0], stamp_s, poses.position_row(message.kind, message.fields))
-        if message.topic == self._heading:
-            _write_row(self._files[1], stamp_s, poses.heading_row(message.kind, message.fields))
-
-    def finish(self) -> None:
-        """Write what comes last."""
-        (self._folder / _KIND).write_text(self._kind, encoding="utf-8")
-
-    def close(self) -> None:
-        """Close the files."""
-        for file in self._files:
-            file.close()
+    def write(self, folder: Path) -> Writer:
+        """Write rows of positions and of headings, and the type of the messages."""
+        kind, begun = "", set[str]()
+        with (
+            (folder / _POSES).open("w", encoding="utf-8") as positions,
+            (folder / _HEADINGS).open("w", encoding="utf-8") as headings,
+        ):
+            while (message := (yield)) is not None:
+                first = message.topic not in begun
+                begun.add(message.topic)
+                stamp_s = stamp_of(message, self._stamps, first, f"{self.where}: topic {message.topic}")
+                if message.topic == self.label:
+                    kind = message.kind
+                    if kind == kinds.NMEA:
+                        positions.write(f"{stamp_s!r} {message.fields.sentence.strip()}\n")
+                    else:
+                        _write_row(positions, stamp_s, kinds.position_row(kind, message.fields))
+                if message.topic == self._heading:
+                    _write_row(headings, stamp_s, kinds.heading_row(message.kind, message.fields))
+        (folder / _KIND).write_text(kind, encoding="utf-8")
 
     def readings(self, folder: Path) -> Readings:
         """The readings that the entry in ``folder`` holds."""
         kind = (folder / _KIND).read_text(encoding="utf-8")
         where = f"{self.where}, topic {self.label}"
-        if kind == poses.NMEA:
-            lines = [
-                line.split(" ", 1) for line in (folder / _POSES).read_text(encoding="utf-8").splitlines()
-            ]
-            stamp_s = np.array([float(stamp) for stamp, _ in lines])
-            return poses.readings_of_sentences(stamp_s, [text for _, text in lines], where)
+        if kind == kinds.NMEA:
+            text = (folder / _POSES).read_text(encoding="utf-8")
+            rows = [line.split(" ", 1) for line in text.splitlines()]
+            return kinds.readings_of_sentences(float(rows[0][0]), [sentence for _, sentence in rows], where)
         headings = None if self._heading is None else _read_rows(folder / _HEADINGS, 6)
-        return poses.readings_of(kind, _read_rows(folder / _POSES, 10), headings, where)
+        return kinds.readings_of(kind, _read_rows(folder / _POSES, 10), headings, where)
 
 
 class TfStream(Stream):
@@ -225,35 +189,20 @@ class TfStream(Stream):
     def __init__(self, moving: bool, where: str) -> None:
         super().__init__("tf" if moving else "tf_static", ["tf"], where)
         self._wanted = [TF_TOPIC, TF_STATIC] if moving else [TF_STATIC]
-        self._file: TextIO | None = None
 
     def topics(self, bag: Bag) -> Sequence[str]:
-        """The topics of this stream, found and of a type that it understands."""
-        if not any(name in bag.topics for name in self._wanted):
+        """Its topics in the bag, at least one."""
+        there = [name for name in self._wanted if name in bag.topics]
+        if not there:
             raise DriveError(f"{self.where}: {bag.path} has no topic {' or '.join(self._wanted)}")
-        return [
-            bag.need(name, [poses.TF, poses.OLD_TF], self.where).name
-            for name in self._wanted
-            if name in bag.topics
-        ]
+        return [bag.need(name, [kinds.TF, kinds.OLD_TF], self.where).name for name in there]
 
-    def begin(self, folder: Path) -> None:
-        """Make ready to write into ``folder``."""
-        self._file = (folder / _TRANSFORMS).open("w", encoding="utf-8")
-
-    def take(self, message: Message) -> None:
-        """Write one message."""
-        assert self._file is not None
-        for edge, row in transform_rows(message.fields):
-            self._file.write("\t".join([*edge, *map(repr, map(float, row))]) + "\n")
-
-    def finish(self) -> None:
-        """All is written."""
-
-    def close(self) -> None:
-        """Close the files."""
-        if self._file is not None:
-            self._file.close()
+    def write(self, folder: Path) -> Writer:
+        """Write a row per transform."""
+        with (folder / _TRANSFORMS).open("w", encoding="utf-8") as file:
+            while (message := (yield)) is not None:
+                for edge, row in transform_rows(message.fields):
+                    file.write("\t".join([*edge, *map(repr, map(float, row))]) + "\n")
 
     def frames(self, folder: Path) -> Frames:
         """The frames that the entry in ``folder`` holds."""
@@ -265,12 +214,49 @@ class TfStream(Stream):
         return Frames.of({edge: np.array(flat).reshape(-1, 8) for edge, flat in rows.items()}, self.where)
 
 
-def stamp_of(message: Message, stamps: str, first: bool, where: str) -> float:
-    """The time of a message, s; that of the ``first`` of a simulation may be zero.
+def import_streams(path: Path, streams: Sequence[Stream], cache: Path) -> list[Path]:
+    """The folders of ``streams`` of the bag at ``path``, imported now unless they were before.
 
-    Raises:
-        DriveError: its header has none.
+    Raises DriveError when the bag is damaged, lacks a topic, or the cache cannot be written.
     """
+    files = bag_files(path)
+    folders = [entry_folder(cache, files, stream.label, stream.settings) for stream in streams]
+    missing = {
+        folder: stream for folder, stream in zip(folders, streams, strict=True) if not is_whole(folder)
+    }
+    if not missing:
+        return folders
+    size_mb = sum(file.stat().st_size for file in files) / 1e6
+    labels = ", ".join(stream.label for stream in missing.values())
+    _log.info("%s: importing %s from %.0f MB into %s, once", path, labels, size_mb, cache)
+    writers: list[Writer] = []
+    try:
+        with open_bag(path) as bag:
+            takers: dict[str, list[Writer]] = defaultdict(list)
+            for folder, stream in missing.items():
+                topics = stream.topics(bag)
+                writers.append(stream.write(begin_entry(folder)))
+                next(writers[-1])
+                for topic in topics:
+                    takers[topic].append(writers[-1])
+            for message in bag.messages(takers):
+                for writer in takers[message.topic]:
+                    writer.send(message)
+            for folder, writer in zip(missing, writers, strict=True):
+                next(writer, None)  # sends None
+                finish_entry(folder)
+    except OSError as failure:
+        raise cannot_write(cache, failure) from None
+    finally:
+        for writer in writers:
+            writer.close()
+        for folder in missing:
+            drop_entry(folder)
+    return folders
+
+
+def stamp_of(message: Message, stamps: str, first: bool, where: str) -> float:
+    """The time of a message, s; only that of the ``first`` one, of a simulation, may be zero."""
     if stamps == "received":
         return message.received_s
     fields = message.fields
@@ -281,39 +267,6 @@ def stamp_of(message: Message, stamps: str, first: bool, where: str) -> float:
             "by as much as the computer needed"
         )
     return float(stamp.sec + stamp.nanosec / 1e9)
-
-
-def info_of(fields: Any, name: str, where: str) -> CameraInfo:
-    """The intrinsics of a ``CameraInfo`` of ROS 1 or 2.
-
-    Raises:
-        DriveError: it is not calibrated, cut to a region, or of a model that is not known.
-    """
-    intrinsic = np.array(getattr(fields, "k", getattr(fields, "K", None)), dtype=np.float64).reshape(3, 3)
-    distortion = np.array(getattr(fields, "d", getattr(fields, "D", None)), dtype=np.float64).ravel()
-    model = _MODELS.get(fields.distortion_model, fields.distortion_model)
-    if not intrinsic.any():
-        raise DriveError(f"{where}: the camera is not calibrated (K is zero); give camera_info as a file")
-    if max(fields.binning_x, fields.binning_y) > 1 or fields.roi.width or fields.roi.height:
-        raise DriveError(
-            f"{where}: its images are binned or cut to a region; give their camera_info as a file"
-        )
-    if model not in DISTORTION_COEFFICIENTS:
-        raise DriveError(
-            f"{where}: unknown distortion_model '{model}'; give camera_info as a file with one of: "
-            f"{', '.join(DISTORTION_COEFFICIENTS)}"
-        )
-    count = DISTORTION_COEFFICIENTS[model]
-    if len(distortion) > count and distortion[count:].any():
-        raise DriveError(
-            f"{where}: {model} has {count} coefficients, got {len(distortion)}; give it as a file"
-        )
-    # k3 and those after it are zero where they are not given.
-    padded = np.zeros(count)
-    padded[: min(count, len(distortion))] = distortion[:count]
-    info = CameraInfo(name, int(fields.width), int(fields.height), intrinsic, model, tuple(padded.tolist()))
-    check_camera(info, where, DriveError)
-    return info
 
 
 def frame_of(message: Message) -> str:

@@ -10,8 +10,7 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.rigid import inverse, rotation_from_quaternion
-from v2hdm.io.drive.trajectory import interpolate
-from v2hdm.io.importers.poses.rising import in_order
+from v2hdm.io.trajectory import in_order, interpolate, pose_matrices
 from v2hdm.records import FloatArray, Trajectory
 
 Edge = tuple[str, str]
@@ -19,8 +18,7 @@ Edge = tuple[str, str]
 
 TF_TOPIC, TF_STATIC = "/tf", "/tf_static"
 
-_FIXED = 1e-9
-"""Elements of a transform that change by less than this, m or 1, do so by rounding."""
+_FIXED = 1e-9  # elements of a transform, m or 1, that change by less do so by rounding
 
 
 class Frames:
@@ -32,20 +30,14 @@ class Frames:
 
     @classmethod
     def of(cls, rows: Mapping[Edge, FloatArray], where: str) -> Frames:
-        """Frames of rows (N, 8) of stamp, translation and quaternion.
-
-        Raises:
-            DriveError: times fall back or a quaternion is none.
-        """
+        """Frames of rows (N, 8) of stamp, translation and quaternion."""
         edges = {}
         for (parent, child), table in rows.items():
             table = table[in_order(table[:, 0], f"{where}, {parent} to {child}", "transform")]
             norm = np.linalg.norm(table[:, 4:], axis=1, keepdims=True)
             if not np.isfinite(table).all() or (norm < 0.5).any():
                 raise DriveError(f"{where}: the transform of {child} in {parent} is none; record it anew")
-            poses = np.tile(np.eye(4), (len(table), 1, 1))
-            poses[:, :3, :3] = rotation_from_quaternion(table[:, 4:] / norm)
-            poses[:, :3, 3] = table[:, 1:4]
+            poses = pose_matrices(rotation_from_quaternion(table[:, 4:] / norm), table[:, 1:4])
             # Old recorders publish fixed frames again and again.
             moves = len(poses) > 1 and bool(np.ptp(poses, axis=0).max() > _FIXED)
             count = len(poses) if moves else 1
@@ -66,8 +58,7 @@ class Frames:
     def moving(self, dst: str, src: str, max_gap_s: float, where: str) -> Trajectory:
         """``dst_from_src`` at the times of the busiest edge between them, within all of them.
 
-        Raises:
-            DriveError: they are not connected, do not move, or never at one time.
+        Raises DriveError when they are not connected, do not move, or never at one time.
         """
         path = self._path(dst, src)
         if path is None:

@@ -1,0 +1,396 @@
+"""Intrinsics of a camera from the files of the tools that calibrate: one registry of formats.
+
+COLMAP counts pixels from the corner of the image: the centre of the first one is at (0.5, 0.5).
+"""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from v2hdm.errors import DriveError, MapFileError
+from v2hdm.io.calibration.reading import info_of, read_calibration, take_camera_info, take_matrix
+from v2hdm.io.safe.fields import check_camera, take_size_px
+from v2hdm.io.safe.texts import parse_json, parse_yaml, read_text
+from v2hdm.records import DISTORTION_COEFFICIENTS, CameraInfo, FloatArray
+from v2hdm.store.files import take_array, take_text
+
+_XML = re.compile(r"<[?!\w]")  # YAML may begin with ``<<``
+_END_OF_MESSAGE = re.compile(r"\n---\s*$")  # ``ros2 topic echo`` ends with a second, empty document
+# OpenCV's lenses by their number of coefficients, and those beyond ours unless all further ones are zero.
+_BROWN_CONRADY = {4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial"}
+_BEYOND = {14: (12, "tilted sensor"), 12: (8, "thin prism")}
+_COLMAP_LINE = re.compile(r"^\d+\s+[A-Z][A-Z0-9_]+\s+\d+\s+\d+(\s|$)")
+_KALIBR_KEYS = ("camera_model", "intrinsics", "distortion_model", "resolution")
+_KALIBR_PROJECTIONS = {
+    "omni": "omnidirectional (omni)", "ds": "double sphere (ds)", "eucm": "extended unified (eucm)",
+}  # fmt: skip
+
+_Lens = tuple[str, tuple[float, ...]]
+
+
+@dataclass(frozen=True)
+class Document:
+    """One calibration file: its ``text``, and the ``entries`` at its top, none where it is plain text."""
+
+    path: Path
+    text: str
+    entries: dict[str, Any]
+
+    @property
+    def lower(self) -> dict[str, Any]:
+        """The entries by their names in small letters: OpenCV 2 wrote Camera_Matrix and image_Width."""
+        return {str(key).lower(): value for key, value in self.entries.items()}
+
+    def only_camera(self) -> list[str]:
+        """The name of its camera, the file's where it names none."""
+        return [str(self.entries.get("camera_name", self.path.stem))]
+
+
+@dataclass(frozen=True)
+class IntrinsicsFormat:
+    """One format: ``accepts`` a file by a look at it, ``names`` its cameras, ``read`` one of them."""
+
+    accepts: Callable[[Document], bool]
+    names: Callable[[Document], list[str]]
+    read: Callable[[Document, str], CameraInfo]
+
+
+def read_intrinsics(path: Path, camera: str | None = None, name_by: str = "its name") -> CameraInfo:
+    """The intrinsics of one camera, from a file of any format of :data:`INTRINSICS`.
+
+    ``camera`` is needed where the file holds several; ``name_by`` says in errors how the user names it.
+    Raises DriveError when the file is missing, damaged or of no known format, the camera is not in it or not
+    named among several, or its lens is beyond ours.
+    """
+    if path.suffix.lower() == ".bin":
+        raise DriveError(
+            f"{path}: is binary; write COLMAP's model as text (model_converter --output_type TXT)"
+        )
+    document = _read_document(path)
+    chosen = next((one for one in INTRINSICS.values() if one.accepts(document)), None)
+    if chosen is None:
+        raise DriveError(f"{path}: no intrinsics of a known format ({', '.join(INTRINSICS)}) in this file")
+    names = chosen.names(document)
+    if camera is None and len(names) > 1:
+        raise DriveError(f"{path}: holds the cameras {', '.join(names)}; name one by {name_by}")
+    if camera is not None and camera not in names:
+        raise DriveError(f"{path}: no camera '{camera}' in this file; it holds: {', '.join(names)}")
+    return chosen.read(document, names[0] if camera is None else camera)
+
+
+def is_calibration(path: Path) -> bool:
+    """Whether the file is a calibration of ours, which says where the camera sits, too."""
+    return _is_own(_read_document(path))
+
+
+def _read_document(path: Path) -> Document:
+    if path.is_dir():
+        raise DriveError(f"{path}: is a folder; name the calibration file in it")
+    text = read_text(path, DriveError)
+    start = text.lstrip("\ufeff \t\r\n")
+    content: object = {}
+    if _XML.match(start):
+        content = _of_xml(path, start)
+    elif start.startswith("{"):
+        content = parse_json(start, str(path), DriveError)
+    elif path.suffix.lower() != ".txt" and start:
+        # OpenCV 4 begins its files with a directive that YAML 1.1 refuses; its tag says no more than the
+        # keys.
+        plain = start.removeprefix("%YAML:1.0").replace("!!opencv-matrix", "")
+        content = parse_yaml(_END_OF_MESSAGE.sub("\n", plain), str(path), DriveError)
+    return Document(path, text, content if isinstance(content, dict) else {})
+
+
+def _of_xml(path: Path, text: str) -> dict[str, Any]:
+    if "<!" in text.replace("<!--", ""):
+        raise DriveError(f"{path}: holds XML declarations, which no calibration has; restore the file")
+    try:
+        root = ET.fromstring(text)
+    except ET.ParseError as failure:
+        raise DriveError(f"{path}: line {failure.position[0]}: XML syntax error; restore the file") from None
+    if root.tag != "opencv_storage":
+        raise DriveError(f"{path}: expected OpenCV's <opencv_storage>, got <{root.tag}>; name another file")
+    return {node.tag: _xml_value(node) for node in root}
+
+
+def _xml_value(node: ET.Element) -> object:
+    if node.get("type_id") == "opencv-matrix":
+        entry: dict[str, object] = {child.tag: _scalar(child.text) for child in node}
+        entry["data"] = [_scalar(word) for word in (node.findtext("data") or "").split()]
+        return entry
+    return _scalar(node.text)
+
+
+def _scalar(text: str | None) -> object:
+    """A number where it is one, else the text without the quotes that OpenCV puts around it."""
+    words = (text or "").strip()
+    try:
+        return float(words)
+    except ValueError:
+        return words.strip('"')
+
+
+def _brown_conrady(coefficients: Sequence[float], where: str) -> _Lens:
+    """Our model for OpenCV's coefficients k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]]."""
+    values = list(coefficients) or [0.0] * 5
+    while len(values) in _BEYOND:
+        count = len(values)
+        first, lens = _BEYOND[count]
+        if any(values[first:]):
+            raise DriveError(
+                f"{where}: a {lens} ({count} coefficients) is beyond our lens models; calibrate again with "
+                "5 or 8 coefficients"
+            )
+        values = values[:first]
+    if len(values) not in _BROWN_CONRADY:
+        raise DriveError(f"{where}: {len(values)} distortion coefficients; expected 4, 5 or 8")
+    return _complete(_BROWN_CONRADY[len(values)], values)
+
+
+def _complete(model: str, coefficients: Sequence[float]) -> _Lens:
+    """A lens whose further coefficients are zero."""
+    missing = DISTORTION_COEFFICIENTS[model] - len(coefficients)
+    return model, (*map(float, coefficients), *(0.0,) * missing)
+
+
+def _camera(
+    name: str, size: Sequence[object], size_at: Sequence[str], matrix: FloatArray, lens: _Lens, where: str
+) -> CameraInfo:
+    """The checked camera; ``size_at`` names width and height in errors."""
+    width, height = (take_size_px(one, at, DriveError) for one, at in zip(size, size_at, strict=True))
+    info = CameraInfo(name, width, height, matrix, *lens)
+    check_camera(info, where, DriveError)
+    return info
+
+
+def _matrix(fx: float, fy: float, cx: float, cy: float) -> FloatArray:
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class _ColmapModel:
+    """A model of COLMAP's: its numbers of focal lengths and coefficients, and the lens of ours that it is."""
+
+    focals: int
+    coefficients: int
+    lens: Callable[[Sequence[float]], _Lens]
+
+
+def _radial(coefficients: Sequence[float]) -> _Lens:
+    return _complete("plumb_bob", coefficients)
+
+
+def _opencv_lens(coefficients: Sequence[float]) -> _Lens:
+    return _brown_conrady(coefficients, "COLMAP")
+
+
+def _equidistant(coefficients: Sequence[float]) -> _Lens:
+    return _complete("equidistant", coefficients)
+
+
+COLMAP_MODELS: Mapping[str, _ColmapModel] = {
+    "SIMPLE_PINHOLE": _ColmapModel(1, 0, _radial),
+    "PINHOLE": _ColmapModel(2, 0, _radial),
+    "SIMPLE_RADIAL": _ColmapModel(1, 1, _radial),
+    "RADIAL": _ColmapModel(1, 2, _radial),
+    "OPENCV": _ColmapModel(2, 4, _opencv_lens),
+    "FULL_OPENCV": _ColmapModel(2, 8, _opencv_lens),
+    "OPENCV_FISHEYE": _ColmapModel(2, 4, _equidistant),
+    "SIMPLE_RADIAL_FISHEYE": _ColmapModel(1, 1, _equidistant),
+    "RADIAL_FISHEYE": _ColmapModel(1, 2, _equidistant),
+}
+"""COLMAP's models that are lenses of ours."""
+
+
+def _colmap_lines(document: Document) -> list[tuple[int, str]]:
+    lines = ((number, line.strip()) for number, line in enumerate(document.text.splitlines(), 1))
+    return [(number, line) for number, line in lines if line and not line.startswith("#")]
+
+
+def _is_colmap(document: Document) -> bool:
+    lines = _colmap_lines(document)
+    return bool(lines) and bool(_COLMAP_LINE.match(lines[0][1]))
+
+
+def _colmap_names(document: Document) -> list[str]:
+    return [line.split()[0] for _, line in _colmap_lines(document)]
+
+
+def _read_colmap(document: Document, name: str) -> CameraInfo:
+    number, line = next(one for one in _colmap_lines(document) if one[1].split()[0] == name)
+    where = f"{document.path}: line {number}"
+    if not _COLMAP_LINE.match(line):
+        raise DriveError(f"{where}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS; restore the file")
+    _, kind, width, height, *words = line.split()
+    model = COLMAP_MODELS.get(kind)
+    if model is None:
+        raise DriveError(
+            f"{where}: COLMAP's {kind} is beyond our lens models; calibrate with one of: "
+            f"{', '.join(COLMAP_MODELS)}"
+        )
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError:
+        values = np.array([np.nan])
+    expected = model.focals + 2 + model.coefficients
+    if len(values) != expected or not np.isfinite(values).all():
+        raise DriveError(f"{where}: {kind} has {expected} parameters; restore the file")
+    cx, cy = values[model.focals : model.focals + 2] - 0.5
+    return _camera(
+        name,
+        (int(width), int(height)),
+        (f"{where}: WIDTH", f"{where}: HEIGHT"),
+        _matrix(values[0], values[model.focals - 1], cx, cy),
+        model.lens(values[model.focals + 2 :].tolist()),
+        where,
+    )
+
+
+def _kalibr_names(document: Document) -> list[str]:
+    return [
+        str(name)
+        for name, entry in document.entries.items()
+        if isinstance(entry, dict) and {"camera_model", "intrinsics"} & set(entry)
+    ]
+
+
+def _read_kalibr(document: Document, name: str) -> CameraInfo:
+    where, entry = f"{document.path}: {name}", document.entries[name]
+    for key in _KALIBR_KEYS:
+        if key not in entry:
+            raise DriveError(f"{where}: missing key '{key}'; take the camchain that Kalibr wrote")
+    projection = take_text(entry["camera_model"], f"{where}, camera_model", DriveError)
+    if projection != "pinhole":
+        raise DriveError(
+            f"{where}: its lens is {_KALIBR_PROJECTIONS.get(projection, repr(projection))}, which is beyond "
+            "our models; calibrate with pinhole-radtan or pinhole-equi"
+        )
+    model = take_text(entry["distortion_model"], f"{where}, distortion_model", DriveError)
+    given, at = entry.get("distortion_coeffs"), f"{where}, distortion_coeffs"
+    values = [] if given in (None, []) else take_array(given, (-1,), at, DriveError).tolist()
+    if model in ("equidistant", "equi"):
+        if len(values) != 4:
+            raise DriveError(f"{at}: {model} has 4 coefficients, got {len(values)}")
+        lens = _equidistant(values)
+    elif model in ("radtan", "none"):
+        lens = _brown_conrady([] if model == "none" else values, at)
+    else:
+        raise DriveError(
+            f"{where}: its lens is '{model}', which is beyond our models; calibrate with pinhole-radtan or "
+            "pinhole-equi"
+        )
+    size = take_array(entry["resolution"], (2,), f"{where}, resolution", DriveError).tolist()
+    numbers = take_array(entry["intrinsics"], (4,), f"{where}, intrinsics", DriveError)
+    return _camera(name, size, [f"{where}, resolution"] * 2, _matrix(*numbers.tolist()), lens, where)
+
+
+def _is_opencv(document: Document) -> bool:
+    entry = document.lower.get("camera_matrix")
+    return isinstance(entry, dict) and "dt" in entry
+
+
+def _read_opencv(document: Document, name: str) -> CameraInfo:
+    where, entries = str(document.path), document.lower
+    if "xi" in entries:
+        raise DriveError(
+            f"{where}: its lens is omnidirectional (xi), which is beyond our models; calibrate with "
+            "cv2.calibrateCamera or cv2.fisheye.calibrate"
+        )
+    if "distortion_coefficients" not in entries:
+        raise DriveError(
+            f"{where}: missing key 'distortion_coefficients'; add it, zeros for a pinhole camera"
+        )
+    sides = ("image_width", "image_height")
+    for key in sides:
+        if key not in entries:
+            raise DriveError(f"{where}: missing key '{key}'; add the size of the images it was made from")
+    intrinsic = take_matrix(entries["camera_matrix"], f"{where}: camera_matrix")
+    if intrinsic.shape != (3, 3):
+        raise DriveError(f"{where}: camera_matrix: expected 3 x 3; restore the file")
+    at = f"{where}: distortion_coefficients"
+    values = take_matrix(entries["distortion_coefficients"], at).ravel().tolist()
+    if entries.get("fisheye_model") or entries.get("distortion_model") == "equidistant":
+        if len(values) != 4:
+            raise DriveError(
+                f"{at}: OpenCV's fisheye has 4 coefficients, got {len(values)}; restore the file"
+            )
+        lens = _equidistant(values)
+    else:
+        lens = _brown_conrady(values, at)
+    size = [entries[key] for key in sides]
+    return _camera(name, size, [f"{where}: {key}" for key in sides], intrinsic, lens, where)
+
+
+def _is_own(document: Document) -> bool:
+    return isinstance(document.entries.get("camera_matrix"), list)
+
+
+def _read_own(document: Document, name: str) -> CameraInfo:
+    try:
+        info = read_calibration(document.path).info
+    except MapFileError as error:
+        raise DriveError(str(error)) from None
+    if len(info.distortion) != DISTORTION_COEFFICIENTS.get(info.distortion_model):
+        raise DriveError(
+            f"{document.path}: {info.distortion_model} with {len(info.distortion)} coefficients is no lens "
+            f"of ours; known are {', '.join(DISTORTION_COEFFICIENTS)}"
+        )
+    return info
+
+
+def _is_message(document: Document) -> bool:
+    return {"height", "width", "distortion_model"} <= set(document.entries)
+
+
+def _message_names(document: Document) -> list[str]:
+    """Its only camera, by the frame of its header."""
+    header = document.entries.get("header")
+    frame = header.get("frame_id") if isinstance(header, dict) else None
+    return [str(frame or document.path.stem)]
+
+
+def _read_message(document: Document, name: str) -> CameraInfo:
+    where, entries = str(document.path), document.lower
+    for key in ("k", "d"):
+        if key not in entries:
+            raise DriveError(f"{where}: missing key '{key}'; write the message to the file again")
+    region = entries.get("roi")
+    region = region if isinstance(region, dict) else {}
+    fields = SimpleNamespace(
+        k=take_array(entries["k"], (9,), f"{where}: k", DriveError),
+        d=take_array(entries["d"], (-1,), f"{where}: d", DriveError) if entries["d"] else np.empty(0),
+        distortion_model=take_text(entries["distortion_model"], f"{where}: distortion_model", DriveError),
+        width=take_size_px(entries["width"], f"{where}: width", DriveError),
+        height=take_size_px(entries["height"], f"{where}: height", DriveError),
+        binning_x=entries.get("binning_x") or 0,
+        binning_y=entries.get("binning_y") or 0,
+        roi=SimpleNamespace(width=region.get("width", 0), height=region.get("height", 0)),
+    )
+    return info_of(fields, name, where)
+
+
+def _is_camera_info(document: Document) -> bool:
+    return bool({"camera_name", "distortion_model", "camera_matrix"} & set(document.entries))
+
+
+def _read_camera_info(document: Document, name: str) -> CameraInfo:
+    return take_camera_info(document.entries, str(document.path))
+
+
+INTRINSICS: Mapping[str, IntrinsicsFormat] = {
+    "COLMAP cameras.txt": IntrinsicsFormat(_is_colmap, _colmap_names, _read_colmap),
+    "Kalibr camchain": IntrinsicsFormat(lambda one: bool(_kalibr_names(one)), _kalibr_names, _read_kalibr),
+    "V2HDM calibration": IntrinsicsFormat(_is_own, Document.only_camera, _read_own),
+    "OpenCV": IntrinsicsFormat(_is_opencv, Document.only_camera, _read_opencv),
+    "ROS CameraInfo message": IntrinsicsFormat(_is_message, _message_names, _read_message),
+    "ROS camera_info": IntrinsicsFormat(_is_camera_info, Document.only_camera, _read_camera_info),
+}
+"""The formats, by name; the first that accepts a file reads it."""

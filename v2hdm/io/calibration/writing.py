@@ -1,0 +1,233 @@
+"""Writing the calibration of one camera: our own YAML, and the formats that other tools read as they are.
+
+Files for other tools begin with comments on the camera, its sigmas, its drive and date and the verdict on
+that run; without their ``#`` these lines are YAML. The vehicle's frame is ROS' ``base_link`` (REP 105), x
+forward and y left, the camera's that of its images (REP 103's ``_optical``), z forward and x right.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from v2hdm.errors import MapFileError
+from v2hdm.geometry.ipm import ipm_from_extrinsic
+from v2hdm.geometry.rigid import inverse, quaternion_from_rotation
+from v2hdm.io.calibration.reading import Provenance
+from v2hdm.records import Calibration, CameraInfo, FloatArray
+from v2hdm.store.files import dump_yaml, replace_text
+
+VEHICLE_FRAME = "base_link"
+_UNUSED = 1e-12  # distortion coefficients and skews below this move no point by a millionth of a pixel
+
+
+def write_calibration(
+    calibration: Calibration,
+    path: Path,
+    *,
+    clock_s: tuple[float, float] | None = None,
+    verdict: Mapping[str, Any] | None = None,
+    about: Provenance | None = None,
+) -> None:
+    """Write our own calibration file, atomically.
+
+    The sigmas are of the left-perturbation tangent of ``cam_from_vehicle``, along the camera's own axes
+    (right, down, forward), and left out without a covariance. ``clock_s`` is the delay of its images behind
+    their stamps and its sigma (infinite where unknown), ``verdict`` that on the run which found it, as JSON.
+    """
+    info = calibration.info
+    content: dict[str, Any] = {
+        "camera_name": info.name,
+        "image_width": info.width,
+        "image_height": info.height,
+        "camera_matrix": info.intrinsic.tolist(),
+        "distortion_model": info.distortion_model,
+        "distortion_coefficients": list(info.distortion),
+        "cam_from_vehicle": calibration.cam_from_vehicle.tolist(),
+        "vehicle_from_pinhole_px": ipm_from_extrinsic(info, calibration.cam_from_vehicle).tolist(),
+        **_sigmas(calibration),
+    }
+    if calibration.covariance is not None:
+        content["covariance"] = calibration.covariance.tolist()
+    if clock_s is not None:
+        content["clock_offset_s"] = float(clock_s[0])
+        if np.isfinite(clock_s[1]):
+            content["clock_sigma_s"] = float(clock_s[1])
+    if about is not None:
+        known = {"drive": about.drive, "date": about.date}
+        content |= {key: value for key, value in known.items() if value is not None}
+    if verdict is not None:
+        content["verdict"] = dict(verdict)
+    replace_text(path, dump_yaml(content))
+
+
+def write_camera_info(info: CameraInfo, path: Path) -> None:
+    """Write ``info`` as ROS' ``camera_info`` with the identity as rectification, atomically."""
+    replace_text(path, dump_yaml(_camera_info(info)))
+
+
+def camera_info_yaml(calibration: Calibration, about: Provenance) -> str:
+    """ROS' ``camera_info`` as ``camera_calibration_parsers`` reads it: the intrinsics alone."""
+    return _comments(calibration, about) + dump_yaml(_camera_info(calibration.info))
+
+
+def _camera_info(info: CameraInfo) -> dict[str, Any]:
+    return {
+        "image_width": info.width,
+        "image_height": info.height,
+        "camera_name": info.name,
+        "camera_matrix": _matrix(info.intrinsic),
+        "distortion_model": info.distortion_model,
+        "distortion_coefficients": _matrix(np.array([info.distortion])),
+        "rectification_matrix": _matrix(np.eye(3)),
+        "projection_matrix": _matrix(np.column_stack([info.intrinsic, np.zeros(3)])),
+    }
+
+
+def static_transform_yaml(calibration: Calibration, about: Provenance) -> str:
+    """A ``tf2_msgs/TFMessage``, as ``/tf_static`` takes it: where the camera sits on the vehicle."""
+    vehicle_from_cam = inverse(calibration.cam_from_vehicle)
+    translation = dict(zip("xyz", vehicle_from_cam[:3, 3].tolist(), strict=True))
+    quaternion = quaternion_from_rotation(vehicle_from_cam[None, :3, :3])[0]
+    rotation = dict(zip("xyzw", quaternion.tolist(), strict=True))
+    transform = {
+        "header": {"frame_id": VEHICLE_FRAME},
+        "child_frame_id": _optical_frame(calibration),
+        "transform": {"translation": translation, "rotation": rotation},
+    }
+    return _comments(calibration, about) + dump_yaml({"transforms": [transform]})
+
+
+def urdf(calibration: Calibration, about: Provenance) -> str:
+    """A URDF robot: the vehicle's link, the camera's, and the fixed joint whose origin is the calibration."""
+    vehicle_from_cam = inverse(calibration.cam_from_vehicle)
+    frame = _optical_frame(calibration)
+    robot = ET.Element("robot", name="vehicle")
+    for link in (VEHICLE_FRAME, frame):
+        ET.SubElement(robot, "link", name=link)
+    joint = ET.SubElement(robot, "joint", name=f"{frame}_joint", type="fixed")
+    ET.SubElement(joint, "parent", link=VEHICLE_FRAME)
+    ET.SubElement(joint, "child", link=frame)
+    rpy = _spaced(_fixed_axis_angles(vehicle_from_cam))
+    ET.SubElement(joint, "origin", xyz=_spaced(vehicle_from_cam[:3, 3]), rpy=rpy)
+    ET.indent(robot, "  ")
+    comment = _comments(calibration, about).replace("--", "- -")
+    return f'<?xml version="1.0"?>\n<!--\n{comment}-->\n{ET.tostring(robot, encoding="unicode")}\n'
+
+
+def kalibr_yaml(calibration: Calibration, about: Provenance) -> str:
+    """A camera chain of Kalibr, with ``T_cam_vehicle`` for ``T_cam_imu``; refuses lenses that it lacks."""
+    info = calibration.info
+    (fx, skew, cx), (_, fy, cy), _ = info.intrinsic.tolist()
+    models = {"plumb_bob": "radtan", "rational_polynomial": "radtan", "equidistant": "equidistant"}
+    if info.distortion_model not in models or np.abs([skew, *info.distortion[4:]]).max() > _UNUSED:
+        raise MapFileError(
+            f"camera '{info.name}': Kalibr has no lens with a skew or more than four coefficients, and this "
+            f"is {info.distortion_model} {list(info.distortion)}; take its intrinsics from camera_info"
+        )
+    camera = {
+        "camera_model": "pinhole",
+        "intrinsics": [fx, fy, cx, cy],
+        "distortion_model": models[info.distortion_model],
+        "distortion_coeffs": list(info.distortion[:4]),
+        "resolution": [info.width, info.height],
+        "T_cam_vehicle": calibration.cam_from_vehicle.tolist(),
+    }
+    return _comments(calibration, about) + dump_yaml({"cam0": camera})
+
+
+def opencv_yaml(calibration: Calibration, about: Provenance) -> str:
+    """A file for ``cv2.FileStorage``: intrinsics, extrinsic, the IPM from undistorted pixels to ground."""
+    info = calibration.info
+    storage = cv2.FileStorage(".yml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
+    storage.write("camera_name", info.name)
+    storage.write("image_width", info.width)
+    storage.write("image_height", info.height)
+    storage.write("camera_matrix", info.intrinsic)
+    storage.write("distortion_model", info.distortion_model)
+    storage.write("distortion_coefficients", np.array([info.distortion]))
+    storage.write("cam_from_vehicle", calibration.cam_from_vehicle)
+    storage.write("vehicle_from_pinhole_px", ipm_from_extrinsic(info, calibration.cam_from_vehicle))
+    if calibration.covariance is not None:
+        storage.write("covariance", calibration.covariance)
+    head, body = storage.releaseAndGetString().split("---\n", 1)
+    return f"{head}---\n{_comments(calibration, about)}{body}"
+
+
+@dataclass(frozen=True)
+class CalibrationFormat:
+    """The ending of a file's name, and the function that makes its text."""
+
+    ending: str
+    text: Callable[[Calibration, Provenance], str]
+
+
+CALIBRATION_FORMATS: Mapping[str, CalibrationFormat] = {
+    "camera_info": CalibrationFormat("camera_info.yaml", camera_info_yaml),
+    "static_transform": CalibrationFormat("static_transform.yaml", static_transform_yaml),
+    "urdf": CalibrationFormat("origin.urdf", urdf),
+    "kalibr": CalibrationFormat("kalibr.yaml", kalibr_yaml),
+    "opencv": CalibrationFormat("opencv.yaml", opencv_yaml),
+}
+"""Formats of a calibration besides our own, by name."""
+
+
+def write_calibration_as(
+    name: str, calibration: Calibration, about: Provenance, folder: Path, stem: str
+) -> Path:
+    """Write one of :data:`CALIBRATION_FORMATS` to ``<folder>/<stem>_<ending>``, atomically; returns the path.
+
+    Raises MapFileError when the format cannot describe this camera.
+    """
+    chosen = CALIBRATION_FORMATS[name]
+    path = folder / f"{stem}_{chosen.ending}"
+    replace_text(path, chosen.text(calibration, about))
+    return path
+
+
+def _comments(calibration: Calibration, about: Provenance) -> str:
+    known: dict[str, Any] = {"camera_name": calibration.info.name}
+    if calibration.covariance is not None:
+        known["sigma_axes"] = "of the camera: right, down, forward"
+    known |= _sigmas(calibration) | {"drive": about.drive, "date": about.date, "verdict": about.verdict}
+    known = {key: value for key, value in known.items() if value is not None}
+    return "".join(f"# {line}\n" for line in dump_yaml(known).splitlines())
+
+
+def _sigmas(calibration: Calibration) -> dict[str, Any]:
+    if calibration.covariance is None:
+        return {}
+    sigma = np.sqrt(np.diag(calibration.covariance))
+    return {
+        "translation_sigma_m": sigma[:3].tolist(),
+        "rotation_sigma_deg": np.degrees(sigma[3:]).tolist(),
+    }
+
+
+def _optical_frame(calibration: Calibration) -> str:
+    return f"{calibration.info.name}_optical_frame"
+
+
+def _matrix(values: FloatArray) -> dict[str, Any]:
+    return {"rows": values.shape[0], "cols": values.shape[1], "data": values.ravel().tolist()}
+
+
+def _spaced(values: FloatArray) -> str:
+    return " ".join(repr(value) for value in values.tolist())
+
+
+def _fixed_axis_angles(dst_from_src: FloatArray) -> FloatArray:
+    """Roll, pitch and yaw (3,) in rad about fixed axes, as URDF has them: Rz(yaw) Ry(pitch) Rx(roll)."""
+    rotation = dst_from_src[:3, :3]
+    flat = float(np.hypot(rotation[0, 0], rotation[1, 0]))
+    pitch = np.arctan2(-rotation[2, 0], flat)
+    yaw = np.arctan2(rotation[1, 0], rotation[0, 0]) if flat > 0 else 0.0
+    # By its cosines with the other two axes turned, roll stays exact where the pitch is a right angle.
+    across = rotation.T @ [-np.sin(yaw), np.cos(yaw), 0.0]
+    return np.array([np.arctan2(-across[2], across[1]), pitch, yaw])

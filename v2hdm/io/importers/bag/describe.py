@@ -1,0 +1,205 @@
+"""A bag without a ``drive.yaml``: its description from its topics and frames, as far as they suffice.
+
+The mounting of the cameras comes from ``/tf_static``. Where something is missing, the error holds the
+description so far, to be completed and put beside the bag.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from v2hdm.errors import DriveError
+from v2hdm.geometry.rigid import inverse
+from v2hdm.io.calibration.mounting import roi_ahead
+from v2hdm.io.importers import new_entry
+from v2hdm.io.importers.bag import messages as kinds
+from v2hdm.io.importers.bag.reading import Bag, Topic, bag_files, open_bag
+from v2hdm.io.importers.bag.streams import INFO_KIND, TfStream, frame_of, import_streams
+from v2hdm.io.importers.bag.tf import TF_STATIC, TF_TOPIC, Frames, frame_name
+from v2hdm.io.importers.imported import entry_folder, is_whole
+from v2hdm.records import FloatArray
+from v2hdm.store.files import dump_yaml, load_yaml
+
+_VEHICLES = ("base_footprint", "base_link")  # frames, the one on the ground first (REP-105, REP-120)
+_MAPS = ("map", "odom")
+_LEAST_MESSAGES = 2
+_IMAGE_WORDS = frozenset(
+    {"image", "image_raw", "image_color", "image_mono", "image_rect", "image_rect_color", "compressed",
+     "camera", "cameras", "sensing", "sensors", "raw", "image_raw_compressed"}
+)  # fmt: skip
+_TURNED = 1e-6  # elements of a rotation that are closer to the identity's are so by rounding
+_DESCRIPTION = "drive.yaml"
+IMAGE_KINDS = (*kinds.IMAGE_KINDS, kinds.VIDEO)
+
+
+def describe_bag(path: Path, cache: Path) -> dict[str, Any]:
+    """The content of a ``drive.yaml`` for the bag at ``path``, which names the bag relative to its folder.
+
+    Raises DriveError where the bag does not suffice, on one line with the description so far.
+    """
+    folder = entry_folder(cache, bag_files(path), "drive", ["bare"])
+    if not is_whole(folder):
+        description = _Description(path, cache)
+        if description.missing:
+            raise DriveError(
+                f"{path}: says no {', no '.join(description.missing)}; complete this and save it as "
+                f"drive.yaml in a folder beside the bag: {dump_flow(description.content)}"
+            )
+        with new_entry(folder) as partial:
+            (partial / _DESCRIPTION).write_text(dump_yaml(description.content), encoding="utf-8")
+    return load_yaml(folder / _DESCRIPTION, DriveError) | {"bag": path.name}
+
+
+def list_topics(path: Path, cache: Path) -> str:
+    """The topics of a bag with types and counts, and the ``drive.yaml`` for it as far as it is known."""
+    with open_bag(path) as bag:
+        topics = list(bag.topics.values())
+    width = max((len(topic.name) for topic in topics), default=0)
+    lines = [f"{topic.name:<{width}}  {topic.messages:>8}  {topic.kind}" for topic in topics]
+    if not any(topic.kind in IMAGE_KINDS for topic in topics):
+        return "\n".join([*lines, "", "# no topic of images: not a drive"])
+    found = _Description(path, cache)
+    said = f"; still to be said: {', '.join(found.missing)}" if found.missing else ""
+    return "\n".join([*lines, "", f"# drive.yaml{said}", dump_yaml(found.content).rstrip()])
+
+
+def dump_flow(content: Mapping[str, Any]) -> str:
+    """``content`` as YAML on one line."""
+    return str(yaml.safe_dump(dict(content), sort_keys=False, default_flow_style=True, width=10**6)).strip()
+
+
+class _Description:
+    """The ``content`` of a ``drive.yaml`` as far as it is known, and a list of what is ``missing``."""
+
+    def __init__(self, path: Path, cache: Path) -> None:
+        self._missing: list[str] = []
+        with open_bag(path) as bag:
+            images = _cameras(bag)
+            infos = {name: _info_topic(bag, topic) for name, topic in images.items()}
+            position = _only(bag, kinds.POSE_KINDS[:-1])
+            heading = None
+            if position is not None and position.kind == kinds.FIX:
+                heading = _only(bag, [kinds.QUATERNION]) or _only(bag, [kinds.IMU])
+            wanted = [*infos.values(), position, heading]
+            has_static, has_tf = TF_STATIC in bag.topics, TF_TOPIC in bag.topics
+            self._frame_of = _frames_of_topics(bag, {topic.name for topic in wanted if topic is not None})
+        if not images:
+            raise DriveError(f"{path}: has no topic of images ({', '.join(IMAGE_KINDS)}); not a drive")
+        self._frames = Frames({})
+        if has_static or has_tf:
+            stream = TfStream(has_tf, f"{path}: tf")
+            self._frames = stream.frames(import_streams(path, [stream], cache)[0])
+        self._vehicle = next((name for name in _VEHICLES if name in self._frames.names), None)
+        self.content: dict[str, Any] = {"name": path.stem, "bag": path.name}
+        self.content["poses"] = self._poses(position, heading)
+        self.content["cameras"] = {
+            name: self._camera(name, topic, infos[name]) for name, topic in images.items()
+        }
+        self.missing = list(dict.fromkeys(self._missing))
+
+    def _poses(self, position: Topic | None, heading: Topic | None) -> dict[str, Any]:
+        if position is None:
+            world = next((name for name in _MAPS if name in self._frames.names), None)
+            if world is not None and self._vehicle is not None:
+                return {"topic": TF_TOPIC, "frame": world, "vehicle": self._vehicle}
+            self._missing.append("one topic of poses")
+            return {"topic": "?"}
+        entry: dict[str, Any] = {"topic": position.name}
+        if position.kind == kinds.FIX:
+            if heading is None:
+                self._missing.append("topic of headings")
+            entry["heading_topic"] = "?" if heading is None else heading.name
+        sensor = self._frame_of.get(position.name, "")
+        vehicle_from_sensor = self._vehicle_from(sensor)
+        if vehicle_from_sensor is None:
+            self._missing.append(f"place of the poses' frame '{sensor}' on the vehicle (lever_arm_m)")
+            entry["lever_arm_m"] = "?"
+            return entry
+        entry["lever_arm_m"] = vehicle_from_sensor[:3, 3].tolist()
+        turned: FloatArray | None = vehicle_from_sensor
+        if heading is not None:
+            turned = self._vehicle_from(self._frame_of.get(heading.name, ""))
+        if turned is None:
+            self._missing.append("turn of the heading's sensor on the vehicle (mounting_rpy_deg)")
+            entry["mounting_rpy_deg"] = "?"
+        elif np.abs(turned[:3, :3] - np.eye(3)).max() > _TURNED:
+            entry["mounting_rpy_deg"] = _rpy_deg(turned[:3, :3])
+        return entry
+
+    def _camera(self, name: str, topic: Topic, info: Topic | None) -> dict[str, Any]:
+        entry: dict[str, Any] = {"camera_info": {"topic": "?"}, "images": {"topic": topic.name}}
+        vehicle_from_cam = None
+        if info is None:
+            self._missing.append(f"camera_info of {topic.name}")
+        else:
+            entry["camera_info"] = {"topic": info.name}
+            vehicle_from_cam = self._vehicle_from(self._frame_of[info.name])
+        if vehicle_from_cam is None:
+            self._missing.append(f"mounting of camera '{name}' (cam_from_vehicle, roi_vehicle)")
+            return entry | {"cam_from_vehicle": "?", "roi_vehicle": "?"}
+        entry["cam_from_vehicle"] = inverse(vehicle_from_cam).tolist()
+        entry["roi_vehicle"] = roi_ahead(vehicle_from_cam).tolist()
+        return entry
+
+    def _vehicle_from(self, sensor: str) -> FloatArray | None:
+        """``vehicle_from_sensor`` where fixed frames lead there."""
+        if self._vehicle is None or not sensor:
+            return None
+        return np.eye(4) if sensor == self._vehicle else self._frames.fixed(self._vehicle, sensor)
+
+
+def _frames_of_topics(bag: Bag, names: set[str]) -> dict[str, str]:
+    """By topic, the frame whose pose or image its first message holds."""
+    frames: dict[str, str] = {}
+    for message in bag.messages(names):
+        if message.topic in frames:
+            continue
+        frames[message.topic] = frame_of(message)
+        if message.kind == kinds.ODOMETRY:
+            frames[message.topic] = frame_name(message.fields.child_frame_id)
+        elif message.kind in kinds.HEADING_KINDS and message.kind not in (kinds.IMU, kinds.QUATERNION):
+            frames[message.topic] = ""  # a pose's header names the frame that it is in, not whose it is
+        if len(frames) == len(names):
+            break
+    return frames
+
+
+def _cameras(bag: Bag) -> dict[str, Topic]:
+    """Topics of images by the camera's name; a camera's compressed ones rather than its raw ones."""
+    topics = [topic for topic in bag.topics.values() if topic.kind in IMAGE_KINDS and topic.messages]
+    by_base: dict[str, Topic] = {}
+    for topic in sorted(topics, key=lambda topic: topic.kind != kinds.COMPRESSED):
+        by_base.setdefault(topic.name.removesuffix("/compressed"), topic)
+    names = {base: _camera_name(base) for base in by_base}
+    if len(set(names.values())) < len(names):
+        names = {base: base.strip("/").replace("/", "_") for base in by_base}
+    return {names[base]: topic for base, topic in sorted(by_base.items())}
+
+
+def _camera_name(base: str) -> str:
+    words = [word for word in base.split("/") if word and word not in _IMAGE_WORDS]
+    return words[-1] if words else "camera"
+
+
+def _info_topic(bag: Bag, image: Topic) -> Topic | None:
+    """The ``camera_info`` beside the images, as ``image_transport`` names it."""
+    base = image.name.removesuffix("/compressed")
+    topic = bag.topics.get(base.rsplit("/", 1)[0] + "/camera_info") or bag.topics.get(base + "/camera_info")
+    return topic if topic is not None and topic.kind == INFO_KIND and topic.messages else None
+
+
+def _only(bag: Bag, kinds: Sequence[str]) -> Topic | None:
+    found = [one for one in bag.topics.values() if one.kind in kinds and one.messages >= _LEAST_MESSAGES]
+    return found[0] if len(found) == 1 else None
+
+
+def _rpy_deg(rotation: FloatArray) -> list[float]:
+    """Roll, pitch and yaw in degrees, about fixed axes (REP-103)."""
+    pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[2, 1], rotation[2, 2]))
+    roll, yaw = np.arctan2(rotation[2, 1], rotation[2, 2]), np.arctan2(rotation[1, 0], rotation[0, 0])
+    return [float(np.degrees(angle)) for angle in (roll, pitch, yaw)]

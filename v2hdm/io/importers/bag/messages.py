@@ -1,0 +1,223 @@
+"""Messages of bags: images and video as bytes of image files, poses and headings as readings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+import cv2
+import numpy as np
+
+from v2hdm.errors import DriveError
+from v2hdm.extras import need
+from v2hdm.geometry.rigid import rotation_from_quaternion
+from v2hdm.io.importers.nmea import nmea_readings
+from v2hdm.io.importers.tables import Attitudes, Readings
+from v2hdm.io.safe.pixels import png
+from v2hdm.io.trajectory import in_order
+from v2hdm.records import FloatArray
+
+RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+IMAGE_KINDS = (RAW, COMPRESSED)
+
+_PNG_SIGNATURE, _JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+
+
+# Channels, and OpenCV's conversion to BGR.
+_ENCODINGS: Mapping[str, tuple[int, int | None]] = {
+    "mono8": (1, None),
+    "8UC1": (1, None),
+    "bgr8": (3, None),
+    "8UC3": (3, None),
+    "rgb8": (3, cv2.COLOR_RGB2BGR),
+    "bgra8": (4, cv2.COLOR_BGRA2BGR),
+    "rgba8": (4, cv2.COLOR_RGBA2BGR),
+    # OpenCV names a Bayer pattern by its second row, ROS by its first.
+    "bayer_rggb8": (1, cv2.COLOR_BayerBG2BGR),
+    "bayer_bggr8": (1, cv2.COLOR_BayerRG2BGR),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGR2BGR),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGB2BGR),
+    "yuv422": (2, cv2.COLOR_YUV2BGR_UYVY),
+    "uyvy": (2, cv2.COLOR_YUV2BGR_UYVY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2BGR_YUYV),
+    "yuyv": (2, cv2.COLOR_YUV2BGR_YUYV),
+}
+
+
+def file_of(kind: str, fields: Any, where: str) -> tuple[str, bytes]:
+    """Suffix and content of an image message's file: compressed ones as they are, raw ones as PNG."""
+    if kind == RAW:
+        return ".png", png(_pixels(fields, where))
+    data = fields.data.tobytes()
+    if data.startswith(_JPEG_START):
+        return ".jpg", data
+    if data.startswith(_PNG_SIGNATURE):
+        return ".png", data
+    raise DriveError(
+        f"{where}: compressed as '{fields.format}', neither JPEG nor PNG; record JPEG, PNG or raw images"
+    )
+
+
+def _pixels(fields: Any, where: str) -> np.ndarray:
+    if fields.encoding not in _ENCODINGS:
+        raise DriveError(
+            f"{where}: encoding '{fields.encoding}' is not known; record one of {', '.join(_ENCODINGS)}"
+        )
+    channels, to_bgr = _ENCODINGS[fields.encoding]
+    height, width, step = int(fields.height), int(fields.width), int(fields.step)
+    row = width * channels
+    if not height or not width or step < row or len(fields.data) < step * (height - 1) + row:
+        raise DriveError(
+            f"{where}: {len(fields.data)} bytes are no image of {width} x {height} in {fields.encoding} with "
+            f"{step} bytes a row; record it anew"
+        )
+    data = np.zeros(step * height, dtype=np.uint8)
+    data[: len(fields.data)] = fields.data[: len(data)]
+    shape = (height, width) if channels == 1 else (height, width, channels)
+    pixels = data.reshape(height, step)[:, :row].reshape(shape)
+    if to_bgr is not None:
+        pixels = np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), to_bgr), dtype=np.uint8)
+    return pixels
+
+
+VIDEO = "foxglove_msgs/msg/CompressedVideo"
+
+_FORMATS = ("h264", "h265", "vp9", "av1")
+_CODECS = {"h265": "hevc"}  # FFmpeg's other names of formats
+
+
+class VideoDecoder:
+    """Decodes the packets of one topic in their order; ``form`` is their format as messages name it."""
+
+    def __init__(self, form: str, where: str) -> None:
+        self._av = need("av", "video", f"{where}: video in a bag", DriveError)
+        if form not in _FORMATS:
+            raise DriveError(f"{where}: video in the format '{form}', known are {', '.join(_FORMATS)}")
+        self._where = where
+        self._context: Any = self._av.CodecContext.create(_CODECS.get(form, form), "r")
+        self._begun = False
+        self._context.thread_count = 1  # frames of several threads come late
+
+    def frames(self, data: bytes | None, number: int) -> Iterator[tuple[int, np.ndarray]]:
+        """The frames that the packet ``number`` completes, with their packets' numbers; None ends the video.
+
+        Pixels are (H, W, 3) BGR. Frames before the first key frame never come. Raises DriveError on damage.
+        """
+        packet = None
+        if data is not None:
+            packet = self._av.Packet(data)
+            packet.pts = number
+        try:
+            for frame in self._context.decode(packet):
+                self._begun = True
+                yield int(frame.pts), frame.to_ndarray(format="bgr24")
+        except self._av.error.FFmpegError as failure:
+            if not self._begun:
+                return  # parameters come with the first key frame
+            raise DriveError(
+                f"{self._where}: packet {number + 1} cannot be decoded ({' '.join(str(failure).split())}); "
+                "leave it out, or record images"
+            ) from None
+
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+FIX = "sensor_msgs/msg/NavSatFix"
+TF, OLD_TF = "tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"
+NMEA = "nmea_msgs/msg/Sentence"
+_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+_POSE = "geometry_msgs/msg/PoseStamped"
+IMU = "sensor_msgs/msg/Imu"
+QUATERNION = "geometry_msgs/msg/QuaternionStamped"
+
+POSE_KINDS = (ODOMETRY, _WITH_COVARIANCE, _POSE, FIX, NMEA, TF)
+HEADING_KINDS = (IMU, QUATERNION, ODOMETRY, _WITH_COVARIANCE, _POSE)
+
+_NO_FIX = -1
+_NORM_TOLERANCE = 1e-2
+_YAW = 35  # place of the variance of yaw among the 36 numbers of a pose's covariance (REP-103)
+
+Row = tuple[float, ...]
+
+
+def position_row(kind: str, fields: Any) -> Row:
+    """Position (3), standard deviation (1, nan if not stated), quaternion (4, nan if none), its sigma (1)."""
+    if kind == FIX:
+        return _fix(fields)
+    return _pose(fields.pose, None) if kind == _POSE else _pose(fields.pose.pose, fields.pose.covariance)
+
+
+def heading_row(kind: str, fields: Any) -> Row:
+    """Quaternion (4) and the standard deviation of its heading (1), nan if not stated."""
+    if kind == IMU:
+        if fields.orientation_covariance[0] < 0:  # sensor_msgs: this Imu measures no orientation
+            return (np.nan,) * 5
+        return (*_quaternion(fields.orientation), _sigma(fields.orientation_covariance[8]))
+    if kind == QUATERNION:
+        return (*_quaternion(fields.quaternion), np.nan)
+    return position_row(kind, fields)[4:]
+
+
+def readings_of(
+    kind: str,
+    positions: tuple[FloatArray, FloatArray],
+    headings: tuple[FloatArray, FloatArray] | None,
+    where: str,
+) -> Readings:
+    """Readings of a topic's stamps (P,) and rows (P, 9), and of rows (A, 5) of a topic of headings."""
+    stamp_s, rows = positions
+    order = in_order(stamp_s, where, "message")
+    stamp_s, rows = stamp_s[order], rows[order]
+    if not np.isfinite(rows[:, :3][~np.isinf(rows[:, 3])]).all():
+        raise DriveError(f"{where}: holds a position that is not finite; record it anew")
+    if headings is not None:
+        heading_s, turned = headings
+        by_time = in_order(heading_s, where, "message of the heading")
+        heading_s, turned = heading_s[by_time], turned[by_time]
+    else:
+        heading_s, turned = stamp_s, rows[:, 4:]
+    # A dual antenna writes nan where it has none.
+    known = np.isfinite(turned[:, :4]).all(axis=1)
+    attitudes = None
+    if known.any():
+        norm = np.linalg.norm(turned[known, :4], axis=1, keepdims=True)
+        if (np.abs(norm - 1) > _NORM_TOLERANCE).any():
+            raise DriveError(
+                f"{where}: holds a quaternion of norm {norm[np.argmax(np.abs(norm - 1)), 0]:.3g}: no "
+                "orientation was measured there; choose another topic for the heading"
+            )
+        rotation = rotation_from_quaternion(turned[known, :4] / norm)
+        attitudes = Attitudes(heading_s[known], rotation, turned[known, 4])
+    geodetic = kind == FIX
+    return Readings(stamp_s, rows[:, :3], geodetic, rows[:, 3], attitudes, antenna=geodetic)
+
+
+def readings_of_sentences(first_s: float, lines: list[str], where: str) -> Readings:
+    """Readings of NMEA sentences in messages, the first of which was stamped ``first_s``."""
+    return nmea_readings(lines, where, datetime.fromtimestamp(first_s, tz=UTC).date())
+
+
+def _pose(pose: Any, covariance: Any) -> Row:
+    place = pose.position
+    sigma_m, sigma_rad = np.nan, np.nan
+    if covariance is not None:
+        sigma_m, sigma_rad = _sigma((covariance[0] + covariance[7]) / 2), _sigma(covariance[_YAW])
+    return (place.x, place.y, place.z, sigma_m, *_quaternion(pose.orientation), sigma_rad)
+
+
+def _fix(fields: Any) -> Row:
+    sigma_m = np.nan
+    if fields.position_covariance_type:
+        sigma_m = _sigma((fields.position_covariance[0] + fields.position_covariance[4]) / 2)
+    if fields.status.status <= _NO_FIX:
+        sigma_m = np.inf
+    return (fields.latitude, fields.longitude, fields.altitude, sigma_m, *([np.nan] * 5))
+
+
+def _quaternion(orientation: Any) -> Row:
+    return (orientation.x, orientation.y, orientation.z, orientation.w)
+
+
+def _sigma(variance: float) -> float:
+    """Standard deviation, nan of a variance that stands for "not known"."""
+    return float(np.sqrt(variance)) if variance > 0 else np.nan

@@ -1,0 +1,303 @@
+"""Poses as people have them: one registry of formats, and poses of the vehicle in the map made of each.
+
+Antenna and vehicle: ``vehicle = position - rotation @ lever_arm``. True and grid north: the attitude at a
+place is relative to that place's east and north; the map's axes are those at its origin, and both differences
+are taken exactly, over the earth's centre.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from v2hdm.errors import DriveError
+from v2hdm.geometry.geodetic import (
+    convergence_rad,
+    datum_of,
+    enu_axes,
+    enu_from_geodetic,
+    geodetic_from_grid,
+    has_height_datum,
+    is_geographic,
+    position_of,
+)  # fmt: skip
+from v2hdm.geometry.rigid import rotation_from_euler
+from v2hdm.io.importers import nmea, tables
+from v2hdm.io.importers.tables import Readings
+from v2hdm.io.trajectory import check_geodetic, interpolate, pose_matrices, read_tum, why_no_pose
+from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, Trajectory
+from v2hdm.store.files import check_keys, take_array, take_choice, take_mapping, take_number, take_text
+
+_log = logging.getLogger(__name__)
+
+HEADINGS = ("true", "grid")
+COMMON_KEYS = (
+    "crs", "heading", "lever_arm_m", "mounting_rpy_deg", "max_sigma_m", "geoid_m", "epoch", "offset_s",
+)  # fmt: skip
+TOPIC_KEYS = ("heading_topic", "frame", "vehicle", "stamps")
+ReadTopic = Callable[[dict[str, Any], str], Readings]
+
+
+@dataclass(frozen=True)
+class PoseSettings:
+    """The keys of ``poses`` in ``drive.yaml`` that every format has.
+
+    Attributes:
+        crs: system of the coordinates, such as EPSG:25832; None for the map's own, or WGS84.
+        heading: north that headings count from, ``true`` or ``grid``; None where it is not stated.
+        lever_arm_m: (3,) the point that positions are of, in the vehicle frame; None where it is not stated.
+        vehicle_from_sensor: (3, 3) turn of the attitude's sensor on the vehicle.
+        max_sigma_m: positions stated to be less sure are left out: RTK fixed is 0.02, float about 0.5.
+        geoid_m: height of the geoid above the ellipsoid, for heights above the sea; None if not stated.
+        epoch: of the coordinates, in years; None if not stated.
+        offset_s: added to the recorded times.
+    """
+
+    vehicle_from_sensor: FloatArray
+    crs: str | None = None
+    heading: str | None = None
+    lever_arm_m: FloatArray | None = None
+    max_sigma_m: float = 0.1
+    geoid_m: float | None = None
+    epoch: float | None = None
+    offset_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Poses ``map_from_vehicle`` as a drive has them.
+
+    ``noise`` holds those fields of :class:`PoseNoise` that the source states; ``origin`` is the map's place
+    on the earth, None where the poses are the map's own.
+    """
+
+    trajectory: Trajectory
+    noise: Mapping[str, float]
+    origin: GeodeticOrigin | None
+
+
+@dataclass(frozen=True)
+class PoseFormat:
+    """One format: ``read(path, entry, root, where)`` and the ``keys`` that it has of its own."""
+
+    read: Callable[[Path, dict[str, Any], Path, str], Readings]
+    keys: tuple[str, ...] = ()
+
+
+def _read_tum(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
+    return tables.readings_of_poses(read_tum(path))
+
+
+POSE_FORMATS: Mapping[str, PoseFormat] = {
+    "tum": PoseFormat(_read_tum),
+    "kitti": PoseFormat(tables.read_kitti_rows, tables.KITTI_KEYS),
+    "csv": PoseFormat(tables.read_table, tables.TABLE_KEYS),
+    "nmea": PoseFormat(nmea.read_nmea, nmea.KEYS),
+}
+"""Formats of files by the key that names the file; ``topic`` names one of a bag instead."""
+
+
+def read_poses(
+    content: object,
+    root: Path,
+    origin: GeodeticOrigin | None,
+    max_gap_s: float,
+    where: str,
+    read_topic: ReadTopic,
+) -> Recorded:
+    """The poses of ``poses`` in ``drive.yaml``: a TUM file's name, or a mapping with a format or a topic.
+
+    File names are relative to ``root``, ``origin`` is the map's place on the earth as the drive states it,
+    attitudes further apart than ``max_gap_s`` are not interpolated across, ``where`` names the key in errors,
+    and ``read_topic`` reads a topic of the drive's bag.
+    """
+    if isinstance(content, str):
+        return Recorded(read_tum(root / content), {}, origin)
+    entry = take_mapping(content, where, DriveError)
+    named = [key for key in (*POSE_FORMATS, "topic") if key in entry]
+    if len(named) != 1:
+        raise DriveError(
+            f"{where}: name one source, a file of poses by its format ({', '.join(POSE_FORMATS)}) or a topic "
+            f"of the bag; got {', '.join(named) or 'none'}"
+        )
+    (kind,) = named
+    keys = TOPIC_KEYS if kind == "topic" else POSE_FORMATS[kind].keys
+    check_keys(entry, (kind,), (*keys, *COMMON_KEYS), where, DriveError)
+    settings = _take_settings(entry, where)
+    name = take_text(entry[kind], f"{where}, {kind}", DriveError)
+    if kind == "topic":
+        return assemble(read_topic(entry, where), settings, origin, max_gap_s, f"{where}, topic {name}")
+    readings = POSE_FORMATS[kind].read(root / name, entry, root, where)
+    return assemble(readings, settings, origin, max_gap_s, str(root / name))
+
+
+def _take_settings(entry: Mapping[str, Any], where: str) -> PoseSettings:
+    given: dict[str, Any] = {}
+    for key in ("max_sigma_m", "geoid_m", "epoch", "offset_s"):
+        if key in entry:
+            given[key] = take_number(entry[key], f"{where}, {key}", DriveError)
+    for key in ("lever_arm_m", "mounting_rpy_deg"):
+        if key in entry:
+            given[key] = take_array(entry[key], (3,), f"{where}, {key}", DriveError)
+    if entry.get("heading") is not None:
+        given["heading"] = take_choice(entry["heading"], HEADINGS, f"{where}, heading", DriveError)
+    if given.get("max_sigma_m", 1.0) <= 0:
+        raise DriveError(f"{where}, max_sigma_m: give a positive number of metres")
+    crs = entry.get("crs")
+    if isinstance(crs, int) and not isinstance(crs, bool):
+        crs = f"EPSG:{crs}"
+    if crs is not None:
+        given["crs"] = take_text(crs, f"{where}, crs", DriveError)
+    roll, pitch, yaw = np.radians(given.pop("mounting_rpy_deg", np.zeros(3)))[:, None]
+    return PoseSettings(rotation_from_euler(roll, pitch, yaw)[0], **given)
+
+
+def assemble(
+    readings: Readings, settings: PoseSettings, origin: GeodeticOrigin | None, max_gap_s: float, where: str
+) -> Recorded:
+    """The vehicle's poses in the map, from the ``readings`` of the source ``where``.
+
+    Without an ``origin`` the first position is that of a source which has a place on the earth. Attitudes
+    further apart than ``max_gap_s`` are not interpolated across. Raises DriveError for positions without a
+    heading, of an antenna whose place is not stated, without a sufficient fix, or of an unsuitable system.
+    """
+    if readings.antenna and settings.lever_arm_m is None:
+        raise DriveError(
+            f"{where}: holds an antenna's positions: add lever_arm_m: [x, y, z], where the antenna sits in "
+            "the vehicle frame (m forward, left, up); [0, 0, 0] only if it is above the rear axle, on the "
+            "ground"
+        )
+    if readings.attitudes is None:
+        raise DriveError(
+            f"{where}: holds positions without a heading, and the course over ground is none where a vehicle "
+            "turns, stands or reverses; add a heading (HDT, THS, PASHR, an Imu or dual-antenna topic, a "
+            "column)"
+        )
+    heading_sigma_rad = readings.attitudes.sigma_rad
+    sure = _sure_enough(readings, settings.max_sigma_m, where)
+    readings = replace(
+        readings, stamp_s=readings.stamp_s[sure], points=readings.points[sure], sigma_m=readings.sigma_m[sure]
+    )
+    rotation, known = _rotation_at(readings, max_gap_s, where)
+    points, sigma_m = readings.points[known], readings.sigma_m[known]
+    rotation = rotation @ settings.vehicle_from_sensor.T
+    stamp_s = readings.stamp_s[known] + settings.offset_s
+    if readings.geodetic or settings.crs is not None:
+        if readings.geodetic:
+            check_geodetic(points, where)
+        geodetic, north_rad = _on_earth(points, readings.geodetic, settings, where)
+        datum = "WGS84" if settings.crs is None else datum_of(settings.crs, where, DriveError)
+        origin = _origin(origin, geodetic[0], datum, settings, where)
+        zeros = np.zeros(len(points))
+        # A grid whose north lies clockwise of true north turns all that is measured from it clockwise.
+        rotation = rotation_from_euler(zeros, zeros, -north_rad) @ rotation
+        rotation = enu_axes(position_of(origin))[0].T @ enu_axes(geodetic) @ rotation
+        points = enu_from_geodetic(origin, geodetic)
+    elif settings.heading is not None or settings.geoid_m is not None:
+        key = "heading" if settings.heading is not None else "geoid_m"
+        raise DriveError(
+            f"{where}, {key}: only for coordinates with a place on the earth; add crs or drop it"
+        )
+    if settings.lever_arm_m is not None:
+        points = points - rotation @ settings.lever_arm_m
+    noise = _noise({"position_m": sigma_m, "heading_rad": heading_sigma_rad})
+    return Recorded(Trajectory(stamp_s, pose_matrices(rotation, points)), noise, origin)
+
+
+def _sure_enough(readings: Readings, max_sigma_m: float, where: str) -> BoolArray:
+    unsure = readings.sigma_m > max_sigma_m
+    if unsure.all():
+        stated = readings.sigma_m[np.isfinite(readings.sigma_m)]
+        best = f"the best is {stated.min():.2g} m" if len(stated) else "none is a fix"
+        raise DriveError(
+            f"{where}: no position is sure to {max_sigma_m:g} m ({best}); record with an RTK fix, or set "
+            "max_sigma_m higher and expect a map as unsure"
+        )
+    if unsure.any():
+        _log.warning(
+            "%s: left out %d of %d positions, stated to be less sure than %g m (no RTK fix; max_sigma_m)",
+            where, int(unsure.sum()), len(unsure), max_sigma_m,
+        )  # fmt: skip
+    return np.asarray(~unsure)
+
+
+def _rotation_at(readings: Readings, max_gap_s: float, where: str) -> tuple[FloatArray, BoolArray]:
+    """Rotations (K, 3, 3) at the times of those positions that have one, and their flags (P,)."""
+    attitudes = readings.attitudes
+    assert attitudes is not None
+    if np.array_equal(attitudes.stamp_s, readings.stamp_s):
+        return attitudes.rotation, np.ones(len(readings.stamp_s), dtype=bool)
+    turns = Trajectory(
+        attitudes.stamp_s, pose_matrices(attitudes.rotation, np.zeros((len(attitudes.stamp_s), 3)))
+    )
+    found, known = interpolate(turns, readings.stamp_s, max_gap_s)
+    if not known.any():
+        raise DriveError(
+            f"{where}: no position ({readings.stamp_s[0]:.3f} to {readings.stamp_s[-1]:.3f} s) has a heading "
+            f"({attitudes.stamp_s[0]:.3f} to {attitudes.stamp_s[-1]:.3f} s) within {max_gap_s:g} s "
+            "(drive.max_gap_s): "
+            f"{why_no_pose(readings.stamp_s, attitudes.stamp_s, max_gap_s, 'positions', 'headings')}"
+        )
+    if not known.all():
+        lacking = int((~known).sum())
+        _log.warning("%s: left out %d of %d positions: no heading at their time", where, lacking, len(known))
+    return found[known, :3, :3], known
+
+
+def _on_earth(
+    points: FloatArray, geodetic: bool, settings: PoseSettings, where: str
+) -> tuple[FloatArray, FloatArray]:
+    """Latitude, longitude and height above the ellipsoid (P, 3), and the north that counts (P,), rad."""
+    crs = settings.crs
+    if crs is not None and has_height_datum(crs, where, DriveError) and settings.geoid_m is None:
+        raise DriveError(
+            f"{where}: heights of {crs} count from the sea: add geoid_m, the geoid's height above the "
+            "ellipsoid"
+        )
+    raised = points + np.array([0.0, 0.0, settings.geoid_m or 0.0])
+    if geodetic:
+        if crs is not None and not is_geographic(crs, where, DriveError):
+            raise DriveError(f"{where}: holds latitudes and longitudes, but crs {crs} is projected; mend crs")
+        if settings.heading == "grid":
+            raise DriveError(
+                f"{where}: heading 'grid' of latitudes and longitudes, which have no grid; mend it"
+            )
+        return raised, np.zeros(len(points))
+    assert crs is not None
+    if settings.heading is None:
+        raise DriveError(
+            f"{where}: true and grid north differ in {crs}: add heading: true (gyrocompass, dual antenna) or "
+            "heading: grid (yaw of the projected coordinates)"
+        )
+    north_rad = np.zeros(len(points))
+    if settings.heading == "grid":
+        north_rad = convergence_rad(crs, raised, where, DriveError)
+    return geodetic_from_grid(crs, raised, where, DriveError), north_rad
+
+
+def _origin(
+    given: GeodeticOrigin | None, first: FloatArray, datum: str, settings: PoseSettings, where: str
+) -> GeodeticOrigin:
+    if given is None:
+        return GeodeticOrigin(float(first[0]), float(first[1]), float(first[2]), datum, settings.epoch)
+    # Without crs the source does not say its datum: that of a correction service is the origin's.
+    if settings.crs is not None and given.datum.replace(" ", "") != datum.replace(" ", ""):
+        raise DriveError(
+            f"{where}: the poses are in {datum}, the origin in {given.datum}, which differ by decimetres; "
+            f"give the origin in {datum} (datum: {datum})"
+        )
+    return given if given.epoch is not None else replace(given, epoch=settings.epoch)
+
+
+def _noise(sigmas: Mapping[str, FloatArray]) -> dict[str, float]:
+    """Root mean squares of the sigmas that are stated."""
+    return {
+        key: float(np.sqrt(np.mean(np.square(stated))))
+        for key, values in sigmas.items()
+        if len(stated := values[np.isfinite(values) & (values > 0)])
+    }

@@ -1,0 +1,292 @@
+"""Readings of a pose file or topic, before frames, antenna and noise; from KITTI's rows and from CSV files.
+
+KITTI's odometry benchmark writes twelve numbers per row, with a file of times beside it. The columns of a CSV
+file say by their names what they hold and in which unit; ``columns`` in ``drive.yaml`` translates their
+names.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from v2hdm.errors import DriveError
+from v2hdm.geometry.rigid import rotation_from_euler, rotation_from_quaternion
+from v2hdm.io.trajectory import in_order, pose_matrices
+from v2hdm.records import FloatArray, Trajectory
+from v2hdm.store.files import check_keys, read_text, take_choice, take_mapping, take_text
+
+KITTI_KEYS, TABLE_KEYS = ("stamps", "axes"), ("columns",)
+
+SIGMA_OF_QUALITY_M: Mapping[int, float] = {
+    0: np.inf,  # no fix
+    1: 3.0,  # single
+    2: 1.0,  # differential
+    3: 3.0,  # PPS
+    4: 0.02,  # RTK, fixed
+    5: 0.5,  # RTK, float
+    6: np.inf,  # dead reckoning
+    7: np.inf,  # typed in
+    8: np.inf,  # simulated
+    9: 1.0,  # satellite-based augmentation, as some receivers number it
+}
+"""Standard deviation of a position, a coordinate, m, by the quality of NMEA's GGA (0183, 4.11)."""
+
+
+@dataclass(frozen=True)
+class Attitudes:
+    """Attitudes over time.
+
+    ``stamp_s`` (A,) rise strictly; ``rotation`` (A, 3, 3) leads from the sensor to x east, y north, z up of
+    the true or grid north at the place, or to the map itself; ``sigma_rad`` (A,) is the heading's, nan if not
+    stated.
+    """
+
+    stamp_s: FloatArray
+    rotation: FloatArray
+    sigma_rad: FloatArray
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Positions over time, and attitudes, if any, perhaps at other times.
+
+    ``points`` (P, 3) are x, y, z in m of the map or a projected system, or, where ``geodetic``, latitude and
+    longitude in degrees and height above the ellipsoid in m. ``stamp_s`` (P,) rise strictly. ``sigma_m`` (P,)
+    is a horizontal coordinate's, nan where it is not stated, infinite where there was no fix. ``antenna``
+    marks positions of an antenna, which seldom sits at the vehicle's origin.
+    """
+
+    stamp_s: FloatArray
+    points: FloatArray
+    geodetic: bool
+    sigma_m: FloatArray
+    attitudes: Attitudes | None
+    antenna: bool = field(default=False)
+
+
+_VEHICLE_FROM_CAMERA_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+_UPRIGHT = 0.5  # least cosine between the poses' z axis and up for poses of a ground vehicle
+_ROTATION_TOLERANCE = _NORM_TOLERANCE = 1e-3
+
+
+def readings_of_poses(poses: Trajectory) -> Readings:
+    """Poses in the map, whose sigmas nobody has stated, as readings."""
+    unknown = np.full(len(poses.stamp_s), np.nan)
+    attitudes = Attitudes(poses.stamp_s, poses.map_from_vehicle[:, :3, :3], unknown)
+    return Readings(poses.stamp_s, poses.map_from_vehicle[:, :3, 3], False, unknown, attitudes)
+
+
+def read_kitti_rows(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
+    """Read rows of 3 x 4 matrices.
+
+    ``axes: camera`` are those of the benchmark, x right, y down, z forward, in the map as on the vehicle;
+    ``axes: vehicle`` x forward, y left, z up.
+    """
+    if "stamps" not in entry:
+        raise DriveError(f"{where}: KITTI's rows have no times: add stamps, a file with one time in s a line")
+    axes = take_choice(entry.get("axes", "vehicle"), ("vehicle", "camera"), f"{where}, axes", DriveError)
+    poses = _numbers(path, 12).reshape(-1, 3, 4)
+    stamp_s = read_stamps(root / take_text(entry["stamps"], f"{where}, stamps", DriveError))
+    if len(stamp_s) != len(poses):
+        raise DriveError(f"{path}: {len(poses)} poses, but {len(stamp_s)} times; give one time a pose")
+    rotation, points = poses[:, :, :3], poses[:, :, 3]
+    wrong = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max(axis=(1, 2)) > _ROTATION_TOLERANCE
+    if wrong.any():
+        raise DriveError(f"{path}: line {int(np.argmax(wrong)) + 1}: its 3 x 3 part is no rotation; mend it")
+    if axes == "camera":
+        turn = _VEHICLE_FROM_CAMERA_AXES
+        rotation, points = turn @ rotation @ turn.T, points @ turn.T
+    elif np.median(rotation[:, 2, 2]) < _UPRIGHT:
+        raise DriveError(
+            f"{path}: the poses' z axis does not point up; say axes: camera if they are KITTI's own"
+        )
+    rows = in_order(stamp_s, str(path))
+    return readings_of_poses(Trajectory(stamp_s[rows], pose_matrices(rotation[rows], points[rows])))
+
+
+def read_stamps(path: Path) -> FloatArray:
+    """Times (N,) in s, one per line."""
+    return _numbers(path, 1)[:, 0]
+
+
+def _numbers(path: Path, columns: int) -> FloatArray:
+    rows = []
+    for number, line in enumerate(read_text(path, DriveError).splitlines(), start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        try:
+            row = [float(part) for part in line.replace(",", " ").split()]
+        except ValueError:
+            row = []
+        if len(row) != columns or not np.isfinite(row).all():
+            raise DriveError(
+                f"{path}: line {number}: expected {columns} finite numbers, got '{line[:60]}'; mend it"
+            )
+        rows.append(row)
+    if not rows:
+        raise DriveError(f"{path}: holds no numbers; expected {columns} a line")
+    return np.array(rows)
+
+
+_STAMPS: Mapping[str, float] = {"stamp_s": 1.0, "stamp_ms": 1e3, "stamp_us": 1e6, "stamp_ns": 1e9}
+_MAP = ("x_m", "y_m", "z_m")
+_GEODETIC = ("latitude_deg", "longitude_deg", "altitude_m")
+_QUATERNION = ("qx", "qy", "qz", "qw")
+_ANGLES = (
+    "heading_deg", "yaw_deg", "yaw_rad", "roll_deg", "roll_rad", "pitch_deg", "pitch_rad", "pitch_up_deg",
+)  # fmt: skip
+_SURENESS = ("quality", "sigma_m", "heading_sigma_deg")
+NAMES = (*_STAMPS, "utc", *_MAP, *_GEODETIC, *_QUATERNION, *_ANGLES, *_SURENESS)
+"""Columns that are understood. ``heading_deg`` counts clockwise from north, ``yaw_...`` counter-clockwise
+from x or east; roll is positive with the left side up, ``pitch_...`` with the nose down, ``pitch_up_deg``
+up."""
+
+
+def read_table(path: Path, entry: dict[str, Any], root: Path, where: str) -> Readings:
+    """Read the CSV file at ``path``, separated by commas, semicolons, tabs or blanks."""
+    columns = _columns(path, _take_names(entry.get("columns"), f"{where}, columns"))
+    stamp_s = _stamps(columns, path)
+    rows = in_order(stamp_s, str(path), "pose")
+    columns = {name: values[rows] for name, values in columns.items()}
+    geodetic = _GEODETIC[0] in columns
+    names = _GEODETIC if geodetic else _MAP
+    if geodetic == (_MAP[0] in columns):
+        raise DriveError(
+            f"{path}: needs positions, as columns {', '.join(_MAP)} or {', '.join(_GEODETIC)}, one of the two"
+        )
+    _need(columns, names[:2], path)
+    count = len(rows)
+    points = np.column_stack([columns.get(name, np.zeros(count)) for name in names])
+    sigma_m = columns.get("sigma_m", np.full(count, np.nan))
+    if "quality" in columns:
+        stated = np.array([SIGMA_OF_QUALITY_M.get(value, np.inf) for value in columns["quality"]])
+        sigma_m = np.where(np.isfinite(sigma_m) & np.isfinite(stated), sigma_m, stated)
+    heading_sigma = np.radians(columns.get("heading_sigma_deg", np.full(count, np.nan)))
+    rotation = _rotation(columns, path)
+    attitudes = None if rotation is None else Attitudes(stamp_s[rows], rotation, heading_sigma)
+    return Readings(stamp_s[rows], points, geodetic, sigma_m, attitudes, antenna=geodetic)
+
+
+def _take_names(content: object, where: str) -> dict[str, str]:
+    if content is None:
+        return {}
+    entry = take_mapping(content, where, DriveError)
+    check_keys(entry, (), NAMES, where, DriveError)
+    return {ours: take_text(theirs, f"{where}, {ours}", DriveError) for ours, theirs in entry.items()}
+
+
+def _columns(path: Path, names: Mapping[str, str]) -> dict[str, FloatArray]:
+    """The columns of our ``NAMES`` that the file has, each (N,)."""
+    header, rows = read_rows(path, ",;\t", "pose")
+    for ours, theirs in names.items():
+        if header.count(theirs) != 1:
+            raise DriveError(
+                f"{path}: has no column '{theirs}' for {ours}, or two; it has: {', '.join(header)}"
+            )
+    found = {ours: header.index(theirs) for ours, theirs in names.items()}
+    for place, name in enumerate(header):
+        if name in NAMES and place not in found.values() and name not in found:
+            found[name] = place
+    table: dict[str, list[float]] = {name: [] for name in found}
+    for number, cells in rows:
+        for name, place in found.items():
+            table[name].append(_parse(name, cells[place], f"{path}: line {number}: {header[place]}"))
+    return {name: np.array(values, dtype=np.float64) for name, values in table.items()}
+
+
+def read_rows(path: Path, separators: str, thing: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """The names in the first line of a CSV file, and the cells of each further line with its number.
+
+    The first of ``separators`` that the line of names holds separates the cells, else blanks do. ``#`` before
+    the names is dropped; further lines that begin with it are comments. A line is one ``thing``.
+    """
+    text = read_text(path, DriveError)
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    lines = [*lines[:1], *(one for one in lines[1:] if not one[1].lstrip().startswith("#"))]
+    if len(lines) < 2:
+        raise DriveError(f"{path}: holds no {thing}; expected a line of column names and one line a {thing}")
+    title = lines[0][1].lstrip("\ufeff# ")
+    separator = next((mark for mark in separators if mark in title), None)
+
+    def split(line: str) -> list[str]:
+        if separator is None:
+            return line.split()
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
+
+    header = split(title)
+    rows = [(number, split(line)) for number, line in lines[1:]]
+    for number, cells in rows:
+        if len(cells) != len(header):
+            raise DriveError(
+                f"{path}: line {number}: {len(cells)} cells under {len(header)} columns; mend that line"
+            )
+    return header, rows
+
+
+def _parse(name: str, cell: str, where: str) -> float:
+    try:
+        if name == "utc":
+            moment = datetime.fromisoformat(cell)
+            return moment.replace(tzinfo=moment.tzinfo or UTC).timestamp()
+        value = float(cell) if cell or name not in _SURENESS else np.nan
+    except ValueError:
+        kind = "a time such as 2024-05-17T08:30:00.25Z" if name == "utc" else "a number"
+        raise DriveError(f"{where}: '{cell}' is not {kind}; mend that line") from None
+    if not np.isfinite(value) and name not in _SURENESS:
+        raise DriveError(f"{where}: '{cell}' is not a finite number; drop or mend that line")
+    return value
+
+
+def _stamps(columns: Mapping[str, FloatArray], path: Path) -> FloatArray:
+    named = [name for name in (*_STAMPS, "utc") if name in columns]
+    if len(named) != 1:
+        has = ", ".join(named) or "none"
+        raise DriveError(
+            f"{path}: needs one column of times, {', '.join(_STAMPS)} or utc, has {has}; see columns"
+        )
+    return columns[named[0]] / _STAMPS.get(named[0], 1.0)
+
+
+def _rotation(columns: Mapping[str, FloatArray], path: Path) -> FloatArray | None:
+    angles = [name for name in _ANGLES if name in columns]
+    yaws = [name for name in angles if name.startswith(("heading", "yaw"))]
+    if "qw" in columns:
+        _need(columns, _QUATERNION, path)
+        if angles:
+            raise DriveError(f"{path}: has a quaternion and {angles[0]}: say one of them under columns")
+        quaternion = np.column_stack([columns[name] for name in _QUATERNION])
+        norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
+        if (np.abs(norm - 1) > _NORM_TOLERANCE).any():
+            k = int(np.argmax(np.abs(norm - 1) > _NORM_TOLERANCE))
+            raise DriveError(f"{path}: pose {k + 1}: quaternion of norm {norm[k, 0]:.6g} instead of 1")
+        return rotation_from_quaternion(quaternion / norm)
+    if not yaws:
+        return None
+    for kind in (("heading_deg", "yaw_deg", "yaw_rad"), ("roll_deg", "roll_rad"),
+                 ("pitch_deg", "pitch_rad", "pitch_up_deg")):  # fmt: skip
+        twice = [name for name in kind if name in columns]
+        if len(twice) > 1:
+            raise DriveError(f"{path}: says {twice[0]} and {twice[1]}: name one of them under columns")
+    zeros = np.zeros(len(columns[yaws[0]]))
+
+    def radians(kind: str) -> FloatArray:
+        if f"{kind}_rad" in columns:
+            return columns[f"{kind}_rad"]
+        return np.radians(columns.get(f"{kind}_deg", zeros))
+
+    yaw = np.pi / 2 - radians("heading") if "heading_deg" in columns else radians("yaw")
+    pitch = -radians("pitch_up") if "pitch_up_deg" in columns else radians("pitch")
+    return rotation_from_euler(radians("roll"), pitch, yaw)
+
+
+def _need(columns: Mapping[str, FloatArray], names: Sequence[str], path: Path) -> None:
+    missing = [name for name in names if name not in columns]
+    if missing:
+        raise DriveError(f"{path}: has no column '{missing[0]}'; say under columns what the file calls it")

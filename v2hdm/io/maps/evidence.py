@@ -1,0 +1,177 @@
+"""Evidence beside a map: corner observations with residuals, as CSV, and rejected candidates."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from v2hdm.errors import MapFileError
+from v2hdm.io.maps.features import ground_height_m
+from v2hdm.io.maps.geojson import geojson_feature, geojson_positions, write_features
+from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, IntArray, Road
+from v2hdm.store.files import (
+    load_json,
+    read_text,
+    replace_text,
+    take_array,
+    take_mapping,
+    take_number,
+    take_text,
+)
+
+FILE = "residuals.csv"  # in a result folder
+
+COLUMNS = (
+    *("image", "camera", "taken_s", "marking", "corner", "point"),
+    *("u_px", "v_px", "du_px", "dv_px", "distance_sigma"),
+)
+"""``image`` is a path below the drive's folder; ``marking`` the id of a feature of ``map.geojson``, empty
+where the candidate was left out; ``corner`` counts from 1 in the order of its ``corners_map``; ``point`` is 0
+where only the distance from a line was seen. ``u_px``, ``v_px`` are pinhole pixels, ``du_px``, ``dv_px``
+projected minus observed, ``distance_sigma`` the same in standard deviations."""
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """K corner observations that an optimisation accepted.
+
+    Attributes:
+        image: paths of the images, below the drive's folder; ``row_image`` (K,) are indices into them.
+        camera: name of the camera of each image.
+        taken_s: (I,) times of the images, on the clock of the poses.
+        marking: (K,) the id of the marking, 0 where its candidate was left out of the map.
+        corner: (K,) 0 to 3, in the order of its corners.
+        is_point: (K,) whether the observation says where the corner is, not only on which line.
+        observed_px: (K, 2) pinhole pixels.
+        residual_px: (K, 2) projected minus observed.
+        distance_sigma: (K,) its length in standard deviations.
+    """
+
+    image: tuple[str, ...]
+    camera: tuple[str, ...]
+    taken_s: FloatArray
+    row_image: IntArray
+    marking: IntArray
+    corner: IntArray
+    is_point: BoolArray
+    observed_px: FloatArray
+    residual_px: FloatArray
+    distance_sigma: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.row_image)
+
+    def renamed(self, marking: IntArray, corner: IntArray) -> Residuals:
+        """The same with other ids (M,) of markings 1 to M, 0 for none, and other corners (M, 4)."""
+        known = self.marking > 0
+        of = np.maximum(self.marking - 1, 0)
+        return replace(
+            self,
+            marking=np.where(known, np.append(marking, 0)[of], 0),
+            corner=np.where(known, np.vstack([corner, np.arange(4)])[of, self.corner], self.corner),
+        )
+
+
+def write_residuals(residuals: Residuals, path: Path) -> None:
+    """Write ``residuals`` to ``path``, atomically, a row an observation."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(COLUMNS)
+    for k, i in enumerate(residuals.row_image.tolist()):
+        u, v = residuals.observed_px[k]
+        du, dv = residuals.residual_px[k]
+        table.writerow([
+            residuals.image[i], residuals.camera[i], f"{residuals.taken_s[i]:.6f}",
+            residuals.marking[k] or "", residuals.corner[k] + 1, int(residuals.is_point[k]),
+            f"{u:.3f}", f"{v:.3f}", f"{du:.4f}", f"{dv:.4f}", f"{residuals.distance_sigma[k]:.3f}",
+        ])  # fmt: skip
+    replace_text(path, text.getvalue())
+
+
+def read_residuals(path: Path) -> Residuals:
+    """Read the file of :func:`write_residuals`; raises MapFileError where it is missing or damaged."""
+    rows = list(csv.reader(io.StringIO(read_text(path, MapFileError))))
+    if not rows or tuple(rows[0]) != COLUMNS:
+        raise MapFileError(f"{path}: its columns are not {','.join(COLUMNS)}; map the drive again")
+    images: dict[str, tuple[int, str, float]] = {}
+    row_image, numbers = [], []
+    for line, row in enumerate(rows[1:], start=2):
+        try:
+            image, camera, taken_s, marking, *rest = row
+            number, _, _ = images.setdefault(image, (len(images), camera, float(taken_s)))
+            numbers.append([float(marking or 0), *(float(value) for value in rest)])
+            if len(numbers[-1]) != len(COLUMNS) - 3:
+                raise ValueError
+        except ValueError:
+            raise MapFileError(f"{path}: line {line}: not {len(COLUMNS)} fields as named above") from None
+        row_image.append(number)
+    table = np.array(numbers, dtype=np.float64).reshape(-1, len(COLUMNS) - 3)
+    return Residuals(
+        image=tuple(images),
+        camera=tuple(camera for _, camera, _ in images.values()),
+        taken_s=np.array([taken_s for _, _, taken_s in images.values()]),
+        row_image=np.array(row_image, dtype=np.int64),
+        marking=table[:, 0].astype(np.int64),
+        corner=table[:, 1].astype(np.int64) - 1,
+        is_point=table[:, 2] > 0,
+        observed_px=table[:, 3:5],
+        residual_px=table[:, 5:7],
+        distance_sigma=table[:, 7],
+    )
+
+
+@dataclass(frozen=True)
+class ExcludedMarking:
+    """A candidate that the map of ``cameras`` left out: its class, where (2,) in the map, and why."""
+
+    kind: str
+    position_map: FloatArray
+    sightings: int
+    reason: str
+    cameras: str
+
+
+def write_exclusions(
+    excluded: Sequence[ExcludedMarking], path: Path, origin: GeodeticOrigin | None, road: Road | None
+) -> None:
+    """Write a FeatureCollection of points, atomically; ``cameras`` names the camera set of each."""
+    features = []
+    for number, one in enumerate(excluded):
+        place = one.position_map.reshape(1, 2)
+        heights = None if road is None else ground_height_m(road, place)
+        properties = {
+            "id": number,
+            "class": one.kind,
+            "reason": one.reason,
+            "sightings": one.sightings,
+            "cameras": one.cameras,
+            "position_map": one.position_map.tolist(),
+        }
+        (position,) = geojson_positions(place, heights, origin)
+        features.append(geojson_feature(f"excluded/{number}", "Point", position, properties))
+    write_features(path, features, origin, {})
+
+
+def read_exclusions(path: Path) -> list[ExcludedMarking]:
+    """Read the file of :func:`write_exclusions`; raises MapFileError where it is missing or damaged."""
+    features = load_json(path, MapFileError).get("features")
+    if not isinstance(features, list):
+        raise MapFileError(f"{path}: no 'features'; give what v2hdm.map wrote")
+    excluded = []
+    for number, feature in enumerate(features):
+        where = f"{path}: feature {number}"
+        feature = take_mapping(feature, where, MapFileError)
+        entry = take_mapping(feature.get("properties"), where, MapFileError)
+        kind, reason, cameras = (
+            take_text(entry.get(key), f"{where}: {key}", MapFileError)
+            for key in ("class", "reason", "cameras")
+        )
+        at = take_array(entry.get("position_map", np.nan), (2,), f"{where}: position_map", MapFileError)
+        sightings = take_number(entry.get("sightings"), f"{where}: sightings", MapFileError)
+        excluded.append(ExcludedMarking(kind, at, int(sightings), reason, cameras))
+    return excluded

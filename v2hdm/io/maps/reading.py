@@ -1,0 +1,360 @@
+"""Reading a map from the formats that people edit, GeoJSON and GeoPackage.
+
+A file holds a feature's geometry and its exact local coordinates. The geometry is the truth, for people edit
+it; the stored coordinates stand where they agree with it within the file's rounding.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from v2hdm.errors import ConfigError, MapFileError
+from v2hdm.extras import need
+from v2hdm.geometry.geodetic import enu_from_geodetic
+from v2hdm.geometry.planar import signed_area
+from v2hdm.io.maps.features import (
+    CORNERS,
+    OUTLINE,
+    POINTS,
+    Feature,
+    map_of,
+    unique_ids,
+    with_id,
+)  # fmt: skip
+from v2hdm.io.safe.fields import take_covariance, take_origin, take_whole
+from v2hdm.io.safe.texts import parse_json, take_name
+from v2hdm.records import FloatArray, GeodeticOrigin, HdMap, IntArray
+from v2hdm.store.files import load_json, take_array, take_mapping, take_number
+
+_log = logging.getLogger(__name__)
+
+Verdict = Mapping[str, Any] | None
+
+_LARGEST_ID = 1_000_000_000  # every format and GIS holds it as a whole number of 32 bits
+_MOST_SIGHTINGS = 1_000_000_000
+_LEAST_OF_A_RING = 3  # corners of a polygon, the repeated first one aside (RFC 7946, section 3.1.6)
+_NAMED = 9  # edited features that the log names
+
+# Degrees and m by which positions may be off without an edit. Of GeoJSON, GDAL takes a last digit after
+# several zeros for noise and drops it, and files of version 0.1 have nine and four decimals: 0.1 mm on the
+# ground. Local metres are written at full precision; a GIS that rewrites them keeps 15 digits.
+_TEXT_ROUNDING, _BINARY_ROUNDING, _LOCAL_ROUNDING_M = (1e-9, 1e-9, 1e-4), (1e-11, 1e-11, 1e-6), 1e-6
+
+RESOLUTION = ("xy_coordinate_resolution", "z_coordinate_resolution")
+"""Members of GeoJSON that state how coordinates are rounded, m or degrees, for GDAL since 3.9."""
+
+EXACT = ("heights_m", "covariance_m2")
+"""Columns of a GeoPackage that hold JSON, beside that of the coordinates."""
+
+LAYERS = {CORNERS: "markings", POINTS: "lanes", OUTLINE: "symbols"}
+"""Layers of a GeoPackage by the property that holds the coordinates of their features."""
+
+_SQL = re.compile(r"sqlite3_\w+\(.*\) failed: |Failed to prepare SQL .*: ")
+_WKB_KINDS = {2: False, 3: True, 5: False, 6: True}
+"""Whether WKB types (line, polygon, and the Multi... of one of them) are closed (OGC 06-103r4, table 7)."""
+
+
+def read_map(path: Path) -> tuple[HdMap, Verdict]:
+    """A map and the verdict on it, from a GeoJSON file or GeoPackage.
+
+    Raises MapFileError when the file is missing, damaged or in another format, ConfigError when a package
+    that reads it is not installed.
+    """
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise MapFileError(
+            f"{path}: no map that can be read; give a file that ends in {' or '.join(_READERS)}"
+        )
+    return reader[0](path), reader[1](path)
+
+
+def read_geojson(path: Path) -> HdMap:
+    """Read our own GeoJSON, which others may have edited; markings and lanes keep their order.
+
+    Ids that are missing or there twice are given anew. The log says what was edited.
+    """
+    content = load_json(path, MapFileError)
+    about, features = content.get("v2hdm"), content.get("features")
+    if not isinstance(about, dict) or not isinstance(features, list):
+        raise MapFileError(
+            f"{path}: not a map written by v2hdm (no 'v2hdm' member or no 'features'); give one that is. A "
+            "GIS keeps that member when it saves edits in place, and drops it from a copy"
+        )
+    origin = take_origin(about.get("origin"), f"{path}: origin", MapFileError)
+    rounding = np.full(3, _LOCAL_ROUNDING_M) if origin is None else np.array(_TEXT_ROUNDING)
+    for axes, key in zip((slice(0, 2), slice(2, 3)), RESOLUTION, strict=True):
+        if key in content:
+            stated = take_number(content[key], f"{path}: {key}", MapFileError)
+            rounding[axes] = np.maximum(rounding[axes], stated)
+    reader = _Reader(path, origin, rounding)
+    for number, feature in enumerate(features):
+        where = f"{path}: feature {number}"
+        entry = take_mapping(feature, where, MapFileError)
+        properties = take_mapping(entry.get("properties"), where, MapFileError)
+        reader.add(properties, _of_geojson(entry.get("geometry"), where), where)
+    hd_map, largest, over_m = reader.map(), about.get("largest_id"), about.get("drift_over_m")
+    if largest is not None:
+        largest = take_whole(largest, 0, _LARGEST_ID, f"{path}: largest_id", MapFileError)
+    if over_m is not None:
+        over_m = take_number(over_m, f"{path}: drift_over_m", MapFileError)
+    return replace(hd_map, largest_id=largest or 0, drift_over_m=over_m)
+
+
+def read_verdict(path: Path) -> Verdict:
+    """The verdict beside a map in GeoJSON, None where there is none."""
+    about = load_json(path, MapFileError).get("v2hdm")
+    verdict = about.get("verdict") if isinstance(about, dict) else None
+    return verdict if isinstance(verdict, dict) else None
+
+
+def read_geopackage(path: Path) -> HdMap:
+    """Read our own GeoPackage, which others may have edited, as :func:`read_geojson` does."""
+    origin = take_origin(_about(path, "origin"), f"{path}: origin", MapFileError)
+    rounding = np.full(3, _LOCAL_ROUNDING_M) if origin is None else np.array(_BINARY_ROUNDING)
+    reader = _Reader(path, origin, rounding)
+    for key, layer in LAYERS.items():
+        for number, (wkb, properties) in enumerate(_layer(path, layer)):
+            where = f"{path}: {layer}, row {number + 1}"
+            exact = {name: _json(properties.get(name), f"{where}, {name}") for name in (key, *EXACT)}
+            reader.add(properties | exact, _of_wkb(wkb, where), where)
+    return reader.map()
+
+
+def read_geopackage_verdict(path: Path) -> Verdict:
+    """The verdict beside a map in a GeoPackage, None where there is none."""
+    verdict = _about(path, "verdict")
+    return verdict if isinstance(verdict, dict) else None
+
+
+_READERS: Mapping[str, tuple[Callable[[Path], HdMap], Callable[[Path], Verdict]]] = {
+    ".geojson": (read_geojson, read_verdict),
+    ".gpkg": (read_geopackage, read_geopackage_verdict),
+}
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """A feature's geometry as a file has it: ``positions`` (N, 2 or 3) without a closing one."""
+
+    positions: FloatArray
+    closed: bool
+
+
+class _Reader:
+    """Reads the features of one file: reports those whose geometry was edited, and gives ids.
+
+    ``rounding`` (3,) is how far positions may be off for having been rounded, in the file's own units.
+    """
+
+    def __init__(self, path: Path, origin: GeodeticOrigin | None, rounding: FloatArray) -> None:
+        self._path, self._origin, self._rounding = path, origin, rounding
+        self._features: list[Feature] = []
+        self._edited: list[int] = []
+
+    def add(self, properties: Mapping[str, Any], geometry: Geometry | None, where: str) -> None:
+        if geometry is None and not properties.keys() & set(LAYERS):
+            raise MapFileError(
+                f"{where}: has neither a geometry nor '{CORNERS}', '{POINTS}' or '{OUTLINE}'; drop it"
+            )
+        if geometry is not None and geometry.closed and len(geometry.positions) < _LEAST_OF_A_RING:
+            raise MapFileError(f"{where}: its ring has fewer than three corners; mend it, or drop it")
+        geodetic = geometry is not None and self._origin is not None
+        if geometry is not None and geodetic and (np.abs(geometry.positions[:, 1]) > 90).any():
+            raise MapFileError(f"{where}: its geometry is not in degrees of longitude and latitude; mend it")
+        closed = POINTS not in properties if geometry is None else geometry.closed
+        stored = _stored(properties, closed, where)
+        feature = stored if geometry is None else _believed(stored, geometry, self._origin, self._rounding)
+        if closed and not feature.symbol and len(feature.points_map) != 4:
+            raise MapFileError(
+                f"{where}: a marking has four corners, this has {len(feature.points_map)}; mend its outline"
+            )
+        if feature is not stored and len(stored.points_map):
+            self._edited.append(len(self._features))
+        self._features.append(feature)
+
+    def map(self) -> HdMap:
+        """All that was read, logging edits and new ids."""
+        before = [feature.id for feature in self._features]
+        ids = unique_ids(before)
+        if self._edited:
+            named = ", ".join(str(ids[index]) for index in self._edited[:_NAMED])
+            more = ", ..." if len(self._edited) > _NAMED else ""
+            _log.info(
+                "%s: %d features were edited and are taken as drawn: %s",
+                self._path, len(self._edited), named + more,
+            )  # fmt: skip
+        new = sum(a != b for a, b in zip(before, ids, strict=True))
+        if new:
+            _log.info("%s: %d features had no id of their own and were given one", self._path, new)
+        return map_of(map(with_id, self._features, ids), self._origin)
+
+
+def _believed(
+    stored: Feature, geometry: Geometry, origin: GeodeticOrigin | None, rounding: FloatArray
+) -> Feature:
+    """``stored`` itself where the geometry says the same, else what the geometry says, point by point.
+
+    A ring may start at another corner and run the other way round. Points whose number has not changed keep
+    their order and covariance, and their heights unless these were edited, too.
+    """
+    positions, size = geometry.positions, geometry.positions.shape[1]
+    if len(positions) != len(stored.points_map):
+        xyz = _in_map(positions, None, origin)
+        if geometry.closed and signed_area(xyz[:, :2]) < 0:
+            xyz = xyz[::-1]
+        raised = np.abs(xyz[:, 2]).max(initial=0.0) > rounding[2]
+        heights_m = xyz[:, 2] if raised else None
+        return replace(
+            stored, points_map=xyz[:, :2], heights_m=heights_m, covariance_m2=None, relative_sigma_m=None
+        )
+    drawn = stored.positions(origin)
+    expected = np.zeros((len(positions), 3))
+    expected[stored.ring, : drawn.shape[1]] = drawn
+    positions = positions[_aligned(expected[:, :2], positions, geometry.closed)]
+    agree = np.abs(positions - expected[:, :size]) <= rounding[:size]
+    if agree.all():
+        return stored
+    xyz = _in_map(positions, stored.heights_m, origin)
+    points_map = np.where(agree[:, :2].all(axis=1, keepdims=True), stored.points_map, xyz[:, :2])
+    heights_m = stored.heights_m
+    if not agree[:, 2:].all():
+        heights_m = np.where(agree[:, 2], stored.xyz_map[:, 2], xyz[:, 2])
+    return replace(stored, points_map=points_map, heights_m=heights_m)
+
+
+def _in_map(positions: FloatArray, heights_m: FloatArray | None, origin: GeodeticOrigin | None) -> FloatArray:
+    """A file's positions (N, 2 or 3) in the map (N, 3), m; heights that they lack are ``heights_m`` or 0."""
+    known = np.zeros(len(positions)) if heights_m is None else heights_m
+    if origin is None:
+        return np.column_stack([positions, known])[:, :3]
+    above_m = np.column_stack([positions, origin.altitude_m + known])[:, 2]
+    return enu_from_geodetic(origin, np.column_stack([positions[:, 1], positions[:, 0], above_m]))
+
+
+def _aligned(expected: FloatArray, positions: FloatArray, closed: bool) -> IntArray:
+    """The order of ``positions`` that comes nearest to ``expected``: as they are unless they form a ring."""
+    order = np.arange(len(positions))
+    if not closed:
+        return order
+    orders = [np.roll(one, -start) for one in (order, order[::-1]) for start in range(len(order))]
+    return min(orders, key=lambda one: float(((positions[one, :2] - expected) ** 2).sum()))
+
+
+def _stored(properties: Mapping[str, Any], closed: bool, where: str) -> Feature:
+    """The feature by its properties alone; without points where they are not among them."""
+    symbol = closed and properties.get(CORNERS) is None and properties.get(OUTLINE) is not None
+    key = OUTLINE if symbol else CORNERS if closed else POINTS
+    points = np.empty((0, 2))
+    if properties.get(key) is not None:
+        shape = (4, 2) if key == CORNERS else (-1, 2)
+        points = take_array(properties[key], shape, f"{where}, {key}", MapFileError)
+
+    def optional(key: str, take: Callable[..., Any], *how: Any) -> Any:
+        # Properties of each point mean nothing without the points.
+        known = properties.get(key) if key not in EXACT or len(points) else None
+        return None if known is None else take(known, *how, f"{where}, {key}", MapFileError)
+
+    return Feature(
+        id=optional("id", take_whole, -_LARGEST_ID, _LARGEST_ID) or 0,
+        kind=take_name(properties.get("class"), f"{where}, class", MapFileError),
+        points_map=points,
+        sightings=optional("sightings", take_whole, 0, _MOST_SIGHTINGS) or 0,
+        closed=closed,
+        heights_m=optional("heights_m", take_array, (len(points),)),
+        covariance_m2=optional("covariance_m2", take_covariance, 2 * len(points)),
+        relative_sigma_m=optional("relative_sigma_m", take_number),
+        symbol=symbol,
+        place_sigma_m=optional("sigma_m", take_number) if symbol else None,
+    )
+
+
+def _of_geojson(content: object, where: str) -> Geometry | None:
+    """A Polygon of one ring, a LineString, or a Multi... of one of them, as a GIS may make of it."""
+    if content is None:
+        return None
+    entry = take_mapping(content, f"{where}, geometry", MapFileError)
+    kind, parts = entry.get("type"), entry.get("coordinates")
+    closed = kind in ("Polygon", "MultiPolygon")
+    if not closed and kind not in ("LineString", "MultiLineString"):
+        raise MapFileError(
+            f"{where}: its geometry is a {kind}; draw markings as Polygons, lanes as LineStrings"
+        )
+    for _ in range({"Polygon": 1, "MultiPolygon": 2, "MultiLineString": 1}.get(str(kind), 0)):
+        if not isinstance(parts, list) or len(parts) != 1:
+            raise MapFileError(f"{where}: its {kind} has holes or several parts; split it")
+        (parts,) = parts
+    heights = isinstance(parts, list) and bool(parts) and isinstance(parts[0], list) and len(parts[0]) > 2
+    positions = take_array(parts, (-1, 3 if heights else 2), f"{where}, coordinates", MapFileError)
+    return Geometry(positions[:-1] if closed else positions, closed)
+
+
+def _of_wkb(wkb: bytes | None, where: str) -> Geometry | None:
+    """A polygon of one ring, a line, or a Multi... of one of them, from well-known binary."""
+    if wkb is None:
+        return None
+    at = 0
+    for _ in range(2):
+        order = "<" if wkb[at] == 1 else ">"
+        code, parts = struct.unpack_from(f"{order}II", wkb, at + 1)
+        # A thousand (ISO) or the highest bit (as GDAL did before ISO) stands for heights.
+        plain = code & 0xFFFF
+        kind, dimensions = plain % 1000, 3 if code & 0x80000000 or plain // 1000 == 1 else 2
+        at += 9
+        if kind < 4:
+            break
+        if parts != 1:
+            raise MapFileError(f"{where}: its geometry has several parts; split it")
+    closed = _WKB_KINDS.get(kind)
+    if closed is None:
+        raise MapFileError(f"{where}: its geometry is none that a map has; draw a polygon or a line")
+    count = parts
+    if closed:
+        if parts != 1:
+            raise MapFileError(f"{where}: its polygon has holes; fill them")
+        (count,) = struct.unpack_from(f"{order}I", wkb, at)
+        at += 4
+    positions = np.frombuffer(wkb, f"{order}f8", count * dimensions, at).reshape(count, dimensions)
+    positions = take_array(positions.tolist(), (-1, dimensions), f"{where}, geometry", MapFileError)
+    return Geometry(positions[:-1] if closed else positions, closed)
+
+
+def short_gdal_error(failure: Exception) -> str:
+    """The first line of an error of GDAL, without its SQL."""
+    return _SQL.sub("", str(failure).splitlines()[0])
+
+
+def _about(path: Path, key: str) -> object:
+    """The entry ``key`` of a GeoPackage's table about the map."""
+    rows = _layer(path, "v2hdm")
+    return _json(rows[0][1].get(key), f"{path}: {key}") if rows else None
+
+
+def _layer(path: Path, layer: str) -> list[tuple[bytes | None, dict[str, Any]]]:
+    """Geometry and properties of each row of a GeoPackage's layer; missing numbers are None."""
+    raw, errors = (
+        need(f"pyogrio.{part}", "gis", "the format gpkg", ConfigError) for part in ("raw", "errors")
+    )
+    if not path.is_file():
+        raise MapFileError(f"{path}: no such file; check the path or restore it")
+    try:
+        meta, _, geometry, columns = raw.read(str(path), layer=layer)
+    except (errors.DataSourceError, errors.DataLayerError, errors.FeatureError) as failure:
+        problem = short_gdal_error(failure)
+        raise MapFileError(f"{path}: not a map written by v2hdm ({problem}); give one that is") from None
+    rows = [
+        {name: None if value != value else value for name, value in zip(meta["fields"], row, strict=True)}
+        for row in zip(*(column.tolist() for column in columns), strict=True)
+    ]
+    return list(zip([None] * len(rows) if geometry is None else geometry, rows, strict=True))
+
+
+def _json(text: object, where: str) -> object:
+    return None if text is None else parse_json(str(text), where, MapFileError)

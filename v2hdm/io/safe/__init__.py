@@ -1,0 +1,1 @@
+"""Validation of bytes from outside: texts, images, and the fields that several formats share."""

@@ -1,0 +1,147 @@
+"""Fields of several file formats, read with the same checks: cameras, covariances, the map's origin."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from v2hdm.errors import V2hdmError
+from v2hdm.records import CameraInfo, FloatArray, GeodeticOrigin
+from v2hdm.store.files import check_keys, take_array, take_mapping, take_number, take_text
+
+_log = logging.getLogger(__name__)
+
+_LARGEST_PX = 65535
+_LONGEST_FOCAL_PX = 1e6
+_ROUNDING = 1e-3  # share by which a covariance may be off for having been rounded
+_MIDDLE = 1.0  # focal lengths from the axis to 45 degrees from it: farther out radial terms prevail
+_WIDEST_RAD = np.deg2rad(89.5)  # rays farther from the axis have no pixel in the pinhole image
+
+
+def take_size_px(content: object, where: str, error: type[V2hdmError]) -> int:
+    """``content`` as the width or height of an image."""
+    return take_whole(content, 1, _LARGEST_PX, where, error)
+
+
+def take_whole(content: object, least: int, most: int, where: str, error: type[V2hdmError]) -> int:
+    """``content`` as a whole number of a range."""
+    value = take_number(content, where, error)
+    if value != int(value) or not least <= value <= most:
+        raise error(f"{where}: expected a whole number of {least} to {most}, got {value:g}; mend it")
+    return int(value)
+
+
+def take_origin(content: object, where: str, error: type[V2hdmError]) -> GeodeticOrigin | None:
+    """``content`` as the map's place on the earth; None where there is none."""
+    if content is None:
+        return None
+    entry = take_mapping(content, where, error)
+    check_keys(entry, ("latitude_deg", "longitude_deg", "altitude_m"), ("datum", "epoch"), where, error)
+
+    def number(key: str) -> float:
+        return take_number(entry[key], f"{where}, {key}", error)
+
+    latitude_deg, longitude_deg = number("latitude_deg"), number("longitude_deg")
+    if abs(latitude_deg) > 90 or abs(longitude_deg) > 180:
+        raise error(f"{where}: latitude must lie within +-90 and longitude within +-180 degrees; mend them")
+    return GeodeticOrigin(
+        latitude_deg=latitude_deg,
+        longitude_deg=longitude_deg,
+        altitude_m=number("altitude_m"),
+        datum=take_text(entry.get("datum", "WGS84"), f"{where}, datum", error),
+        epoch=None if entry.get("epoch") is None else number("epoch"),
+    )
+
+
+def take_covariance(content: object, size: int, where: str, error: type[V2hdmError]) -> FloatArray:
+    """``content`` as a covariance (size, size), perhaps written with fewer digits than it has."""
+    matrix = take_array(content, (size, size), where, error)
+    if not _is_covariance(matrix):
+        raise error(f"{where}: not symmetric or negative somewhere; mend it or leave it out")
+    return matrix
+
+
+def check_camera(info: CameraInfo, where: str, error: type[V2hdmError]) -> None:
+    """Refuse an impossible camera matrix and a lens that cannot be undone within the image.
+
+    A lens that folds over itself in the image's corners only, where its target never was, is a warning. The
+    number of coefficients must be the model's.
+    """
+    (fx, skew, cx), (zero, fy, cy), last = info.intrinsic
+    if min(fx, fy) <= 0 or zero or list(last) != [0, 0, 1]:
+        raise error(
+            f"{where}: camera_matrix: not of the form fx s cx, 0 fy cy, 0 0 1 with positive fx, fy; mend it"
+        )
+    if max(fx, fy, abs(skew), abs(cx), abs(cy)) > _LONGEST_FOCAL_PX:
+        raise error(f"{where}: camera_matrix: beyond {_LONGEST_FOCAL_PX:g} px; mend it")
+    _check_tangential(info, where, error)
+    reach, sides = lens_reach(info), _sides(info)
+    if reach >= np.hypot(*sides):
+        return
+    scale_px = (fx + fy) / 2
+    problem = (
+        f"{where}: distortion_coefficients: this lens folds over itself {scale_px * reach:.0f} px from its "
+        f"centre, and the image reaches {scale_px * np.hypot(*sides):.0f} px from there"
+    )
+    if reach < max(sides):
+        raise error(f"{problem}; calibrate it again with points up to the image's corners")
+    _log.warning("%s: do not trust what lies in its corners; calibrate with points up to there", problem)
+
+
+def _check_tangential(info: CameraInfo, where: str, error: type[V2hdmError]) -> None:
+    """Refuse a lens so far off its axis that the image's middle is turned over or torn."""
+    # The tangential part moves a point at r focal lengths by up to 3 p r^2, so that neighbours change places
+    # where 6 p r reaches 1; every real lens is below a tenth of that.
+    if info.distortion_model == "equidistant" or len(info.distortion) < 4:
+        return
+    tangential = float(np.hypot(info.distortion[2], info.distortion[3]))
+    if 6 * tangential * min(max(_sides(info)), _MIDDLE) >= 1:
+        raise error(
+            f"{where}: distortion_coefficients: p1 and p2 of {info.distortion[2]:g} and "
+            f"{info.distortion[3]:g} turn the image over; their order is k1 k2 p1 p2 k3, mend them"
+        )
+
+
+def lens_reach(info: CameraInfo) -> float:
+    """The radius within which recorded points have one ray each, in focal lengths; infinite for most."""
+    angles = np.linspace(0, _WIDEST_RAD, 4096)
+    with np.errstate(all="ignore"):  # absurd coefficients do not rise
+        recorded = recorded_distance(info, angles)
+        falls = np.flatnonzero(~(np.diff(recorded) > 0))
+    return float(recorded[falls[0]]) if len(falls) else np.inf
+
+
+def recorded_distance(info: CameraInfo, angles: FloatArray) -> FloatArray:
+    """Distance from the centre, in focal lengths, of rays by their angles from the axis (rad)."""
+    k = info.distortion
+    if info.distortion_model == "equidistant":
+        square = angles**2
+        return angles * (1 + square * (k[0] + square * (k[1] + square * (k[2] + square * k[3]))))
+    rays = np.tan(angles)
+    square = rays**2
+    recorded: FloatArray = rays * (1 + square * (k[0] + square * (k[1] + square * k[4])))
+    if len(k) > 5:
+        recorded /= 1 + square * (k[5] + square * (k[6] + square * k[7]))
+    return recorded
+
+
+def _sides(info: CameraInfo) -> tuple[float, float]:
+    """The image's reach from the axis to a side, and up or down, in focal lengths."""
+    (fx, _, cx), (_, fy, cy), _ = info.intrinsic
+    across = max(abs(cx + 0.5), abs(info.width - 0.5 - cx)) / fx
+    down = max(abs(cy + 0.5), abs(info.height - 0.5 - cy)) / fy
+    return float(across), float(down)
+
+
+def _is_covariance(matrix: FloatArray) -> bool:
+    variance = np.diag(matrix)
+    if (variance < 0).any():
+        return False
+    with np.errstate(all="ignore"):  # absurd numbers fail the tests that follow
+        sigma = np.sqrt(variance)
+        scale = np.outer(sigma, sigma)
+        correlation = matrix / np.where(scale > 0, scale, 1.0)
+        if not np.abs(correlation - correlation.T).max() <= _ROUNDING:
+            return False
+    return bool(np.linalg.eigvalsh(correlation).min() > -_ROUNDING)

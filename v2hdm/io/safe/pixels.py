@@ -1,0 +1,293 @@
+"""Validation of images from outside: every image file that others wrote is checked and decoded here.
+
+The size is read from the header before anything is decoded, so that a small file cannot ask for all of the
+memory. Damage that decoders only warn of, such as half an image or grey blocks, is an error.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import stat
+import struct
+import sys
+import tempfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import BinaryIO
+
+import cv2
+import numpy as np
+
+from v2hdm.errors import DriveError
+from v2hdm.store.inputs import note_input
+
+_log = logging.getLogger(__name__)
+
+MOST_PX = 200_000_000  # the largest sensors of mapping cameras have 150 million
+LEAST_SIDE_PX = 16  # narrower images show no marking, and not one cell of the network
+_MOST_BYTES = 1 << 30
+_TAIL_BYTES = 4096
+_PNG = b"\x89PNG\r\n\x1a\n"
+_JPEG = b"\xff\xd8"
+_TIFF = (b"II*\0", b"MM\0*")
+# Start-of-frame markers; DHT, JPG and DAC lie in their midst and are none.
+_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_JPEG_WITHOUT_LENGTH = frozenset([0x01, *range(0xD0, 0xD9)])
+_APP1, _START_OF_SCAN = 0xE1, 0xDA
+_WIDTH_TAG, _HEIGHT_TAG, _ORIENTATION_TAG = 0x100, 0x101, 0x112
+_UPRIGHT = 1
+
+# Warnings of the libraries below OpenCV about an image that they decode all the same.
+_DAMAGE = re.compile(
+    r"Corrupt JPEG|Premature end|libpng (error|warning: .*CRC)|Invalid SOS|bad Huffman", re.I
+)
+_QUICK = (cv2.IMWRITE_PNG_COMPRESSION, 1)
+
+
+@dataclass(frozen=True)
+class Header:
+    """Size of an image as it is stored, px, and its EXIF orientation (1 is upright; TIFF 6.0, section 8)."""
+
+    width: int
+    height: int
+    orientation: int = _UPRIGHT
+
+
+def read_header(path: Path) -> Header:
+    """The header of a PNG, JPEG, TIFF, BMP or WebP file; refuses truncated, tiny and huge ones."""
+    with _opened(path) as data:
+        return _checked(data, path)
+
+
+def read_pixels(path: Path, flags: int) -> np.ndarray:
+    """The decoded pixels of an image, with OpenCV's ``flags``; errors as :func:`read_header`, or damage."""
+    with _opened(path) as stored:
+        data = stored[:]
+    header = _checked(data, path)
+    _check_sums(data, path)
+    if header.orientation != _UPRIGHT and not flags & cv2.IMREAD_IGNORE_ORIENTATION:
+        _warn_turned(path.parent, header.orientation)
+    with _complaints() as lines:
+        try:
+            pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+        except cv2.error:
+            pixels = None
+    if pixels is None or any(map(_DAMAGE.search, lines)):
+        raise DriveError(f"{path}: the image is damaged; copy it again or drop it from the list")
+    return np.asarray(pixels)
+
+
+def png(pixels: np.ndarray) -> bytes:
+    """The PNG file of an image, (H, W) or (H, W, 3) BGR uint8, quick rather than small."""
+    done, data = cv2.imencode(".png", pixels, _QUICK)
+    assert done
+    return data.tobytes()
+
+
+@lru_cache
+def _warn_turned(folder: Path, orientation: int) -> None:
+    _log.warning(
+        "%s: images are turned upright, as their EXIF orientation %d says; their calibration must be of the "
+        "turned ones",
+        folder, orientation,
+    )  # fmt: skip
+
+
+class _Stored:
+    """The bytes of an open file, read where they are asked for: a header may lie at its end (TIFF)."""
+
+    def __init__(self, stream: BinaryIO, size: int) -> None:
+        self._stream, self._size = stream, size
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, part: slice) -> bytes:
+        begin, end, _ = part.indices(self._size)
+        self._stream.seek(begin)
+        return self._stream.read(max(end - begin, 0))
+
+
+_Data = bytes | _Stored
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[_Stored]:
+    try:
+        about = path.stat()
+        if not stat.S_ISREG(about.st_mode):
+            raise DriveError(f"{path}: is no image file but a folder or a device; check the list")
+        if about.st_size > _MOST_BYTES:
+            raise DriveError(f"{path}: image of {about.st_size / 1e6:.0f} MB; check what it is")
+        note_input(path)
+        with path.open("rb") as stream:
+            yield _Stored(stream, about.st_size)
+    except (FileNotFoundError, NotADirectoryError):
+        raise DriveError(f"{path}: image listed but missing; restore it or drop it from the list") from None
+    except (OSError, ValueError) as failure:
+        reason = getattr(failure, "strerror", None) or failure
+        raise DriveError(f"{path}: cannot read this image ({reason}); check its permissions") from None
+
+
+def _checked(data: _Data, path: Path) -> Header:
+    if not len(data):
+        raise DriveError(f"{path}: image file is empty; restore it or drop it from the list")
+    begin = data[:12]
+    is_webp = begin[:4] == b"RIFF" and begin[8:] == b"WEBP"
+    if not (is_webp or begin.startswith((_PNG, _JPEG, b"BM", *_TIFF))):
+        raise DriveError(f"{path}: not a PNG, JPEG, TIFF, BMP or WebP image; convert it, or drop it")
+    try:
+        header = _header(data)
+    except (struct.error, LookupError, ValueError):
+        header = None
+    if header is None or not _is_whole(data):
+        raise DriveError(f"{path}: image is truncated or damaged; restore it or drop it from the list")
+    size = f"{path}: image is {header.width} x {header.height} px"
+    if min(header.width, header.height) < LEAST_SIDE_PX:
+        raise DriveError(f"{size}; give images of at least {LEAST_SIDE_PX} px a side")
+    if header.width * header.height > MOST_PX:
+        raise DriveError(f"{size}, more than {MOST_PX // 10**6} million in all; scale it down or drop it")
+    return header
+
+
+def _is_whole(data: _Data) -> bool:
+    """Whether a file has its end."""
+    end = {_JPEG: b"\xff\xd9", _PNG[:2]: b"IEND"}.get(data[:2], b"")
+    return end in data[-_TAIL_BYTES:]
+
+
+def _header(data: _Data) -> Header | None:
+    begin = data[:8]
+    if begin == _PNG:
+        width, height = _unpack(">II", data, 16)
+        return Header(width, height, _png_orientation(data))
+    if begin.startswith(_JPEG):
+        return _jpeg_header(data)
+    if begin.startswith(_TIFF):
+        tags = _tiff_tags(data)
+        return Header(tags[_WIDTH_TAG], tags[_HEIGHT_TAG], tags.get(_ORIENTATION_TAG, _UPRIGHT))
+    if begin.startswith(b"BM"):
+        if _unpack("<I", data, 14)[0] < 40:  # OS/2's header
+            return Header(*_unpack("<HH", data, 18))
+        width, height = _unpack("<ii", data, 18)
+        return Header(width, abs(height))
+    return _webp_header(data[:32])
+
+
+def _unpack(form: str, data: _Data, at: int) -> tuple[int, ...]:
+    return struct.unpack(form, data[at : at + struct.calcsize(form)])
+
+
+def _jpeg_header(data: _Data) -> Header | None:
+    """Walk the segments up to the start of frame (ITU-T T.81, B.2)."""
+    orientation, at = _UPRIGHT, 2
+    while at < len(data):
+        marker = data[at : at + 1][0]
+        at += 1
+        if marker == 0xFF or marker in _JPEG_WITHOUT_LENGTH:
+            continue
+        if marker == _START_OF_SCAN:
+            return None
+        (length,) = _unpack(">H", data, at)
+        if marker in _JPEG_FRAMES:
+            height, width = _unpack(">HH", data, at + 3)
+            return Header(width, height, orientation)
+        if marker == _APP1 and data[at + 2 : at + 8] == b"Exif\0\0":
+            orientation = _orientation(data[at + 8 : at + length])
+        at += length
+    return None
+
+
+def _png_orientation(data: _Data) -> int:
+    for kind, at, length in _png_chunks(data):
+        if kind == b"eXIf":
+            return _orientation(data[at : at + length])
+        if kind == b"IDAT":
+            break
+    return _UPRIGHT
+
+
+def _png_chunks(data: _Data) -> Iterator[tuple[bytes, int, int]]:
+    """Kind, begin and length of the body of each whole chunk (PNG, third edition, section 5.3)."""
+    at = len(_PNG)
+    while at + 12 <= len(data):
+        (length,) = _unpack(">I", data, at)
+        if at + 12 + length > len(data):
+            break
+        yield data[at + 4 : at + 8], at + 8, length
+        at += 12 + length
+
+
+def _check_sums(data: bytes, path: Path) -> None:
+    """Compare every chunk of a PNG with its checksum, of which decoders only warn."""
+    if not data.startswith(_PNG):
+        return
+    for kind, at, length in _png_chunks(data):
+        if zlib.crc32(data[at : at + length], zlib.crc32(kind)) != _unpack(">I", data, at + length)[0]:
+            raise DriveError(f"{path}: the image is damaged; copy it again or drop it from the list")
+
+
+def _webp_header(data: bytes) -> Header:
+    """The size in the first chunk (RFC 9649, section 2)."""
+    kind = data[12:16]
+    if kind == b"VP8X":
+        return Header(*(int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27)))
+    if kind == b"VP8L":
+        bits = int.from_bytes(data[21:25], "little")
+        return Header((bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1)
+    width, height = struct.unpack_from("<HH", data, 26)
+    return Header(width & 0x3FFF, height & 0x3FFF)
+
+
+def _orientation(exif: bytes) -> int:
+    """The orientation in an EXIF block, upright where that is damaged."""
+    try:
+        tag = _tiff_tags(exif).get(_ORIENTATION_TAG, _UPRIGHT) if exif.startswith(_TIFF) else _UPRIGHT
+    except struct.error:
+        return _UPRIGHT
+    return tag if 1 <= tag <= 8 else _UPRIGHT
+
+
+def _tiff_tags(data: _Data) -> dict[int, int]:
+    """The whole numbers in the first directory of a TIFF, by tag."""
+    order = "<" if data[:2] == b"II" else ">"
+    (at,) = _unpack(f"{order}I", data, 4)
+    (count,) = _unpack(f"{order}H", data, at)
+    tags = {}
+    for number in range(count):
+        tag, kind, length = _unpack(f"{order}HHI", data, at + 2 + 12 * number)
+        if length == 1 and kind in (3, 4):
+            tags[tag] = _unpack(f"{order}{'H' if kind == 3 else 'I'}", data, at + 10 + 12 * number)[0]
+    if _WIDTH_TAG in tags and _HEIGHT_TAG not in tags:
+        raise ValueError("no height")
+    return tags
+
+
+@contextmanager
+def _complaints() -> Iterator[list[str]]:
+    """Collect the lines that C libraries print on stderr; those that report no damage are printed after."""
+    complaints: list[str] = []
+    sys.stderr.flush()
+    try:
+        stderr = os.dup(2)
+    except OSError:  # no stderr at all
+        yield complaints
+        return
+    with tempfile.TemporaryFile() as printed:
+        os.dup2(printed.fileno(), 2)
+        try:
+            yield complaints
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+            printed.seek(0)
+            for line in printed.read(1 << 20).decode("utf-8", "replace").splitlines():
+                complaints.append(line)
+                if not _DAMAGE.search(line):
+                    print(line, file=sys.stderr)

@@ -1,0 +1,242 @@
+"""Poses over time: their text files, the order and unit of their stamps, and the pose at any time.
+
+Trajectories are files in the format of the TUM RGB-D benchmark, ``timestamp tx ty tz qx qy qz qw`` per line;
+``timestamp filename`` lines list the images of a camera. ``#`` begins a comment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from v2hdm.errors import DriveError
+from v2hdm.geometry.rigid import quaternion_from_rotation, rotation_from_quaternion, slerp
+from v2hdm.records import BoolArray, FloatArray, GeodeticOrigin, IntArray, Trajectory
+from v2hdm.store.files import read_text, replace_text
+
+UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}  # and how many of each make a second
+
+_COLUMNS = "timestamp tx ty tz qx qy qz qw"
+_NORM_TOLERANCE = 1e-3  # files with four decimals pass, a forgotten component does not
+_FARTHEST_M = 1e8  # coordinates on the earth end at ten thousand kilometres
+_FARTHEST_FROM_ORIGIN_M = 1e5  # a map is flat, and there the ground is 800 m below it
+_LATE_S = 1.0  # a reading that comes later than this after its successor is of another clock or recording
+
+_UNITS: Mapping[str, float] = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
+_LONGEST_S, _QUICKEST_S = 5.0, 5e-4  # limits of the time between two poses, or images, of a drive
+_ALIKE = 5.0  # poses and images of one drive last equally long to within this factor
+_LATEST_S = 1e11  # stamps in s since 1970 stay below this for three thousand years
+
+
+def pose_matrices(rotation: FloatArray, points: FloatArray) -> FloatArray:
+    """Poses (N, 4, 4) of rotations (N, 3, 3) and positions (N, 3)."""
+    poses = np.tile(np.eye(4), (len(points), 1, 1))
+    poses[:, :3, :3] = rotation
+    poses[:, :3, 3] = points
+    return poses
+
+
+def interpolate(
+    trajectory: Trajectory, stamp_s: FloatArray, max_gap_s: float
+) -> tuple[FloatArray, BoolArray]:
+    """The poses at ``stamp_s`` (N,): position linear, rotation by slerp, never extrapolated.
+
+    Returns ``map_from_vehicle`` (N, 4, 4) and flags (N,). A flag is False, and the pose the nearest recorded
+    one, before the first pose, after the last, and in a gap longer than ``max_gap_s``; the time of a recorded
+    pose itself is never in a gap.
+    """
+    recorded = trajectory.stamp_s
+    stamp_s = np.asarray(stamp_s, dtype=np.float64)
+    after = np.clip(np.searchsorted(recorded, stamp_s, side="left"), 0, len(recorded) - 1)
+    before = np.where(recorded[after] == stamp_s, after, np.maximum(after - 1, 0))
+    span_s = recorded[after] - recorded[before]
+    inside = (stamp_s >= recorded[0]) & (stamp_s <= recorded[-1]) & (span_s <= max_gap_s)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        linear = np.where(span_s > 0, (stamp_s - recorded[before]) / span_s, 0.0)
+    fraction = np.clip(np.where(inside, linear, np.round(linear)), 0.0, 1.0)
+
+    first, second = trajectory.map_from_vehicle[before], trajectory.map_from_vehicle[after]
+    points = first[:, :3, 3] + fraction[:, None] * (second[:, :3, 3] - first[:, :3, 3])
+    begin, end = (quaternion_from_rotation(poses[:, :3, :3]) for poses in (first, second))
+    return pose_matrices(rotation_from_quaternion(slerp(begin, end, fraction)), points), inside
+
+
+def check_trajectory(trajectory: Trajectory, origin: GeodeticOrigin | None, where: str) -> None:
+    """Refuse poses off the earth, or far from the map's ``origin`` on it."""
+    farthest_m = float(np.abs(trajectory.map_from_vehicle[:, :3, 3]).max())
+    if not farthest_m <= _FARTHEST_M:
+        raise DriveError(
+            f"{where}: a position is {farthest_m:.3g} m from zero, off the earth; mend the poses"
+        )
+    if origin is not None and farthest_m > _FARTHEST_FROM_ORIGIN_M:
+        raise DriveError(
+            f"{where}: the poses lie {farthest_m / 1e3:.0f} km from the map's origin, which is at latitude "
+            f"{origin.latitude_deg:.4f}, longitude {origin.longitude_deg:.4f}: are they coordinates of a "
+            "grid such as UTM? Then say so under poses with crs, or give the origin that they count from"
+        )
+
+
+def check_geodetic(geodetic: FloatArray, where: str) -> None:
+    """Refuse latitudes, longitudes (degrees) and heights (m) (N, 3) that are not near the ground."""
+    off = (np.abs(geodetic) > [90.0, 180.0, 1e5]).any(axis=1)
+    if off.any():
+        row = int(np.argmax(off))
+        latitude, longitude, height_m = geodetic[row]
+        raise DriveError(
+            f"{where}: position {row + 1}: latitude {latitude:g}, longitude {longitude:g}, height "
+            f"{height_m:g} m: latitude must lie within +-90 and longitude within +-180 degrees; mend them"
+        )
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read the trajectory at ``path``: stamps in s, strictly rising, and poses ``map_from_vehicle`` in m."""
+    rows: dict[int, list[float]] = {}
+    for number, line in _content_lines(path):
+        where, parts = f"{path}: line {number}", line.replace(",", " ").split()
+        if len(parts) != 8:
+            raise DriveError(f"{where}: expected 8 columns '{_COLUMNS}', got {len(parts)}; mend that line")
+        rows[number] = [_parse_float(part, where) for part in parts]
+    if not rows:
+        raise DriveError(f"{path}: holds no pose; expected lines '{_COLUMNS}'")
+    numbers, table = list(rows), np.array(list(rows.values()))
+    _check_rising(table[:, 0], numbers, path)
+    norm = np.linalg.norm(table[:, 4:], axis=1)
+    wrong = np.flatnonzero(np.abs(norm - 1.0) > _NORM_TOLERANCE)
+    if len(wrong):
+        raise DriveError(
+            f"{path}: line {numbers[wrong[0]]}: quaternion of norm {norm[wrong[0]]:.6g} instead of 1; "
+            f"normalise it, order qx qy qz qw"
+        )
+    return Trajectory(
+        table[:, 0], pose_matrices(rotation_from_quaternion(table[:, 4:] / norm[:, None]), table[:, 1:4])
+    )
+
+
+def write_tum(trajectory: Trajectory, path: Path) -> None:
+    """Write ``trajectory`` to ``path`` with nanoseconds and nanometres, atomically."""
+    poses = trajectory.map_from_vehicle
+    quaternion = quaternion_from_rotation(poses[:, :3, :3])
+    lines = [f"# {_COLUMNS}"]
+    for stamp_s, position, xyzw in zip(trajectory.stamp_s, poses[:, :3, 3], quaternion, strict=True):
+        values = " ".join([*(f"{value:.9f}" for value in position), *(f"{value:.12f}" for value in xyzw)])
+        lines.append(f"{stamp_s:.9f} {values}")
+    replace_text(path, "\n".join(lines) + "\n")
+
+
+def read_image_list(path: Path) -> tuple[FloatArray, list[str]]:
+    """Read ``timestamp filename`` lines: stamps (N,) in s, strictly rising, and the file names."""
+    stamps: dict[int, float] = {}
+    names: list[str] = []
+    for number, line in _content_lines(path):
+        where, parts = f"{path}: line {number}", line.split(maxsplit=1)
+        if len(parts) != 2:
+            raise DriveError(f"{where}: expected 'timestamp filename', got '{line}'; mend that line")
+        stamps[number] = _parse_float(parts[0], where)
+        names.append(parts[1])
+    if not names:
+        raise DriveError(f"{path}: lists no image; expected lines 'timestamp filename'")
+    stamp_s = np.array(list(stamps.values()))
+    _check_rising(stamp_s, list(stamps), path)
+    return stamp_s, names
+
+
+def write_image_list(stamp_s: FloatArray, names: Sequence[str], path: Path) -> None:
+    """Write ``timestamp filename`` lines with nanoseconds, atomically."""
+    lines = [f"{stamp:.9f} {name}" for stamp, name in zip(stamp_s, names, strict=True)]
+    replace_text(path, "\n".join(["# timestamp filename", *lines]) + "\n")
+
+
+def _content_lines(path: Path) -> Iterator[tuple[int, str]]:
+    for number, raw in enumerate(read_text(path, DriveError).splitlines(), start=1):
+        line = raw.strip()
+        if line and not line.startswith("#"):
+            yield number, line
+
+
+def _parse_float(text: str, where: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise DriveError(f"{where}: '{text}' is not a number; mend that line") from None
+    if not np.isfinite(value):
+        raise DriveError(f"{where}: '{text}' is not a finite number; drop or mend that line")
+    return value
+
+
+def _check_rising(stamp_s: FloatArray, numbers: Sequence[int], path: Path) -> None:
+    wrong = np.flatnonzero(np.diff(stamp_s) <= 0)
+    if len(wrong):
+        k = int(wrong[0])
+        problem = "repeats" if stamp_s[k + 1] == stamp_s[k] else "is earlier than"
+        raise DriveError(
+            f"{path}: line {numbers[k + 1]}: time {stamp_s[k + 1]:.9f} {problem} that of line {numbers[k]}; "
+            "sort the lines by time and drop repeats"
+        )
+
+
+def in_order(stamp_s: FloatArray, where: str, what: str = "line") -> IntArray:
+    """Rows (K,) by time, the first of equal times; refuses stamps a second or more behind an earlier one.
+
+    Recorders and networks swap neighbours; a longer way back in time is a second clock or recording.
+    """
+    if not len(stamp_s):
+        raise DriveError(f"{where}: holds no pose; record some, or check what it is")
+    if not np.isfinite(stamp_s).all():
+        raise DriveError(
+            f"{where}: {what} {int(np.argmin(np.isfinite(stamp_s))) + 1}: its time is not finite"
+        )
+    late_s = np.maximum.accumulate(stamp_s) - stamp_s
+    if late_s.max() >= _LATE_S:
+        k = int(np.argmax(late_s >= _LATE_S))
+        raise DriveError(
+            f"{where}: {what} {k + 1}: its time {stamp_s[k]:.3f} s is {late_s[k]:.3f} s before that of an "
+            "earlier one: two clocks or two recordings in one; keep one of them"
+        )
+    return np.unique(stamp_s, return_index=True)[1]
+
+
+def why_no_pose(
+    image_stamp_s: FloatArray,
+    pose_stamp_s: FloatArray,
+    max_gap_s: float,
+    asking: str = "images",
+    asked: str = "poses",
+) -> str:
+    """The likely cause, and its remedy, why no image (N,) finds a pose (P,): units, epochs, or gaps.
+
+    ``asking`` and ``asked`` are the words for images and poses.
+    """
+    images, poses = unit_of(image_stamp_s), unit_of(pose_stamp_s)
+    if unit := images or poses:
+        whose = "all stamps" if images == poses else f"the {asking if images else asked}' stamps"
+        return f"{whose} are in {unit}: divide them by {_UNITS[unit]:g} to give seconds"
+    for unit, scale in _UNITS.items():
+        ratio = np.ptp(image_stamp_s) / max(np.ptp(pose_stamp_s), 1e-9)
+        for longer, size in ((asking, ratio), (asked, 1 / max(ratio, 1e-12))):
+            if scale / _ALIKE < size < scale * _ALIKE:
+                return f"the {longer}' stamps are in {unit}: divide them by {scale:g} to give seconds"
+    if image_stamp_s[-1] < pose_stamp_s[0] or image_stamp_s[0] > pose_stamp_s[-1]:
+        offset_s = float(pose_stamp_s[0] - image_stamp_s[0])
+        when = "later" if offset_s > 0 else "earlier"
+        return (
+            f"the {asked} begin {abs(offset_s):.0f} s {when} than the {asking}: one of them is of another "
+            "drive, or counts from another epoch (GPS time, time since start); put both on one clock"
+        )
+    apart_s = float(np.median(np.diff(pose_stamp_s))) if len(pose_stamp_s) > 1 else np.inf
+    return (
+        f"the {asked} are {apart_s:.3g} s apart, more than max_gap_s {max_gap_s:g}: record more of them, "
+        "or set drive.max_gap_s where the vehicle drives that evenly"
+    )
+
+
+def unit_of(stamp_s: FloatArray) -> str | None:
+    """The unit of stamps (N,) that cannot be seconds, None where they can."""
+    apart = float(np.median(np.diff(stamp_s))) if len(stamp_s) > 1 else 0.0
+    if apart <= _LONGEST_S and stamp_s[-1] < _LATEST_S:
+        return None
+    for unit, scale in _UNITS.items():
+        if _QUICKEST_S <= apart / scale <= 1.0 and stamp_s[-1] / scale < _LATEST_S:
+            return unit
+    return None
