@@ -39,8 +39,8 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.fleet.cluster import LOCAL, cluster
 from v2hdm.fleet.crew import RayCrew
-from v2hdm.fleet.eyes import Eyes, detect_by
 from v2hdm.fleet.parts import RayTeam
+from v2hdm.fleet.workers import Eyes, detect_by
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.pipeline.config import DriveConfig, RunConfig

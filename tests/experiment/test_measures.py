@@ -10,8 +10,7 @@ import pytest
 
 from tests.experiment.scene import CALIBRATED, ESTIMATED, TRUE, experiment, plain_map, record
 from v2hdm.experiment.measures import Measured, measure
-from v2hdm.experiment.tables import write_tables
-from v2hdm.experiment.words import claims, words
+from v2hdm.experiment.summary import claims, words, write_tables
 
 
 def two_ports(opt_m: float = 0.01) -> list[Measured]:

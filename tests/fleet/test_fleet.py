@@ -24,13 +24,11 @@ from v2hdm.detection.batch import detect_all, with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError, DriveError, WorkerError
-from v2hdm.fleet.board import Board
-from v2hdm.fleet.eyes import Eyes, detect_by, open_eyes
-from v2hdm.fleet.gpus import EYES_A_GPU, Shares
+from v2hdm.fleet.cluster import EYES_A_GPU, Shares
 from v2hdm.fleet.plan import plan, plan_site
-from v2hdm.fleet.rows import Row, exit_code
 from v2hdm.fleet.run import FleetOptions, run_fleet
-from v2hdm.fleet.work import map_drive
+from v2hdm.fleet.table import Row, exit_code
+from v2hdm.fleet.workers import Board, Eyes, detect_by, map_drive, open_eyes
 from v2hdm.io.drive import read_drive
 from v2hdm.pipeline import RunConfig
 from v2hdm.records import ImageDetections
@@ -63,7 +61,7 @@ def found_by(eyes: list[Any], drive: Path, **settings: Any) -> str:
 def test_actors_find_what_processes_find_also_when_one_is_killed(
     ray: Any, drive: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("v2hdm.fleet.eyes.IMAGES_A_BATCH", 2)
+    monkeypatch.setattr("v2hdm.fleet.workers.IMAGES_A_BATCH", 2)
     eyes = eyes_of(ray, 2, max_restarts=-1, max_task_retries=3)
     killed = ray.get(eyes[0].process.remote())
     expected = repr(detect_all(read_drive(drive), DetectorOptions()))
@@ -110,7 +108,7 @@ def test_actors_share_a_gpu(ray: Any, drive: Path, monkeypatch: pytest.MonkeyPat
             ids: list[Any] = ray.get_gpu_ids()
             return ids
 
-    monkeypatch.setattr("v2hdm.fleet.eyes.Eyes", OnGpu)
+    monkeypatch.setattr("v2hdm.fleet.workers.Eyes", OnGpu)
     cuda = RunConfig(detector=DetectorOptions(device="cuda"))
     shares = Shares.of([cuda])
     eyes = open_eyes({"cuda"}, 2, 1, shares.eyes, str(Path.cwd()), 0)["cuda"]
@@ -197,7 +195,7 @@ def test_a_fleet_outlives_its_workers_keeps_what_is_finished_and_goes_on_past_wh
         return map_drive(*arguments)
 
     monkeypatch.setattr("v2hdm.fleet.run.cluster", here)
-    monkeypatch.setattr("v2hdm.fleet.work.map_drive", dies_once)
+    monkeypatch.setattr("v2hdm.fleet.workers.map_drive", dies_once)
     good, nowhere = written(tmp_path, "good", drive), written(tmp_path, "nowhere", tmp_path / "absent")
     typo = written(tmp_path, "typo", drive)
     typo.write_text(typo.read_text() + "mapping: {max_rang_m: 3}\n")

@@ -15,8 +15,7 @@ from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import distort_points
 from v2hdm.mosaic import blend as module
 from v2hdm.mosaic.blend import WARP_ERROR_PX, Tiling, whole
-from v2hdm.mosaic.canvas import Canvas
-from v2hdm.mosaic.shots import FEATHER, Lens, Shot, adjusted_shots, lens_of, recorded_shots
+from v2hdm.mosaic.shots import FEATHER, Canvas, Lens, Shot, adjusted_shots, lens_of, recorded_shots
 from v2hdm.records import Calibration, Drive
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from v2hdm.mosaic.canvas import Canvas
 from v2hdm.mosaic.sharpness import edge_widths_m, measure_edges, paint_sides
+from v2hdm.mosaic.shots import Canvas
 from v2hdm.records import HdMap, Marking
 
 CANVAS = Canvas(np.array([0.0, 6.0]), 0.02, 300, 300)

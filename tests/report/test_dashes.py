@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from v2hdm.records import LANE_DASH, HdMap, Marking
-from v2hdm.report.dashes import dash_spacing
+from v2hdm.report.metrics import dash_spacing
 
 
 def dash(along_m: float, across_m: float, heading_rad: float = 0.7) -> Marking:

@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.report.scene import diamond_at, make_truth
 from v2hdm.records import DIAMOND, LANE_DASH, HdMap, Lane, Marking
-from v2hdm.report.lane_metrics import lane_metrics
-from v2hdm.report.metrics import corner_errors, driven_past, extrinsic_metrics, marking_metrics
+from v2hdm.report.metrics import corner_errors, driven_past, extrinsic_metrics, lane_metrics, marking_metrics
 
 
 def test_only_the_marking_inside_the_region_of_interest_counts_as_driven_past() -> None:

@@ -7,8 +7,7 @@ from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic, project_gro
 from v2hdm.geometry.lens import distort_points
 from v2hdm.io.drive.trajectory import interpolate
 from v2hdm.records import DIAMOND, LANE_DASH, CameraInfo
-from v2hdm.simulate.port.build import Port, build_port
-from v2hdm.simulate.port.calibration import calibrate, cam_from_vehicle, camera_info
+from v2hdm.simulate.port.build import Port, build_port, calibrate, cam_from_vehicle, camera_info
 from v2hdm.simulate.port.config import (
     CalibrationConfig,
     DisturbanceConfig,
@@ -16,10 +15,9 @@ from v2hdm.simulate.port.config import (
     PortConfig,
     RouteConfig,
 )
-from v2hdm.simulate.port.disturbance import correlated_noise, drive_along, pose_noise
-from v2hdm.simulate.port.layout import build_layout
-from v2hdm.simulate.port.route import build_route
-from v2hdm.simulate.port.visibility import hidden_by, inside_image, points_seen
+from v2hdm.simulate.port.drive import hidden_by, inside_image, points_seen
+from v2hdm.simulate.port.paint import build_layout
+from v2hdm.simulate.port.route import build_route, correlated_noise, drive_along, pose_noise
 from v2hdm.simulate.render.renderer import Renderer
 from v2hdm.simulate.render.scene import Box, Ground, Scene
 

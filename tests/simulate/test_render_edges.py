@@ -5,8 +5,7 @@ import pytest
 
 from v2hdm.geometry.lens import distort_points
 from v2hdm.records import DIAMOND, CameraInfo
-from v2hdm.simulate.render.optics import Motion, Optics
-from v2hdm.simulate.render.renderer import Rendered, render
+from v2hdm.simulate.render.renderer import Motion, Optics, Rendered, render
 from v2hdm.simulate.render.scene import Box, Ground, Light, Paint, Scene
 from v2hdm.simulate.render.view import camera_rays
 

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from v2hdm.fleet.cluster import LOCAL, RETRIES, cluster
-from v2hdm.fleet.gpus import NO_GPU, Shares, wants_gpu
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from rich.text import Text
+
+from v2hdm.fleet.cluster import LOCAL, NO_GPU, RETRIES, Shares, cluster, wants_gpu
 from v2hdm.fleet.plan import Job, plan, plan_site
-from v2hdm.fleet.rows import Row, as_csv, as_json
+from v2hdm.fleet.table import ERROR, Row, as_csv, as_json
+from v2hdm.progress import progress_lines
 from v2hdm.store.objects.bucket import place_of
 from v2hdm.store.objects.results import GrowingObjects, growing_objects
 from v2hdm.store.outputs import GrowingFolder, growing_folder
@@ -105,9 +110,7 @@ class _Table:
 
 def _map_all(ray: Any, todo: Sequence[Job], table: _Table, tell: Tell) -> None:
     """Map the drives, as many at a time as there are cores."""
-    from v2hdm.fleet.board import Board
-    from v2hdm.fleet.eyes import open_eyes
-    from v2hdm.fleet.work import map_drive
+    from v2hdm.fleet.workers import Board, map_drive, open_eyes
 
     cores, gpus = (int(ray.cluster_resources().get(kind, 0)) for kind in ("CPU", "GPU"))
     cores, here = max(cores, 1), str(Path.cwd())
@@ -151,3 +154,59 @@ def _outcome(ray: Any, reference: Any, job: Job) -> tuple[Row, str]:
         )
         return Row.of_error(job.name, job.source, line), str(error)
     return outcome
+
+
+_STYLES = {"PASS": "bold green", "WARN": "bold yellow", "FAIL": "bold red", ERROR: "bold red"}
+
+
+def fleet_on_terminal(files: Sequence[Path], overrides: Sequence[str], options: FleetOptions) -> list[Row]:
+    """Map a fleet, show how far it is, and its table."""
+    console = Console()
+    with _view(console) as tell:
+        rows = run_fleet(files, overrides, options, tell)
+    console.print(_table(rows))
+    for row in rows:
+        if row.says:
+            console.print(f"{row.drive}: {row.says}", highlight=False, markup=False, soft_wrap=True)
+    console.print(f"table in {options.folder}: fleet.csv, fleet.json", highlight=False, soft_wrap=True)
+    return rows
+
+
+def _table(rows: Sequence[Row]) -> Table:
+    table = Table(header_style="bold")
+    for name in ("drive", "verdict", "images", "markings", "minutes"):
+        table.add_column(name, justify="left" if name in ("drive", "verdict") else "right")
+    for row in rows:
+        numbers = ["" if one is None else str(one) for one in (row.images, row.markings)]
+        minutes = "kept" if row.kept else "" if row.minutes is None else f"{row.minutes:.1f}"
+        table.add_row(Text(row.drive), Text(row.status, _STYLES.get(row.status, "")), *numbers, minutes)
+    return table
+
+
+@contextmanager
+def _view(console: Console) -> Iterator[Tell]:
+    """A bar for the fleet and one for each drive in work; without a terminal lines, now and then."""
+    if not console.is_terminal:
+        lines = progress_lines(lambda text: console.print(text, highlight=False, markup=False))
+        yield lambda drive, stage, done, total: lines(f"{drive}: {stage}", done, total)
+        return
+    columns = (
+        TextColumn("{task.description:<20}", markup=False),
+        TextColumn("{task.fields[stage]:<12}", markup=False),
+        BarColumn(30),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def advance(drive: str, stage: str, done: int, total: int) -> None:
+            if stage in _STYLES:  # its verdict: it is done
+                if drive in tasks:
+                    bars.remove_task(tasks.pop(drive))
+                return
+            if drive not in tasks:
+                tasks[drive] = bars.add_task(drive, total=total, stage=stage)
+            bars.update(tasks[drive], completed=done, total=total, stage="" if drive == ALL else stage)
+
+        yield advance

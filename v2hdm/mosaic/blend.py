@@ -27,8 +27,7 @@ from v2hdm.detection.image_file import read_bgr
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.tensors import distort_points
-from v2hdm.mosaic.canvas import Canvas
-from v2hdm.mosaic.shots import Lens, Shot
+from v2hdm.mosaic.shots import Canvas, Lens, Shot
 from v2hdm.records import FloatArray
 
 TILES_PX = (128, 64, 32, 16)

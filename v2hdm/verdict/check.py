@@ -18,9 +18,9 @@ from v2hdm.ground import GroundEstimate
 from v2hdm.ground.rig import estimate_cameras
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.records import Drive, FloatArray, Trajectory
-from v2hdm.report.camera_grid import save_grid
+from v2hdm.report.figures import save_route
 from v2hdm.report.outputs import result_folder, write_json
-from v2hdm.report.route import save_route
+from v2hdm.report.photos import save_grid
 from v2hdm.settings import check_workers
 from v2hdm.verdict import Status, Verdict, check_drive
 

@@ -20,11 +20,9 @@ from v2hdm.records import DIAMOND, Drive, Marking
 from v2hdm.report.__main__ import main
 from v2hdm.report.outputs import write_json
 from v2hdm.report.page import pictures
-from v2hdm.report.page.document import Document, document
-from v2hdm.report.page.facts import read_facts
+from v2hdm.report.page.document import Document, document, write_page
+from v2hdm.report.page.facts import ground_residuals, read_facts
 from v2hdm.report.page.layers import ellipses
-from v2hdm.report.page.sightings import ground_residuals
-from v2hdm.report.page.write import write_page
 
 
 @pytest.fixture(scope="module")
@@ -192,7 +190,7 @@ def test_check_points_of_the_folder_are_told_in_centimetres_and_shown_on_the_map
 def test_a_mosaic_of_the_folder_is_a_layer_within_its_budget(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from v2hdm.report.page import ground
+    from v2hdm.report.page import layers as ground
 
     drive = make_result(tmp_path)
     random = np.random.default_rng(0).integers(0, 255, (600, 800, 4), dtype=np.uint8)

@@ -7,9 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from v2hdm.experiment.figures.cameras import save_calibration, save_fields
-from v2hdm.experiment.figures.errors import save_balance, save_boxes, save_growth, save_ranges
-from v2hdm.experiment.figures.site import save_map, save_shift
+from v2hdm.experiment.figures.curves import save_balance, save_boxes, save_growth, save_ranges
+from v2hdm.experiment.figures.site import save_calibration, save_fields, save_map, save_shift
 from v2hdm.experiment.measures import Measured
 from v2hdm.experiment.plan import Job
 

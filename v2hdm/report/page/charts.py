@@ -15,8 +15,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
 from v2hdm.records import FloatArray, HdMap
-from v2hdm.report.page.facts import Route
-from v2hdm.report.page.sightings import GroundResiduals
+from v2hdm.report.page.facts import GroundResiduals, Route
 from v2hdm.report.style import OKABE_ITO
 
 INK, MUTED, GRID, PAPER = "#1b1e21", "#5c646b", "#dde1e5", "#fdfdfd"

@@ -1,21 +1,24 @@
-"""The whole page as one document: what the templates fill in, and nothing that they have to compute."""
+"""From a result folder to its ``report.html``: one file with everything in it."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
+import jinja2
 import numpy as np
 
+from v2hdm.records import Drive
 from v2hdm.report.page import charts, tables
-from v2hdm.report.page.cameras import CameraPage, camera_pages
-from v2hdm.report.page.cells import Figure, Table, in_words, pair_table
-from v2hdm.report.page.facts import Facts
-from v2hdm.report.page.ground import GroundPage, ground_page
-from v2hdm.report.page.layers import layers
+from v2hdm.report.page.facts import Facts, GroundResiduals, ground_residuals, read_facts
+from v2hdm.report.page.layers import GroundPage, ground_page, layers
 from v2hdm.report.page.pictures import overlays, pictures
-from v2hdm.report.page.sightings import GroundResiduals, ground_residuals
+from v2hdm.report.page.tables import CameraPage, Figure, Table, camera_pages, in_words, pair_table
+from v2hdm.store.files import replace_text
 
 _SAYS = {
     "PASS": "Every check is within its limit. Map and calibrations can be relied on as stated below.",
@@ -249,3 +252,51 @@ def _missing(facts: Facts) -> tuple[str, ...]:
             "The folder has no residuals.csv (an older run): no residuals, no pictures. Map it again."
         )
     return tuple(found)
+
+
+FILE = "report.html"
+"""Name of the page in a result folder."""
+
+_ASSETS = {
+    "leaflet.js": "vendor",
+    "leaflet.css": "vendor",
+    "page.css": "templates",
+    "map.js": "templates",
+}
+"""Scripts and styles that stand in the page as they are, by the folder that holds them."""
+
+
+def write_page(folder: Path, drive: Drive | None) -> Path:
+    """Write ``report.html`` into a result folder, atomically, and return its path.
+
+    Args:
+        folder: what :mod:`v2hdm.map` wrote.
+        drive: that was mapped, for pictures, the recorded route and truth; None where it is not at hand.
+
+    Raises:
+        MapFileError: the folder is no result, or a file in it is damaged.
+        DriveError: an image or the truth of the drive is damaged.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("v2hdm.report.page"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    here = files("v2hdm.report.page")
+    page = document(read_facts(folder, drive))
+    text = environment.get_template("page.html").render(
+        page=page,
+        assets={name: (here / where / name).read_text(encoding="utf-8") for name, where in _ASSETS.items()},
+        map_json=_json(page.map_data),
+        pictures_json=_json(page.pictures),
+    )
+    replace_text(folder / FILE, text)
+    return folder / FILE
+
+
+def _json(content: object) -> str:
+    """JSON that may stand in a script element: nothing in it ends the element or begins a comment."""
+    text = json.dumps(content, allow_nan=False, separators=(",", ":"))
+    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")

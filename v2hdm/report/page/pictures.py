@@ -13,10 +13,8 @@ from v2hdm.detection.batch import read_image
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.records import Drive, FloatArray, Image
-from v2hdm.report.page.coding import jpeg
-from v2hdm.report.page.facts import Facts
-from v2hdm.report.page.layers import excluded_key, marking_key, symbol_key
-from v2hdm.report.page.sightings import cams_from_map
+from v2hdm.report.page.facts import Facts, cams_from_map
+from v2hdm.report.page.layers import excluded_key, jpeg, marking_key, symbol_key
 
 BUDGET_BYTES = 8_000_000
 """Of all pictures together, as text in the page: a report stays below 15 MB."""

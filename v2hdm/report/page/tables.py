@@ -1,20 +1,93 @@
-"""The report's tables and figures of merit."""
+"""The report's tables, figures of merit and cameras as texts with their units: what the templates set."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 
+from v2hdm.geometry.mounting import angle_sigmas, centre_sigmas, mounting_angles
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import FloatArray, Lane, Marking, Symbol
 from v2hdm.report.metrics import corner_errors, match_markings
-from v2hdm.report.page.cells import Figure, Table, in_words, name_of, number, significant, table
-from v2hdm.report.page.facts import Facts
+from v2hdm.report.page.facts import CameraFacts, Facts
 from v2hdm.report.page.layers import SIGMAS_95, ellipses
-from v2hdm.report.table import METHODS
+from v2hdm.report.terminal import METHODS
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of texts under their headings; ``numeric`` columns are set to the right.
+
+    ``caption`` says what the table shows.
+    """
+
+    caption: str
+    headings: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    numeric: tuple[bool, ...]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One number that a reader asks for: what, how much with its unit, and what it means."""
+
+    name: str
+    value: str
+    unit: str
+    note: str
+
+
+def table(caption: str, headings: Sequence[str], rows: Iterable[Sequence[str]], words: int = 1) -> Table:
+    """A table whose first ``words`` columns are words and whose others are numbers."""
+    return Table(
+        caption, tuple(headings), tuple(tuple(row) for row in rows),
+        tuple(n >= words for n in range(len(headings))),
+    )  # fmt: skip
+
+
+def number(value: object, digits: int, factor: float = 1.0) -> str:
+    """A number as text, a dash where there is none."""
+    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
+        return "–"
+    return f"{factor * value:.{digits}f}".replace("-", "−")
+
+
+def name_of(kind: str) -> str:
+    """A class as people write it."""
+    return kind.replace("_", " ")
+
+
+def in_words(count: int, what: str) -> str:
+    """``1 marking``, ``2 markings``."""
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
+def significant(value: object) -> str:
+    """A number with three digits that count."""
+    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
+        return "–"
+    if value == 0:
+        return "0"
+    digits = max(0, 2 - math.floor(math.log10(abs(value))))
+    return number(value, min(digits, 6))
+
+
+def pair_table(caption: str, content: Mapping[str, Any]) -> Table | None:
+    """Names and values as they stand in ``metrics.json``."""
+    rows = [[name_of(str(key)), _plain(value)] for key, value in content.items()]
+    return Table(caption, ("", ""), tuple(tuple(row) for row in rows), (False, False)) if rows else None
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(_plain(one) for one in value)
+    return significant(value) if isinstance(value, float) else str(value)
+
 
 _LEAST_FOR_SHARE = 20
 """Corners from which a share of them is told."""
@@ -268,3 +341,66 @@ def _median(values: FloatArray) -> float:
 
 def _most(values: FloatArray) -> float:
     return float(np.percentile(values, 95)) if len(values) else math.nan
+
+
+@dataclass(frozen=True)
+class CameraPage:
+    """What the report says of one camera: its words, its table, its picture (JPEG in base64)."""
+
+    name: str
+    words: str
+    lens: str
+    mounting: Table
+    picture: str | None = None
+
+
+def camera_pages(facts: Facts, pictures: Mapping[str, str]) -> tuple[CameraPage, ...]:
+    """One for each camera that was calibrated."""
+    extrinsics = facts.metrics.get("extrinsics") or {}
+    out = []
+    for name, one in facts.cameras.items():
+        found = extrinsics.get(name, {})
+        info = one.calibration.info
+        words = str(found.get("certainty") or "").removeprefix(f"{name}: ")
+        lens = (
+            f"{info.width} × {info.height} px, focal length {info.intrinsic[0, 0]:.0f} px, "
+            f"{name_of(info.distortion_model)}"
+        )
+        out.append(CameraPage(name, words, lens, _mounting(one, found), pictures.get(name)))
+    return tuple(out)
+
+
+def _mounting(one: CameraFacts, found: Mapping[str, Any]) -> Table:
+    calibration = one.calibration
+    matrix, covariance = calibration.cam_from_vehicle, calibration.covariance
+    centre, angles = camera_centre(matrix), np.rad2deg(mounting_angles(matrix))
+    unknown = np.full(3, np.nan)
+    centre_sigma = unknown if covariance is None else centre_sigmas(matrix, covariance)
+    angle_sigma = unknown if covariance is None else np.rad2deg(angle_sigmas(matrix, covariance))
+    rows = [
+        [f"centre {axis}", f"{number(centre[n], 3)} m", f"{number(centre_sigma[n], 1, 1e3)} mm",
+         _change(found.get(f"{key}_change_m"), 1e3, 0, "mm")]
+        for n, (axis, key) in enumerate((("forward", "x"), ("left", "y"), ("up", "z")))
+    ]  # fmt: skip
+    rows += [
+        [axis, f"{number(angles[n], 3)}°", f"{number(angle_sigma[n], 3)}°",
+         _change(found.get(f"{key}_change_deg"), 1.0, 2, "°")]
+        for n, (axis, key) in enumerate((("roll", "roll"), ("pitch, down", "pitch"), ("yaw, left", "yaw")))
+    ]  # fmt: skip
+    if one.clock_offset_s is not None:
+        rows.append([
+            "clock, images later", f"{number(one.clock_offset_s, 1, 1e3)} ms",
+            f"{number(one.clock_sigma_s, 1, 1e3)} ms", "–",
+        ])  # fmt: skip
+    return table(
+        "",
+        ("", "value", "± 1 σ", "changed by"),
+        rows,
+    )
+
+
+def _change(value: object, factor: float, digits: int, unit: str) -> str:
+    if not isinstance(value, int | float):
+        return "–"
+    sign = "+" if value > 0 else ""
+    return f"{sign}{number(value, digits, factor)}{unit if unit == '°' else f' {unit}'}"

@@ -1,21 +1,66 @@
-"""Detection on Ray: batches of images by actors whose model stays loaded."""
+"""The workers of a fleet: actors that detect, tasks that map, and an actor that collects their progress."""
 
 from __future__ import annotations
 
 import os
+import time
+import traceback
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import cv2
 import ray
 from ray.exceptions import RayActorError, RayTaskError
 
+from v2hdm.cli.door import told
 from v2hdm.detection.batch import detect_image
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import DriveError, WorkerError
-from v2hdm.fleet.gpus import EYES_A_GPU
+from v2hdm.fleet.cluster import EYES_A_GPU
+from v2hdm.fleet.plan import Job
+from v2hdm.fleet.table import Row
+from v2hdm.pipeline import RunConfig
+from v2hdm.pipeline.finished import RunResult
+from v2hdm.pipeline.places import in_place
 from v2hdm.records import Drive, ImageDetections
+from v2hdm.store.cache.store import Store
+
+_TELL_EVERY_S = 0.5
+
+
+class Board:
+    """An actor that takes what the drives tell of their progress."""
+
+    def __init__(self) -> None:
+        self._told: dict[tuple[str, str], tuple[int, int]] = {}
+
+    def tell(self, drive: str, stage: str, done: int, total: int) -> None:
+        """Note how far a drive is."""
+        self._told[drive, stage] = done, total
+
+    def take(self) -> list[tuple[str, str, int, int]]:
+        """What has been told since the last call."""
+        told, self._told = self._told, {}
+        return [(*key, *value) for key, value in told.items()]
+
+
+class Telling:
+    """Tells the board how far a drive is, now and then and at the ends of its stages."""
+
+    def __init__(self, board: Any, drive: str) -> None:
+        self._board, self._drive, self._told_s = board, drive, -_TELL_EVERY_S
+
+    def __call__(self, task: str, done: int, total: int) -> None:
+        """``done`` of ``total`` steps of ``task`` are finished."""
+        now_s = time.monotonic()
+        if done < total and now_s - self._told_s < _TELL_EVERY_S:
+            return
+        self._told_s = now_s
+        self._board.tell.remote(self._drive, task, done, total)
+
 
 IMAGES_A_BATCH = 8
 """Images that an actor looks at in one call: seconds of work against a millisecond of Ray's."""
@@ -137,3 +182,40 @@ def _result(reference: Any) -> list[ImageDetections]:
             "fewer --workers, or look at the images"
         ) from None
     return result
+
+
+def map_drive(job: Job, eyes: Sequence[Any], board: Any, folder: str) -> tuple[Row, str]:
+    """Map one drive and write its results; its row, and the traceback where it met a bug of ours.
+
+    Args:
+        job: what to map.
+        eyes: the actors that detect.
+        board: the actor that is told of the progress.
+        folder: where relative paths begin.
+    """
+    os.chdir(folder)
+    job.config.workers = 1
+    try:
+        telling = Telling(board, job.name)
+        mapped = partial(_mapped, job, eyes, telling)
+        result, kept = in_place(job.config, mapped, job.config.resume, telling)
+    except Exception as error:  # a drive that fails is a row, and the others go on
+        line = told(error)
+        if line is not None:
+            return Row.of_error(job.name, job.source, line), ""
+        line = f"a bug of ours, {type(error).__name__}: {error}; its traceback is in the fleet's folder"
+        return Row.of_error(job.name, job.source, line), traceback.format_exc()
+    return Row.of_result(job.name, job.source, result.place, result.metrics, kept), ""
+
+
+def _mapped(job: Job, eyes: Sequence[Any], telling: Telling, config: RunConfig, store: Store) -> RunResult:
+    # They load torch, which a finished result does not need.
+    from v2hdm.fleet.crew import RayCrew
+    from v2hdm.mapping.crew import ALONE, Crew
+    from v2hdm.pipeline.work import map_drives
+
+    crew: Crew = ALONE
+    if len(config.drive.paths) > 1:
+        crew = RayCrew(len(eyes), str(Path.cwd()))
+    detect = partial(detect_by, eyes)
+    return map_drives(config, store, job.config_yaml, telling, detect=detect, crew=crew)

@@ -11,10 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 
-from v2hdm.experiment.figures.look import colour, method_of
+from v2hdm.experiment.figures.site import colour, method_of
 from v2hdm.experiment.measures import Matched, Measured
 from v2hdm.experiment.plan import OURS, PAPER
-from v2hdm.experiment.tables import by_port
+from v2hdm.experiment.summary import by_port
 from v2hdm.mapping.options import INCREMENTAL
 from v2hdm.report import style
 

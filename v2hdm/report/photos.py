@@ -1,10 +1,10 @@
-"""What a mounting says of an image: the horizon, the ground in metres, the region of interest."""
+"""Lines on photographs: ground grids, horizons and the map, visible on paint and asphalt, with a legend."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -14,9 +14,84 @@ from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import Camera, CameraInfo, FloatArray
-from v2hdm.report.drawing import Pen, draw_lines, with_legend
 from v2hdm.report.style import OKABE_ITO
 from v2hdm.store.files import whole_file
+
+_SUBPIXELS = 4
+"""Bits of a pixel's fraction in which OpenCV takes coordinates."""
+
+_LARGEST_PX = 1e4
+"""Farther out nothing is drawn, and OpenCV's integers would overflow."""
+
+_HALO_BGR = (25, 25, 25)
+_STRIP_BGR = (250, 250, 250)
+_TEXT_BGR = (35, 35, 35)
+_FONT = cv2.FONT_HERSHEY_DUPLEX
+
+
+@dataclass(frozen=True)
+class Pen:
+    """How a line is drawn: ``colour`` as #rrggbb; ``dash_px``, length of dash and gap, None for solid."""
+
+    colour: str
+    dash_px: tuple[float, float] | None = None
+    width: int = 2
+
+    @property
+    def bgr(self) -> tuple[int, int, int]:
+        """The colour as OpenCV takes it."""
+        value = int(self.colour[1:], 16)
+        return value & 255, value >> 8 & 255, value >> 16
+
+
+def draw_lines(canvas: np.ndarray, lines: Iterable[FloatArray], pen: Pen) -> None:
+    """Draw polylines (N, 2) px, with a dark edge, so that they are seen on paint and on asphalt."""
+    pieces = [piece for line in lines for piece in (_dashes(line, *pen.dash_px) if pen.dash_px else [line])]
+    fixed = [
+        np.round(np.clip(piece, -_LARGEST_PX, _LARGEST_PX) * (1 << _SUBPIXELS)).astype(np.int32)
+        for piece in pieces
+    ]
+    for colour, width in ((_HALO_BGR, 2 * pen.width), (pen.bgr, pen.width)):
+        cv2.polylines(canvas, fixed, False, colour, width, cv2.LINE_AA, shift=_SUBPIXELS)
+
+
+def _dashes(line: FloatArray, dash_px: float, gap_px: float) -> list[FloatArray]:
+    """The dashes of a polyline: pieces of it that are ``dash_px`` long."""
+    steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    out = []
+    for start in np.arange(0.0, way[-1], dash_px + gap_px):
+        end = min(start + dash_px, way[-1])
+        between = (way > start) & (way < end)
+        ends = np.column_stack([np.interp([start, end], way, line[:, axis]) for axis in (0, 1)])
+        out.append(np.vstack([ends[:1], line[between], ends[1:]]))
+    return out
+
+
+def with_legend(canvas: np.ndarray, entries: Sequence[tuple[Pen | None, str]]) -> np.ndarray:
+    """The picture (H, W, 3) with a strip below it that names each pen; text alone has none."""
+    width = canvas.shape[1]
+    size = float(np.clip(width / 1900, 0.4, 0.75))
+    row_px, sample_px = round(44 * size), round(64 * size)
+    rows: list[list[tuple[Pen | None, str, int]]] = [[]]
+    used = 0
+    for pen, text in entries:
+        needed = (sample_px + 12 if pen else 0) + cv2.getTextSize(text, _FONT, size, 1)[0][0] + 28
+        if rows[-1] and used + needed > width - 16:
+            rows.append([])
+            used = 0
+        rows[-1].append((pen, text, used + 16))
+        used += needed
+    strip = np.full((row_px * len(rows) + 8, width, 3), _STRIP_BGR, np.uint8)
+    for number, row in enumerate(rows):
+        middle = 4 + row_px * number + row_px // 2
+        for pen, text, left in row:
+            if pen is not None:
+                draw_lines(strip, [np.array([[left, middle], [left + sample_px, middle]], float)], pen)
+                left += sample_px + 12
+            cv2.putText(strip, text, (left, middle + round(9 * size)), _FONT, size, _TEXT_BGR, 1, cv2.LINE_AA)
+    return np.vstack([canvas, strip])
+
 
 _FARTHEST_M = 40.0
 """Lines farther along the view lie on top of each other near the horizon."""
@@ -40,7 +115,7 @@ _WORDS: Mapping[str, str] = {"guess": "grid and horizon: the guess", "ground": "
 
 _ROI = Pen("#ffffff")
 
-_FONT, _TEXT_SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.45
+_SMALL_FONT, _TEXT_SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.45
 
 
 def save_grid(
@@ -151,7 +226,7 @@ def _label(
             continue
         u, last_v = pieces[0][0]
         text = f"{'xy'[along]} {mark:g} m"
-        left = -6 - cv2.getTextSize(text, _FONT, _TEXT_SIZE, 1)[0][0] if to_the_left else 6
+        left = -6 - cv2.getTextSize(text, _SMALL_FONT, _TEXT_SIZE, 1)[0][0] if to_the_left else 6
         _write(canvas, text, (int(u) + left, int(last_v) - 4), pen.bgr)
 
 
@@ -161,7 +236,7 @@ def _dense(line: FloatArray) -> FloatArray:
 
 
 def _write(canvas: np.ndarray, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> None:
-    (width, height), below = cv2.getTextSize(text, _FONT, _TEXT_SIZE, 1)
+    (width, height), below = cv2.getTextSize(text, _SMALL_FONT, _TEXT_SIZE, 1)
     corner, opposite = (at[0] - 2, at[1] - height - 2), (at[0] + width + 2, at[1] + below)
     cv2.rectangle(canvas, corner, opposite, (40, 40, 40), cv2.FILLED)
-    cv2.putText(canvas, text, at, _FONT, _TEXT_SIZE, colour, 1, cv2.LINE_AA)
+    cv2.putText(canvas, text, at, _SMALL_FONT, _TEXT_SIZE, colour, 1, cv2.LINE_AA)

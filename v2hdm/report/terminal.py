@@ -1,4 +1,4 @@
-"""The table that ends a run on the terminal."""
+"""Tables and progress bars on the terminal."""
 
 from __future__ import annotations
 
