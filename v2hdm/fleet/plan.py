@@ -1,4 +1,4 @@
-"""What a fleet maps: run files composed, each drive or a whole site with the folder of its result."""
+"""The plan of a fleet: run files composed, each drive or a whole site with the folder of its result."""
 
 from __future__ import annotations
 
@@ -20,12 +20,9 @@ from v2hdm.store.objects.bucket import place_of
 
 @dataclass(frozen=True)
 class Job:
-    """One drive to map, or several of one site together.
+    """One drive to map, or several of one site together; ``source`` is its run file, or those of its drives.
 
-    Attributes:
-        name: of the run.
-        source: its run file, or those of its drives.
-        config, config_yaml: what to do, and as text to be kept beside the results.
+    ``config_yaml`` is the configuration as text, kept beside the results.
     """
 
     name: str
@@ -35,14 +32,14 @@ class Job:
 
     @property
     def place(self) -> str:
-        """What takes the results: a folder, or the URL of one."""
+        """The folder of the results, or its URL."""
         there = place_of(self.config.output, "output=")
         return str((there / self.name).resolve() if isinstance(there, Path) else there.below(self.name))
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What to map, a row for each file that says no drive, and the sources of both in the files' order."""
+    """The jobs, a row for each file that names no drive, and the sources of both in the files' order."""
 
     jobs: list[Job]
     refused: list[Row]
@@ -50,12 +47,7 @@ class Plan:
 
 
 def plan(files: Sequence[Path], overrides: Sequence[str]) -> Plan:
-    """The drives of run files, each by itself.
-
-    Args:
-        files: as ``conf/run/*.yaml`` are written.
-        overrides: ``key=value`` for all of them.
-    """
+    """The drives of run files (as ``conf/run/*.yaml``), each by itself, with ``key=value`` for all of them."""
     jobs: list[Job] = []
     refused: list[Row] = []
     taken: dict[str, Path] = {}
@@ -76,12 +68,7 @@ def plan(files: Sequence[Path], overrides: Sequence[str]) -> Plan:
 
 
 def plan_site(files: Sequence[Path], overrides: Sequence[str], site: str) -> Plan:
-    """All drives of run files as the one site of that name.
-
-    Args:
-        files: as for :func:`plan`; what they say beside their drives and names is the same in all.
-        overrides: ``key=value`` for all of them.
-        site: names the result.
+    """All drives of run files, whose other settings are equal, as the one site of that name.
 
     Raises:
         ConfigError: the site's name cannot be that of a folder.
@@ -109,8 +96,7 @@ def _site_job(files: Sequence[Path], overrides: Sequence[str], site: str, source
         if not config.drive.paths:
             raise ConfigError(f"{file}: --site joins drives that lie in folders; set drive.path")
         _refuse_other_settings(files[0], settings, file, config)
-        told = config.drive.path
-        paths += map(str, told if isinstance(told, list) else [told])
+        paths += map(str, config.drive.path if isinstance(config.drive.path, list) else [config.drive.path])
     OmegaConf.update(first, "name", site)
     OmegaConf.update(first, "drive.path", paths)
     return Job(site, source, to_dataclass(first, RunConfig, f"set it in {files[0]}"), to_yaml(first))
@@ -126,9 +112,9 @@ def _composed(file: Path, overrides: Sequence[str]) -> tuple[DictConfig, RunConf
 
 
 def _refuse_other_settings(first: Path, settings: RunConfig, file: Path, config: RunConfig) -> None:
-    told, other = (dict(_leaves(_without_drive(one))) for one in (settings, config))
-    for key in [*told, *other]:
-        values = [one.get(key) for one in (told, other)]
+    mine, other = (dict(_leaves(_without_drive(one))) for one in (settings, config))
+    for key in [*mine, *other]:
+        values = [one.get(key) for one in (mine, other)]
         if values[0] != values[1]:
             raise ConfigError(
                 f"{file}: {key} is {shown(values[1])}, and {shown(values[0])} in {first}: a site has one "
@@ -141,7 +127,7 @@ def _without_drive(config: RunConfig) -> dict[str, Any]:
 
 
 def _leaves(settings: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
-    """All that settings say, by its dotted key."""
+    """Every setting by its dotted key."""
     for key, value in settings.items():
         if isinstance(value, dict) and value:
             yield from _leaves(value, f"{before}{key}.")

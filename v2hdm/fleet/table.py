@@ -1,4 +1,4 @@
-"""The table of verdicts: a row a drive, in the terminal, as CSV and as JSON."""
+"""The table of verdicts: one row per drive, on the terminal, as CSV and as JSON."""
 
 from __future__ import annotations
 
@@ -9,15 +9,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+from rich.table import Table
+from rich.text import Text
+
 from v2hdm.cli.door import EXIT_FAILED_VERDICT, EXIT_USER_ERROR, one_line
+from v2hdm.report.terminal import new_table
 
 ERROR = "ERROR"
 """Status of a drive of which there is no result."""
 
+STYLES = {"PASS": "bold green", "WARN": "bold yellow", "FAIL": "bold red", ERROR: "bold red"}
+
 
 @dataclass(frozen=True)
 class Row:
-    """What became of one drive.
+    """The outcome of one drive.
 
     Attributes:
         drive: name of the run.
@@ -47,16 +53,19 @@ class Row:
     @classmethod
     def of_result(cls, drive: str, source: str, place: str, metrics: Mapping[str, Any], kept: bool) -> Row:
         """The row of a finished run, from its ``metrics.json``."""
-        verdict = metrics["verdict"]
-        raised = verdict["findings"]
-        says = f"{raised[0]['check']} ({raised[0]['about']}): {raised[0]['says']}" if raised else ""
-        sets = list(metrics["results"].values())
-        markings = int(sets[-1]["Opt"]["markings"]) if sets else None
-        minutes = round(sum(metrics.get("seconds", {}).values()) / 60, 3)
-        images = int(metrics["drive"]["images"])
-        status = str(verdict["status"])
-        where = (place, source)
-        return cls(drive, status, one_line(says), images, markings, minutes, kept, *where)
+        verdict, sets = metrics["verdict"], list(metrics["results"].values())
+        worst = next((f"{one['check']} ({one['about']}): {one['says']}" for one in verdict["findings"]), "")
+        return cls(
+            drive,
+            status=str(verdict["status"]),
+            says=one_line(worst),
+            images=int(metrics["drive"]["images"]),
+            markings=int(sets[-1]["Opt"]["markings"]) if sets else None,
+            minutes=round(sum(metrics.get("seconds", {}).values()) / 60, 3),
+            kept=kept,
+            folder=place,
+            source=source,
+        )
 
 
 def as_csv(rows: Sequence[Row]) -> bytes:
@@ -73,7 +82,17 @@ def as_json(rows: Sequence[Row]) -> bytes:
     return (json.dumps({"drives": [asdict(row) for row in rows]}, indent=2) + "\n").encode()
 
 
+def as_table(rows: Sequence[Row]) -> Table:
+    """The rows for the terminal."""
+    table = new_table(None, ("drive", "verdict"), ("images", "markings", "minutes"))
+    for row in rows:
+        numbers = ["" if one is None else str(one) for one in (row.images, row.markings)]
+        minutes = "kept" if row.kept else "" if row.minutes is None else f"{row.minutes:.1f}"
+        table.add_row(Text(row.drive), Text(row.status, STYLES.get(row.status, "")), *numbers, minutes)
+    return table
+
+
 def exit_code(rows: Sequence[Row]) -> int:
     """2 where a drive gave no result, else 3 where a verdict is FAIL, else 0."""
-    told = {row.status for row in rows}
-    return EXIT_USER_ERROR if ERROR in told else EXIT_FAILED_VERDICT if "FAIL" in told else 0
+    found = {row.status for row in rows}
+    return EXIT_USER_ERROR if ERROR in found else EXIT_FAILED_VERDICT if "FAIL" in found else 0

@@ -19,7 +19,7 @@ from v2hdm.detection.batch import detect_image
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import DriveError, WorkerError
-from v2hdm.fleet.cluster import EYES_A_GPU
+from v2hdm.fleet.cluster import DETECTORS_A_GPU
 from v2hdm.fleet.plan import Job
 from v2hdm.fleet.table import Row
 from v2hdm.pipeline import RunConfig
@@ -28,54 +28,50 @@ from v2hdm.pipeline.places import in_place
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.store.cache.store import Store
 
-_TELL_EVERY_S = 0.5
-
-
-class Board:
-    """An actor that takes what the drives tell of their progress."""
-
-    def __init__(self) -> None:
-        self._told: dict[tuple[str, str], tuple[int, int]] = {}
-
-    def tell(self, drive: str, stage: str, done: int, total: int) -> None:
-        """Note how far a drive is."""
-        self._told[drive, stage] = done, total
-
-    def take(self) -> list[tuple[str, str, int, int]]:
-        """What has been told since the last call."""
-        told, self._told = self._told, {}
-        return [(*key, *value) for key, value in told.items()]
-
-
-class Telling:
-    """Tells the board how far a drive is, now and then and at the ends of its stages."""
-
-    def __init__(self, board: Any, drive: str) -> None:
-        self._board, self._drive, self._told_s = board, drive, -_TELL_EVERY_S
-
-    def __call__(self, task: str, done: int, total: int) -> None:
-        """``done`` of ``total`` steps of ``task`` are finished."""
-        now_s = time.monotonic()
-        if done < total and now_s - self._told_s < _TELL_EVERY_S:
-            return
-        self._told_s = now_s
-        self._board.tell.remote(self._drive, task, done, total)
-
-
 IMAGES_A_BATCH = 8
-"""Images that an actor looks at in one call: seconds of work against a millisecond of Ray's."""
+"""Images that an actor detects in at one call: seconds of work against a millisecond of Ray's."""
 
 _BATCHES_AHEAD = 2
 """Calls that wait at each actor, so that it is never idle between them."""
 
 _DRIVES_KEPT = 4
+_REPORT_EVERY_S = 0.5
 
 
-class Eyes:
-    """An actor that detects: its model stays loaded, and so do the drives that it has seen last."""
+class ProgressActor:
+    """Collects how far the drives are until the head asks."""
+
+    def __init__(self) -> None:
+        self._reported: dict[tuple[str, str], tuple[int, int]] = {}
+
+    def report(self, drive: str, stage: str, done: int, total: int) -> None:
+        """Note how far a drive is."""
+        self._reported[drive, stage] = done, total
+
+    def take(self) -> list[tuple[str, str, int, int]]:
+        """All reports since the last call."""
+        reported, self._reported = self._reported, {}
+        return [(*key, *value) for key, value in reported.items()]
+
+
+class DriveProgress:
+    """Reports one drive to the :class:`ProgressActor`, now and then and at the ends of its stages."""
+
+    def __init__(self, actor: Any, drive: str) -> None:
+        self._actor, self._drive, self._reported_s = actor, drive, -_REPORT_EVERY_S
+
+    def __call__(self, task: str, done: int, total: int) -> None:
+        """``done`` of ``total`` steps of ``task`` are finished."""
+        now_s = time.monotonic()
+        if done == total or now_s - self._reported_s >= _REPORT_EVERY_S:
+            self._reported_s = now_s
+            self._actor.report.remote(self._drive, task, done, total)
+
+
+class DetectorActor:
+    """Detects in images: the model and the last drives stay loaded. Relative paths begin at ``folder``."""
 
     def __init__(self, folder: str) -> None:
-        """``folder`` is where relative paths begin."""
         os.chdir(folder)
         cv2.setNumThreads(1)
         self._detectors: dict[str, Detector] = {}
@@ -88,9 +84,9 @@ class Eyes:
     def detect(
         self, drive: Sequence[Any], options: DetectorOptions, images: Sequence[int]
     ) -> list[ImageDetections]:
-        """What is in some ``images`` of a drive, given by a reference within a list: it is fetched once."""
+        """Detections in some images of a drive, given by a reference within a list: it is fetched once."""
         (reference,) = drive
-        key = reference.hex()
+        key, known = reference.hex(), repr(options)
         if key not in self._drives:
             while len(self._drives) >= _DRIVES_KEPT:
                 self._drives.pop(next(iter(self._drives)))
@@ -101,35 +97,33 @@ class Eyes:
                     f"{root}: is not on {os.uname().nodename}, which is to detect in its images; put drives, "
                     "and local_cache for those that are copied, on a folder that all machines share"
                 )
-        known = repr(options)
         if known not in self._detectors:
             self._detectors = {known: Detector.load(options=options)}
         return [detect_image(self._detectors[known], self._drives[key], index) for index in images]
 
 
-def open_eyes(
+def open_detectors(
     devices: Collection[str], cores: int, gpus: int, gpu_share: float, folder: str, retries: int
 ) -> dict[str, list[Any]]:
     """Actors that detect, for each device that is asked for: one a core, on GPUs some to each.
 
     Args:
         devices: as in :attr:`DetectorOptions.device`.
-        cores: of all machines.
-        gpus: of all machines.
-        gpu_share: of a GPU that an actor there takes on Ray's books.
+        cores, gpus: of all machines.
+        gpu_share: of a GPU that an actor there books.
         folder: where relative paths begin.
         retries: how often a batch is begun anew whose actor died.
     """
     lasting = {"max_restarts": -1, "max_task_retries": retries}
     # A core has one actor that detects and one drive that is mapped: the one waits for the other by turns.
-    # Those on GPUs are counted there.
+    # Actors on GPUs are counted there.
     places = {
         "cpu": (cores, {"num_cpus": 0.5}),
-        "cuda": (min(cores, EYES_A_GPU * gpus), {"num_cpus": 0, "num_gpus": gpu_share}),
+        "cuda": (min(cores, DETECTORS_A_GPU * gpus), {"num_cpus": 0, "num_gpus": gpu_share}),
     }
     return {
         device: [
-            ray.remote(Eyes).options(**lasting, **places[device][1]).remote(folder)
+            ray.remote(DetectorActor).options(**lasting, **places[device][1]).remote(folder)
             for _ in range(places[device][0])
         ]
         for device in devices
@@ -137,24 +131,23 @@ def open_eyes(
 
 
 def detect_by(
-    eyes: Sequence[Any],
+    detectors: Sequence[Any],
     drive: Drive,
     options: DetectorOptions,
     images: Sequence[int],
     workers: int,
     take: Callable[[ImageDetections], None],
 ) -> None:
-    """:func:`v2hdm.detection.batch.detect_images` by actors; what is found is the same.
+    """:func:`v2hdm.detection.batch.detect_images` by actors, with the same detections and errors.
 
     Raises:
-        V2hdmError: as there.
         WorkerError: an actor died again and again.
     """
     reference = ray.put(drive)
     batches = [images[begin : begin + IMAGES_A_BATCH] for begin in range(0, len(images), IMAGES_A_BATCH)]
     found: dict[int, list[ImageDetections]] = {}
     waiting: dict[Any, tuple[int, Any]] = {}
-    free = _BATCHES_AHEAD * list(eyes)
+    free = _BATCHES_AHEAD * list(detectors)
     left, taken = list(enumerate(batches))[::-1], 0
     while left or waiting:
         while left and free:
@@ -184,21 +177,21 @@ def _result(reference: Any) -> list[ImageDetections]:
     return result
 
 
-def map_drive(job: Job, eyes: Sequence[Any], board: Any, folder: str) -> tuple[Row, str]:
+def map_drive(job: Job, detectors: Sequence[Any], progress: Any, folder: str) -> tuple[Row, str]:
     """Map one drive and write its results; its row, and the traceback where it met a bug of ours.
 
     Args:
-        job: what to map.
-        eyes: the actors that detect.
-        board: the actor that is told of the progress.
+        job: the drive.
+        detectors: the actors that detect.
+        progress: the :class:`ProgressActor`.
         folder: where relative paths begin.
     """
     os.chdir(folder)
     job.config.workers = 1
     try:
-        telling = Telling(board, job.name)
-        mapped = partial(_mapped, job, eyes, telling)
-        result, kept = in_place(job.config, mapped, job.config.resume, telling)
+        report = DriveProgress(progress, job.name)
+        mapped = partial(_mapped, job, detectors, report)
+        result, kept = in_place(job.config, mapped, job.config.resume, report)
     except Exception as error:  # a drive that fails is a row, and the others go on
         line = told(error)
         if line is not None:
@@ -208,7 +201,9 @@ def map_drive(job: Job, eyes: Sequence[Any], board: Any, folder: str) -> tuple[R
     return Row.of_result(job.name, job.source, result.place, result.metrics, kept), ""
 
 
-def _mapped(job: Job, eyes: Sequence[Any], telling: Telling, config: RunConfig, store: Store) -> RunResult:
+def _mapped(
+    job: Job, detectors: Sequence[Any], report: DriveProgress, config: RunConfig, store: Store
+) -> RunResult:
     # They load torch, which a finished result does not need.
     from v2hdm.fleet.crew import RayCrew
     from v2hdm.mapping.crew import ALONE, Crew
@@ -216,6 +211,6 @@ def _mapped(job: Job, eyes: Sequence[Any], telling: Telling, config: RunConfig, 
 
     crew: Crew = ALONE
     if len(config.drive.paths) > 1:
-        crew = RayCrew(len(eyes), str(Path.cwd()))
-    detect = partial(detect_by, eyes)
-    return map_drives(config, store, job.config_yaml, telling, detect=detect, crew=crew)
+        crew = RayCrew(len(detectors), str(Path.cwd()))
+    detect = partial(detect_by, detectors)
+    return map_drives(config, store, job.config_yaml, report, detect=detect, crew=crew)

@@ -1,4 +1,4 @@
-"""What surrounds the markings of a port: containers, trucks, posts, shadows, and dirt on the ground."""
+"""The surroundings of a port's markings: containers, trucks, posts, shadows, and dirt on the ground."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from v2hdm.records import FloatArray
 from v2hdm.simulate.port.config import SurfaceConfig, YardConfig
 from v2hdm.simulate.port.route import Route
 from v2hdm.simulate.render.scene import (
+    RECTANGLE,
     Backdrop,
     Bgr,
     Box,
@@ -22,6 +23,7 @@ from v2hdm.simulate.render.scene import (
     Scene,
     Shadow,
     box_footprint,
+    placed,
 )
 
 _CONTAINER_M = (12.19, 2.44, 2.59)
@@ -83,29 +85,27 @@ def build_scene(
 ) -> Scene:
     """A port without its paint."""
     azimuth, elevation = np.deg2rad(yard.sun_azimuth_deg), np.deg2rad(yard.sun_elevation_deg)
-    sun = (np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation))
-    plain = Light()
+    east, north = np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation)
+    blue, green, red = (yard.sun_strength * channel for channel in Light().sun_bgr)
     light = Light(
-        sun_direction_map=(float(sun[0]), float(sun[1]), float(sun[2])),
-        sun_bgr=_scaled(plain.sun_bgr, yard.sun_strength),
+        sun_direction_map=(float(east), float(north), float(np.sin(elevation))), sun_bgr=(blue, green, red)
     )
-    a = surface.albedo
+    a, slab_m = surface.albedo, (surface.slab_m[0], surface.slab_m[1])
     ground = Ground(
         albedo_bgr=(0.95 * a, a, 1.03 * a),
         texture=surface.texture,
         contrast=surface.contrast,
         stains=surface.stains,
-        slab_m=(surface.slab_m[0], surface.slab_m[1]) if min(surface.slab_m) > 0 else None,
+        slab_m=slab_m if min(slab_m) > 0 else None,
         slab_yaw_rad=0.02,
         joint_width_m=surface.joint_width_m,
         wet_fraction=surface.wet_fraction,
         marks=_ground_marks(surface, route, rng),
         seed=seed,
     )
-    boxes = _stacks(yard, route, rng) + _occluders(yard, route, rng)
     return Scene(
         ground=ground,
-        boxes=tuple(boxes),
+        boxes=(*_stacks(yard, route, rng), *_occluders(yard, route, rng)),
         shadows=tuple(_strips(yard, route, rng)),
         light=light,
         backdrop=Backdrop(seed=seed, haze_m=yard.haze_m),
@@ -119,15 +119,13 @@ def moving_trucks(yard: YardConfig, route: Route, rng: np.random.Generator) -> t
         speed = float(rng.uniform(3.0, 6.0))
         meeting_m = route.length_m * (k + rng.uniform(0.3, 0.9)) / yard.moving_trucks
         start = meeting_m * (1 + speed / route.speed_mps)
-        colour = _CONTAINER_COLOURS[int(rng.integers(len(_CONTAINER_COLOURS)))]
-        trucks.append(
-            MovingTruck(float(start), speed, yard.moving_offset_m, colour, int(rng.integers(1 << 20)))
-        )
+        colour, seed = _colour(rng), int(rng.integers(1 << 20))
+        trucks.append(MovingTruck(float(start), speed, yard.moving_offset_m, colour, seed))
     return tuple(trucks)
 
 
-def _scaled(colour: Bgr, factor: float) -> Bgr:
-    return colour[0] * factor, colour[1] * factor, colour[2] * factor
+def _colour(rng: np.random.Generator) -> Bgr:
+    return _CONTAINER_COLOURS[int(rng.integers(len(_CONTAINER_COLOURS)))]
 
 
 def _stacks(yard: YardConfig, route: Route, rng: np.random.Generator) -> list[Box]:
@@ -146,17 +144,10 @@ def _stacks(yard: YardConfig, route: Route, rng: np.random.Generator) -> list[Bo
                 base = Box(centre_map=(float(x), float(y)), size_m=_CONTAINER_M, yaw_rad=yaw)
                 if not filled or not _keeps_clear(base, route, boxes, yard.stack_clearance_m - 0.5):
                     continue
+                base = replace(base, corrugated=True)
                 for level in range(tall):
-                    colour = _CONTAINER_COLOURS[int(colours[level])]
-                    boxes.append(
-                        replace(
-                            base,
-                            base_m=level * height,
-                            albedo_bgr=colour,
-                            corrugated=True,
-                            seed=int(station * 10) + level,
-                        )
-                    )
+                    colour, seed = _CONTAINER_COLOURS[int(colours[level])], int(station * 10) + level
+                    boxes.append(replace(base, base_m=level * height, albedo_bgr=colour, seed=seed))
     return boxes
 
 
@@ -184,8 +175,8 @@ def _occluders(yard: YardConfig, route: Route, rng: np.random.Generator) -> list
         at = np.array([rng.uniform(12.0, route.length_m - 12.0)])
         side = float(rng.choice([-1.0, 1.0]))
         x, y = route.points_at(at, side * rng.uniform(6.3, 7.4))[0]
-        colour = _CONTAINER_COLOURS[int(rng.integers(len(_CONTAINER_COLOURS)))]
-        boxes += _truck((float(x), float(y)), float(route.yaw_at(at)[0]), colour, int(rng.integers(1 << 20)))
+        colour, seed = _colour(rng), int(rng.integers(1 << 20))
+        boxes += _truck((float(x), float(y)), float(route.yaw_at(at)[0]), colour, seed)
     for count, size, offsets, colour in (
         (yard.barriers, (1.3, 0.5, 0.85), (2.6, 5.0), (0.5, 0.5, 0.5)),
         (yard.lamp_posts, (0.22, 0.22, 11.0), (5.9, 8.0), (0.3, 0.3, 0.3)),
@@ -209,7 +200,7 @@ def _strips(yard: YardConfig, route: Route, rng: np.random.Generator) -> list[Sh
         axis = np.array([np.cos(yaw), np.sin(yaw)])
         across = np.array([-axis[1], axis[0]])
         length, width = rng.uniform(8.0, 30.0), rng.choice([0.15, 0.4, 0.9, 2.5])
-        corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (length / 2, width / 2)
+        corners = RECTANGLE * (length / 2, width / 2)
         polygon = centre + corners[:, :1] * axis + corners[:, 1:] * across
         strips.append(Shadow(polygon_map=polygon, softness_m=float(rng.uniform(0.03, 0.2))))
     return strips
@@ -248,9 +239,7 @@ def _patch(dark: NDArray[np.uint8], pixels: _ToPixels, route: Route, rng: np.ran
     centre = route.points_at(at, rng.uniform(-5.0, 5.0))[0]
     yaw = float(route.yaw_at(at)[0])
     size = rng.uniform(0.6, 3.0, 2)
-    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * size
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    polygon = corners @ np.array([[cos, sin], [-sin, cos]]) + centre
+    polygon = placed(RECTANGLE * size, centre, yaw)
     cv2.fillPoly(dark, [pixels(polygon)], int(rng.uniform(6, 26)), cv2.LINE_AA, _SUBPIXEL_BITS)
 
 

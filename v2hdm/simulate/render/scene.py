@@ -18,6 +18,9 @@ Bgr = tuple[float, float, float]
 WHITE_PAINT: Bgr = (0.70, 0.74, 0.75)
 YELLOW_PAINT: Bgr = (0.07, 0.42, 0.62)
 
+RECTANGLE = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
+"""Corners of the square from -1 to 1, counter-clockwise."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class GroundMarks:
@@ -168,12 +171,15 @@ def _turn(a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]) -> f
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
+def placed(shape: FloatArray, centre_map: FloatArray | tuple[float, float], yaw_rad: float) -> FloatArray:
+    """A shape (N, 2) turned by ``yaw_rad`` about its origin, which comes to lie at ``centre_map``."""
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    return np.asarray(shape @ np.array([[cos, sin], [-sin, cos]]) + centre_map)
+
+
 def box_footprint(box: Box) -> FloatArray:
     """The four corners (4, 2) of a box's base in the map, counter-clockwise."""
-    length, width, _ = box.size_m
-    half = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (length / 2, width / 2)
-    cos, sin = np.cos(box.yaw_rad), np.sin(box.yaw_rad)
-    return np.asarray(half @ np.array([[cos, sin], [-sin, cos]]) + box.centre_map)
+    return placed(RECTANGLE * (box.size_m[0] / 2, box.size_m[1] / 2), box.centre_map, box.yaw_rad)
 
 
 def box_shadow(box: Box, light: Light, softness_m: float = 0.08) -> Shadow:
