@@ -94,7 +94,7 @@ def marking_metrics(
         false_markings=len(mapped) - len(rows),
         expected=int(wanted.sum()),
         recall=float(found[wanted].mean()) if wanted.any() else float("nan"),
-        corner_rmse_m=_rms(errors),
+        corner_rmse_m=rms(errors),
         corner_bias_m=float(np.linalg.norm(errors.mean(axis=0))) if len(errors) else float("nan"),
     )
 
@@ -135,7 +135,8 @@ def extrinsic_metrics(cam_from_vehicle: FloatArray, true_cam_from_vehicle: Float
     )
 
 
-def _rms(errors: FloatArray) -> float:
+def rms(errors: FloatArray) -> float:
+    """Root mean square length of vectors (N, 2), nan where there are none."""
     return float(np.sqrt((errors**2).sum(axis=1).mean())) if len(errors) else float("nan")
 
 
@@ -168,7 +169,7 @@ def lane_metrics(lanes: Sequence[Lane], truth: Truth) -> LaneMetrics:
     true_visible = _stack(
         resample(piece)
         for lane, visible in zip(truth.map.lanes, truth.lane_visible, strict=True)
-        for piece in _runs(lane.points_map, visible)
+        for piece in runs(lane.points_map, visible)
     )
     mapped = _stack(resample(lane.points_map) for lane in lanes)
     if not len(mapped) or not len(true_all):
@@ -191,7 +192,7 @@ def resample(points: FloatArray, step_m: float = SAMPLE_STEP_M) -> FloatArray:
     """Points (M, 2) every ``step_m`` along a polyline (N, 2), its first point included."""
     if len(points) < 2:
         return points
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    along = way_along(points)
     at = np.arange(0.0, along[-1] + 1e-9, step_m)
     return np.column_stack([np.interp(at, along, points[:, 0]), np.interp(at, along, points[:, 1])])
 
@@ -217,7 +218,17 @@ def distance_to_points(points: FloatArray, line: FloatArray) -> FloatArray:
     return np.asarray(np.where(joined, lateral, distance[:, 0]))
 
 
-def _runs(points: FloatArray, keep: BoolArray) -> list[FloatArray]:
+def way_along(points: FloatArray) -> FloatArray:
+    """Distance (N,) along a polyline (N, 2) from its first point."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+
+
+def length_m(points: FloatArray) -> float:
+    """Length of a polyline (N, 2)."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def runs(points: FloatArray, keep: BoolArray) -> list[FloatArray]:
     """The maximal stretches of a polyline whose vertices are all kept."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], keep.astype(int), [0]])))
     return [points[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
@@ -346,7 +357,5 @@ def _lane_figures(hd_map: HdMap, truth: Truth | None) -> dict[str, Any]:
         return asdict(lane_metrics(hd_map.lanes, truth))
     return {
         "lanes": len(hd_map.lanes),
-        "length_m": float(
-            sum(np.linalg.norm(np.diff(lane.points_map, axis=0), axis=1).sum() for lane in hd_map.lanes)
-        ),
+        "length_m": float(sum(length_m(lane.points_map) for lane in hd_map.lanes)),
     }

@@ -10,10 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from v2hdm.geometry.ipm import project_ground
+from v2hdm.geometry.ipm import apply_in_front, project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import Camera, CameraInfo, FloatArray
+from v2hdm.records import BoolArray, Camera, CameraInfo, FloatArray, HdMap
+from v2hdm.report.metrics import runs, way_along
 from v2hdm.report.style import OKABE_ITO
 from v2hdm.store.files import whole_file
 
@@ -57,8 +58,7 @@ def draw_lines(canvas: np.ndarray, lines: Iterable[FloatArray], pen: Pen) -> Non
 
 def _dashes(line: FloatArray, dash_px: float, gap_px: float) -> list[FloatArray]:
     """The dashes of a polyline: pieces of it that are ``dash_px`` long."""
-    steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
-    way = np.concatenate([[0.0], np.cumsum(steps)])
+    way = way_along(line)
     out = []
     for start in np.arange(0.0, way[-1], dash_px + gap_px):
         end = min(start + dash_px, way[-1])
@@ -144,9 +144,7 @@ def save_grid(
     legend.append((_ROI, "roi_vehicle, by the guess"))
     for number, (name, cam_from_vehicle) in enumerate(mountings.items()):
         _label(canvas, camera.info, cam_from_vehicle, PENS[name], to_the_left=number == 0)
-    shown = with_legend(canvas, legend)
-    with whole_file(path) as partial:
-        partial.write_bytes(cv2.imencode(path.suffix, shown, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes())
+    _write_image(path, with_legend(canvas, legend), cv2.IMWRITE_JPEG_QUALITY, 88)
 
 
 def project_line(
@@ -154,13 +152,7 @@ def project_line(
 ) -> list[FloatArray]:
     """The pieces (N, 2), recorded px, of a dense ground line (M, 2) that lie in and near the image."""
     pinhole, depth_m = project_ground(info.intrinsic, cam_from_vehicle, line_vehicle)
-    visible = depth_m > _NEAREST_M
-    margin = 0.15 * np.array([info.width, info.height])
-    size = np.array([info.width, info.height])
-    visible &= ((pinhole > -margin) & (pinhole < size + margin)).all(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], visible.astype(int), [0]])))
-    pieces = [pinhole[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
-    return [distort_points(info, piece) for piece in pieces]
+    return _visible_pieces(info, pinhole, depth_m > _NEAREST_M, 0.15)
 
 
 def _axes(cam_from_vehicle: FloatArray) -> tuple[FloatArray, int, float]:
@@ -240,3 +232,67 @@ def _write(canvas: np.ndarray, text: str, at: tuple[int, int], colour: tuple[int
     corner, opposite = (at[0] - 2, at[1] - height - 2), (at[0] + width + 2, at[1] + below)
     cv2.rectangle(canvas, corner, opposite, (40, 40, 40), cv2.FILLED)
     cv2.putText(canvas, text, at, _SMALL_FONT, _TEXT_SIZE, colour, 1, cv2.LINE_AA)
+
+
+_OVERLAY_RANGE_M = 30.0
+
+_BEFORE = Pen(OKABE_ITO["orange"], dash_px=(9.0, 6.0))
+"""How the map is drawn by what a run began with."""
+
+OVERLAY = {"Opt": Pen(OKABE_ITO["sky"])}
+"""How it is drawn by what the run found."""
+
+
+def save_overlay(
+    path: Path,
+    image: np.ndarray,
+    info: CameraInfo,
+    hd_map: HdMap,
+    position_map: FloatArray,
+    views: Mapping[str, FloatArray],
+) -> None:
+    """Draw a map into an image as several calibrations and poses see it.
+
+    Args:
+        path: where the picture goes.
+        image: as recorded.
+        info: its camera.
+        hd_map: what is drawn.
+        position_map: (2,) the vehicle's; what lies far from it is not drawn.
+        views: by name the homography ``pinhole_px_from_map`` (3 x 3) of the ground, whose third
+            coordinate is positive in front of the camera.
+    """
+    canvas = image.copy()
+    outlines = [one.corners_map for one in hd_map.markings] + [one.outline_map for one in hd_map.symbols]
+    lines = [*(np.vstack([one, one[:1]]) for one in outlines), *(lane.points_map for lane in hd_map.lanes)]
+    legend: list[tuple[Pen | None, str]] = []
+    for name, pinhole_px_from_map in views.items():
+        pen = OVERLAY.get(name, _BEFORE)
+        for line in lines:
+            draw_lines(canvas, _project_map_line(line, info, position_map, pinhole_px_from_map), pen)
+        said = "found by the run" if name in OVERLAY else "that the run began with"
+        legend.append((pen, f"{name}: the map by the calibration and pose {said}"))
+    _write_image(path, with_legend(canvas, legend))
+
+
+def _project_map_line(
+    line_map: FloatArray, info: CameraInfo, position_map: FloatArray, pinhole_px_from_map: FloatArray
+) -> list[FloatArray]:
+    """The visible pieces (N, 2), recorded px, of a ground line; densified, so lenses bend it."""
+    dense = np.concatenate([np.linspace(a, b, 8) for a, b in itertools.pairwise(line_map)])
+    near = np.linalg.norm(dense - position_map, axis=1) < _OVERLAY_RANGE_M
+    return _visible_pieces(info, apply_in_front(pinhole_px_from_map, dense), near, 0.1)
+
+
+def _visible_pieces(
+    info: CameraInfo, pinhole_px: FloatArray, visible: BoolArray, margin: float
+) -> list[FloatArray]:
+    """The visible pieces, recorded px, of a line in and near the image, by a share of the image's size."""
+    size = np.array([info.width, info.height])
+    visible = visible & ((pinhole_px > -margin * size) & (pinhole_px < (1 + margin) * size)).all(axis=1)
+    return [distort_points(info, piece) for piece in runs(pinhole_px, visible)]
+
+
+def _write_image(path: Path, canvas: np.ndarray, *options: int) -> None:
+    with whole_file(path) as partial:
+        partial.write_bytes(cv2.imencode(path.suffix, canvas, options)[1].tobytes())

@@ -19,9 +19,6 @@ from v2hdm.records import CameraInfo, FloatArray
 from v2hdm.report import style
 from v2hdm.report.photos import project_line
 
-PAINT = "#dfe4e8"
-"""Filling of true markings."""
-
 LINK = "#e3001b"
 """Colour of lines between corners that belong together."""
 
@@ -46,6 +43,9 @@ _SITE_IN = 9.0
 
 _INSET_IN = 3.4
 _BESIDE_M = 12.0
+_WIDE = 1.6
+"""Width of a site over its height above which the insets stand below it."""
+
 _OPT, _LANE = style.METHOD["Opt"], style.METHOD["ONI"]
 
 _NEAR_M, _FAR_M = 1.0, 6.0
@@ -79,18 +79,14 @@ def save_map(path: Path, record: Mapping[str, Any], measured: Measured) -> str |
         for axes in (site, *others):
             _draw_truth(axes, record)
             axes.add_collection(LineCollection(lanes, colors=_LANE, lw=1.0, zorder=2))
-            inside = axes is not site
-            axes.add_collection(
-                PolyCollection(
-                    list(mapped), facecolors="none" if inside else _OPT, edgecolors=_OPT, lw=1.4, zorder=3
-                )
-            )
-        for letter, axes, (centre, half_m, text) in zip("abc", others, insets, strict=True):
-            _frame(site, axes, centre, half_m, letter)
-            axes.set_title(f"{letter}: {text}", fontsize=10)
+            fill = _OPT if axes is site else "none"
+            outlines = PolyCollection(list(mapped), facecolors=fill, edgecolors=_OPT, lw=1.4, zorder=3)
+            axes.add_collection(outlines)
+        for letter, axes, place in zip("abc", others, insets, strict=True):
+            _frame(site, axes, place, letter)
         site.set_title(f"{drive_of(record)}: Opt, {cameras}, {len(mapped)} markings over the truth")
         site.plot([], [], color=style.ROUTE, lw=5, label="route")
-        site.fill([], [], facecolor=PAINT, edgecolor=style.TRUTH, label="truth")
+        site.fill([], [], facecolor=style.PAINT, edgecolor=style.TRUTH, label="truth")
         site.fill([], [], facecolor=_OPT, edgecolor=_OPT, label="mapped marking")
         site.plot([], [], color=_LANE, lw=1.0, label="mapped lane line")
         fig.legend(handles=site.get_legend_handles_labels()[0], loc="outside lower center", ncols=4)
@@ -128,19 +124,16 @@ def save_shift(path: Path, record: Mapping[str, Any], measured: Measured) -> str
             _draw_truth(axes, record)
             width = 0.7 if axes is site else 1.5
             for corners, colour in ((eni, _ENI), (oni, style.METHOD["ONI"])):
-                outlines = PolyCollection(
-                    list(corners), facecolors="none", edgecolors=colour, lw=width, zorder=3
-                )
-                axes.add_collection(outlines)
+                look: dict[str, Any] = {"edgecolors": colour, "lw": width, "zorder": 3}
+                axes.add_collection(PolyCollection(list(corners), facecolors="none", **look))
             axes.add_collection(LineCollection(links, colors=LINK, lw=width, ls=(0, (3, 2)), zorder=4))
-        for letter, axes, (centre, half_m, text) in zip("ab", others, insets, strict=True):
-            _frame(site, axes, centre, half_m, letter)
-            axes.set_title(f"{letter}: {text}", fontsize=10)
+        for letter, axes, place in zip("ab", others, insets, strict=True):
+            _frame(site, axes, place, letter)
         site.set_title(f"{drive_of(record)}: ENI against ONI, {cameras}")
         site.plot([], [], color=_ENI, label="ENI")
         site.plot([], [], color=style.METHOD["ONI"], label="ONI")
         site.plot([], [], color=LINK, ls=(0, (3, 2)), label="the same corner")
-        site.fill([], [], facecolor=PAINT, edgecolor=style.TRUTH, label="truth")
+        site.fill([], [], facecolor=style.PAINT, edgecolor=style.TRUTH, label="truth")
         fig.legend(handles=site.get_legend_handles_labels()[0], loc="outside lower center", ncols=4)
     return (
         f"The naive map of {drive_of(record)} (cameras: {cameras}) under the borrowed IPM (ENI, black) and "
@@ -150,6 +143,10 @@ def save_shift(path: Path, record: Mapping[str, Any], measured: Measured) -> str
         "that the lines of neighbours run alike and turn with the vehicle: the error is one of the "
         "calibration, not of single sightings."
     )
+
+
+_Place = tuple[FloatArray, float, str]
+"""Of an inset its centre (2,) and half its width, m, and its title."""
 
 
 def _true_corners(record: Mapping[str, Any]) -> FloatArray:
@@ -172,16 +169,11 @@ def _extent_m(record: Mapping[str, Any]) -> FloatArray:
     return np.asarray(np.ptp(np.array(record["route"]), axis=0) + 2 * _BESIDE_M)
 
 
-def _is_wide(record: Mapping[str, Any]) -> bool:
-    extent = _extent_m(record)
-    return bool(extent[0] > 1.6 * extent[1])
-
-
 def _size_in(record: Mapping[str, Any], insets: int) -> tuple[float, float]:
     """Width and height: the insets stand to the right of a site, below one that is much wider than high."""
     extent = _extent_m(record)
     width, height = _SITE_IN * extent / extent.max()
-    if _is_wide(record):
+    if extent[0] > _WIDE * extent[1]:
         return max(width, insets * _INSET_IN) + 0.6, height + _INSET_IN + 1.4
     return width + _INSET_IN + 1.4, max(height, insets * (_INSET_IN + 0.5)) + 0.8
 
@@ -190,7 +182,7 @@ def _axes(fig: Figure, record: Mapping[str, Any], insets: int) -> tuple[Axes, li
     """The site with its route, and the axes of the insets."""
     extent = _extent_m(record)
     width, height = _SITE_IN * extent / extent.max()
-    if _is_wide(record):
+    if extent[0] > _WIDE * extent[1]:
         grid = fig.add_gridspec(2, insets, height_ratios=[height, _INSET_IN])
         site, others = fig.add_subplot(grid[0, :]), [fig.add_subplot(grid[1, n]) for n in range(insets)]
     else:
@@ -199,12 +191,9 @@ def _axes(fig: Figure, record: Mapping[str, Any], insets: int) -> tuple[Axes, li
     route = np.array(record["route"])
     site.plot(*route.T, color=style.ROUTE, lw=5, zorder=0, solid_capstyle="round")
     low, high = route.min(axis=0) - _BESIDE_M, route.max(axis=0) + _BESIDE_M
-    site.set_xlim(low[0], high[0])
-    site.set_ylim(low[1], high[1])
+    site.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     for axes in (site, *others):
-        axes.set_aspect("equal")
-        axes.set_xlabel("east (m)")
-        axes.set_ylabel("north (m)")
+        style.set_map_axes(axes)
     return site, others
 
 
@@ -215,27 +204,21 @@ def _lines(plain: Sequence[Any]) -> list[FloatArray]:
 def _draw_truth(axes: Axes, record: Mapping[str, Any]) -> None:
     corners = _true_corners(record)
     axes.add_collection(
-        PolyCollection(list(corners), facecolors=PAINT, edgecolors=style.TRUTH, lw=0.4, zorder=1)
+        PolyCollection(list(corners), facecolors=style.PAINT, edgecolors=style.TRUTH, lw=0.4, zorder=1)
     )
-    axes.add_collection(LineCollection(_lines(record["true_lanes"]), colors=PAINT, lw=2.2, zorder=0.5))
+    axes.add_collection(LineCollection(_lines(record["true_lanes"]), colors=style.PAINT, lw=2.2, zorder=0.5))
 
 
-def _frame(site: Axes, inset: Axes, centre: FloatArray, half_m: float, letter: str) -> None:
+def _frame(site: Axes, inset: Axes, place: _Place, letter: str) -> None:
     """Cut an inset to a square, and mark that square on the site."""
+    centre, half_m, text = place
     square = centre + half_m * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
     site.plot(*square.T, color="k", lw=1.0, zorder=5)
     corner, offset = _LETTERS[letter]
-    site.annotate(
-        letter,
-        square[corner],
-        xytext=offset,
-        textcoords="offset points",
-        weight="bold",
-        zorder=6,
-        fontsize=12,
-    )
-    inset.set_xlim(centre[0] - half_m, centre[0] + half_m)
-    inset.set_ylim(centre[1] - half_m, centre[1] + half_m)
+    bold: dict[str, Any] = {"weight": "bold", "zorder": 6, "fontsize": 12}
+    site.annotate(letter, square[corner], xytext=offset, textcoords="offset points", **bold)
+    style.cut_to_square(inset, centre, half_m)
+    inset.set_title(f"{letter}: {text}", fontsize=10)
 
 
 _ROI = "#0b7a75"
@@ -284,10 +267,7 @@ def _draw_image(axes: Axes, camera: Mapping[str, Any], pictures: Path) -> None:
                 str(number), point, xytext=(6, 4), textcoords="offset points", color="white", weight="bold",
                 bbox={"facecolor": "black", "alpha": 0.55, "pad": 1.0, "lw": 0}, fontsize=8,
             )  # fmt: skip
-    axes.set_xlim(-0.5, info.width - 0.5)
-    axes.set_ylim(info.height - 0.5, -0.5)
-    axes.set_xlabel("u (px)")
-    axes.set_ylabel("v (px)")
+    style.set_image_axes(axes, -0.5, info.width - 0.5, info.height - 0.5, -0.5)
 
 
 def _draw_ground(axes: Axes, camera: Mapping[str, Any]) -> None:
@@ -303,8 +283,7 @@ def _draw_ground(axes: Axes, camera: Mapping[str, Any]) -> None:
     axes.plot(0, 0, "ko", mfc="white", ms=7, label="rear axle")
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.1)
-    axes.set_xlabel("x: forward (m)")
-    axes.set_ylabel("y: left (m)")
+    axes.set(xlabel="x: forward (m)", ylabel="y: left (m)")
 
 
 def save_fields(path: Path, record: Mapping[str, Any]) -> str | None:
@@ -342,15 +321,10 @@ def _draw_field(axes: Axes, field: Mapping[str, Any], size_px: tuple[int, int]) 
         if mean is not None:
             places.append((np.array([index % CELLS[0], index // CELLS[0]]) + 0.5) * cell)
             arrows.append(mean)
-    axes.set_xlim(0, width)
-    axes.set_ylim(height, 0)
-    axes.set_aspect("equal")
-    axes.set_xticks(np.arange(CELLS[0] + 1) * cell[0])
-    axes.set_yticks(np.arange(CELLS[1] + 1) * cell[1])
-    axes.grid(color="#e6eaed")
-    axes.set_axisbelow(True)
-    axes.set_xlabel("u (px)")
-    axes.set_ylabel("v (px)")
+    style.set_image_axes(axes, 0, width, height, 0)
+    axes.set(xticks=np.arange(CELLS[0] + 1) * cell[0], yticks=np.arange(CELLS[1] + 1) * cell[1])
+    axes.set(aspect="equal", axisbelow=True)
+    axes.grid(color=style.GRID)
     if not arrows:
         return
     longest = float(np.linalg.norm(arrows, axis=1).max())
