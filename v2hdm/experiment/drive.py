@@ -39,8 +39,7 @@ from v2hdm.store.cache.room import Room
 from v2hdm.store.cache.store import Store
 from v2hdm.store.files import whole_file
 
-_FASTEST = 1
-"""Level of gzip: a fifth of the size already, at a tenth of the time of the default."""
+_FASTEST = 1  # level of gzip: a fifth of the size already, at a tenth of the time of the default
 
 
 def store(path: Path, key: str, content: Mapping[str, Any]) -> None:

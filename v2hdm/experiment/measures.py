@@ -175,8 +175,7 @@ RANGE_STEP_M = 1.0
 """Width of a bin of ranges."""
 
 _FARTHEST_M = 22.0
-_FEWEST = 20
-"""Corners below which neither a cell nor a bin has figures."""
+_FEWEST = 20  # corners below which neither a cell nor a bin has figures
 
 
 @dataclass(frozen=True)

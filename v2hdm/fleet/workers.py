@@ -31,9 +31,7 @@ from v2hdm.store.cache.store import Store
 IMAGES_A_BATCH = 8
 """Images that an actor detects in at one call: seconds of work against a millisecond of Ray's."""
 
-_BATCHES_AHEAD = 2
-"""Calls that wait at each actor, so that it is never idle between them."""
-
+_BATCHES_AHEAD = 2  # calls that wait at each actor, so that it is never idle between them
 _DRIVES_KEPT = 4
 _REPORT_EVERY_S = 0.5
 

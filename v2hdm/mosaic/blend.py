@@ -39,11 +39,8 @@ SHEET_PX = 2048
 WARP_ERROR_PX = 0.02
 """By so much of an image's pixels may interpolated positions be off."""
 
-_NODES = 8
-"""Chebyshev nodes along a tile's side."""
-
-_KEPT_IMAGES = 96
-"""Decoded images that neighbouring sheets share, 1.5 MB each."""
+_NODES = 8  # Chebyshev nodes along a tile's side
+_KEPT_IMAGES = 96  # decoded images that neighbouring sheets share, 1.5 MB each
 
 
 @dataclass(frozen=True)

@@ -41,9 +41,7 @@ MULTIPLE_PX = 256
 
 _PICTURE_QUALITY = 80
 _JPEG_QUALITY = 90
-_SEEN_ALPHA = 128
-"""A GeoTIFF's mask knows but seen and unseen."""
-
+_SEEN_ALPHA = 128  # the mask of a GeoTIFF knows but seen and unseen
 _BLOCK_PX = 512
 _OVERVIEWS = (2, 4, 8, 16)
 _AT_ONCE_BYTES = 1 << 24

@@ -29,17 +29,10 @@ from v2hdm.report import style
 REACH_M = 0.75
 """Half of the length of a profile, m: misplaced paint is found within it."""
 
-_MIDDLE = (0.2, 0.8)
-"""Part of a side over which its profile is averaged: without its corners."""
-
-_SAMPLES = 12
-"""Places along a side's middle part."""
-
-_LEAST_SIDE_M = 0.4
-"""Shorter sides have no middle part that pixels of some centimetres would resolve, m."""
-
-_SEEN_ALPHA = 128
-"""Alpha from which the mosaic counts as showing the ground."""
+_MIDDLE = (0.2, 0.8)  # part of a side over which its profile is averaged: without its corners
+_SAMPLES = 12  # places along a side's middle part
+_LEAST_SIDE_M = 0.4  # shorter sides have no middle part that pixels of some centimetres would resolve, m
+_SEEN_ALPHA = 128  # alpha from which the mosaic counts as showing the ground
 
 
 @dataclass(frozen=True)

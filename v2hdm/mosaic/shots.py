@@ -80,8 +80,7 @@ class Canvas:
 FEATHER = 1 / 15
 """Band at the edge of what is trusted over which the weight rises from 0 to 1, in heights of the image."""
 
-_OUTLINE_STEP_PX = 16
-"""Distance of the points by which the outline of what is trusted is laid on the ground."""
+_OUTLINE_STEP_PX = 16  # distance of the points by which the outline of what is trusted is laid on the ground
 
 
 @dataclass(frozen=True)

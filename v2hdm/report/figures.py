@@ -146,11 +146,8 @@ def _common_marking(maps: Mapping[str, HdMap], best: str) -> FloatArray:
     return np.asarray(markings[chosen].corners_map.mean(axis=0))
 
 
-_ARROWS = 30
-"""Arrows along the route: enough to see a heading go wrong, few enough to see each."""
-
-_MOST_POINTS = 5000
-"""Points of the line that is drawn."""
+_ARROWS = 30  # arrows along the route: enough to see a heading go wrong, few enough to see each
+_MOST_POINTS = 5000  # points of the line that is drawn
 
 
 def save_route(path: Path, trajectory: Trajectory) -> None:
@@ -192,9 +189,7 @@ def _draw_headings(axes: Axes, poses: FloatArray) -> None:
     )  # fmt: skip
 
 
-_AROUND_M = 2.0
-"""Ground around a change in its close-up, m."""
-
+_AROUND_M = 2.0  # ground around a change in its close-up, m
 _MOST_CLOSE_UPS = 12
 
 _COLOURS = {Fate.MOVED: "#3b6fb6", Fate.VANISHED: "#d0432b", Fate.NEW: "#0b7a75"}

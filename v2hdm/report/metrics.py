@@ -279,8 +279,7 @@ def _successor_distances(dashes: FloatArray) -> FloatArray:
     return np.asarray(nearest[np.isfinite(nearest)])
 
 
-_MAIN_REASONS = 3
-"""Reasons of exclusion that a headline names."""
+_MAIN_REASONS = 3  # reasons of exclusion that a headline names
 
 
 def map_figures(hd_map: HdMap, truth: Truth | None, expected: BoolArray | None) -> dict[str, Any]:

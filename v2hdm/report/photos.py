@@ -18,12 +18,8 @@ from v2hdm.report.metrics import runs, way_along
 from v2hdm.report.style import OKABE_ITO
 from v2hdm.store.files import whole_file
 
-_SUBPIXELS = 4
-"""Bits of a pixel's fraction in which OpenCV takes coordinates."""
-
-_LARGEST_PX = 1e4
-"""Farther out nothing is drawn, and OpenCV's integers would overflow."""
-
+_SUBPIXELS = 4  # bits of a pixel's fraction in which OpenCV takes coordinates
+_LARGEST_PX = 1e4  # farther out nothing is drawn, and OpenCV's integers would overflow
 _HALO_BGR = (25, 25, 25)
 _STRIP_BGR = (250, 250, 250)
 _TEXT_BGR = (35, 35, 35)
@@ -93,17 +89,11 @@ def with_legend(canvas: np.ndarray, entries: Sequence[tuple[Pen | None, str]]) -
     return np.vstack([canvas, strip])
 
 
-_FARTHEST_M = 40.0
-"""Lines farther along the view lie on top of each other near the horizon."""
+_FARTHEST_M = 40.0  # lines farther along the view lie on top of each other near the horizon
 
-_ALONG_M, _ACROSS_M = 5.0, 2.0
-"""Spacing of the grid along and across the vehicle."""
-
-_HALF_WIDTH_M = 8.0
-"""How far the grid reaches to either side of the camera."""
-
-_NEAREST_M = 0.3
-"""Ground nearer than this to the camera's plane has no place in an image."""
+_ALONG_M, _ACROSS_M = 5.0, 2.0  # spacing of the grid along and across the vehicle
+_HALF_WIDTH_M = 8.0  # how far the grid reaches to either side of the camera
+_NEAREST_M = 0.3  # ground nearer than this to the camera's plane has no place in an image
 
 PENS: Mapping[str, Pen] = {
     "guess": Pen(OKABE_ITO["orange"], dash_px=(8.0, 5.0), width=1),
@@ -236,8 +226,7 @@ def _write(canvas: np.ndarray, text: str, at: tuple[int, int], colour: tuple[int
 
 _OVERLAY_RANGE_M = 30.0
 
-_BEFORE = Pen(OKABE_ITO["orange"], dash_px=(9.0, 6.0))
-"""How the map is drawn by what a run began with."""
+_BEFORE = Pen(OKABE_ITO["orange"], dash_px=(9.0, 6.0))  # how the map is drawn by what a run began with
 
 OVERLAY = {"Opt": Pen(OKABE_ITO["sky"])}
 """How it is drawn by what the run found."""

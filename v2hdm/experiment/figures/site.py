@@ -38,13 +38,10 @@ def drive_of(record: Mapping[str, Any]) -> str:
     return str(record["port"]) if record["seed"] is None else f"{record['port']}, seed {record['seed']}"
 
 
-_SITE_IN = 9.0
-"""Longer side of the site."""
-
+_SITE_IN = 9.0  # longer side of the site
 _INSET_IN = 3.4
 _BESIDE_M = 12.0
-_WIDE = 1.6
-"""Width of a site over its height above which the insets stand below it."""
+_WIDE = 1.6  # width of a site over its height above which the insets stand below it
 
 _OPT, _LANE = style.METHOD["Opt"], style.METHOD["ONI"]
 
@@ -54,8 +51,7 @@ _NEAR_M, _FAR_M = 1.0, 6.0
 _LETTERS = {"a": (2, (3, 1)), "b": (0, (-9, -9)), "c": (3, (-9, 1))}
 """Of each inset the corner of its square that its letter stands at, and how far from it (pt)."""
 
-_ENI = "#3a3f44"
-"""ENI's outlines, where its own red is that of the correspondences."""
+_ENI = "#3a3f44"  # ENI's outlines, where its own red is that of the correspondences
 
 
 def save_map(path: Path, record: Mapping[str, Any], measured: Measured) -> str | None:
@@ -222,8 +218,7 @@ def _frame(site: Axes, inset: Axes, place: _Place, letter: str) -> None:
 
 
 _ROI = "#0b7a75"
-_ARROW_SHARE = 0.8
-"""Share of a cell's width that the longest arrow of a field takes."""
+_ARROW_SHARE = 0.8  # share of a cell's width that the longest arrow of a field takes
 
 
 def save_calibration(path: Path, record: Mapping[str, Any], pictures: Path) -> str | None:

@@ -22,14 +22,10 @@ BUDGET_BYTES = 8_000_000
 PER_CAMERA = 2
 """Pictures of a marking by one camera: the nearest one, and one from the middle of its sightings."""
 
-_USUAL_BYTES = 5_000
-"""Of one picture; no more are cut than could fit."""
-
+_USUAL_BYTES = 5_000  # of one picture; no more are cut than could fit
 _LONGEST_PX = 320
 _LEAST_PX = 96
-_MARGIN = 0.45
-"""Share of a marking's size that is shown around it."""
-
+_MARGIN = 0.45  # share of a marking's size that is shown around it
 _QUALITY = 72
 
 _NEAR_M, _FAR_M = 3.0, 14.0

@@ -89,8 +89,7 @@ def _plain(value: object) -> str:
     return significant(value) if isinstance(value, float) else str(value)
 
 
-_LEAST_FOR_SHARE = 20
-"""Corners from which a share of them is told."""
+_LEAST_FOR_SHARE = 20  # corners from which a share of them is told
 
 
 _Mapped = TypeVar("_Mapped", Marking, Symbol, Lane)

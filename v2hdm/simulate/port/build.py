@@ -214,8 +214,7 @@ class Port:
         )
 
 
-_SHORTEST_ROUTE_M = 25.0
-"""What stands in the way does so at least 12 m from either end."""
+_SHORTEST_ROUTE_M = 25.0  # what stands in the way does so at least 12 m from either end
 
 
 def _visit_seed(config: PortConfig, part: int) -> list[int]:

@@ -252,15 +252,9 @@ def _shares(length_m: float) -> FloatArray:
     return np.linspace(0.0, 1.0, max(int(np.ceil(length_m / _VERTEX_SPACING_M)), 1) + 1)
 
 
-_BESIDE_ROUTE_M = 4.5
-"""Only paint this near to the route is altered: a vehicle sees it from everywhere."""
-
-_CLEAR_M = 2.6
-"""Distance of an altered marking from all other altered ones, before and after, m."""
-
-_FREE_M = 1.3
-"""Distance of new paint's centre from other paint, m."""
-
+_BESIDE_ROUTE_M = 4.5  # only paint this near to the route is altered: a vehicle sees it from everywhere
+_CLEAR_M = 2.6  # distance of an altered marking from all other altered ones, before and after, m
+_FREE_M = 1.3  # distance of new paint's centre from other paint, m
 _TRIES = 4000
 
 
