@@ -21,6 +21,7 @@ from v2hdm.io.drive.tum import read_tum
 from v2hdm.io.maps.geojson import read_geojson
 from v2hdm.mosaic.blend import Sheet, blend
 from v2hdm.mosaic.sharpness import (
+    Panel,
     edge_widths_m,
     measure_edges,
     no_edges,
@@ -194,26 +195,29 @@ def write_mosaic(
     hd_map = read_geojson(folder / "map.geojson")
     ground = ground_of(folder, drive, resolution_m)
     sides = paint_sides(hd_map)
-    before, after = (no_edges(len(sides.ends_map)) for _ in range(2))
+    edges = {when: no_edges(len(sides.ends_map)) for when in ("before", "after")}
+
+    def measure(when: str, sheet: Sheet) -> None:
+        rows, columns = sheet.rgba.shape[:2]
+        part = ground.canvas.window(sheet.row, sheet.column, rows, columns)
+        edges[when] = edges[when].with_those_of(measure_edges(sheet.rgba, part, sides.ends_map))
+
     picture = Picture(ground.canvas)
-    tell = _two_passes(progress)
     with ExitStack() as stack:
         try:
             tiff = stack.enter_context(geotiff(folder / TIFF, ground.canvas, drive.origin))
         except ConfigError as missing:
             _log.warning("no GeoTIFF is written: %s", missing)
             tiff = None
-        for sheet in blend(ground.canvas, ground.after, ground.lenses, device, tell(0)):
+        for sheet in blend(ground.canvas, ground.after, ground.lenses, device, _half(progress, 0)):
             if tiff is not None:
                 tiff.put(sheet)
             picture.put(sheet)
-            after = after.with_those_of(
-                measure_edges(sheet.rgba, _part(ground.canvas, sheet), sides.ends_map)
-            )
-    for sheet in blend(ground.canvas, ground.before, ground.lenses, device, tell(1)):
-        before = before.with_those_of(measure_edges(sheet.rgba, _part(ground.canvas, sheet), sides.ends_map))
+            measure("after", sheet)
+    for sheet in blend(ground.canvas, ground.before, ground.lenses, device, _half(progress, 1)):
+        measure("before", sheet)
     picture.write(folder / PICTURE)
-    sharpness = _sharpness(*edge_widths_m([before, after]))
+    sharpness = _sharpness(*edge_widths_m([edges["before"], edges["after"]]))
     content = {
         "image": PICTURE,
         "bounds_m": ground.canvas.bounds_m,
@@ -223,14 +227,11 @@ def write_mosaic(
         "crs": crs_of(drive.origin),
         "sharpness": sharpness,
     }
-    _compare(folder / COMPARISON, ground, richest_place(drive, sides, after.contrast), sharpness, device)
+    _compare(
+        folder / COMPARISON, ground, richest_place(drive, sides, edges["after"].contrast), sharpness, device
+    )
     write_json(folder / EXTENT, content)
     return content
-
-
-def _part(canvas: Canvas, sheet: Sheet) -> Canvas:
-    rows, columns = sheet.rgba.shape[:2]
-    return canvas.window(sheet.row, sheet.column, rows, columns)
 
 
 def _sharpness(before_m: FloatArray, after_m: FloatArray) -> dict[str, float | int]:
@@ -296,27 +297,17 @@ def _calibrations(folder: Path) -> tuple[dict[str, Calibration], dict[str, float
 def _compare(
     path: Path, ground: Ground, pose: FloatArray, sharpness: Mapping[str, float], device: str
 ) -> None:
-    titles = "before: initial calibration, recorded poses", "after: optimised calibration, adjusted poses"
-    widths = [sharpness.get(f"edge_width_{when}_m") for when in ("before", "after")]
-    captions = [
-        "" if width is None else f"paint edges {100 * width:.1f} cm wide (median)" for width in widths
-    ]
-    save_comparison(
-        path,
-        pose,
-        dict(zip(titles, (ground.before, ground.after), strict=True)),
-        ground.lenses,
-        dict(zip(titles, captions, strict=True)),
-        device,
-    )
+    panels = []
+    for when, title, shots in (
+        ("before", "before: initial calibration, recorded poses", ground.before),
+        ("after", "after: optimised calibration, adjusted poses", ground.after),
+    ):
+        width = sharpness.get(f"edge_width_{when}_m")
+        caption = "" if width is None else f"paint edges {100 * width:.1f} cm wide (median)"
+        panels.append(Panel(title, caption, shots))
+    save_comparison(path, pose, panels, ground.lenses, device)
 
 
-def _two_passes(progress: Progress | None) -> Callable[[int], Progress | None]:
-    """A progress for each of two passes of about the same work."""
-
-    def of(number: int) -> Progress | None:
-        if progress is None:
-            return None
-        return lambda done, total: progress(number * total + done, 2 * total)
-
-    return of
+def _half(progress: Progress | None, number: int) -> Progress | None:
+    """The progress of one of two passes of about the same work."""
+    return progress and (lambda done, total: progress(number * total + done, 2 * total))

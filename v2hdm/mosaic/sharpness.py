@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -122,24 +123,19 @@ _BAR_M = 2.0
 
 
 def richest_place(drive: Drive, sides: PaintSides, contrast: FloatArray) -> FloatArray:
-    """The pose (4, 4) about which the most paint edges are to be seen, and were seen most often.
+    """The image's pose (4, 4) about which the most paint edges are to be seen, and were seen most often.
 
-    Each image's pose is a candidate, its place the ground about it. Its worth is the sum, over the sides that
-    lie on it whole, of their contrast in the mosaic times the number of images that they were found in.
-
-    Args:
-        drive: the poses.
-        sides: of the map.
-        contrast: theirs (S,) in the mosaic, nan where it does not show them whole.
+    Its worth is the sum, over the sides that lie whole on the ground about it, of their ``contrast`` (S,) in
+    the mosaic, nan where it does not show them, times the number of images that they were found in.
     """
     worth = np.nan_to_num(contrast) * sides.sightings
-    poses = np.stack([image.map_from_vehicle for image in drive.images])
-    of_place = []
-    for pose in poses:
+
+    def of_place(pose: FloatArray) -> float:
         offset = (sides.ends_map - pose[:2, 3]) @ pose[:2, :2]
         inside = (np.abs(offset) <= [AHEAD_M / 2, ACROSS_M / 2]).all(axis=(1, 2))
-        of_place.append(worth[inside].sum())
-    return np.asarray(poses[int(np.argmax(of_place))])
+        return float(worth[inside].sum())
+
+    return max((image.map_from_vehicle for image in drive.images), key=of_place)
 
 
 def close_up_canvas(map_from_vehicle: FloatArray) -> Canvas:
@@ -151,40 +147,29 @@ def close_up_canvas(map_from_vehicle: FloatArray) -> Canvas:
     return Canvas(corner, _CELL_M, rows, columns, (float(right[0]), float(right[1])))
 
 
-def save_comparison(
-    path: Path,
-    map_from_vehicle: FloatArray,
-    shots: Mapping[str, Sequence[Shot]],
-    lenses: Mapping[str, Lens],
-    captions: Mapping[str, str],
-    device: str,
-) -> None:
-    """Draw the ground about a pose as several sets of shots show it, with a caption under each.
+class Panel(NamedTuple):
+    """One of the pictures that are compared."""
 
-    Args:
-        path: where the PNG goes.
-        map_from_vehicle: the pose (4, 4).
-        shots: by title.
-        lenses: of the cameras.
-        captions: by title.
-        device: of torch.
-    """
+    title: str
+    caption: str
+    shots: Sequence[Shot]
+
+
+def save_comparison(
+    path: Path, map_from_vehicle: FloatArray, panels: Sequence[Panel], lenses: Mapping[str, Lens], device: str
+) -> None:
+    """Draw the ground about a pose (4, 4) as several sets of shots show it, side by side, as PNG."""
     canvas = close_up_canvas(map_from_vehicle)
-    panels = {title: whole(canvas, own, lenses, device) for title, own in shots.items()}
-    levels = _levels(list(panels.values())[-1])
+    pictures = [whole(canvas, panel.shots, lenses, device) for panel in panels]
+    levels = _levels(pictures[-1])
     height_in = _PANEL_IN * AHEAD_M / ACROSS_M + 0.8
     with style.figure(path, _PANEL_IN * len(panels) + 0.1, height_in) as fig:
-        for axes, (title, rgba) in zip(
-            np.atleast_1d(fig.subplots(1, len(panels))), panels.items(), strict=True
-        ):
-            axes.imshow(
-                _brightened(rgba, levels), extent=(0, ACROSS_M, 0, AHEAD_M), interpolation="antialiased"
-            )
-            axes.set_title(title)
-            axes.set_xlabel(captions[title])
-            axes.set(xticks=[], yticks=[])
-            for spine in axes.spines.values():
-                spine.set_visible(False)
+        every = np.atleast_1d(fig.subplots(1, len(panels)))
+        for axes, panel, rgba in zip(every, panels, pictures, strict=True):
+            shown = _brightened(rgba, levels)
+            axes.imshow(shown, extent=(0, ACROSS_M, 0, AHEAD_M), interpolation="antialiased")
+            axes.set(title=panel.title, xlabel=panel.caption, xticks=[], yticks=[])
+            axes.spines[:].set_visible(False)
             _scale_bar(axes)
 
 

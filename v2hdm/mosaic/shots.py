@@ -109,17 +109,14 @@ class Shot:
 
     def outline_map(self, lens: Lens) -> FloatArray:
         """The ground (N, 2), m, that is trusted: a convex polygon."""
-        return apply_homography(
-            np.asarray(np.linalg.inv(self.pinhole_px_from_map), dtype=np.float64), lens.outline_pinhole_px
-        )
+        map_from_pinhole_px = np.asarray(np.linalg.inv(self.pinhole_px_from_map), dtype=np.float64)
+        return apply_homography(map_from_pinhole_px, lens.outline_pinhole_px)
 
 
 def lens_of(camera: Camera, cam_from_vehicle: FloatArray) -> Lens:
-    """What an image of a camera shows of the ground within its ROI, feathered to its edges.
+    """The part of a camera's image that shows the ground within its ROI, feathered to its edges.
 
-    Args:
-        camera: with its ROI and, where known, the mask of its own vehicle.
-        cam_from_vehicle: where it sits (4, 4).
+    The camera sits at ``cam_from_vehicle`` (4, 4); the mask of its own vehicle is left out where it is known.
     """
     info = camera.info
     pinhole_px, _ = project_ground(info.intrinsic, cam_from_vehicle, _densely(camera.roi_vehicle))
@@ -132,12 +129,8 @@ def lens_of(camera: Camera, cam_from_vehicle: FloatArray) -> Lens:
     inside[[0, -1]] = inside[:, [0, -1]] = 0
     depth_px = cv2.distanceTransform(inside, cv2.DIST_L2, 5)[1:-1, 1:-1]
     trust = np.clip(depth_px / (FEATHER * info.height), 0, 1).astype(np.float32)
-    edge = np.concatenate(
-        [
-            c[::_OUTLINE_STEP_PX, 0]
-            for c in cv2.findContours(inside[1:-1, 1:-1], cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
-        ]
-    )
+    contours, _ = cv2.findContours(inside[1:-1, 1:-1], cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    edge = np.concatenate([contour[::_OUTLINE_STEP_PX, 0] for contour in contours])
     hull = cv2.convexHull(undistort_points(info, edge.astype(np.float64)).astype(np.float32))[:, 0]
     return Lens(info, trust, hull.astype(np.float64))
 
@@ -149,12 +142,8 @@ def recorded_shots(drive: Drive) -> list[Shot]:
         for name, camera in drive.cameras.items()
     }
     return [
-        Shot(
-            image.path,
-            image.camera,
-            px_from_vehicle[image.camera] @ flat_motion(inverse(image.map_from_vehicle)),
-        )
-        for image in drive.images
+        Shot(one.path, one.camera, px_from_vehicle[one.camera] @ flat_motion(inverse(one.map_from_vehicle)))
+        for one in drive.images
     ]
 
 
@@ -178,17 +167,12 @@ def adjusted_shots(
     if drive.recorded is not None and drive.trajectory is not None:
         recorded, flat = (interpolate(one, taken_s, np.inf)[0] for one in (drive.recorded, drive.trajectory))
         poses = flat @ np.linalg.inv(recorded) @ poses
-    return [
-        Shot(
-            image.path,
-            image.camera,
-            pinhole_px_from_ground(
-                calibrations[image.camera].info.intrinsic,
-                calibrations[image.camera].cam_from_vehicle @ inverse(pose),
-            ),
-        )
-        for image, pose in zip(images, poses, strict=True)
-    ]
+    shots = []
+    for image, pose in zip(images, poses, strict=True):
+        own = calibrations[image.camera]
+        px_from_map = pinhole_px_from_ground(own.info.intrinsic, own.cam_from_vehicle @ inverse(pose))
+        shots.append(Shot(image.path, image.camera, px_from_map))
+    return shots
 
 
 def _densely(polygon: FloatArray, pieces: int = 16) -> FloatArray:
