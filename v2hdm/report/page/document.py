@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
@@ -127,13 +128,11 @@ def document(facts: Facts) -> Document:
 
 
 def _summary(facts: Facts) -> str:
-    """What was mapped, in a sentence."""
+    """The contents of the map in a sentence."""
     if facts.hd_map is None:
         return "No map came of this drive."
-    words = [
-        in_words(len(facts.hd_map.markings), "marking"),
-        in_words(len(facts.hd_map.lanes), "lane line"),
-    ]
+    counts = ((facts.hd_map.markings, "marking"), (facts.hd_map.lanes, "lane line"))
+    words = [in_words(len(own), name) for own, name in counts]
     if facts.hd_map.symbols:
         words.append(in_words(len(facts.hd_map.symbols), "symbol"))
     sentence = f"{', '.join(words[:-1])} and {words[-1]}"
@@ -151,8 +150,7 @@ def _site(facts: Facts) -> Chart | None:
     return Chart(
         "The map from above",
         "Where markings stand close together along the whole route, the drive was seen throughout. "
-        "Crosses show "
-        "what was left out: they should be few and at the edges.",
+        "Crosses show what was left out: they should be few and at the edges.",
         charts.site_chart(facts.hd_map, facts.route, excluded),
     )
 
@@ -160,22 +158,19 @@ def _site(facts: Facts) -> Chart | None:
 def _accuracy_chart(facts: Facts) -> Chart | None:
     if facts.hd_map is None:
         return None
-    relative = tables.relative_m(facts.hd_map.markings)
-    absolute = tables.half_axes_m(facts.hd_map.markings)
-    series = {
-        name: 100 * values
-        for name, values in (("relative to neighbours", relative), ("absolute", absolute))
-        if len(values)
+    known = {
+        "relative to neighbours": tables.relative_m(facts.hd_map.markings),
+        "absolute": tables.half_axes_m(facts.hd_map.markings),
     }
+    series = {name: 100 * values for name, values in known.items() if len(values)}
     if not series:
         return None
     return Chart(
         "How many corners are how good",
         "Read it upwards from the accuracy that you need: the lines say which share of the corners "
-        "reaches it. "
-        "The absolute accuracy rests on the receiver’s stated noise. An offset that a whole drive "
-        "shares, as of a "
-        "base station set up wrongly, shows in no drive: only surveyed check points tell it.",
+        "reaches it. The absolute accuracy rests on the receiver’s stated noise. An offset that a whole "
+        "drive shares, as of a base station set up wrongly, shows in no drive: only surveyed check points "
+        "tell it.",
         charts.ellipse_chart(series),
     )
 
@@ -190,15 +185,14 @@ def _residual_charts(facts: Facts, residuals: GroundResiduals | None) -> tuple[C
         Chart(
             "How far corners lie from where the map puts them",
             "Left: in pixels. Right: in standard deviations of the detector’s own statement; lines to "
-            "the left "
-            "of the grey one mean that the corners are better than stated, a long tail that some are wrong.",
+            "the left of the grey one mean that the corners are better than stated, a long tail that some "
+            "are wrong.",
             charts.histogram_chart(residuals),
         ),
         Chart(
             "Over the image",
             "Mean residual of each part of the image, drawn longer than it is (the key gives the scale). "
-            "Arrows "
-            "without a pattern are noise; a swirl or a fan would be a wrong lens or principal point.",
+            "Arrows without a pattern are noise; a swirl or a fan would be a wrong lens or principal point.",
             charts.field_chart(residuals, sizes),
         ),
         Chart(
@@ -211,8 +205,7 @@ def _residual_charts(facts: Facts, residuals: GroundResiduals | None) -> tuple[C
         Chart(
             "Along the route",
             "Above: a stretch that stands out was seen badly or has wrong poses. Below: what was taken "
-            "off the "
-            "recorded poses, with the band of 95 %; it should wander within the receiver’s noise and "
+            "off the recorded poses, with the band of 95 %; it should wander within the receiver’s noise and "
             "never jump.",
             charts.route_chart(facts.route, residuals),
         ),
@@ -220,7 +213,7 @@ def _residual_charts(facts: Facts, residuals: GroundResiduals | None) -> tuple[C
 
 
 def _excluded(facts: Facts) -> Chart | None:
-    counts = tables.exclusion_counts(facts)
+    counts = Counter(one.reason for one in facts.excluded).most_common()
     if not counts:
         return None
     return Chart(
@@ -257,12 +250,7 @@ def _missing(facts: Facts) -> tuple[str, ...]:
 FILE = "report.html"
 """Name of the page in a result folder."""
 
-_ASSETS = {
-    "leaflet.js": "vendor",
-    "leaflet.css": "vendor",
-    "page.css": "templates",
-    "map.js": "templates",
-}
+_ASSETS = {"leaflet.js": "vendor", "leaflet.css": "vendor", "page.css": "templates", "map.js": "templates"}
 """Scripts and styles that stand in the page as they are, by the folder that holds them."""
 
 

@@ -23,7 +23,8 @@ from v2hdm.io.maps.features import features_of
 from v2hdm.io.maps.geojson import read_geojson
 from v2hdm.io.maps.residuals import FILE as RESIDUALS
 from v2hdm.io.maps.residuals import Residuals, read_residuals
-from v2hdm.records import BoolArray, Calibration, Drive, FloatArray, HdMap, IntArray, Trajectory, Truth
+from v2hdm.records import BoolArray, Calibration, Drive, FloatArray, HdMap, IntArray, Truth
+from v2hdm.report.metrics import way_along
 from v2hdm.store.files import load_json, load_yaml, read_text
 
 BEST = "Opt"
@@ -53,8 +54,7 @@ class Route:
     @property
     def way_m(self) -> FloatArray:
         """How far the vehicle has driven (F,), m."""
-        steps = np.linalg.norm(np.diff(self.map_from_vehicle[:, :2, 3], axis=0), axis=1)
-        return np.concatenate([[0.0], np.cumsum(steps)])
+        return way_along(self.map_from_vehicle[:, :2, 3])
 
 
 @dataclass(frozen=True)
@@ -70,18 +70,8 @@ class CameraFacts:
 class Facts:
     """A result folder, read; what is not in it is None or empty.
 
-    Attributes:
-        folder: it.
-        metrics: ``metrics.json``.
-        config: ``config.yaml`` as text.
-        hd_map: the map, with ids.
-        excluded: what the map of all cameras left out.
-        cameras: by name.
-        route: the adjusted poses.
-        residuals: of the corner observations.
-        check_points: the rows of ``check_points.csv`` by its columns.
-        drive: that was mapped.
-        truth: of the drive, if it was rendered.
+    ``excluded`` are the candidates that the map of all cameras left out, ``check_points`` the rows of
+    ``check_points.csv`` by its columns; ``truth`` is there if the drive was rendered.
     """
 
     folder: Path
@@ -130,6 +120,7 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
     excluded = read_exclusions(folder / "excluded.geojson") if (folder / "excluded.geojson").is_file() else []
     residuals = folder / RESIDUALS
     config = folder / "config.yaml"
+    heading, *checked = _table(folder / "check_points.csv") or ((),)
     return Facts(
         folder=folder,
         metrics=metrics,
@@ -139,7 +130,7 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
         cameras=_cameras(folder),
         route=_route(folder, drive),
         residuals=read_residuals(residuals) if residuals.is_file() else None,
-        check_points=_rows(folder / "check_points.csv"),
+        check_points=tuple(dict(zip(heading, row, strict=False)) for row in checked),
         drive=drive,
         truth=read_truth(drive) if drive is not None and drive.truth_dir is not None else None,
     )
@@ -147,12 +138,10 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
 
 def _with_ids(hd_map: HdMap) -> HdMap:
     ids = iter([one.id for one in features_of(hd_map)])
-    return replace(
-        hd_map,
-        markings=tuple(replace(one, id=next(ids)) for one in hd_map.markings),
-        lanes=tuple(replace(one, id=next(ids)) for one in hd_map.lanes),
-        symbols=tuple(replace(one, id=next(ids)) for one in hd_map.symbols),
-    )
+    markings = tuple(replace(one, id=next(ids)) for one in hd_map.markings)
+    lanes = tuple(replace(one, id=next(ids)) for one in hd_map.lanes)
+    symbols = tuple(replace(one, id=next(ids)) for one in hd_map.symbols)
+    return replace(hd_map, markings=markings, lanes=lanes, symbols=symbols)
 
 
 def _cameras(folder: Path) -> dict[str, CameraFacts]:
@@ -177,18 +166,17 @@ def _route(folder: Path, drive: Drive | None) -> Route | None:
         table = np.array(rows, dtype=np.float64).reshape(len(adjusted.stamp_s), 8)
     except ValueError:
         raise MapFileError(f"{path}: not a line of 8 numbers for each pose of trajectory.tum") from None
-    recorded = flat = None
-    if drive is not None:
-        recorded = _at(drive.recorded or drive.trajectory, adjusted.stamp_s)
-        flat = _at(drive.trajectory, adjusted.stamp_s)
-    moved = adjusted.map_from_vehicle
-    if recorded is not None and flat is not None:
-        moved = flat @ inverse(recorded) @ moved
-    return Route(adjusted.stamp_s, adjusted.map_from_vehicle, recorded, moved, table[:, 2:], table[:, 1] > 0)
-
-
-def _at(trajectory: Trajectory | None, stamp_s: FloatArray) -> FloatArray | None:
-    return None if trajectory is None else interpolate(trajectory, stamp_s, float("inf"))[0]
+    stamp_s, poses = adjusted.stamp_s, adjusted.map_from_vehicle
+    recorded, moved = None, poses
+    if drive is not None and drive.trajectory is not None:
+        recorded, flat = (
+            interpolate(one, stamp_s, float("inf"))[0]
+            for one in (drive.recorded or drive.trajectory, drive.trajectory)
+        )
+        moved = flat @ inverse(recorded) @ poses
+    elif drive is not None and drive.recorded is not None:
+        recorded = interpolate(drive.recorded, stamp_s, float("inf"))[0]
+    return Route(stamp_s, poses, recorded, moved, table[:, 2:], table[:, 1] > 0)
 
 
 def _table(path: Path) -> tuple[tuple[str, ...], ...]:
@@ -197,26 +185,12 @@ def _table(path: Path) -> tuple[tuple[str, ...], ...]:
     return tuple(tuple(row) for row in csv.reader(io.StringIO(read_text(path, MapFileError))) if row)
 
 
-def _rows(path: Path) -> tuple[Mapping[str, str], ...]:
-    heading, *rows = _table(path) or ((),)
-    return tuple(dict(zip(heading, row, strict=False)) for row in rows)
-
-
 @dataclass(frozen=True)
 class GroundResiduals:
-    """K corner observations.
+    """K corner observations, as in :class:`Residuals`; ``camera`` (K,) indexes ``cameras``.
 
-    Attributes:
-        cameras: names; ``camera`` (K,) says whose.
-        marking: (K,) id, 0 where the candidate was left out.
-        corner: (K,) 0 to 3.
-        is_point: (K,) whether it says where the corner is, not only on which line.
-        taken_s: (K,) when.
-        observed_px: (K, 2) pinhole pixels.
-        residual_px: (K, 2) projected minus observed.
-        distance_sigma: (K,) its length in standard deviations.
-        range_m: (K,) from the camera's foot to the corner, as observed.
-        ground_m: (K, 2) projected minus observed on the ground, in the map; nan above the horizon.
+    ``range_m`` (K,) is from the camera's foot to the corner, as observed, ``ground_m`` (K, 2) projected minus
+    observed on the ground, in the map; both are nan above the horizon.
     """
 
     cameras: tuple[str, ...]

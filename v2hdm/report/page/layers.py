@@ -13,7 +13,7 @@ import numpy as np
 
 from v2hdm.errors import MapFileError
 from v2hdm.records import FloatArray, Lane, Marking, Symbol
-from v2hdm.report.metrics import corner_errors, match_markings
+from v2hdm.report.metrics import corner_errors, match_markings, rms
 from v2hdm.report.page.facts import Facts, GroundResiduals
 from v2hdm.store.files import load_json, take_array, take_mapping, take_text
 
@@ -22,6 +22,12 @@ def jpeg(pixels: np.ndarray, quality: int) -> str:
     """An image (H, W, 3) BGR as JPEG in base64."""
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
     return as_base64(cv2.imencode(".jpg", pixels, options)[1].tobytes())
+
+
+def shrunk(pixels: np.ndarray, factor: float) -> np.ndarray:
+    """An image of ``factor`` times the size, at least a pixel of it."""
+    size = (max(1, round(pixels.shape[1] * factor)), max(1, round(pixels.shape[0] * factor)))
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
 
 
 def as_base64(content: bytes) -> str:
@@ -54,8 +60,7 @@ def mosaic_layer(folder: Path) -> dict[str, Any] | None:
     """
     if not (folder / EXTENT).is_file():
         return None
-    content = load_json(folder / EXTENT, MapFileError)
-    where = f"{folder / EXTENT}"
+    content, where = load_json(folder / EXTENT, MapFileError), f"{folder / EXTENT}"
     bounds = take_array(content.get("bounds_m"), (4,), f"{where}: bounds_m", MapFileError)
     path = folder / Path(take_text(content.get("image"), f"{where}: image", MapFileError)).name
     coded = path.read_bytes() if path.is_file() else b""
@@ -76,9 +81,7 @@ def _small_enough(pixels: np.ndarray) -> str:
         text = as_base64(coded)
         if len(text) <= LARGEST_BYTES:
             return text
-        factor = 0.9 * float(np.sqrt(LARGEST_BYTES / len(text)))
-        size = (max(1, round(pixels.shape[1] * factor)), max(1, round(pixels.shape[0] * factor)))
-        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+        pixels = shrunk(pixels, 0.9 * float(np.sqrt(LARGEST_BYTES / len(text))))
 
 
 def ground_page(folder: Path) -> GroundPage | None:
@@ -87,19 +90,18 @@ def ground_page(folder: Path) -> GroundPage | None:
     pixels = cv2.imread(str(path)) if path.is_file() else None
     if pixels is None:
         return None
-    factor = min(1.0, _COMPARISON_WIDTH_PX / pixels.shape[1])
-    size = (round(pixels.shape[1] * factor), round(pixels.shape[0] * factor))
-    shown = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-    told: Mapping[str, Any] = {}
+    shown = shrunk(pixels, min(1.0, _COMPARISON_WIDTH_PX / pixels.shape[1]))
+    sharpness: Mapping[str, Any] = {}
     if (folder / EXTENT).is_file():
         content = load_json(folder / EXTENT, MapFileError)
-        told = take_mapping(content.get("sharpness", {}), f"{folder / EXTENT}: sharpness", MapFileError)
+        sharpness = take_mapping(content.get("sharpness", {}), f"{folder / EXTENT}: sharpness", MapFileError)
     caption = "All images laid on the ground, by the initial and by the optimised calibration and poses."
-    if told.get("edges"):
-        before, after = (100 * float(told[f"edge_width_{one}_m"]) for one in ("before", "after"))
+    if sharpness.get("edges"):
+        before, after = (100 * float(sharpness[f"edge_width_{one}_m"]) for one in ("before", "after"))
         caption += (
             f" Paint edges are {before:.1f} cm wide before and {after:.1f} cm after: "
-            f"{float(told['after_over_before']):.1f} times as sharp (median of {told['edges']} sides)."
+            f"{float(sharpness['after_over_before']):.1f} times as sharp "
+            f"(median of {sharpness['edges']} sides)."
         )
     return GroundPage(jpeg(shown, 84), caption)
 
@@ -109,21 +111,6 @@ SIGMAS_95 = 2.4477
 root of the chi-square quantile of two degrees of freedom."""
 
 _LEAST_ARROW_SIGHTINGS = 4
-
-
-def marking_key(identity: int | None) -> str:
-    """By what the page finds the pictures of a marking."""
-    return f"m{identity}"
-
-
-def symbol_key(identity: int | None) -> str:
-    """The same of a symbol."""
-    return f"s{identity}"
-
-
-def excluded_key(number: int) -> str:
-    """The same of candidate ``number`` of those left out."""
-    return f"x{number}"
 
 
 def ellipses(marking: Marking) -> FloatArray | None:
@@ -144,16 +131,10 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
         return {}
     named: list[Marking | Symbol | Lane] = [*hd_map.markings, *hd_map.symbols, *hd_map.lanes]
     kinds = sorted({one.kind for one in named})
-    arrows = _arrows(residuals)
-    errors = _errors(facts)
+    arrows, errors = _arrows(residuals), _errors(facts)
     markings = []
     for number, marking in enumerate(hd_map.markings):
-        found: dict[str, Any] = {
-            "id": marking.id,
-            "k": kinds.index(marking.kind),
-            "c": _metres(marking.corners_map),
-            "n": marking.sightings,
-        }
+        found = _feature(marking, kinds, "c", marking.corners_map)
         axes = ellipses(marking)
         if axes is not None:
             found["e"] = np.round(axes, 5).tolist()
@@ -169,18 +150,10 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
         "kinds": kinds,
         "cameras": list(residuals.cameras) if residuals else [],
         "markings": markings,
-        "lanes": [
-            {"id": one.id, "k": kinds.index(one.kind), "p": _metres(one.points_map), "n": one.sightings}
-            for one in hd_map.lanes
-        ],
+        "lanes": [_feature(one, kinds, "p", one.points_map) for one in hd_map.lanes],
         "symbols": [
-            {
-                "id": one.id,
-                "k": kinds.index(one.kind),
-                "p": _metres(one.outline_map),
-                "n": one.sightings,
-                "e": None if one.sigma_m is None else round(SIGMAS_95 * one.sigma_m, 5),
-            }
+            _feature(one, kinds, "p", one.outline_map)
+            | {"e": None if one.sigma_m is None else round(SIGMAS_95 * one.sigma_m, 5)}
             for one in hd_map.symbols
         ],
         "excluded": [
@@ -197,6 +170,12 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
     }
 
 
+def _feature(
+    one: Marking | Symbol | Lane, kinds: list[str], key: str, points_map: FloatArray
+) -> dict[str, Any]:
+    return {"id": one.id, "k": kinds.index(one.kind), key: _metres(points_map), "n": one.sightings}
+
+
 def _metres(points: FloatArray) -> list[list[float]]:
     rounded: list[list[float]] = np.round(points, 3).tolist()
     return rounded
@@ -210,8 +189,7 @@ def _errors(facts: Facts) -> dict[int, float]:
     rows, columns = match_markings(mapped, true)
     found = {}
     for row, column in zip(rows, columns, strict=True):
-        off = corner_errors([mapped[row]], [true[column]])
-        found[row] = float(np.sqrt((off**2).sum(axis=1).mean()))
+        found[row] = rms(corner_errors([mapped[row]], [true[column]]))
     return found
 
 
