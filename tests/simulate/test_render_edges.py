@@ -5,7 +5,7 @@ import pytest
 
 from v2hdm.geometry.lens import distort_points
 from v2hdm.records import DIAMOND, CameraInfo
-from v2hdm.simulate.render.renderer import Motion, Optics, Rendered, render
+from v2hdm.simulate.render.renderer import Motion, Optics, Rendered, Renderer
 from v2hdm.simulate.render.scene import Box, Ground, Light, Paint, Scene
 from v2hdm.simulate.render.view import camera_rays
 
@@ -23,7 +23,7 @@ CLEAN = Optics(psf_sigma_px=0.7, vignetting=0.0, read_noise=0.0, full_well_elect
 
 
 def picture(scene: Scene, motion: Motion | None = None) -> Rendered:
-    return render(scene, INFO, CAM_FROM_MAP, np.random.default_rng(0), CLEAN, motion)
+    return Renderer(scene).render(INFO, CAM_FROM_MAP, np.random.default_rng(0), CLEAN, motion)
 
 
 def pinhole(points_map: np.ndarray) -> np.ndarray:
@@ -107,8 +107,10 @@ def test_a_shadow_falls_away_from_the_sun() -> None:
 def test_a_picture_is_a_function_of_scene_place_and_random_state() -> None:
     scene = Scene(ground=Ground(texture="asphalt", wet_fraction=0.2))
     noisy = Optics()
-    one, two = (render(scene, INFO, CAM_FROM_MAP, np.random.default_rng(3), noisy).image for _ in range(2))
-    other = render(scene, INFO, CAM_FROM_MAP, np.random.default_rng(4), noisy).image
+    renderer = Renderer(scene)
+    one, two, other = (
+        renderer.render(INFO, CAM_FROM_MAP, np.random.default_rng(seed), noisy).image for seed in (3, 3, 4)
+    )
     assert np.array_equal(one, two)
     assert not np.array_equal(one, other)
 
@@ -117,5 +119,5 @@ def test_a_camera_that_looks_up_sees_only_sky() -> None:
     turned = CAM_FROM_MAP.copy()
     turned[1, :3], turned[2, :3] = CAM_FROM_MAP[2, :3], -CAM_FROM_MAP[1, :3]
     turned[:3, 3] = -turned[:3, :3] @ np.array([0, 0, 2.4])
-    rendered = render(Scene(), INFO, turned, np.random.default_rng(0))
+    rendered = Renderer(Scene()).render(INFO, turned, np.random.default_rng(0))
     assert rendered.image.min() > 0

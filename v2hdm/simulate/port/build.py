@@ -30,16 +30,10 @@ def camera_info(name: str, config: CameraConfig) -> CameraInfo:
     """The intrinsics of a configured camera."""
     focal = config.focal_px
     du, dv = config.principal_offset_px
-    intrinsic = np.array(
-        [
-            [focal, 0.0, (config.width - 1) / 2 + du],
-            [0.0, focal, (config.height - 1) / 2 + dv],
-            [0.0, 0.0, 1.0],
-        ]
-    )
-    return CameraInfo(
-        name, config.width, config.height, intrinsic, "plumb_bob", tuple(float(d) for d in config.distortion)
-    )
+    u, v = (config.width - 1) / 2 + du, (config.height - 1) / 2 + dv
+    intrinsic = np.array([[focal, 0.0, u], [0.0, focal, v], [0.0, 0.0, 1.0]])
+    distortion = tuple(float(d) for d in config.distortion)
+    return CameraInfo(name, config.width, config.height, intrinsic, "plumb_bob", distortion)
 
 
 def cam_from_vehicle(mount: MountConfig) -> FloatArray:
@@ -52,33 +46,14 @@ def cam_from_vehicle(mount: MountConfig) -> FloatArray:
     return out
 
 
-def ground_points(mount: MountConfig, config: CalibrationConfig) -> FloatArray:
-    """The true calibration points (N, 2) on the ground in the vehicle frame, laid out before the camera."""
-    yaw = np.deg2rad(mount.yaw_deg)
-    ahead, left = np.array(config.points_ahead_m, dtype=np.float64).T
-    return np.column_stack(
-        [
-            mount.x_m + ahead * np.cos(yaw) - left * np.sin(yaw),
-            mount.y_m + ahead * np.sin(yaw) + left * np.cos(yaw),
-        ]
-    )
-
-
 @dataclass(frozen=True)
 class ManualCalibration:
-    """What a manual calibration rests on, and what comes of it.
+    """The data of a manual calibration, and its result."""
 
-    Attributes:
-        surveyed_vehicle: (N, 2) m, the points on the ground as they were measured.
-        clicked_px: (N, 2) px, the same points as they were clicked in the recorded image.
-        ipm: ``vehicle_from_pinhole_px`` (3 x 3).
-        roi_vehicle: (M, 2) m, the region that it was made for, the convex hull of the surveyed points.
-    """
-
-    surveyed_vehicle: FloatArray
-    clicked_px: FloatArray
-    ipm: FloatArray
-    roi_vehicle: FloatArray
+    surveyed_vehicle: FloatArray  # (N, 2) m, the points on the ground as they were measured
+    clicked_px: FloatArray  # (N, 2), the same points as they were clicked in the recorded image
+    ipm: FloatArray  # vehicle_from_pinhole_px (3 x 3)
+    roi_vehicle: FloatArray  # (M, 2) m, its region: the convex hull of the surveyed points
 
 
 def calibrate(
@@ -89,16 +64,23 @@ def calibrate(
     Raises:
         ConfigError: when a point lies outside the image, or the points do not determine a homography.
     """
-    points = ground_points(mount, config)
+    yaw = np.deg2rad(mount.yaw_deg)
+    ahead, left = np.array(config.points_ahead_m, dtype=np.float64).T
+    points = np.column_stack(
+        [
+            mount.x_m + ahead * np.cos(yaw) - left * np.sin(yaw),
+            mount.y_m + ahead * np.sin(yaw) + left * np.cos(yaw),
+        ]
+    )
     pinhole_px, _ = project_ground(info.intrinsic, cam_from_vehicle(mount), points)
     clicked_px = distort_points(info, pinhole_px)
     clicked_px = clicked_px + rng.normal(0.0, config.click_sigma_px, points.shape)
     surveyed = points + rng.normal(0.0, config.survey_sigma_m, points.shape)
     outside = (clicked_px < 0).any(axis=1) | (clicked_px > (info.width - 1, info.height - 1)).any(axis=1)
     if outside.any():
-        ahead, left = config.points_ahead_m[int(np.argmax(outside))]
+        first_ahead, first_left = config.points_ahead_m[int(np.argmax(outside))]
         raise ConfigError(
-            f"calibration.points_ahead_m: [{ahead:g}, {left:g}] is outside camera "
+            f"calibration.points_ahead_m: [{first_ahead:g}, {first_left:g}] is outside camera "
             f"'{info.name}'; move it or the mount"
         )
     # Solved towards pixels, where the larger and equal errors are.
@@ -106,9 +88,8 @@ def calibrate(
     if pinhole_from_vehicle is None:
         raise ConfigError("calibration.points_ahead_m: these points do not fix a homography; spread them out")
     ipm = np.linalg.inv(pinhole_from_vehicle)
-    return ManualCalibration(
-        surveyed, clicked_px, np.asarray(ipm / np.linalg.norm(ipm)), convex_hull(surveyed)
-    )
+    unit_ipm = np.asarray(ipm / np.linalg.norm(ipm))
+    return ManualCalibration(surveyed, clicked_px, unit_ipm, convex_hull(surveyed))
 
 
 def survey_camera(
@@ -118,10 +99,7 @@ def survey_camera(
     initial_ipm: str,
     rng: np.random.Generator,
 ) -> tuple[Camera, ManualCalibration]:
-    """What the mapper gets to know of a camera: two IPMs, a region, a surveyed centre.
-
-    Beside it the vehicle's own manual calibration, of which the mapper knows no more than the IPM.
-    """
+    """A camera as the mapper knows it (two IPMs, a region, a surveyed centre), and its manual calibration."""
     info = camera_info(name, config)
     own = calibrate(info, config.mount, calibration, rng)
     borrowed = calibrate(info, config.borrowed_mount, calibration, rng)
@@ -137,6 +115,7 @@ def survey_camera(
     return camera, own
 
 
+_IPMS = ("calibrated", "estimated")
 ORIGIN = GeodeticOrigin(latitude_deg=29.95, longitude_deg=122.05, altitude_m=12.0, epoch=2026.0)
 
 # Independent random streams of one seed, so that a change to one part leaves the others alone.
@@ -178,14 +157,10 @@ class Port:
             full_well_electrons=exposure.full_well_electrons,
             read_noise=exposure.read_noise,
         )
-        return self.renderer.render(
-            self.cameras[camera].info,
-            self.cam_from_map(camera, frame),
-            rng,
-            optics,
-            self._motion(camera, frame),
-            self.moving_boxes(frame),
-        )
+        info, pose, motion = (
+            self.cameras[camera].info, self.cam_from_map(camera, frame), self._motion(camera, frame)
+        )  # fmt: skip
+        return self.renderer.render(info, pose, rng, optics, motion, self.moving_boxes(frame))
 
     def jpeg(self, image_bgr: NDArray[np.uint8]) -> bytes:
         """The file that the vehicle would have recorded of a picture (H, W, 3)."""
@@ -207,11 +182,9 @@ class Port:
         centre = camera_centre(extrinsic)
         turning = np.array([0.0, 0.0, yaw_rate])
         velocity = extrinsic[:3, :3] @ (np.array([speed, 0.0, 0.0]) + np.cross(turning, centre))
-        return Motion(
-            velocity_cam=_triple(velocity),
-            angular_velocity_cam=_triple(extrinsic[:3, :3] @ turning),
-            exposure_s=self.config.exposure.exposure_s,
-        )
+        (vx, vy, vz), (wx, wy, wz) = velocity.tolist(), (extrinsic[:3, :3] @ turning).tolist()
+        exposure_s = self.config.exposure.exposure_s
+        return Motion(velocity_cam=(vx, vy, vz), angular_velocity_cam=(wx, wy, wz), exposure_s=exposure_s)
 
 
 _SHORTEST_ROUTE_M = 25.0  # what stands in the way does so at least 12 m from either end
@@ -243,59 +216,46 @@ def build_port(config: PortConfig) -> Port:
     """
     _check(config)
 
-    def stream(part: int) -> np.random.Generator:
-        return np.random.default_rng([config.seed, part])
-
-    def anew(part: int) -> np.random.Generator:
-        return np.random.default_rng(_visit_seed(config, part))
-
+    streams = {part: np.random.default_rng([config.seed, part]) for part in (_LAYOUT, _YARD, _ALTERED)}
+    anew = {part: np.random.default_rng(_visit_seed(config, part)) for part in (_TRUCKS, _POSES)}
     route = build_route(config.route)
     if route.length_m < _SHORTEST_ROUTE_M:
         raise ConfigError(
             f"port '{config.name}', route.pieces: {route.length_m:g} m in all; "
             f"give {_SHORTEST_ROUTE_M:g} m or more"
         )
-    layout = build_layout(config.paint, route, stream(_LAYOUT))
-    layout, alterations = alter(layout, config.altered, config.paint, route, stream(_ALTERED))
-    scene = build_scene(config.surface, config.yard, route, stream(_YARD), config.seed)
+    layout = build_layout(config.paint, route, streams[_LAYOUT])
+    layout, alterations = alter(layout, config.altered, config.paint, route, streams[_ALTERED])
+    scene = build_scene(config.surface, config.yard, route, streams[_YARD], config.seed)
     cameras = {name: camera for name, (camera, _) in surveyed_cameras(config).items()}
+    scene, classes = replace(scene, paints=tuple(layout.paints)), (*PAINT_CLASSES, *config.paint.stencils)
     return Port(
         config=config,
         route=route,
-        renderer=Renderer(
-            replace(scene, paints=tuple(layout.paints)), (*PAINT_CLASSES, *config.paint.stencils)
-        ),
-        trucks=moving_trucks(config.yard, route, anew(_TRUCKS)),
+        renderer=Renderer(scene, classes),
+        trucks=moving_trucks(config.yard, route, anew[_TRUCKS]),
         hd_map=layout.hd_map(ORIGIN),
         cameras=cameras,
         cam_from_vehicle={name: cam_from_vehicle(config.cameras[name].mount) for name in cameras},
-        driven=drive_along(route, config.route, config.disturbance, anew(_POSES)),
+        driven=drive_along(route, config.route, config.disturbance, anew[_POSES]),
         alterations=tuple(alterations),
     )
 
 
 def _check(config: PortConfig) -> None:
     """Refuse what would fail far from its cause."""
+    altered, route, pieces = config.altered, config.route, config.route.pieces
     rules: list[tuple[Any, str]] = [
         (config.cameras, "cameras: none given; add at least one"),
-        (
-            config.initial_ipm in ("calibrated", "estimated"),
-            "initial_ipm: choose 'calibrated' or 'estimated'",
-        ),
+        (config.initial_ipm in _IPMS, "initial_ipm: choose 'calibrated' or 'estimated'"),
         (config.visit >= 0, "visit: must be 0 or more"),
-        (
-            min(config.altered.moved, config.altered.removed, config.altered.added) >= 0,
-            "altered: numbers must be 0 or more",
-        ),
-        (len(config.altered.moved_by_m) == 2, "altered.moved_by_m: give the least and the largest distance"),
-        (config.route.pieces, "route.pieces: empty; give [length_m, turn_deg] pieces"),
-        (
-            all(len(p) == 2 and p[0] > 0 for p in config.route.pieces),
-            "route.pieces: each is [length_m > 0, turn_deg]",
-        ),
-        (config.route.speed_mps > 0, "route.speed_mps: must be positive"),
-        (config.route.image_spacing_m > 0, "route.image_spacing_m: must be positive"),
-        (config.route.pose_rate_hz > 0, "route.pose_rate_hz: must be positive"),
+        (min(altered.moved, altered.removed, altered.added) >= 0, "altered: numbers must be 0 or more"),
+        (len(altered.moved_by_m) == 2, "altered.moved_by_m: give the least and the largest distance"),
+        (pieces, "route.pieces: empty; give [length_m, turn_deg] pieces"),
+        (all(len(p) == 2 and p[0] > 0 for p in pieces), "route.pieces: each is [length_m > 0, turn_deg]"),
+        (route.speed_mps > 0, "route.speed_mps: must be positive"),
+        (route.image_spacing_m > 0, "route.image_spacing_m: must be positive"),
+        (route.pose_rate_hz > 0, "route.pose_rate_hz: must be positive"),
         (len(config.surface.slab_m) == 2, "surface.slab_m: give length and width, or [0, 0]"),
         (0 <= config.surface.wet_fraction < 1, "surface.wet_fraction: must be within 0 and 1"),
         (config.paint.diamond_spacing_m > 1, "paint.diamond_spacing_m: must be more than 1 m"),
@@ -323,12 +283,7 @@ def _is_convex(shape: list[list[float]]) -> bool:
         return False
     side = np.roll(shape, -1, axis=0) - np.array(shape)
     following = np.roll(side, -1, axis=0)
-    turn = np.arctan2(
-        side[:, 0] * following[:, 1] - side[:, 1] * following[:, 0], (side * following).sum(axis=1)
-    )
+    cross = side[:, 0] * following[:, 1] - side[:, 1] * following[:, 0]
+    turn = np.arctan2(cross, (side * following).sum(axis=1))
     one_way = (turn > 0).all() or (turn < 0).all()
     return bool(one_way and np.isclose(abs(turn.sum()), 2 * np.pi))
-
-
-def _triple(vector: FloatArray) -> tuple[float, float, float]:
-    return float(vector[0]), float(vector[1]), float(vector[2])

@@ -115,11 +115,10 @@ def rendered_drive(config: PortConfig, cache: Path, workers: int, progress: Prog
     """The folder of a port's drive in a cache, rendered now unless it was rendered before.
 
     Args:
-        config: The port.
-        cache: Folder of all rendered drives; a drive's own folder is named by the port and a hash of its
-            configuration and of the renderer's version.
-        workers: Processes to render with; 1 renders in this one.
-        progress: Called with the number of finished images and of all.
+        config: the port.
+        cache: folder of all rendered drives.
+        workers: processes to render with; 1 renders in this one.
+        progress: called with the number of finished images and of all.
 
     Raises:
         ConfigError: when the configuration makes no port.
@@ -188,14 +187,10 @@ def render_drive(config: PortConfig, folder: Path, workers: int, progress: Progr
 
 
 def _images(port: Port, folder: Path) -> list[Image]:
+    driven = port.driven
     return [
-        Image(
-            name,
-            float(stamp),
-            folder / name / "images" / f"{frame:06d}.jpg",
-            port.driven.map_from_vehicle[frame],
-        )
-        for frame, stamp in enumerate(port.driven.stamp_s)
+        Image(name, float(stamp), folder / name / "images" / f"{frame:06d}.jpg", pose)
+        for frame, (stamp, pose) in enumerate(zip(driven.stamp_s, driven.map_from_vehicle, strict=True))
         for name in port.cameras
     ]
 

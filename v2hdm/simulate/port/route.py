@@ -66,19 +66,15 @@ def build_route(config: RouteConfig) -> Route:
 
     Curvature ramps over 4 m between pieces, as a steered vehicle's does.
     """
-    curvature = np.concatenate(
-        [
-            np.full(max(round(length / _STEP_M), 1), np.deg2rad(turn) / length)
-            for length, turn in config.pieces
-        ]
-    )
+    steps = [(max(round(length / _STEP_M), 1), np.deg2rad(turn) / length) for length, turn in config.pieces]
+    curvature = np.concatenate([np.full(count, bend) for count, bend in steps])
     window = int(_TRANSITION_M / _STEP_M)
     padded = np.pad(curvature, (window // 2, window - 1 - window // 2), mode="edge")
     curvature = np.convolve(padded, np.full(window, 1.0 / window), mode="valid")
     yaw = np.concatenate([[0.0], np.cumsum(curvature * _STEP_M)])
     middle = 0.5 * (yaw[1:] + yaw[:-1])
-    steps = _STEP_M * np.column_stack([np.cos(middle), np.sin(middle)])
-    points = np.vstack([[0.0, 0.0], np.cumsum(steps, axis=0)])
+    moves = _STEP_M * np.column_stack([np.cos(middle), np.sin(middle)])
+    points = np.vstack([[0.0, 0.0], np.cumsum(moves, axis=0)])
     return Route(
         station_m=np.linspace(0.0, len(curvature) * _STEP_M, len(yaw)),
         points_map=points,
@@ -121,19 +117,14 @@ def drive_along(
     """
     lead_m = route.speed_mps * _LEAD_S
     stations = np.arange(lead_m, route.length_m - lead_m, config.image_spacing_m)
-    times = _times_at(route, np.append(stations, route.length_m))
+    grid = np.arange(0.0, route.length_m / route.speed_mps * 1.5 + 10.0, 0.05)
+    times = np.interp(np.append(stations, route.length_m), route.station_at(grid), grid)
     stamp_s = np.round(times[:-1], 6)
     recorded_s = np.arange(0.0, times[-1], 1.0 / config.pose_rate_hz)
     stamp_s = stamp_s[stamp_s < recorded_s[-1]]
     return DrivenPoses(
         stamp_s, _true_poses(route, stamp_s, disturbance, rng), _recorded(route, recorded_s, disturbance, rng)
     )
-
-
-def _times_at(route: Route, station_m: FloatArray) -> FloatArray:
-    """Times (K,) at which the vehicle passes rising stations (K,)."""
-    grid = np.arange(0.0, station_m[-1] / route.speed_mps * 1.5 + 10.0, 0.05)
-    return np.interp(station_m, route.station_at(grid), grid)
 
 
 def _true_poses(
@@ -172,18 +163,17 @@ def _poses(
 
 
 def pose_noise(config: DisturbanceConfig, speed_mps: float) -> PoseNoise:
-    """What the receiver's data sheet would state, and a test drive of the suspension at ``speed_mps``."""
-    heading_rad = float(np.deg2rad(config.heading_deg))
-    roll_pitch_rad = float(np.deg2rad(config.roll_pitch_deg))
+    """The noise in the receiver's data sheet, and of a test drive of the suspension at ``speed_mps``."""
+    heading, roll_pitch = (float(np.deg2rad(one)) for one in (config.heading_deg, config.roll_pitch_deg))
     return PoseNoise(
         position_m=float(np.hypot(config.rtk_white_m, config.rtk_correlated_m)),
-        heading_rad=heading_rad,
-        roll_pitch_rad=roll_pitch_rad,
+        heading_rad=heading,
+        roll_pitch_rad=roll_pitch,
         position_drift_m=config.rtk_correlated_m,
         position_drift_over_m=config.rtk_correlation_m,
-        heading_drift_rad=heading_rad / float(np.sqrt(2.0)),
+        heading_drift_rad=heading / float(np.sqrt(2.0)),
         heading_drift_over_m=config.heading_correlation_s * speed_mps,
-        roll_pitch_drift_rad=roll_pitch_rad / float(np.sqrt(2.0)),
+        roll_pitch_drift_rad=roll_pitch / float(np.sqrt(2.0)),
         roll_pitch_drift_over_m=config.jitter_correlation_s * speed_mps,
     )
 
@@ -192,10 +182,8 @@ def measured_disturbances(config: DisturbanceConfig, driven: DrivenPoses) -> dic
     """The configured standard deviations, per axis, and under ``actual_`` their values at the images."""
     recorded, _ = interpolate(driven.recorded, driven.stamp_s, np.inf)
     true = driven.map_from_vehicle
-    yaw = [heading_rad(pose) for pose in (recorded, true)]
     tilt = np.stack([true[:, 2, 0], true[:, 2, 1]])
-    error = recorded[:, :2, 3] - true[:, :2, 3]
-    turned = np.angle(np.exp(1j * (yaw[0] - yaw[1])))
+    turned = np.angle(np.exp(1j * (heading_rad(recorded) - heading_rad(true))))
 
     def rms(values: FloatArray) -> float:
         return float(np.sqrt(np.mean(values**2)))
@@ -207,6 +195,6 @@ def measured_disturbances(config: DisturbanceConfig, driven: DrivenPoses) -> dic
         "heading_deg": config.heading_deg,
         "actual_roll_pitch_deg": float(np.rad2deg(rms(tilt))),
         "actual_heave_m": rms(true[:, 2, 3]),
-        "actual_rtk_position_m": rms(error),
+        "actual_rtk_position_m": rms(recorded[:, :2, 3] - true[:, :2, 3]),
         "actual_heading_deg": float(np.rad2deg(rms(turned))),
     }

@@ -73,15 +73,10 @@ class Renderer:
         motion: Motion | None = None,
         moving_boxes: tuple[Box, ...] = (),
     ) -> Rendered:
-        """Render one image.
+        """Render one image of a camera of any size, at ``cam_from_map`` in the middle of the exposure.
 
-        Args:
-            info: The camera, lens distortion included; any size.
-            cam_from_map: Where it is, at the middle of the exposure.
-            rng: Source of the sensor noise; the picture is a function of its state.
-            optics: Lens and sensor.
-            motion: Motion during the exposure.
-            moving_boxes: What stands in the scene for this image only.
+        The sensor noise is drawn from ``rng``: the picture is a function of its state. ``moving_boxes`` stand
+        in the scene for this image only.
         """
         view = View(camera_rays(info), np.asarray(cam_from_map, dtype=np.float64))
         labels = np.zeros((info.height, info.width), dtype=np.uint8)
@@ -120,18 +115,6 @@ class Renderer:
         self._paint.draw(view, ground, albedo, labels)
         sun = sun_visibility(shadows, scene.dapples, view, ground)
         return _lit(albedo, sun, wetness(scene.ground, ground), ground, view, scene.light)
-
-
-def render(
-    scene: Scene,
-    info: CameraInfo,
-    cam_from_map: FloatArray,
-    rng: np.random.Generator,
-    optics: Optics | None = None,
-    motion: Motion | None = None,
-) -> Rendered:
-    """Render one image of a scene; see :meth:`Renderer.render`."""
-    return Renderer(scene).render(info, cam_from_map, rng, optics, motion)
 
 
 def _lit(
@@ -272,8 +255,7 @@ def _noise(image: Float32, optics: Optics, rng: np.random.Generator) -> Float32:
     height, width = image.shape[:2]
     row, column = (int(n) for n in rng.integers(0, _NOISE_SHIFT_PX, 2))
     field = _normal_field(height + _NOISE_SHIFT_PX, width + _NOISE_SHIFT_PX)
-    variance = np.maximum(image, 0)
-    variance *= np.float32(1.0 / optics.full_well_electrons)
+    variance = np.maximum(image, 0) * np.float32(1.0 / optics.full_well_electrons)
     variance += np.float32(optics.read_noise**2)
     return np.asarray(cv2.multiply(cv2.sqrt(variance), field[row : row + height, column : column + width]))
 

@@ -156,19 +156,18 @@ def convex_hull(points: FloatArray) -> FloatArray:
     """Convex hull (M, 2) of points (N, 2), counter-clockwise, in float64 (Andrew's monotone chain)."""
     ordered = sorted(map(tuple, np.asarray(points, dtype=np.float64)))
 
+    def turns_left(a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]) -> bool:
+        return (b[0] - a[0]) * (c[1] - a[1]) > (b[1] - a[1]) * (c[0] - a[0])
+
     def chain(sequence: list[tuple[float, ...]]) -> list[tuple[float, ...]]:
         hull: list[tuple[float, ...]] = []
         for p in sequence:
-            while len(hull) > 1 and _turn(hull[-2], hull[-1], p) <= 0:
+            while len(hull) > 1 and not turns_left(hull[-2], hull[-1], p):
                 hull.pop()
             hull.append(p)
         return hull[:-1]
 
     return np.array(chain(ordered) + chain(ordered[::-1]))
-
-
-def _turn(a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]) -> float:
-    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
 def placed(shape: FloatArray, centre_map: FloatArray | tuple[float, float], yaw_rad: float) -> FloatArray:
@@ -185,8 +184,6 @@ def box_footprint(box: Box) -> FloatArray:
 def box_shadow(box: Box, light: Light, softness_m: float = 0.08) -> Shadow:
     """The shadow that a box throws on the ground: hull of its lower and upper face along the sun's rays."""
     sun = np.array(light.sun_direction_map)
-    per_metre = -sun[:2] / max(sun[2], 0.1)
-    footprint = box_footprint(box)
-    lower = footprint + box.base_m * per_metre
-    upper = footprint + (box.base_m + box.size_m[2]) * per_metre
-    return Shadow(polygon_map=convex_hull(np.vstack([lower, upper])), softness_m=softness_m)
+    per_metre, footprint = -sun[:2] / max(sun[2], 0.1), box_footprint(box)
+    faces = [footprint + height * per_metre for height in (box.base_m, box.base_m + box.size_m[2])]
+    return Shadow(polygon_map=convex_hull(np.vstack(faces)), softness_m=softness_m)
