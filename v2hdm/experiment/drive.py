@@ -67,12 +67,12 @@ def _plain(value: object) -> object:
     raise TypeError(f"{type(value).__name__} is not plain")
 
 
-Tell = Callable[[str, int, int], None]
-"""Told a stage, and how many of its steps are done, of how many."""
+Progress = Callable[[str, int, int], None]
+"""Called with a stage, and how many of its steps are done, of how many."""
 
 SETTING_FILE = "drive.json.gz"
 GROWTH_STEPS = 8
-"""Sizes of the growing map at which its error is told."""
+"""Sizes of the growing map at which its error is stated."""
 
 
 def setting_key(job: Job) -> str:
@@ -98,34 +98,31 @@ def recipe_file(recipe: str) -> str:
     return f"{recipe}.json.gz"
 
 
-def drive_record(job: Job, workers: int, tell: Tell) -> dict[str, Any]:
-    """What is known of a drive and of its maps, from disk or found now and kept there.
+def drive_record(job: Job, workers: int, progress: Progress) -> dict[str, Any]:
+    """The record of a drive and of its maps, from disk or made now and kept there.
 
     Args:
         job: the drive.
         workers: processes to render and detect in; 1 stays in this one.
-        tell: told how far each stage is.
+        progress: called with how far each stage is.
 
     Raises:
         V2hdmError: the drive cannot be rendered, read or looked at, or has no truth.
     """
     if _setting_and_maps(job) is None:
-        _find(job, workers, tell)
+        _find(job, workers, progress)
     known = _setting_and_maps(job)
     assert known is not None
-    tell("finished", 1, 1)
+    progress("finished", 1, 1)
     return _together(*known)
 
 
 def _setting_and_maps(job: Job) -> tuple[dict[str, Any], dict[str, dict[str, Any]]] | None:
-    """What is on disk: the drive, and its maps by recipe; None where something is missing."""
+    """The drive, and its maps by recipe, from disk; None where something is missing."""
     setting = stored(job.folder / SETTING_FILE, setting_key(job))
-    maps = {
-        recipe: found
-        for recipe in job.options
-        if (found := stored(job.folder / recipe_file(recipe), recipe_key(job, recipe))) is not None
-    }
-    return None if setting is None or len(maps) < len(job.options) else (setting, maps)
+    kept = {name: stored(job.folder / recipe_file(name), recipe_key(job, name)) for name in job.options}
+    maps = {recipe: found for recipe, found in kept.items() if found is not None}
+    return None if setting is None or len(maps) < len(kept) else (setting, maps)
 
 
 def _together(setting: Mapping[str, Any], maps: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -144,10 +141,10 @@ def _together(setting: Mapping[str, Any], maps: Mapping[str, Mapping[str, Any]])
     }
 
 
-def _find(job: Job, workers: int, tell: Tell) -> None:
+def _find(job: Job, workers: int, progress: Progress) -> None:
     """Open the drive, and map it by those recipes whose maps are missing."""
     if job.site.simulate is not None:
-        folder = rendered_drive(job.site.simulate, job.cache, workers, partial(tell, "render"))
+        folder = rendered_drive(job.site.simulate, job.cache, workers, partial(progress, "render"))
     else:
         folder = Path(job.site.drive.path or "")
     drive = read_drive(folder, job.site.drive)
@@ -156,14 +153,14 @@ def _find(job: Job, workers: int, tell: Tell) -> None:
     cache, contents = Store(job.cache), Contents.of([drive])
     room, max_gap_s = Room(cache), job.site.drive.max_gap_s
     with cache.in_use():
-        (inspection,) = inspect_each([drive], contents, max_gap_s, room, workers, tell)
+        (inspection,) = inspect_each([drive], contents, max_gap_s, room, workers, progress)
         detections = detect_in_pieces(
-            inspection.drive, contents, job.detector, room, workers, partial(tell, "detect")
+            inspection.drive, contents, job.detector, room, workers, partial(progress, "detect")
         )
     for recipe in job.options:
         path, key = job.folder / recipe_file(recipe), recipe_key(job, recipe)
         if stored(path, key) is None:
-            store(path, key, _mapped(job, recipe, inspection, detections, truth, tell))
+            store(path, key, _mapped(job, recipe, inspection, detections, truth, progress))
 
 
 def _setting(job: Job, drive: Drive, truth: Truth) -> dict[str, Any]:
@@ -207,7 +204,7 @@ def _mapped(
     inspection: Inspection,
     detections: Sequence[ImageDetections],
     truth: Truth,
-    tell: Tell,
+    progress: Progress,
 ) -> dict[str, Any]:
     """Maps, growth and extrinsics of a drive under a recipe; under ours residuals, too."""
     drive = inspection.drive
@@ -216,7 +213,7 @@ def _mapped(
         "maps": {}, "growth": {}, "extrinsics": {}, "failures": [], "lanes": {}, "residuals": {},
     }  # fmt: skip
     for done, (name, members) in enumerate(sets.items()):
-        tell(f"map, {recipe}", done, len(sets))
+        progress(f"map, {recipe}", done, len(sets))
         last = name == list(sets)[-1]
         steps = GROWTH_STEPS if last and recipe != PAPER else 0
         try:
@@ -232,7 +229,7 @@ def _mapped(
         if last and recipe == OURS:
             out["lanes"] = {"Opt": [lane.points_map for lane in methods["Opt"].hd_map.lanes]}
             out["residuals"] = residuals(inspection.drive_as_described, detections, methods, truth)
-    tell(f"map, {recipe}", len(sets), len(sets))
+    progress(f"map, {recipe}", len(sets), len(sets))
     return out
 
 

@@ -22,7 +22,7 @@ from v2hdm.geometry.rigid import camera_centre, inverse
 from v2hdm.mapping.results import MethodResult
 from v2hdm.mapping.sightings.table import Sightings, collect_sightings
 from v2hdm.records import DIAMOND, Drive, FloatArray, HdMap, ImageDetections, IntArray, Marking, Truth
-from v2hdm.report.metrics import corner_errors, marking_metrics, match_markings
+from v2hdm.report.metrics import corner_errors, marking_metrics, match_markings, rms
 from v2hdm.report.terminal import METHODS
 
 ROWS: tuple[str, ...] = (
@@ -36,15 +36,9 @@ ROWS: tuple[str, ...] = (
 class Row:
     """One method on one set of cameras of one drive; lengths in m, nan where nothing matched.
 
-    Attributes:
-        markings: mapped.
-        recall: share of the diamonds driven past that were mapped; of all markings where there are none.
-        false_markings: mapped without a true counterpart.
-        rmse_m: root mean square distance of corners from the true ones.
-        bias_m: length of their mean error vector.
-        spread_m: root mean square distance of the error vectors from their mean.
-        shared: markings that every method of this camera set has mapped.
-        shared_rmse_m: ``rmse_m`` of those alone.
+    ``recall`` is that of the diamonds driven past, of all markings where there are none. ``spread_m`` is the
+    root mean square distance of the error vectors from their mean. ``shared`` counts the markings that every
+    method of this camera set has mapped, ``shared_rmse_m`` is of those alone.
     """
 
     markings: int
@@ -155,14 +149,10 @@ def _row(
         false_markings=overall.false_markings,
         rmse_m=overall.corner_rmse_m,
         bias_m=overall.corner_bias_m,
-        spread_m=_rms(errors - errors.mean(axis=0)) if len(errors) else float("nan"),
+        spread_m=rms(errors - errors.mean(axis=0)) if len(errors) else float("nan"),
         shared=len(shared),
-        shared_rmse_m=_rms(of_shared),
+        shared_rmse_m=rms(of_shared),
     )
-
-
-def _rms(errors_m: FloatArray) -> float:
-    return float(np.sqrt((errors_m**2).sum(axis=1).mean())) if len(errors_m) else float("nan")
 
 
 SAME_SHARE = 0.5
@@ -180,15 +170,14 @@ _FEWEST = 20  # corners below which neither a cell nor a bin has figures
 
 @dataclass(frozen=True)
 class _Sighted:
-    """Corners (4,) of sightings that were recognised in the map: one entry per sighting.
+    """N sightings that were recognised in the map: ``row`` (N,) indexes them, ``marking`` (N,) the map.
 
-    ``row`` indexes the sightings, ``marking`` the map, ``shift`` says which corner of the marking is the
-    sighting's first: corner ``k`` is the marking's ``(k + shift) % 4``.
+    ``corners_map`` (N, 4, 2) are the markings' corners in the order of the sightings'.
     """
 
-    row: list[int]
-    marking: list[int]
-    shift: list[int]
+    row: IntArray
+    marking: IntArray
+    corners_map: FloatArray
 
 
 def residuals(
@@ -199,17 +188,16 @@ def residuals(
 ) -> dict[str, Any]:
     """By camera ``field`` and ``range`` of a camera set's results, as plain content.
 
+    ``field`` holds for ``before`` and ``after`` the median residual (px) of detected corners against the
+    optimised map, by cell of the image: before under the first IPM and the recorded poses, after under
+    the optimised extrinsic and the adjusted poses. ``range`` holds by method quartiles of the distance
+    (m) between corners of single sightings, laid on the ground, and the true ones.
+
     Args:
         drive: as it was described, with its first IPMs.
-        detections: what was found in its images.
+        detections: of its images.
         methods: of one camera set; ``Opt`` is among them.
         truth: of the drive.
-
-    Returns:
-        ``field`` holds for ``before`` and ``after`` the median residual (px) of detected corners against the
-        optimised map, by cell of the image: before under the first IPM and the recorded poses, after under
-        the optimised extrinsic and the adjusted poses. ``range`` holds by method quartiles of the distance
-        (m) between corners of single sightings, laid on the ground, and the true ones.
     """
     best = methods["Opt"]
     out: dict[str, Any] = {}
@@ -234,16 +222,12 @@ def _adjusted(drive: Drive, image: int, best: MethodResult) -> FloatArray:
 def _recognised(drive: Drive, sightings: Sightings, name: str, best: MethodResult) -> _Sighted:
     """Which sightings are of which marking of the map, by where the optimised calibration sees it."""
     calibration, markings = best.calibrations[name], best.hd_map.markings
-    seen = _Sighted([], [], [])
-    if not markings:
-        return seen
-    corners = np.array([marking.corners_map for marking in markings])
+    found: list[tuple[int, int, FloatArray]] = []
+    corners = np.array([marking.corners_map for marking in markings]).reshape(-1, 4, 2)
     kinds = np.array([marking.kind for marking in markings])
     for image in np.unique(sightings.image):
         cam_from_map = calibration.cam_from_vehicle @ inverse(_adjusted(drive, int(image), best))
-        places, depth = project_ground(
-            calibration.info.intrinsic, cam_from_map, corners.reshape(-1, 2)
-        )  # fmt: skip
+        places, depth = project_ground(calibration.info.intrinsic, cam_from_map, corners.reshape(-1, 2))
         places, ahead = places.reshape(-1, 4, 2), (depth.reshape(-1, 4) > 0).all(axis=1)
         centres = places.mean(axis=1)
         for row in np.flatnonzero(sightings.image == image):
@@ -258,29 +242,22 @@ def _recognised(drive: Drive, sightings: Sightings, name: str, best: MethodResul
             if distance.min() > SAME_SHARE * np.linalg.norm(np.ptp(corners_px, axis=0)):
                 continue
             off = [((np.roll(places[marking], -s, axis=0) - corners_px) ** 2).sum() for s in range(4)]
-            seen.row.append(int(row))
-            seen.marking.append(marking)
-            seen.shift.append(int(np.argmin(off)))
-    return seen
-
-
-def _turned(markings: Sequence[Marking], seen: _Sighted) -> FloatArray:
-    """Corners (N, 4, 2) of the recognised markings, in the order of their sightings' corners."""
-    corners = [
-        np.roll(markings[m].corners_map, -s, axis=0) for m, s in zip(seen.marking, seen.shift, strict=True)
-    ]
-    return np.array(corners).reshape(-1, 4, 2)
+            turned = np.roll(corners[marking], -int(np.argmin(off)), axis=0)
+            found.append((int(row), marking, turned))
+    rows, seen, turned_map = zip(*found, strict=True) if found else ((), (), ())
+    return _Sighted(
+        np.array(rows, np.int64), np.array(seen, np.int64), np.array(turned_map).reshape(-1, 4, 2)
+    )
 
 
 def _field(
     drive: Drive, sightings: Sightings, name: str, best: MethodResult, seen: _Sighted
 ) -> dict[str, Any]:
     camera = drive.cameras[name]
-    rows = np.array(seen.row, dtype=np.int64)
-    corners_map, observed = _turned(best.hd_map.markings, seen), sightings.corners_pinhole_px[rows]
+    corners_map, observed = seen.corners_map, sightings.corners_pinhole_px[seen.row]
     first = np.linalg.inv(facing_ipm(camera.ipm[camera.initial_ipm], camera.roi_vehicle.mean(axis=0)))
     found = best.calibrations[name]
-    images = [int(image) for image in sightings.image[rows]]
+    images = [int(image) for image in sightings.image[seen.row]]
     before = [first @ flat_motion(inverse(drive.images[image].map_from_vehicle)) for image in images]
     after = [
         pinhole_px_from_ground(
@@ -297,9 +274,7 @@ def _field(
 
 
 def _projected(homographies: Sequence[FloatArray], corners_map: FloatArray) -> FloatArray:
-    if not len(corners_map):
-        return np.empty((0, 4, 2))
-    return apply_in_front(np.array(homographies), corners_map)
+    return apply_in_front(np.array(homographies).reshape(-1, 3, 3), corners_map)
 
 
 def _cells(observed_px: FloatArray, projected_px: FloatArray, size: tuple[int, int]) -> dict[str, Any]:
@@ -332,13 +307,16 @@ def _by_range(
     camera, best = drive.cameras[name], methods["Opt"]
     mapped, true = match_markings(best.hd_map.markings, truth.map.markings)
     true_of = dict(zip(mapped, true, strict=True))
-    known = [n for n, marking in enumerate(seen.marking) if marking in true_of]
-    rows = np.array([seen.row[n] for n in known], dtype=np.int64)
+    known = np.flatnonzero(np.isin(seen.marking, mapped))
+    rows = seen.row[known]
     if not len(rows):
         return {}
-    turned = _turned(best.hd_map.markings, seen)[known]
-    corners = np.array([truth.map.markings[true_of[seen.marking[n]]].corners_map for n in known])
-    corners = np.array([_alike(one, other) for one, other in zip(corners, turned, strict=True)])
+    corners = np.array(
+        [
+            _alike(truth.map.markings[true_of[int(marking)]].corners_map, turned)
+            for marking, turned in zip(seen.marking[known], seen.corners_map[known], strict=True)
+        ]
+    )
     images = [int(image) for image in sightings.image[rows]]
     recorded = flat_motion(np.array([drive.images[image].map_from_vehicle for image in images]))
     vehicle_from_map = inverse(np.array([_adjusted(drive, image, best) for image in images]))

@@ -142,7 +142,7 @@ def _results_csv(measured: Sequence[Measured]) -> str:
         for cameras, rows in one.rows.items():
             for method, row in rows.items():
                 cells = [f"{take(row):.6g}" for take, _ in COLUMNS.values()]
-                lines.append([one.port, _seed(one), cameras, method, *cells])
+                lines.append([one.port, one.seed, cameras, method, *cells])
     return _csv(lines)
 
 
@@ -150,12 +150,8 @@ def _calibrations_csv(measured: Sequence[Measured]) -> str:
     lines: list[list[object]] = [["port", "seed", "camera", "extrinsic of", *_EXTRINSICS]]
     for one in measured:
         for camera, origin, errors in _extrinsics(one):
-            lines.append([one.port, _seed(one), camera, origin, *(f"{error:.6g}" for error in errors)])
+            lines.append([one.port, one.seed, camera, origin, *(f"{error:.6g}" for error in errors)])
     return _csv(lines)
-
-
-def _seed(one: Measured) -> str:
-    return "" if one.seed is None else str(one.seed)
 
 
 def _csv(lines: Iterable[Iterable[object]]) -> str:
@@ -186,8 +182,8 @@ _PAPER = (
 class Claim:
     """One claim held against the figures of one port and set of cameras.
 
-    ``values`` are those of the seeds, ``limit`` says what their mean is to keep; ``holds`` whether it does.
-    ``shared`` are the same ratios over the markings that every method has mapped.
+    The mean of ``values``, one per seed, is to keep ``limit``; ``shared`` are the same ratios over the
+    markings that every method has mapped.
     """
 
     text: str
@@ -241,15 +237,15 @@ def words(measured: Sequence[Measured], config: ExperimentConfig) -> str:
     drives = ", ".join(one.title for one in measured)
     recipes = "".join(f"- {name}: {what}\n" for name, what in RECIPES.items() if name in config.recipes)
     return (
-        f"# Experiment {config.name}\n\nv2hdm {__version__}. Drives: {drives}. Recipes:\n\n{recipes}\n## "
-        f"Beside the paper\n\n{_PAPER}\n\nRatios are of corner RMSE; the mean over the seeds is asked, the "
-        "range of the seeds stands behind "
-        f"it.\n\n{markdown(heads, lines)}\n{_verdict(tested)}\n{_remarks(measured)}{_failures(measured)}## "
-        f"Maps\n\n{markdown(*results_table(measured))}\n{NOTE}\n\n## "
-        f"Calibrations\n\n{markdown(*calibrations_table(measured))}\nHow far each camera's extrinsic is "
-        "from the true one: angle, and distance of the centre. CNI and ENI are the rigid extrinsics "
-        "nearest to the manual and the borrowed IPM; Opt is found with all cameras together.\n\nFigures "
-        "and what they show: [figures.md](figures.md).\n"
+        f"# Experiment {config.name}\n\nv2hdm {__version__}. Drives: {drives}. Recipes:\n\n{recipes}\n"
+        f"## Beside the paper\n\n{_PAPER}\n\n"
+        "Ratios are of corner RMSE; the mean over the seeds is asked, the range of the seeds stands behind "
+        f"it.\n\n{markdown(heads, lines)}\n{_verdict(tested)}\n{_remarks(measured)}{_failures(measured)}"
+        f"## Maps\n\n{markdown(*results_table(measured))}\n{NOTE}\n\n"
+        f"## Calibrations\n\n{markdown(*calibrations_table(measured))}\n"
+        "How far each camera's extrinsic is from the true one: angle, and distance of the centre. CNI and "
+        "ENI are the rigid extrinsics nearest to the manual and the borrowed IPM; Opt is found with all "
+        "cameras together.\n\nFigures and what they show: [figures.md](figures.md).\n"
     )
 
 
@@ -257,14 +253,12 @@ def _verdict(tested: Sequence[Claim]) -> str:
     broken = [claim for claim in tested if not claim.holds]
     if not broken:
         return f"All {len(tested)} figures agree with the paper's claims.\n"
-    lines = "".join(
-        f"- {claim.where}: {claim.text} is {claim.figure}, asked was {claim.limit}\n" for claim in broken
-    )
+    lines = "".join(f"- {c.where}: {c.text} is {c.figure}, asked was {c.limit}\n" for c in broken)
     return f"**{len(broken)} of {len(tested)} figures disagree with the paper's claims:**\n\n{lines}"
 
 
 def _remarks(measured: Sequence[Measured]) -> str:
-    """What the paper's recipe gives beside ours, and what shared markings say of the ratios."""
+    """Errors on shared markings, those of the paper's recipe beside ours."""
     out = []
     for port, drives in by_port(measured).items():
         for cameras in drives[0].rows:
@@ -272,9 +266,8 @@ def _remarks(measured: Sequence[Measured]) -> str:
             if rows:
                 cni, opt = (_cm(row[name].shared_rmse_m for row in rows) for name in ("CNI", "Opt"))
                 count = np.mean([row["Opt"].shared for row in rows])
-                line = (
-                    f"- {port}, {cameras}: on {count:.0f} shared markings CNI is {cni} cm off, Opt {opt} cm"
-                )
+                where = f"- {port}, {cameras}: on {count:.0f} shared markings"
+                line = f"{where} CNI is {cni} cm off, Opt {opt} cm"
                 recipe = _common(drives, cameras, ("Opt, paper",))
                 if recipe:
                     line += f"; by the paper's recipe {_cm(r['Opt, paper'].shared_rmse_m for r in recipe)} cm"

@@ -18,18 +18,11 @@ def save_figures(
     todo: Sequence[Job],
     records: Sequence[Mapping[str, Any]],
     measured: Sequence[Measured],
-    tell: Callable[[int, int], None],
+    progress: Callable[[int, int], None],
 ) -> dict[str, str]:
-    """Draw all figures into a folder.
+    """Draw all figures into a folder; figures of single drives show the first seed of each port.
 
-    Those of single drives show the first seed of each port.
-
-    Args:
-        folder: where to.
-        todo: the drives.
-        records: what is known of them.
-        measured: their figures.
-        tell: told how many figures are drawn, of how many.
+    ``progress`` is called with how many figures are drawn, of how many.
 
     Returns:
         By file name the caption of each figure that could be drawn.
@@ -50,11 +43,11 @@ def save_figures(
     work["bias_spread.png"] = partial(save_balance, measured=measured)
     captions = {}
     for done, (name, draw) in enumerate(work.items()):
-        tell(done, len(work))
+        progress(done, len(work))
         caption = draw(folder / name)
         if caption is None:
             (folder / name).unlink(missing_ok=True)
         else:
             captions[name] = caption
-    tell(len(work), len(work))
+    progress(len(work), len(work))
     return captions
