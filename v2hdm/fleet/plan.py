@@ -47,7 +47,7 @@ class Plan:
 
 
 def plan(files: Sequence[Path], overrides: Sequence[str]) -> Plan:
-    """The drives of run files (as ``conf/run/*.yaml``), each by itself, with ``key=value`` for all of them."""
+    """The drives of run files, each by itself; ``overrides`` are ``key=value`` for all of them."""
     jobs: list[Job] = []
     refused: list[Row] = []
     taken: dict[str, Path] = {}

@@ -103,14 +103,9 @@ class DetectorActor:
 def open_detectors(
     devices: Collection[str], cores: int, gpus: int, gpu_share: float, folder: str, retries: int
 ) -> dict[str, list[Any]]:
-    """Actors that detect, for each device that is asked for: one a core, on GPUs some to each.
+    """Actors that detect, for each device that is asked for: one per core, on GPUs some to each.
 
-    Args:
-        devices: as in :attr:`DetectorOptions.device`.
-        cores, gpus: of all machines.
-        gpu_share: of a GPU that an actor there books.
-        folder: where relative paths begin.
-        retries: how often a batch is begun anew whose actor died.
+    ``cores`` and ``gpus`` are those of all machines; an actor on a GPU books ``gpu_share`` of it.
     """
     lasting = {"max_restarts": -1, "max_task_retries": retries}
     # A core has one actor that detects and one drive that is mapped: the one waits for the other by turns.
@@ -178,11 +173,7 @@ def _result(reference: Any) -> list[ImageDetections]:
 def map_drive(job: Job, detectors: Sequence[Any], progress: Any, folder: str) -> tuple[Row, str]:
     """Map one drive and write its results; its row, and the traceback where it met a bug of ours.
 
-    Args:
-        job: the drive.
-        detectors: the actors that detect.
-        progress: the :class:`ProgressActor`.
-        folder: where relative paths begin.
+    ``progress`` is the :class:`ProgressActor`; relative paths begin at ``folder``.
     """
     os.chdir(folder)
     job.config.workers = 1

@@ -29,12 +29,8 @@ def save_birdseye(
 ) -> None:
     """Draw ``maps[best]`` over the truth from above, beside a close-up with all methods.
 
-    Args:
-        path: where the PNG goes.
-        maps: the map of each method, by its name.
-        best: the method shown on the whole site; its markings are coloured by their corner error.
-        route_map: vehicle positions (N, 2), m, with nan between two drives.
-        truth: ground truth, or None on a real drive.
+    The best map's markings are coloured by their corner error where there is truth. ``route_map`` (N, 2), m,
+    has nan between two drives.
     """
     span_m = np.nanmax(route_map, axis=0) - np.nanmin(route_map, axis=0)
     extent_m = np.maximum(span_m, 1.0) + 2 * _BESIDE_ROUTE_M
@@ -60,16 +56,13 @@ def save_growth(path: Path, growth: Mapping[str, Sequence[tuple[int, float]]]) -
             counts, errors = np.array(points, dtype=np.float64).reshape(-1, 2).T
             if not len(counts):
                 continue
+            look = {"ls": style.LINE.get(method, "-"), "color": style.METHOD.get(method, "k")}
             axes.plot(
-                counts, 100 * errors, ls=style.LINE.get(method, "-"), marker=style.MARKER.get(method, "."),
-                ms=4.5, color=style.METHOD.get(method, "k"), label=method,
-            )  # fmt: skip
+                counts, 100 * errors, marker=style.MARKER.get(method, "."), ms=4.5, label=method, **look
+            )
         style.set_logarithmic(axes, "y")
-        axes.set(
-            xlabel="markings mapped so far",
-            ylabel="corner RMSE (cm)",
-            title="Growth of the error with the map",
-        )
+        axes.set(xlabel="markings mapped so far", ylabel="corner RMSE (cm)")
+        axes.set_title("Growth of the error with the map")
         fig.legend(ncols=4, loc="outside lower center", handlelength=3.2)
 
 
@@ -168,11 +161,8 @@ def save_route(path: Path, trajectory: Trajectory) -> None:
         axes.plot(*place[0], "o", color="white", mec="#1b1e21", ms=9, zorder=4, label="start")
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.08)
-        axes.set(
-            xlabel="x: east (m)",
-            ylabel="y: north (m)",
-            title="Route as recorded; arrows: the vehicle's x axis",
-        )
+        axes.set(xlabel="x: east (m)", ylabel="y: north (m)")
+        axes.set_title("Route as recorded; arrows: the vehicle's x axis")
         fig.legend(loc="outside lower left")
 
 
@@ -198,11 +188,7 @@ _COLOURS = {Fate.MOVED: "#3b6fb6", Fate.VANISHED: "#d0432b", Fate.NEW: "#0b7a75"
 def save_changes(path: Path, changes: Changes, hd_map: HdMap, route_map: FloatArray) -> None:
     """Draw the changes over the map as it is now, beside close-ups of the largest moves.
 
-    Args:
-        path: where the PNG goes.
-        changes: what became of the earlier map's markings.
-        hd_map: the map as it is now.
-        route_map: vehicle positions (N, 2), m, with nan between two drives.
+    ``route_map`` (N, 2), m, has nan between two drives.
     """
     moved = sorted(changes.of(Fate.MOVED), key=_distance_m, reverse=True)[:_MOST_CLOSE_UPS]
     columns = 3 if len(moved) > 4 else 2
@@ -215,9 +201,8 @@ def save_changes(path: Path, changes: Changes, hd_map: HdMap, route_map: FloatAr
             whole, close = np.asarray(fig.subfigures(1, 2, width_ratios=[site_in, detail_in])).tolist()
             rows = -(-len(moved) // columns)
             axes = close.subplots(rows, columns, squeeze=False).ravel()
-            close.suptitle(
-                "The largest moves by id: dashed before, solid now; east and north (m)", fontsize=9
-            )
+            title = "The largest moves by id: dashed before, solid now; east and north (m)"
+            close.suptitle(title, fontsize=9)
             for place, one in zip(axes, moved, strict=False):
                 _move_close_up(place, one, changes, hd_map)
             for place in axes[len(moved) :]:

@@ -35,10 +35,9 @@ FULLY_VISIBLE = 0.99
 class MarkingMetrics:
     """Mapped markings of one class, or of all, against the true ones.
 
-    ``markings`` counts the mapped ones, ``false_markings`` those without a true counterpart,
-    ``expected`` the true ones driven past within the region of interest and ``recall`` their mapped
-    share. ``corner_rmse_m`` is the root mean square distance of corners, ``corner_bias_m`` the
-    length of their mean error vector; both are nan where nothing matched.
+    ``false_markings`` have no true counterpart, ``expected`` are the true ones driven past within the region
+    of interest and ``recall`` their mapped share. ``corner_bias_m`` is the length of the corners' mean error
+    vector; it and the RMSE are nan where nothing matched.
     """
 
     markings: int
@@ -172,16 +171,15 @@ def lane_metrics(lanes: Sequence[Lane], truth: Truth) -> LaneMetrics:
         for piece in runs(lane.points_map, visible)
     )
     mapped = _stack(resample(lane.points_map) for lane in lanes)
+    mapped_m = len(mapped) * SAMPLE_STEP_M
     if not len(mapped) or not len(true_all):
-        return LaneMetrics(
-            len(lanes), len(mapped) * SAMPLE_STEP_M, float("nan"), 0.0, len(mapped) * SAMPLE_STEP_M
-        )
+        return LaneMetrics(len(lanes), mapped_m, float("nan"), 0.0, mapped_m)
     lateral = distance_to_points(mapped, true_all)
     near = lateral <= LATERAL_GATE_M
     covered = distance_to_points(true_visible, mapped) <= LATERAL_GATE_M
     return LaneMetrics(
         lanes=len(lanes),
-        length_m=len(mapped) * SAMPLE_STEP_M,
+        length_m=mapped_m,
         mean_lateral_error_m=float(lateral[near].mean()) if near.any() else float("nan"),
         mapped_fraction=float(covered.mean()) if len(covered) else float("nan"),
         false_length_m=float((~near).sum() * SAMPLE_STEP_M),
@@ -248,7 +246,7 @@ MAX_OFFSET_M = 0.5
 
 @dataclass(frozen=True)
 class DashSpacing:
-    """Distance from dash to next dash of the same line, centre to centre: count, median, spread (m)."""
+    """Distance from dash to next dash of the same line, centre to centre."""
 
     pairs: int
     median_m: float

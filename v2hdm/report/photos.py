@@ -44,10 +44,8 @@ class Pen:
 def draw_lines(canvas: np.ndarray, lines: Iterable[FloatArray], pen: Pen) -> None:
     """Draw polylines (N, 2) px, with a dark edge, so that they are seen on paint and on asphalt."""
     pieces = [piece for line in lines for piece in (_dashes(line, *pen.dash_px) if pen.dash_px else [line])]
-    fixed = [
-        np.round(np.clip(piece, -_LARGEST_PX, _LARGEST_PX) * (1 << _SUBPIXELS)).astype(np.int32)
-        for piece in pieces
-    ]
+    clipped = [np.clip(piece, -_LARGEST_PX, _LARGEST_PX) for piece in pieces]
+    fixed = [np.round(piece * (1 << _SUBPIXELS)).astype(np.int32) for piece in clipped]
     for colour, width in ((_HALO_BGR, 2 * pen.width), (pen.bgr, pen.width)):
         cv2.polylines(canvas, fixed, False, colour, width, cv2.LINE_AA, shift=_SUBPIXELS)
 
@@ -111,14 +109,9 @@ _SMALL_FONT, _TEXT_SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.45
 def save_grid(
     path: Path, image: np.ndarray, camera: Camera, mountings: Mapping[str, FloatArray], caption: str
 ) -> None:
-    """Draw horizon, metric ground grid and ROI into an image.
+    """Draw horizon, metric ground grid and ROI into an image (H, W, 3) BGR, as recorded.
 
-    Args:
-        path: where the picture goes.
-        image: (H, W, 3) BGR, as recorded.
-        camera: intrinsics and ROI.
-        mountings: ``cam_from_vehicle`` (4 x 4) by a name of :data:`PENS`.
-        caption: text below the picture.
+    ``mountings`` are ``cam_from_vehicle`` (4 x 4) by a name of :data:`PENS`.
     """
     canvas = image.copy()
     legend: list[tuple[Pen | None, str]] = [(None, caption)]
@@ -129,8 +122,9 @@ def save_grid(
         draw_lines(canvas, [_horizon(camera.info, cam_from_vehicle)], replace(pen, width=2))
         legend.append((pen, _WORDS[name]))
     closed = np.vstack([camera.roi_vehicle, camera.roi_vehicle[:1]])
-    first = next(iter(mountings.values()))
-    draw_lines(canvas, project_line(camera.info, first, _dense(closed)), _ROI)
+    parts, first = np.linspace(0, 1, 40)[:, None], next(iter(mountings.values()))
+    dense = np.concatenate([a + parts * (b - a) for a, b in itertools.pairwise(closed)])
+    draw_lines(canvas, project_line(camera.info, first, dense), _ROI)
     legend.append((_ROI, "roi_vehicle, by the guess"))
     for number, (name, cam_from_vehicle) in enumerate(mountings.items()):
         _label(canvas, camera.info, cam_from_vehicle, PENS[name], to_the_left=number == 0)
@@ -167,14 +161,13 @@ def _grid_lines(cam_from_vehicle: FloatArray) -> list[FloatArray]:
     sides = middle + np.arange(-_HALF_WIDTH_M, _HALF_WIDTH_M + 0.1, _ACROSS_M)
     lines = []
     for mark in _marks(cam_from_vehicle):
-        line = np.empty((60, 2))
-        line[:, along], line[:, other] = mark, np.linspace(sides[0], sides[-1], 60)
+        line = np.full((60, 2), mark)
+        line[:, other] = np.linspace(sides[0], sides[-1], 60)
         lines.append(line)
     for mark in sides:
-        line = np.empty((300, 2))
         # Denser where it is near: the same number of points to each doubling of the distance.
+        line = np.full((300, 2), mark)
         line[:, along] = foot[along] + side * np.geomspace(0.2, _FARTHEST_M, 300)
-        line[:, other] = mark
         lines.append(line)
     return lines
 
@@ -186,16 +179,11 @@ def _horizon(info: CameraInfo, cam_from_vehicle: FloatArray) -> FloatArray:
     rays = np.column_stack([np.cos(angles), np.sin(angles)]) @ cam_from_vehicle[:3, :2].T
     rays = rays[rays[:, 2] > 0.2]
     pinhole = (rays @ info.intrinsic.T)[:, :2] / rays[:, 2:]
-    near = (pinhole[:, 0] > -0.1 * info.width) & (pinhole[:, 0] < 1.1 * info.width)
-    return distort_points(info, pinhole[near])
+    return distort_points(info, pinhole[np.abs(pinhole[:, 0] / info.width - 0.5) < 0.6])
 
 
 def _label(
-    canvas: np.ndarray,
-    info: CameraInfo,
-    cam_from_vehicle: FloatArray,
-    pen: Pen,
-    to_the_left: bool,
+    canvas: np.ndarray, info: CameraInfo, cam_from_vehicle: FloatArray, pen: Pen, to_the_left: bool
 ) -> None:
     """Write the lines' coordinates in metres beside the middle of the view."""
     foot, along, _ = _axes(cam_from_vehicle)
@@ -210,11 +198,6 @@ def _label(
         text = f"{'xy'[along]} {mark:g} m"
         left = -6 - cv2.getTextSize(text, _SMALL_FONT, _TEXT_SIZE, 1)[0][0] if to_the_left else 6
         _write(canvas, text, (int(u) + left, int(last_v) - 4), pen.bgr)
-
-
-def _dense(line: FloatArray) -> FloatArray:
-    parts = np.linspace(0, 1, 40)[:, None]
-    return np.concatenate([a + parts * (b - a) for a, b in itertools.pairwise(line)])
 
 
 def _write(canvas: np.ndarray, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> None:
@@ -240,16 +223,10 @@ def save_overlay(
     position_map: FloatArray,
     views: Mapping[str, FloatArray],
 ) -> None:
-    """Draw a map into an image as several calibrations and poses see it.
+    """Draw a map into an image, as recorded, as several calibrations and poses project it.
 
-    Args:
-        path: where the picture goes.
-        image: as recorded.
-        info: its camera.
-        hd_map: what is drawn.
-        position_map: (2,) the vehicle's; what lies far from it is not drawn.
-        views: by name the homography ``pinhole_px_from_map`` (3 x 3) of the ground, whose third
-            coordinate is positive in front of the camera.
+    Markings far from ``position_map`` (2,), the vehicle's, are not drawn. ``views`` are by name the homography
+    ``pinhole_px_from_map`` (3 x 3) of the ground, whose third coordinate is positive in front of the camera.
     """
     canvas = image.copy()
     outlines = [one.corners_map for one in hd_map.markings] + [one.outline_map for one in hd_map.symbols]
