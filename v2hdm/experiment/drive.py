@@ -44,7 +44,7 @@ _FASTEST = 1  # level of gzip: a fifth of the size already, at a tenth of the ti
 
 def store(path: Path, key: str, content: Mapping[str, Any]) -> None:
     """Write plain content (lists, numbers, texts, arrays) under a key, whole or not at all."""
-    text = json.dumps({"key": key, "content": content}, default=_plain)
+    text = json.dumps({"key": key, "content": content}, default=lambda value: value.tolist())
     with whole_file(path) as partial:
         partial.write_bytes(gzip.compress(text.encode(), _FASTEST))
 
@@ -57,14 +57,6 @@ def stored(path: Path, key: str) -> dict[str, Any] | None:
     except (OSError, EOFError, zlib.error, ValueError, KeyError, TypeError):
         return None
     return content
-
-
-def _plain(value: object) -> object:
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, np.generic):
-        return value.item()
-    raise TypeError(f"{type(value).__name__} is not plain")
 
 
 Progress = Callable[[str, int, int], None]

@@ -28,7 +28,7 @@ COLUMNS: Mapping[str, tuple[Callable[[Row], float], int]] = {
     "shared": (lambda row: row.shared, 0),
     "RMSE of shared (cm)": (lambda row: _CM * row.shared_rmse_m, 1),
 }
-"""Of each column its figure, and the digits behind the point."""
+"""The figure of each column, and the digits behind the point."""
 
 _EXTRINSICS = ("rotation (deg)", "centre (cm)")
 
@@ -41,7 +41,7 @@ NOTE = (
     "markings that every row of the same cameras has mapped: only there do the methods' errors compare "
     "like with like."
 )
-"""What the columns and rows of the main table are."""
+"""The columns and rows of the main table explained."""
 
 
 def write_tables(folder: Path, measured: Sequence[Measured]) -> None:

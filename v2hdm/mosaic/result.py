@@ -35,7 +35,7 @@ from v2hdm.report.outputs import write_json
 from v2hdm.store.files import load_yaml, take_number, whole_file
 
 LARGEST_PICTURE_PX = 8192
-"""Of either side of the picture: what graphics cards of computers and phones alike can draw."""
+"""Limit of either side of the picture, which graphics cards of computers and phones alike can draw."""
 
 MULTIPLE_PX = 256
 """Sides of a canvas are multiples of it, so that pictures reduced by up to that factor fit it exactly."""

@@ -38,7 +38,7 @@ _SEEN_ALPHA = 128  # alpha from which the mosaic counts as showing the ground
 
 @dataclass(frozen=True)
 class Edges:
-    """Of S paint sides: the largest ``slope`` (S,), grey values a m, and the ``contrast`` (S,), grey values.
+    """The largest ``slope`` (S,), grey values per m, and ``contrast`` (S,), grey values, of S paint sides.
 
     Both are nan where the mosaic does not show the whole profile.
     """
@@ -47,7 +47,7 @@ class Edges:
     contrast: FloatArray
 
     def with_those_of(self, other: Edges) -> Edges:
-        """Those of the same sides in another part of the same mosaic, where this part has none."""
+        """These edges, completed by those of another part of the same mosaic."""
         known = np.isfinite(self.slope)
         return Edges(np.where(known, self.slope, other.slope), np.where(known, self.contrast, other.contrast))
 
@@ -72,7 +72,7 @@ def paint_sides(hd_map: HdMap) -> PaintSides:
 
 
 def no_edges(count: int) -> Edges:
-    """What is known of ``count`` sides before a mosaic was looked at."""
+    """Edges of ``count`` sides that no mosaic has shown yet."""
     return Edges(np.full(count, np.nan), np.full(count, np.nan))
 
 

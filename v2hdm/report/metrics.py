@@ -325,7 +325,7 @@ def growth_figures(maps: Sequence[HdMap], truth: Truth) -> list[tuple[int, float
 
 
 def headline(cameras: str, results: Mapping[str, Mapping[str, Any]]) -> str:
-    """What one camera set reached, in one sentence."""
+    """The result of one camera set in one sentence."""
     best = results.get("Opt", {})
     start = next((results[m] for m in ("ENI", "CNI") if m in results), {})
     if "corner_rmse_m" not in best or "corner_rmse_m" not in start:
@@ -344,8 +344,8 @@ def _own_words(figures: Mapping[str, Any]) -> str:
     words += f", {figures.get('lanes', {}).get('lanes', 0)} lane lines"
     reasons = list(figures.get("excluded_for", {}).items())[:_MAIN_REASONS]
     if reasons:
-        told = ", ".join(f"{count} {reason}" for reason, count in reasons)
-        words += f"; {figures['excluded']} candidates left out, most often: {told}"
+        listed = ", ".join(f"{count} {reason}" for reason, count in reasons)
+        words += f"; {figures['excluded']} candidates left out, most often: {listed}"
     return words
 
 

@@ -225,8 +225,9 @@ def save_overlay(
 ) -> None:
     """Draw a map into an image, as recorded, as several calibrations and poses project it.
 
-    Markings far from ``position_map`` (2,), the vehicle's, are not drawn. ``views`` are by name the homography
-    ``pinhole_px_from_map`` (3 x 3) of the ground, whose third coordinate is positive in front of the camera.
+    Markings far from ``position_map`` (2,), the vehicle's, are not drawn. ``views`` are by name the
+    homography ``pinhole_px_from_map`` (3 x 3) of the ground, whose third coordinate is positive in front of
+    the camera.
     """
     canvas = image.copy()
     outlines = [one.corners_map for one in hd_map.markings] + [one.outline_map for one in hd_map.symbols]

@@ -41,7 +41,7 @@ METHOD = {
 """Colour of each method, the same in every figure."""
 
 LINE: dict[str, Any] = {"CNI": (0, (6, 2)), "ENI": (0, (1.5, 1.5)), "Opt": "-", "ONI": (0, (7, 2, 1.5, 2))}
-"""Line style of each method: they are told apart without colour, too."""
+"""Line style of each method: they differ without colour, too."""
 
 MARKER = {"CNI": "s", "ENI": "^", "Opt": "o", "ONI": "D"}
 """Marker of each method."""

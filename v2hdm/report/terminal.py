@@ -74,7 +74,7 @@ def _number(value: float | None, digits: int, factor: float = 1.0) -> str:
 
 
 def changes_table(changes: Mapping[str, Any]) -> Table:
-    """What became of an earlier map's markings: those that moved, are gone or are new, one a row."""
+    """The fate of an earlier map's markings that moved, are gone or are new, one per row."""
     counts = ", ".join(f"{number} {fate}" for fate, number in changes["counts"].items() if number)
     numbers = ("by (cm)", "sigma (cm)", "odds", "seen / should be")
     table = new_table(f"changes: {counts}", ("class", "fate"), numbers, before=("id",))

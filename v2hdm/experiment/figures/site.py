@@ -49,7 +49,7 @@ _NEAR_M, _FAR_M = 1.0, 6.0
 """Half the width of an inset: of one that shows a corner's error, and of one that shows a neighbourhood."""
 
 _LETTERS = {"a": (2, (3, 1)), "b": (0, (-9, -9)), "c": (3, (-9, 1))}
-"""Of each inset the corner of its square that its letter stands at, and how far from it (pt)."""
+"""Corner of each inset's square that its letter stands at, and how far from it (pt)."""
 
 _ENI = "#3a3f44"  # ENI's outlines, where its own red is that of the correspondences
 
@@ -142,7 +142,7 @@ def save_shift(path: Path, record: Mapping[str, Any], measured: Measured) -> str
 
 
 _Place = tuple[FloatArray, float, str]
-"""Of an inset its centre (2,) and half its width, m, and its title."""
+"""An inset: its centre (2,) and half its width, m, and its title."""
 
 
 def _true_corners(record: Mapping[str, Any]) -> FloatArray:
@@ -286,7 +286,7 @@ def save_fields(path: Path, record: Mapping[str, Any]) -> str | None:
     cameras = record.get("residuals")
     if not cameras:
         return None
-    told = []
+    changes = []
     with style.figure(path, 13.0, 4.2 * len(cameras)) as fig:
         panels = fig.subplots(len(cameras), 2, squeeze=False)
         for row, (name, found) in enumerate(cameras.items()):
@@ -296,14 +296,14 @@ def save_fields(path: Path, record: Mapping[str, Any]) -> str | None:
                 length = field[when]["length_px"]
                 lengths.append("-" if length is None else f"{length:.2f} px")
                 panels[row, column].set_title(f"{drive_of(record)}, {name}: {when}, {lengths[-1]}")
-            told.append(f"{name} from {lengths[0]} to {lengths[1]}")
+            changes.append(f"{name} from {lengths[0]} to {lengths[1]}")
     return (
         "Median residual of detected corners against the optimised map by cell of the image, "
         f"{drive_of(record)}: before, under the IPM that the mapping started from and the recorded poses; "
         "after, under the optimised extrinsic and the adjusted poses. Axes in px of the image without "
         "distortion. The arrow above each panel gives its scale, which differs between panels; cells "
         "without an arrow hold too few corners. The median length of all residuals falls: "
-        f"{', '.join(told)}. See that before the arrows run along with each other, as under a turned "
+        f"{', '.join(changes)}. See that before the arrows run along with each other, as under a turned "
         "camera, and look for any such order that is left after."
     )
 

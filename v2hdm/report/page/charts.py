@@ -75,7 +75,7 @@ def _chart(name: str, width_in: float, height_in: float) -> Iterator[tuple[Figur
 
 
 def _look(number: int) -> dict[str, Any]:
-    """Colour and dashes of series ``number``: told apart without colour, too."""
+    """Colour and dashes of series ``number``: they differ without colour, too."""
     return {"color": OKABE_ITO[_ORDER[number % len(_ORDER)]], "linestyle": _DASHES[number % len(_DASHES)]}
 
 

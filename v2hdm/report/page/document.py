@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
 
 import jinja2
 import numpy as np
@@ -16,9 +15,9 @@ import numpy as np
 from v2hdm.records import Drive
 from v2hdm.report.page import charts, tables
 from v2hdm.report.page.facts import Facts, GroundResiduals, ground_residuals, read_facts
-from v2hdm.report.page.layers import GroundPage, ground_page, layers
+from v2hdm.report.page.layers import ground_page, layers
 from v2hdm.report.page.pictures import overlays, pictures
-from v2hdm.report.page.tables import CameraPage, Figure, Table, camera_pages, in_words, pair_table
+from v2hdm.report.page.tables import in_words
 from v2hdm.store.files import replace_text
 
 _SAYS = {
@@ -39,50 +38,8 @@ class Chart:
     svg: str
 
 
-@dataclass(frozen=True)
-class VerdictPage:
-    """The verdict: its status, what that means, and the rows of its findings."""
-
-    status: str
-    says: str
-    raised: tuple[tuple[str, ...], ...]
-    untold: tuple[tuple[str, ...], ...]
-    passed: tuple[tuple[str, ...], ...]
-
-
-@dataclass(frozen=True)
-class Document:
-    """What the page shows, in the order of its sections; what a run does not have is None or empty.
-
-    ``map_data`` and ``pictures`` are the JSON documents of the map in the page.
-    """
-
-    name: str
-    date: str
-    version: str
-    summary: str
-    verdict: VerdictPage
-    figures: tuple[Figure, ...]
-    site: Chart | None
-    accuracy: tuple[Table, ...]
-    accuracy_chart: Chart | None
-    check_points: Table | None
-    map_data: Mapping[str, Any]
-    pictures: Mapping[str, Any]
-    cameras: tuple[CameraPage, ...]
-    ground: GroundPage | None
-    residuals: tuple[Chart, ...]
-    excluded: Chart | None
-    excluded_words: str
-    contents: Table | None
-    methods: Table | None
-    about: tuple[Table, ...]
-    config: str
-    missing: tuple[str, ...]
-
-
-def document(facts: Facts) -> Document:
-    """Everything that is known of a run, as the page says it.
+def document(facts: Facts) -> SimpleNamespace:
+    """The whole page by the names of its templates; parts that a run does not have are None or empty.
 
     Raises:
         DriveError: an image of the drive cannot be read.
@@ -91,37 +48,35 @@ def document(facts: Facts) -> Document:
     verdict = metrics.get("verdict") or {}
     status = str(verdict.get("status", "FAIL"))
     residuals = ground_residuals(facts)
-    accuracy = (tables.accuracy_table(facts), tables.truth_table(facts))
-    about = (
-        pair_table("The drive.", metrics.get("drive") or {}),
-        tables.timing_table(facts),
-        pair_table("Versions of what computed it.", metrics.get("versions") or {}),
-    )
-    return Document(
+    about = [tables.pair_table("The drive.", metrics.get("drive") or {}), tables.timing_table(facts)]
+    about.append(tables.pair_table("Versions of what computed it.", metrics.get("versions") or {}))
+    return SimpleNamespace(
         name=str(metrics.get("name", facts.folder.name)),
         date=str(metrics.get("date", "")),
         version=str(metrics.get("version", "")),
         summary=_summary(facts),
-        verdict=VerdictPage(
-            status,
-            _SAYS.get(status, ""),
-            *(tables.finding_rows(verdict, which) for which in ("findings", "untold", "passed")),
+        verdict=SimpleNamespace(
+            status=status,
+            says=_SAYS.get(status, ""),
+            raised=tables.finding_rows(verdict, "findings"),
+            untold=tables.finding_rows(verdict, "untold"),
+            passed=tables.finding_rows(verdict, "passed"),
         ),
         figures=tables.key_figures(facts),
         site=_site(facts),
-        accuracy=tuple(one for one in accuracy if one is not None),
+        accuracy=[one for one in (tables.accuracy_table(facts), tables.truth_table(facts)) if one],
         accuracy_chart=_accuracy_chart(facts),
         check_points=tables.check_point_table(facts),
         map_data=layers(facts, residuals),
         pictures=pictures(facts),
-        cameras=camera_pages(facts, overlays(facts)),
+        cameras=tables.camera_pages(facts, overlays(facts)),
         ground=ground_page(facts.folder),
         residuals=_residual_charts(facts, residuals),
         excluded=_excluded(facts),
         excluded_words=_excluded_words(facts),
         contents=tables.content_table(facts),
         methods=tables.method_table(facts),
-        about=tuple(one for one in about if one is not None),
+        about=[one for one in about if one is not None],
         config=facts.config.strip(),
         missing=_missing(facts),
     )
@@ -233,7 +188,7 @@ def _excluded_words(facts: Facts) -> str:
 
 
 def _missing(facts: Facts) -> tuple[str, ...]:
-    """What the page lacks, and why."""
+    """Parts that the page lacks, and why."""
     found = []
     if facts.drive is None:
         found.append(
@@ -255,11 +210,9 @@ _ASSETS = {"leaflet.js": "vendor", "leaflet.css": "vendor", "page.css": "templat
 
 
 def write_page(folder: Path, drive: Drive | None) -> Path:
-    """Write ``report.html`` into a result folder, atomically, and return its path.
+    """Write ``report.html`` into a result folder of :mod:`v2hdm.map`, atomically, and return its path.
 
-    Args:
-        folder: what :mod:`v2hdm.map` wrote.
-        drive: that was mapped, for pictures, the recorded route and truth; None where it is not at hand.
+    ``drive`` is the one that was mapped, for pictures, recorded route and truth; None if not at hand.
 
     Raises:
         MapFileError: the folder is no result, or a file in it is damaged.

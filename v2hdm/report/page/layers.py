@@ -38,7 +38,7 @@ def as_base64(content: bytes) -> str:
 EXTENT, COMPARISON = "mosaic.json", "mosaic_before_after.png"
 
 LARGEST_BYTES = 3_500_000
-"""Of the mosaic, as text in the page."""
+"""Budget of the mosaic, as text in the page."""
 
 _QUALITY = 72
 _COMPARISON_WIDTH_PX = 1400
@@ -182,7 +182,7 @@ def _metres(points: FloatArray) -> list[list[float]]:
 
 
 def _errors(facts: Facts) -> dict[int, float]:
-    """Of the markings that have a true counterpart, by their number: root mean square of the corners, m."""
+    """Root mean square corner error, m, by the number of each marking that has a true counterpart."""
     if facts.truth is None or facts.hd_map is None:
         return {}
     mapped, true = facts.hd_map.markings, facts.truth.map.markings

@@ -17,7 +17,7 @@ from v2hdm.report.page.facts import Facts, cams_from_map
 from v2hdm.report.page.layers import jpeg, shrunk
 
 BUDGET_BYTES = 8_000_000
-"""Of all pictures together, as text in the page: a report stays below 15 MB."""
+"""Budget of all pictures together, as text in the page: a report stays below 15 MB."""
 
 PER_CAMERA = 2
 """Pictures of a marking by one camera: the nearest one, and one from the middle of its sightings."""
@@ -104,7 +104,7 @@ def _cuts(facts: Facts, cam_from_map: FloatArray) -> Iterable[_Cut]:
 
 
 def _of_markings(facts: Facts) -> Iterable[_Cut]:
-    """Those by which a marking was mapped: nearest first, a camera at a time."""
+    """Cuts of the sightings by which markings were mapped: nearest first, one camera at a time."""
     residuals = facts.residuals
     assert residuals is not None
     assert facts.hd_map is not None
@@ -135,7 +135,7 @@ def _of_markings(facts: Facts) -> Iterable[_Cut]:
 
 
 def _of_place(facts: Facts, cam_from_map: FloatArray, key: str, shape_map: FloatArray) -> Iterable[_Cut]:
-    """Those that look at a place from near, one of each camera; other things may stand in the way."""
+    """Cuts that look at a place from near, one per camera; other things may stand in the way."""
     residuals = facts.residuals
     assert residuals is not None
     centre = shape_map.mean(axis=0)

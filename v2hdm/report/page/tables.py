@@ -85,7 +85,7 @@ def _plain(value: object) -> str:
     return significant(value) if isinstance(value, float) else str(value)
 
 
-_LEAST_FOR_SHARE = 20  # corners from which a share of them is told
+_LEAST_FOR_SHARE = 20  # corners from which a share of them is stated
 
 
 _Mapped = TypeVar("_Mapped", bound=Marking | Symbol | Lane)
@@ -105,7 +105,7 @@ def relative_m(markings: Iterable[Marking]) -> FloatArray:
 
 
 def key_figures(facts: Facts) -> tuple[Figure, ...]:
-    """What stands at the top of the page."""
+    """The figures at the top of the page."""
     if facts.hd_map is None:
         return ()
     markings, best = facts.hd_map.markings, facts.best
@@ -208,7 +208,7 @@ _CHECK_COLUMNS: Mapping[str, tuple[str, float | None, int]] = {
     "dz_m": ("up (cm)", 100.0, 1),
     "not_compared_because": ("not compared because", None, 0),
 }
-"""Of the columns of ``check_points.csv`` heading, factor (None for words) and digits."""
+"""Heading, factor (None for words) and digits of columns of ``check_points.csv``."""
 
 
 def check_point_table(facts: Facts) -> Table | None:
@@ -236,7 +236,7 @@ def _check_cell(name: str, text: str) -> str:
 
 
 def content_table(facts: Facts) -> Table | None:
-    """What is in the map, by class: how many or how long, and how often seen."""
+    """The content of the map by class: how many or how long, and how often seen."""
     if facts.hd_map is None:
         return None
     rows = []
@@ -326,7 +326,7 @@ def _percentile(values: FloatArray, share: float) -> float:
 
 @dataclass(frozen=True)
 class CameraPage:
-    """What the report says of one camera: its words, its table, its picture (JPEG in base64)."""
+    """One camera in the report: its words, its table, its picture (JPEG in base64)."""
 
     name: str
     words: str

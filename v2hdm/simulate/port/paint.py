@@ -212,11 +212,10 @@ class _Painter:
             (OTHER_PAINT, config.lettering_spacing_m, None),
         ):
             for station in np.arange(spacing * 0.6, route.length_m - 5.0, spacing):
-                at = np.array([station + rng.uniform(-2.0, 2.0)])
+                at = station + rng.uniform(-2.0, 2.0)
                 offset = 0.0 if shapes is not None else float(rng.choice([-7.2, -3.5, 3.5, 7.2]))
                 drawn = shapes if shapes is not None else self._lettering()
-                centre, yaw = route.points_at(at, offset)[0], float(route.yaw_at(at)[0])
-                self._place(kind, drawn, centre, yaw, self._worn(), self._colour())
+                self._place(kind, drawn, *route.pose_at(at, offset), self._worn(), self._colour())
 
     def _lettering(self) -> list[FloatArray]:
         """Block letters of upright and level bars, as bay numbers are painted."""
@@ -233,7 +232,7 @@ class _Painter:
         self,
         kind: str,
         shapes: Sequence[FloatArray],
-        centre: FloatArray,
+        centre: FloatArray | tuple[float, float],
         yaw_rad: float,
         worn: tuple[float, float],
         colour: Bgr,
@@ -315,9 +314,9 @@ class _Alterer:
         """Add a diamond beside the route where there is room."""
         route, rng = self.route, self.rng
         for _ in range(_TRIES):
-            at = np.array([rng.uniform(8.0, route.length_m - 8.0)])
-            centre = route.points_at(at, rng.uniform(-_BESIDE_ROUTE_M, _BESIDE_ROUTE_M))[0]
-            after = placed(half, centre, float(route.yaw_at(at)[0]))
+            station = rng.uniform(8.0, route.length_m - 8.0)
+            offset_m = rng.uniform(-_BESIDE_ROUTE_M, _BESIDE_ROUTE_M)
+            after = placed(half, *route.pose_at(station, offset_m))
             if self._is_apart(after) and self._is_clear(after, None):
                 self.done.append(Alteration(DIAMOND, None, after))
                 return

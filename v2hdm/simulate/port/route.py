@@ -42,6 +42,12 @@ class Route:
         x, y = (np.interp(station_m, self.station_m, self.points_map[:, axis]) for axis in (0, 1))
         return np.column_stack([x - offset_m * np.sin(yaw), y + offset_m * np.cos(yaw)])
 
+    def pose_at(self, station_m: float, offset_m: float = 0.0) -> tuple[tuple[float, float], float]:
+        """Point and heading at one station, ``offset_m`` to the left of the path."""
+        at = np.array([station_m])
+        x, y = self.points_at(at, offset_m)[0].tolist()
+        return (x, y), float(self.yaw_at(at)[0])
+
     def is_straight(self, station_m: FloatArray) -> FloatArray:
         """Whether (K,) the path is straight at stations (K,)."""
         return np.asarray(np.abs(np.interp(station_m, self.station_m, self.curvature)) < 1e-4)

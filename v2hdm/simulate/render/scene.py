@@ -1,4 +1,4 @@
-"""What there is to be seen: the ground, the paint on it, what stands on it, and the light.
+"""A scene: the ground, the paint on it, what stands on it, and the light.
 
 Everything lies in the ``map`` frame of :mod:`v2hdm.records` (metres, z up, ground at z = 0).
 Colours are linear reflectances or radiances in blue, green, red order, as OpenCV stores them.
@@ -127,7 +127,7 @@ class Light:
 
 @dataclass(frozen=True, kw_only=True)
 class Backdrop:
-    """What closes the view beyond the boxes: a skyline of blocks up to ``height_rad`` high, and haze.
+    """The end of the view beyond the boxes: a skyline of blocks up to ``height_rad`` high, and haze.
 
     ``haze_m`` is the distance at which the ground has lost 63 % of its contrast.
     """

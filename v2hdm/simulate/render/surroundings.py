@@ -1,4 +1,4 @@
-"""What stands on the ground, drawn from far to near over it, and the sky and skyline behind it."""
+"""The boxes on the ground, drawn from far to near over it, and the sky and skyline behind them."""
 
 from __future__ import annotations
 
