@@ -25,9 +25,8 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError, DriveError, WorkerError
 from v2hdm.fleet.cluster import DETECTORS_A_GPU, Shares
-from v2hdm.fleet.plan import plan, plan_site
+from v2hdm.fleet.plan import Row, exit_code, plan, plan_site
 from v2hdm.fleet.run import FleetOptions, run_fleet
-from v2hdm.fleet.table import Row, exit_code
 from v2hdm.fleet.workers import DetectorActor, ProgressActor, detect_by, map_drive, open_detectors
 from v2hdm.io.drive import read_drive
 from v2hdm.pipeline import RunConfig

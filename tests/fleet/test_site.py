@@ -20,9 +20,8 @@ from v2hdm import pipeline
 from v2hdm.errors import DriveError, WorkerError
 from v2hdm.fleet.crew import RayCrew
 from v2hdm.fleet.parts import RayTeam
-from v2hdm.fleet.plan import plan_site
+from v2hdm.fleet.plan import Row, plan_site
 from v2hdm.fleet.run import FleetOptions, run_fleet
-from v2hdm.fleet.table import Row
 from v2hdm.fleet.workers import map_drive
 from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mapping.methods import run_methods

@@ -46,12 +46,9 @@ NO_GPU = (
 
 @contextmanager
 def cluster(address: str, workers: int) -> Iterator[Any]:
-    """The module ``ray``, connected.
+    """The module ``ray``, connected to a running cluster (``auto`` finds that of this machine).
 
-    Args:
-        address: of a running cluster, ``auto`` for that of this machine; ``local`` starts one here, which
-            ends with the block or the process.
-        workers: cores that a local one uses; 0 takes all.
+    ``local`` starts one here of so many cores, 0 for all; it ends with the block or the process.
 
     Raises:
         ConfigError: Ray is not installed, or there is no cluster at the address.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,8 +12,7 @@ from typing import Any
 from rich.console import Console
 
 from v2hdm.fleet.cluster import LOCAL, NO_GPU, RETRIES, Shares, cluster, wants_gpu
-from v2hdm.fleet.plan import Job, plan, plan_site
-from v2hdm.fleet.table import STYLES, Row, as_csv, as_json, as_table
+from v2hdm.fleet.plan import STYLES, Job, Row, as_csv, as_json, as_table, plan, plan_site
 from v2hdm.report.terminal import DriveProgress, drive_bars, plain
 from v2hdm.store.objects.bucket import place_of
 from v2hdm.store.objects.results import GrowingObjects, growing_objects
@@ -57,10 +56,9 @@ def fleet_on_terminal(files: Sequence[Path], overrides: Sequence[str], options: 
 def run_fleet(
     files: Sequence[Path], overrides: Sequence[str], options: FleetOptions, progress: DriveProgress
 ) -> list[Row]:
-    """Map the drives of run files; the table is written anew whenever one is done.
+    """Map the drives of run files: a row for each file, in their order, or one for a site.
 
-    Returns:
-        A row for each file, in their order; one for a site.
+    The table is written anew whenever a drive is done.
 
     Raises:
         V2hdmError: the table cannot be written, or there is no Ray.
@@ -135,18 +133,11 @@ def _map_all(ray: Any, todo: Sequence[Job], table: _Table, progress: DriveProgre
             mapping = ray.remote(map_drive).options(num_cpus=0.5, num_gpus=share, max_retries=RETRIES)
             doing[mapping.remote(job, detectors[job.config.detector.device], reports, here)] = job
         done, _ = ray.wait(list(doing), num_returns=1, timeout=_LOOK_EVERY_S)
-        for report in _reported(ray, reports):
-            progress(*report)
+        with suppress(ray.exceptions.RayError):  # the actor died, and is being restarted
+            for report in ray.get(reports.take.remote()):
+                progress(*report)
         for reference in done:
             table.add(*_outcome(ray, reference, doing.pop(reference)))
-
-
-def _reported(ray: Any, reports: Any) -> list[tuple[str, str, int, int]]:
-    try:
-        new: list[tuple[str, str, int, int]] = ray.get(reports.take.remote())
-    except ray.exceptions.RayError:  # it died, and is being restarted
-        return []
-    return new
 
 
 def _outcome(ray: Any, reference: Any, job: Job) -> tuple[Row, str]:

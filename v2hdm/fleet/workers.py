@@ -20,8 +20,7 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import DriveError, WorkerError
 from v2hdm.fleet.cluster import DETECTORS_A_GPU
-from v2hdm.fleet.plan import Job
-from v2hdm.fleet.table import Row
+from v2hdm.fleet.plan import Job, Row
 from v2hdm.pipeline import RunConfig
 from v2hdm.pipeline.finished import RunResult
 from v2hdm.pipeline.places import in_place
@@ -86,7 +85,7 @@ class DetectorActor:
         (reference,) = drive
         key, known = reference.hex(), repr(options)
         if key not in self._drives:
-            while len(self._drives) >= _DRIVES_KEPT:
+            if len(self._drives) == _DRIVES_KEPT:
                 self._drives.pop(next(iter(self._drives)))
             self._drives[key] = ray.get(reference)
             root = self._drives[key].root
@@ -107,20 +106,19 @@ def open_detectors(
 
     ``cores`` and ``gpus`` are those of all machines; an actor on a GPU books ``gpu_share`` of it.
     """
-    lasting = {"max_restarts": -1, "max_task_retries": retries}
+    actor = ray.remote(DetectorActor)
     # A core has one actor that detects and one drive that is mapped: the one waits for the other by turns.
     # Actors on GPUs are counted there.
     places = {
         "cpu": (cores, {"num_cpus": 0.5}),
         "cuda": (min(cores, DETECTORS_A_GPU * gpus), {"num_cpus": 0, "num_gpus": gpu_share}),
     }
-    return {
-        device: [
-            ray.remote(DetectorActor).options(**lasting, **places[device][1]).remote(folder)
-            for _ in range(places[device][0])
-        ]
-        for device in devices
-    }
+    opened = {}
+    for device in devices:
+        count, books = places[device]
+        options = actor.options(max_restarts=-1, max_task_retries=retries, **books)
+        opened[device] = [options.remote(folder) for _ in range(count)]
+    return opened
 
 
 def detect_by(
