@@ -60,7 +60,7 @@ class DriveProgress:
     def __call__(self, task: str, done: int, total: int) -> None:
         """``done`` of ``total`` steps of ``task`` are finished."""
         now_s = time.monotonic()
-        if done == total or now_s - self._reported_s >= _REPORT_EVERY_S:
+        if done >= total or now_s - self._reported_s >= _REPORT_EVERY_S:
             self._reported_s = now_s
             self._actor.report.remote(self._drive, task, done, total)
 
