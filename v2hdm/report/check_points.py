@@ -46,27 +46,16 @@ one."""
 
 @dataclass(frozen=True)
 class CheckedPoint:
-    """One check point beside the corner of the map that is nearest to it.
-
-    Attributes:
-        point: as surveyed.
-        marking: which marking of the map.
-        marking_id: its id in the map's files.
-        kind: its class.
-        corner: which of its corners, 0 to 3.
-        off_m: (2,) map minus survey.
-        map_covariance_m2: (2, 2) of the map's corner.
-        off_height_m: map minus survey; None where one of them has no height.
-    """
+    """One check point beside the corner of the map that is nearest to it."""
 
     point: SurveyedPoint
     marking: int
-    marking_id: int
+    marking_id: int  # in the map's files
     kind: str
-    corner: int
-    off_m: FloatArray
-    map_covariance_m2: FloatArray
-    off_height_m: float | None
+    corner: int  # 0 to 3
+    off_m: FloatArray  # (2,) map minus survey
+    map_covariance_m2: FloatArray  # (2, 2) of the map's corner
+    off_height_m: float | None  # map minus survey; None where one of them has no height
 
     @property
     def covariance_m2(self) -> FloatArray:

@@ -33,23 +33,14 @@ BEST = "Opt"
 
 @dataclass(frozen=True)
 class Route:
-    """The adjusted poses of a run.
+    """The adjusted poses of a run."""
 
-    Attributes:
-        stamp_s: (F,) rising.
-        map_from_vehicle: (F, 4, 4) adjusted, in the frame of the recorded poses.
-        recorded: (F, 4, 4) the same as recorded, None without the drive.
-        flat: (F, 4, 4) adjusted, with the road laid flat as the map is; as recorded without the drive.
-        sigma: (F, 6) forward, left, up in m, roll, pitch, heading in rad.
-        seen: (F,) whether a marking was seen then.
-    """
-
-    stamp_s: FloatArray
-    map_from_vehicle: FloatArray
-    recorded: FloatArray | None
-    flat: FloatArray
-    sigma: FloatArray
-    seen: BoolArray
+    stamp_s: FloatArray  # (F,) rising
+    map_from_vehicle: FloatArray  # (F, 4, 4) adjusted, in the frame of the recorded poses
+    recorded: FloatArray | None  # (F, 4, 4) as recorded, None without the drive
+    flat: FloatArray  # (F, 4, 4) adjusted, with the road laid flat as the map is, if the drive is there
+    sigma: FloatArray  # (F, 6) forward, left, up in m, roll, pitch, heading in rad
+    seen: BoolArray  # (F,) whether a marking was seen then
 
     @property
     def way_m(self) -> FloatArray:

@@ -50,8 +50,7 @@ def draw_boxes(
 def _corners(box: Box) -> FloatArray:
     """The eight corners (8, 3), lower ones first."""
     footprint = box_footprint(box)
-    low, high = np.full((4, 1), box.base_m), np.full((4, 1), box.base_m + box.size_m[2])
-    return np.vstack([np.hstack([footprint, low]), np.hstack([footprint, high])])
+    return np.vstack([np.insert(footprint, 2, box.base_m + up, axis=1) for up in (0.0, box.size_m[2])])
 
 
 def _faces(box: Box) -> list[_Face]:
