@@ -21,8 +21,8 @@ from v2hdm.adjust import Drift, PoseSigma, solve
 from v2hdm.cli import config
 from v2hdm.pipeline import RunConfig
 from v2hdm.simulate import PortConfig
-from v2hdm.simulate.port.calibration import cam_from_vehicle
-from v2hdm.simulate.port.disturbance import pose_noise
+from v2hdm.simulate.port.build import cam_from_vehicle
+from v2hdm.simulate.port.route import pose_noise
 
 WANTED_M = 0.02
 PIXEL_SIGMA = 0.4

@@ -34,8 +34,7 @@ from v2hdm.detection.road import RoadDetector
 from v2hdm.detection.stopwatch import Stopwatch, lap
 from v2hdm.io.calibration import write_calibration
 from v2hdm.records import Calibration, CameraInfo
-from v2hdm.simulate.render.optics import Motion, Optics
-from v2hdm.simulate.render.renderer import Renderer
+from v2hdm.simulate.render.renderer import Motion, Optics, Renderer
 
 WIDTH, HEIGHT = 1280, 720
 OURS = "ours, read to metres"

@@ -23,7 +23,7 @@ from train.scenes.views import TrainingView
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.records import Camera, FloatArray
 from v2hdm.simulate.port.build import Port, build_port
-from v2hdm.simulate.render.optics import Motion, Optics
+from v2hdm.simulate.render.renderer import Motion, Optics
 
 SEED = 9001
 """No shipped run has it."""

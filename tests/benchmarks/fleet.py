@@ -39,8 +39,8 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.fleet.cluster import LOCAL, cluster
 from v2hdm.fleet.crew import RayCrew
-from v2hdm.fleet.eyes import Eyes, detect_by
 from v2hdm.fleet.parts import RayTeam
+from v2hdm.fleet.workers import DetectorActor, detect_by
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.pipeline.config import DriveConfig, RunConfig
@@ -115,15 +115,15 @@ def off_m(one: Solution, other: Solution) -> float:
 
 def timed_detection(ray: Any, drive: Any, options: DetectorOptions, actors: int) -> tuple[float, float, Any]:
     """Wall time, CPU time of the busiest actor, and what it found."""
-    eyes = [ray.remote(Eyes).options(num_cpus=1).remote(str(Path.cwd())) for _ in range(actors)]
-    ray.get([one.detect.remote([ray.put(drive)], options, [0]) for one in eyes])
-    processes = ray.get([one.process.remote() for one in eyes])
+    detectors = [ray.remote(DetectorActor).options(num_cpus=1).remote(str(Path.cwd())) for _ in range(actors)]
+    ray.get([one.detect.remote([ray.put(drive)], options, [0]) for one in detectors])
+    processes = ray.get([one.process.remote() for one in detectors])
     before, began = [cpu_s(one) for one in processes], time.perf_counter()
     found: list[Any] = []
-    detect_by(eyes, drive, options, range(len(drive.images)), 1, found.append)
+    detect_by(detectors, drive, options, range(len(drive.images)), 1, found.append)
     took = time.perf_counter() - began
     spent = max(cpu_s(one) - past for one, past in zip(processes, before, strict=True))
-    for one in eyes:
+    for one in detectors:
         ray.kill(one)
     return took, spent, found
 

@@ -33,9 +33,9 @@ from v2hdm.pipeline.base import grey_reader, read_base
 from v2hdm.records import Change, Drive, Fate, FloatArray, HdMap, ImageDetections, Truth
 from v2hdm.report.metrics import corner_errors, driven_past, marking_metrics, match_markings
 from v2hdm.simulate import PortConfig, rendered_drive
-from v2hdm.simulate.port.alter import Alteration
 from v2hdm.simulate.port.build import build_port
 from v2hdm.simulate.port.config import AlteredConfig, RouteConfig, YardConfig
+from v2hdm.simulate.port.paint import Alteration
 
 CACHE = Path("~/.cache/v2hdm/living").expanduser()
 

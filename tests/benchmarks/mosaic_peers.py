@@ -22,10 +22,8 @@ import torch
 
 from v2hdm.detection.image_file import read_bgr
 from v2hdm.mosaic.blend import whole
-from v2hdm.mosaic.canvas import Canvas
-from v2hdm.mosaic.files import MULTIPLE_PX
-from v2hdm.mosaic.result import RESOLUTION_M, ground_of
-from v2hdm.mosaic.shots import Lens, Shot
+from v2hdm.mosaic.result import MULTIPLE_PX, RESOLUTION_M, ground_of
+from v2hdm.mosaic.shots import Canvas, Lens, Shot
 from v2hdm.pipeline.mosaic import drive_of_result
 
 Undistort = Callable[[str, np.ndarray], np.ndarray]

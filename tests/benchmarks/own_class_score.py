@@ -27,7 +27,7 @@ from v2hdm.records import ARROW, FloatArray, Symbol
 from v2hdm.report.metrics import MIN_SIGHTINGS
 from v2hdm.simulate.port.build import Port, build_port
 from v2hdm.simulate.port.config import PaintConfig, PortConfig, RouteConfig
-from v2hdm.simulate.port.visibility import points_seen
+from v2hdm.simulate.port.drive import points_seen
 
 FOUND_M = 0.5
 CELL_M = 0.005

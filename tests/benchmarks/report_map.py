@@ -18,7 +18,7 @@ import numpy as np
 
 from tests.report.page.browser import browser_path, opened
 from tests.report.page.folder import make_site
-from v2hdm.report.page.write import write_page
+from v2hdm.report.page.document import write_page
 
 _COUNT = """() => {
     window.frames_ms = [];

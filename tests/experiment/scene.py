@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from v2hdm.experiment.drive import SETTING_FILE, recipe_file, recipe_key, setting_key
+from v2hdm.experiment.drive import SETTING_FILE, recipe_file, recipe_key, setting_key, store
 from v2hdm.experiment.plan import DriveConfig, ExperimentConfig, Job, Site
-from v2hdm.experiment.stored import store
 from v2hdm.records import DIAMOND
 
 DIAMOND_CORNERS = np.array([[0.5, 0.0], [0.0, 0.25], [-0.5, 0.0], [0.0, -0.25]])

@@ -12,11 +12,10 @@ import pytest
 from tests.experiment.scene import CALIBRATED, ESTIMATED, experiment, keep, record
 from tests.mapping.scene import SceneOptions, make_scene
 from v2hdm.errors import ConfigError, DriveError
-from v2hdm.experiment.drive import _content, drive_record, recipe_file, setting_key
+from v2hdm.experiment.drive import _content, drive_record, recipe_file, setting_key, store, stored
+from v2hdm.experiment.measures import residuals
 from v2hdm.experiment.plan import ExperimentConfig, jobs
-from v2hdm.experiment.residuals import residuals
 from v2hdm.experiment.run import run_experiment
-from v2hdm.experiment.stored import store, stored
 from v2hdm.mapping.methods import run_methods
 from v2hdm.records import HdMap, Truth
 from v2hdm.store.cache.keys import key_of

@@ -15,8 +15,8 @@ from tests.faults.failing_calls import Failure, watch, why_not
 from tests.faults.forked import Forked
 from tests.faults.judge import Case, judge, judge_again
 from v2hdm.mosaic.blend import Sheet
-from v2hdm.mosaic.canvas import Canvas
-from v2hdm.mosaic.files import geotiff
+from v2hdm.mosaic.result import geotiff
+from v2hdm.mosaic.shots import Canvas
 
 pytestmark = pytest.mark.skipif(why_not() is not None, reason=str(why_not()))
 

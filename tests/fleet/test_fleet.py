@@ -24,13 +24,10 @@ from v2hdm.detection.batch import detect_all, with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError, DriveError, WorkerError
-from v2hdm.fleet.board import Board
-from v2hdm.fleet.eyes import Eyes, detect_by, open_eyes
-from v2hdm.fleet.gpus import EYES_A_GPU, Shares
-from v2hdm.fleet.plan import plan, plan_site
-from v2hdm.fleet.rows import Row, exit_code
+from v2hdm.fleet.cluster import DETECTORS_A_GPU, Shares
+from v2hdm.fleet.plan import Row, exit_code, plan, plan_site
 from v2hdm.fleet.run import FleetOptions, run_fleet
-from v2hdm.fleet.work import map_drive
+from v2hdm.fleet.workers import DetectorActor, ProgressActor, detect_by, map_drive, open_detectors
 from v2hdm.io.drive import read_drive
 from v2hdm.pipeline import RunConfig
 from v2hdm.records import ImageDetections
@@ -49,58 +46,61 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def eyes_of(ray: Any, count: int, **options: Any) -> list[Any]:
-    return [ray.remote(Eyes).options(num_cpus=0.1, **options).remote(str(Path.cwd())) for _ in range(count)]
+def detectors_of(ray: Any, count: int, **options: Any) -> list[Any]:
+    return [
+        ray.remote(DetectorActor).options(num_cpus=0.1, **options).remote(str(Path.cwd()))
+        for _ in range(count)
+    ]
 
 
-def found_by(eyes: list[Any], drive: Path, **settings: Any) -> str:
+def found_by(detectors: list[Any], drive: Path, **settings: Any) -> str:
     options, found = DetectorOptions(**settings), []
     whole = with_own_vehicle(read_drive(drive), Detector.load(options=options))
-    detect_by(eyes, whole, options, range(len(whole.images)), 1, found.append)
+    detect_by(detectors, whole, options, range(len(whole.images)), 1, found.append)
     return repr(found)
 
 
 def test_actors_find_what_processes_find_also_when_one_is_killed(
     ray: Any, drive: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("v2hdm.fleet.eyes.IMAGES_A_BATCH", 2)
-    eyes = eyes_of(ray, 2, max_restarts=-1, max_task_retries=3)
-    killed = ray.get(eyes[0].process.remote())
+    monkeypatch.setattr("v2hdm.fleet.workers.IMAGES_A_BATCH", 2)
+    detectors = detectors_of(ray, 2, max_restarts=-1, max_task_retries=3)
+    killed = ray.get(detectors[0].process.remote())
     expected = repr(detect_all(read_drive(drive), DetectorOptions()))
     threading.Timer(0.3, os.kill, (killed, signal.SIGKILL)).start()
-    assert found_by(eyes, drive) == expected
-    assert ray.get(eyes[0].process.remote()) != killed
-    for one in eyes:
+    assert found_by(detectors, drive) == expected
+    assert ray.get(detectors[0].process.remote()) != killed
+    for one in detectors:
         ray.kill(one)
 
 
 def test_what_is_wrong_with_an_image_is_told_as_by_the_mapping_door(ray: Any, drive: Path) -> None:
     whole = read_drive(drive)
-    eyes = eyes_of(ray, 1)
+    detectors = detectors_of(ray, 1)
     image = whole.images[2].path
     content = image.read_bytes()
     try:
         image.write_bytes(content[: len(content) // 2])
         with pytest.raises(DriveError, match=image.name):
-            detect_by(eyes, whole, DetectorOptions(), range(len(whole.images)), 1, print)
+            detect_by(detectors, whole, DetectorOptions(), range(len(whole.images)), 1, print)
     finally:
         image.write_bytes(content)
-        ray.kill(eyes[0])
+        ray.kill(detectors[0])
 
 
 def test_an_actor_that_dies_again_and_again_is_told(ray: Any, drive: Path) -> None:
-    class Blind(Eyes):
+    class Blind(DetectorActor):
         def detect(self, *_: object) -> list[Any]:
             os.kill(os.getpid(), signal.SIGKILL)
             return []
 
-    eyes = [ray.remote(Blind).options(num_cpus=0.1).remote(str(Path.cwd()))]
+    detectors = [ray.remote(Blind).options(num_cpus=0.1).remote(str(Path.cwd()))]
     with pytest.raises(WorkerError, match="died again and again"):
-        found_by(eyes, drive)
+        found_by(detectors, drive)
 
 
 def test_actors_share_a_gpu(ray: Any, drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class OnGpu(Eyes):
+    class OnGpu(DetectorActor):
         def __init__(self, folder: str) -> None:
             # There is no GPU here: what is asked for there is done on the CPU.
             network._PROVIDERS["cuda"] = network._PROVIDERS["cpu"]
@@ -110,27 +110,27 @@ def test_actors_share_a_gpu(ray: Any, drive: Path, monkeypatch: pytest.MonkeyPat
             ids: list[Any] = ray.get_gpu_ids()
             return ids
 
-    monkeypatch.setattr("v2hdm.fleet.eyes.Eyes", OnGpu)
+    monkeypatch.setattr("v2hdm.fleet.workers.DetectorActor", OnGpu)
     cuda = RunConfig(detector=DetectorOptions(device="cuda"))
     shares = Shares.of([cuda])
-    eyes = open_eyes({"cuda"}, 2, 1, shares.eyes, str(Path.cwd()), 0)["cuda"]
-    assert [ray.get(one.gpus.remote()) for one in eyes] == [[0], [0]]
-    assert ray.available_resources()["GPU"] == 1 - 2 * shares.eyes
+    detectors = open_detectors({"cuda"}, 2, 1, shares.detector, str(Path.cwd()), 0)["cuda"]
+    assert [ray.get(one.gpus.remote()) for one in detectors] == [[0], [0]]
+    assert ray.available_resources()["GPU"] == 1 - 2 * shares.detector
     whole = with_own_vehicle(read_drive(drive), Detector.load())
     found: list[ImageDetections] = []
-    detect_by(eyes, whole, cuda.detector, range(3), 1, found.append)
+    detect_by(detectors, whole, cuda.detector, range(3), 1, found.append)
     assert repr(found) == repr(detect_all(read_drive(drive), DetectorOptions())[:3])
-    for one in eyes:
+    for one in detectors:
         ray.kill(one)
 
 
 def test_all_that_shares_a_gpu_fits_on_it() -> None:
     detects = RunConfig(detector=DetectorOptions(device="cuda"))
     maps = RunConfig(device="cuda")
-    assert Shares.of([detects, RunConfig()]).eyes * EYES_A_GPU == 1
+    assert Shares.of([detects, RunConfig()]).detector * DETECTORS_A_GPU == 1
     assert Shares.of([maps, RunConfig()]).mapping == 1
     both = Shares.of([detects, maps])
-    assert both.eyes * EYES_A_GPU + both.mapping == 1
+    assert both.detector * DETECTORS_A_GPU + both.mapping == 1
 
 
 def test_a_drive_that_wants_a_gpu_where_there_is_none_is_a_row(
@@ -161,16 +161,16 @@ def test_a_drive_cache_and_results_at_an_object_store_make_the_same_map(
     settings = ["output=s3://bucket/results", "cache=s3://bucket/cache", f"local_cache={tmp_path / 'one'}"]
     (job,) = plan([written(tmp_path, "good", "s3://bucket/drives/tiny")], settings).jobs
     assert job.place == "s3://bucket/results/good"
-    eyes, board = eyes_of(ray, 1), ray.remote(Board).options(num_cpus=0).remote()
+    detectors, progress = detectors_of(ray, 1), ray.remote(ProgressActor).options(num_cpus=0).remote()
     for kept in (False, True):
-        row, trace = map_drive(job, eyes, board, str(Path.cwd()))
+        row, trace = map_drive(job, detectors, progress, str(Path.cwd()))
         assert (row.status, row.kept, row.folder) == ("PASS", kept, job.place), (row, trace)
-    ray.kill(eyes[0])
+    ray.kill(detectors[0])
 
     # Another machine, with the drive in a folder of its own: what was detected is at the store.
     settings = [f"output={tmp_path / 'out'}", "cache=s3://bucket/cache", f"local_cache={tmp_path / 'two'}"]
     (job,) = plan([written(tmp_path, "good", drive)], settings).jobs
-    row, trace = map_drive(job, [], board, str(Path.cwd()))
+    row, trace = map_drive(job, [], progress, str(Path.cwd()))
     assert row.status == "PASS", (row, trace)
     for name in ("map.geojson", "calibration_front.yaml"):
         there = s3.get_object(Bucket="bucket", Key=f"results/good/{name}")["Body"].read()
@@ -197,7 +197,7 @@ def test_a_fleet_outlives_its_workers_keeps_what_is_finished_and_goes_on_past_wh
         return map_drive(*arguments)
 
     monkeypatch.setattr("v2hdm.fleet.run.cluster", here)
-    monkeypatch.setattr("v2hdm.fleet.work.map_drive", dies_once)
+    monkeypatch.setattr("v2hdm.fleet.workers.map_drive", dies_once)
     good, nowhere = written(tmp_path, "good", drive), written(tmp_path, "nowhere", tmp_path / "absent")
     typo = written(tmp_path, "typo", drive)
     typo.write_text(typo.read_text() + "mapping: {max_rang_m: 3}\n")

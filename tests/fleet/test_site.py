@@ -20,10 +20,9 @@ from v2hdm import pipeline
 from v2hdm.errors import DriveError, WorkerError
 from v2hdm.fleet.crew import RayCrew
 from v2hdm.fleet.parts import RayTeam
-from v2hdm.fleet.plan import plan_site
-from v2hdm.fleet.rows import Row
+from v2hdm.fleet.plan import Row, plan_site
 from v2hdm.fleet.run import FleetOptions, run_fleet
-from v2hdm.fleet.work import map_drive
+from v2hdm.fleet.workers import map_drive
 from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions
@@ -72,7 +71,7 @@ def test_a_site_by_workers_one_of_which_dies_is_the_map_of_one_process(
             crew._done = done
 
     monkeypatch.setattr("v2hdm.fleet.run.cluster", here)
-    monkeypatch.setattr("v2hdm.fleet.work.map_drive", mapping)
+    monkeypatch.setattr("v2hdm.fleet.workers.map_drive", mapping)
     files = [written(tmp_path, one.name, one) for one in drives]
     settings = ["mapping.adjustment=together", "workers=1"]
     told: list[tuple[str, str, int, int]] = []

@@ -1,4 +1,4 @@
-"""The mosaic shows the ground as it is."""
+"""The mosaic shows the ground as it is, however large, and its edges as sharp as they are."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import distort_points
 from v2hdm.mosaic import blend as module
 from v2hdm.mosaic.blend import WARP_ERROR_PX, Tiling, whole
-from v2hdm.mosaic.canvas import Canvas
-from v2hdm.mosaic.shots import FEATHER, Lens, Shot, adjusted_shots, lens_of, recorded_shots
-from v2hdm.records import Calibration, Drive
+from v2hdm.mosaic.sharpness import edge_widths_m, measure_edges, paint_sides
+from v2hdm.mosaic.shots import FEATHER, Canvas, Lens, Shot, adjusted_shots, lens_of, recorded_shots
+from v2hdm.records import Calibration, Drive, HdMap, Marking
 
 
 @pytest.fixture(scope="module")
@@ -146,3 +146,46 @@ def test_an_image_of_another_size_is_named(drive: Drive, tmp_path: Path) -> None
     shot = Shot(path, "front", recorded_shots(drive)[0].pinhole_px_from_map)
     with pytest.raises(DriveError, match=r"small.png: the image is 30x20"):
         whole(Canvas(np.array([6.0, 1.0]), 0.02, 50, 50), [shot], lenses(drive))
+
+
+CANVAS = Canvas(np.array([0.0, 6.0]), 0.02, 300, 300)
+SQUARE = np.array([[2.0, 2.0], [4.0, 2.0], [4.0, 4.0], [2.0, 4.0]])
+SIDES = paint_sides(HdMap((Marking("diamond", SQUARE, 3),))).ends_map
+
+
+def painted(width_m: float, shift_m: float = 0.0) -> np.ndarray:
+    """A square whose edges rise over ``width_m``, out of place by ``shift_m`` in x and y."""
+    across = (np.arange(300) + 0.5) * 0.02 - 3 - shift_m
+    rise = np.clip((1 - np.abs(across)) / width_m + 0.5, 0, 1)
+    grey = 60 + 150 * np.minimum(rise[None, :], rise[::-1, None])
+    return np.dstack([grey, grey, grey, np.full_like(grey, 255)]).round().astype(np.uint8)
+
+
+def median_widths(*mosaics: np.ndarray) -> list[float]:
+    edges = [measure_edges(rgba, CANVAS, SIDES) for rgba in mosaics]
+    return [float(np.median(widths)) for widths in edge_widths_m(edges)]
+
+
+@pytest.mark.parametrize("width_m", [0.06, 0.1, 0.3])
+@pytest.mark.parametrize("shift_m", [0.0, 0.3])
+def test_a_ramp_is_as_wide_as_it_was_drawn_though_out_of_place(width_m: float, shift_m: float) -> None:
+    assert median_widths(painted(width_m, shift_m))[0] == pytest.approx(width_m, rel=0.05)
+
+
+def test_paint_that_appears_twice_has_edges_twice_as_wide() -> None:
+    once = painted(0.06)
+    twice = (once.astype(float) / 2 + painted(0.06, 0.4).astype(float) / 2).round().astype(np.uint8)
+    doubled, sharp = median_widths(twice, once)
+    assert doubled == pytest.approx(2 * sharp, rel=0.1)
+
+
+def test_edges_that_a_mosaic_does_not_show_whole_are_left_out_of_all() -> None:
+    half = painted(0.06)
+    half[:, :150, 3] = 0
+    before, after = edge_widths_m([measure_edges(one, CANVAS, SIDES) for one in (half, painted(0.06))])
+    assert len(before) == len(after) == 1
+
+
+def test_short_sides_are_no_edges() -> None:
+    assert not len(paint_sides(HdMap((Marking("diamond", 0.1 * SQUARE, 3),))).ends_map)
+    assert not len(paint_sides(HdMap(())).sightings)

@@ -18,8 +18,8 @@ from v2hdm.cli import mosaic
 from v2hdm.geometry.geodetic import geodetic_from_enu
 from v2hdm.io.drive.of_result import METRICS
 from v2hdm.mosaic.blend import Sheet
-from v2hdm.mosaic.canvas import Canvas
-from v2hdm.mosaic.files import Picture, crs_of, geotiff
+from v2hdm.mosaic.result import Picture, crs_of, geotiff
+from v2hdm.mosaic.shots import Canvas
 
 
 @pytest.fixture(scope="module")

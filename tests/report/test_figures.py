@@ -11,8 +11,9 @@ from tests.report.scene import diamond_at, make_truth
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.records import HdMap
 from v2hdm.report import figures, style
-from v2hdm.report.figures import save_birdseye, save_growth, save_overlay
-from v2hdm.report.table import METHODS, results_table
+from v2hdm.report.figures import save_birdseye, save_growth
+from v2hdm.report.photos import save_overlay
+from v2hdm.report.terminal import METHODS, results_table
 
 
 def test_the_birds_eye_view_is_drawn_with_and_without_truth(tmp_path: Path) -> None:

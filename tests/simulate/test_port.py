@@ -1,25 +1,37 @@
+"""Ports: their paint, stencils and disturbances, and the one call that renders one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from tests.simulate.conftest import FRONT, tiny_port
-from v2hdm.errors import ConfigError
+from v2hdm.catalogue import PAINT_CLASSES
+from v2hdm.cli.config import compose_run_file, conf_dir, to_dataclass
+from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic, project_ground
 from v2hdm.geometry.lens import distort_points
+from v2hdm.geometry.planar import signed_area
 from v2hdm.io.trajectory import interpolate
+from v2hdm.pipeline import RunConfig
 from v2hdm.records import DIAMOND, LANE_DASH, CameraInfo
-from v2hdm.simulate.port.build import Port, build_port
-from v2hdm.simulate.port.calibration import calibrate, cam_from_vehicle, camera_info
+from v2hdm.simulate import simulate_port
+from v2hdm.simulate.port import drive
+from v2hdm.simulate.port.build import Port, build_port, calibrate, cam_from_vehicle, camera_info
 from v2hdm.simulate.port.config import (
     CalibrationConfig,
     DisturbanceConfig,
     PaintConfig,
     PortConfig,
     RouteConfig,
+    StencilConfig,
 )
-from v2hdm.simulate.port.disturbance import correlated_noise, drive_along, pose_noise
-from v2hdm.simulate.port.layout import build_layout
-from v2hdm.simulate.port.route import build_route
-from v2hdm.simulate.port.visibility import hidden_by, inside_image, points_seen
+from v2hdm.simulate.port.drive import hidden_by, inside_image, points_seen
+from v2hdm.simulate.port.paint import build_layout
+from v2hdm.simulate.port.route import build_route, correlated_noise, drive_along, pose_noise
 from v2hdm.simulate.render.renderer import Renderer
 from v2hdm.simulate.render.scene import Box, Ground, Scene
 
@@ -210,3 +222,94 @@ def test_another_visit_finds_the_same_paint_under_other_noise() -> None:
     assert not np.allclose(first.driven.map_from_vehicle, second.driven.map_from_vehicle, atol=1e-6)
     camera = next(iter(first.cameras))
     assert (first.picture(camera, 0).image != second.picture(camera, 0).image).any()
+
+
+PAD = [[-0.6, -0.3], [-0.6, 0.3], [0.6, 0.3], [0.6, -0.3]]
+"""Clockwise on purpose."""
+
+T = [
+    [[0.35, -0.5], [0.5, -0.5], [0.5, 0.5], [0.35, 0.5]],
+    [[-0.5, -0.075], [0.36, -0.075], [0.36, 0.075], [-0.5, 0.075]],
+]
+STENCILS = {"pad": StencilConfig(shapes_m=[PAD], spacing_m=8.0), "parking_t": StencilConfig(shapes_m=T)}
+
+
+def test_own_quadrilaterals_are_true_markings_and_symbols_are_paint() -> None:
+    port = build_port(PortConfig(paint=PaintConfig(stencils=STENCILS)))
+    paints = [paint.kind for paint in port.renderer.scene.paints]
+    pads = [marking.corners_map for marking in port.hd_map.markings if marking.kind == "pad"]
+    assert len(pads) == paints.count("pad") > 40
+    assert paints.count("parking_t") > 60
+    assert paints.count("parking_t") % 2 == 0
+    assert "parking_t" not in {marking.kind for marking in port.hd_map.markings}
+    assert all(signed_area(corners) == pytest.approx(0.72) for corners in pads)
+    centres = np.array([corners.mean(axis=0) for corners in pads])
+    others = np.array([m.corners_map.mean(axis=0) for m in port.hd_map.markings if m.kind == "diamond"])
+    assert np.linalg.norm(centres[:, None] - others, axis=2).min() > 1.6
+
+
+def test_a_port_with_stencils_is_otherwise_the_same() -> None:
+    plain, stencilled = build_port(tiny_port()), build_port(tiny_port(paint=PaintConfig(stencils=STENCILS)))
+    before, after = plain.renderer.scene.paints, stencilled.renderer.scene.paints
+    assert len(after) > len(before)
+    for one, other in zip(before, after, strict=False):
+        assert replace(one, polygon_map=0) == replace(other, polygon_map=0)  # type: ignore[arg-type]
+        np.testing.assert_array_equal(one.polygon_map, other.polygon_map)
+
+
+def test_own_paint_has_labels_after_those_of_the_shipped_classes() -> None:
+    port = build_port(tiny_port(paint=PaintConfig(stencils=STENCILS)))
+    shown = np.unique([port.picture("front", frame).labels for frame in range(3)])
+    assert 1 + len(PAINT_CLASSES) in shown
+    assert shown.max() <= len(PAINT_CLASSES) + 2
+
+
+@pytest.mark.parametrize(
+    ("stencils", "words"),
+    [
+        ({"diamond": StencilConfig(shapes_m=[PAD])}, "stencils.diamond: there is a class"),
+        ({"pad": StencilConfig(shapes_m=[])}, "stencils.pad.shapes_m"),
+        ({"pad": StencilConfig(shapes_m=[PAD[:2]])}, "stencils.pad.shapes_m"),
+        ({"pad": StencilConfig(shapes_m=[[*PAD[:3], [0.0, 0.2]]])}, "convex"),
+        ({"pad": StencilConfig(shapes_m=[[*PAD[:3], [float("nan"), 0.2]]])}, "convex"),
+        ({"pad": StencilConfig(shapes_m=[PAD], spacing_m=0.5)}, "stencils.pad.spacing_m"),
+    ],
+)
+def test_stencils_that_cannot_be_painted_are_refused(stencils: dict[str, StencilConfig], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        build_port(tiny_port(paint=PaintConfig(stencils=stencils)))
+
+
+def test_ports_without_stencils_keep_their_folder_in_the_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drive, "render_drive", lambda *_: None)
+    plain = drive.rendered_drive(PortConfig(), tmp_path, 1, lambda done, total: None)
+    stencilled = PortConfig(paint=PaintConfig(stencils=STENCILS))
+    assert plain.name == "port1-5152c55c71"
+    assert drive.rendered_drive(stencilled, tmp_path, 1, lambda done, total: None) != plain
+
+
+def test_a_port_is_rendered_once_per_seed_and_has_its_truth(tmp_path: Path) -> None:
+    first, again = (simulate_port(tiny_port(), tmp_path) for _ in range(2))
+    other = simulate_port(tiny_port(), tmp_path, seed=5)
+    assert first.root == again.root != other.root
+    assert first.truth_dir is not None
+    assert len(first.images) == 22
+
+
+@pytest.mark.parametrize("name", ["port1", "port2"])
+def test_a_shipped_port_is_that_of_its_run_file(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rendered = []
+    monkeypatch.setattr(drive, "render_drive", lambda config, *_: rendered.append(config))
+    with pytest.raises(DriveError, match="no such drive"):
+        simulate_port(name, tmp_path)
+    composed = compose_run_file(conf_dir() / "run" / f"{name}.yaml", "map", RunConfig, [])
+    assert rendered == [to_dataclass(composed, RunConfig, "").simulate]
+
+
+def test_an_unknown_port_is_one_line_that_lists_the_shipped_ones(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no port 'port3'; choose from port1, port2"):
+        simulate_port("port3", tmp_path)

@@ -33,7 +33,7 @@ from v2hdm.catalogue import LANE_CLASSES, PAINT_CLASSES
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.planar import clip_convex, inside_convex
 from v2hdm.records import DIAMOND, LANE_DASH, CameraInfo, FloatArray
-from v2hdm.simulate.render.optics import Motion, Optics
+from v2hdm.simulate.render.renderer import Motion, Optics
 from v2hdm.simulate.render.scene import Ground, Light, box_footprint
 
 TINY = DataConfig(width=64, height=32, render_width=80, render_height=48, views_per_render=2, reservoir=3)

@@ -14,7 +14,7 @@ from train.scenes.paint import Bend, Brush, RoadPaint, arrow, crosswalk, rectang
 from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.records import ARROW, CROSSWALK_BAR, STOP_LINE, FloatArray
-from v2hdm.simulate.render.optics import Optics
+from v2hdm.simulate.render.renderer import Optics
 from v2hdm.simulate.render.scene import Bgr, Box, Ground, GroundMarks, Light, Paint, Shadow, box_footprint
 
 _CROSSED_M = 22.0

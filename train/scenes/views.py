@@ -15,7 +15,7 @@ from v2hdm.detection.camera.view import ASIDE_RAD
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import CameraInfo, FloatArray
-from v2hdm.simulate.render.optics import Motion, Optics
+from v2hdm.simulate.render.renderer import Motion, Optics
 
 _LENS_TOLERANCE_PX = 0.1
 _BORDER_POINTS = 17

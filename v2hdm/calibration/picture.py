@@ -18,7 +18,7 @@ from v2hdm.calibration.residuals import Residuals
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import FloatArray
 from v2hdm.report import style
-from v2hdm.report.camera_grid import project_line
+from v2hdm.report.photos import project_line
 
 _HEIGHT_IN = 6.4
 _ARROW_SHARE = 0.06  # length of the longest arrow of a right point, as a share of the picture's width

@@ -14,7 +14,7 @@ from v2hdm import pipeline
 from v2hdm.pipeline.config import run_name
 from v2hdm.pipeline.telling import logging_to
 from v2hdm.progress import progress_lines
-from v2hdm.report.table import changes_table, results_table
+from v2hdm.report.terminal import changes_table, results_table
 from v2hdm.verdict import Status, Verdict
 from v2hdm.viewer import RerunViewer, check_viewer
 

@@ -41,7 +41,7 @@ def _experiment() -> int:
 def _run(job: Job) -> None:
     from v2hdm.cli import config
     from v2hdm.experiment.plan import ExperimentConfig
-    from v2hdm.experiment.view import experiment_on_terminal
+    from v2hdm.experiment.run import experiment_on_terminal
 
     settings = config.to_dataclass(job.composed, ExperimentConfig, _PORTS)
     settings.output = job.folder(settings.output)

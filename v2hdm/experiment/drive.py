@@ -1,12 +1,16 @@
 """One drive of an experiment: read or rendered, detected, mapped by every recipe, held against the truth.
 
-Everything that tables, figures and words need of it is kept as plain content, a file for each recipe, so
-that a finished drive is never opened again.
+Everything that tables, figures and text need of it is kept as plain content, a file for each recipe, so that
+a finished drive is never opened again. Files are gzipped JSON, whose numbers come back exactly, under the key
+of all that they were made from. A file of another key, or a damaged one, counts as absent.
 """
 
 from __future__ import annotations
 
+import gzip
+import json
 import shutil
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import cache, partial
@@ -16,9 +20,8 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import AdjustError, MappingError
+from v2hdm.experiment.measures import residuals
 from v2hdm.experiment.plan import OURS, PAPER, Job
-from v2hdm.experiment.residuals import residuals
-from v2hdm.experiment.stored import store, stored
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.io.drive import read_drive
 from v2hdm.io.drive.truth import read_truth
@@ -29,20 +32,39 @@ from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.inspect import Inspection, inspect_each
 from v2hdm.pipeline.keys import Contents, model_key
 from v2hdm.records import Drive, HdMap, ImageDetections, Marking, Truth
-from v2hdm.report.evaluation import growth_figures
-from v2hdm.report.metrics import driven_past, extrinsic_metrics
+from v2hdm.report.metrics import driven_past, extrinsic_metrics, growth_figures
 from v2hdm.simulate import rendered_drive, surveyed_cameras
 from v2hdm.store.cache.keys import code_key, file_digest, key_of
 from v2hdm.store.cache.room import Room
 from v2hdm.store.cache.store import Store
 from v2hdm.store.files import whole_file
 
-Tell = Callable[[str, int, int], None]
-"""Told a stage, and how many of its steps are done, of how many."""
+_FASTEST = 1  # level of gzip: a fifth of the size already, at a tenth of the time of the default
+
+
+def store(path: Path, key: str, content: Mapping[str, Any]) -> None:
+    """Write plain content (lists, numbers, texts, arrays) under a key, whole or not at all."""
+    text = json.dumps({"key": key, "content": content}, default=lambda value: value.tolist())
+    with whole_file(path) as partial:
+        partial.write_bytes(gzip.compress(text.encode(), _FASTEST))
+
+
+def stored(path: Path, key: str) -> dict[str, Any] | None:
+    """The content of a file of :func:`store`; None where there is none of this key."""
+    try:
+        found = json.loads(gzip.decompress(path.read_bytes()))
+        content: dict[str, Any] | None = found["content"] if found["key"] == key else None
+    except (OSError, EOFError, zlib.error, ValueError, KeyError, TypeError):
+        return None
+    return content
+
+
+Progress = Callable[[str, int, int], None]
+"""Called with a stage, and how many of its steps are done, of how many."""
 
 SETTING_FILE = "drive.json.gz"
 GROWTH_STEPS = 8
-"""Sizes of the growing map at which its error is told."""
+"""Sizes of the growing map at which its error is stated."""
 
 
 def setting_key(job: Job) -> str:
@@ -68,34 +90,31 @@ def recipe_file(recipe: str) -> str:
     return f"{recipe}.json.gz"
 
 
-def drive_record(job: Job, workers: int, tell: Tell) -> dict[str, Any]:
-    """What is known of a drive and of its maps, from disk or found now and kept there.
+def drive_record(job: Job, workers: int, progress: Progress) -> dict[str, Any]:
+    """The record of a drive and of its maps, from disk or made now and kept there.
 
     Args:
         job: the drive.
         workers: processes to render and detect in; 1 stays in this one.
-        tell: told how far each stage is.
+        progress: called with how far each stage is.
 
     Raises:
         V2hdmError: the drive cannot be rendered, read or looked at, or has no truth.
     """
     if _setting_and_maps(job) is None:
-        _find(job, workers, tell)
+        _find(job, workers, progress)
     known = _setting_and_maps(job)
     assert known is not None
-    tell("finished", 1, 1)
+    progress("finished", 1, 1)
     return _together(*known)
 
 
 def _setting_and_maps(job: Job) -> tuple[dict[str, Any], dict[str, dict[str, Any]]] | None:
-    """What is on disk: the drive, and its maps by recipe; None where something is missing."""
+    """The drive, and its maps by recipe, from disk; None where something is missing."""
     setting = stored(job.folder / SETTING_FILE, setting_key(job))
-    maps = {
-        recipe: found
-        for recipe in job.options
-        if (found := stored(job.folder / recipe_file(recipe), recipe_key(job, recipe))) is not None
-    }
-    return None if setting is None or len(maps) < len(job.options) else (setting, maps)
+    kept = {name: stored(job.folder / recipe_file(name), recipe_key(job, name)) for name in job.options}
+    maps = {recipe: found for recipe, found in kept.items() if found is not None}
+    return None if setting is None or len(maps) < len(kept) else (setting, maps)
 
 
 def _together(setting: Mapping[str, Any], maps: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -114,10 +133,10 @@ def _together(setting: Mapping[str, Any], maps: Mapping[str, Mapping[str, Any]])
     }
 
 
-def _find(job: Job, workers: int, tell: Tell) -> None:
+def _find(job: Job, workers: int, progress: Progress) -> None:
     """Open the drive, and map it by those recipes whose maps are missing."""
     if job.site.simulate is not None:
-        folder = rendered_drive(job.site.simulate, job.cache, workers, partial(tell, "render"))
+        folder = rendered_drive(job.site.simulate, job.cache, workers, partial(progress, "render"))
     else:
         folder = Path(job.site.drive.path or "")
     drive = read_drive(folder, job.site.drive)
@@ -126,14 +145,14 @@ def _find(job: Job, workers: int, tell: Tell) -> None:
     cache, contents = Store(job.cache), Contents.of([drive])
     room, max_gap_s = Room(cache), job.site.drive.max_gap_s
     with cache.in_use():
-        (inspection,) = inspect_each([drive], contents, max_gap_s, room, workers, tell)
+        (inspection,) = inspect_each([drive], contents, max_gap_s, room, workers, progress)
         detections = detect_in_pieces(
-            inspection.drive, contents, job.detector, room, workers, partial(tell, "detect")
+            inspection.drive, contents, job.detector, room, workers, partial(progress, "detect")
         )
     for recipe in job.options:
         path, key = job.folder / recipe_file(recipe), recipe_key(job, recipe)
         if stored(path, key) is None:
-            store(path, key, _mapped(job, recipe, inspection, detections, truth, tell))
+            store(path, key, _mapped(job, recipe, inspection, detections, truth, progress))
 
 
 def _setting(job: Job, drive: Drive, truth: Truth) -> dict[str, Any]:
@@ -177,7 +196,7 @@ def _mapped(
     inspection: Inspection,
     detections: Sequence[ImageDetections],
     truth: Truth,
-    tell: Tell,
+    progress: Progress,
 ) -> dict[str, Any]:
     """Maps, growth and extrinsics of a drive under a recipe; under ours residuals, too."""
     drive = inspection.drive
@@ -186,7 +205,7 @@ def _mapped(
         "maps": {}, "growth": {}, "extrinsics": {}, "failures": [], "lanes": {}, "residuals": {},
     }  # fmt: skip
     for done, (name, members) in enumerate(sets.items()):
-        tell(f"map, {recipe}", done, len(sets))
+        progress(f"map, {recipe}", done, len(sets))
         last = name == list(sets)[-1]
         steps = GROWTH_STEPS if last and recipe != PAPER else 0
         try:
@@ -202,7 +221,7 @@ def _mapped(
         if last and recipe == OURS:
             out["lanes"] = {"Opt": [lane.points_map for lane in methods["Opt"].hd_map.lanes]}
             out["residuals"] = residuals(inspection.drive_as_described, detections, methods, truth)
-    tell(f"map, {recipe}", len(sets), len(sets))
+    progress(f"map, {recipe}", len(sets), len(sets))
     return out
 
 

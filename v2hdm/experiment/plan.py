@@ -1,4 +1,4 @@
-"""What an experiment maps: its ports, its seeds, and how each drive is mapped."""
+"""The plan of an experiment: its ports, its seeds, and how each drive is mapped."""
 
 from __future__ import annotations
 
@@ -107,18 +107,11 @@ def jobs(config: ExperimentConfig) -> list[Job]:
                 found.append((port, seed, replace(site, simulate=replace(site.simulate, seed=seed))))
             elif seed == config.seeds[0]:
                 found.append((port, None, site))
-    return [
-        Job(
-            port,
-            seed,
-            site,
-            config.detector,
-            options,
-            Path(config.cache),
-            folder / (port if seed is None else f"{port}-{seed}"),
-        )
-        for port, seed, site in found
-    ]
+    jobs = []
+    for port, number, site in found:
+        own = folder / (port if number is None else f"{port}-{number}")
+        jobs.append(Job(port, number, site, config.detector, options, Path(config.cache), own))
+    return jobs
 
 
 def _options(given: MappingOptions, recipe: str) -> MappingOptions:

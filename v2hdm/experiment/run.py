@@ -1,4 +1,4 @@
-"""An experiment from its settings to its folder: the drives side by side, then tables, figures and words."""
+"""An experiment from its settings to its folder: the drives side by side, then tables, figures and text."""
 
 from __future__ import annotations
 
@@ -6,33 +6,35 @@ import logging
 import multiprocessing
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
+from rich.table import Table
+
 from v2hdm.errors import ConfigError
 from v2hdm.experiment.drive import drive_record
 from v2hdm.experiment.figures import save_figures
 from v2hdm.experiment.measures import Measured, measure
 from v2hdm.experiment.plan import ExperimentConfig, Job, jobs
-from v2hdm.experiment.tables import write_tables
-from v2hdm.experiment.words import write_words
+from v2hdm.experiment.summary import by_port, claims, results_table, write_tables, write_words
+from v2hdm.report.terminal import DriveProgress, drive_bars, new_table, plain
 from v2hdm.store.files import replace_text
 from v2hdm.store.outputs import growing_folder, listed_files
 from v2hdm.workers import share_out
-
-Tell = Callable[[str, str, int, int], None]
-"""Told a drive, its stage, and how many of the stage's steps are done, of how many."""
 
 _OPTION = "output="
 _PATIENCE_S = 2.0
 _queue: SimpleQueue[tuple[str, str, int, int] | None] | None = None
 
 
-def run_experiment(config: ExperimentConfig, config_yaml: str, tell: Tell) -> tuple[Path, list[Measured]]:
+def run_experiment(
+    config: ExperimentConfig, config_yaml: str, progress: DriveProgress
+) -> tuple[Path, list[Measured]]:
     """Map every drive by every recipe and write what comes of it into ``<output>/<name>/``.
 
     Drives that an earlier run has finished under the same settings are taken from there.
@@ -40,7 +42,7 @@ def run_experiment(config: ExperimentConfig, config_yaml: str, tell: Tell) -> tu
     Args:
         config: what to do.
         config_yaml: the configuration as text, kept beside the results.
-        tell: told how far each drive is.
+        progress: called with how far each drive is.
 
     Returns:
         The folder, and the figures of every drive.
@@ -53,9 +55,9 @@ def run_experiment(config: ExperimentConfig, config_yaml: str, tell: Tell) -> tu
     try:
         with growing_folder(folder, _OPTION):
             replace_text(folder / "config.yaml", config_yaml or f"{config!r}\n")
-            records = _records(todo, config.workers or os.cpu_count() or 1, tell)
+            records = _records(todo, config.workers or os.cpu_count() or 1, progress)
             measured = [measure(record) for record in records]
-            drawing = partial(tell, "figures", "draw")
+            drawing = partial(progress, "figures", "draw")
             captions = save_figures(folder, todo, records, measured, drawing)
             write_tables(folder, measured)
             write_words(folder, measured, captions, config)
@@ -66,23 +68,23 @@ def run_experiment(config: ExperimentConfig, config_yaml: str, tell: Tell) -> tu
     return folder, measured
 
 
-def _records(todo: Sequence[Job], workers: int, tell: Tell) -> list[dict[str, Any]]:
+def _records(todo: Sequence[Job], workers: int, progress: DriveProgress) -> list[dict[str, Any]]:
     if workers <= 1 or len(todo) == 1:
-        return [drive_record(job, workers, partial(tell, job.title)) for job in todo]
+        return [drive_record(job, workers, partial(progress, job.title)) for job in todo]
     records: list[dict[str, Any]] = []
-    with _listening(tell) as queue:
+    with _listening(progress) as queue:
         share_out(_work, todo, workers, _start_worker, (queue,), records.append)
     return records
 
 
 @contextmanager
-def _listening(tell: Tell) -> Iterator[SimpleQueue[tuple[str, str, int, int] | None]]:
-    """A queue whose messages are told here while other processes work."""
+def _listening(progress: DriveProgress) -> Iterator[SimpleQueue[tuple[str, str, int, int] | None]]:
+    """A queue whose messages become progress here while other processes work."""
     queue: SimpleQueue[tuple[str, str, int, int] | None] = multiprocessing.get_context("spawn").SimpleQueue()
 
     def listen() -> None:
         while (message := queue.get()) is not None:
-            tell(*message)
+            progress(*message)
 
     # A process that was ended in the middle of a message leaves a queue that is never heard to its end.
     listener = threading.Thread(target=listen, daemon=True)
@@ -102,9 +104,43 @@ def _start_worker(queue: SimpleQueue[tuple[str, str, int, int] | None]) -> None:
 
 def _work(job: Job) -> dict[str, Any]:
     with listed_files(job.root, _OPTION):
-        return drive_record(job, 1, partial(_tell, job.title))
+        return drive_record(job, 1, partial(_report, job.title))
 
 
-def _tell(title: str, stage: str, done: int, total: int) -> None:
+def _report(title: str, stage: str, done: int, total: int) -> None:
     if _queue is not None:
         _queue.put((title, stage, done, total))
+
+
+_SHOWN = ("method", "cameras", "markings", "RMSE (cm)", "RMSE of shared (cm)")
+"""Columns of the main table that the terminal shows."""
+
+
+def experiment_on_terminal(config: ExperimentConfig, config_yaml: str) -> None:
+    """Run an experiment and show how far it is and what came of it."""
+    console = Console()
+    with drive_bars(console) as progress:
+        folder, measured = run_experiment(config, config_yaml, progress)
+    for port, drives in by_port(measured).items():
+        console.print(_table(port, drives))
+    tested = claims(measured)
+    for claim in tested:
+        if not claim.holds:
+            difference = f"{claim.where}: {claim.text} is {claim.figure}, asked {claim.limit}"
+            plain(console, f"disagrees with the paper: {difference}")
+    agree = sum(claim.holds for claim in tested)
+    plain(console, f"{agree} of {len(tested)} figures agree with the paper's claims")
+    plain(console, f"results in {folder}: begin with experiment.md and figures.md")
+
+
+def _table(port: str, drives: Sequence[Measured]) -> Table:
+    """The columns of the main table that fit a terminal: method by camera set."""
+    seeds = f", {len(drives)} seeds" if len(drives) > 1 else ""
+    table = new_table(f"{port}{seeds}", _SHOWN[:2], _SHOWN[2:])
+    heads, lines = results_table(drives)
+    shown = [heads.index(name) for name in _SHOWN]
+    for number, line in enumerate(lines):
+        if number and line[1] != lines[number - 1][1]:
+            table.add_section()
+        table.add_row(*(line[column] for column in shown))
+    return table

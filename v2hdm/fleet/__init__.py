@@ -1,1 +1,1 @@
-"""Many drives on Ray: detection by workers that keep the model loaded, one mapping task a drive."""
+"""Many drives on Ray: detection by actors that keep the model loaded, one mapping task per drive."""

@@ -27,9 +27,8 @@ def _fleet(parsed: argparse.Namespace) -> int:
     import ray  # noqa: F401  # its absence is told before that of what is built on it
 
     from v2hdm.errors import ConfigError
-    from v2hdm.fleet.rows import exit_code
-    from v2hdm.fleet.run import FleetOptions
-    from v2hdm.fleet.view import fleet_on_terminal
+    from v2hdm.fleet.plan import exit_code
+    from v2hdm.fleet.run import FleetOptions, fleet_on_terminal
     from v2hdm.settings import check_workers
     from v2hdm.store.objects.bucket import is_url
 

@@ -5,14 +5,15 @@ from __future__ import annotations
 import logging
 import os
 import secrets
-import shutil
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 from v2hdm.errors import ConfigError
 from v2hdm.extras import need
+from v2hdm.pipeline import RunConfig
 
 LOCAL = "local"
 """The address of a Ray of our own on this machine."""
@@ -29,49 +30,49 @@ _QUIET = {
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "RAY_DEDUP_LOGS": "0",
 }
-"""No usage is told to anybody."""
+"""Ray reports no usage to anybody."""
 
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Workers share the cores among them; linear algebra of one takes one."""
+
+DETECTORS_A_GPU = 8
+"""Actors that detect on one GPU: each takes memory there, and most of an image's time is the CPU's."""
+
+NO_GPU = (
+    "device=cuda or detector.device=cuda is set, and none of Ray's machines has a GPU: set them to cpu, or "
+    "start Ray where there is one"
+)
 
 
 @contextmanager
 def cluster(address: str, workers: int) -> Iterator[Any]:
-    """The module ``ray``, connected.
+    """The module ``ray``, connected to a running cluster (``auto`` finds that of this machine).
 
-    Args:
-        address: of a running cluster, ``auto`` for that of this machine; ``local`` starts one here, which
-            ends with the block or the process.
-        workers: cores that a local one uses; 0 takes all.
+    ``local`` starts one here of so many cores, 0 for all; it ends with the block or the process.
 
     Raises:
         ConfigError: Ray is not installed, or there is no cluster at the address.
     """
-    os.environ.update(_QUIET)
-    local = address == LOCAL
-    given = {name: os.environ.get(name) for name in _ONE_THREAD}
-    if local:
-        # A secret of this process's own: else Ray keeps one in the home folder for all.
-        os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-    ray = need("ray", "fleet", "a fleet", ConfigError)
-    logging.getLogger("ray").setLevel(logging.ERROR)
-    folder = tempfile.mkdtemp(prefix="v2hdm-ray-") if local else None
-    own: dict[str, Any] = {
-        "num_cpus": workers or None,
-        "include_dashboard": False,
-        "object_store_memory": _OBJECT_STORE_BYTES,
-        "_temp_dir": folder,
-    }
-    try:
+    with ExitStack() as stack:
+        stack.callback(_restore, {name: os.environ.get(name) for name in _ONE_THREAD})
+        os.environ.update(_QUIET | _ONE_THREAD)
+        if address == LOCAL:
+            # A secret of this process's own: else Ray keeps one in the home folder for all.
+            os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+            folder = tempfile.TemporaryDirectory(prefix="v2hdm-ray-", ignore_cleanup_errors=True)
+            options: dict[str, Any] = {
+                "num_cpus": workers or None,
+                "include_dashboard": False,
+                "object_store_memory": _OBJECT_STORE_BYTES,
+                "_temp_dir": stack.enter_context(folder),
+            }
+        else:
+            options = {"runtime_env": {"env_vars": _ONE_THREAD}}
+        ray = need("ray", "fleet", "a fleet", ConfigError)
+        logging.getLogger("ray").setLevel(logging.ERROR)
+        stack.callback(ray.shutdown)
         try:
-            ray.init(
-                address=address,
-                log_to_driver=False,
-                configure_logging=False,
-                runtime_env=None if local else {"env_vars": dict.fromkeys(_ONE_THREAD, "1")},
-                **(own if local else {}),
-            )
+            ray.init(address=address, log_to_driver=False, configure_logging=False, **options)
         except (ConnectionError, ValueError, RuntimeError) as error:
             why = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise ConfigError(
@@ -79,12 +80,30 @@ def cluster(address: str, workers: int) -> Iterator[Any]:
                 "same RAY_AUTH_TOKEN, or leave --address out"
             ) from error
         yield ray
-    finally:
-        ray.shutdown()
-        for name, value in given.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-        if folder is not None:
-            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _restore(environment: dict[str, str | None]) -> None:
+    for name, value in environment.items():
+        os.environ.pop(name, None)
+        if value is not None:
+            os.environ[name] = value
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Ray's share of a GPU for an actor that detects and for a mapping task."""
+
+    detector: float
+    mapping: float
+
+    @classmethod
+    def of(cls, configs: Sequence[RunConfig]) -> Shares:
+        """A whole GPU for a mapping task, or for all actors on it; half for each where both are on GPUs."""
+        both = "cuda" in {one.detector.device for one in configs} & {one.device for one in configs}
+        part = 0.5 if both else 1.0
+        return cls(part / DETECTORS_A_GPU, part)
+
+
+def wants_gpu(config: RunConfig) -> bool:
+    """Whether a run has work for a GPU."""
+    return "cuda" in (config.device, config.detector.device)

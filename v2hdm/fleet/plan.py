@@ -1,31 +1,110 @@
-"""What a fleet maps: run files composed, each drive or a whole site with the folder of its result."""
+"""The plan of a fleet, from run files, and its table of verdicts: one row per drive."""
 
 from __future__ import annotations
 
+import csv
+import io
+import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
+from rich.table import Table
+from rich.text import Text
 
 from v2hdm.cli.config import compose_run_file, to_dataclass, to_yaml
+from v2hdm.cli.door import EXIT_FAILED_VERDICT, EXIT_USER_ERROR, one_line
 from v2hdm.errors import ConfigError, V2hdmError
-from v2hdm.fleet.rows import Row
 from v2hdm.io.safe.texts import shown, take_name
 from v2hdm.pipeline import RunConfig
 from v2hdm.pipeline.config import run_name
+from v2hdm.report.terminal import new_table
 from v2hdm.store.objects.bucket import place_of
+
+ERROR = "ERROR"
+"""Status of a drive of which there is no result."""
+
+STYLES = {"PASS": "bold green", "WARN": "bold yellow", "FAIL": "bold red", ERROR: "bold red"}
+
+
+@dataclass(frozen=True)
+class Row:
+    """The outcome of one drive: ``says`` is the worst finding, or the error, in one line.
+
+    ``kept`` says that an earlier result of the same content was found. ``folder`` is that of the result,
+    or its URL, empty without one; ``source`` is the run file, or those of a site.
+    """
+
+    drive: str
+    status: str
+    says: str
+    images: int | None
+    markings: int | None
+    minutes: float | None
+    kept: bool
+    folder: str
+    source: str
+
+    @classmethod
+    def of_error(cls, drive: str, source: str, message: str) -> Row:
+        """The row of a drive that gave no result."""
+        return cls(drive, ERROR, one_line(message), None, None, None, False, "", source)
+
+    @classmethod
+    def of_result(cls, drive: str, source: str, place: str, metrics: Mapping[str, Any], kept: bool) -> Row:
+        """The row of a finished run, from its ``metrics.json``."""
+        verdict, sets = metrics["verdict"], list(metrics["results"].values())
+        worst = next((f"{one['check']} ({one['about']}): {one['says']}" for one in verdict["findings"]), "")
+        return cls(
+            drive,
+            status=str(verdict["status"]),
+            says=one_line(worst),
+            images=int(metrics["drive"]["images"]),
+            markings=int(sets[-1]["Opt"]["markings"]) if sets else None,
+            minutes=round(sum(metrics.get("seconds", {}).values()) / 60, 3),
+            kept=kept,
+            folder=place,
+            source=source,
+        )
+
+
+def as_csv(rows: Sequence[Row]) -> bytes:
+    """The rows as a spreadsheet."""
+    out = io.StringIO()
+    writer = csv.DictWriter(out, [one.name for one in fields(Row)], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(asdict(row) for row in rows)
+    return out.getvalue().encode()
+
+
+def as_json(rows: Sequence[Row]) -> bytes:
+    """The rows as JSON."""
+    return (json.dumps({"drives": [asdict(row) for row in rows]}, indent=2) + "\n").encode()
+
+
+def as_table(rows: Sequence[Row]) -> Table:
+    """The rows for the terminal."""
+    table = new_table(None, ("drive", "verdict"), ("images", "markings", "minutes"))
+    for row in rows:
+        numbers = ["" if one is None else str(one) for one in (row.images, row.markings)]
+        minutes = "kept" if row.kept else "" if row.minutes is None else f"{row.minutes:.1f}"
+        table.add_row(Text(row.drive), Text(row.status, STYLES.get(row.status, "")), *numbers, minutes)
+    return table
+
+
+def exit_code(rows: Sequence[Row]) -> int:
+    """2 where a drive gave no result, else 3 where a verdict is FAIL, else 0."""
+    found = {row.status for row in rows}
+    return EXIT_USER_ERROR if ERROR in found else EXIT_FAILED_VERDICT if "FAIL" in found else 0
 
 
 @dataclass(frozen=True)
 class Job:
-    """One drive to map, or several of one site together.
+    """One drive to map, or several of one site together; ``source`` is its run file, or those of its drives.
 
-    Attributes:
-        name: of the run.
-        source: its run file, or those of its drives.
-        config, config_yaml: what to do, and as text to be kept beside the results.
+    ``config_yaml`` is the configuration as text, kept beside the results.
     """
 
     name: str
@@ -35,14 +114,14 @@ class Job:
 
     @property
     def place(self) -> str:
-        """What takes the results: a folder, or the URL of one."""
+        """The folder of the results, or its URL."""
         there = place_of(self.config.output, "output=")
         return str((there / self.name).resolve() if isinstance(there, Path) else there.below(self.name))
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What to map, a row for each file that says no drive, and the sources of both in the files' order."""
+    """The jobs, a row for each file that names no drive, and the sources of both in the files' order."""
 
     jobs: list[Job]
     refused: list[Row]
@@ -50,18 +129,15 @@ class Plan:
 
 
 def plan(files: Sequence[Path], overrides: Sequence[str]) -> Plan:
-    """The drives of run files, each by itself.
-
-    Args:
-        files: as ``conf/run/*.yaml`` are written.
-        overrides: ``key=value`` for all of them.
-    """
+    """The drives of run files, each by itself; ``overrides`` are ``key=value`` for all of them."""
     jobs: list[Job] = []
     refused: list[Row] = []
     taken: dict[str, Path] = {}
     for file in files:
         try:
-            job = _job(file, overrides)
+            composed, config = _composed(file, overrides)
+            take_name(run_name(config), "name", ConfigError)
+            job = Job(run_name(config), str(file), config, to_yaml(composed))
             place = job.place
             if place in taken:
                 raise ConfigError(
@@ -76,12 +152,7 @@ def plan(files: Sequence[Path], overrides: Sequence[str]) -> Plan:
 
 
 def plan_site(files: Sequence[Path], overrides: Sequence[str], site: str) -> Plan:
-    """All drives of run files as the one site of that name.
-
-    Args:
-        files: as for :func:`plan`; what they say beside their drives and names is the same in all.
-        overrides: ``key=value`` for all of them.
-        site: names the result.
+    """All drives of run files, whose other settings are equal, as the one site of that name.
 
     Raises:
         ConfigError: the site's name cannot be that of a folder.
@@ -94,13 +165,6 @@ def plan_site(files: Sequence[Path], overrides: Sequence[str], site: str) -> Pla
         return Plan([], [Row.of_error(site, source, str(error))], [source])
 
 
-def _job(file: Path, overrides: Sequence[str]) -> Job:
-    composed, config = _composed(file, overrides)
-    name = run_name(config)
-    take_name(name, "name", ConfigError)
-    return Job(name, str(file), config, to_yaml(composed))
-
-
 def _site_job(files: Sequence[Path], overrides: Sequence[str], site: str, source: str) -> Job:
     first, settings = _composed(files[0], overrides)
     paths: list[str] = []
@@ -109,8 +173,7 @@ def _site_job(files: Sequence[Path], overrides: Sequence[str], site: str, source
         if not config.drive.paths:
             raise ConfigError(f"{file}: --site joins drives that lie in folders; set drive.path")
         _refuse_other_settings(files[0], settings, file, config)
-        told = config.drive.path
-        paths += map(str, told if isinstance(told, list) else [told])
+        paths += map(str, config.drive.path if isinstance(config.drive.path, list) else [config.drive.path])
     OmegaConf.update(first, "name", site)
     OmegaConf.update(first, "drive.path", paths)
     return Job(site, source, to_dataclass(first, RunConfig, f"set it in {files[0]}"), to_yaml(first))
@@ -126,9 +189,10 @@ def _composed(file: Path, overrides: Sequence[str]) -> tuple[DictConfig, RunConf
 
 
 def _refuse_other_settings(first: Path, settings: RunConfig, file: Path, config: RunConfig) -> None:
-    told, other = (dict(_leaves(_without_drive(one))) for one in (settings, config))
-    for key in [*told, *other]:
-        values = [one.get(key) for one in (told, other)]
+    without = [replace(one, name=None, drive=replace(one.drive, path=None)) for one in (settings, config)]
+    mine, other = (dict(_leaves(asdict(one))) for one in without)
+    for key in [*mine, *other]:
+        values = [one.get(key) for one in (mine, other)]
         if values[0] != values[1]:
             raise ConfigError(
                 f"{file}: {key} is {shown(values[1])}, and {shown(values[0])} in {first}: a site has one "
@@ -136,12 +200,8 @@ def _refuse_other_settings(first: Path, settings: RunConfig, file: Path, config:
             )
 
 
-def _without_drive(config: RunConfig) -> dict[str, Any]:
-    return asdict(replace(config, name=None, drive=replace(config.drive, path=None)))
-
-
 def _leaves(settings: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
-    """All that settings say, by its dotted key."""
+    """Every setting by its dotted key."""
     for key, value in settings.items():
         if isinstance(value, dict) and value:
             yield from _leaves(value, f"{before}{key}.")

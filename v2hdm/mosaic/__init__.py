@@ -1,8 +1,6 @@
 """The ground from above: all images of a drive warped onto one plane, blended, measured and written.
 
-Modules: :mod:`~v2hdm.mosaic.canvas` (which ground a pixel shows), :mod:`~v2hdm.mosaic.shots` (images
-and where they look), :mod:`~v2hdm.mosaic.blend` (the warp and the weighted mean, on kornia),
-:mod:`~v2hdm.mosaic.sharpness` (how wide paint edges are), :mod:`~v2hdm.mosaic.files` (GeoTIFF and
-picture), :mod:`~v2hdm.mosaic.comparison` (before and after), :mod:`~v2hdm.mosaic.result` (from a
-result folder to all of it).
+:mod:`~v2hdm.mosaic.shots` has the images and the raster on the ground, :mod:`~v2hdm.mosaic.blend` the warp
+and the weighted mean, :mod:`~v2hdm.mosaic.sharpness` the width of paint edges and the comparison before and
+after, :mod:`~v2hdm.mosaic.result` all of it from a result folder, and its files.
 """

@@ -6,29 +6,29 @@ coordinate of the mapped point. That is proportional to its depth, so that near 
 the image is trusted for is warped with its colours, in one pass.
 
 The canvas is done in sheets, so that memory does not grow with the drive, and each sheet in tiles of which an
-image touches only those that it shows. Within a tile lens, projection and weight are smooth: kornia evaluates
-them at Chebyshev nodes, and the polynomial through these gives them at every pixel.
+image touches only those that it shows. Within a tile homography, lens and weight are smooth: kornia
+evaluates them at Chebyshev nodes, the polynomial through these gives them at every pixel, and kornia's
+``remap`` samples the image there.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import torch
+from kornia.geometry.transform import remap
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from v2hdm.detection.image_file import read_bgr
 from v2hdm.errors import ConfigError, DriveError
+from v2hdm.geometry import tensors
 from v2hdm.geometry.ipm import apply_homography
-from v2hdm.geometry.tensors import distort_points
-from v2hdm.mosaic.canvas import Canvas
-from v2hdm.mosaic.shots import Lens, Shot
+from v2hdm.mosaic.shots import Canvas, Lens, Shot
 from v2hdm.records import FloatArray
 
 TILES_PX = (128, 64, 32, 16)
@@ -40,11 +40,8 @@ SHEET_PX = 2048
 WARP_ERROR_PX = 0.02
 """By so much of an image's pixels may interpolated positions be off."""
 
-_NODES = 8
-"""Chebyshev nodes along a tile's side."""
-
-_KEPT_IMAGES = 96
-"""Decoded images that neighbouring sheets share, 1.5 MB each."""
+_NODES = 8  # Chebyshev nodes along a tile's side
+_KEPT_IMAGES = 96  # decoded images that neighbouring sheets share, 1.5 MB each
 
 
 @dataclass(frozen=True)
@@ -109,7 +106,7 @@ def blend(
 
 
 _Views = list[tuple[int, FloatArray]]
-"""Of each image that shows a sheet: its index and the (column, row) of the tiles (T, 2) that it shows."""
+"""Images that show a sheet: the index of each and the (column, row) of the tiles (T, 2) that it shows."""
 
 
 def _plan(
@@ -169,52 +166,40 @@ class _Source:
 
 
 class _Sources:
-    """The images of shots in the order in which they are asked for; the next is decoded meanwhile.
-
-    The last used are kept, cut to what is trusted.
-    """
+    """The images of shots, in any order; the next is decoded meanwhile, the last used stay decoded."""
 
     def __init__(self, shots: Sequence[Shot], lenses: Mapping[str, Lens], device: str):
         self._shots, self._lenses, self._device = shots, lenses, device
-        self._kept: OrderedDict[Path, np.ndarray] = OrderedDict()
         self._boxes = {name: _box(lens.trust) for name, lens in lenses.items()}
         self._trust = {
             name: torch.from_numpy(lens.trust[self._boxes[name]].copy()).to(device)
             for name, lens in lenses.items()
         }
+        self._decoded = lru_cache(maxsize=_KEPT_IMAGES)(self._decode)
 
     def of(self, order: Sequence[int]) -> Iterator[_Source]:
         """The images of these indices of shots."""
+        shots = [self._shots[index] for index in order]
         with ThreadPoolExecutor(1) as decoder:
-            ahead = decoder.submit(self._pixels, self._shots[order[0]]) if order else None
-            for position, index in enumerate(order):
-                assert ahead is not None
-                pixels = ahead.result()
-                if position + 1 < len(order):
-                    ahead = decoder.submit(self._pixels, self._shots[order[position + 1]])
-                yield self._source(self._shots[index], pixels)
+            ahead = [decoder.submit(self._decoded, shot.path, shot.camera) for shot in shots[:1]]
+            for shot, following in zip(shots, [*shots[1:], None], strict=True):
+                pixels = ahead.pop().result()
+                if following is not None:
+                    ahead.append(decoder.submit(self._decoded, following.path, following.camera))
+                box, trust = self._boxes[shot.camera], self._trust[shot.camera]
+                values = torch.empty((4, *trust.shape), dtype=torch.float32, device=self._device)
+                values[:3] = torch.from_numpy(pixels).to(self._device).permute(2, 0, 1)
+                values[3] = trust
+                yield _Source(values, (box[1].start, box[0].start), self._lenses[shot.camera])
 
-    def _source(self, shot: Shot, pixels: np.ndarray) -> _Source:
-        box, trust = self._boxes[shot.camera], self._trust[shot.camera]
-        values = torch.empty((4, *trust.shape), dtype=torch.float32, device=self._device)
-        values[:3] = torch.from_numpy(pixels).to(self._device).permute(2, 0, 1)
-        values[3] = trust
-        return _Source(values, (box[1].start, box[0].start), self._lenses[shot.camera])
-
-    def _pixels(self, shot: Shot) -> np.ndarray:
-        if shot.path in self._kept:
-            self._kept.move_to_end(shot.path)
-            return self._kept[shot.path]
-        pixels, lens = read_bgr(shot.path), self._lenses[shot.camera]
+    def _decode(self, path: Path, camera: str) -> np.ndarray:
+        pixels, lens = read_bgr(path), self._lenses[camera]
         if pixels.shape[:2] != lens.trust.shape:
             raise DriveError(
-                f"{shot.path}: the image is {pixels.shape[1]}x{pixels.shape[0]} but camera "
-                f"{shot.camera!r} has {lens.info.width}x{lens.info.height}; mend its camera_info or images"
+                f"{path}: the image is {pixels.shape[1]}x{pixels.shape[0]} but camera {camera!r} has "
+                f"{lens.info.width}x{lens.info.height}; mend its camera_info or images"
             )
-        self._kept[shot.path] = cut = pixels[self._boxes[shot.camera]].copy()
-        if len(self._kept) > _KEPT_IMAGES:
-            self._kept.popitem(last=False)
-        return cut
+        return pixels[self._boxes[camera]].copy()
 
 
 class Tiling:
@@ -224,7 +209,7 @@ class Tiling:
         self.side_px = side_px
         at_nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
         nodes = (side_px - 1) / 2 * (1 + at_nodes)
-        self.nodes = np.stack(np.meshgrid(nodes, nodes), axis=-1)
+        self.nodes = np.stack(np.meshgrid(nodes, nodes), axis=-1).reshape(-1, 2)
         vandermonde = np.polynomial.chebyshev.chebvander
         at_pixels = vandermonde(np.linspace(-1, 1, side_px), _NODES - 1)
         self.pixels_from_nodes = at_pixels @ np.linalg.inv(vandermonde(at_nodes, _NODES - 1))
@@ -254,28 +239,26 @@ class Tiling:
         px_from_canvas = shot.pinhole_px_from_map @ canvas.map_from_canvas
         outline = apply_homography(canvas.canvas_from_map, outline_map)
         tiles = _tiles_under(outline, np.full(2, np.iinfo(np.int64).max), self.side_px)
-        at = np.arange(self.side_px)
-        pixels = np.stack(np.meshgrid(at, at), axis=-1)
-        exact, third = _project(px_from_canvas, pixels, tiles * self.side_px)
-        nodes, third_nodes = _project(px_from_canvas, self.nodes, tiles * self.side_px)
-        if min(third.min(), third_nodes.min()) <= 0:
+        at = np.arange(self.side_px, dtype=np.float64)
+        corners = self.side_px * tiles[:, None]
+        pixels = corners + np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
+        nodes = corners + self.nodes
+        if min((one @ px_from_canvas[2, :2] + px_from_canvas[2, 2]).min() for one in (pixels, nodes)) <= 0:
             return np.inf
-        across = self.pixels_from_nodes
-        found = np.moveaxis(across @ np.moveaxis(_distorted(lens, nodes), 3, 1) @ across.T, 1, 3)
-        return float(np.abs(found - _distorted(lens, exact)).max())
+        exact, known = (
+            _recorded_px(lens, px_from_canvas, one).reshape(len(tiles), *shape, 2).movedim(3, 1)
+            for one, shape in ((pixels, (self.side_px, self.side_px)), (nodes, (_NODES, _NODES)))
+        )
+        across = torch.from_numpy(self.pixels_from_nodes)
+        return float((across @ known @ across.mT - exact).abs().max())
 
 
-def _project(
-    px_from_canvas: FloatArray, at: np.ndarray, corners: np.ndarray
-) -> tuple[FloatArray, FloatArray]:
-    """Pinhole pixels (T, ..., 2) and third coordinates (T, ...) of points in tiles that begin at (T, 2)."""
-    homogeneous = (at + corners[:, None, None]) @ px_from_canvas[:, :2].T + px_from_canvas[:, 2]
-    return homogeneous[..., :2] / homogeneous[..., 2:], homogeneous[..., 2]
-
-
-def _distorted(lens: Lens, pinhole_px: FloatArray) -> FloatArray:
-    flat = torch.from_numpy(pinhole_px.reshape(-1, 2))
-    return np.asarray(distort_points(lens.info, flat).reshape(pinhole_px.shape).numpy())
+def _recorded_px(lens: Lens, pinhole_px_from_canvas: FloatArray, points: FloatArray) -> Tensor:
+    """Where an image shows points (T, N, 2) of a canvas, recorded px (T, N, 2), by kornia."""
+    at = torch.from_numpy(points)
+    homography = torch.from_numpy(pinhole_px_from_canvas)
+    pinhole_px = tensors.apply_homography(homography.expand(len(at), 3, 3), at)
+    return tensors.distort_points(lens.info, pinhole_px.reshape(-1, 2)).reshape(at.shape)
 
 
 class _Sums:
@@ -288,39 +271,34 @@ class _Sums:
         side = tiling.side_px
         self._sums = torch.zeros((len(self._tiles), 4, side, side), device=device)
         self._rows = torch.from_numpy(tiling.pixels_from_nodes).float().to(device)
-        # For x and y side by side.
-        self._pairs = torch.from_numpy(np.kron(tiling.pixels_from_nodes.T, np.eye(2))).float().to(device)
 
     def add(self, source: _Source, pinhole_px_from_sheet: FloatArray, tiles: np.ndarray) -> None:
         """Add an image to the tiles (T, 2) of (column, row) that it shows."""
-        grid, density = self._warp(source, pinhole_px_from_sheet, tiles)
-        values = grid_sample(
-            source.values.expand(len(tiles), -1, -1, -1), grid, padding_mode="zeros", align_corners=True
-        )
+        x, y, density = self._warp(source, pinhole_px_from_sheet, tiles)
+        image = source.values.expand(len(tiles), -1, -1, -1)
+        values: Tensor = remap(image, x, y, align_corners=True, normalized_coordinates=True)
         weight = values[:, 3] * density
         values[:, :3] *= weight[:, None]
         values[:, 3] = weight
         at = torch.tensor([self._at[int(c), int(r)] for c, r in tiles], device=self._device)
         self._sums.index_add_(0, at, values)
 
-    def _warp(
-        self, source: _Source, pinhole_px_from_sheet: FloatArray, tiles: np.ndarray
-    ) -> tuple[Tensor, Tensor]:
+    def _warp(self, source: _Source, pinhole_px_from_sheet: FloatArray, tiles: np.ndarray) -> Tensor:
         """Where the pixels of tiles lie in an image, and how many of its pixels each covers.
 
         Returns:
-            ``grid`` (T, side, side, 2) in [-1, 1] over the cut image, as of ``grid_sample``, and the density
-            (T, side, side) in px of the image a px of the sheet.
+            (3, T, side, side): x and y in [-1, 1] over the cut image, as of ``grid_sample``, and the
+            density in px of the image a px of the sheet.
         """
-        side = self._tiling.side_px
-        pinhole_px, third = _project(pinhole_px_from_sheet, self._tiling.nodes, side * tiles)
-        density = torch.from_numpy(np.linalg.det(pinhole_px_from_sheet) / third**3).float().to(self._device)
-        px = distort_points(source.lens.info, torch.from_numpy(pinhole_px.reshape(-1, 2)).to(self._device))
+        nodes = self._tiling.side_px * tiles[:, None] + self._tiling.nodes
+        third = nodes @ pinhole_px_from_sheet[2, :2] + pinhole_px_from_sheet[2, 2]
+        density = torch.from_numpy(np.linalg.det(pinhole_px_from_sheet) / third**3)
+        px = _recorded_px(source.lens, pinhole_px_from_sheet, nodes)
         height, width = source.values.shape[1:]
         size = px.new_tensor([width - 1, height - 1])
-        pairs = (2 * (px - px.new_tensor(source.corner_px)) / size - 1).float()
-        grid = self._rows @ pairs.reshape(len(tiles), _NODES, 2 * _NODES) @ self._pairs
-        return grid.reshape(len(tiles), side, side, 2), self._rows @ density @ self._rows.mT
+        x, y = (2 * (px - px.new_tensor(source.corner_px)) / size - 1).unbind(-1)
+        known = torch.stack([x, y, density]).float().to(self._device)
+        return self._rows @ known.reshape(3, len(tiles), _NODES, _NODES) @ self._rows.mT
 
     def mean(self, full_weight: float) -> np.ndarray:
         """The sheet as (rows, columns, 4) uint8 RGBA, opaque from ``full_weight`` on."""

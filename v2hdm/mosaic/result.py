@@ -1,31 +1,153 @@
-"""From the folder of a run to the mosaic of its ground, written beside the map."""
+"""From the folder of a run to the mosaic of its ground: GeoTIFF, picture and comparison beside the map."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from v2hdm.detection.batch import with_own_vehicle
 from v2hdm.detection.detector import Detector
 from v2hdm.errors import ConfigError, DriveError, MapFileError
+from v2hdm.extras import need
 from v2hdm.io.calibration import read_calibration
 from v2hdm.io.maps import read_geojson
 from v2hdm.io.trajectory import read_tum
 from v2hdm.mosaic.blend import Sheet, blend
-from v2hdm.mosaic.canvas import Canvas
-from v2hdm.mosaic.comparison import richest_place, save_comparison
-from v2hdm.mosaic.files import MULTIPLE_PX, Picture, crs_of, geotiff
-from v2hdm.mosaic.sharpness import edge_widths_m, measure_edges, no_edges, paint_sides
-from v2hdm.mosaic.shots import Lens, Shot, adjusted_shots, lens_of, recorded_shots
-from v2hdm.records import Calibration, Drive, FloatArray
+from v2hdm.mosaic.sharpness import (
+    Panel,
+    edge_widths_m,
+    measure_edges,
+    no_edges,
+    paint_sides,
+    richest_place,
+    save_comparison,
+)
+from v2hdm.mosaic.shots import Canvas, Lens, Shot, adjusted_shots, lens_of, recorded_shots
+from v2hdm.records import Calibration, Drive, FloatArray, GeodeticOrigin
 from v2hdm.report.outputs import write_json
-from v2hdm.store.files import load_yaml, take_number
+from v2hdm.store.files import load_yaml, take_number, whole_file
+
+LARGEST_PICTURE_PX = 8192
+"""Limit of either side of the picture, which graphics cards of computers and phones alike can draw."""
+
+MULTIPLE_PX = 256
+"""Sides of a canvas are multiples of it, so that pictures reduced by up to that factor fit it exactly."""
+
+_PICTURE_QUALITY = 80
+_JPEG_QUALITY = 90
+_SEEN_ALPHA = 128  # the mask of a GeoTIFF knows but seen and unseen
+_BLOCK_PX = 512
+_OVERVIEWS = (2, 4, 8, 16)
+_AT_ONCE_BYTES = 1 << 24
+_SEMI_MAJOR_M = 6378137.0
+
+_ENGINEERING = (
+    'LOCAL_CS["V2HDM map frame: east, north in metres from an origin that the drive does not state",'
+    'LOCAL_DATUM["local",0],UNIT["metre",1],AXIS["East",EAST],AXIS["North",NORTH]]'
+)
+
+
+def crs_of(origin: GeodeticOrigin | None) -> str:
+    """The coordinate system of the map frame, as PROJ or WKT text.
+
+    With an origin it is a transverse Mercator projection about it, scaled to its height above the ellipsoid:
+    it agrees with the frame's tangent plane to a millimetre within 2 km, and every GIS knows it. Without, the
+    frame is an engineering system: metres that belong nowhere on the earth.
+    """
+    if origin is None:
+        return _ENGINEERING
+    scale = 1 + origin.altitude_m / _SEMI_MAJOR_M
+    return (
+        f"+proj=tmerc +lat_0={origin.latitude_deg!r} +lon_0={origin.longitude_deg!r} +k={scale!r} "
+        "+x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
+    )
+
+
+class GeoTiff:
+    """A GeoTIFF that takes sheets one by one."""
+
+    def __init__(self, dataset: Any, rasterio: Any):
+        self._dataset, self._rasterio = dataset, rasterio
+
+    def put(self, sheet: Sheet) -> None:
+        """Write one sheet."""
+        rows, columns = sheet.rgba.shape[:2]
+        window = self._rasterio.windows.Window(sheet.column, sheet.row, columns, rows)
+        self._dataset.write(np.moveaxis(sheet.rgba[..., :3], 2, 0), window=window)
+        self._dataset.write_mask(sheet.rgba[..., 3] >= _SEEN_ALPHA, window=window)
+
+
+@contextmanager
+def geotiff(path: Path, canvas: Canvas, origin: GeodeticOrigin | None) -> Iterator[GeoTiff]:
+    """A GeoTIFF of a canvas, tiled, JPEG within, with overviews and a mask; whole or not at all.
+
+    Raises:
+        ConfigError: rasterio is not installed.
+    """
+    rasterio = need("rasterio", "gis", path.name, ConfigError)
+    west, _, _, north = canvas.bounds_m
+    profile = {
+        "driver": "GTiff", "width": canvas.columns, "height": canvas.rows, "count": 3, "dtype": "uint8",
+        "crs": rasterio.crs.CRS.from_user_input(crs_of(origin)),
+        "transform": rasterio.Affine(canvas.cell_m, 0, west, 0, -canvas.cell_m, north),
+        "tiled": True, "blockxsize": _BLOCK_PX, "blockysize": _BLOCK_PX, "compress": "jpeg",
+        "photometric": "ycbcr", "jpeg_quality": _JPEG_QUALITY, "bigtiff": "if_safer", "sparse_ok": True,
+    }  # fmt: skip
+    # In memory first, compressed: on a disk, GDAL goes on after a call that fails and says nothing.
+    with (
+        rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True, GDAL_CACHEMAX=64),
+        rasterio.MemoryFile(ext=".tif") as memory,
+    ):
+        with memory.open(**profile) as dataset:
+            yield GeoTiff(dataset, rasterio)
+        with rasterio.open(memory.name, "r+") as dataset:
+            dataset.build_overviews(_OVERVIEWS, rasterio.enums.Resampling.average)
+        memory.seek(0)
+        with whole_file(path) as partial, partial.open("wb") as file:
+            while data := memory.read(_AT_ONCE_BYTES):
+                file.write(data)
+
+
+class Picture:
+    """A mosaic reduced by a power of two so that no side is above :data:`LARGEST_PICTURE_PX`."""
+
+    def __init__(self, canvas: Canvas):
+        self.factor = 1
+        while max(canvas.rows, canvas.columns) > LARGEST_PICTURE_PX * self.factor:
+            self.factor *= 2
+        self.resolution_m = canvas.cell_m * self.factor
+        self._rgba = np.zeros((canvas.rows // self.factor, canvas.columns // self.factor, 4), dtype=np.uint8)
+
+    def put(self, sheet: Sheet) -> None:
+        """Draw one sheet: the mean over the pixels that are seen."""
+        rows, columns = (side // self.factor for side in sheet.rgba.shape[:2])
+        row, column = sheet.row // self.factor, sheet.column // self.factor
+        alpha = sheet.rgba[..., 3:].astype(np.float32) / 255
+        reduced = cv2.resize(
+            np.concatenate([sheet.rgba[..., :3] * alpha, alpha], axis=2),
+            (columns, rows),
+            interpolation=cv2.INTER_AREA,
+        )
+        seen = reduced[..., 3:]
+        colours = np.divide(reduced[..., :3], seen, out=np.zeros_like(reduced[..., :3]), where=seen > 0)
+        self._rgba[row : row + rows, column : column + columns] = np.round(
+            np.concatenate([colours, 255 * seen], axis=2)
+        )
+
+    def write(self, path: Path) -> None:
+        """Write it as WebP, transparent where nothing was seen; whole or not at all."""
+        bgra = cv2.cvtColor(self._rgba, cv2.COLOR_RGBA2BGRA)
+        with whole_file(path) as partial:
+            encoded = cv2.imencode(path.suffix, bgra, [cv2.IMWRITE_WEBP_QUALITY, _PICTURE_QUALITY])[1]
+            partial.write_bytes(encoded.tobytes())
+
 
 _log = logging.getLogger(__name__)
 
@@ -73,26 +195,29 @@ def write_mosaic(
     hd_map = read_geojson(folder / "map.geojson")
     ground = ground_of(folder, drive, resolution_m)
     sides = paint_sides(hd_map)
-    before, after = (no_edges(len(sides.ends_map)) for _ in range(2))
+    edges = {when: no_edges(len(sides.ends_map)) for when in ("before", "after")}
+
+    def measure(when: str, sheet: Sheet) -> None:
+        rows, columns = sheet.rgba.shape[:2]
+        part = ground.canvas.window(sheet.row, sheet.column, rows, columns)
+        edges[when] = edges[when].with_those_of(measure_edges(sheet.rgba, part, sides.ends_map))
+
     picture = Picture(ground.canvas)
-    tell = _two_passes(progress)
     with ExitStack() as stack:
         try:
             tiff = stack.enter_context(geotiff(folder / TIFF, ground.canvas, drive.origin))
         except ConfigError as missing:
             _log.warning("no GeoTIFF is written: %s", missing)
             tiff = None
-        for sheet in blend(ground.canvas, ground.after, ground.lenses, device, tell(0)):
+        for sheet in blend(ground.canvas, ground.after, ground.lenses, device, _half(progress, 0)):
             if tiff is not None:
                 tiff.put(sheet)
             picture.put(sheet)
-            after = after.with_those_of(
-                measure_edges(sheet.rgba, _part(ground.canvas, sheet), sides.ends_map)
-            )
-    for sheet in blend(ground.canvas, ground.before, ground.lenses, device, tell(1)):
-        before = before.with_those_of(measure_edges(sheet.rgba, _part(ground.canvas, sheet), sides.ends_map))
+            measure("after", sheet)
+    for sheet in blend(ground.canvas, ground.before, ground.lenses, device, _half(progress, 1)):
+        measure("before", sheet)
     picture.write(folder / PICTURE)
-    sharpness = _sharpness(*edge_widths_m([before, after]))
+    sharpness = _sharpness(*edge_widths_m([edges["before"], edges["after"]]))
     content = {
         "image": PICTURE,
         "bounds_m": ground.canvas.bounds_m,
@@ -102,14 +227,11 @@ def write_mosaic(
         "crs": crs_of(drive.origin),
         "sharpness": sharpness,
     }
-    _compare(folder / COMPARISON, ground, richest_place(drive, sides, after.contrast), sharpness, device)
+    _compare(
+        folder / COMPARISON, ground, richest_place(drive, sides, edges["after"].contrast), sharpness, device
+    )
     write_json(folder / EXTENT, content)
     return content
-
-
-def _part(canvas: Canvas, sheet: Sheet) -> Canvas:
-    rows, columns = sheet.rgba.shape[:2]
-    return canvas.window(sheet.row, sheet.column, rows, columns)
 
 
 def _sharpness(before_m: FloatArray, after_m: FloatArray) -> dict[str, float | int]:
@@ -175,27 +297,17 @@ def _calibrations(folder: Path) -> tuple[dict[str, Calibration], dict[str, float
 def _compare(
     path: Path, ground: Ground, pose: FloatArray, sharpness: Mapping[str, float], device: str
 ) -> None:
-    titles = "before: initial calibration, recorded poses", "after: optimised calibration, adjusted poses"
-    widths = [sharpness.get(f"edge_width_{when}_m") for when in ("before", "after")]
-    captions = [
-        "" if width is None else f"paint edges {100 * width:.1f} cm wide (median)" for width in widths
-    ]
-    save_comparison(
-        path,
-        pose,
-        dict(zip(titles, (ground.before, ground.after), strict=True)),
-        ground.lenses,
-        dict(zip(titles, captions, strict=True)),
-        device,
-    )
+    panels = []
+    for when, title, shots in (
+        ("before", "before: initial calibration, recorded poses", ground.before),
+        ("after", "after: optimised calibration, adjusted poses", ground.after),
+    ):
+        width = sharpness.get(f"edge_width_{when}_m")
+        caption = "" if width is None else f"paint edges {100 * width:.1f} cm wide (median)"
+        panels.append(Panel(title, caption, shots))
+    save_comparison(path, pose, panels, ground.lenses, device)
 
 
-def _two_passes(progress: Progress | None) -> Callable[[int], Progress | None]:
-    """A progress for each of two passes of about the same work."""
-
-    def of(number: int) -> Progress | None:
-        if progress is None:
-            return None
-        return lambda done, total: progress(number * total + done, 2 * total)
-
-    return of
+def _half(progress: Progress | None, number: int) -> Progress | None:
+    """The progress of one of two passes of about the same work."""
+    return progress and (lambda done, total: progress(number * total + done, 2 * total))

@@ -12,35 +12,33 @@ shows there. Blending only ever lowers it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
+from matplotlib.axes import Axes
 
 from v2hdm.geometry.ipm import apply_homography
-from v2hdm.mosaic.canvas import Canvas
-from v2hdm.records import FloatArray, HdMap
+from v2hdm.mosaic.blend import whole
+from v2hdm.mosaic.shots import Canvas, Lens, Shot
+from v2hdm.records import Drive, FloatArray, HdMap
+from v2hdm.report import style
 
 REACH_M = 0.75
 """Half of the length of a profile, m: misplaced paint is found within it."""
 
-_MIDDLE = (0.2, 0.8)
-"""Part of a side over which its profile is averaged: without its corners."""
-
-_SAMPLES = 12
-"""Places along a side's middle part."""
-
-_LEAST_SIDE_M = 0.4
-"""Shorter sides have no middle part that pixels of some centimetres would resolve, m."""
-
-_SEEN_ALPHA = 128
-"""Alpha from which the mosaic counts as showing the ground."""
+_MIDDLE = (0.2, 0.8)  # part of a side over which its profile is averaged: without its corners
+_SAMPLES = 12  # places along a side's middle part
+_LEAST_SIDE_M = 0.4  # shorter sides have no middle part that pixels of some centimetres would resolve, m
+_SEEN_ALPHA = 128  # alpha from which the mosaic counts as showing the ground
 
 
 @dataclass(frozen=True)
 class Edges:
-    """Of S paint sides: the largest ``slope`` (S,), grey values a m, and the ``contrast`` (S,), grey values.
+    """The largest ``slope`` (S,), grey values per m, and ``contrast`` (S,), grey values, of S paint sides.
 
     Both are nan where the mosaic does not show the whole profile.
     """
@@ -49,7 +47,7 @@ class Edges:
     contrast: FloatArray
 
     def with_those_of(self, other: Edges) -> Edges:
-        """Those of the same sides in another part of the same mosaic, where this part has none."""
+        """These edges, completed by those of another part of the same mosaic."""
         known = np.isfinite(self.slope)
         return Edges(np.where(known, self.slope, other.slope), np.where(known, self.contrast, other.contrast))
 
@@ -74,7 +72,7 @@ def paint_sides(hd_map: HdMap) -> PaintSides:
 
 
 def no_edges(count: int) -> Edges:
-    """What is known of ``count`` sides before a mosaic was looked at."""
+    """Edges of ``count`` sides that no mosaic has shown yet."""
     return Edges(np.full(count, np.nan), np.full(count, np.nan))
 
 
@@ -114,3 +112,83 @@ def _profiles(sides: FloatArray, step_m: float) -> FloatArray:
     across = np.linspace(-REACH_M, REACH_M, round(2 * REACH_M / step_m) + 1)
     middle = sides[:, 0, None] + at[:, None] * along[:, None]
     return np.asarray(middle[:, :, None] + across[:, None] * normal[:, None, None])
+
+
+AHEAD_M, ACROSS_M = 12.0, 8.0
+"""Length and width of the ground that is compared."""
+
+_CELL_M = 0.01
+_PANEL_IN = 5.2
+_BAR_M = 2.0
+
+
+def richest_place(drive: Drive, sides: PaintSides, contrast: FloatArray) -> FloatArray:
+    """The image's pose (4, 4) about which the most paint edges are to be seen, and were seen most often.
+
+    Its worth is the sum, over the sides that lie whole on the ground about it, of their ``contrast`` (S,) in
+    the mosaic, nan where it does not show them, times the number of images that they were found in.
+    """
+    worth = np.nan_to_num(contrast) * sides.sightings
+
+    def of_place(pose: FloatArray) -> float:
+        offset = (sides.ends_map - pose[:2, 3]) @ pose[:2, :2]
+        inside = (np.abs(offset) <= [AHEAD_M / 2, ACROSS_M / 2]).all(axis=(1, 2))
+        return float(worth[inside].sum())
+
+    return max((image.map_from_vehicle for image in drive.images), key=of_place)
+
+
+def close_up_canvas(map_from_vehicle: FloatArray) -> Canvas:
+    """The ground about a pose, the vehicle's way pointing up."""
+    ahead = map_from_vehicle[:2, 0] / np.linalg.norm(map_from_vehicle[:2, 0])
+    right = np.array([ahead[1], -ahead[0]])
+    corner = map_from_vehicle[:2, 3] + ahead * AHEAD_M / 2 - right * ACROSS_M / 2
+    rows, columns = round(AHEAD_M / _CELL_M), round(ACROSS_M / _CELL_M)
+    return Canvas(corner, _CELL_M, rows, columns, (float(right[0]), float(right[1])))
+
+
+class Panel(NamedTuple):
+    """One of the pictures that are compared."""
+
+    title: str
+    caption: str
+    shots: Sequence[Shot]
+
+
+def save_comparison(
+    path: Path, map_from_vehicle: FloatArray, panels: Sequence[Panel], lenses: Mapping[str, Lens], device: str
+) -> None:
+    """Draw the ground about a pose (4, 4) as several sets of shots show it, side by side, as PNG."""
+    canvas = close_up_canvas(map_from_vehicle)
+    pictures = [whole(canvas, panel.shots, lenses, device) for panel in panels]
+    levels = _levels(pictures[-1])
+    height_in = _PANEL_IN * AHEAD_M / ACROSS_M + 0.8
+    with style.figure(path, _PANEL_IN * len(panels) + 0.1, height_in) as fig:
+        every = np.atleast_1d(fig.subplots(1, len(panels)))
+        for axes, panel, rgba in zip(every, panels, pictures, strict=True):
+            shown = _brightened(rgba, levels)
+            axes.imshow(shown, extent=(0, ACROSS_M, 0, AHEAD_M), interpolation="antialiased")
+            axes.set(title=panel.title, xlabel=panel.caption, xticks=[], yticks=[])
+            axes.spines[:].set_visible(False)
+            _scale_bar(axes)
+
+
+def _scale_bar(axes: Axes) -> None:
+    left, low = 0.4, 0.4
+    axes.plot([left, left + _BAR_M], [low, low], color="white", lw=3, solid_capstyle="butt")
+    axes.text(left + _BAR_M / 2, low + 0.12, f"{_BAR_M:g} m", color="white", ha="center", va="bottom")
+
+
+def _levels(rgba: np.ndarray) -> tuple[float, float]:
+    """Grey values of the darkest and the brightest ground."""
+    grey = cv2.cvtColor(np.ascontiguousarray(rgba[..., :3]), cv2.COLOR_RGB2GRAY)[rgba[..., 3] > 0]
+    low, high = np.percentile(grey, (0.2, 99.8)) if grey.size else (0.0, 255.0)
+    return float(low), float(max(high, low + 1))
+
+
+def _brightened(rgba: np.ndarray, levels: tuple[float, float]) -> np.ndarray:
+    """The picture with its levels stretched; white where nothing was seen."""
+    low, high = levels
+    stretched = np.clip((rgba[..., :3].astype(np.float32) - 0.5 * low) / (high - 0.5 * low), 0, 1)
+    seen = rgba[..., 3:].astype(np.float32) / 255
+    return np.asarray(1 - seen * (1 - stretched))

@@ -38,7 +38,7 @@ from v2hdm.pipeline.write import BEST, write_results
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.check_points import write_check_points
 from v2hdm.report.outputs import result_folder, write_json
-from v2hdm.report.page.write import write_page
+from v2hdm.report.page.document import write_page
 from v2hdm.simulate import rendered_drive
 from v2hdm.store.cache.pruning import make_room
 from v2hdm.store.cache.room import Room

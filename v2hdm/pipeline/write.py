@@ -24,8 +24,9 @@ from v2hdm.pipeline.base import write_changes
 from v2hdm.pipeline.evaluate import CameraSets, Judgement
 from v2hdm.pipeline.trajectory import write_trajectories
 from v2hdm.records import Calibration, Drive, FloatArray, HdMap, Image, ImageDetections
-from v2hdm.report.figures import save_birdseye, save_growth, save_overlay
+from v2hdm.report.figures import save_birdseye, save_growth
 from v2hdm.report.outputs import write_json
+from v2hdm.report.photos import save_overlay
 from v2hdm.verdict import Verdict
 
 _log = logging.getLogger(__name__)

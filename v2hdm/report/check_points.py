@@ -1,4 +1,4 @@
-r"""Check points: surveyed corners that no estimate has seen, against the map.
+r"""Check points: surveyed corners that no estimate has used, against the map.
 
 The errors of a map's corners are not independent of each other: what is left of the receiver's drift moves
 all of them alike. The test of all points together therefore takes their joint covariance,
@@ -46,27 +46,16 @@ one."""
 
 @dataclass(frozen=True)
 class CheckedPoint:
-    """One check point beside the corner of the map that is nearest to it.
-
-    Attributes:
-        point: as surveyed.
-        marking: which marking of the map.
-        marking_id: its id in the map's files.
-        kind: its class.
-        corner: which of its corners, 0 to 3.
-        off_m: (2,) map minus survey.
-        map_covariance_m2: (2, 2) of the map's corner.
-        off_height_m: map minus survey; None where one of them has no height.
-    """
+    """One check point beside the corner of the map that is nearest to it."""
 
     point: SurveyedPoint
     marking: int
-    marking_id: int
+    marking_id: int  # in the map's files
     kind: str
-    corner: int
-    off_m: FloatArray
-    map_covariance_m2: FloatArray
-    off_height_m: float | None
+    corner: int  # 0 to 3
+    off_m: FloatArray  # (2,) map minus survey
+    map_covariance_m2: FloatArray  # (2, 2) of the map's corner
+    off_height_m: float | None  # map minus survey; None where one of them has no height
 
     @property
     def covariance_m2(self) -> FloatArray:
@@ -91,12 +80,9 @@ class CheckedPoint:
 
 @dataclass(frozen=True)
 class CheckTable:
-    """All check points of a survey against a map.
+    """All check points of a survey against a map: ``compared`` have a corner of it, ``unmatched`` a reason.
 
-    Attributes:
-        compared: those that have a corner of the map, in the survey's order.
-        unmatched: the others, and why.
-        covariance_m2: (2N, 2N) joint covariance of the differences, stacked x0, y0, x1, ...
+    ``covariance_m2`` (2N, 2N) is the joint one of the differences, stacked x0, y0, x1, ...
     """
 
     compared: tuple[CheckedPoint, ...]
@@ -119,19 +105,20 @@ class CheckTable:
         return squared(self.off_m.ravel(), self.covariance_m2)
 
     def figures(self) -> dict[str, Any]:
-        """What goes into ``metrics.json``."""
+        """The figures in ``metrics.json``."""
         out: dict[str, Any] = {"points": len(self.compared) + len(self.unmatched)}
         out |= {"compared": len(self.compared), "unmatched": {p.id: why for p, why in self.unmatched}}
         if not self.compared:
             return out
         degrees = 2 * len(self.compared)
-        east_m, north_m = self.off_m.mean(axis=0).tolist()
-        out |= {
+        rmse_x_m, rmse_y_m = (float(np.sqrt(np.mean(off_m**2))) for off_m in self.off_m.T)
+        mean_x_m, mean_y_m = self.off_m.mean(axis=0).tolist()
+        return out | {
             "rmse_m": self.rmse_m,
-            "rmse_x_m": float(np.sqrt(np.mean(self.off_m[:, 0] ** 2))),
-            "rmse_y_m": float(np.sqrt(np.mean(self.off_m[:, 1] ** 2))),
-            "mean_x_m": east_m,
-            "mean_y_m": north_m,
+            "rmse_x_m": rmse_x_m,
+            "rmse_y_m": rmse_y_m,
+            "mean_x_m": mean_x_m,
+            "mean_y_m": mean_y_m,
             "percentile_95_m": self._percentile_m(),
             "largest_m": max(one.distance_m for one in self.compared),
             "inside_95_percent": sum(one.is_inside for one in self.compared),
@@ -141,7 +128,6 @@ class CheckTable:
             "probability": float(chi2.sf(self.squared, degrees)),
             "height": self._height_figures(),
         }
-        return out
 
     @property
     def headline(self) -> str:
@@ -183,17 +169,10 @@ def compare(
     joint: JointCovariance,
     route_map: FloatArray,
 ) -> CheckTable:
-    """Hold check points against the corners of a map.
+    """Hold check points against the corners of a map that lie within ``reach_m`` of them.
 
-    Which corner a point is of, :func:`v2hdm.io.maps.surveyed.match` decides; what is reported is how far the
-    two are apart, of every point that has a corner within reach.
-
-    Args:
-        hd_map: the map, with heights where the drive has them.
-        points: check points in the map.
-        reach_m: how far a corner may lie from its point.
-        joint: of corners of the map.
-        route_map: (F, 2) where the vehicle was.
+    :func:`v2hdm.io.maps.surveyed.match` decides of which corner a point is. ``route_map`` (F, 2) is where the
+    vehicle was.
     """
     corners = np.array([marking.corners_map for marking in hd_map.markings]).reshape(-1, 2)
     positions = np.array([point.position_map for point in points]).reshape(-1, 2)
@@ -208,7 +187,8 @@ def compare(
         if matched[k] < 0:
             there = f"{hd_map.markings[nearest[k] // 4].kind} {ids[nearest[k] // 4]}"
             if off_m[k] > reach_m:
-                why = _far(off_m[k], there, reach_m, route_m[k])
+                nearest_m = f"{off_m[k]:.2f} m away, the route {route_m[k]:.0f} m"
+                why = f"no corner within {reach_m:g} m: the nearest, of {there}, is {nearest_m}"
             else:
                 better = points[int(np.argmax(matched == nearest[k]))].id
                 why = f"{better} fits the only corner within reach better, of {there}"
@@ -219,36 +199,19 @@ def compare(
         off_height_m = None
         if found.heights_m is not None and point.height_m is not None:
             off_height_m = float(found.heights_m[corner] - point.height_m)
-        compared.append(
-            CheckedPoint(
-                point,
-                marking,
-                ids[marking],
-                found.kind,
-                corner,
-                found.corners_map[corner] - point.position_map,
-                joint(np.array([marking]), np.array([corner])),
-                off_height_m,
-            )
-        )
-    return CheckTable(tuple(compared), tuple(unmatched), _joint(compared, joint))
-
-
-def _far(off_m: float, there: str, reach_m: float, route_m: float) -> str:
-    nearest = f"the nearest, of {there}, is {off_m:.2f} m away, the route {route_m:.0f} m"
-    return f"no corner within {reach_m:g} m: {nearest}"
-
-
-def _joint(compared: Sequence[CheckedPoint], joint: JointCovariance) -> FloatArray:
-    """Joint covariance (2N, 2N) of the differences."""
+        off = found.corners_map[corner] - point.position_map
+        covariance = joint(np.array([marking]), np.array([corner]))
+        one = CheckedPoint(point, marking, ids[marking], found.kind, corner, off, covariance, off_height_m)
+        compared.append(one)
     if not compared:
-        return np.zeros((0, 0))
-    of_map = joint(np.array([one.marking for one in compared]), np.array([one.corner for one in compared]))
-    return of_map + np.diag(np.concatenate([one.point.sigma_m**2 for one in compared]))
+        return CheckTable((), tuple(unmatched), np.zeros((0, 0)))
+    of_map = joint(*np.array([(one.marking, one.corner) for one in compared]).T)
+    own = np.diag(np.concatenate([one.point.sigma_m**2 for one in compared]))
+    return CheckTable(tuple(compared), tuple(unmatched), of_map + own)
 
 
 def write_check_points(table: CheckTable, path: Path) -> None:
-    """Write the table as CSV to ``path``: a row a check point, those compared first, then the others."""
+    """Write the table as CSV to ``path``: one row per check point, compared ones first."""
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(COLUMNS)

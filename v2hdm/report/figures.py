@@ -1,34 +1,23 @@
-"""The pictures of a run: bird's-eye map against truth, growth of the error, overlay on an image."""
+"""The figures of a run as PNG: map against truth, growth, route, and changes to an earlier map."""
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-import cv2
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.patches import Polygon
 
-from v2hdm.geometry.ipm import apply_in_front
-from v2hdm.geometry.lens import distort_points
-from v2hdm.records import CameraInfo, FloatArray, HdMap, Truth
+from v2hdm.records import Change, Changes, Fate, FloatArray, HdMap, Trajectory, Truth
 from v2hdm.report import metrics, style
-from v2hdm.report.drawing import Pen, draw_lines, with_legend
-from v2hdm.store.files import whole_file
 
 _HEIGHT_IN = 7.6
 _BESIDE_ROUTE_M = 12.0
 _DETAIL_RADIUS_M = 5.5
 _DETAIL_MARGIN_M = 0.15
-_OVERLAY_RANGE_M = 30.0
-
-_BEFORE = Pen(style.OKABE_ITO["orange"], dash_px=(9.0, 6.0))
-"""How the map is drawn by what a run began with."""
-
-OVERLAY = {"Opt": Pen(style.OKABE_ITO["sky"])}
-"""How it is drawn by what the run found."""
 
 
 def save_birdseye(
@@ -40,12 +29,8 @@ def save_birdseye(
 ) -> None:
     """Draw ``maps[best]`` over the truth from above, beside a close-up with all methods.
 
-    Args:
-        path: where the PNG goes.
-        maps: the map of each method, by its name.
-        best: the method shown on the whole site; its markings are coloured by their corner error.
-        route_map: vehicle positions (N, 2), m, with nan between two drives.
-        truth: ground truth, or None on a real drive.
+    The best map's markings are coloured by their corner error where there is truth. ``route_map`` (N, 2), m,
+    has nan between two drives.
     """
     span_m = np.nanmax(route_map, axis=0) - np.nanmin(route_map, axis=0)
     extent_m = np.maximum(span_m, 1.0) + 2 * _BESIDE_ROUTE_M
@@ -59,9 +44,7 @@ def save_birdseye(
         site.set_title(f"{best}: {len(maps[best].markings)} markings, {len(maps[best].lanes)} lane lines")
         _close_up(detail, maps, best, truth)
         for axes in (site, detail):
-            axes.set_aspect("equal")
-            axes.set_xlabel("east (m)")
-            axes.set_ylabel("north (m)")
+            style.set_map_axes(axes)
         site.legend(loc="upper left", bbox_to_anchor=(0.0, -0.09), ncols=4, borderaxespad=0.0)
 
 
@@ -73,72 +56,29 @@ def save_growth(path: Path, growth: Mapping[str, Sequence[tuple[int, float]]]) -
             counts, errors = np.array(points, dtype=np.float64).reshape(-1, 2).T
             if not len(counts):
                 continue
+            look = {"ls": style.LINE.get(method, "-"), "color": style.METHOD.get(method, "k")}
             axes.plot(
-                counts, 100 * errors, ls=style.LINE.get(method, "-"), marker=style.MARKER.get(method, "."),
-                ms=4.5, color=style.METHOD.get(method, "k"), label=method,
-            )  # fmt: skip
-        axes.set_yscale("log")
-        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-        axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:g}"[0] in "25" else "")
-        axes.grid(axis="y", which="both", color="#e6eaed")
-        axes.set_xlabel("markings mapped so far")
-        axes.set_ylabel("corner RMSE (cm)")
+                counts, 100 * errors, marker=style.MARKER.get(method, "."), ms=4.5, label=method, **look
+            )
+        style.set_logarithmic(axes, "y")
+        axes.set(xlabel="markings mapped so far", ylabel="corner RMSE (cm)")
         axes.set_title("Growth of the error with the map")
         fig.legend(ncols=4, loc="outside lower center", handlelength=3.2)
 
 
-def save_overlay(
-    path: Path,
-    image: np.ndarray,
-    info: CameraInfo,
-    hd_map: HdMap,
-    position_map: FloatArray,
-    views: Mapping[str, FloatArray],
-) -> None:
-    """Draw a map into an image as several calibrations and poses see it.
-
-    Args:
-        path: where the picture goes.
-        image: as recorded.
-        info: its camera.
-        hd_map: what is drawn.
-        position_map: (2,) the vehicle's; what lies far from it is not drawn.
-        views: by name the homography ``pinhole_px_from_map`` (3 x 3) of the ground, whose third
-            coordinate is positive in front of the camera.
-    """
-    canvas = image.copy()
-    legend: list[tuple[Pen | None, str]] = []
-    for name, pinhole_px_from_map in views.items():
-        pen = OVERLAY.get(name, _BEFORE)
-        for line, closed in _lines_of(hd_map):
-            draw_lines(canvas, _project_line(line, closed, info, position_map, pinhole_px_from_map), pen)
-        said = "found by the run" if name in OVERLAY else "that the run began with"
-        legend.append((pen, f"{name}: the map by the calibration and pose {said}"))
-    with whole_file(path) as partial:
-        partial.write_bytes(cv2.imencode(path.suffix, with_legend(canvas, legend))[1].tobytes())
-
-
 def _draw_truth(axes: Axes, truth: Truth) -> None:
     polygons = [m.corners_map for m in truth.map.markings]
-    axes.add_collection(
-        PolyCollection(polygons, facecolors="#dfe4e8", edgecolors=style.TRUTH, lw=0.4, label="truth")
-    )
-    axes.add_collection(
-        LineCollection([lane.points_map for lane in truth.map.lanes], colors="#dfe4e8", lw=2.2)
-    )
+    lanes = [lane.points_map for lane in truth.map.lanes]
+    paint = PolyCollection(polygons, facecolors=style.PAINT, edgecolors=style.TRUTH, lw=0.4, label="truth")
+    axes.add_collection(paint)
+    axes.add_collection(LineCollection(lanes, colors=style.PAINT, lw=2.2))
     axes.autoscale_view()
 
 
 def _draw_best(axes: Axes, hd_map: HdMap, truth: Truth | None) -> None:
     solid = style.METHOD["Opt"]
-    axes.add_collection(
-        LineCollection(
-            [lane.points_map for lane in hd_map.lanes],
-            colors=style.OKABE_ITO["sky"],
-            lw=1.1,
-            label="lane lines",
-        )
-    )
+    lanes = [lane.points_map for lane in hd_map.lanes]
+    axes.add_collection(LineCollection(lanes, colors=style.OKABE_ITO["sky"], lw=1.1, label="lane lines"))
     outlines = [symbol.outline_map for symbol in hd_map.symbols]
     symbols = PolyCollection(outlines, facecolors="none", edgecolors=solid, lw=0.9, label="symbols")
     axes.add_collection(symbols)
@@ -151,7 +91,7 @@ def _draw_best(axes: Axes, hd_map: HdMap, truth: Truth | None) -> None:
     error_cm = np.full(len(polygons), np.nan)
     for row, column in zip(rows, columns, strict=True):
         errors = metrics.corner_errors([hd_map.markings[row]], [truth.map.markings[column]])
-        error_cm[row] = 100 * np.sqrt((errors**2).sum(axis=1).mean())
+        error_cm[row] = 100 * metrics.rms(errors)
     shown = PolyCollection(polygons, array=error_cm, cmap="viridis_r", edgecolors="face", lw=1.2)
     top = np.nanpercentile(error_cm, 98) if np.isfinite(error_cm).any() else 1.0
     shown.set_clim(0.0, max(1.0, top))
@@ -168,16 +108,15 @@ def _close_up(axes: Axes, maps: Mapping[str, HdMap], best: str, truth: Truth | N
     centre = _common_marking(maps, best)
     if truth is not None:
         polygons = _wholly_near(truth.map, centre)
-        axes.add_collection(PolyCollection(polygons, facecolors="#dfe4e8", edgecolors=style.TRUTH, lw=0.6))
-        axes.fill([], [], facecolor="#dfe4e8", edgecolor=style.TRUTH, label="truth")
+        axes.add_collection(PolyCollection(polygons, facecolors=style.PAINT, edgecolors=style.TRUTH, lw=0.6))
+        axes.fill([], [], facecolor=style.PAINT, edgecolor=style.TRUTH, label="truth")
     for method in sorted(maps, key=lambda name: name != best):
         look = {"color": style.METHOD.get(method, "k"), "ls": style.LINE.get(method, "-")}
         look |= {"lw": 2.2 if method == best else 1.5}
         for number, polygon in enumerate(_wholly_near(maps[method], centre)):
             closed = np.vstack([polygon, polygon[:1]])
             axes.plot(*closed.T, label=None if number else method, **look)
-    axes.set_xlim(centre[0] - _DETAIL_RADIUS_M, centre[0] + _DETAIL_RADIUS_M)
-    axes.set_ylim(centre[1] - _DETAIL_RADIUS_M, centre[1] + _DETAIL_RADIUS_M)
+    style.cut_to_square(axes, centre, _DETAIL_RADIUS_M)
     axes.set_title("Close-up: the markings by every method")
     axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.09), ncols=5, borderaxespad=0.0, handlelength=3.0)
 
@@ -200,27 +139,132 @@ def _common_marking(maps: Mapping[str, HdMap], best: str) -> FloatArray:
     return np.asarray(markings[chosen].corners_map.mean(axis=0))
 
 
-def _lines_of(hd_map: HdMap) -> list[tuple[FloatArray, bool]]:
-    outlines = [(marking.corners_map, True) for marking in hd_map.markings]
-    outlines += [(symbol.outline_map, True) for symbol in hd_map.symbols]
-    return outlines + [(lane.points_map, False) for lane in hd_map.lanes]
+_ARROWS = 30  # arrows along the route: enough to see a heading go wrong, few enough to see each
+_MOST_POINTS = 5000  # points of the line that is drawn
 
 
-def _project_line(
-    line_map: FloatArray,
-    closed: bool,
-    info: CameraInfo,
-    position_map: FloatArray,
-    pinhole_px_from_map: FloatArray,
-) -> list[FloatArray]:
-    """The visible pieces (N, 2), recorded px, of a ground line; densified, so lenses bend it."""
-    ends = np.vstack([line_map, line_map[:1]]) if closed else line_map
-    dense = np.concatenate([np.linspace(a, b, 8) for a, b in itertools.pairwise(ends)])
-    points_pinhole_px = apply_in_front(pinhole_px_from_map, dense)
-    margin = np.array([info.width, info.height]) * 0.1
-    size = np.array([info.width, info.height])
-    near = np.linalg.norm(dense - position_map, axis=1) < _OVERLAY_RANGE_M
-    visible = near & ((points_pinhole_px > -margin) & (points_pinhole_px < size + margin)).all(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], visible.astype(int), [0]])))
-    pieces = [points_pinhole_px[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
-    return [distort_points(info, piece) for piece in pieces]
+def save_route(path: Path, trajectory: Trajectory) -> None:
+    """Draw where the vehicle was, how fast, and where its x axis pointed."""
+    stride = -(-len(trajectory.stamp_s) // _MOST_POINTS)
+    stamp_s, poses = trajectory.stamp_s[::stride], trajectory.map_from_vehicle[::stride]
+    place = poses[:, :2, 3]
+    with style.figure(path, 8.0, 6.0) as fig:
+        axes = fig.subplots()
+        if len(place) > 1:
+            segments = np.stack([place[:-1], place[1:]], axis=1)
+            speed = np.linalg.norm(np.diff(place, axis=0), axis=1) / np.diff(stamp_s)
+            line = LineCollection(list(segments), array=speed, cmap="cividis", lw=8, capstyle="round")
+            line.set_clim(0.0, max(float(np.percentile(speed, 99)), 1e-9))
+            axes.add_collection(line)
+            fig.colorbar(line, ax=axes, shrink=0.7, label="speed (m/s)")
+        _draw_headings(axes, poses)
+        axes.plot(*place[0], "o", color="white", mec="#1b1e21", ms=9, zorder=4, label="start")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.margins(0.08)
+        axes.set(xlabel="x: east (m)", ylabel="y: north (m)")
+        axes.set_title("Route as recorded; arrows: the vehicle's x axis")
+        fig.legend(loc="outside lower left")
+
+
+def _draw_headings(axes: Axes, poses: FloatArray) -> None:
+    """Arrows at even distances along the path, each a twentieth of the route's extent long."""
+    place = poses[:, :2, 3]
+    way = metrics.way_along(place)
+    chosen = np.unique(np.searchsorted(way, np.linspace(0, way[-1], _ARROWS)))
+    length = 0.05 * max(float(np.ptp(place, axis=0).max()), 1e-9)
+    axes.quiver(
+        *place[chosen].T, *(length * poses[chosen, :2, 0]).T,
+        angles="xy", scale_units="xy", scale=1, width=0.0028, color="white", edgecolor="#1b1e21",
+        linewidth=0.7, zorder=3,
+    )  # fmt: skip
+
+
+_AROUND_M = 2.0  # ground around a change in its close-up, m
+_MOST_CLOSE_UPS = 12
+
+_COLOURS = {Fate.MOVED: "#3b6fb6", Fate.VANISHED: "#d0432b", Fate.NEW: "#0b7a75"}
+
+
+def save_changes(path: Path, changes: Changes, hd_map: HdMap, route_map: FloatArray) -> None:
+    """Draw the changes over the map as it is now, beside close-ups of the largest moves.
+
+    ``route_map`` (N, 2), m, has nan between two drives.
+    """
+    moved = sorted(changes.of(Fate.MOVED), key=_distance_m, reverse=True)[:_MOST_CLOSE_UPS]
+    columns = 3 if len(moved) > 4 else 2
+    corners = np.concatenate([route_map, *(one.corners_map for one in hd_map.markings)])
+    extent_m = np.nanmax(corners, axis=0) - np.nanmin(corners, axis=0) + _BESIDE_ROUTE_M
+    site_in = _HEIGHT_IN * float(np.clip(extent_m[0] / extent_m[1], 0.6, 2.0)) + 1.0
+    detail_in = _HEIGHT_IN * columns / 3 if moved else 0.01
+    with style.figure(path, site_in + detail_in, _HEIGHT_IN) as fig:
+        if moved:
+            whole, close = np.asarray(fig.subfigures(1, 2, width_ratios=[site_in, detail_in])).tolist()
+            rows = -(-len(moved) // columns)
+            axes = close.subplots(rows, columns, squeeze=False).ravel()
+            title = "The largest moves by id: dashed before, solid now; east and north (m)"
+            close.suptitle(title, fontsize=9)
+            for place, one in zip(axes, moved, strict=False):
+                _move_close_up(place, one, changes, hd_map)
+            for place in axes[len(moved) :]:
+                place.set_axis_off()
+        else:
+            whole = fig
+        _site(whole.subplots(), changes, hd_map, route_map)
+
+
+def _site(axes: Axes, changes: Changes, hd_map: HdMap, route_map: FloatArray) -> None:
+    axes.plot(*route_map.T, color=style.ROUTE, lw=5, zorder=0, solid_capstyle="round", label="route")
+    _draw_map(axes, hd_map)
+    for fate, colour in _COLOURS.items():
+        own = changes.of(fate)
+        places = np.array([_outline(one).mean(axis=0) for one in own]).reshape(-1, 2)
+        marker = {Fate.MOVED: "o", Fate.VANISHED: "x", Fate.NEW: "+"}[fate]
+        face = "none" if fate is Fate.MOVED else colour
+        label = f"{len(own)} {fate.value}"
+        axes.plot(*places.T, marker, ms=9, mew=1.6, mec=colour, mfc=face, zorder=3, label=label)
+        beside: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7, "color": colour}
+        for one, (east, north) in zip(own, places.tolist(), strict=True):
+            axes.annotate(str(one.id), (east, north), (5, 5), **beside)
+    axes.set_title(f"{changes.same} markings as they were, {len(changes.of(Fate.NOT_SEEN))} not seen")
+    style.set_map_axes(axes)
+    axes.legend(loc="best")
+
+
+def _move_close_up(axes: Axes, one: Change, changes: Changes, hd_map: HdMap) -> None:
+    """Old outline dashed, new one solid, an arrow from centre to centre with its length and sigma."""
+    assert one.before is not None
+    assert one.after is not None
+    assert one.shift_sigma_m is not None
+    _draw_map(axes, hd_map)
+    for other in changes.changes:
+        colour = _COLOURS.get(other.fate)
+        for corners, line in ((other.before, "--"), (other.after, "-")):
+            if corners is not None and other.fate in _COLOURS:
+                axes.add_patch(
+                    Polygon(corners, closed=True, fill=False, edgecolor=colour, lw=1.4, ls=line, zorder=3)
+                )
+    begin, end = one.before.mean(axis=0), one.after.mean(axis=0)
+    axes.annotate("", xy=end, xytext=begin, arrowprops={"arrowstyle": "->", "color": "#2d3439", "lw": 1.4})
+    sigma_cm = 100 * float(np.sqrt(np.mean(one.shift_sigma_m**2)))
+    axes.set_title(f"id {one.id}: {100 * _distance_m(one):.0f} +- {sigma_cm:.1f} cm", fontsize=8)
+    style.cut_to_square(axes, np.concatenate([one.before, one.after]).mean(axis=0), _AROUND_M)
+    axes.set_aspect("equal")
+    axes.tick_params(labelsize=6)
+
+
+def _draw_map(axes: Axes, hd_map: HdMap) -> None:
+    lanes = [lane.points_map for lane in hd_map.lanes]
+    axes.add_collection(LineCollection(lanes, colors=style.PAINT, lw=1.6))
+    polygons = [one.corners_map for one in hd_map.markings]
+    axes.add_collection(PolyCollection(polygons, facecolors="#c9d3da", edgecolors="#9aa4ad", lw=0.4))
+    axes.autoscale_view()
+
+
+def _outline(one: Change) -> FloatArray:
+    corners = one.before if one.after is None else one.after
+    assert corners is not None
+    return corners
+
+
+def _distance_m(one: Change) -> float:
+    return 0.0 if one.shift_m is None else float(np.linalg.norm(one.shift_m))

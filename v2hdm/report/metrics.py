@@ -1,4 +1,4 @@
-"""How far a map and a calibration are from the truth.
+"""How far a map and a calibration are from the truth, as ``metrics.json`` states it.
 
 Only this package and the pipeline's evaluation step read ground truth. All lengths are metres in
 the map frame unless a name says otherwise.
@@ -6,16 +6,20 @@ the map frame unless a name says otherwise.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from v2hdm.catalogue import CORNERED_CLASSES
 from v2hdm.geometry.planar import inside_convex
+from v2hdm.geometry.quadrilateral import long_axis
 from v2hdm.geometry.rigid import camera_centre, ground_in_vehicle
-from v2hdm.records import BoolArray, Drive, FloatArray, HdMap, Marking, Truth
+from v2hdm.records import DIAMOND, LANE_DASH, BoolArray, Drive, FloatArray, HdMap, Lane, Marking, Truth
 
 MATCH_GATE_M = 2.0
 """A mapped marking farther than this from every true one of its class is false."""
@@ -31,10 +35,9 @@ FULLY_VISIBLE = 0.99
 class MarkingMetrics:
     """Mapped markings of one class, or of all, against the true ones.
 
-    ``markings`` counts the mapped ones, ``false_markings`` those without a true counterpart,
-    ``expected`` the true ones driven past within the region of interest and ``recall`` their mapped
-    share. ``corner_rmse_m`` is the root mean square distance of corners, ``corner_bias_m`` the
-    length of their mean error vector; both are nan where nothing matched.
+    ``false_markings`` have no true counterpart, ``expected`` are the true ones driven past within the region
+    of interest and ``recall`` their mapped share. ``corner_bias_m`` is the length of the corners' mean error
+    vector; it and the RMSE are nan where nothing matched.
     """
 
     markings: int
@@ -90,7 +93,7 @@ def marking_metrics(
         false_markings=len(mapped) - len(rows),
         expected=int(wanted.sum()),
         recall=float(found[wanted].mean()) if wanted.any() else float("nan"),
-        corner_rmse_m=_rms(errors),
+        corner_rmse_m=rms(errors),
         corner_bias_m=float(np.linalg.norm(errors.mean(axis=0))) if len(errors) else float("nan"),
     )
 
@@ -131,5 +134,225 @@ def extrinsic_metrics(cam_from_vehicle: FloatArray, true_cam_from_vehicle: Float
     )
 
 
-def _rms(errors: FloatArray) -> float:
+def rms(errors: FloatArray) -> float:
+    """Root mean square length of vectors (N, 2), nan where there are none."""
     return float(np.sqrt((errors**2).sum(axis=1).mean())) if len(errors) else float("nan")
+
+
+SAMPLE_STEP_M = 0.1
+"""Polylines are compared at points this far apart."""
+
+LATERAL_GATE_M = 0.3
+"""A mapped lane this near to a true one maps it."""
+
+
+@dataclass(frozen=True)
+class LaneMetrics:
+    """Mapped lane lines against the true ones.
+
+    ``mean_lateral_error_m`` is over the mapped length that lies within :data:`LATERAL_GATE_M` of a
+    true line, ``mapped_fraction`` the share of the visible true length with a mapped line that
+    near, ``false_length_m`` the mapped length without a true line beside it.
+    """
+
+    lanes: int
+    length_m: float
+    mean_lateral_error_m: float
+    mapped_fraction: float
+    false_length_m: float
+
+
+def lane_metrics(lanes: Sequence[Lane], truth: Truth) -> LaneMetrics:
+    """Compare mapped lanes with the truth; see :class:`LaneMetrics`."""
+    true_all = _stack(resample(lane.points_map) for lane in truth.map.lanes)
+    true_visible = _stack(
+        resample(piece)
+        for lane, visible in zip(truth.map.lanes, truth.lane_visible, strict=True)
+        for piece in runs(lane.points_map, visible)
+    )
+    mapped = _stack(resample(lane.points_map) for lane in lanes)
+    mapped_m = len(mapped) * SAMPLE_STEP_M
+    if not len(mapped) or not len(true_all):
+        return LaneMetrics(len(lanes), mapped_m, float("nan"), 0.0, mapped_m)
+    lateral = distance_to_points(mapped, true_all)
+    near = lateral <= LATERAL_GATE_M
+    covered = distance_to_points(true_visible, mapped) <= LATERAL_GATE_M
+    return LaneMetrics(
+        lanes=len(lanes),
+        length_m=mapped_m,
+        mean_lateral_error_m=float(lateral[near].mean()) if near.any() else float("nan"),
+        mapped_fraction=float(covered.mean()) if len(covered) else float("nan"),
+        false_length_m=float((~near).sum() * SAMPLE_STEP_M),
+    )
+
+
+def resample(points: FloatArray, step_m: float = SAMPLE_STEP_M) -> FloatArray:
+    """Points (M, 2) every ``step_m`` along a polyline (N, 2), its first point included."""
+    if len(points) < 2:
+        return points
+    along = way_along(points)
+    at = np.arange(0.0, along[-1] + 1e-9, step_m)
+    return np.column_stack([np.interp(at, along, points[:, 0]), np.interp(at, along, points[:, 1])])
+
+
+def distance_to_points(points: FloatArray, line: FloatArray) -> FloatArray:
+    """Distance (N,) of points to a densely sampled line, the samples joined by their tangent.
+
+    The two nearest samples span the local line, so the result is lateral to far below the
+    sampling step.
+    """
+    if not len(points):
+        return np.empty(0)
+    if len(line) < 2:
+        return np.asarray(np.linalg.norm(points - line[0], axis=1))
+    distance, nearest = cKDTree(line).query(points, k=2)
+    first, second = line[nearest[:, 0]], line[nearest[:, 1]]
+    span = second - first
+    length2 = np.maximum((span**2).sum(axis=1), 1e-18)
+    share = np.clip(((points - first) * span).sum(axis=1) / length2, 0.0, 1.0)
+    # Samples of two different lines are farther apart than a step: do not join those.
+    joined = np.sqrt(length2) <= 1.5 * SAMPLE_STEP_M
+    lateral = np.linalg.norm(points - (first + share[:, None] * span), axis=1)
+    return np.asarray(np.where(joined, lateral, distance[:, 0]))
+
+
+def way_along(points: FloatArray) -> FloatArray:
+    """Distance (N,) along a polyline (N, 2) from its first point."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+
+
+def length_m(points: FloatArray) -> float:
+    """Length of a polyline (N, 2)."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def runs(points: FloatArray, keep: BoolArray) -> list[FloatArray]:
+    """The maximal stretches of a polyline whose vertices are all kept."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], keep.astype(int), [0]])))
+    return [points[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
+
+
+def _stack(pieces: Iterable[FloatArray]) -> FloatArray:
+    arrays = [piece for piece in pieces if len(piece)]
+    return np.concatenate(arrays) if arrays else np.empty((0, 2))
+
+
+MAX_CYCLE_M = 15.0
+"""Successors farther away belong to another row of dashes."""
+
+MAX_OFFSET_M = 0.5
+"""A successor lies at most this far beside the axis of its dash."""
+
+
+@dataclass(frozen=True)
+class DashSpacing:
+    """Distance from dash to next dash of the same line, centre to centre."""
+
+    pairs: int
+    median_m: float
+    deviation_m: float
+
+
+def dash_spacing(hd_map: HdMap) -> DashSpacing:
+    """Measure the cycle of all dashed lines of a map; nan where no dash has a successor."""
+    dashes = [m.corners_map for m in hd_map.markings if m.kind == LANE_DASH]
+    gaps = _successor_distances(np.array(dashes).reshape(-1, 4, 2))
+    if not len(gaps):
+        return DashSpacing(0, float("nan"), float("nan"))
+    median = float(np.median(gaps))
+    # 1.4826 makes the median absolute deviation the sigma of a Gaussian.
+    return DashSpacing(len(gaps), median, float(1.4826 * np.median(np.abs(gaps - median))))
+
+
+def _successor_distances(dashes: FloatArray) -> FloatArray:
+    """Distance (P,) from each dash (J, 4, 2) to the nearest one ahead of it along its own axis."""
+    if len(dashes) < 2:
+        return np.empty(0)
+    centres, axes = dashes.mean(axis=1), np.array([long_axis(corners) for corners in dashes])
+    offset = centres[None] - centres[:, None]
+    along = (offset * axes[:, None]).sum(axis=2)
+    across = offset[..., 0] * axes[:, None, 1] - offset[..., 1] * axes[:, None, 0]
+    ahead = (along > 0.5) & (along <= MAX_CYCLE_M) & (np.abs(across) <= MAX_OFFSET_M)
+    nearest = np.where(ahead, along, np.inf).min(axis=1)
+    return np.asarray(nearest[np.isfinite(nearest)])
+
+
+_MAIN_REASONS = 3  # reasons of exclusion that a headline names
+
+
+def map_figures(hd_map: HdMap, truth: Truth | None, expected: BoolArray | None) -> dict[str, Any]:
+    """Figures of one map: against the truth where there is one, counts and dash spacing always.
+
+    Counts and errors are of markings of all classes; ``recall`` and ``expected`` are those of the
+    diamonds, the site's landmarks, where it has any. ``by_class`` holds every figure of each class.
+    """
+    figures: dict[str, Any] = {"markings": len(hd_map.markings)}
+    if truth is not None and expected is not None:
+        figures |= asdict(marking_metrics(hd_map, truth, expected))
+        shown = dict.fromkeys(m.kind for m in (*truth.map.markings, *hd_map.markings))
+        kinds = dict.fromkeys((*CORNERED_CLASSES, *shown))
+        by_class = {kind: asdict(marking_metrics(hd_map, truth, expected, kind)) for kind in kinds}
+        if by_class[DIAMOND]["expected"]:
+            figures |= {name: by_class[DIAMOND][name] for name in ("expected", "recall")}
+        figures["by_class"] = by_class
+    figures["lanes"] = _lane_figures(hd_map, truth)
+    figures["dash_spacing"] = asdict(dash_spacing(hd_map))
+    return figures
+
+
+def extrinsic_figures(estimate: FloatArray, initial: FloatArray, true: FloatArray | None) -> dict[str, float]:
+    """How far an extrinsic (4 x 4) moved from its start and, where known, how far it is from truth.
+
+    The turns are those of the camera about the vehicle's axes (deg): yaw to the left, pitch nose
+    down, roll to the right.
+    """
+    turn_vehicle = estimate[:3, :3].T @ initial[:3, :3]
+    yaw, pitch, roll = Rotation.from_matrix(turn_vehicle).as_euler("ZYX", degrees=True)
+    centres = [camera_centre(t) for t in (estimate, initial)]
+    shift_m = centres[0] - centres[1]
+    figures = {"yaw_change_deg": yaw, "pitch_change_deg": pitch, "roll_change_deg": roll}
+    figures |= {f"{axis}_change_m": float(value) for axis, value in zip("xyz", shift_m, strict=True)}
+    if true is not None:
+        figures |= asdict(extrinsic_metrics(estimate, true))
+    return figures
+
+
+def growth_figures(maps: Sequence[HdMap], truth: Truth) -> list[tuple[int, float]]:
+    """Number of markings and corner RMSE (m) of each of a sequence of growing maps."""
+    nothing = np.zeros(len(truth.map.markings), dtype=bool)
+    found = [(len(m.markings), marking_metrics(m, truth, nothing).corner_rmse_m) for m in maps]
+    return [(count, rmse) for count, rmse in found if np.isfinite(rmse)]
+
+
+def headline(cameras: str, results: Mapping[str, Mapping[str, Any]]) -> str:
+    """The result of one camera set in one sentence."""
+    best = results.get("Opt", {})
+    start = next((results[m] for m in ("ENI", "CNI") if m in results), {})
+    if "corner_rmse_m" not in best or "corner_rmse_m" not in start:
+        return f"{cameras}: {_own_words(best)}"
+    return (
+        f"{cameras}: corners {100 * start['corner_rmse_m']:.1f} cm off before, "
+        f"{100 * best['corner_rmse_m']:.1f} cm after the optimisation"
+    )
+
+
+def _own_words(figures: Mapping[str, Any]) -> str:
+    """The size of a map, its accuracy, and the main reasons why candidates are not in it."""
+    words = f"{figures.get('markings', 0)} markings"
+    if np.isfinite(figures.get("median_sigma_m", np.nan)):
+        words += f" (sigma of a corner {100 * figures['median_sigma_m']:.1f} cm)"
+    words += f", {figures.get('lanes', {}).get('lanes', 0)} lane lines"
+    reasons = list(figures.get("excluded_for", {}).items())[:_MAIN_REASONS]
+    if reasons:
+        listed = ", ".join(f"{count} {reason}" for reason, count in reasons)
+        words += f"; {figures['excluded']} candidates left out, most often: {listed}"
+    return words
+
+
+def _lane_figures(hd_map: HdMap, truth: Truth | None) -> dict[str, Any]:
+    if truth is not None:
+        return asdict(lane_metrics(hd_map.lanes, truth))
+    return {
+        "lanes": len(hd_map.lanes),
+        "length_m": float(sum(length_m(lane.points_map) for lane in hd_map.lanes)),
+    }

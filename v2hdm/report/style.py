@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib as mpl
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from v2hdm.records import FloatArray
 from v2hdm.store.files import whole_file
 
 OKABE_ITO = {
@@ -24,6 +26,10 @@ OKABE_ITO = {
 }
 """Colours that colour-blind people tell apart: Okabe and Ito, Color Universal Design, 2008."""
 
+PAINT = "#dfe4e8"
+"""Filling of true markings."""
+
+GRID = "#e6eaed"
 TRUTH = "#9aa4ad"
 ROUTE = "#c9d3da"
 METHOD = {
@@ -35,7 +41,7 @@ METHOD = {
 """Colour of each method, the same in every figure."""
 
 LINE: dict[str, Any] = {"CNI": (0, (6, 2)), "ENI": (0, (1.5, 1.5)), "Opt": "-", "ONI": (0, (7, 2, 1.5, 2))}
-"""Line style of each method: they are told apart without colour, too."""
+"""Line style of each method: they differ without colour, too."""
 
 MARKER = {"CNI": "s", "ENI": "^", "Opt": "o", "ONI": "D"}
 """Marker of each method."""
@@ -68,3 +74,29 @@ def figure(path: Path, width_in: float, height_in: float, dpi: int = 110) -> Ite
         yield fig
         with whole_file(path) as partial:
             fig.savefig(partial, format="png")
+
+
+def set_map_axes(axes: Axes) -> None:
+    """Axes of the map frame: as long east as north."""
+    axes.set(aspect="equal", xlabel="east (m)", ylabel="north (m)")
+
+
+def set_image_axes(axes: Axes, left: float, right: float, bottom: float, top: float) -> None:
+    """Axes of an image, whose rows rise downwards."""
+    axes.set(xlim=(left, right), ylim=(bottom, top), xlabel="u (px)", ylabel="v (px)")
+
+
+def cut_to_square(axes: Axes, centre: FloatArray, half: float) -> None:
+    """Show the square about a point (2,) that reaches ``half`` to each side."""
+    axes.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half))
+
+
+def set_logarithmic(axes: Axes, which: Literal["x", "y"]) -> None:
+    """A logarithmic axis with a grid, whose 1, 2 and 5 have labels."""
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    (axes.set_xscale if which == "x" else axes.set_yscale)("log")
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.set_minor_formatter(
+        lambda value, _: f"{value:g}" if f"{value:g}".lstrip("0.")[:1] in ("2", "5") else ""
+    )
+    axes.grid(axis=which, which="both", color=GRID)

@@ -11,7 +11,7 @@ import pytest
 
 from tests.report.page.browser import Watched, browser_path, opened
 from tests.report.page.folder import NASTY, NASTY_NAME, PLACES, make_result
-from v2hdm.report.page.write import write_page
+from v2hdm.report.page.document import write_page
 
 WINDOWS = [(1280, 800, "light"), (1280, 800, "dark"), (390, 844, "light"), (390, 844, "dark")]
 

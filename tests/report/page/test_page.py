@@ -6,6 +6,7 @@ import base64
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -20,11 +21,9 @@ from v2hdm.records import DIAMOND, Drive, Marking
 from v2hdm.report.__main__ import main
 from v2hdm.report.outputs import write_json
 from v2hdm.report.page import pictures
-from v2hdm.report.page.document import Document, document
-from v2hdm.report.page.facts import read_facts
+from v2hdm.report.page.document import document, write_page
+from v2hdm.report.page.facts import ground_residuals, read_facts
 from v2hdm.report.page.layers import ellipses
-from v2hdm.report.page.sightings import ground_residuals
-from v2hdm.report.page.write import write_page
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +37,7 @@ def result(drive: Drive) -> Path:
 
 
 @pytest.fixture(scope="module")
-def page(drive: Drive, result: Path) -> Document:
+def page(drive: Drive, result: Path) -> SimpleNamespace:
     return document(read_facts(result, drive))
 
 
@@ -79,7 +78,7 @@ def test_the_stated_ellipses_hold_95_of_100_true_corners_of_right_covariances(
     assert abs(int(table.rows[-1][-1]) - 95) <= 1
 
 
-def test_key_figures_and_tables_state_what_the_files_do(page: Document) -> None:
+def test_key_figures_and_tables_state_what_the_files_do(page: SimpleNamespace) -> None:
     figures = {one.name: (one.value, one.unit) for one in page.figures}
     assert figures["Markings"] == ("4", "")
     assert figures["Between neighbours"] == ("1.0", "cm")  # 2.45 x 0.004 m
@@ -192,7 +191,7 @@ def test_check_points_of_the_folder_are_told_in_centimetres_and_shown_on_the_map
 def test_a_mosaic_of_the_folder_is_a_layer_within_its_budget(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from v2hdm.report.page import ground
+    from v2hdm.report.page import layers as ground
 
     drive = make_result(tmp_path)
     random = np.random.default_rng(0).integers(0, 255, (600, 800, 4), dtype=np.uint8)

@@ -7,9 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from v2hdm.experiment.figures.cameras import save_calibration, save_fields
-from v2hdm.experiment.figures.errors import save_balance, save_boxes, save_growth, save_ranges
-from v2hdm.experiment.figures.site import save_map, save_shift
+from v2hdm.experiment.figures.curves import save_balance, save_boxes, save_growth, save_ranges
+from v2hdm.experiment.figures.site import save_calibration, save_fields, save_map, save_shift
 from v2hdm.experiment.measures import Measured
 from v2hdm.experiment.plan import Job
 
@@ -19,18 +18,11 @@ def save_figures(
     todo: Sequence[Job],
     records: Sequence[Mapping[str, Any]],
     measured: Sequence[Measured],
-    tell: Callable[[int, int], None],
+    progress: Callable[[int, int], None],
 ) -> dict[str, str]:
-    """Draw all figures into a folder.
+    """Draw all figures into a folder; figures of single drives show the first seed of each port.
 
-    Those of single drives show the first seed of each port.
-
-    Args:
-        folder: where to.
-        todo: the drives.
-        records: what is known of them.
-        measured: their figures.
-        tell: told how many figures are drawn, of how many.
+    ``progress`` is called with how many figures are drawn, of how many.
 
     Returns:
         By file name the caption of each figure that could be drawn.
@@ -51,11 +43,11 @@ def save_figures(
     work["bias_spread.png"] = partial(save_balance, measured=measured)
     captions = {}
     for done, (name, draw) in enumerate(work.items()):
-        tell(done, len(work))
+        progress(done, len(work))
         caption = draw(folder / name)
         if caption is None:
             (folder / name).unlink(missing_ok=True)
         else:
             captions[name] = caption
-    tell(len(work), len(work))
+    progress(len(work), len(work))
     return captions

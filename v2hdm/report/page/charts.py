@@ -15,9 +15,8 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
 from v2hdm.records import FloatArray, HdMap
-from v2hdm.report.page.facts import Route
-from v2hdm.report.page.sightings import GroundResiduals
-from v2hdm.report.style import OKABE_ITO
+from v2hdm.report.page.facts import GroundResiduals, Route
+from v2hdm.report.style import OKABE_ITO, set_image_axes
 
 INK, MUTED, GRID, PAPER = "#1b1e21", "#5c646b", "#dde1e5", "#fdfdfd"
 """Colours of text, axes, grid and background: those that ``page.css`` replaces by its theme's."""
@@ -76,7 +75,7 @@ def _chart(name: str, width_in: float, height_in: float) -> Iterator[tuple[Figur
 
 
 def _look(number: int) -> dict[str, Any]:
-    """Colour and dashes of series ``number``: told apart without colour, too."""
+    """Colour and dashes of series ``number``: they differ without colour, too."""
     return {"color": OKABE_ITO[_ORDER[number % len(_ORDER)]], "linestyle": _DASHES[number % len(_DASHES)]}
 
 
@@ -94,22 +93,17 @@ def site_chart(hd_map: HdMap, route: Route | None, excluded: FloatArray) -> str:
             axes.plot(*way.T, color=MUTED, lw=1.0, ls=(0, (4, 2)), label="route of the vehicle")
             axes.plot(*way[0], "o", color=MUTED, ms=4)
         lanes = [one.points_map for one in hd_map.lanes]
-        axes.add_collection(
-            LineCollection(lanes, colors=OKABE_ITO["sky"], linewidths=0.9, label="lane lines")
-        )
+        lines = LineCollection(lanes, colors=OKABE_ITO["sky"], linewidths=0.9, label="lane lines")
+        axes.add_collection(lines)
         shapes = [m.corners_map for m in hd_map.markings] + [one.outline_map for one in hd_map.symbols]
-        colour = OKABE_ITO["blue"]
-        axes.add_collection(
-            PolyCollection(shapes, facecolors=colour, edgecolors=colour, linewidths=0.8, label="markings")
-        )
+        paint: dict[str, Any] = {"facecolors": OKABE_ITO["blue"], "edgecolors": OKABE_ITO["blue"]}
+        axes.add_collection(PolyCollection(shapes, linewidths=0.8, label="markings", **paint))
         if len(excluded):
-            axes.plot(
-                *excluded.T, "x", color=OKABE_ITO["vermillion"], ms=4, mew=1.0, label="left out, with reason"
-            )
+            cross: dict[str, Any] = {"color": OKABE_ITO["vermillion"], "ms": 4, "mew": 1.0}
+            axes.plot(*excluded.T, "x", label="left out, with reason", **cross)
         axes.set_aspect("equal", adjustable="datalim")
         axes.autoscale_view()
-        axes.set_xlabel("east (m)")
-        axes.set_ylabel("north (m)")
+        axes.set(xlabel="east (m)", ylabel="north (m)")
         figure.legend(loc="outside upper left", ncols=4, fontsize=8.5, handlelength=1.8, columnspacing=1.4)
     return out[0]
 
@@ -129,8 +123,7 @@ def histogram_chart(residuals: GroundResiduals) -> str:
             _steps(right, residuals.distance_sigma[own], edges_sigma, name, number)
         ideal = edges_sigma * np.exp(-0.5 * edges_sigma**2)
         right.plot(edges_sigma, ideal, color=MUTED, lw=1.0, label="as the noise model says")
-        left.set_xlabel("distance, projected to observed (px)")
-        left.set_ylabel("share of corners per px")
+        left.set(xlabel="distance, projected to observed (px)", ylabel="share of corners per px")
         right.set_xlabel("the same (standard deviations)")
         for axes in (left, right):
             axes.set_ylim(bottom=0)
@@ -159,9 +152,8 @@ def field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]]
         for axes in panels[len(names) :]:
             axes.set_axis_off()
         fields = [_field(residuals, number, sizes[name]) for number, name in enumerate(names)]
-        longest = max(
-            (float(np.linalg.norm(mean, axis=1).max()) for _, mean in fields if len(mean)), default=0.1
-        )
+        lengths = [float(np.linalg.norm(mean, axis=1).max()) for _, mean in fields if len(mean)]
+        longest = max(lengths, default=0.1)
         key_px = _round_down(max(longest, 1e-3))
         for number, (axes, name) in enumerate(zip(panels, names, strict=False)):
             width_px, height_px = sizes[name]
@@ -176,12 +168,8 @@ def field_chart(residuals: GroundResiduals, sizes: Mapping[str, tuple[int, int]]
                 arrows, 0.88, 1.06, key_px, f"{key_px:g} px", labelpos="W", coordinates="axes",
                 labelcolor=INK, color=INK, fontproperties={"size": 8.5},
             )  # fmt: skip
-            axes.set_xlim(0, width_px)
-            axes.set_ylim(height_px, 0)
-            axes.set_aspect("equal")
-            axes.set_xlabel("u (px)")
-            axes.set_ylabel("v (px)")
-            axes.set_title(name)
+            set_image_axes(axes, 0, width_px, height_px, 0)
+            axes.set(aspect="equal", title=name)
             for side in ("top", "right"):
                 axes.spines[side].set_visible(True)
     return out[0]
@@ -192,16 +180,14 @@ def _field(residuals: GroundResiduals, camera: int, size: tuple[int, int]) -> tu
     own = (residuals.camera == camera) & residuals.is_point
     place, off = residuals.observed_px[own], residuals.residual_px[own]
     rows, columns = CELLS
-    column = np.floor(place[:, 0] / size[0] * columns).astype(np.int64)
-    row = np.floor(place[:, 1] / size[1] * rows).astype(np.int64)
+    column, row = np.floor(place / size * (columns, rows)).astype(np.int64).T
     inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
     cell = (row * columns + column)[inside]
     count = np.bincount(cell, minlength=rows * columns)
     enough = np.flatnonzero(count >= _LEAST_IN_CELL)
     mean = np.column_stack([np.bincount(cell, off[inside, a], rows * columns) for a in (0, 1)])
-    centres = np.column_stack(
-        [(enough % columns + 0.5) * size[0] / columns, (enough // columns + 0.5) * size[1] / rows]
-    )
+    u, v = (enough % columns + 0.5) * size[0] / columns, (enough // columns + 0.5) * size[1] / rows
+    centres = np.column_stack([u, v])
     return centres, mean[enough] / count[enough][:, None]
 
 
@@ -298,10 +284,8 @@ def ellipse_chart(semi_axes_cm: Mapping[str, FloatArray]) -> str:
                 np.concatenate([[0], order, [top]]), np.concatenate([[0], share, [100]]), where="post",
                 label=name, **_look(number),
             )  # fmt: skip
-        axes.set_xlabel("95 % of the error lies within (cm)")
-        axes.set_ylabel("share of corners (%)")
-        axes.set_ylim(0, 102)
-        axes.set_xlim(0, max(top, 1e-3))
+        axes.set(xlabel="95 % of the error lies within (cm)", xlim=(0, max(top, 1e-3)))
+        axes.set(ylabel="share of corners (%)", ylim=(0, 102))
         axes.grid()
         axes.legend(loc="lower right", fontsize=8.5)
     return out[0]

@@ -1,21 +1,24 @@
-"""The whole page as one document: what the templates fill in, and nothing that they have to compute."""
+"""From a result folder to its ``report.html``: one file with everything in it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections import Counter
 from dataclasses import dataclass
-from typing import Any
+from importlib.resources import files
+from pathlib import Path
+from types import SimpleNamespace
 
+import jinja2
 import numpy as np
 
+from v2hdm.records import Drive
 from v2hdm.report.page import charts, tables
-from v2hdm.report.page.cameras import CameraPage, camera_pages
-from v2hdm.report.page.cells import Figure, Table, in_words, pair_table
-from v2hdm.report.page.facts import Facts
-from v2hdm.report.page.ground import GroundPage, ground_page
-from v2hdm.report.page.layers import layers
+from v2hdm.report.page.facts import Facts, GroundResiduals, ground_residuals, read_facts
+from v2hdm.report.page.layers import ground_page, layers
 from v2hdm.report.page.pictures import overlays, pictures
-from v2hdm.report.page.sightings import GroundResiduals, ground_residuals
+from v2hdm.report.page.tables import in_words
+from v2hdm.store.files import replace_text
 
 _SAYS = {
     "PASS": "Every check is within its limit. Map and calibrations can be relied on as stated below.",
@@ -35,50 +38,8 @@ class Chart:
     svg: str
 
 
-@dataclass(frozen=True)
-class VerdictPage:
-    """The verdict: its status, what that means, and the rows of its findings."""
-
-    status: str
-    says: str
-    raised: tuple[tuple[str, ...], ...]
-    untold: tuple[tuple[str, ...], ...]
-    passed: tuple[tuple[str, ...], ...]
-
-
-@dataclass(frozen=True)
-class Document:
-    """What the page shows, in the order of its sections; what a run does not have is None or empty.
-
-    ``map_data`` and ``pictures`` are the JSON documents of the map in the page.
-    """
-
-    name: str
-    date: str
-    version: str
-    summary: str
-    verdict: VerdictPage
-    figures: tuple[Figure, ...]
-    site: Chart | None
-    accuracy: tuple[Table, ...]
-    accuracy_chart: Chart | None
-    check_points: Table | None
-    map_data: Mapping[str, Any]
-    pictures: Mapping[str, Any]
-    cameras: tuple[CameraPage, ...]
-    ground: GroundPage | None
-    residuals: tuple[Chart, ...]
-    excluded: Chart | None
-    excluded_words: str
-    contents: Table | None
-    methods: Table | None
-    about: tuple[Table, ...]
-    config: str
-    missing: tuple[str, ...]
-
-
-def document(facts: Facts) -> Document:
-    """Everything that is known of a run, as the page says it.
+def document(facts: Facts) -> SimpleNamespace:
+    """The whole page by the names of its templates; parts that a run does not have are None or empty.
 
     Raises:
         DriveError: an image of the drive cannot be read.
@@ -87,50 +48,46 @@ def document(facts: Facts) -> Document:
     verdict = metrics.get("verdict") or {}
     status = str(verdict.get("status", "FAIL"))
     residuals = ground_residuals(facts)
-    accuracy = (tables.accuracy_table(facts), tables.truth_table(facts))
-    about = (
-        pair_table("The drive.", metrics.get("drive") or {}),
-        tables.timing_table(facts),
-        pair_table("Versions of what computed it.", metrics.get("versions") or {}),
-    )
-    return Document(
+    about = [tables.pair_table("The drive.", metrics.get("drive") or {}), tables.timing_table(facts)]
+    about.append(tables.pair_table("Versions of what computed it.", metrics.get("versions") or {}))
+    return SimpleNamespace(
         name=str(metrics.get("name", facts.folder.name)),
         date=str(metrics.get("date", "")),
         version=str(metrics.get("version", "")),
         summary=_summary(facts),
-        verdict=VerdictPage(
-            status,
-            _SAYS.get(status, ""),
-            *(tables.finding_rows(verdict, which) for which in ("findings", "untold", "passed")),
+        verdict=SimpleNamespace(
+            status=status,
+            says=_SAYS.get(status, ""),
+            raised=tables.finding_rows(verdict, "findings"),
+            untold=tables.finding_rows(verdict, "untold"),
+            passed=tables.finding_rows(verdict, "passed"),
         ),
         figures=tables.key_figures(facts),
         site=_site(facts),
-        accuracy=tuple(one for one in accuracy if one is not None),
+        accuracy=[one for one in (tables.accuracy_table(facts), tables.truth_table(facts)) if one],
         accuracy_chart=_accuracy_chart(facts),
         check_points=tables.check_point_table(facts),
         map_data=layers(facts, residuals),
         pictures=pictures(facts),
-        cameras=camera_pages(facts, overlays(facts)),
+        cameras=tables.camera_pages(facts, overlays(facts)),
         ground=ground_page(facts.folder),
         residuals=_residual_charts(facts, residuals),
         excluded=_excluded(facts),
         excluded_words=_excluded_words(facts),
         contents=tables.content_table(facts),
         methods=tables.method_table(facts),
-        about=tuple(one for one in about if one is not None),
+        about=[one for one in about if one is not None],
         config=facts.config.strip(),
         missing=_missing(facts),
     )
 
 
 def _summary(facts: Facts) -> str:
-    """What was mapped, in a sentence."""
+    """The contents of the map in a sentence."""
     if facts.hd_map is None:
         return "No map came of this drive."
-    words = [
-        in_words(len(facts.hd_map.markings), "marking"),
-        in_words(len(facts.hd_map.lanes), "lane line"),
-    ]
+    counts = ((facts.hd_map.markings, "marking"), (facts.hd_map.lanes, "lane line"))
+    words = [in_words(len(own), name) for own, name in counts]
     if facts.hd_map.symbols:
         words.append(in_words(len(facts.hd_map.symbols), "symbol"))
     sentence = f"{', '.join(words[:-1])} and {words[-1]}"
@@ -148,8 +105,7 @@ def _site(facts: Facts) -> Chart | None:
     return Chart(
         "The map from above",
         "Where markings stand close together along the whole route, the drive was seen throughout. "
-        "Crosses show "
-        "what was left out: they should be few and at the edges.",
+        "Crosses show what was left out: they should be few and at the edges.",
         charts.site_chart(facts.hd_map, facts.route, excluded),
     )
 
@@ -157,22 +113,19 @@ def _site(facts: Facts) -> Chart | None:
 def _accuracy_chart(facts: Facts) -> Chart | None:
     if facts.hd_map is None:
         return None
-    relative = tables.relative_m(facts.hd_map.markings)
-    absolute = tables.half_axes_m(facts.hd_map.markings)
-    series = {
-        name: 100 * values
-        for name, values in (("relative to neighbours", relative), ("absolute", absolute))
-        if len(values)
+    known = {
+        "relative to neighbours": tables.relative_m(facts.hd_map.markings),
+        "absolute": tables.half_axes_m(facts.hd_map.markings),
     }
+    series = {name: 100 * values for name, values in known.items() if len(values)}
     if not series:
         return None
     return Chart(
         "How many corners are how good",
         "Read it upwards from the accuracy that you need: the lines say which share of the corners "
-        "reaches it. "
-        "The absolute accuracy rests on the receiver’s stated noise. An offset that a whole drive "
-        "shares, as of a "
-        "base station set up wrongly, shows in no drive: only surveyed check points tell it.",
+        "reaches it. The absolute accuracy rests on the receiver’s stated noise. An offset that a whole "
+        "drive shares, as of a base station set up wrongly, shows in no drive: only surveyed check points "
+        "tell it.",
         charts.ellipse_chart(series),
     )
 
@@ -187,15 +140,14 @@ def _residual_charts(facts: Facts, residuals: GroundResiduals | None) -> tuple[C
         Chart(
             "How far corners lie from where the map puts them",
             "Left: in pixels. Right: in standard deviations of the detector’s own statement; lines to "
-            "the left "
-            "of the grey one mean that the corners are better than stated, a long tail that some are wrong.",
+            "the left of the grey one mean that the corners are better than stated, a long tail that some "
+            "are wrong.",
             charts.histogram_chart(residuals),
         ),
         Chart(
             "Over the image",
             "Mean residual of each part of the image, drawn longer than it is (the key gives the scale). "
-            "Arrows "
-            "without a pattern are noise; a swirl or a fan would be a wrong lens or principal point.",
+            "Arrows without a pattern are noise; a swirl or a fan would be a wrong lens or principal point.",
             charts.field_chart(residuals, sizes),
         ),
         Chart(
@@ -208,8 +160,7 @@ def _residual_charts(facts: Facts, residuals: GroundResiduals | None) -> tuple[C
         Chart(
             "Along the route",
             "Above: a stretch that stands out was seen badly or has wrong poses. Below: what was taken "
-            "off the "
-            "recorded poses, with the band of 95 %; it should wander within the receiver’s noise and "
+            "off the recorded poses, with the band of 95 %; it should wander within the receiver’s noise and "
             "never jump.",
             charts.route_chart(facts.route, residuals),
         ),
@@ -217,7 +168,7 @@ def _residual_charts(facts: Facts, residuals: GroundResiduals | None) -> tuple[C
 
 
 def _excluded(facts: Facts) -> Chart | None:
-    counts = tables.exclusion_counts(facts)
+    counts = Counter(one.reason for one in facts.excluded).most_common()
     if not counts:
         return None
     return Chart(
@@ -237,7 +188,7 @@ def _excluded_words(facts: Facts) -> str:
 
 
 def _missing(facts: Facts) -> tuple[str, ...]:
-    """What the page lacks, and why."""
+    """Parts that the page lacks, and why."""
     found = []
     if facts.drive is None:
         found.append(
@@ -249,3 +200,44 @@ def _missing(facts: Facts) -> tuple[str, ...]:
             "The folder has no residuals.csv (an older run): no residuals, no pictures. Map it again."
         )
     return tuple(found)
+
+
+FILE = "report.html"
+"""Name of the page in a result folder."""
+
+_ASSETS = {"leaflet.js": "vendor", "leaflet.css": "vendor", "page.css": "templates", "map.js": "templates"}
+"""Scripts and styles that stand in the page as they are, by the folder that holds them."""
+
+
+def write_page(folder: Path, drive: Drive | None) -> Path:
+    """Write ``report.html`` into a result folder of :mod:`v2hdm.map`, atomically, and return its path.
+
+    ``drive`` is the one that was mapped, for pictures, recorded route and truth; None if not at hand.
+
+    Raises:
+        MapFileError: the folder is no result, or a file in it is damaged.
+        DriveError: an image or the truth of the drive is damaged.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("v2hdm.report.page"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    here = files("v2hdm.report.page")
+    page = document(read_facts(folder, drive))
+    text = environment.get_template("page.html").render(
+        page=page,
+        assets={name: (here / where / name).read_text(encoding="utf-8") for name, where in _ASSETS.items()},
+        map_json=_json(page.map_data),
+        pictures_json=_json(page.pictures),
+    )
+    replace_text(folder / FILE, text)
+    return folder / FILE
+
+
+def _json(content: object) -> str:
+    """JSON that may stand in a script element: nothing in it ends the element or begins a comment."""
+    text = json.dumps(content, allow_nan=False, separators=(",", ":"))
+    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")

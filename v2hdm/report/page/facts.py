@@ -1,4 +1,4 @@
-"""What is known of a run: the files of its result folder, and the drive that it mapped."""
+"""The facts of a run: the files of its result folder, its drive, and its residuals on the ground."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import MapFileError
-from v2hdm.geometry.rigid import inverse
+from v2hdm.geometry.ipm import apply_in_front, ground_from_pinhole_px
+from v2hdm.geometry.rigid import camera_centre, inverse
 from v2hdm.io.calibration import read_calibration
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.maps import read_geojson
@@ -20,7 +21,8 @@ from v2hdm.io.maps.evidence import FILE as RESIDUALS
 from v2hdm.io.maps.evidence import ExcludedMarking, Residuals, read_exclusions, read_residuals
 from v2hdm.io.maps.features import features_of
 from v2hdm.io.trajectory import interpolate, read_tum
-from v2hdm.records import BoolArray, Calibration, Drive, FloatArray, HdMap, Trajectory, Truth
+from v2hdm.records import BoolArray, Calibration, Drive, FloatArray, HdMap, IntArray, Truth
+from v2hdm.report.metrics import way_along
 from v2hdm.store.files import load_json, load_yaml, read_text
 
 BEST = "Opt"
@@ -29,29 +31,19 @@ BEST = "Opt"
 
 @dataclass(frozen=True)
 class Route:
-    """The adjusted poses of a run.
+    """The adjusted poses of a run."""
 
-    Attributes:
-        stamp_s: (F,) rising.
-        map_from_vehicle: (F, 4, 4) adjusted, in the frame of the recorded poses.
-        recorded: (F, 4, 4) the same as recorded, None without the drive.
-        flat: (F, 4, 4) adjusted, with the road laid flat as the map is; as recorded without the drive.
-        sigma: (F, 6) forward, left, up in m, roll, pitch, heading in rad.
-        seen: (F,) whether a marking was seen then.
-    """
-
-    stamp_s: FloatArray
-    map_from_vehicle: FloatArray
-    recorded: FloatArray | None
-    flat: FloatArray
-    sigma: FloatArray
-    seen: BoolArray
+    stamp_s: FloatArray  # (F,) rising
+    map_from_vehicle: FloatArray  # (F, 4, 4) adjusted, in the frame of the recorded poses
+    recorded: FloatArray | None  # (F, 4, 4) as recorded, None without the drive
+    flat: FloatArray  # (F, 4, 4) adjusted, with the road laid flat as the map is, if the drive is there
+    sigma: FloatArray  # (F, 6) forward, left, up in m, roll, pitch, heading in rad
+    seen: BoolArray  # (F,) whether a marking was seen then
 
     @property
     def way_m(self) -> FloatArray:
         """How far the vehicle has driven (F,), m."""
-        steps = np.linalg.norm(np.diff(self.map_from_vehicle[:, :2, 3], axis=0), axis=1)
-        return np.concatenate([[0.0], np.cumsum(steps)])
+        return way_along(self.map_from_vehicle[:, :2, 3])
 
 
 @dataclass(frozen=True)
@@ -67,18 +59,8 @@ class CameraFacts:
 class Facts:
     """A result folder, read; what is not in it is None or empty.
 
-    Attributes:
-        folder: it.
-        metrics: ``metrics.json``.
-        config: ``config.yaml`` as text.
-        hd_map: the map, with ids.
-        excluded: what the map of all cameras left out.
-        cameras: by name.
-        route: the adjusted poses.
-        residuals: of the corner observations.
-        check_points: the rows of ``check_points.csv`` by its columns.
-        drive: that was mapped.
-        truth: of the drive, if it was rendered.
+    ``excluded`` are the candidates that the map of all cameras left out, ``check_points`` the rows of
+    ``check_points.csv`` by its columns; ``truth`` is there if the drive was rendered.
     """
 
     folder: Path
@@ -127,6 +109,7 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
     excluded = read_exclusions(folder / "excluded.geojson") if (folder / "excluded.geojson").is_file() else []
     residuals = folder / RESIDUALS
     config = folder / "config.yaml"
+    heading, *checked = _table(folder / "check_points.csv") or ((),)
     return Facts(
         folder=folder,
         metrics=metrics,
@@ -136,7 +119,7 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
         cameras=_cameras(folder),
         route=_route(folder, drive),
         residuals=read_residuals(residuals) if residuals.is_file() else None,
-        check_points=_rows(folder / "check_points.csv"),
+        check_points=tuple(dict(zip(heading, row, strict=False)) for row in checked),
         drive=drive,
         truth=read_truth(drive) if drive is not None and drive.truth_dir is not None else None,
     )
@@ -144,12 +127,10 @@ def read_facts(folder: Path, drive: Drive | None) -> Facts:
 
 def _with_ids(hd_map: HdMap) -> HdMap:
     ids = iter([one.id for one in features_of(hd_map)])
-    return replace(
-        hd_map,
-        markings=tuple(replace(one, id=next(ids)) for one in hd_map.markings),
-        lanes=tuple(replace(one, id=next(ids)) for one in hd_map.lanes),
-        symbols=tuple(replace(one, id=next(ids)) for one in hd_map.symbols),
-    )
+    markings = tuple(replace(one, id=next(ids)) for one in hd_map.markings)
+    lanes = tuple(replace(one, id=next(ids)) for one in hd_map.lanes)
+    symbols = tuple(replace(one, id=next(ids)) for one in hd_map.symbols)
+    return replace(hd_map, markings=markings, lanes=lanes, symbols=symbols)
 
 
 def _cameras(folder: Path) -> dict[str, CameraFacts]:
@@ -174,18 +155,17 @@ def _route(folder: Path, drive: Drive | None) -> Route | None:
         table = np.array(rows, dtype=np.float64).reshape(len(adjusted.stamp_s), 8)
     except ValueError:
         raise MapFileError(f"{path}: not a line of 8 numbers for each pose of trajectory.tum") from None
-    recorded = flat = None
-    if drive is not None:
-        recorded = _at(drive.recorded or drive.trajectory, adjusted.stamp_s)
-        flat = _at(drive.trajectory, adjusted.stamp_s)
-    moved = adjusted.map_from_vehicle
-    if recorded is not None and flat is not None:
-        moved = flat @ inverse(recorded) @ moved
-    return Route(adjusted.stamp_s, adjusted.map_from_vehicle, recorded, moved, table[:, 2:], table[:, 1] > 0)
-
-
-def _at(trajectory: Trajectory | None, stamp_s: FloatArray) -> FloatArray | None:
-    return None if trajectory is None else interpolate(trajectory, stamp_s, float("inf"))[0]
+    stamp_s, poses = adjusted.stamp_s, adjusted.map_from_vehicle
+    recorded, moved = None, poses
+    if drive is not None and drive.trajectory is not None:
+        recorded, flat = (
+            interpolate(one, stamp_s, float("inf"))[0]
+            for one in (drive.recorded or drive.trajectory, drive.trajectory)
+        )
+        moved = flat @ inverse(recorded) @ poses
+    elif drive is not None and drive.recorded is not None:
+        recorded = interpolate(drive.recorded, stamp_s, float("inf"))[0]
+    return Route(stamp_s, poses, recorded, moved, table[:, 2:], table[:, 1] > 0)
 
 
 def _table(path: Path) -> tuple[tuple[str, ...], ...]:
@@ -194,6 +174,79 @@ def _table(path: Path) -> tuple[tuple[str, ...], ...]:
     return tuple(tuple(row) for row in csv.reader(io.StringIO(read_text(path, MapFileError))) if row)
 
 
-def _rows(path: Path) -> tuple[Mapping[str, str], ...]:
-    heading, *rows = _table(path) or ((),)
-    return tuple(dict(zip(heading, row, strict=False)) for row in rows)
+@dataclass(frozen=True)
+class GroundResiduals:
+    """K corner observations, as in :class:`Residuals`; ``camera`` (K,) indexes ``cameras``.
+
+    ``range_m`` (K,) is from the camera's foot to the corner, as observed, ``ground_m`` (K, 2) projected minus
+    observed on the ground, in the map; both are nan above the horizon.
+    """
+
+    cameras: tuple[str, ...]
+    camera: IntArray
+    marking: IntArray
+    corner: IntArray
+    is_point: BoolArray
+    taken_s: FloatArray
+    observed_px: FloatArray
+    residual_px: FloatArray
+    distance_sigma: FloatArray
+    range_m: FloatArray
+    ground_m: FloatArray
+
+
+def ground_residuals(facts: Facts) -> GroundResiduals | None:
+    """The residuals of a run that has any, of the cameras whose calibration is known; else None."""
+    if facts.residuals is None or facts.route is None or not len(facts.residuals):
+        return None
+    residuals = facts.residuals
+    calibrations = {name: one.calibration for name, one in facts.cameras.items()}
+    names = tuple(sorted(set(residuals.camera) & calibrations.keys()))
+    if not names:
+        return None
+    number = {name: n for n, name in enumerate(names)}
+    of_image = np.array([number.get(name, -1) for name in residuals.camera])
+    rows = np.flatnonzero(of_image[residuals.row_image] >= 0)
+    row_image = residuals.row_image[rows]
+    cam_from_map = cams_from_map(residuals, facts.route, calibrations)
+    observed, off = residuals.observed_px[rows], residuals.residual_px[rows]
+    known = np.flatnonzero(of_image >= 0)
+    intrinsic = np.array([calibrations[residuals.camera[i]].info.intrinsic for i in known])
+    map_from_px, foot_map = np.full((len(of_image), 3, 3), np.nan), np.full((len(of_image), 2), np.nan)
+    map_from_px[known] = ground_from_pinhole_px(intrinsic, cam_from_map[known])
+    foot_map[known] = camera_centre(cam_from_map[known])[:, :2]
+    seen, projected = (
+        apply_in_front(map_from_px[row_image], px[:, None])[:, 0] for px in (observed, observed + off)
+    )
+    return GroundResiduals(
+        cameras=names,
+        camera=of_image[row_image],
+        marking=residuals.marking[rows],
+        corner=residuals.corner[rows],
+        is_point=residuals.is_point[rows],
+        taken_s=residuals.taken_s[row_image],
+        observed_px=observed,
+        residual_px=off,
+        distance_sigma=residuals.distance_sigma[rows],
+        range_m=np.linalg.norm(seen - foot_map[row_image], axis=1),
+        ground_m=projected - seen,
+    )
+
+
+def cams_from_map(residuals: Residuals, route: Route, calibrations: Mapping[str, Calibration]) -> FloatArray:
+    """Where each image (I, 4, 4) was taken from, by the adjusted poses; nan for cameras not calibrated."""
+    frame = nearest_pose(route, residuals.taken_s)
+    out = np.full((len(residuals.image), 4, 4), np.nan)
+    for i, name in enumerate(residuals.camera):
+        if name in calibrations:
+            out[i] = calibrations[name].cam_from_vehicle @ inverse(route.flat[frame[i]])
+    return out
+
+
+def nearest_pose(route: Route, taken_s: FloatArray) -> IntArray:
+    """The index (N,) of the pose nearest in time."""
+    after = np.clip(np.searchsorted(route.stamp_s, taken_s), 1, max(len(route.stamp_s) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(route.stamp_s) - 1)
+    later = np.abs(route.stamp_s[after] - taken_s) < np.abs(route.stamp_s[before] - taken_s)
+    return np.asarray(np.where(later, after, before))

@@ -1,37 +1,116 @@
-"""What the map in the page shows, as one JSON document in local metres."""
+"""The map in the page as one JSON document in local metres, and the mosaic of the ground below it."""
 
 from __future__ import annotations
 
+import base64
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
+from v2hdm.errors import MapFileError
 from v2hdm.records import FloatArray, Lane, Marking, Symbol
-from v2hdm.report.metrics import corner_errors, match_markings
-from v2hdm.report.page.facts import Facts
-from v2hdm.report.page.ground import mosaic_layer
-from v2hdm.report.page.sightings import GroundResiduals
+from v2hdm.report.metrics import corner_errors, match_markings, rms
+from v2hdm.report.page.facts import Facts, GroundResiduals
+from v2hdm.store.files import load_json, take_array, take_mapping, take_text
+
+
+def jpeg(pixels: np.ndarray, quality: int) -> str:
+    """An image (H, W, 3) BGR as JPEG in base64."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
+    return as_base64(cv2.imencode(".jpg", pixels, options)[1].tobytes())
+
+
+def shrunk(pixels: np.ndarray, factor: float) -> np.ndarray:
+    """An image of ``factor`` times the size, at least a pixel of it."""
+    size = (max(1, round(pixels.shape[1] * factor)), max(1, round(pixels.shape[0] * factor)))
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+
+
+def as_base64(content: bytes) -> str:
+    """Bytes as text."""
+    return base64.b64encode(content).decode("ascii")
+
+
+EXTENT, COMPARISON = "mosaic.json", "mosaic_before_after.png"
+
+LARGEST_BYTES = 3_500_000
+"""Budget of the mosaic, as text in the page."""
+
+_QUALITY = 72
+_COMPARISON_WIDTH_PX = 1400
+
+
+@dataclass(frozen=True)
+class GroundPage:
+    """The same ground before and after the optimisation (JPEG in base64), and what to see in it."""
+
+    picture: str
+    caption: str
+
+
+def mosaic_layer(folder: Path) -> dict[str, Any] | None:
+    """The mosaic for the map: WebP in base64 and its bounds (west, south, east, north), m; None without one.
+
+    Raises:
+        MapFileError: ``mosaic.json`` is damaged, or the picture that it names is missing.
+    """
+    if not (folder / EXTENT).is_file():
+        return None
+    content, where = load_json(folder / EXTENT, MapFileError), f"{folder / EXTENT}"
+    bounds = take_array(content.get("bounds_m"), (4,), f"{where}: bounds_m", MapFileError)
+    path = folder / Path(take_text(content.get("image"), f"{where}: image", MapFileError)).name
+    coded = path.read_bytes() if path.is_file() else b""
+    if path.suffix == ".webp" and 0 < len(as_base64(coded)) <= LARGEST_BYTES:
+        text = as_base64(coded)
+    else:
+        pixels = cv2.imdecode(np.frombuffer(coded, np.uint8), cv2.IMREAD_UNCHANGED) if coded else None
+        if pixels is None:
+            raise MapFileError(f"{path}: no picture that can be read; make the mosaic again")
+        text = _small_enough(pixels)
+    return {"src": text, "type": "image/webp", "bounds": bounds.tolist()}
+
+
+def _small_enough(pixels: np.ndarray) -> str:
+    """A picture in base64, as large as its budget allows."""
+    while True:
+        coded = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])[1].tobytes()
+        text = as_base64(coded)
+        if len(text) <= LARGEST_BYTES:
+            return text
+        pixels = shrunk(pixels, 0.9 * float(np.sqrt(LARGEST_BYTES / len(text))))
+
+
+def ground_page(folder: Path) -> GroundPage | None:
+    """The comparison, with its sharpness; None where the folder has none."""
+    path = folder / COMPARISON
+    pixels = cv2.imread(str(path)) if path.is_file() else None
+    if pixels is None:
+        return None
+    shown = shrunk(pixels, min(1.0, _COMPARISON_WIDTH_PX / pixels.shape[1]))
+    sharpness: Mapping[str, Any] = {}
+    if (folder / EXTENT).is_file():
+        content = load_json(folder / EXTENT, MapFileError)
+        sharpness = take_mapping(content.get("sharpness", {}), f"{folder / EXTENT}: sharpness", MapFileError)
+    caption = "All images laid on the ground, by the initial and by the optimised calibration and poses."
+    if sharpness.get("edges"):
+        before, after = (100 * float(sharpness[f"edge_width_{one}_m"]) for one in ("before", "after"))
+        caption += (
+            f" Paint edges are {before:.1f} cm wide before and {after:.1f} cm after: "
+            f"{float(sharpness['after_over_before']):.1f} times as sharp "
+            f"(median of {sharpness['edges']} sides)."
+        )
+    return GroundPage(jpeg(shown, 84), caption)
+
 
 SIGMAS_95 = 2.4477
 """Half axes of the ellipse that holds 95 % of a normal error in two dimensions, in standard deviations: the
 root of the chi-square quantile of two degrees of freedom."""
 
 _LEAST_ARROW_SIGHTINGS = 4
-
-
-def marking_key(identity: int | None) -> str:
-    """By what the page finds the pictures of a marking."""
-    return f"m{identity}"
-
-
-def symbol_key(identity: int | None) -> str:
-    """The same of a symbol."""
-    return f"s{identity}"
-
-
-def excluded_key(number: int) -> str:
-    """The same of candidate ``number`` of those left out."""
-    return f"x{number}"
 
 
 def ellipses(marking: Marking) -> FloatArray | None:
@@ -52,16 +131,10 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
         return {}
     named: list[Marking | Symbol | Lane] = [*hd_map.markings, *hd_map.symbols, *hd_map.lanes]
     kinds = sorted({one.kind for one in named})
-    arrows = _arrows(residuals)
-    errors = _errors(facts)
+    arrows, errors = _arrows(residuals), _errors(facts)
     markings = []
     for number, marking in enumerate(hd_map.markings):
-        found: dict[str, Any] = {
-            "id": marking.id,
-            "k": kinds.index(marking.kind),
-            "c": _metres(marking.corners_map),
-            "n": marking.sightings,
-        }
+        found = _feature(marking, kinds, "c", marking.corners_map)
         axes = ellipses(marking)
         if axes is not None:
             found["e"] = np.round(axes, 5).tolist()
@@ -77,18 +150,10 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
         "kinds": kinds,
         "cameras": list(residuals.cameras) if residuals else [],
         "markings": markings,
-        "lanes": [
-            {"id": one.id, "k": kinds.index(one.kind), "p": _metres(one.points_map), "n": one.sightings}
-            for one in hd_map.lanes
-        ],
+        "lanes": [_feature(one, kinds, "p", one.points_map) for one in hd_map.lanes],
         "symbols": [
-            {
-                "id": one.id,
-                "k": kinds.index(one.kind),
-                "p": _metres(one.outline_map),
-                "n": one.sightings,
-                "e": None if one.sigma_m is None else round(SIGMAS_95 * one.sigma_m, 5),
-            }
+            _feature(one, kinds, "p", one.outline_map)
+            | {"e": None if one.sigma_m is None else round(SIGMAS_95 * one.sigma_m, 5)}
             for one in hd_map.symbols
         ],
         "excluded": [
@@ -105,21 +170,26 @@ def layers(facts: Facts, residuals: GroundResiduals | None) -> dict[str, Any]:
     }
 
 
+def _feature(
+    one: Marking | Symbol | Lane, kinds: list[str], key: str, points_map: FloatArray
+) -> dict[str, Any]:
+    return {"id": one.id, "k": kinds.index(one.kind), key: _metres(points_map), "n": one.sightings}
+
+
 def _metres(points: FloatArray) -> list[list[float]]:
     rounded: list[list[float]] = np.round(points, 3).tolist()
     return rounded
 
 
 def _errors(facts: Facts) -> dict[int, float]:
-    """Of the markings that have a true counterpart, by their number: root mean square of the corners, m."""
+    """Root mean square corner error, m, by the number of each marking that has a true counterpart."""
     if facts.truth is None or facts.hd_map is None:
         return {}
     mapped, true = facts.hd_map.markings, facts.truth.map.markings
     rows, columns = match_markings(mapped, true)
     found = {}
     for row, column in zip(rows, columns, strict=True):
-        off = corner_errors([mapped[row]], [true[column]])
-        found[row] = float(np.sqrt((off**2).sum(axis=1).mean()))
+        found[row] = rms(corner_errors([mapped[row]], [true[column]]))
     return found
 
 

@@ -13,25 +13,19 @@ from v2hdm.detection.batch import read_image
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
 from v2hdm.records import Drive, FloatArray, Image
-from v2hdm.report.page.coding import jpeg
-from v2hdm.report.page.facts import Facts
-from v2hdm.report.page.layers import excluded_key, marking_key, symbol_key
-from v2hdm.report.page.sightings import cams_from_map
+from v2hdm.report.page.facts import Facts, cams_from_map
+from v2hdm.report.page.layers import jpeg, shrunk
 
 BUDGET_BYTES = 8_000_000
-"""Of all pictures together, as text in the page: a report stays below 15 MB."""
+"""Budget of all pictures together, as text in the page: a report stays below 15 MB."""
 
 PER_CAMERA = 2
 """Pictures of a marking by one camera: the nearest one, and one from the middle of its sightings."""
 
-_USUAL_BYTES = 5_000
-"""Of one picture; no more are cut than could fit."""
-
+_USUAL_BYTES = 5_000  # of one picture; no more are cut than could fit
 _LONGEST_PX = 320
 _LEAST_PX = 96
-_MARGIN = 0.45
-"""Share of a marking's size that is shown around it."""
-
+_MARGIN = 0.45  # share of a marking's size that is shown around it
 _QUALITY = 72
 
 _NEAR_M, _FAR_M = 3.0, 14.0
@@ -40,21 +34,20 @@ _NEAR_M, _FAR_M = 3.0, 14.0
 
 @dataclass(frozen=True)
 class _Cut:
-    """A piece of an image to be cut: of the feature ``key``, which has ``shape_map`` (N, 2).
-
-    ``seen_px`` (M, 2) are its corners as they were detected, recorded px; ``rank`` 0 is the best one of it.
-    """
+    """A piece of an image to be cut, of the feature ``key``; ``rank`` 0 is the best one of it."""
 
     key: str
     rank: int
     image: str
     row: int
-    shape_map: FloatArray
-    seen_px: FloatArray
+    shape_map: FloatArray  # (N, 2)
+    seen_px: FloatArray  # (M, 2) corners as they were detected, recorded px
 
 
 def pictures(facts: Facts) -> dict[str, list[dict[str, Any]]]:
-    """By feature (see :mod:`v2hdm.report.page.layers`) its pictures, the best first; empty without the drive.
+    """Pictures by feature, the best first: ``m`` or ``s`` and the id, ``x`` and a number for one left out.
+
+    Empty without the drive.
 
     Each has ``src`` (JPEG as base64), ``size``, ``camera``, ``image``, ``t`` (s), the shape as the map puts
     it there (``map``) and the corners as they were detected (``seen``), both in px of the picture.
@@ -96,7 +89,7 @@ def _within_budget(made: list[tuple[int, str, dict[str, Any]]]) -> dict[str, lis
 
 
 def _name(image: Image, drive: Drive) -> str:
-    """As ``residuals.csv`` names it."""
+    """The image's name in ``residuals.csv``."""
     path = image.path
     return path.relative_to(drive.root).as_posix() if path.is_relative_to(drive.root) else str(path)
 
@@ -105,13 +98,13 @@ def _cuts(facts: Facts, cam_from_map: FloatArray) -> Iterable[_Cut]:
     assert facts.hd_map is not None
     yield from _of_markings(facts)
     for symbol in facts.hd_map.symbols:
-        yield from _of_place(facts, cam_from_map, symbol_key(symbol.id), symbol.outline_map)
+        yield from _of_place(facts, cam_from_map, f"s{symbol.id}", symbol.outline_map)
     for number, one in enumerate(facts.excluded):
-        yield from _of_place(facts, cam_from_map, excluded_key(number), one.position_map[None])
+        yield from _of_place(facts, cam_from_map, f"x{number}", one.position_map[None])
 
 
 def _of_markings(facts: Facts) -> Iterable[_Cut]:
-    """Those by which a marking was mapped: nearest first, a camera at a time."""
+    """Cuts of the sightings by which markings were mapped: nearest first, one camera at a time."""
     residuals = facts.residuals
     assert residuals is not None
     assert facts.hd_map is not None
@@ -138,11 +131,11 @@ def _of_markings(facts: Facts) -> Iterable[_Cut]:
             chosen = [ranked[0], ranked[len(ranked) // 2]][: min(PER_CAMERA, len(ranked))]
             for step, (_, row, seen_px) in enumerate(chosen):
                 rank = step * len(by_camera) + number
-                yield _Cut(marking_key(marking), rank, residuals.image[row], row, corners[marking], seen_px)
+                yield _Cut(f"m{marking}", rank, residuals.image[row], row, corners[marking], seen_px)
 
 
 def _of_place(facts: Facts, cam_from_map: FloatArray, key: str, shape_map: FloatArray) -> Iterable[_Cut]:
-    """Those that look at a place from near, one of each camera; other things may stand in the way."""
+    """Cuts that look at a place from near, one per camera; other things may stand in the way."""
     residuals = facts.residuals
     assert residuals is not None
     centre = shape_map.mean(axis=0)
@@ -150,13 +143,9 @@ def _of_place(facts: Facts, cam_from_map: FloatArray, key: str, shape_map: Float
     for name, one in facts.cameras.items():
         rows = np.flatnonzero([camera == name for camera in residuals.camera])
         info = one.calibration.info
-        px, depth_m = project_ground(
-            info.intrinsic[None].repeat(len(rows), 0),
-            cam_from_map[rows],
-            centre[None, None].repeat(len(rows), 0),
-        )
-        margin = 0.05 * np.array([info.width, info.height])
-        inside = ((px[:, 0] > margin) & (px[:, 0] < np.array([info.width, info.height]) - margin)).all(axis=1)
+        px, depth_m = project_ground(info.intrinsic, cam_from_map[rows], centre[None])
+        size = np.array([info.width, info.height])
+        inside = ((px[:, 0] > 0.05 * size) & (px[:, 0] < size - 0.05 * size)).all(axis=1)
         near = inside & (depth_m[:, 0] > _NEAR_M) & (depth_m[:, 0] < _FAR_M)
         if near.any():
             best = rows[near][np.argmin(depth_m[near, 0])]
@@ -186,8 +175,7 @@ def _cut_out(
     piece = pixels[first[1] : last[1], first[0] : last[0]]
     factor = min(1.0, _LONGEST_PX / max(piece.shape[:2]))
     if factor < 1.0:
-        size = (max(1, round(piece.shape[1] * factor)), max(1, round(piece.shape[0] * factor)))
-        piece = cv2.resize(piece, size, interpolation=cv2.INTER_AREA)
+        piece = shrunk(piece, factor)
     return {
         "src": jpeg(piece, _QUALITY),
         "size": [piece.shape[1], piece.shape[0]],
@@ -210,9 +198,6 @@ def overlays(facts: Facts) -> Mapping[str, str]:
     for name in facts.cameras:
         path = facts.folder / f"overlay_{name}.png"
         pixels = cv2.imread(str(path)) if path.is_file() else None
-        if pixels is None:
-            continue
-        factor = min(1.0, 1200 / pixels.shape[1])
-        size = (round(pixels.shape[1] * factor), round(pixels.shape[0] * factor))
-        found[name] = jpeg(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), 82)
+        if pixels is not None:
+            found[name] = jpeg(shrunk(pixels, min(1.0, 1200 / pixels.shape[1])), 82)
     return found

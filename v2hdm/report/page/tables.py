@@ -1,26 +1,94 @@
-"""The report's tables and figures of merit."""
+"""The report's tables, figures of merit and cameras as texts with their units: what the templates set."""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 
+from v2hdm.geometry.mounting import angle_sigmas, centre_sigmas, mounting_angles
+from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import FloatArray, Lane, Marking, Symbol
-from v2hdm.report.metrics import corner_errors, match_markings
-from v2hdm.report.page.cells import Figure, Table, in_words, name_of, number, significant, table
-from v2hdm.report.page.facts import Facts
+from v2hdm.report.metrics import corner_errors, length_m, match_markings
+from v2hdm.report.page.facts import CameraFacts, Facts
 from v2hdm.report.page.layers import SIGMAS_95, ellipses
-from v2hdm.report.table import METHODS
-
-_LEAST_FOR_SHARE = 20
-"""Corners from which a share of them is told."""
+from v2hdm.report.terminal import METHODS
 
 
-_Mapped = TypeVar("_Mapped", Marking, Symbol, Lane)
+@dataclass(frozen=True)
+class Table:
+    """Rows of texts under their headings; ``numeric`` columns are set to the right."""
+
+    caption: str
+    headings: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    numeric: tuple[bool, ...]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One number that a reader asks for: what, how much with its unit, and what it means."""
+
+    name: str
+    value: str
+    unit: str
+    note: str
+
+
+def table(caption: str, headings: Sequence[str], rows: Iterable[Sequence[str]], words: int = 1) -> Table:
+    """A table whose first ``words`` columns are words and whose others are numbers."""
+    return Table(
+        caption, tuple(headings), tuple(tuple(row) for row in rows),
+        tuple(n >= words for n in range(len(headings))),
+    )  # fmt: skip
+
+
+def number(value: object, digits: int, factor: float = 1.0) -> str:
+    """A number as text, a dash where there is none."""
+    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
+        return "–"
+    return f"{factor * value:.{digits}f}".replace("-", "−")
+
+
+def name_of(kind: str) -> str:
+    """A class as people write it."""
+    return kind.replace("_", " ")
+
+
+def in_words(count: int, what: str) -> str:
+    """``1 marking``, ``2 markings``."""
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
+def significant(value: object) -> str:
+    """A number with three digits that count."""
+    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
+        return "–"
+    if value == 0:
+        return "0"
+    digits = max(0, 2 - math.floor(math.log10(abs(value))))
+    return number(value, min(digits, 6))
+
+
+def pair_table(caption: str, content: Mapping[str, Any]) -> Table | None:
+    """Names and values as they stand in ``metrics.json``."""
+    rows = [[name_of(str(key)), _plain(value)] for key, value in content.items()]
+    return Table(caption, ("", ""), tuple(tuple(row) for row in rows), (False, False)) if rows else None
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(_plain(one) for one in value)
+    return significant(value) if isinstance(value, float) else str(value)
+
+
+_LEAST_FOR_SHARE = 20  # corners from which a share of them is stated
+
+
+_Mapped = TypeVar("_Mapped", bound=Marking | Symbol | Lane)
 
 
 def half_axes_m(markings: Iterable[Marking]) -> FloatArray:
@@ -37,18 +105,16 @@ def relative_m(markings: Iterable[Marking]) -> FloatArray:
 
 
 def key_figures(facts: Facts) -> tuple[Figure, ...]:
-    """What stands at the top of the page."""
+    """The figures at the top of the page."""
     if facts.hd_map is None:
         return ()
     markings, best = facts.hd_map.markings, facts.best
     lanes = best.get("lanes", {})
+    symbols = f"{in_words(len(facts.hd_map.symbols), 'symbol')} besides"
+    length = f"{number(lanes.get('length_m'), 0)} m together"
     figures = [
-        Figure(
-            "Markings", str(len(markings)), "", f"{in_words(len(facts.hd_map.symbols), 'symbol')} besides"
-        ),
-        Figure(
-            "Lane lines", str(len(facts.hd_map.lanes)), "", f"{number(lanes.get('length_m'), 0)} m together"
-        ),
+        Figure("Markings", str(len(markings)), "", symbols),
+        Figure("Lane lines", str(len(facts.hd_map.lanes)), "", length),
     ]
     for name, values, note in (
         ("Between neighbours", relative_m(markings), "95 % of a corner’s error, relative"),
@@ -79,16 +145,14 @@ def accuracy_table(facts: Facts) -> Table | None:
         return None
     rows = []
     for name, own in [*by_kind.items(), *([("all", facts.hd_map.markings)] if len(by_kind) > 1 else [])]:
-        relative, absolute = 100 * relative_m(own), 100 * half_axes_m(own)
-        rows.append([
-            name_of(name), str(len(own)), number(_median(relative), 1), number(_most(relative), 1),
-            number(_median(absolute), 1), number(_most(absolute), 1),
-        ])  # fmt: skip
+        sizes_m = (relative_m(own), half_axes_m(own))
+        shares = [_percentile(values, at) for values in sizes_m for at in (50, 95)]
+        rows.append([name_of(name), str(len(own)), *(number(one, 1, 100) for one in shares)])
     return table(
         "95 % error of a corner as the adjustment states it (cm). Relative: what a marking adds to the "
-        "error of "
-        "a distance to others about 10 m away (radius). Absolute: in the map’s frame, with the drift of the "
-        "poses (larger half axis). Each for the median corner and for the corner that 95 % are better than.",
+        "error of a distance to others about 10 m away (radius). Absolute: in the map’s frame, with the "
+        "drift of the poses (larger half axis). Each for the median corner and for the corner that 95 % are "
+        "better than.",
         ("class", "markings", "relative, median", "relative, 95th", "absolute, median", "absolute, 95th"),
         rows,
     )
@@ -100,18 +164,12 @@ def truth_table(facts: Facts) -> Table | None:
         return None
     by_class = facts.best.get("by_class", {})
     rows = []
-    for name, own in _by_kind(facts.hd_map.markings).items():
-        found = by_class.get(name, {})
-        rows.append([
-            name_of(name), str(len(own)), number(found.get("false_markings"), 0),
-            number(found.get("recall"), 1, 100), number(found.get("corner_rmse_m"), 2, 100),
-            number(found.get("corner_bias_m"), 2, 100), number(_inside(own, facts), 0, 100),
-        ])  # fmt: skip
-    rows.append([
-        "all", str(len(facts.hd_map.markings)), number(facts.best.get("false_markings"), 0), "–",
-        number(facts.best.get("corner_rmse_m"), 2, 100), number(facts.best.get("corner_bias_m"), 2, 100),
-        number(_inside(facts.hd_map.markings, facts), 0, 100),
-    ])  # fmt: skip
+    for name, own in [*_by_kind(facts.hd_map.markings).items(), ("all", facts.hd_map.markings)]:
+        found = facts.best if name == "all" else by_class.get(name, {})
+        recall = None if name == "all" else found.get("recall")
+        errors = [number(found.get(key), 2, 100) for key in ("corner_rmse_m", "corner_bias_m")]
+        false, inside = number(found.get("false_markings"), 0), number(_inside(own, facts), 0, 100)
+        rows.append([name_of(name), str(len(own)), false, number(recall, 1, 100), *errors, inside])
     return table(
         "The drive was rendered, so the truth is known; the mapper never sees it. Recall counts markings "
         "that were driven past in full view. The last column tests the stated accuracy: 95 is exact, more "
@@ -150,7 +208,7 @@ _CHECK_COLUMNS: Mapping[str, tuple[str, float | None, int]] = {
     "dz_m": ("up (cm)", 100.0, 1),
     "not_compared_because": ("not compared because", None, 0),
 }
-"""Of the columns of ``check_points.csv`` heading, factor (None for words) and digits."""
+"""Heading, factor (None for words) and digits of columns of ``check_points.csv``."""
 
 
 def check_point_table(facts: Facts) -> Table | None:
@@ -177,23 +235,20 @@ def _check_cell(name: str, text: str) -> str:
         return "–"
 
 
-def exclusion_counts(facts: Facts) -> list[tuple[str, int]]:
-    """Why candidates are not in the map, the commonest reason first."""
-    return Counter(one.reason for one in facts.excluded).most_common()
-
-
 def content_table(facts: Facts) -> Table | None:
-    """What is in the map, by class: how many or how long, and how often seen."""
+    """The content of the map by class: how many or how long, and how often seen."""
     if facts.hd_map is None:
         return None
     rows = []
-    for name, own in _by_kind(facts.hd_map.markings).items():
-        rows.append([name_of(name), "marking", str(len(own)), "–", _sightings(own)])
-    for name, symbols in _by_kind(facts.hd_map.symbols).items():
-        rows.append([name_of(name), "symbol", str(len(symbols)), "–", _sightings(symbols)])
-    for name, lanes in _by_kind(facts.hd_map.lanes).items():
-        length_m = sum(float(np.linalg.norm(np.diff(one.points_map, axis=0), axis=1).sum()) for one in lanes)
-        rows.append([name_of(name), "lane line", str(len(lanes)), number(length_m, 1), _sightings(lanes)])
+    drawn: dict[str, Sequence[Marking | Symbol | Lane]] = {
+        "marking": facts.hd_map.markings, "symbol": facts.hd_map.symbols, "lane line": facts.hd_map.lanes
+    }  # fmt: skip
+    for form, every in drawn.items():
+        for name, own in _by_kind(every).items():
+            lanes = [one for one in own if isinstance(one, Lane)]
+            length = number(sum(length_m(one.points_map) for one in lanes) if lanes else None, 1)
+            sightings = number(float(np.median([one.sightings for one in own])), 0)
+            rows.append([name_of(name), form, str(len(own)), length, sightings])
     return table(
         "What the map holds. Sightings: images that show one of them, the median.",
         ("class", "as", "count", "length (m)", "sightings"),
@@ -202,8 +257,16 @@ def content_table(facts: Facts) -> Table | None:
     )
 
 
-def _sightings(own: Sequence[Any]) -> str:
-    return number(float(np.median([one.sightings for one in own])), 0)
+_AGAINST_TRUTH = {
+    "recall (%)": ("recall", 1, 100.0),
+    "false": ("false_markings", 0, 1.0),
+    "RMSE (cm)": ("corner_rmse_m", 1, 100.0),
+    "bias (cm)": ("corner_bias_m", 1, 100.0),
+}
+_WITHOUT_TRUTH = {
+    "sigma (cm)": ("median_sigma_m", 1, 100.0),
+    "reprojection (px)": ("reprojection_rmse_px", 2, 1.0),
+}
 
 
 def method_table(facts: Facts) -> Table | None:
@@ -211,22 +274,17 @@ def method_table(facts: Facts) -> Table | None:
     if not facts.results:
         return None
     has_truth = any("recall" in row for row in facts.results.values())
+    columns = _AGAINST_TRUTH if has_truth else _WITHOUT_TRUTH
     rows = []
     for name in METHODS:
         row = facts.results.get(name)
         if row is None:
             continue
-        figures = [str(row.get("markings", "–"))]
-        if has_truth:
-            figures += [number(row.get("recall"), 1, 100), number(row.get("false_markings"), 0)]
-            figures += [number(row.get(key), 1, 100) for key in ("corner_rmse_m", "corner_bias_m")]
-        else:
-            figures += [number(row.get("median_sigma_m"), 1, 100), number(row.get("reprojection_rmse_px"), 2)]
-        rows.append([name, METHODS[name], *figures])
-    truth = ("recall (%)", "false", "RMSE (cm)", "bias (cm)")
+        shown = [number(row.get(key), digits, factor) for key, digits, factor in columns.values()]
+        rows.append([name, METHODS[name], str(row.get("markings", "–")), *shown])
     return table(
         "The same drive by each method, all cameras together. Opt is the result of this report.",
-        ("", "method", "markings", *(truth if has_truth else ("sigma (cm)", "reprojection (px)"))),
+        ("", "method", "markings", *columns),
         rows,
         words=2,
     )
@@ -262,9 +320,64 @@ def _by_kind(own: Sequence[_Mapped]) -> dict[str, list[_Mapped]]:
     return dict(sorted(found.items(), key=lambda pair: -len(pair[1])))
 
 
-def _median(values: FloatArray) -> float:
-    return float(np.median(values)) if len(values) else math.nan
+def _percentile(values: FloatArray, share: float) -> float:
+    return float(np.percentile(values, share)) if len(values) else math.nan
 
 
-def _most(values: FloatArray) -> float:
-    return float(np.percentile(values, 95)) if len(values) else math.nan
+@dataclass(frozen=True)
+class CameraPage:
+    """One camera in the report: its words, its table, its picture (JPEG in base64)."""
+
+    name: str
+    words: str
+    lens: str
+    mounting: Table
+    picture: str | None = None
+
+
+def camera_pages(facts: Facts, pictures: Mapping[str, str]) -> tuple[CameraPage, ...]:
+    """One for each camera that was calibrated."""
+    extrinsics = facts.metrics.get("extrinsics") or {}
+    out = []
+    for name, one in facts.cameras.items():
+        found = extrinsics.get(name, {})
+        info = one.calibration.info
+        words = str(found.get("certainty") or "").removeprefix(f"{name}: ")
+        lens = (
+            f"{info.width} × {info.height} px, focal length {info.intrinsic[0, 0]:.0f} px, "
+            f"{name_of(info.distortion_model)}"
+        )
+        out.append(CameraPage(name, words, lens, _mounting(one, found), pictures.get(name)))
+    return tuple(out)
+
+
+def _mounting(one: CameraFacts, found: Mapping[str, Any]) -> Table:
+    calibration = one.calibration
+    matrix, covariance = calibration.cam_from_vehicle, calibration.covariance
+    centre, angles = camera_centre(matrix), np.rad2deg(mounting_angles(matrix))
+    unknown = np.full(3, np.nan)
+    centre_sigma = unknown if covariance is None else centre_sigmas(matrix, covariance)
+    angle_sigma = unknown if covariance is None else np.rad2deg(angle_sigmas(matrix, covariance))
+    rows = [
+        [f"centre {axis}", f"{number(centre[n], 3)} m", f"{number(centre_sigma[n], 1, 1e3)} mm",
+         _change(found.get(f"{key}_change_m"), 1e3, 0, "mm")]
+        for n, (axis, key) in enumerate((("forward", "x"), ("left", "y"), ("up", "z")))
+    ]  # fmt: skip
+    rows += [
+        [axis, f"{number(angles[n], 3)}°", f"{number(angle_sigma[n], 3)}°",
+         _change(found.get(f"{key}_change_deg"), 1.0, 2, "°")]
+        for n, (axis, key) in enumerate((("roll", "roll"), ("pitch, down", "pitch"), ("yaw, left", "yaw")))
+    ]  # fmt: skip
+    if one.clock_offset_s is not None:
+        rows.append([
+            "clock, images later", f"{number(one.clock_offset_s, 1, 1e3)} ms",
+            f"{number(one.clock_sigma_s, 1, 1e3)} ms", "–",
+        ])  # fmt: skip
+    return table("", ("", "value", "± 1 σ", "changed by"), rows)
+
+
+def _change(value: object, factor: float, digits: int, unit: str) -> str:
+    if not isinstance(value, int | float):
+        return "–"
+    sign = "+" if value > 0 else ""
+    return f"{sign}{number(value, digits, factor)}{unit if unit == '°' else f' {unit}'}"

@@ -1,4 +1,4 @@
-"""A port made from its configuration: scene, vehicle, drive, and one image of it at a time."""
+"""A port made from its configuration: scene, vehicle, manual calibration, drive, and single images."""
 
 from __future__ import annotations
 
@@ -11,19 +11,111 @@ from numpy.typing import NDArray
 
 from v2hdm.catalogue import PAINT_CLASSES
 from v2hdm.errors import ConfigError, DriveError
-from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import Camera, FloatArray, GeodeticOrigin, HdMap
-from v2hdm.simulate.port.alter import Alteration, alter
-from v2hdm.simulate.port.calibration import ManualCalibration, cam_from_vehicle, survey_camera
-from v2hdm.simulate.port.config import PortConfig
-from v2hdm.simulate.port.disturbance import DrivenPoses, drive_along
-from v2hdm.simulate.port.layout import build_layout
-from v2hdm.simulate.port.route import Route, build_route
+from v2hdm.geometry.ipm import project_ground
+from v2hdm.geometry.lens import distort_points, undistort_points
+from v2hdm.geometry.rigid import camera_centre, rotation_from_euler
+from v2hdm.records import Camera, CameraInfo, CentrePrior, FloatArray, GeodeticOrigin, HdMap
+from v2hdm.simulate.port.config import CalibrationConfig, CameraConfig, MountConfig, PortConfig
+from v2hdm.simulate.port.paint import Alteration, alter, build_layout
+from v2hdm.simulate.port.route import DrivenPoses, Route, build_route, drive_along
 from v2hdm.simulate.port.yard import MovingTruck, build_scene, moving_trucks
-from v2hdm.simulate.render.optics import Motion, Optics
-from v2hdm.simulate.render.renderer import Rendered, Renderer
-from v2hdm.simulate.render.scene import Box
+from v2hdm.simulate.render.renderer import Motion, Optics, Rendered, Renderer
+from v2hdm.simulate.render.scene import Box, convex_hull
 
+# Columns: the camera's x, y and z axes (right, down, forward) in a frame with x forward, y left, z up.
+_FORWARD_LEFT_UP_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def camera_info(name: str, config: CameraConfig) -> CameraInfo:
+    """The intrinsics of a configured camera."""
+    focal = config.focal_px
+    du, dv = config.principal_offset_px
+    u, v = (config.width - 1) / 2 + du, (config.height - 1) / 2 + dv
+    intrinsic = np.array([[focal, 0.0, u], [0.0, focal, v], [0.0, 0.0, 1.0]])
+    distortion = tuple(float(d) for d in config.distortion)
+    return CameraInfo(name, config.width, config.height, intrinsic, "plumb_bob", distortion)
+
+
+def cam_from_vehicle(mount: MountConfig) -> FloatArray:
+    """The extrinsic (4 x 4) of a mount: the camera looks along x, then turns by yaw, pitch and roll."""
+    angles = (np.deg2rad([a]) for a in (mount.roll_deg, mount.pitch_deg, mount.yaw_deg))
+    vehicle_from_cam = rotation_from_euler(*angles)[0] @ _FORWARD_LEFT_UP_FROM_OPTICAL
+    out = np.eye(4)
+    out[:3, :3] = vehicle_from_cam.T
+    out[:3, 3] = -vehicle_from_cam.T @ (mount.x_m, mount.y_m, mount.z_m)
+    return out
+
+
+@dataclass(frozen=True)
+class ManualCalibration:
+    """The data of a manual calibration, and its result."""
+
+    surveyed_vehicle: FloatArray  # (N, 2) m, the points on the ground as they were measured
+    clicked_px: FloatArray  # (N, 2), the same points as they were clicked in the recorded image
+    ipm: FloatArray  # vehicle_from_pinhole_px (3 x 3)
+    roi_vehicle: FloatArray  # (M, 2) m, its region: the convex hull of the surveyed points
+
+
+def calibrate(
+    info: CameraInfo, mount: MountConfig, config: CalibrationConfig, rng: np.random.Generator
+) -> ManualCalibration:
+    """Calibrate a camera by hand: survey points on the ground, click them in the image, solve.
+
+    Raises:
+        ConfigError: when a point lies outside the image, or the points do not determine a homography.
+    """
+    yaw = np.deg2rad(mount.yaw_deg)
+    ahead, left = np.array(config.points_ahead_m, dtype=np.float64).T
+    points = np.column_stack(
+        [
+            mount.x_m + ahead * np.cos(yaw) - left * np.sin(yaw),
+            mount.y_m + ahead * np.sin(yaw) + left * np.cos(yaw),
+        ]
+    )
+    pinhole_px, _ = project_ground(info.intrinsic, cam_from_vehicle(mount), points)
+    clicked_px = distort_points(info, pinhole_px)
+    clicked_px = clicked_px + rng.normal(0.0, config.click_sigma_px, points.shape)
+    surveyed = points + rng.normal(0.0, config.survey_sigma_m, points.shape)
+    outside = (clicked_px < 0).any(axis=1) | (clicked_px > (info.width - 1, info.height - 1)).any(axis=1)
+    if outside.any():
+        first_ahead, first_left = config.points_ahead_m[int(np.argmax(outside))]
+        raise ConfigError(
+            f"calibration.points_ahead_m: [{first_ahead:g}, {first_left:g}] is outside camera "
+            f"'{info.name}'; move it or the mount"
+        )
+    # Solved towards pixels, where the larger and equal errors are.
+    pinhole_from_vehicle, _ = cv2.findHomography(surveyed, undistort_points(info, clicked_px), 0)
+    if pinhole_from_vehicle is None:
+        raise ConfigError("calibration.points_ahead_m: these points do not fix a homography; spread them out")
+    ipm = np.linalg.inv(pinhole_from_vehicle)
+    unit_ipm = np.asarray(ipm / np.linalg.norm(ipm))
+    return ManualCalibration(surveyed, clicked_px, unit_ipm, convex_hull(surveyed))
+
+
+def survey_camera(
+    name: str,
+    config: CameraConfig,
+    calibration: CalibrationConfig,
+    initial_ipm: str,
+    rng: np.random.Generator,
+) -> tuple[Camera, ManualCalibration]:
+    """A camera as the mapper knows it (two IPMs, a region, a surveyed centre), and its manual calibration."""
+    info = camera_info(name, config)
+    own = calibrate(info, config.mount, calibration, rng)
+    borrowed = calibrate(info, config.borrowed_mount, calibration, rng)
+    centre = np.array([config.mount.x_m, config.mount.y_m, config.mount.z_m])
+    sigma = np.full(3, calibration.centre_sigma_m)
+    camera = Camera(
+        info=info,
+        ipm={"calibrated": own.ipm, "estimated": borrowed.ipm},
+        initial_ipm=initial_ipm,
+        roi_vehicle=own.roi_vehicle if initial_ipm == "calibrated" else borrowed.roi_vehicle,
+        centre_prior=CentrePrior(centre + rng.normal(0.0, sigma), sigma),
+    )
+    return camera, own
+
+
+_IPMS = ("calibrated", "estimated")
 ORIGIN = GeodeticOrigin(latitude_deg=29.95, longitude_deg=122.05, altitude_m=12.0, epoch=2026.0)
 
 # Independent random streams of one seed, so that a change to one part leaves the others alone.
@@ -65,14 +157,10 @@ class Port:
             full_well_electrons=exposure.full_well_electrons,
             read_noise=exposure.read_noise,
         )
-        return self.renderer.render(
-            self.cameras[camera].info,
-            self.cam_from_map(camera, frame),
-            rng,
-            optics,
-            self._motion(camera, frame),
-            self.moving_boxes(frame),
-        )
+        info, pose, motion = (
+            self.cameras[camera].info, self.cam_from_map(camera, frame), self._motion(camera, frame)
+        )  # fmt: skip
+        return self.renderer.render(info, pose, rng, optics, motion, self.moving_boxes(frame))
 
     def jpeg(self, image_bgr: NDArray[np.uint8]) -> bytes:
         """The file that the vehicle would have recorded of a picture (H, W, 3)."""
@@ -94,15 +182,12 @@ class Port:
         centre = camera_centre(extrinsic)
         turning = np.array([0.0, 0.0, yaw_rate])
         velocity = extrinsic[:3, :3] @ (np.array([speed, 0.0, 0.0]) + np.cross(turning, centre))
-        return Motion(
-            velocity_cam=_triple(velocity),
-            angular_velocity_cam=_triple(extrinsic[:3, :3] @ turning),
-            exposure_s=self.config.exposure.exposure_s,
-        )
+        (vx, vy, vz), (wx, wy, wz) = velocity.tolist(), (extrinsic[:3, :3] @ turning).tolist()
+        exposure_s = self.config.exposure.exposure_s
+        return Motion(velocity_cam=(vx, vy, vz), angular_velocity_cam=(wx, wy, wz), exposure_s=exposure_s)
 
 
-_SHORTEST_ROUTE_M = 25.0
-"""What stands in the way does so at least 12 m from either end."""
+_SHORTEST_ROUTE_M = 25.0  # what stands in the way does so at least 12 m from either end
 
 
 def _visit_seed(config: PortConfig, part: int) -> list[int]:
@@ -131,59 +216,46 @@ def build_port(config: PortConfig) -> Port:
     """
     _check(config)
 
-    def stream(part: int) -> np.random.Generator:
-        return np.random.default_rng([config.seed, part])
-
-    def anew(part: int) -> np.random.Generator:
-        return np.random.default_rng(_visit_seed(config, part))
-
+    streams = {part: np.random.default_rng([config.seed, part]) for part in (_LAYOUT, _YARD, _ALTERED)}
+    anew = {part: np.random.default_rng(_visit_seed(config, part)) for part in (_TRUCKS, _POSES)}
     route = build_route(config.route)
     if route.length_m < _SHORTEST_ROUTE_M:
         raise ConfigError(
             f"port '{config.name}', route.pieces: {route.length_m:g} m in all; "
             f"give {_SHORTEST_ROUTE_M:g} m or more"
         )
-    layout = build_layout(config.paint, route, stream(_LAYOUT))
-    layout, alterations = alter(layout, config.altered, config.paint, route, stream(_ALTERED))
-    scene = build_scene(config.surface, config.yard, route, stream(_YARD), config.seed)
+    layout = build_layout(config.paint, route, streams[_LAYOUT])
+    layout, alterations = alter(layout, config.altered, config.paint, route, streams[_ALTERED])
+    scene = build_scene(config.surface, config.yard, route, streams[_YARD], config.seed)
     cameras = {name: camera for name, (camera, _) in surveyed_cameras(config).items()}
+    scene, classes = replace(scene, paints=tuple(layout.paints)), (*PAINT_CLASSES, *config.paint.stencils)
     return Port(
         config=config,
         route=route,
-        renderer=Renderer(
-            replace(scene, paints=tuple(layout.paints)), (*PAINT_CLASSES, *config.paint.stencils)
-        ),
-        trucks=moving_trucks(config.yard, route, anew(_TRUCKS)),
+        renderer=Renderer(scene, classes),
+        trucks=moving_trucks(config.yard, route, anew[_TRUCKS]),
         hd_map=layout.hd_map(ORIGIN),
         cameras=cameras,
         cam_from_vehicle={name: cam_from_vehicle(config.cameras[name].mount) for name in cameras},
-        driven=drive_along(route, config.route, config.disturbance, anew(_POSES)),
+        driven=drive_along(route, config.route, config.disturbance, anew[_POSES]),
         alterations=tuple(alterations),
     )
 
 
 def _check(config: PortConfig) -> None:
     """Refuse what would fail far from its cause."""
+    altered, route, pieces = config.altered, config.route, config.route.pieces
     rules: list[tuple[Any, str]] = [
         (config.cameras, "cameras: none given; add at least one"),
-        (
-            config.initial_ipm in ("calibrated", "estimated"),
-            "initial_ipm: choose 'calibrated' or 'estimated'",
-        ),
+        (config.initial_ipm in _IPMS, "initial_ipm: choose 'calibrated' or 'estimated'"),
         (config.visit >= 0, "visit: must be 0 or more"),
-        (
-            min(config.altered.moved, config.altered.removed, config.altered.added) >= 0,
-            "altered: numbers must be 0 or more",
-        ),
-        (len(config.altered.moved_by_m) == 2, "altered.moved_by_m: give the least and the largest distance"),
-        (config.route.pieces, "route.pieces: empty; give [length_m, turn_deg] pieces"),
-        (
-            all(len(p) == 2 and p[0] > 0 for p in config.route.pieces),
-            "route.pieces: each is [length_m > 0, turn_deg]",
-        ),
-        (config.route.speed_mps > 0, "route.speed_mps: must be positive"),
-        (config.route.image_spacing_m > 0, "route.image_spacing_m: must be positive"),
-        (config.route.pose_rate_hz > 0, "route.pose_rate_hz: must be positive"),
+        (min(altered.moved, altered.removed, altered.added) >= 0, "altered: numbers must be 0 or more"),
+        (len(altered.moved_by_m) == 2, "altered.moved_by_m: give the least and the largest distance"),
+        (pieces, "route.pieces: empty; give [length_m, turn_deg] pieces"),
+        (all(len(p) == 2 and p[0] > 0 for p in pieces), "route.pieces: each is [length_m > 0, turn_deg]"),
+        (route.speed_mps > 0, "route.speed_mps: must be positive"),
+        (route.image_spacing_m > 0, "route.image_spacing_m: must be positive"),
+        (route.pose_rate_hz > 0, "route.pose_rate_hz: must be positive"),
         (len(config.surface.slab_m) == 2, "surface.slab_m: give length and width, or [0, 0]"),
         (0 <= config.surface.wet_fraction < 1, "surface.wet_fraction: must be within 0 and 1"),
         (config.paint.diamond_spacing_m > 1, "paint.diamond_spacing_m: must be more than 1 m"),
@@ -211,12 +283,7 @@ def _is_convex(shape: list[list[float]]) -> bool:
         return False
     side = np.roll(shape, -1, axis=0) - np.array(shape)
     following = np.roll(side, -1, axis=0)
-    turn = np.arctan2(
-        side[:, 0] * following[:, 1] - side[:, 1] * following[:, 0], (side * following).sum(axis=1)
-    )
+    cross = side[:, 0] * following[:, 1] - side[:, 1] * following[:, 0]
+    turn = np.arctan2(cross, (side * following).sum(axis=1))
     one_way = (turn > 0).all() or (turn < 0).all()
     return bool(one_way and np.isclose(abs(turn.sum()), 2 * np.pi))
-
-
-def _triple(vector: FloatArray) -> tuple[float, float, float]:
-    return float(vector[0]), float(vector[1]), float(vector[2])

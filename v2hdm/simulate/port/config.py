@@ -80,7 +80,7 @@ class CalibrationConfig:
 
 @dataclass(kw_only=True)
 class DisturbanceConfig:
-    """What separates the recorded poses from the true ones; standard deviations per axis.
+    """Differences of the recorded poses from the true ones; standard deviations per axis.
 
     Roll and pitch jitter have a white and a correlated part of equal power; so has the heading error. RTK's
     position error has a white part and one that is correlated over ``rtk_correlation_m`` of driving.
@@ -188,7 +188,7 @@ class PaintConfig:
 
 @dataclass(kw_only=True)
 class AlteredConfig:
-    """What was painted anew since the port was laid out.
+    """Paint that was moved, removed or added since the port was laid out.
 
     Attributes:
         moved: how many markings were moved.
@@ -235,7 +235,7 @@ class SurfaceConfig:
 
 @dataclass(kw_only=True)
 class YardConfig:
-    """What stands and drives in the port, and the light.
+    """Things that stand and drive in the port, and the light.
 
     ``stack_fill`` is the fraction of the places beside the route with container stacks; parked trucks
     and barriers stand closer; moving trucks come the other way. Strips are shadows of cranes and beams.

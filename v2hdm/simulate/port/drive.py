@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -16,21 +16,92 @@ import cv2
 import numpy as np
 
 from v2hdm.errors import DriveError
+from v2hdm.geometry.ipm import project_ground
+from v2hdm.geometry.lens import distort_points
 from v2hdm.geometry.planar import inside_convex
-from v2hdm.geometry.rigid import ground_in_vehicle
+from v2hdm.geometry.rigid import camera_centre, ground_in_vehicle
 from v2hdm.io.drive.folder import DRIVE_FILE, TRUTH_FOLDER
 from v2hdm.io.drive.writing import write_drive, write_truth
 from v2hdm.io.safe.pixels import read_header
 from v2hdm.io.trajectory import read_image_list
-from v2hdm.records import Drive, Image, Truth
+from v2hdm.records import BoolArray, CameraInfo, Drive, FloatArray, Image, Truth
 from v2hdm.simulate.port.build import Port, build_port
 from v2hdm.simulate.port.config import AlteredConfig, PortConfig
-from v2hdm.simulate.port.disturbance import measured_disturbances, pose_noise
-from v2hdm.simulate.port.visibility import points_seen, quad_samples
+from v2hdm.simulate.port.route import measured_disturbances, pose_noise
 from v2hdm.simulate.render.renderer import RENDERER_VERSION
+from v2hdm.simulate.render.scene import Box
 from v2hdm.store.cache.folders import note_use
 from v2hdm.store.files import whole_file
 from v2hdm.workers import share_out
+
+_SAMPLES = 5
+_FARTHEST_M = 40.0
+_NEAR_M = 0.3
+
+
+def quad_samples(corners: FloatArray) -> FloatArray:
+    """A grid of points (J, 25, 2), each standing for an equal share of quadrilaterals (J, 4, 2)."""
+    steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+    s, t = (g.ravel()[None, :, None] for g in np.meshgrid(steps, steps))
+    a, b, c, d = (corners[:, k, None, :] for k in range(4))
+    return np.asarray((1 - s) * (1 - t) * a + s * (1 - t) * b + s * t * c + (1 - s) * t * d)
+
+
+def points_seen(
+    info: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray, boxes: Sequence[Box]
+) -> BoolArray:
+    """Which ground points (N, 2) an image shows: inside its border, within 40 m, not behind a box."""
+    centre = camera_centre(cam_from_map)
+    seen = np.hypot(*(points_map - centre[:2]).T) < _FARTHEST_M
+    seen[seen] = inside_image(info, cam_from_map, points_map[seen])
+    near = [b for b in boxes if _may_hide(b, cam_from_map, float(centre[2]))]
+    if seen.any() and near:
+        seen[seen] = ~hidden_by(near, centre, points_map[seen])
+    return np.asarray(seen)
+
+
+def _may_hide(box: Box, cam_from_map: FloatArray, height_m: float) -> bool:
+    """Whether a box lies before the camera, near enough, and not above all its sight lines to the ground."""
+    reach = float(np.hypot(box.size_m[0], box.size_m[1])) / 2
+    depth = float(cam_from_map[2, :2] @ np.array(box.centre_map) + cam_from_map[2, 3])
+    return box.base_m < height_m and -reach < depth < _FARTHEST_M + reach
+
+
+def inside_image(info: CameraInfo, cam_from_map: FloatArray, points_map: FloatArray) -> BoolArray:
+    """Which ground points (N, 2) fall between the image's borders."""
+    pinhole, depth_m = project_ground(info.intrinsic, cam_from_map, points_map)
+    inside = depth_m > _NEAR_M
+    # Far outside the image the lens polynomial folds back; only near it are its values meaningful.
+    margin = np.array([info.width, info.height]) * 0.25
+    inside &= ((pinhole > -margin) & (pinhole < 5.0 * margin)).all(axis=1)
+    recorded = distort_points(info, pinhole[inside])
+    inside[inside] = ((recorded >= 0) & (recorded <= (info.width - 1, info.height - 1))).all(axis=1)
+    return np.asarray(inside)
+
+
+def hidden_by(boxes: Sequence[Box], centre_map: FloatArray, points_map: FloatArray) -> BoolArray:
+    """Which sight lines from ``centre_map`` (3,) to ground points (N, 2) pass through a box.
+
+    The slab test (Kay and Kajiya 1986) in the frame of every box.
+    """
+    hidden = np.zeros(len(points_map), dtype=np.bool_)
+    for box in boxes:
+        cos, sin = np.cos(box.yaw_rad), np.sin(box.yaw_rad)
+        turn = np.array([[cos, -sin], [sin, cos]])
+        eye = np.append((centre_map[:2] - box.centre_map) @ turn, centre_map[2] - box.base_m)
+        ground = np.column_stack(
+            [(points_map - box.centre_map) @ turn, np.full(len(points_map), -box.base_m)]
+        )
+        ray = ground - eye
+        half = np.array([box.size_m[0] / 2, box.size_m[1] / 2])
+        low, high = np.append(-half, 0.0), np.append(half, box.size_m[2])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            first, second = (low - eye) / ray, (high - eye) / ray
+        enter = np.fmin(first, second).max(axis=1)
+        leave = np.fmax(first, second).min(axis=1)
+        hidden |= (enter < np.minimum(leave, 1.0)) & (leave > 0)
+    return hidden
+
 
 Progress = Callable[[int, int], None]
 _Job = tuple[str, int, str]
@@ -43,11 +114,10 @@ def rendered_drive(config: PortConfig, cache: Path, workers: int, progress: Prog
     """The folder of a port's drive in a cache, rendered now unless it was rendered before.
 
     Args:
-        config: The port.
-        cache: Folder of all rendered drives; a drive's own folder is named by the port and a hash of its
-            configuration and of the renderer's version.
-        workers: Processes to render with; 1 renders in this one.
-        progress: Called with the number of finished images and of all.
+        config: the port.
+        cache: folder of all rendered drives.
+        workers: processes to render with; 1 renders in this one.
+        progress: called with the number of finished images and of all.
 
     Raises:
         ConfigError: when the configuration makes no port.
@@ -116,14 +186,10 @@ def render_drive(config: PortConfig, folder: Path, workers: int, progress: Progr
 
 
 def _images(port: Port, folder: Path) -> list[Image]:
+    driven = port.driven
     return [
-        Image(
-            name,
-            float(stamp),
-            folder / name / "images" / f"{frame:06d}.jpg",
-            port.driven.map_from_vehicle[frame],
-        )
-        for frame, stamp in enumerate(port.driven.stamp_s)
+        Image(name, float(stamp), folder / name / "images" / f"{frame:06d}.jpg", pose)
+        for frame, (stamp, pose) in enumerate(zip(driven.stamp_s, driven.map_from_vehicle, strict=True))
         for name in port.cameras
     ]
 

@@ -1,9 +1,10 @@
-"""What surrounds the markings of a port: containers, trucks, posts, shadows, and dirt on the ground."""
+"""The surroundings of a port's markings: containers, trucks, posts, shadows, and dirt on the ground."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from v2hdm.records import FloatArray
 from v2hdm.simulate.port.config import SurfaceConfig, YardConfig
 from v2hdm.simulate.port.route import Route
 from v2hdm.simulate.render.scene import (
+    RECTANGLE,
     Backdrop,
     Bgr,
     Box,
@@ -22,6 +24,7 @@ from v2hdm.simulate.render.scene import (
     Scene,
     Shadow,
     box_footprint,
+    placed,
 )
 
 _CONTAINER_M = (12.19, 2.44, 2.59)
@@ -52,9 +55,8 @@ class MovingTruck:
         station = self.start_m - self.speed_mps * stamp_s
         if not 15.0 < station < route.length_m - 15.0:
             return ()
-        yaw = float(route.yaw_at(np.array([station]))[0]) + np.pi
-        centre = route.points_at(np.array([station]), self.offset_m)[0]
-        return _truck((float(centre[0]), float(centre[1])), yaw, self.colour, self.seed)
+        centre, yaw = route.pose_at(station, self.offset_m)
+        return _truck(centre, yaw + np.pi, self.colour, self.seed)
 
 
 def _truck(centre_map: tuple[float, float], yaw_rad: float, colour: Bgr, seed: int) -> tuple[Box, ...]:
@@ -63,10 +65,8 @@ def _truck(centre_map: tuple[float, float], yaw_rad: float, colour: Bgr, seed: i
 
     def part(along: float, size: tuple[float, float, float], base: float, paint: Bgr, ribbed: bool) -> Box:
         x, y = np.array(centre_map) + along * ahead
-        return Box(
-            centre_map=(float(x), float(y)), size_m=size, yaw_rad=yaw_rad, albedo_bgr=paint, base_m=base,
-            corrugated=ribbed, seed=seed,
-        )  # fmt: skip
+        at: dict[str, Any] = {"centre_map": (float(x), float(y)), "yaw_rad": yaw_rad, "base_m": base}
+        return Box(size_m=size, albedo_bgr=paint, corrugated=ribbed, seed=seed, **at)
 
     black: Bgr = (0.03, 0.03, 0.03)
     return (
@@ -83,29 +83,27 @@ def build_scene(
 ) -> Scene:
     """A port without its paint."""
     azimuth, elevation = np.deg2rad(yard.sun_azimuth_deg), np.deg2rad(yard.sun_elevation_deg)
-    sun = (np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation))
-    plain = Light()
+    east, north = np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation)
+    blue, green, red = (yard.sun_strength * channel for channel in Light().sun_bgr)
     light = Light(
-        sun_direction_map=(float(sun[0]), float(sun[1]), float(sun[2])),
-        sun_bgr=_scaled(plain.sun_bgr, yard.sun_strength),
+        sun_direction_map=(float(east), float(north), float(np.sin(elevation))), sun_bgr=(blue, green, red)
     )
-    a = surface.albedo
+    a, slab_m = surface.albedo, (surface.slab_m[0], surface.slab_m[1])
     ground = Ground(
         albedo_bgr=(0.95 * a, a, 1.03 * a),
         texture=surface.texture,
         contrast=surface.contrast,
         stains=surface.stains,
-        slab_m=(surface.slab_m[0], surface.slab_m[1]) if min(surface.slab_m) > 0 else None,
+        slab_m=slab_m if min(slab_m) > 0 else None,
         slab_yaw_rad=0.02,
         joint_width_m=surface.joint_width_m,
         wet_fraction=surface.wet_fraction,
         marks=_ground_marks(surface, route, rng),
         seed=seed,
     )
-    boxes = _stacks(yard, route, rng) + _occluders(yard, route, rng)
     return Scene(
         ground=ground,
-        boxes=tuple(boxes),
+        boxes=(*_stacks(yard, route, rng), *_occluders(yard, route, rng)),
         shadows=tuple(_strips(yard, route, rng)),
         light=light,
         backdrop=Backdrop(seed=seed, haze_m=yard.haze_m),
@@ -119,15 +117,13 @@ def moving_trucks(yard: YardConfig, route: Route, rng: np.random.Generator) -> t
         speed = float(rng.uniform(3.0, 6.0))
         meeting_m = route.length_m * (k + rng.uniform(0.3, 0.9)) / yard.moving_trucks
         start = meeting_m * (1 + speed / route.speed_mps)
-        colour = _CONTAINER_COLOURS[int(rng.integers(len(_CONTAINER_COLOURS)))]
-        trucks.append(
-            MovingTruck(float(start), speed, yard.moving_offset_m, colour, int(rng.integers(1 << 20)))
-        )
+        colour, seed = _colour(rng), int(rng.integers(1 << 20))
+        trucks.append(MovingTruck(float(start), speed, yard.moving_offset_m, colour, seed))
     return tuple(trucks)
 
 
-def _scaled(colour: Bgr, factor: float) -> Bgr:
-    return colour[0] * factor, colour[1] * factor, colour[2] * factor
+def _colour(rng: np.random.Generator) -> Bgr:
+    return _CONTAINER_COLOURS[int(rng.integers(len(_CONTAINER_COLOURS)))]
 
 
 def _stacks(yard: YardConfig, route: Route, rng: np.random.Generator) -> list[Box]:
@@ -140,31 +136,21 @@ def _stacks(yard: YardConfig, route: Route, rng: np.random.Generator) -> list[Bo
             for station in np.arange(4.0, route.length_m, length + 0.6):
                 filled, tall = rng.random() < yard.stack_fill / (1 + row), int(rng.integers(1, 4))
                 colours = rng.integers(len(_CONTAINER_COLOURS), size=3)
-                at = np.array([station])
-                x, y = route.points_at(at, offset)[0]
-                yaw = float(route.yaw_at(at)[0])
-                base = Box(centre_map=(float(x), float(y)), size_m=_CONTAINER_M, yaw_rad=yaw)
+                centre, yaw = route.pose_at(station, offset)
+                base = Box(centre_map=centre, size_m=_CONTAINER_M, yaw_rad=yaw)
                 if not filled or not _keeps_clear(base, route, boxes, yard.stack_clearance_m - 0.5):
                     continue
+                base = replace(base, corrugated=True)
                 for level in range(tall):
-                    colour = _CONTAINER_COLOURS[int(colours[level])]
-                    boxes.append(
-                        replace(
-                            base,
-                            base_m=level * height,
-                            albedo_bgr=colour,
-                            corrugated=True,
-                            seed=int(station * 10) + level,
-                        )
-                    )
+                    colour, seed = _CONTAINER_COLOURS[int(colours[level])], int(station * 10) + level
+                    boxes.append(replace(base, base_m=level * height, albedo_bgr=colour, seed=seed))
     return boxes
 
 
 def _keeps_clear(box: Box, route: Route, others: list[Box], clearance_m: float) -> bool:
     corners = box_footprint(box)
-    outline = np.vstack(
-        [corners + t * (np.roll(corners, -1, axis=0) - corners) for t in (0.0, 0.25, 0.5, 0.75)]
-    )
+    sides = np.roll(corners, -1, axis=0) - corners
+    outline = np.vstack([corners + t * sides for t in (0.0, 0.25, 0.5, 0.75)])
     if float(route.distance_to(outline).min()) < clearance_m:
         return False
     reach = np.hypot(box.size_m[0], box.size_m[1]) / 2
@@ -181,21 +167,18 @@ def _occluders(yard: YardConfig, route: Route, rng: np.random.Generator) -> list
     """Parked trucks, barriers and lamp posts nearer to the route than the stacks."""
     boxes: list[Box] = []
     for _ in range(yard.parked_trucks):
-        at = np.array([rng.uniform(12.0, route.length_m - 12.0)])
-        side = float(rng.choice([-1.0, 1.0]))
-        x, y = route.points_at(at, side * rng.uniform(6.3, 7.4))[0]
-        colour = _CONTAINER_COLOURS[int(rng.integers(len(_CONTAINER_COLOURS)))]
-        boxes += _truck((float(x), float(y)), float(route.yaw_at(at)[0]), colour, int(rng.integers(1 << 20)))
+        station, side = rng.uniform(12.0, route.length_m - 12.0), float(rng.choice([-1.0, 1.0]))
+        centre, yaw = route.pose_at(station, side * rng.uniform(6.3, 7.4))
+        boxes += _truck(centre, yaw, _colour(rng), int(rng.integers(1 << 20)))
     for count, size, offsets, colour in (
         (yard.barriers, (1.3, 0.5, 0.85), (2.6, 5.0), (0.5, 0.5, 0.5)),
         (yard.lamp_posts, (0.22, 0.22, 11.0), (5.9, 8.0), (0.3, 0.3, 0.3)),
     ):
         for _ in range(count):
-            at = np.array([rng.uniform(8.0, route.length_m - 8.0)])
-            side = float(rng.choice([-1.0, 1.0]))
-            x, y = route.points_at(at, side * rng.uniform(*offsets))[0]
-            yaw = float(route.yaw_at(at)[0] + rng.normal(0.0, 0.3))
-            boxes.append(Box(centre_map=(float(x), float(y)), size_m=size, yaw_rad=yaw, albedo_bgr=colour))
+            station, side = rng.uniform(8.0, route.length_m - 8.0), float(rng.choice([-1.0, 1.0]))
+            centre, yaw = route.pose_at(station, side * rng.uniform(*offsets))
+            yaw += rng.normal(0.0, 0.3)
+            boxes.append(Box(centre_map=centre, size_m=size, yaw_rad=yaw, albedo_bgr=colour))
     return [box for box in boxes if float(route.distance_to(box_footprint(box)).min()) > 1.9]
 
 
@@ -203,13 +186,12 @@ def _strips(yard: YardConfig, route: Route, rng: np.random.Generator) -> list[Sh
     """Hard shadows of cranes, gantries and cables across the route."""
     strips = []
     for _ in range(yard.shadow_strips):
-        at = np.array([rng.uniform(0.0, route.length_m)])
-        centre = route.points_at(at, rng.uniform(-4.0, 4.0))[0]
-        yaw = float(route.yaw_at(at)[0] + rng.uniform(0.3, 2.8))
+        centre, yaw = route.pose_at(rng.uniform(0.0, route.length_m), rng.uniform(-4.0, 4.0))
+        yaw += rng.uniform(0.3, 2.8)
         axis = np.array([np.cos(yaw), np.sin(yaw)])
         across = np.array([-axis[1], axis[0]])
         length, width = rng.uniform(8.0, 30.0), rng.choice([0.15, 0.4, 0.9, 2.5])
-        corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (length / 2, width / 2)
+        corners = RECTANGLE * (length / 2, width / 2)
         polygon = centre + corners[:, :1] * axis + corners[:, 1:] * across
         strips.append(Shadow(polygon_map=polygon, softness_m=float(rng.uniform(0.03, 0.2))))
     return strips
@@ -228,13 +210,11 @@ def _ground_marks(surface: SurfaceConfig, route: Route, rng: np.random.Generator
     for _ in range(surface.patches):
         _patch(dark, pixels, route, rng)
     for _ in range(surface.oil_stains):
-        at = np.array([rng.uniform(0.0, route.length_m)])
-        x, y = pixels(route.points_at(at, rng.normal(0.0, 3.5)))[0]
-        axes = (int(rng.uniform(6, 90)), int(rng.uniform(6, 60)))
-        shade = int(rng.uniform(15, 60))
-        cv2.ellipse(
-            dark, (int(x), int(y)), axes, float(rng.uniform(0, 180)), 0, 360, shade, -1, cv2.LINE_AA, 3
-        )
+        centre, _ = route.pose_at(rng.uniform(0.0, route.length_m), rng.normal(0.0, 3.5))
+        x, y = pixels(np.array(centre)).tolist()
+        axes, shade = (int(rng.uniform(6, 90)), int(rng.uniform(6, 60))), int(rng.uniform(15, 60))
+        turn = float(rng.uniform(0, 180))
+        cv2.ellipse(dark, (x, y), axes, turn, 0, 360, shade, -1, cv2.LINE_AA, 3)
     tracks = np.zeros_like(dark)
     for _ in range(int(40 * surface.tyre_marks)):
         _tyre_marks(tracks, pixels, route, rng)
@@ -244,13 +224,8 @@ def _ground_marks(surface: SurfaceConfig, route: Route, rng: np.random.Generator
 
 
 def _patch(dark: NDArray[np.uint8], pixels: _ToPixels, route: Route, rng: np.random.Generator) -> None:
-    at = np.array([rng.uniform(0.0, route.length_m)])
-    centre = route.points_at(at, rng.uniform(-5.0, 5.0))[0]
-    yaw = float(route.yaw_at(at)[0])
-    size = rng.uniform(0.6, 3.0, 2)
-    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * size
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    polygon = corners @ np.array([[cos, sin], [-sin, cos]]) + centre
+    centre, yaw = route.pose_at(rng.uniform(0.0, route.length_m), rng.uniform(-5.0, 5.0))
+    polygon = placed(RECTANGLE * rng.uniform(0.6, 3.0, 2), centre, yaw)
     cv2.fillPoly(dark, [pixels(polygon)], int(rng.uniform(6, 26)), cv2.LINE_AA, _SUBPIXEL_BITS)
 
 

@@ -1,4 +1,4 @@
-"""What there is to be seen: the ground, the paint on it, what stands on it, and the light.
+"""A scene: the ground, the paint on it, what stands on it, and the light.
 
 Everything lies in the ``map`` frame of :mod:`v2hdm.records` (metres, z up, ground at z = 0).
 Colours are linear reflectances or radiances in blue, green, red order, as OpenCV stores them.
@@ -17,6 +17,9 @@ Bgr = tuple[float, float, float]
 
 WHITE_PAINT: Bgr = (0.70, 0.74, 0.75)
 YELLOW_PAINT: Bgr = (0.07, 0.42, 0.62)
+
+RECTANGLE = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
+"""Corners of the square from -1 to 1, counter-clockwise."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +127,7 @@ class Light:
 
 @dataclass(frozen=True, kw_only=True)
 class Backdrop:
-    """What closes the view beyond the boxes: a skyline of blocks up to ``height_rad`` high, and haze.
+    """The end of the view beyond the boxes: a skyline of blocks up to ``height_rad`` high, and haze.
 
     ``haze_m`` is the distance at which the ground has lost 63 % of its contrast.
     """
@@ -153,10 +156,13 @@ def convex_hull(points: FloatArray) -> FloatArray:
     """Convex hull (M, 2) of points (N, 2), counter-clockwise, in float64 (Andrew's monotone chain)."""
     ordered = sorted(map(tuple, np.asarray(points, dtype=np.float64)))
 
+    def turns_left(a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]) -> bool:
+        return (b[0] - a[0]) * (c[1] - a[1]) > (b[1] - a[1]) * (c[0] - a[0])
+
     def chain(sequence: list[tuple[float, ...]]) -> list[tuple[float, ...]]:
         hull: list[tuple[float, ...]] = []
         for p in sequence:
-            while len(hull) > 1 and _turn(hull[-2], hull[-1], p) <= 0:
+            while len(hull) > 1 and not turns_left(hull[-2], hull[-1], p):
                 hull.pop()
             hull.append(p)
         return hull[:-1]
@@ -164,23 +170,20 @@ def convex_hull(points: FloatArray) -> FloatArray:
     return np.array(chain(ordered) + chain(ordered[::-1]))
 
 
-def _turn(a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]) -> float:
-    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+def placed(shape: FloatArray, centre_map: FloatArray | tuple[float, float], yaw_rad: float) -> FloatArray:
+    """A shape (N, 2) turned by ``yaw_rad`` about its origin, which comes to lie at ``centre_map``."""
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    return np.asarray(shape @ np.array([[cos, sin], [-sin, cos]]) + centre_map)
 
 
 def box_footprint(box: Box) -> FloatArray:
     """The four corners (4, 2) of a box's base in the map, counter-clockwise."""
-    length, width, _ = box.size_m
-    half = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (length / 2, width / 2)
-    cos, sin = np.cos(box.yaw_rad), np.sin(box.yaw_rad)
-    return np.asarray(half @ np.array([[cos, sin], [-sin, cos]]) + box.centre_map)
+    return placed(RECTANGLE * (box.size_m[0] / 2, box.size_m[1] / 2), box.centre_map, box.yaw_rad)
 
 
 def box_shadow(box: Box, light: Light, softness_m: float = 0.08) -> Shadow:
     """The shadow that a box throws on the ground: hull of its lower and upper face along the sun's rays."""
     sun = np.array(light.sun_direction_map)
-    per_metre = -sun[:2] / max(sun[2], 0.1)
-    footprint = box_footprint(box)
-    lower = footprint + box.base_m * per_metre
-    upper = footprint + (box.base_m + box.size_m[2]) * per_metre
-    return Shadow(polygon_map=convex_hull(np.vstack([lower, upper])), softness_m=softness_m)
+    per_metre, footprint = -sun[:2] / max(sun[2], 0.1), box_footprint(box)
+    faces = [footprint + height * per_metre for height in (box.base_m, box.base_m + box.size_m[2])]
+    return Shadow(polygon_map=convex_hull(np.vstack(faces)), softness_m=softness_m)

@@ -139,7 +139,7 @@ def following_row(array: FloatArray) -> FloatArray:
 
 
 def _visible_part(view: View, polygon: FloatArray) -> FloatArray:
-    """What is left (M, 3) of a homogeneous polygon in front of the camera and near the image."""
+    """The part (M, 3) of a homogeneous polygon in front of the camera and near the image."""
     u0, v0, u1, v1 = view.rays.bounds
     limits = np.array(
         [

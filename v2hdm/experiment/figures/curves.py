@@ -4,21 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 
-from v2hdm.experiment.figures.look import colour, method_of
+from v2hdm.experiment.figures.site import colour, method_of
 from v2hdm.experiment.measures import Matched, Measured
 from v2hdm.experiment.plan import OURS, PAPER
-from v2hdm.experiment.tables import by_port
+from v2hdm.experiment.summary import by_port
 from v2hdm.mapping.options import INCREMENTAL
 from v2hdm.report import style
 
-_GRID = "#e6eaed"
 _BOX = "#7fb8b4"
 _TOP_PERCENTILE = 99.5
 """Percentile of the corner errors at which a panel of boxes ends: one bad corner would flatten the rest."""
@@ -70,12 +69,9 @@ def _draw_boxes(axes: Axes, found: Matched) -> int:
         f"{mean[-1]:.1f} cm", (number[-1], mean[-1]), xytext=(4, 0), textcoords="offset points", va="center"
     )
     top = float(np.percentile(error_cm, _TOP_PERCENTILE))
-    axes.set_xlim(0, len(number) + 1)
-    axes.set_ylim(0, 1.05 * top)
-    axes.grid(axis="y", color=_GRID)
-    axes.set_axisbelow(True)
-    axes.set_xlabel("marking, in the order of the route")
-    axes.set_ylabel("corner error (cm)")
+    axes.set(xlim=(0, len(number) + 1), ylim=(0, 1.05 * top), axisbelow=True)
+    axes.grid(axis="y", color=style.GRID)
+    axes.set(xlabel="marking, in the order of the route", ylabel="corner error (cm)")
     return int((error_cm > 1.05 * top).sum())
 
 
@@ -90,10 +86,9 @@ def save_growth(path: Path, records: Sequence[Mapping[str, Any]]) -> str | None:
             for record in records:
                 if record["port"] == port:
                     _draw_growth(axes, record["growth"])
-            _logarithmic(axes, "y")
-            _logarithmic(axes, "x")
-            axes.set_xlabel("markings mapped so far")
-            axes.set_ylabel("corner RMSE (cm)")
+            style.set_logarithmic(axes, "y")
+            style.set_logarithmic(axes, "x")
+            axes.set(xlabel="markings mapped so far", ylabel="corner RMSE (cm)", axisbelow=True)
             axes.set_title(f"{port}: the error while the map grows")
         fig.legend(handles=_growth_legend(records), loc="outside lower center", ncols=5)
     return (
@@ -110,27 +105,15 @@ def _draw_growth(axes: Axes, growth: Mapping[str, Any]) -> None:
             if not points or (recipe != OURS and method != "Opt"):
                 continue
             counts, errors = np.array(points, dtype=np.float64).T
-            incremental = recipe == INCREMENTAL
-            axes.plot(
-                counts, 100 * errors, marker=style.MARKER[method], ms=5, lw=1.3, color=colour(method),
-                ls=(0, (2, 1)) if incremental else style.LINE[method],
-                mfc="white" if incremental else colour(method),
-            )  # fmt: skip
+            look = _INCREMENTAL if recipe == INCREMENTAL else {"mfc": colour(method)}
+            axes.plot(counts, 100 * errors, ms=5, lw=1.3, **_line(method) | look)
 
 
 def _growth_legend(records: Sequence[Mapping[str, Any]]) -> list[Line2D]:
     methods = dict.fromkeys(name for record in records for name in record["growth"].get(OURS, {}))
-    handles = [
-        Line2D([], [], color=colour(name), marker=style.MARKER[name], ls=style.LINE[name], label=name)
-        for name in methods
-    ]
+    handles = [Line2D([], [], label=name, **_line(name)) for name in methods]
     if any(INCREMENTAL in record["growth"] for record in records):
-        handles.append(
-            Line2D(
-                [], [], color=colour("Opt"), marker=style.MARKER["Opt"], mfc="white", ls=(0, (2, 1)),
-                label="Opt, incremental",
-            )
-        )  # fmt: skip
+        handles.append(Line2D([], [], label="Opt, incremental", **_line("Opt") | _INCREMENTAL))
     return handles
 
 
@@ -152,14 +135,10 @@ def save_ranges(path: Path, records: Sequence[Mapping[str, Any]]) -> str | None:
                     if r["port"] == port and camera in r["residuals"]
                 ]
                 _draw_ranges(axes, found)
-                _logarithmic(axes, "y")
-                axes.set_xlabel("distance of the corner from the camera (m)")
-                axes.set_ylabel("error on the ground (cm)")
-                axes.set_title(f"{port}, {camera}")
-        handles = [
-            Line2D([], [], color=colour(name), marker=style.MARKER[name], ls=style.LINE[name], label=name)
-            for name in style.MARKER
-        ]
+                style.set_logarithmic(axes, "y")
+                axes.set(xlabel="distance of the corner from the camera (m)", axisbelow=True)
+                axes.set(ylabel="error on the ground (cm)", title=f"{port}, {camera}")
+        handles = [Line2D([], [], label=name, **_line(name)) for name in style.MARKER]
         fig.legend(handles=handles, loc="outside lower center", ncols=4)
     return (
         "How far a corner of a single sighting, laid on the ground, is from the true one (cm), by its "
@@ -180,9 +159,7 @@ def _draw_ranges(axes: Axes, found: Sequence[Mapping[str, Any]]) -> None:
             continue
         middle = np.array(sorted(bins))
         lower, median, upper = 100 * np.array([np.mean(bins[m], axis=0) for m in middle]).T
-        axes.plot(
-            middle, median, marker=style.MARKER[method], ms=4, color=colour(method), ls=style.LINE[method]
-        )
+        axes.plot(middle, median, ms=4, **_line(method))
         axes.fill_between(middle, lower, upper, color=colour(method), alpha=0.13, lw=0)
 
 
@@ -197,14 +174,11 @@ def save_balance(path: Path, measured: Sequence[Measured]) -> str | None:
             for axes, (port, drives) in zip(row, ports.items(), strict=True):
                 for name in shown:
                     found = [one.rows[cameras][name] for one in drives if name in one.rows.get(cameras, {})]
-                    spread, bias = ([100 * value for value in values] for values in (
-                        [one.spread_m for one in found if one.spread_m > 0],
-                        [one.bias_m for one in found if one.spread_m > 0],
-                    ))  # fmt: skip
-                    axes.plot(spread, bias, **_sign(name))
-                _logarithmic(axes, "x")
-                _logarithmic(axes, "y")
-                axes.set_title(f"{port}, {cameras}")
+                    pairs = [(one.spread_m, one.bias_m) for one in found if one.spread_m > 0]
+                    axes.plot(*(100 * np.array(pairs).reshape(-1, 2).T), **_sign(name))
+                style.set_logarithmic(axes, "x")
+                style.set_logarithmic(axes, "y")
+                axes.set(title=f"{port}, {cameras}", axisbelow=True)
         for axes in panels[:, 0]:
             axes.set_ylabel("bias (cm)")
         for axes in panels[-1]:
@@ -225,8 +199,15 @@ def save_balance(path: Path, measured: Sequence[Measured]) -> str | None:
     )
 
 
+_INCREMENTAL = {"ls": (0, (2, 1)), "mfc": "white"}
+
+
+def _line(method: str) -> dict[str, Any]:
+    return {"color": colour(method), "marker": style.MARKER[method], "ls": style.LINE[method]}
+
+
 def _sign(row: str) -> dict[str, Any]:
-    """How a row of the tables is drawn as single points."""
+    """Keywords of a row of the tables drawn as single points."""
     face = "white" if PAPER in row else colour(row)
     return {"lw": 0, "marker": style.MARKER[method_of(row)], "color": colour(row), "mfc": face, "ms": 7}
 
@@ -245,17 +226,4 @@ def _equal_errors(panels: Sequence[Axes]) -> None:
                     f"{value:g}", (spread[inside][0], bias[inside][0]), color=style.TRUTH, fontsize=8,
                     xytext=(2, -9), textcoords="offset points",
                 )  # fmt: skip
-        axes.set_xlim(left, right)
-        axes.set_ylim(bottom, top)
-
-
-def _logarithmic(axes: Axes, which: Literal["x", "y"]) -> None:
-    """A logarithmic axis whose 1, 2 and 5 have labels."""
-    axis = axes.xaxis if which == "x" else axes.yaxis
-    (axes.set_xscale if which == "x" else axes.set_yscale)("log")
-    axis.set_major_formatter(lambda value, _: f"{value:g}")
-    axis.set_minor_formatter(
-        lambda value, _: f"{value:g}" if f"{value:g}".lstrip("0.")[:1] in ("2", "5") else ""
-    )
-    axes.grid(axis=which, which="both", color=_GRID)
-    axes.set_axisbelow(True)
+        axes.set(xlim=(left, right), ylim=(bottom, top))

@@ -19,11 +19,14 @@ from v2hdm.errors import ConfigError
 from v2hdm.extras import need
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.geometry.rigid import inverse
+from v2hdm.io.safe.texts import shown
 from v2hdm.mapping.results import AdjustedPoses, MethodResult
 from v2hdm.records import Camera, Drive, FloatArray, HdMap, ImageDetections
 from v2hdm.report.style import METHOD, OKABE_ITO, ROUTE
 
 _log = logging.getLogger(__name__)
+
+VIEWERS = ("none", "rerun")
 
 FILE = "recording.rrd"
 """The recording's name in a result folder."""
@@ -162,6 +165,17 @@ class RerunViewer:
 
     def _pose(self, dst_from_src: FloatArray) -> Any:
         return self._rr.Transform3D(translation=dst_from_src[:3, 3], mat3x3=dst_from_src[:3, :3])
+
+
+def check_viewer(name: str) -> bool:
+    """Whether a run is to be watched by :class:`RerunViewer`.
+
+    Raises:
+        ConfigError: there is no viewer of this name.
+    """
+    if name not in VIEWERS:
+        raise ConfigError(f"viewer is {shown(name)}: choose {' or '.join(VIEWERS)}")
+    return name != "none"
 
 
 def has_display() -> bool:

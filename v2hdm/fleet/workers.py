@@ -1,0 +1,203 @@
+"""The workers of a fleet: actors that detect, tasks that map, and an actor that collects their progress."""
+
+from __future__ import annotations
+
+import os
+import time
+import traceback
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import ray
+from ray.exceptions import RayActorError, RayTaskError
+
+from v2hdm.cli.door import told
+from v2hdm.detection.batch import detect_image
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.options import DetectorOptions
+from v2hdm.errors import DriveError, WorkerError
+from v2hdm.fleet.cluster import DETECTORS_A_GPU
+from v2hdm.fleet.plan import Job, Row
+from v2hdm.pipeline import RunConfig
+from v2hdm.pipeline.finished import RunResult
+from v2hdm.pipeline.places import in_place
+from v2hdm.records import Drive, ImageDetections
+from v2hdm.store.cache.store import Store
+
+IMAGES_A_BATCH = 8
+"""Images that an actor detects in at one call: seconds of work against a millisecond of Ray's."""
+
+_BATCHES_AHEAD = 2  # calls that wait at each actor, so that it is never idle between them
+_DRIVES_KEPT = 4
+_REPORT_EVERY_S = 0.5
+
+
+class ProgressActor:
+    """Collects how far the drives are until the head asks."""
+
+    def __init__(self) -> None:
+        self._reported: dict[tuple[str, str], tuple[int, int]] = {}
+
+    def report(self, drive: str, stage: str, done: int, total: int) -> None:
+        """Note how far a drive is."""
+        self._reported[drive, stage] = done, total
+
+    def take(self) -> list[tuple[str, str, int, int]]:
+        """All reports since the last call."""
+        reported, self._reported = self._reported, {}
+        return [(*key, *value) for key, value in reported.items()]
+
+
+class DriveProgress:
+    """Reports one drive to the :class:`ProgressActor`, now and then and at the ends of its stages."""
+
+    def __init__(self, actor: Any, drive: str) -> None:
+        self._actor, self._drive, self._reported_s = actor, drive, -_REPORT_EVERY_S
+
+    def __call__(self, task: str, done: int, total: int) -> None:
+        """``done`` of ``total`` steps of ``task`` are finished."""
+        now_s = time.monotonic()
+        if done >= total or now_s - self._reported_s >= _REPORT_EVERY_S:
+            self._reported_s = now_s
+            self._actor.report.remote(self._drive, task, done, total)
+
+
+class DetectorActor:
+    """Detects in images: the model and the last drives stay loaded. Relative paths begin at ``folder``."""
+
+    def __init__(self, folder: str) -> None:
+        os.chdir(folder)
+        cv2.setNumThreads(1)
+        self._detectors: dict[str, Detector] = {}
+        self._drives: dict[str, Drive] = {}
+
+    def process(self) -> int:
+        """Its process's number."""
+        return os.getpid()
+
+    def detect(
+        self, drive: Sequence[Any], options: DetectorOptions, images: Sequence[int]
+    ) -> list[ImageDetections]:
+        """Detections in some images of a drive, given by a reference within a list: it is fetched once."""
+        (reference,) = drive
+        key, known = reference.hex(), repr(options)
+        if key not in self._drives:
+            if len(self._drives) == _DRIVES_KEPT:
+                self._drives.pop(next(iter(self._drives)))
+            self._drives[key] = ray.get(reference)
+            root = self._drives[key].root
+            if not root.exists():
+                raise DriveError(
+                    f"{root}: is not on {os.uname().nodename}, which is to detect in its images; put drives, "
+                    "and local_cache for those that are copied, on a folder that all machines share"
+                )
+        if known not in self._detectors:
+            self._detectors = {known: Detector.load(options=options)}
+        return [detect_image(self._detectors[known], self._drives[key], index) for index in images]
+
+
+def open_detectors(
+    devices: Collection[str], cores: int, gpus: int, gpu_share: float, folder: str, retries: int
+) -> dict[str, list[Any]]:
+    """Actors that detect, for each device that is asked for: one per core, on GPUs some to each.
+
+    ``cores`` and ``gpus`` are those of all machines; an actor on a GPU books ``gpu_share`` of it.
+    """
+    actor = ray.remote(DetectorActor)
+    # A core has one actor that detects and one drive that is mapped: the one waits for the other by turns.
+    # Actors on GPUs are counted there.
+    places = {
+        "cpu": (cores, {"num_cpus": 0.5}),
+        "cuda": (min(cores, DETECTORS_A_GPU * gpus), {"num_cpus": 0, "num_gpus": gpu_share}),
+    }
+    opened = {}
+    for device in devices:
+        count, books = places[device]
+        options = actor.options(max_restarts=-1, max_task_retries=retries, **books)
+        opened[device] = [options.remote(folder) for _ in range(count)]
+    return opened
+
+
+def detect_by(
+    detectors: Sequence[Any],
+    drive: Drive,
+    options: DetectorOptions,
+    images: Sequence[int],
+    workers: int,
+    take: Callable[[ImageDetections], None],
+) -> None:
+    """:func:`v2hdm.detection.batch.detect_images` by actors, with the same detections and errors.
+
+    Raises:
+        WorkerError: an actor died again and again.
+    """
+    reference = ray.put(drive)
+    batches = [images[begin : begin + IMAGES_A_BATCH] for begin in range(0, len(images), IMAGES_A_BATCH)]
+    found: dict[int, list[ImageDetections]] = {}
+    waiting: dict[Any, tuple[int, Any]] = {}
+    free = _BATCHES_AHEAD * list(detectors)
+    left, taken = list(enumerate(batches))[::-1], 0
+    while left or waiting:
+        while left and free:
+            number, batch = left.pop()
+            actor = free.pop(0)
+            waiting[actor.detect.remote([reference], options, batch)] = number, actor
+        (done,), _ = ray.wait(list(waiting), num_returns=1)
+        number, actor = waiting.pop(done)
+        found[number] = _result(done)
+        free.append(actor)
+        while taken in found:
+            for one in found.pop(taken):
+                take(one)
+            taken += 1
+
+
+def _result(reference: Any) -> list[ImageDetections]:
+    try:
+        result: list[ImageDetections] = ray.get(reference)
+    except RayTaskError as failure:
+        raise failure.cause from None
+    except RayActorError:
+        raise WorkerError(
+            "a detection worker died again and again over the same images, perhaps for want of memory; set "
+            "fewer --workers, or look at the images"
+        ) from None
+    return result
+
+
+def map_drive(job: Job, detectors: Sequence[Any], progress: Any, folder: str) -> tuple[Row, str]:
+    """Map one drive and write its results; its row, and the traceback where it met a bug of ours.
+
+    ``progress`` is the :class:`ProgressActor`; relative paths begin at ``folder``.
+    """
+    os.chdir(folder)
+    job.config.workers = 1
+    try:
+        report = DriveProgress(progress, job.name)
+        mapped = partial(_mapped, job, detectors, report)
+        result, kept = in_place(job.config, mapped, job.config.resume, report)
+    except Exception as error:  # a drive that fails is a row, and the others go on
+        line = told(error)
+        if line is not None:
+            return Row.of_error(job.name, job.source, line), ""
+        line = f"a bug of ours, {type(error).__name__}: {error}; its traceback is in the fleet's folder"
+        return Row.of_error(job.name, job.source, line), traceback.format_exc()
+    return Row.of_result(job.name, job.source, result.place, result.metrics, kept), ""
+
+
+def _mapped(
+    job: Job, detectors: Sequence[Any], report: DriveProgress, config: RunConfig, store: Store
+) -> RunResult:
+    # They load torch, which a finished result does not need.
+    from v2hdm.fleet.crew import RayCrew
+    from v2hdm.mapping.crew import ALONE, Crew
+    from v2hdm.pipeline.work import map_drives
+
+    crew: Crew = ALONE
+    if len(config.drive.paths) > 1:
+        crew = RayCrew(len(detectors), str(Path.cwd()))
+    detect = partial(detect_by, detectors)
+    return map_drives(config, store, job.config_yaml, report, detect=detect, crew=crew)

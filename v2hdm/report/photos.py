@@ -1,0 +1,265 @@
+"""Lines on photographs: ground grids, horizons and the map, visible on paint and asphalt, with a legend."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from v2hdm.geometry.ipm import apply_in_front, project_ground
+from v2hdm.geometry.lens import distort_points
+from v2hdm.geometry.rigid import camera_centre
+from v2hdm.records import BoolArray, Camera, CameraInfo, FloatArray, HdMap
+from v2hdm.report.metrics import runs, way_along
+from v2hdm.report.style import OKABE_ITO
+from v2hdm.store.files import whole_file
+
+_SUBPIXELS = 4  # bits of a pixel's fraction in which OpenCV takes coordinates
+_LARGEST_PX = 1e4  # farther out nothing is drawn, and OpenCV's integers would overflow
+_HALO_BGR = (25, 25, 25)
+_STRIP_BGR = (250, 250, 250)
+_TEXT_BGR = (35, 35, 35)
+_FONT = cv2.FONT_HERSHEY_DUPLEX
+
+
+@dataclass(frozen=True)
+class Pen:
+    """How a line is drawn: ``colour`` as #rrggbb; ``dash_px``, length of dash and gap, None for solid."""
+
+    colour: str
+    dash_px: tuple[float, float] | None = None
+    width: int = 2
+
+    @property
+    def bgr(self) -> tuple[int, int, int]:
+        """The colour as OpenCV takes it."""
+        value = int(self.colour[1:], 16)
+        return value & 255, value >> 8 & 255, value >> 16
+
+
+def draw_lines(canvas: np.ndarray, lines: Iterable[FloatArray], pen: Pen) -> None:
+    """Draw polylines (N, 2) px, with a dark edge, so that they are seen on paint and on asphalt."""
+    pieces = [piece for line in lines for piece in (_dashes(line, *pen.dash_px) if pen.dash_px else [line])]
+    clipped = [np.clip(piece, -_LARGEST_PX, _LARGEST_PX) for piece in pieces]
+    fixed = [np.round(piece * (1 << _SUBPIXELS)).astype(np.int32) for piece in clipped]
+    for colour, width in ((_HALO_BGR, 2 * pen.width), (pen.bgr, pen.width)):
+        cv2.polylines(canvas, fixed, False, colour, width, cv2.LINE_AA, shift=_SUBPIXELS)
+
+
+def _dashes(line: FloatArray, dash_px: float, gap_px: float) -> list[FloatArray]:
+    """The dashes of a polyline: pieces of it that are ``dash_px`` long."""
+    way = way_along(line)
+    out = []
+    for start in np.arange(0.0, way[-1], dash_px + gap_px):
+        end = min(start + dash_px, way[-1])
+        between = (way > start) & (way < end)
+        ends = np.column_stack([np.interp([start, end], way, line[:, axis]) for axis in (0, 1)])
+        out.append(np.vstack([ends[:1], line[between], ends[1:]]))
+    return out
+
+
+def with_legend(canvas: np.ndarray, entries: Sequence[tuple[Pen | None, str]]) -> np.ndarray:
+    """The picture (H, W, 3) with a strip below it that names each pen; text alone has none."""
+    width = canvas.shape[1]
+    size = float(np.clip(width / 1900, 0.4, 0.75))
+    row_px, sample_px = round(44 * size), round(64 * size)
+    rows: list[list[tuple[Pen | None, str, int]]] = [[]]
+    used = 0
+    for pen, text in entries:
+        needed = (sample_px + 12 if pen else 0) + cv2.getTextSize(text, _FONT, size, 1)[0][0] + 28
+        if rows[-1] and used + needed > width - 16:
+            rows.append([])
+            used = 0
+        rows[-1].append((pen, text, used + 16))
+        used += needed
+    strip = np.full((row_px * len(rows) + 8, width, 3), _STRIP_BGR, np.uint8)
+    for number, row in enumerate(rows):
+        middle = 4 + row_px * number + row_px // 2
+        for pen, text, left in row:
+            if pen is not None:
+                draw_lines(strip, [np.array([[left, middle], [left + sample_px, middle]], float)], pen)
+                left += sample_px + 12
+            cv2.putText(strip, text, (left, middle + round(9 * size)), _FONT, size, _TEXT_BGR, 1, cv2.LINE_AA)
+    return np.vstack([canvas, strip])
+
+
+_FARTHEST_M = 40.0  # lines farther along the view lie on top of each other near the horizon
+
+_ALONG_M, _ACROSS_M = 5.0, 2.0  # spacing of the grid along and across the vehicle
+_HALF_WIDTH_M = 8.0  # how far the grid reaches to either side of the camera
+_NEAREST_M = 0.3  # ground nearer than this to the camera's plane has no place in an image
+
+PENS: Mapping[str, Pen] = {
+    "guess": Pen(OKABE_ITO["orange"], dash_px=(8.0, 5.0), width=1),
+    "ground": Pen(OKABE_ITO["sky"], width=1),
+}
+"""How the grid is drawn under each mounting: the guess, and the one found from bare ground."""
+
+_WORDS: Mapping[str, str] = {"guess": "grid and horizon: the guess", "ground": "as bare ground says"}
+
+_ROI = Pen("#ffffff")
+
+_SMALL_FONT, _TEXT_SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.45
+
+
+def save_grid(
+    path: Path, image: np.ndarray, camera: Camera, mountings: Mapping[str, FloatArray], caption: str
+) -> None:
+    """Draw horizon, metric ground grid and ROI into an image (H, W, 3) BGR, as recorded.
+
+    ``mountings`` are ``cam_from_vehicle`` (4 x 4) by a name of :data:`PENS`.
+    """
+    canvas = image.copy()
+    legend: list[tuple[Pen | None, str]] = [(None, caption)]
+    for name, cam_from_vehicle in mountings.items():
+        pen = PENS[name]
+        for line in _grid_lines(cam_from_vehicle):
+            draw_lines(canvas, project_line(camera.info, cam_from_vehicle, line), pen)
+        draw_lines(canvas, [_horizon(camera.info, cam_from_vehicle)], replace(pen, width=2))
+        legend.append((pen, _WORDS[name]))
+    closed = np.vstack([camera.roi_vehicle, camera.roi_vehicle[:1]])
+    parts, first = np.linspace(0, 1, 40)[:, None], next(iter(mountings.values()))
+    dense = np.concatenate([a + parts * (b - a) for a, b in itertools.pairwise(closed)])
+    draw_lines(canvas, project_line(camera.info, first, dense), _ROI)
+    legend.append((_ROI, "roi_vehicle, by the guess"))
+    for number, (name, cam_from_vehicle) in enumerate(mountings.items()):
+        _label(canvas, camera.info, cam_from_vehicle, PENS[name], to_the_left=number == 0)
+    _write_image(path, with_legend(canvas, legend), cv2.IMWRITE_JPEG_QUALITY, 88)
+
+
+def project_line(
+    info: CameraInfo, cam_from_vehicle: FloatArray, line_vehicle: FloatArray
+) -> list[FloatArray]:
+    """The pieces (N, 2), recorded px, of a dense ground line (M, 2) that lie in and near the image."""
+    pinhole, depth_m = project_ground(info.intrinsic, cam_from_vehicle, line_vehicle)
+    return _visible_pieces(info, pinhole, depth_m > _NEAREST_M, 0.15)
+
+
+def _axes(cam_from_vehicle: FloatArray) -> tuple[FloatArray, int, float]:
+    """The camera's foot, the vehicle axis (0 or 1) that it looks along most, and to which side."""
+    foot = camera_centre(cam_from_vehicle)[:2]
+    view = cam_from_vehicle[2, :2]
+    along = int(np.argmax(np.abs(view)))
+    return foot, along, float(np.sign(view[along]) or 1.0)
+
+
+def _marks(cam_from_vehicle: FloatArray) -> FloatArray:
+    """Coordinates of the lines across the view, in the vehicle frame."""
+    foot, along, side = _axes(cam_from_vehicle)
+    ends = np.sort([foot[along], foot[along] + side * _FARTHEST_M])
+    return np.arange(np.ceil(ends[0] / _ALONG_M), np.floor(ends[1] / _ALONG_M) + 1) * _ALONG_M
+
+
+def _grid_lines(cam_from_vehicle: FloatArray) -> list[FloatArray]:
+    foot, along, side = _axes(cam_from_vehicle)
+    other = 1 - along
+    middle = round(float(foot[other]) / _ACROSS_M) * _ACROSS_M
+    sides = middle + np.arange(-_HALF_WIDTH_M, _HALF_WIDTH_M + 0.1, _ACROSS_M)
+    lines = []
+    for mark in _marks(cam_from_vehicle):
+        line = np.full((60, 2), mark)
+        line[:, other] = np.linspace(sides[0], sides[-1], 60)
+        lines.append(line)
+    for mark in sides:
+        # Denser where it is near: the same number of points to each doubling of the distance.
+        line = np.full((300, 2), mark)
+        line[:, along] = foot[along] + side * np.geomspace(0.2, _FARTHEST_M, 300)
+        lines.append(line)
+    return lines
+
+
+def _horizon(info: CameraInfo, cam_from_vehicle: FloatArray) -> FloatArray:
+    """Where level directions within 60 deg of the view are seen, recorded px (N, 2)."""
+    heading = np.arctan2(cam_from_vehicle[2, 1], cam_from_vehicle[2, 0])
+    angles = heading + np.deg2rad(np.linspace(-60, 60, 241))
+    rays = np.column_stack([np.cos(angles), np.sin(angles)]) @ cam_from_vehicle[:3, :2].T
+    rays = rays[rays[:, 2] > 0.2]
+    pinhole = (rays @ info.intrinsic.T)[:, :2] / rays[:, 2:]
+    return distort_points(info, pinhole[np.abs(pinhole[:, 0] / info.width - 0.5) < 0.6])
+
+
+def _label(
+    canvas: np.ndarray, info: CameraInfo, cam_from_vehicle: FloatArray, pen: Pen, to_the_left: bool
+) -> None:
+    """Write the lines' coordinates in metres beside the middle of the view."""
+    foot, along, _ = _axes(cam_from_vehicle)
+    last_v = np.inf
+    for mark in sorted(_marks(cam_from_vehicle), key=lambda mark: abs(mark - foot[along])):
+        place = foot.copy()
+        place[along] = mark
+        pieces = project_line(info, cam_from_vehicle, np.array([place, place]))
+        if not pieces or last_v - pieces[0][0, 1] < 16:
+            continue
+        u, last_v = pieces[0][0]
+        text = f"{'xy'[along]} {mark:g} m"
+        left = -6 - cv2.getTextSize(text, _SMALL_FONT, _TEXT_SIZE, 1)[0][0] if to_the_left else 6
+        _write(canvas, text, (int(u) + left, int(last_v) - 4), pen.bgr)
+
+
+def _write(canvas: np.ndarray, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> None:
+    (width, height), below = cv2.getTextSize(text, _SMALL_FONT, _TEXT_SIZE, 1)
+    corner, opposite = (at[0] - 2, at[1] - height - 2), (at[0] + width + 2, at[1] + below)
+    cv2.rectangle(canvas, corner, opposite, (40, 40, 40), cv2.FILLED)
+    cv2.putText(canvas, text, at, _SMALL_FONT, _TEXT_SIZE, colour, 1, cv2.LINE_AA)
+
+
+_OVERLAY_RANGE_M = 30.0
+
+_BEFORE = Pen(OKABE_ITO["orange"], dash_px=(9.0, 6.0))  # how the map is drawn by what a run began with
+
+OVERLAY = {"Opt": Pen(OKABE_ITO["sky"])}
+"""How it is drawn by what the run found."""
+
+
+def save_overlay(
+    path: Path,
+    image: np.ndarray,
+    info: CameraInfo,
+    hd_map: HdMap,
+    position_map: FloatArray,
+    views: Mapping[str, FloatArray],
+) -> None:
+    """Draw a map into an image, as recorded, as several calibrations and poses project it.
+
+    Markings far from ``position_map`` (2,), the vehicle's, are not drawn. ``views`` are by name the
+    homography ``pinhole_px_from_map`` (3 x 3) of the ground, whose third coordinate is positive in front of
+    the camera.
+    """
+    canvas = image.copy()
+    outlines = [one.corners_map for one in hd_map.markings] + [one.outline_map for one in hd_map.symbols]
+    lines = [*(np.vstack([one, one[:1]]) for one in outlines), *(lane.points_map for lane in hd_map.lanes)]
+    legend: list[tuple[Pen | None, str]] = []
+    for name, pinhole_px_from_map in views.items():
+        pen = OVERLAY.get(name, _BEFORE)
+        for line in lines:
+            draw_lines(canvas, _project_map_line(line, info, position_map, pinhole_px_from_map), pen)
+        said = "found by the run" if name in OVERLAY else "that the run began with"
+        legend.append((pen, f"{name}: the map by the calibration and pose {said}"))
+    _write_image(path, with_legend(canvas, legend))
+
+
+def _project_map_line(
+    line_map: FloatArray, info: CameraInfo, position_map: FloatArray, pinhole_px_from_map: FloatArray
+) -> list[FloatArray]:
+    """The visible pieces (N, 2), recorded px, of a ground line; densified, so lenses bend it."""
+    dense = np.concatenate([np.linspace(a, b, 8) for a, b in itertools.pairwise(line_map)])
+    near = np.linalg.norm(dense - position_map, axis=1) < _OVERLAY_RANGE_M
+    return _visible_pieces(info, apply_in_front(pinhole_px_from_map, dense), near, 0.1)
+
+
+def _visible_pieces(
+    info: CameraInfo, pinhole_px: FloatArray, visible: BoolArray, margin: float
+) -> list[FloatArray]:
+    """The visible pieces, recorded px, of a line in and near the image, by a share of the image's size."""
+    size = np.array([info.width, info.height])
+    visible = visible & ((pinhole_px > -margin * size) & (pinhole_px < (1 + margin) * size)).all(axis=1)
+    return [distort_points(info, piece) for piece in runs(pinhole_px, visible)]
+
+
+def _write_image(path: Path, canvas: np.ndarray, *options: int) -> None:
+    with whole_file(path) as partial:
+        partial.write_bytes(cv2.imencode(path.suffix, canvas, options)[1].tobytes())

@@ -1,0 +1,130 @@
+"""Tables and progress bars on the terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from v2hdm.progress import progress_lines
+
+DriveProgress = Callable[[str, str, int, int], None]
+"""Called with a drive, its stage, and how many of the stage's steps are done, of how many."""
+
+METHODS: Mapping[str, str] = {
+    "CNI": "naive map, manually calibrated IPM",
+    "ENI": "naive map, IPM estimated from another vehicle",
+    "Opt": "joint optimisation of extrinsics and corners",
+    "ONI": "naive map, optimised IPM",
+}
+"""The methods of the paper (IROS 2023), in the order of its tables."""
+
+
+_AGAINST_TRUTH = ("recall", "false", "corner RMSE (cm)", "bias (cm)")
+_WITHOUT_TRUTH = ("sigma (cm)", "reprojection (px)")
+
+
+def results_table(title: str, results: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Table:
+    """Method x camera set: markings, recall and corner errors, from ``metrics.json``'s ``results``."""
+    has_truth = any("recall" in row for rows in results.values() for row in rows.values())
+    headings = _AGAINST_TRUTH if has_truth else _WITHOUT_TRUTH
+    table = new_table(title, ("method", "cameras"), ("markings", *headings))
+    methods = sorted({m for rows in results.values() for m in rows}, key=lambda m: (_order(m), m))
+    for method in methods:
+        for cameras, rows in results.items():
+            if method in rows:
+                table.add_row(method, cameras, *_cells(rows[method], has_truth))
+        table.add_section()
+    return table
+
+
+def new_table(
+    title: str | None, words: Sequence[str], numbers: Sequence[str], before: Sequence[str] = ()
+) -> Table:
+    """An empty table whose columns of numbers, ``before`` among them, are set to the right."""
+    table = Table(title=title, title_justify="left", header_style="bold")
+    for heading in (*before, *words, *numbers):
+        table.add_column(heading, justify="left" if heading in words else "right")
+    return table
+
+
+def _order(method: str) -> int:
+    return list(METHODS).index(method) if method in METHODS else len(METHODS)
+
+
+def _cells(row: Mapping[str, float], has_truth: bool) -> list[str]:
+    if not has_truth:
+        sigma, reprojection = row.get("median_sigma_m"), row.get("reprojection_rmse_px")
+        return [str(row["markings"]), _number(sigma, 1, 100.0), _number(reprojection, 2)]
+    return [
+        str(row["markings"]),
+        _number(row.get("recall"), 3),
+        str(row.get("false_markings", "-")),
+        *(_number(row.get(key), 1, 100.0) for key in ("corner_rmse_m", "corner_bias_m")),
+    ]
+
+
+def _number(value: float | None, digits: int, factor: float = 1.0) -> str:
+    return "-" if value is None or math.isnan(value) else f"{factor * value:.{digits}f}"
+
+
+def changes_table(changes: Mapping[str, Any]) -> Table:
+    """The fate of an earlier map's markings that moved, are gone or are new, one per row."""
+    counts = ", ".join(f"{number} {fate}" for fate, number in changes["counts"].items() if number)
+    numbers = ("by (cm)", "sigma (cm)", "odds", "seen / should be")
+    table = new_table(f"changes: {counts}", ("class", "fate"), numbers, before=("id",))
+    table.add_column("at (m)")
+    for one in changes["listed"]:
+        shift, sigma = one["shift_m"], one["shift_sigma_m"]
+        corners = one["after_map"] or one["before_map"]
+        x, y = (sum(corner[k] for corner in corners) / len(corners) for k in (0, 1))
+        table.add_row(
+            str(one["id"]),
+            one["class"],
+            one["fate"],
+            "" if shift is None else f"{100 * math.hypot(*shift):.0f}",
+            "" if sigma is None else f"{100 * math.hypot(*sigma) / math.sqrt(2):.1f}",
+            f"{one['probability']:.3f}",
+            f"{one['found']} / {one['views']}",
+            f"({x:.1f}, {y:.1f})",
+        )
+    return table
+
+
+@contextmanager
+def drive_bars(console: Console, endings: Collection[str] = ()) -> Iterator[DriveProgress]:
+    """A bar for each drive in work, until its stage is one of ``endings``; without a terminal, lines."""
+    if not console.is_terminal:
+        lines = progress_lines(lambda line: plain(console, line))
+        yield lambda drive, stage, done, total: lines(f"{drive}: {stage}", done, total)
+        return
+    columns = (
+        TextColumn("{task.description:<20}", markup=False),
+        TextColumn("{task.fields[stage]:<16}", markup=False),
+        BarColumn(30),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def advance(drive: str, stage: str, done: int, total: int) -> None:
+            if stage in endings:
+                if drive in tasks:
+                    bars.remove_task(tasks.pop(drive))
+                return
+            if drive not in tasks:
+                tasks[drive] = bars.add_task(drive, total=total, stage=stage)
+            bars.update(tasks[drive], completed=done, total=total, stage="" if stage == "drives" else stage)
+
+        yield advance
+
+
+def plain(console: Console, line: str) -> None:
+    """Print a line as it is, however long."""
+    console.print(line, highlight=False, markup=False, soft_wrap=True)

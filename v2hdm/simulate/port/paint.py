@@ -1,0 +1,367 @@
+"""The markings of a port: what is painted where, what was painted anew, and the true map of both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import numpy as np
+
+from v2hdm.catalogue import CORNERED_CLASSES, PAINT_CLASSES
+from v2hdm.geometry.planar import signed_area
+from v2hdm.records import (
+    ARROW,
+    DIAMOND,
+    LANE_DASH,
+    LANE_LINE,
+    OTHER_PAINT,
+    STOP_LINE,
+    FloatArray,
+    GeodeticOrigin,
+    HdMap,
+    Lane,
+    Marking,
+)
+from v2hdm.simulate.port.config import AlteredConfig, PaintConfig, StencilConfig
+from v2hdm.simulate.port.route import Route
+from v2hdm.simulate.render.scene import WHITE_PAINT, YELLOW_PAINT, Bgr, Paint, placed
+
+_VERTEX_SPACING_M = 0.5
+_PIECE_TURN_RAD = 0.06
+_PIECE_LENGTH_M = 25.0
+_PIECE_OVERLAP_M = 0.1
+_LEAST_GAP_M = 1.7
+_LINE_GAP_M = 1.1
+_STENCIL_TRIES = 10
+_DIAMOND = np.array([[0.5, 0.0], [0.0, 0.5], [-0.5, 0.0], [0.0, -0.5]])
+_ARROW_M = [
+    np.array([[-1.5, -0.08], [0.55, -0.08], [0.55, 0.08], [-1.5, 0.08]]),
+    np.array([[0.5, -0.35], [1.5, 0.0], [0.5, 0.35]]),
+]
+_STOP_LINE_M = [np.array([[-0.2, -1.5], [0.2, -1.5], [0.2, 1.5], [-0.2, 1.5]])]
+# The bars (x0, x1, y0, y1) of a letter like an eight on a pocket calculator.
+_LETTER_BARS_M = (
+    (-0.6, 0.6, 0.0, 0.1),
+    (-0.6, 0.6, 0.3, 0.4),
+    (-0.6, -0.5, 0.1, 0.3),
+    (-0.05, 0.05, 0.1, 0.3),
+    (0.5, 0.6, 0.1, 0.3),
+)
+
+
+@dataclass
+class Layout:
+    """Paint, and the markings and lanes of the true map that it stands for."""
+
+    paints: list[Paint] = field(default_factory=list)
+    markings: list[Marking] = field(default_factory=list)
+    lanes: list[Lane] = field(default_factory=list)
+    occupied_map: list[FloatArray] = field(default_factory=list)
+
+    def hd_map(self, origin: GeodeticOrigin | None) -> HdMap:
+        """The true map."""
+        return HdMap(markings=tuple(self.markings), lanes=tuple(self.lanes), origin=origin)
+
+    def vertices(self) -> FloatArray:
+        """The vertices (N, 2) of all lanes."""
+        return np.vstack([lane.points_map for lane in self.lanes] or [np.empty((0, 2))])
+
+    def is_free(self, centre: FloatArray, lines: FloatArray) -> bool:
+        """Whether a marking at ``centre`` (2,) keeps clear of ``lines`` (N, 2) and of all other paint."""
+        for points, gap_m in ((lines, _LINE_GAP_M), (np.array(self.occupied_map), _LEAST_GAP_M)):
+            if len(points) and float(((points - centre) ** 2).sum(axis=1).min()) < gap_m**2:
+                return False
+        return True
+
+
+def build_layout(config: PaintConfig, route: Route, rng: np.random.Generator) -> Layout:
+    """Paint a port along its route."""
+    painter = _Painter(config, route, rng, Layout())
+    for offset in config.solid_offsets_m:
+        painter.solid_line(offset)
+    for offset in config.dashed_offsets_m:
+        painter.dashed_line(offset)
+    painter.other_paint()
+    for offset in config.diamond_offsets_m:
+        painter.diamond_row(offset, False)
+    for offset in config.field_offsets_m:
+        painter.diamond_row(offset, True)
+    for kind, stencil in config.stencils.items():
+        painter.stencil_rows(kind, stencil)
+    return painter.layout
+
+
+@dataclass
+class _Painter:
+    config: PaintConfig
+    route: Route
+    rng: np.random.Generator
+    layout: Layout
+
+    def _paint(
+        self, kind: str, polygon: FloatArray, worn: tuple[float, float], seed: int, colour: Bgr = WHITE_PAINT
+    ) -> None:
+        wear, dirt = worn
+        self.layout.paints.append(
+            Paint(kind=kind, polygon_map=polygon, albedo_bgr=colour, wear=wear, dirt=dirt, seed=seed)
+        )
+
+    def _worn(self) -> tuple[float, float]:
+        """Wear and dirt of one marking: gamma distributed about the means, never gone altogether."""
+        wear = self.config.wear * float(self.rng.gamma(2.0, 0.5))
+        dirt = self.config.dirt * float(self.rng.gamma(2.0, 0.5))
+        return min(wear, 0.4), min(dirt, 0.7)
+
+    def _seed(self) -> int:
+        return int(self.rng.integers(1 << 30))
+
+    def _colour(self) -> Bgr:
+        return WHITE_PAINT if self.rng.random() < 0.7 else YELLOW_PAINT
+
+    def _ribbon(self, ends_m: FloatArray, offset_m: float) -> FloatArray:
+        """A quadrilateral (4, 2) of a line between two stations, counter-clockwise."""
+        right = self.route.points_at(ends_m, offset_m - self.config.line_width_m / 2)
+        left = self.route.points_at(ends_m, offset_m + self.config.line_width_m / 2)
+        return np.array([right[0], right[1], left[1], left[0]])
+
+    def solid_line(self, offset_m: float) -> None:
+        length_m = self.route.length_m
+        points = self.route.points_at(np.arange(0.0, length_m, _VERTEX_SPACING_M), offset_m)
+        self.layout.lanes.append(Lane(LANE_LINE, points, 0))
+        worn, seed = self._worn(), self._seed()
+        for start, end in self._straight_pieces():
+            around = np.array([max(start - _PIECE_OVERLAP_M, 0.0), min(end + _PIECE_OVERLAP_M, length_m)])
+            self._paint(LANE_LINE, self._ribbon(around, offset_m), worn, seed)
+
+    def _straight_pieces(self) -> list[tuple[float, float]]:
+        """Stretches of the route that are straight to within a few millimetres."""
+        edges = [0.0]
+        for station in np.arange(_VERTEX_SPACING_M, self.route.length_m, 0.25):
+            yaw, first_yaw = (float(self.route.yaw_at(np.array([at]))[0]) for at in (station, edges[-1]))
+            if abs(yaw - first_yaw) > _PIECE_TURN_RAD or station - edges[-1] > _PIECE_LENGTH_M:
+                edges.append(float(station))
+        return list(pairwise([*edges, self.route.length_m]))
+
+    def dashed_line(self, offset_m: float) -> None:
+        """Dashes as markings, each straight, and one lane through them all, beside the route between them."""
+        config, route = self.config, self.route
+        period = config.dash_length_m + config.dash_gap_m
+        longer = 1 + abs(offset_m) * float(np.abs(route.curvature).max())
+        points: list[FloatArray] = []
+        last_m = 0.0
+        for start in np.arange(self.rng.uniform(0.5, period), route.length_m - period, period):
+            ends = np.array([start, start + config.dash_length_m])
+            polygon = self._ribbon(ends, offset_m)
+            self._paint(LANE_DASH, polygon, self._worn(), self._seed())
+            self.layout.markings.append(Marking(LANE_DASH, polygon, 0))
+            if points:
+                gap_m = start - last_m
+                points.append(route.points_at(last_m + gap_m * _shares(longer * gap_m)[1:-1], offset_m))
+            tail, head = polygon[[0, 3]].mean(axis=0), polygon[[1, 2]].mean(axis=0)
+            points.append(tail + _shares(float(np.linalg.norm(head - tail)))[:, None] * (head - tail))
+            last_m = float(ends[1])
+        if points:
+            self.layout.lanes.append(Lane(LANE_DASH, np.concatenate(points), 0))
+
+    def diamond_row(self, offset_m: float, is_field: bool) -> None:
+        config, route, rng = self.config, self.route, self.rng
+        half = _DIAMOND * (config.diamond_length_m, config.diamond_width_m)
+        colour = YELLOW_PAINT if config.yellow_diamonds else WHITE_PAINT
+        lines = self.layout.vertices()
+        phase = config.diamond_spacing_m * (0.5 + 0.37 * offset_m % 1.0 * 0.5)
+        for station in np.arange(phase, route.length_m - 2.0, config.diamond_spacing_m):
+            at = np.array([station + rng.normal(0.0, config.placing_sigma_m)])
+            yaw = float(route.yaw_at(at)[0]) + np.deg2rad(rng.normal(0.0, config.placing_sigma_deg))
+            centre = route.points_at(at, offset_m + rng.normal(0.0, config.placing_sigma_m))[0]
+            worn, seed = self._worn(), self._seed()
+            if is_field and not route.is_straight(at)[0]:
+                continue
+            # Rows beyond the lanes may run into another stretch of the route behind a turn.
+            near_route = float(route.distance_to(centre[None])[0]) < abs(offset_m) - 0.5
+            if near_route or not self.layout.is_free(centre, lines):
+                continue
+            corners = placed(half, centre, yaw)
+            self.layout.markings.append(Marking(DIAMOND, corners, 0))
+            self.layout.occupied_map.append(centre)
+            self._paint(DIAMOND, corners, worn, seed, colour)
+
+    def stencil_rows(self, kind: str, stencil: StencilConfig) -> None:
+        route, rng, spacing_m = self.route, self.rng, stencil.spacing_m
+        shapes = [np.array(shape) for shape in stencil.shapes_m]
+        shapes = [shape if signed_area(shape) > 0 else shape[::-1] for shape in shapes]
+        lines = self.layout.vertices()
+        for offset_m in stencil.offsets_m:
+            for station in np.arange(rng.uniform(0.0, spacing_m), route.length_m - 2.0, spacing_m):
+                worn, turned = self._worn(), np.deg2rad(rng.normal(0.0, self.config.placing_sigma_deg))
+                colour = self._colour()
+                for at in station + np.linspace(0.0, spacing_m, _STENCIL_TRIES, endpoint=False):
+                    centre = route.points_at(np.array([at]), offset_m)[0]
+                    beside = float(route.distance_to(centre[None])[0]) >= abs(offset_m) - 0.5
+                    if at < route.length_m - 2.0 and beside and self.layout.is_free(centre, lines):
+                        yaw = float(route.yaw_at(np.array([at]))[0]) + turned
+                        self._place(kind, shapes, centre, yaw, worn, colour)
+                        break
+
+    def other_paint(self) -> None:
+        """Arrows, stop lines and lettering; of these only the stop lines are markings of the map."""
+        config, route, rng = self.config, self.route, self.rng
+        for kind, spacing, shapes in (
+            (ARROW, config.arrow_spacing_m, _ARROW_M),
+            (STOP_LINE, config.stop_line_spacing_m, _STOP_LINE_M),
+            (OTHER_PAINT, config.lettering_spacing_m, None),
+        ):
+            for station in np.arange(spacing * 0.6, route.length_m - 5.0, spacing):
+                at = station + rng.uniform(-2.0, 2.0)
+                offset = 0.0 if shapes is not None else float(rng.choice([-7.2, -3.5, 3.5, 7.2]))
+                drawn = shapes if shapes is not None else self._lettering()
+                self._place(kind, drawn, *route.pose_at(at, offset), self._worn(), self._colour())
+
+    def _lettering(self) -> list[FloatArray]:
+        """Block letters of upright and level bars, as bay numbers are painted."""
+        bars = []
+        for letter in range(int(self.rng.integers(2, 5))):
+            left = -0.55 * letter
+            for x0, x1, y0, y1 in _LETTER_BARS_M:
+                if self.rng.random() < 0.7:
+                    low, high = left + y0, left + y1
+                    bars.append(np.array([[x0, low], [x1, low], [x1, high], [x0, high]]))
+        return bars
+
+    def _place(
+        self,
+        kind: str,
+        shapes: Sequence[FloatArray],
+        centre: FloatArray | tuple[float, float],
+        yaw_rad: float,
+        worn: tuple[float, float],
+        colour: Bgr,
+    ) -> None:
+        for shape in shapes:
+            polygon = placed(shape, centre, yaw_rad)
+            self.layout.occupied_map.extend(polygon)
+            self._paint(kind, polygon, worn, 7, colour)
+            own = kind not in PAINT_CLASSES and len(shapes) == 1 and len(shape) == 4
+            if kind in CORNERED_CLASSES or own:
+                self.layout.markings.append(Marking(kind, polygon, 0))
+
+
+def _shares(length_m: float) -> FloatArray:
+    """From 0 to 1 in steps that are at most half a metre of a length."""
+    return np.linspace(0.0, 1.0, max(int(np.ceil(length_m / _VERTEX_SPACING_M)), 1) + 1)
+
+
+_BESIDE_ROUTE_M = 4.5  # only paint this near to the route is altered: a vehicle sees it from everywhere
+_CLEAR_M = 2.6  # distance of an altered marking from all other altered ones, before and after, m
+_FREE_M = 1.3  # distance of new paint's centre from other paint, m
+_TRIES = 4000
+
+
+@dataclass(frozen=True)
+class Alteration:
+    """One marking: its corners (4, 2) before, None for an added one, and after, None for a removed one."""
+
+    kind: str
+    before: FloatArray | None
+    after: FloatArray | None
+
+
+def alter(
+    layout: Layout, config: AlteredConfig, paint: PaintConfig, route: Route, rng: np.random.Generator
+) -> tuple[Layout, list[Alteration]]:
+    """Paint a port anew in places; fewer where there is no room for so many."""
+    anew = _Alterer(layout, route, rng, [])
+    for length_m in np.linspace(config.moved_by_m[0], config.moved_by_m[1], config.moved):
+        anew.move(float(length_m), config.turned_sigma_rad)
+    for _ in range(config.removed):
+        anew.remove()
+    for _ in range(config.added):
+        anew.add(_DIAMOND * (paint.diamond_length_m, paint.diamond_width_m))
+    return _painted(layout, anew.done, rng), anew.done
+
+
+@dataclass
+class _Alterer:
+    layout: Layout
+    route: Route
+    rng: np.random.Generator
+    done: list[Alteration]
+
+    def move(self, length_m: float, turned_sigma_rad: float) -> None:
+        """Shift a diamond by a distance and turn it a little."""
+        for _ in range(_TRIES):
+            before = self._any(DIAMOND)
+            if before is None:
+                continue
+            angle, turn = self.rng.uniform(0, 2 * np.pi), self.rng.normal(0.0, turned_sigma_rad)
+            centre = before.mean(axis=0)
+            shift = length_m * np.array([np.cos(angle), np.sin(angle)])
+            after = placed(before - centre, centre, turn) + shift
+            if self._is_clear(after, before):
+                self.done.append(Alteration(DIAMOND, before, after))
+                return
+
+    def remove(self) -> None:
+        """Remove a diamond or a dash."""
+        for _ in range(_TRIES):
+            before = self._any(DIAMOND, LANE_DASH)
+            if before is not None:
+                kind = next(one.kind for one in self.layout.markings if one.corners_map is before)
+                self.done.append(Alteration(kind, before, None))
+                return
+
+    def add(self, half: FloatArray) -> None:
+        """Add a diamond beside the route where there is room."""
+        route, rng = self.route, self.rng
+        for _ in range(_TRIES):
+            station = rng.uniform(8.0, route.length_m - 8.0)
+            offset_m = rng.uniform(-_BESIDE_ROUTE_M, _BESIDE_ROUTE_M)
+            after = placed(half, *route.pose_at(station, offset_m))
+            if self._is_apart(after) and self._is_clear(after, None):
+                self.done.append(Alteration(DIAMOND, None, after))
+                return
+
+    def _any(self, *kinds: str) -> FloatArray | None:
+        """Corners of a marking drawn at random; None where it is off the route or near an altered one."""
+        own = [one.corners_map for one in self.layout.markings if one.kind in kinds]
+        corners = own[int(self.rng.integers(len(own)))]
+        beside = float(self.route.distance_to(corners.mean(axis=0)[None])[0]) <= _BESIDE_ROUTE_M
+        return corners if beside and self._is_apart(corners) else None
+
+    def _is_apart(self, corners: FloatArray) -> bool:
+        centre = corners.mean(axis=0)
+        others = [one for each in self.done for one in (each.before, each.after) if one is not None]
+        return all(np.linalg.norm(centre - other.mean(axis=0)) > _CLEAR_M for other in others)
+
+    def _is_clear(self, corners: FloatArray, itself: FloatArray | None) -> bool:
+        """Whether new paint keeps clear of all other."""
+        centre = corners.mean(axis=0)
+        others = [one.polygon_map for one in self.layout.paints if one.polygon_map is not itself]
+        lines = [lane.points_map for lane in self.layout.lanes]
+        nearest = min(float(np.linalg.norm(points - centre, axis=1).min()) for points in [*others, *lines])
+        return nearest > _FREE_M - (0.0 if itself is None else 0.3)
+
+
+def _painted(layout: Layout, done: list[Alteration], rng: np.random.Generator) -> Layout:
+    altered = {id(one.before): one.after for one in done if one.before is not None}
+
+    def now(corners: FloatArray) -> FloatArray | None:
+        return altered.get(id(corners), corners)
+
+    paints = [
+        replace(one, polygon_map=polygon)
+        for one in layout.paints
+        if (polygon := now(one.polygon_map)) is not None
+    ]
+    markings = [
+        replace(one, corners_map=corners)
+        for one in layout.markings
+        if (corners := now(one.corners_map)) is not None
+    ]
+    like = next((paint for paint in layout.paints if paint.kind == DIAMOND), None)
+    for one in done:
+        if one.before is None and one.after is not None and like is not None:
+            seed = int(rng.integers(1 << 30))
+            paints.append(replace(like, polygon_map=one.after, wear=0.05, dirt=0.05, seed=seed))
+            markings.append(Marking(DIAMOND, one.after, 0))
+    return Layout(paints, markings, layout.lanes, layout.occupied_map)
