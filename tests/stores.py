@@ -10,8 +10,9 @@ from typing import Any
 import fsspec
 import pytest
 
-from v2hdm.store.objects import bucket, lease
-from v2hdm.store.objects.bucket import Bucket
+from v2hdm.store import remote as bucket
+from v2hdm.store import remote as lease
+from v2hdm.store.remote import Bucket
 
 
 @pytest.fixture

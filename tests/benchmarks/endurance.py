@@ -37,8 +37,7 @@ from v2hdm.pipeline.survey import take_survey
 from v2hdm.pipeline.telling import silent
 from v2hdm.pipeline.viewer import Unwatched
 from v2hdm.pipeline.write import write_results
-from v2hdm.store.cache.room import Room
-from v2hdm.store.cache.store import Store
+from v2hdm.store.cache import Room, Store
 from v2hdm.verdict import Verdict
 from v2hdm.verdict.results.result import check_result
 

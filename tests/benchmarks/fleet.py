@@ -47,8 +47,7 @@ from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.inspect import inspect_each
 from v2hdm.pipeline.keys import read_visits
 from v2hdm.pipeline.telling import silent
-from v2hdm.store.cache.keys import key_of
-from v2hdm.store.cache.room import Room
+from v2hdm.store.cache import Room, key_of
 
 OPTIONS = SolveOptions(coarse=False)
 _TICKS = os.sysconf("SC_CLK_TCK")

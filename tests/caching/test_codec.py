@@ -20,7 +20,7 @@ from v2hdm.mapping.results import AdjustedPoses
 from v2hdm.pipeline.camera_sets import MappedSet
 from v2hdm.pipeline.inspect import Inspection
 from v2hdm.records import FloatArray, ImageDetections, MarkingDetection
-from v2hdm.store.cache.codec import CodecError, decode, encode
+from v2hdm.store.cache import CodecError, decode, encode
 
 
 @dataclass(frozen=True)

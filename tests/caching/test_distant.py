@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 
 from v2hdm.cli import cache as door
-from v2hdm.store.cache.room import Room
-from v2hdm.store.cache.store import Store, name_of
-from v2hdm.store.objects.bucket import Bucket
+from v2hdm.store.cache import Room, Store, name_of
+from v2hdm.store.remote import Bucket
 
 pytestmark = pytest.mark.usefixtures("quick")
 KEY = "ab" * 32

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from v2hdm.cli import cache as door
-from v2hdm.store.cache.folders import LIST, note_use
-from v2hdm.store.cache.leases import lease
-from v2hdm.store.cache.pruning import DRIVES, items_of, prune
-from v2hdm.store.cache.store import Store
+from v2hdm.store.cache import Store
+from v2hdm.store.folders import LIST, note_use
+from v2hdm.store.lock import lease
+from v2hdm.store.pruning import DRIVES, items_of, prune
 
 KEYS = [f"{number:064x}" for number in range(4)]
 
@@ -62,7 +62,7 @@ def test_nothing_goes_that_a_run_in_progress_has_used(cache: Path) -> None:
 
 def test_a_run_in_another_process_protects_its_entries_until_it_is_killed(cache: Path) -> None:
     code = (
-        "import sys, time; from pathlib import Path; from v2hdm.store.cache.store import Store\n"
+        "import sys, time; from pathlib import Path; from v2hdm.store.cache import Store\n"
         "store = Store(Path(sys.argv[1]))\n"
         "with store.in_use():\n"
         f"    store.get('detect', '{KEYS[3]}'); print('in use', flush=True); time.sleep(60)\n"

@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 
 from v2hdm.errors import DriveError
-from v2hdm.store.cache.room import Room
-from v2hdm.store.cache.store import Store
+from v2hdm.store.cache import Room, Store
 
 KEY = "ab" * 32
 
@@ -93,7 +92,7 @@ def test_a_cache_that_cannot_be_written_is_told_once_and_work_goes_on(
 
 def test_a_process_killed_while_it_writes_leaves_the_entry_or_none(tmp_path: Path) -> None:
     code = (
-        "import sys; from pathlib import Path; from v2hdm.store.cache.store import Store\n"
+        "import sys; from pathlib import Path; from v2hdm.store.cache import Store\n"
         "store = Store(Path(sys.argv[1])); print('go', flush=True)\n"
         "while True: store.put('stage', 'ab' * 32, bytes(2_000_000))\n"
     )

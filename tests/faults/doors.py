@@ -17,11 +17,11 @@ from v2hdm.errors import DriveError
 from v2hdm.io.calibration.camera_info import write_camera_info
 from v2hdm.io.drive.tum import read_image_list, write_image_list
 from v2hdm.simulate import render_drive
-from v2hdm.store.cache.keys import code_key
-from v2hdm.store.cache.leases import STAGES
-from v2hdm.store.cache.pruning import LEFT, items_of, remove_damaged
+from v2hdm.store.cache import code_key
 from v2hdm.store.files import dump_yaml, load_yaml, replace_text
-from v2hdm.store.listing import LIST
+from v2hdm.store.inputs import LIST
+from v2hdm.store.lock import STAGES
+from v2hdm.store.pruning import LEFT, items_of, remove_damaged
 
 IMAGES = 16
 """Of the drive's one camera: enough for a map, few enough for a second or two a run."""

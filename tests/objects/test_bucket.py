@@ -11,8 +11,8 @@ from omegaconf import OmegaConf
 from v2hdm.cli.config import Job
 from v2hdm.errors import ConfigError
 from v2hdm.store.files import whole_file
-from v2hdm.store.objects.bucket import Bucket, place_of
-from v2hdm.store.outputs import result_folder
+from v2hdm.store.remote import Bucket, place_of
+from v2hdm.store.results import result_folder
 
 
 def test_what_was_put_is_read_listed_and_removed(memory: Bucket, tmp_path: Path) -> None:

@@ -10,9 +10,8 @@ from contextlib import AbstractContextManager, contextmanager
 import pytest
 
 from v2hdm.errors import ConfigError
-from v2hdm.store.objects import lease
-from v2hdm.store.objects.bucket import Bucket
-from v2hdm.store.objects.lease import held
+from v2hdm.store import remote as lease
+from v2hdm.store.remote import Bucket, held
 
 pytestmark = pytest.mark.usefixtures("quick")
 

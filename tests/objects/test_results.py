@@ -13,9 +13,8 @@ from typing import Any
 import pytest
 
 from v2hdm.errors import ConfigError
-from v2hdm.store.listing import LIST
-from v2hdm.store.objects.bucket import Bucket
-from v2hdm.store.objects.results import UNFINISHED, ResultObjects, contents_of, growing_objects
+from v2hdm.store.inputs import LIST
+from v2hdm.store.remote import UNFINISHED, Bucket, ResultObjects, contents_of, growing_objects
 
 pytestmark = pytest.mark.usefixtures("quick")
 
@@ -164,9 +163,9 @@ def test_a_table_grows_and_goes_on_later_but_never_over_what_is_not_ours(memory:
 UPLOAD = """
 import sys, time
 from pathlib import Path
-from v2hdm.store.objects import lease
-from v2hdm.store.objects.bucket import Bucket
-from v2hdm.store.objects.results import ResultObjects, contents_of
+from v2hdm.store import remote as lease
+from v2hdm.store.remote import Bucket
+from v2hdm.store.remote import ResultObjects, contents_of
 lease.BEAT_S, lease.SILENT_S = 0.1, 0.6
 def tell(done, total):
     print(done, flush=True)

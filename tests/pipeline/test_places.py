@@ -11,17 +11,15 @@ import pytest
 
 from tests.drive.example import make_drive
 from v2hdm.errors import ConfigError, DriveError
-from v2hdm.io.importers.mirror import mirrored
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.pipeline import DriveConfig, RunConfig, RunResult, places
+from v2hdm.pipeline import DriveConfig, RunConfig, RunResult
+from v2hdm.pipeline import finished as places
 from v2hdm.pipeline.config import run_name
-from v2hdm.pipeline.finished import note_finished
+from v2hdm.pipeline.finished import in_place, note_finished
 from v2hdm.pipeline.keys import Contents, read_drives, result_key
-from v2hdm.pipeline.places import in_place
-from v2hdm.store.cache.keys import code_key, key_of
-from v2hdm.store.cache.store import Store
-from v2hdm.store.objects.bucket import Bucket
-from v2hdm.store.outputs import result_folder
+from v2hdm.store.cache import Store, code_key, key_of
+from v2hdm.store.remote import Bucket, mirrored
+from v2hdm.store.results import result_folder
 from v2hdm.verdict import Verdict
 
 pytestmark = pytest.mark.usefixtures("quick")

@@ -22,7 +22,7 @@ from v2hdm.pipeline import DriveConfig, RunConfig, RunResult, detections, run, w
 from v2hdm.pipeline import inspect as inspection
 from v2hdm.simulate import PortConfig, render_drive
 from v2hdm.simulate.port.config import RouteConfig, YardConfig
-from v2hdm.store.cache.pruning import items_of
+from v2hdm.store.pruning import items_of
 
 SAME = ("map.geojson", "trajectory.tum", "excluded.geojson", "residuals.csv")
 

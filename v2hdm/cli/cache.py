@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from v2hdm.cli.door import ShowVersion, answer_signals, open_door
 
 if TYPE_CHECKING:
-    from v2hdm.store.cache.pruning import Kept
+    from v2hdm.store.pruning import Kept
 
 _INTERRUPTED = "interrupted; what was removed so far is made anew when it is needed"
 _GB = 1e9
@@ -26,9 +26,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _work(parsed: argparse.Namespace) -> None:
     from v2hdm.errors import ConfigError
-    from v2hdm.store.cache.distant import items_at
-    from v2hdm.store.cache.pruning import items_of, prune, remove_damaged, remove_to
-    from v2hdm.store.objects.bucket import place_of
+    from v2hdm.store.pruning import items_at, items_of, prune, remove_damaged, remove_to
+    from v2hdm.store.remote import place_of
 
     cache = place_of(parsed.cache, "--cache")
 

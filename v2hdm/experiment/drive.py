@@ -32,10 +32,8 @@ from v2hdm.records import Drive, HdMap, ImageDetections, Marking, Truth
 from v2hdm.report.evaluation import growth_figures
 from v2hdm.report.metrics import driven_past, extrinsic_metrics
 from v2hdm.simulate import rendered_drive, surveyed_cameras
-from v2hdm.store.cache.keys import code_key, file_digest, key_of
-from v2hdm.store.cache.room import Room
-from v2hdm.store.cache.store import Store
-from v2hdm.store.files import whole_file
+from v2hdm.store.cache import Room, Store, code_key, key_of
+from v2hdm.store.files import file_digest, whole_file
 
 Tell = Callable[[str, int, int], None]
 """Told a stage, and how many of its steps are done, of how many."""

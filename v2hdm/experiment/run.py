@@ -21,7 +21,7 @@ from v2hdm.experiment.plan import ExperimentConfig, Job, jobs
 from v2hdm.experiment.tables import write_tables
 from v2hdm.experiment.words import write_words
 from v2hdm.store.files import replace_text
-from v2hdm.store.outputs import growing_folder, listed_files
+from v2hdm.store.results import growing_folder, listed_files
 from v2hdm.workers import share_out
 
 Tell = Callable[[str, str, int, int], None]

@@ -15,7 +15,7 @@ from v2hdm.fleet.rows import Row
 from v2hdm.io.texts import shown, take_name
 from v2hdm.pipeline import RunConfig
 from v2hdm.pipeline.config import run_name
-from v2hdm.store.objects.bucket import place_of
+from v2hdm.store.remote import place_of
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,8 @@ from v2hdm.fleet.cluster import LOCAL, RETRIES, cluster
 from v2hdm.fleet.gpus import NO_GPU, Shares, wants_gpu
 from v2hdm.fleet.plan import Job, plan, plan_site
 from v2hdm.fleet.rows import Row, as_csv, as_json
-from v2hdm.store.objects.bucket import place_of
-from v2hdm.store.objects.results import GrowingObjects, growing_objects
-from v2hdm.store.outputs import GrowingFolder, growing_folder
+from v2hdm.store.remote import GrowingObjects, growing_objects, place_of
+from v2hdm.store.results import GrowingFolder, growing_folder
 
 Tell = Callable[[str, str, int, int], None]
 """Told a drive, its stage, and how many of the stage's steps are done, of how many."""

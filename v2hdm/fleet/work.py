@@ -15,9 +15,8 @@ from v2hdm.fleet.eyes import detect_by
 from v2hdm.fleet.plan import Job
 from v2hdm.fleet.rows import Row
 from v2hdm.pipeline import RunConfig
-from v2hdm.pipeline.finished import RunResult
-from v2hdm.pipeline.places import in_place
-from v2hdm.store.cache.store import Store
+from v2hdm.pipeline.finished import RunResult, in_place
+from v2hdm.store.cache import Store
 
 
 def map_drive(job: Job, eyes: Sequence[Any], board: Any, folder: str) -> tuple[Row, str]:

@@ -19,8 +19,7 @@ import numpy as np
 import yaml
 
 from v2hdm.errors import V2hdmError
-from v2hdm.store.inputs import note_input
-from v2hdm.store.listing import tell_if_changed
+from v2hdm.store.inputs import note_input, tell_if_changed
 
 MOST_BYTES = 1 << 30
 """Largest text file that is read; an hour of poses at 100 Hz is 30 MB."""

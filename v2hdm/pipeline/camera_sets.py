@@ -20,7 +20,7 @@ from v2hdm.pipeline.viewer import Viewer
 from v2hdm.pipeline.write import BEST
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.check_points import CheckTable
-from v2hdm.store.cache.room import Room
+from v2hdm.store.cache import Room
 
 _log = logging.getLogger(__name__)
 

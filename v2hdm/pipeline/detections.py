@@ -18,8 +18,7 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.pipeline.keys import Contents, model_key
 from v2hdm.records import Drive, ImageDetections
-from v2hdm.store.cache.keys import key_of
-from v2hdm.store.cache.room import Room
+from v2hdm.store.cache import Room, key_of
 
 _log = logging.getLogger(__name__)
 

@@ -14,7 +14,7 @@ from v2hdm.io.drive import join_drives, with_clock_offsets
 from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.pipeline.keys import Contents
 from v2hdm.records import Camera, Drive
-from v2hdm.store.cache.room import Room
+from v2hdm.store.cache import Room
 from v2hdm.verdict import Finding, Status, check_drive, clock_corrections
 from v2hdm.verdict.movement import movement
 

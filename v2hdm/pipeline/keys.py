@@ -13,7 +13,8 @@ from v2hdm.errors import DriveError
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.records import Drive, Image
-from v2hdm.store.cache.keys import file_digest, key_of
+from v2hdm.store.cache import key_of
+from v2hdm.store.files import file_digest
 
 if TYPE_CHECKING:
     from v2hdm.mapping.crew import Crew  # loads torch, which a finished result does not need

@@ -7,11 +7,10 @@ result of just that lies in its place, nothing else is loaded or done.
 from __future__ import annotations
 
 from v2hdm.pipeline.config import RunConfig
-from v2hdm.pipeline.finished import RunResult
-from v2hdm.pipeline.places import in_place
+from v2hdm.pipeline.finished import RunResult, in_place
 from v2hdm.pipeline.telling import Progress, silent
 from v2hdm.pipeline.viewer import Viewer
-from v2hdm.store.cache.store import Store
+from v2hdm.store.cache import Store
 
 
 def run(

@@ -40,9 +40,8 @@ from v2hdm.report.check_points import write_check_points
 from v2hdm.report.outputs import result_folder, write_json
 from v2hdm.report.page.write import write_page
 from v2hdm.simulate import rendered_drive
-from v2hdm.store.cache.pruning import make_room
-from v2hdm.store.cache.room import Room
-from v2hdm.store.cache.store import Store
+from v2hdm.store.cache import Room, Store
+from v2hdm.store.pruning import make_room
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.known_sizes import check_known_sizes
 from v2hdm.verdict.results.result import check_result

@@ -7,6 +7,7 @@ and a damaged map report as what they are. Writers never leave half a file behin
 from __future__ import annotations
 
 import difflib
+import hashlib
 import os
 import re
 import sys
@@ -27,6 +28,7 @@ from v2hdm.store.inputs import refuse_input
 __all__ = [
     "check_keys",
     "dump_yaml",
+    "file_digest",
     "forget_stdout",
     "load_json",
     "load_yaml",
@@ -108,6 +110,12 @@ def replace_text(path: Path, text: str) -> None:
     """Write ``text`` to ``path`` as :func:`whole_file` does."""
     with whole_file(path) as partial:
         partial.write_text(text, encoding="utf-8")
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file's content, in hexadecimal."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def load_yaml(path: Path, error: type[V2hdmError]) -> dict[str, Any]:

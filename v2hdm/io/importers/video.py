@@ -15,7 +15,7 @@ from v2hdm.errors import DriveError
 from v2hdm.extras import need
 from v2hdm.io.drive.lossless import png
 from v2hdm.io.drive.tum import write_image_list
-from v2hdm.io.importers.imported import (
+from v2hdm.store.folders import (
     begin_entry,
     cannot_write,
     drop_entry,

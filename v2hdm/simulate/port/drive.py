@@ -29,8 +29,8 @@ from v2hdm.simulate.port.config import AlteredConfig, PortConfig
 from v2hdm.simulate.port.disturbance import measured_disturbances, pose_noise
 from v2hdm.simulate.port.visibility import points_seen, quad_samples
 from v2hdm.simulate.render.renderer import RENDERER_VERSION
-from v2hdm.store.cache.folders import note_use
 from v2hdm.store.files import whole_file
+from v2hdm.store.folders import note_use
 from v2hdm.workers import share_out
 
 Progress = Callable[[int, int], None]

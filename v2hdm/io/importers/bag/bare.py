@@ -24,7 +24,9 @@ from v2hdm.io.importers.bag.pixels import IMAGE_KINDS as PICTURES
 from v2hdm.io.importers.bag.reading import Bag, Topic, bag_files, open_bag
 from v2hdm.io.importers.bag.streams import INFO_KIND, TfStream, frame_of
 from v2hdm.io.importers.bag.tf import TF_STATIC, TF_TOPIC, Frames, frame_name
-from v2hdm.io.importers.imported import (
+from v2hdm.records import FloatArray
+from v2hdm.store.files import dump_yaml, load_yaml
+from v2hdm.store.folders import (
     begin_entry,
     cannot_write,
     drop_entry,
@@ -32,8 +34,6 @@ from v2hdm.io.importers.imported import (
     finish_entry,
     is_whole,
 )
-from v2hdm.records import FloatArray
-from v2hdm.store.files import dump_yaml, load_yaml
 
 _VEHICLES = ("base_footprint", "base_link")
 """Frames of a vehicle, the one on the ground first (REP-105, REP-120)."""

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from v2hdm.io.importers.bag.reading import bag_files, open_bag
 from v2hdm.io.importers.bag.streams import Stream
-from v2hdm.io.importers.imported import (
+from v2hdm.store.folders import (
     begin_entry,
     cannot_write,
     drop_entry,

@@ -1,6 +1,8 @@
 """What a cache holds, and keeping it below its limit: what was not used for longest goes first.
 
 Only what is ours is looked at, and nothing goes that a run in progress uses.
+
+What the object store behind a cache holds: it tells when an entry was written, not when it was used.
 """
 
 from __future__ import annotations
@@ -14,9 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from v2hdm.store.cache.folders import LIST, remove_ours, size_of
-from v2hdm.store.cache.leases import STAGES, unused_before
-from v2hdm.store.cache.store import ENDING, checked
+from v2hdm.store.cache import ENDING, checked
+from v2hdm.store.folders import LIST, remove_ours, size_of
+from v2hdm.store.lock import STAGES, unused_before
+from v2hdm.store.remote import Bucket
 
 _log = logging.getLogger(__name__)
 
@@ -150,3 +153,41 @@ def remove_damaged(items: Sequence[_Kept]) -> list[_Kept]:
                 item.remove()
                 damaged.append(item)
     return damaged
+
+
+_NAME = re.compile(rf"{STAGES}/(?P<kind>\w+)/{ENTRY.pattern}")
+
+
+@dataclass(frozen=True)
+class ObjectItem:
+    """An entry at an object store, as :class:`v2hdm.store.pruning.Item` is one on disk.
+
+    ``used_s`` is when it was written.
+    """
+
+    kind: str
+    path: str
+    size: int
+    used_s: float
+    objects: Bucket
+
+    def read(self) -> bytes:
+        """Its bytes; none where it is gone."""
+        return self.objects.read(self.path) or b""
+
+    def remove(self) -> None:
+        """Remove it."""
+        self.objects.remove(self.path)
+
+
+def items_at(objects: Bucket) -> list[ObjectItem]:
+    """All entries below a URL, those that were written first first.
+
+    Raises:
+        ConfigError: the store failed.
+    """
+    named = ((_NAME.fullmatch(name), one) for name, one in objects.listed().items())
+    items = [
+        ObjectItem(name["kind"], name.string, one.size, one.written_s, objects) for name, one in named if name
+    ]
+    return sorted(items, key=lambda item: (item.used_s, item.path))

@@ -1,4 +1,6 @@
-"""Who uses a cache now: a file that each process holds locked while it does.
+"""Locks of the operating system on files, which are released by the end of a process, whatever ends it.
+
+Who uses a cache now: a file that each process holds locked while it does.
 
 A run touches all that it uses, so that what was last used before the oldest run in progress began is used by
 none of them.
@@ -7,8 +9,10 @@ none of them.
 from __future__ import annotations
 
 import atexit
+import logging
 import os
 import secrets
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -16,7 +20,28 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-from v2hdm.store.locks import take_lock
+_log = logging.getLogger(__name__)
+
+
+def take_lock(stream: IO[str]) -> bool:
+    """Lock an open file without waiting; whether it was free. Where none can be held, a warning says so."""
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            msvcrt.locking(stream.fileno(), msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
+        return False
+    except OSError as failure:
+        _log.warning(
+            "%s: no lock can be held here (%s); do not write it twice at a time", stream.name, failure
+        )
+    return True
+
 
 STAGES = "stages"
 """Folder within a cache of what runs keep, and of their leases."""

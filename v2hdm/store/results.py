@@ -19,8 +19,8 @@ from pathlib import Path
 
 from v2hdm.errors import ConfigError
 from v2hdm.store.files import refuse_url, told_of_files, whole_file
-from v2hdm.store.listing import LIST
-from v2hdm.store.locks import take_lock
+from v2hdm.store.inputs import LIST
+from v2hdm.store.lock import take_lock
 
 _log = logging.getLogger(__name__)
 
