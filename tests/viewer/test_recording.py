@@ -26,7 +26,7 @@ from v2hdm.pipeline.keys import Contents
 from v2hdm.records import ImageDetections
 from v2hdm.simulate import PortConfig, render_drive
 from v2hdm.simulate.port.config import RouteConfig, YardConfig
-from v2hdm.store.cache import Room, Store
+from v2hdm.store.cache import StageCache
 from v2hdm.viewer import FILE, RerunViewer, check_viewer
 
 ROOT = Path(__file__).parents[2]
@@ -183,6 +183,6 @@ def test_images_are_shown_as_they_are_looked_at(drive_folder: Path, tmp_path: Pa
         shown.append([one.image for one in found])
 
     for _ in range(2):
-        room = Room(Store(tmp_path))
-        detect_in_pieces(drive, Contents.of([drive]), DetectorOptions(), room, 1, lambda *_: None, show=show)
+        cache = StageCache(tmp_path)
+        detect_in_pieces(drive, Contents.of([drive]), DetectorOptions(), cache, 1, lambda *_: None, show=show)
     assert shown == [[], [0], [1], [2], [0, 1, 2]]

@@ -32,7 +32,7 @@ from v2hdm.records import Drive, HdMap, ImageDetections, Marking, Truth
 from v2hdm.report.evaluation import growth_figures
 from v2hdm.report.metrics import driven_past, extrinsic_metrics
 from v2hdm.simulate import rendered_drive, surveyed_cameras
-from v2hdm.store.cache import Room, Store, code_key, key_of
+from v2hdm.store.cache import StageCache, code_key, key_of
 from v2hdm.store.files import file_digest, whole_file
 
 Tell = Callable[[str, int, int], None]
@@ -121,12 +121,12 @@ def _find(job: Job, workers: int, tell: Tell) -> None:
     drive = read_drive(folder, job.site.drive)
     truth = read_truth(drive)
     store(job.folder / SETTING_FILE, setting_key(job), _setting(job, drive, truth))
-    cache, contents = Store(job.cache), Contents.of([drive])
-    room, max_gap_s = Room(cache), job.site.drive.max_gap_s
-    with cache.in_use():
-        (inspection,) = inspect_each([drive], contents, max_gap_s, room, workers, tell)
+    kept, contents = StageCache(job.cache), Contents.of([drive])
+    max_gap_s = job.site.drive.max_gap_s
+    with kept.in_use():
+        (inspection,) = inspect_each([drive], contents, max_gap_s, kept, workers, tell)
         detections = detect_in_pieces(
-            inspection.drive, contents, job.detector, room, workers, partial(tell, "detect")
+            inspection.drive, contents, job.detector, kept, workers, partial(tell, "detect")
         )
     for recipe in job.options:
         path, key = job.folder / recipe_file(recipe), recipe_key(job, recipe)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,9 @@ from v2hdm.fleet.cluster import LOCAL, RETRIES, cluster
 from v2hdm.fleet.gpus import NO_GPU, Shares, wants_gpu
 from v2hdm.fleet.plan import Job, plan, plan_site
 from v2hdm.fleet.rows import Row, as_csv, as_json
-from v2hdm.store.remote import GrowingObjects, growing_objects, place_of
+from v2hdm.store.remote import place_of
 from v2hdm.store.results import GrowingFolder, growing_folder
+from v2hdm.store.upload import RemoteTable
 
 Tell = Callable[[str, str, int, int], None]
 """Told a drive, its stage, and how many of the stage's steps are done, of how many."""
@@ -60,7 +60,7 @@ def run_fleet(
     """
     told = [*overrides, "resume=false"] if options.again else overrides
     todo = plan(files, told) if options.site is None else plan_site(files, told, options.site)
-    with _growing(options.folder, tell) as folder:
+    with _growing(options.folder) as folder:
         table = _Table(folder, todo.sources, tell)
         for row in todo.refused:
             table.add(row)
@@ -70,19 +70,19 @@ def run_fleet(
         return table.rows
 
 
-def _growing(place: Path | str, tell: Tell) -> AbstractContextManager[GrowingFolder | GrowingObjects]:
+def _growing(place: Path | str) -> AbstractContextManager[GrowingFolder | RemoteTable]:
     """Where the table goes: a folder, or a place at an object store."""
     there = place_of(str(place), "--table")
     if isinstance(there, Path):
         return growing_folder(there, "--table")
     there.check()
-    return growing_objects(there, partial(tell, ALL, "listen"))
+    return nullcontext(RemoteTable(there))
 
 
 class _Table:
     """The rows so far, on disk as well."""
 
-    def __init__(self, folder: GrowingFolder | GrowingObjects, sources: Sequence[str], tell: Tell) -> None:
+    def __init__(self, folder: GrowingFolder | RemoteTable, sources: Sequence[str], tell: Tell) -> None:
         self._folder, self._sources, self._tell = folder, sources, tell
         self._rows: dict[str, Row] = {}
 

@@ -15,8 +15,8 @@ from v2hdm.fleet.eyes import detect_by
 from v2hdm.fleet.plan import Job
 from v2hdm.fleet.rows import Row
 from v2hdm.pipeline import RunConfig
-from v2hdm.pipeline.finished import RunResult, in_place
-from v2hdm.store.cache import Store
+from v2hdm.pipeline.finished import RunResult, take_or_make
+from v2hdm.store.cache import StageCache
 
 
 def map_drive(job: Job, eyes: Sequence[Any], board: Any, folder: str) -> tuple[Row, str]:
@@ -33,7 +33,7 @@ def map_drive(job: Job, eyes: Sequence[Any], board: Any, folder: str) -> tuple[R
     try:
         telling = Telling(board, job.name)
         mapped = partial(_mapped, job, eyes, telling)
-        result, kept = in_place(job.config, mapped, job.config.resume, telling)
+        result, kept = take_or_make(job.config, mapped, job.config.resume, telling)
     except Exception as error:  # a drive that fails is a row, and the others go on
         line = told(error)
         if line is not None:
@@ -43,7 +43,9 @@ def map_drive(job: Job, eyes: Sequence[Any], board: Any, folder: str) -> tuple[R
     return Row.of_result(job.name, job.source, result.place, result.metrics, kept), ""
 
 
-def _mapped(job: Job, eyes: Sequence[Any], telling: Telling, config: RunConfig, store: Store) -> RunResult:
+def _mapped(
+    job: Job, eyes: Sequence[Any], telling: Telling, config: RunConfig, cache: StageCache
+) -> RunResult:
     # They load torch, which a finished result does not need.
     from v2hdm.fleet.crew import RayCrew
     from v2hdm.mapping.crew import ALONE, Crew
@@ -53,4 +55,4 @@ def _mapped(job: Job, eyes: Sequence[Any], telling: Telling, config: RunConfig, 
     if len(config.drive.paths) > 1:
         crew = RayCrew(len(eyes), str(Path.cwd()))
     detect = partial(detect_by, eyes)
-    return map_drives(config, store, job.config_yaml, telling, detect=detect, crew=crew)
+    return map_drives(config, cache, job.config_yaml, telling, detect=detect, crew=crew)

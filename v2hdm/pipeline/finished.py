@@ -1,9 +1,7 @@
-"""Finished results: one that nothing has changed for is taken as it lies there.
+"""Finished results: one that nothing has changed for is taken as it is, in its folder or at its store.
 
-Runs whose drive, cache or results are at an object store: they work in folders of this machine.
-
-A drive is copied into the cache first; results are written to a folder there, whole, and then put in their
-place, where a finished one is known by what lies beside it.
+Runs whose drive, cache or results are at an object store work in folders of this machine: a drive is copied
+into the cache first; a result is written to a folder there, whole, and then uploaded.
 """
 
 from __future__ import annotations
@@ -22,17 +20,22 @@ from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.pipeline.keys import Contents, read_drives, result_key
 from v2hdm.pipeline.telling import Progress
 from v2hdm.simulate.port.drive import folder_of_port
-from v2hdm.store.cache import CodecError, Room, Store, code_key, decode, encode, key_of
+from v2hdm.store.cache import CodecError, StageCache, code_key, decode, encode, key_of
 from v2hdm.store.folders import note_use
-from v2hdm.store.inputs import LIST
-from v2hdm.store.remote import Bucket, ResultObjects, contents_of, is_url, mirrored, place_of
-from v2hdm.store.results import drop_result, files_of_result, is_whole
+from v2hdm.store.lock import HOST
+from v2hdm.store.remote import RemoteFolder, download, is_url, place_of
+from v2hdm.store.results import drop_result, files_of_result, is_whole, locked_folder
+from v2hdm.store.upload import contents_of, is_whole_at, refuse_upload, upload
 from v2hdm.verdict.verdict import Verdict
 
 _log = logging.getLogger(__name__)
 
 _STAGE = "finished"
-NOTHING_CHANGED = "nothing has changed: %s is taken as it is (resume=false makes it anew)"
+_UPLOADS = "uploads"
+"""Folder in the cache of results that are not uploaded yet."""
+
+_RECORD = ".v2hdm-finished"
+"""Object beside a result at a store, which says what it was made of."""
 
 
 @dataclass(frozen=True)
@@ -56,86 +59,24 @@ class RunResult:
 
 @dataclass(frozen=True)
 class _Finished:
-    """A result and the key of what it was made of; ``files`` are SHA-256 of our files in its folder."""
+    """A result and the key of its inputs; ``files`` are SHA-256 of our files in its folder."""
 
     key: str
     files: dict[str, str]
     result: RunResult
 
 
-def note_finished(result: RunResult, key: str, store: Store) -> None:
-    """Keep what is needed to know that nothing has changed since."""
-    kept = _Finished(key, files_of_result(result.folder), result)
-    Room(store.on_disk).keep(_STAGE, _place(result.folder), _Finished, kept)
+Work = Callable[[RunConfig, StageCache], RunResult]
 
 
-def key_of_finished(folder: Path, store: Store) -> str | None:
-    """The key of what the result in a folder was made of, where that is known."""
-    kept = Room(store.on_disk).take(_STAGE, _place(folder), _Finished)
-    return None if kept is None else kept.key
-
-
-def finished(config: RunConfig, store: Store) -> RunResult | None:
-    """The result of a run where it lies in its folder already, whole, and made of the same; else None.
-
-    Nothing is refused here: what cannot be read is told by the run that follows.
-    """
-    try:
-        folder = Path(config.output) / run_name(config)
-        kept = Room(store.on_disk).take(_STAGE, _place(folder), _Finished)
-        if kept is None or not is_whole(folder, kept.files) or not is_of(config, kept.key):
-            return None
-    except (V2hdmError, OSError):
-        return None
-    _log.info(NOTHING_CHANGED, folder)
-    return RunResult(folder, kept.result.metrics, kept.result.headlines, kept.result.verdict)
-
-
-def is_of(config: RunConfig, key: str) -> bool:
-    """Whether ``key`` is that of a run's result, made now.
-
-    Raises:
-        V2hdmError, OSError: what it would be made of cannot be read.
-    """
-    if config.simulate is not None:
-        paths: tuple[Path, ...] = (folder_of_port(config.simulate, Path(config.cache)),)
-        note_use(paths[0])
-    else:
-        paths = config.drive.paths
-    drives = read_drives(config, paths)
-    return key == result_key(config, drives, Contents.of(drives), key_of(code_key()))
-
-
-def _place(folder: Path) -> str:
-    return key_of(folder.resolve())
-
-
-_log = logging.getLogger(__name__)
-
-Work = Callable[[RunConfig, Store], RunResult]
-
-_UPLOADS = "uploads"
-"""Folder in the cache of results that are not yet in their place."""
-
-_RECORD = ".v2hdm-finished"
-
-
-@dataclass(frozen=True)
-class _Record:
-    """The key of what a result was made of, and the result; an object beside it."""
-
-    key: str
-    result: RunResult
-
-
-def in_place(config: RunConfig, work: Work, take: bool, progress: Progress) -> tuple[RunResult, bool]:
+def take_or_make(config: RunConfig, work: Work, take: bool, progress: Progress) -> tuple[RunResult, bool]:
     """The result of a run in the place that its settings name, and whether it was there already.
 
     Args:
         config: of the run.
         work: makes a result in folders of this machine.
         take: whether a finished result of the same is taken.
-        progress: told how far it is with what it copies.
+        progress: reports how far it is with its copies.
 
     Raises:
         V2hdmError: as ``work``; or a store does not work, or holds what is not ours.
@@ -144,71 +85,106 @@ def in_place(config: RunConfig, work: Work, take: bool, progress: Progress) -> t
     if is_url(config.local_cache):
         raise ConfigError(f"local_cache={config.local_cache}: is a URL; give a folder of this machine")
     for place in (output, cache):
-        if isinstance(place, Bucket):
+        if isinstance(place, RemoteFolder):
             place.check()
-    behind = cache if isinstance(cache, Bucket) else None
-    folder = Path(config.local_cache) if isinstance(cache, Bucket) else cache
-    local = _local(config, folder, progress)
-    store = Store(folder, behind)
-    if isinstance(output, Bucket):
-        return _put(local, output, store, work, take, progress)
+    folder, behind = (cache, None) if isinstance(cache, Path) else (Path(config.local_cache), cache)
+    local, kept = _local(config, folder, progress), StageCache(folder, behind, config.resume)
+    if isinstance(output, RemoteFolder):
+        return _take_or_upload(local, output, kept, work, take, progress)
     local.output = str(output)
-    there = finished(local, store) if take else None
-    return (work(local, store), False) if there is None else (there, True)
+    there = finished(local, kept) if take else None
+    return (work(local, kept), False) if there is None else (there, True)
+
+
+def note_finished(result: RunResult, key: str, cache: StageCache) -> None:
+    """Keep what is needed to know that nothing has changed since."""
+    entry = _Finished(key, files_of_result(result.folder), result)
+    cache.local.put(_STAGE, key_of(result.folder.resolve()), _Finished, entry)
+
+
+def finished(config: RunConfig, cache: StageCache) -> RunResult | None:
+    """The result of a run where it lies in its folder already, whole, and made of the same; else None.
+
+    Nothing is refused here: the run that follows reports what cannot be read.
+    """
+    try:
+        folder = Path(config.output) / run_name(config)
+        entry = _noted(folder, cache)
+        if entry is None or not is_whole(folder, entry.files) or not _is_of(config, entry.key):
+            return None
+    except (V2hdmError, OSError):
+        return None
+    return _taken(replace(entry.result, folder=folder, url=""))
+
+
+def _noted(folder: Path, cache: StageCache) -> _Finished | None:
+    return cache.local.get(_STAGE, key_of(folder.resolve()), _Finished)
+
+
+def _taken(result: RunResult) -> RunResult:
+    _log.info("nothing has changed: %s is taken as it is (resume=false makes it anew)", result.place)
+    return result
+
+
+def _is_of(config: RunConfig, key: str) -> bool:
+    """Whether ``key`` is that of a run's result, made now; raises where an input cannot be read."""
+    paths = config.drive.paths
+    if config.simulate is not None:
+        paths = (folder_of_port(config.simulate, Path(config.cache)),)
+        note_use(paths[0])
+    drives = read_drives(config, paths)
+    return key == result_key(config, drives, Contents.of(drives), key_of(code_key()))
 
 
 def _local(config: RunConfig, folder: Path, progress: Progress) -> RunConfig:
     """The settings with folders of this machine for the cache and the drives."""
     drive = config.drive
-    imports = str(folder) if is_url(drive.cache) else drive.cache
-    paths = drive.path if isinstance(drive.path, list) else [drive.path]
-    places = [place_of(one, "drive.path=") if isinstance(one, str) and is_url(one) else one for one in paths]
-    if any(isinstance(one, Bucket) for one in places):
+    given = drive.path if isinstance(drive.path, list) else [drive.path]
+    paths = [place_of(one, "drive.path=") if isinstance(one, str) and is_url(one) else one for one in given]
+    if any(isinstance(one, RemoteFolder) for one in paths):
         config = replace(config, name=run_name(config))  # as before anything was copied
-    tell = partial(progress, "copy")
-    folders = [mirrored(one, folder, tell) if isinstance(one, Bucket) else one for one in places]
-    if folders != paths:
-        told = [str(one) for one in folders]
-        drive = replace(drive, path=told if isinstance(drive.path, list) else told[0])
+    copy = partial(download, cache=folder, report=partial(progress, "copy"))
+    paths = [copy(one) if isinstance(one, RemoteFolder) else one for one in paths]
+    if paths != given:
+        local = [str(one) for one in paths]
+        drive = replace(drive, path=local if isinstance(drive.path, list) else local[0])
+    imports = str(folder) if is_url(drive.cache) else drive.cache
     return replace(config, cache=str(folder), drive=replace(drive, cache=imports))
 
 
-def _put(
-    config: RunConfig, output: Bucket, store: Store, work: Work, take: bool, progress: Progress
+def _take_or_upload(
+    config: RunConfig, output: RemoteFolder, cache: StageCache, work: Work, take: bool, progress: Progress
 ) -> tuple[RunResult, bool]:
     name = run_name(config)
     take_name(name, "name", ConfigError)
-    result = ResultObjects(output.below(name))
-    there = _taken(result, config) if take else None
-    if there is not None:
+    place, folder = output.below(name), Path(config.cache) / _UPLOADS / key_of(output.url)[:16]
+    if take and (there := _finished_at(place, config)) is not None:
         return there, True
-    with result.leased(output, partial(progress, "listen")) as lease:
-        there = _taken(result, config) if take else None
-        if there is not None:  # who held the lease has finished it
-            return there, True
-        result.ours()  # what is not ours is told before any work
-        place = Path(config.cache) / _UPLOADS / key_of(output.url)[:16]
-        local = replace(config, output=str(place))
-        made = (finished(local, store) if take else None) or work(local, store)
-        key = key_of_finished(made.folder, store)
-        record = {} if key is None else {_RECORD: encode(_Record(key, made))}
-        result.put({**contents_of(made.folder, LIST), **record}, lease, partial(progress, "upload"))
-    drop_result(made.folder)
+    writer = f"{HOST}, {key_of(folder.resolve())[:8]}"
+    refuse_upload(place, writer)  # what is not ours is reported before any work
+    local = replace(config, output=str(folder))
+    made = (finished(local, cache) if take else None) or work(local, cache)
+    there = _finished_at(place, config) if take else None  # of who was faster
+    with locked_folder(made.folder):
+        if there is None:
+            entry = _noted(made.folder, cache)
+            record = {} if entry is None else {_RECORD: encode(entry)}
+            upload(place, {**contents_of(made.folder), **record}, writer, partial(progress, "upload"))
+        drop_result(made.folder)
     with suppress(OSError):  # other results wait there for their upload
-        place.rmdir()
-        place.parent.rmdir()
-    return replace(made, url=result.objects.url), False
+        folder.rmdir()
+        folder.parent.rmdir()
+    return (replace(made, url=place.url), False) if there is None else (there, True)
 
 
-def _taken(result: ResultObjects, config: RunConfig) -> RunResult | None:
-    """The result that is at the store, where it is whole and made of the same."""
-    if not result.is_whole():
+def _finished_at(place: RemoteFolder, config: RunConfig) -> RunResult | None:
+    """The result that is at a store, where it is whole and made of the same."""
+    if not is_whole_at(place):
         return None
     try:
-        record = decode(result.objects.read(_RECORD) or b"", _Record)
-        if not is_of(config, record.key):
+        entry = decode(place.read(_RECORD) or b"", _Finished)
+        if not _is_of(config, entry.key):
             return None
-    except (CodecError, V2hdmError, OSError):  # told by the run that follows
+    except (CodecError, V2hdmError, OSError):  # the run that follows reports it
         return None
-    _log.info(NOTHING_CHANGED, result.objects)
-    return replace(record.result, url=result.objects.url)
+    return _taken(replace(entry.result, url=place.url))

@@ -1,13 +1,8 @@
-"""Folders of a cache that are ours: rendered drives, and what is imported from bags and videos.
+"""Folders of a cache that are ours: rendered drives, imports from bags and videos, downloads.
 
 Each holds a list of the files that we wrote, ``.v2hdm-cache.json``; only these are ever removed. The list's
-time of change is that of the folder's last use.
-
-Streams of bags and videos kept as plain files: imported once, whole or not at all.
-
-An entry is a folder that is named by a hash of its source (names, sizes and times of change of the files) and
-of how it was read. Its list of contents, with size and hash of every file, tells a damaged one, which is made
-anew.
+time of change is that of the folder's last use. An import is whole or absent: its list of contents, with size
+and hash of every file, shows whether it is damaged, and a damaged one is made anew.
 """
 
 from __future__ import annotations
@@ -15,7 +10,9 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import secrets
 import shutil
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -24,59 +21,46 @@ from typing import Any
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.io.texts import read_json
 from v2hdm.store.files import file_digest
-from v2hdm.store.lock import hold_lease
+from v2hdm.store.lock import HOST, use_until_exit
 
 LIST = ".v2hdm-cache.json"
 """Name of the list in a folder."""
 
 _ABOUT = "files that v2hdm wrote here, which it may remove to make room; touched when they are used"
 
+_VERSION = 2
+"""Raised whenever an import comes out as other files."""
+
+_CONTENTS = "contents.txt"
+_IMAGES = (".png", ".jpg", ".jpeg")
+_WRITER = f"{HOST}-{secrets.token_hex(4)}"
+_STALE_S = 3600.0
+"""What nothing was written to for so long was left by a process that was killed."""
+
 
 def note_use(folder: Path) -> None:
-    """Say that a folder is in use now, and what in it is ours where that was never said.
+    """Record that a folder is in use now, and list what in it is ours where that was never done.
 
     A folder that cannot be written is used as it is. The folder's cache is in use, too, from now on.
     """
-    hold_lease(folder.parent)
+    use_until_exit(folder.parent)
     with suppress(OSError):
         path = folder / LIST
         if path.is_file():
             os.utime(path)
             return
-        files = sorted(one for one in folder.rglob("*") if one.is_file())
+        files = _files(folder)
         names = [one.relative_to(folder).as_posix() for one in files]
-        size = sum(one.stat().st_size for one in files)
-        content = {"about": _ABOUT, "bytes": size, "files": names}
-        partial = folder / f".{os.getpid()}.part"
+        content = {"about": _ABOUT, "bytes": sum(one.stat().st_size for one in files), "files": names}
+        partial = folder / f".{_WRITER}.part"
         partial.write_text(json.dumps(content) + "\n", encoding="utf-8")
         partial.replace(path)
 
 
 def size_of(folder: Path) -> int | None:
     """Bytes of our files in a folder, as its list says; None where it is none of our folders."""
-    content = _listed(folder)
-    size = None if content is None else content.get("bytes")
+    size = _listed(folder).get("bytes")
     return size if isinstance(size, int) and size >= 0 else None
-
-
-def our_files(folder: Path) -> list[Path]:
-    """Those files of a folder that are ours and there."""
-    names = (_listed(folder) or {}).get("files")
-    if not isinstance(names, list):
-        return []
-    listed = [folder / name for name in names if isinstance(name, str) and "\0" not in name]
-    # The list may lie: nothing outside of the folder is ours, whatever way leads there.
-    here = folder.resolve()
-    within = {parent for parent in {path.parent for path in listed} if parent.resolve().is_relative_to(here)}
-    return [path for path in listed if path.parent in within and path.is_file() and not path.is_symlink()]
-
-
-def _listed(folder: Path) -> dict[str, Any] | None:
-    try:
-        content = read_json(folder / LIST, ConfigError)
-    except ConfigError:
-        return None
-    return content if isinstance(content, dict) and content.get("about") == _ABOUT else None
 
 
 def remove_ours(folder: Path) -> None:
@@ -87,24 +71,41 @@ def remove_ours(folder: Path) -> None:
     Raises:
         OSError: a file cannot be removed.
     """
-    for path in sorted(our_files(folder), key=lambda path: (len(path.parts), path)):
+    for path in sorted(_ours(folder), key=lambda path: (len(path.parts), path)):
         path.unlink(missing_ok=True)
     (folder / LIST).unlink(missing_ok=True)
+    remove_empty(folder)
+
+
+def remove_empty(folder: Path) -> None:
+    """Remove the folders in a folder that hold nothing, and itself."""
     below = sorted((one for one in folder.rglob("*") if one.is_dir()), key=lambda one: -len(one.parts))
     for one in [*below, folder]:
         with suppress(OSError):
             one.rmdir()
 
 
-_VERSION = 2
-"""Raised whenever an import comes out as other files."""
+def _ours(folder: Path) -> list[Path]:
+    names = _listed(folder).get("files")
+    if not isinstance(names, list):
+        return []
+    listed = [folder / name for name in names if isinstance(name, str) and "\0" not in name]
+    # The list may lie: nothing outside of the folder is ours, whatever way leads there.
+    here = folder.resolve()
+    within = {parent for parent in {path.parent for path in listed} if parent.resolve().is_relative_to(here)}
+    return [path for path in listed if path.parent in within and path.is_file() and not path.is_symlink()]
 
-_CONTENTS = "contents.txt"
-_IMAGES = (".png", ".jpg", ".jpeg")
+
+def _listed(folder: Path) -> dict[str, Any]:
+    try:
+        content = read_json(folder / LIST, ConfigError)
+    except ConfigError:
+        return {}
+    return content if isinstance(content, dict) and content.get("about") == _ABOUT else {}
 
 
 def entry_folder(cache: Path, files: Sequence[Path], label: str, settings: Any) -> Path:
-    """Where the entry of a stream of some source files belongs.
+    """Where the import of a stream of some source files belongs: named by a hash of all that it is made of.
 
     Raises:
         DriveError: a source cannot be looked at.
@@ -123,42 +124,37 @@ def entry_folder(cache: Path, files: Sequence[Path], label: str, settings: Any) 
 
 
 def is_whole(folder: Path) -> bool:
-    """Whether ``folder`` is an entry with all of its files: images by their size, the rest by content."""
+    """Whether ``folder`` is an import with all of its files: images by their size, the rest by content."""
     try:
         lines = (folder / _CONTENTS).read_text(encoding="utf-8").splitlines()
         entries = [line.split(" ", 2) for line in lines[1:]]
         return lines[0] == str(len(entries)) and all(
-            [size, digest] == _told(folder / name) for size, digest, name in entries
+            [size, digest] == _described(folder / name) for size, digest, name in entries
         )
     except (OSError, ValueError, IndexError):
         return False
 
 
-def _told(path: Path) -> list[str]:
-    """What the list of contents says of a file; a decoder tells of a damaged image."""
-    size = str(path.stat().st_size)
-    return [size, "-" if path.suffix in _IMAGES else file_digest(path)]
-
-
 def begin_entry(folder: Path) -> Path:
-    """An empty hidden folder to fill for ``folder``; those that dead processes left behind are removed."""
+    """An empty hidden folder to fill for ``folder``; those that killed processes have left are removed."""
+    partial = _partial(folder)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         for left in folder.parent.glob(f".{folder.name}.*.part"):
-            if not _is_alive(int(left.name.split(".")[-2])) or left == _partial(folder):
+            if left == partial or _is_stale(left):
                 shutil.rmtree(left, ignore_errors=True)
-        _partial(folder).mkdir()
+        partial.mkdir()
     except OSError as failure:
         raise cannot_write(folder, failure) from None
-    return _partial(folder)
+    return partial
 
 
 def finish_entry(folder: Path) -> None:
     """Put what was filled in its place, with its list of contents."""
     partial = _partial(folder)
     try:
-        files = sorted(path for path in partial.rglob("*") if path.is_file())
-        lines = [" ".join([*_told(path), path.relative_to(partial).as_posix()]) for path in files]
+        files = _files(partial)
+        lines = [" ".join([*_described(path), path.relative_to(partial).as_posix()]) for path in files]
         (partial / _CONTENTS).write_text("\n".join([str(len(lines)), *lines]) + "\n", encoding="utf-8")
         if folder.exists() and not is_whole(folder):
             shutil.rmtree(folder)
@@ -184,14 +180,19 @@ def cannot_write(folder: Path, failure: OSError) -> DriveError:
 
 
 def _partial(folder: Path) -> Path:
-    return folder.with_name(f".{folder.name}.{os.getpid()}.part")
+    return folder.with_name(f".{folder.name}.{_WRITER}.part")
 
 
-def _is_alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
+def _is_stale(folder: Path) -> bool:
+    with suppress(OSError):  # it is being written, or gone
+        return time.time() - max(one.stat().st_mtime for one in [folder, *folder.rglob("*")]) > _STALE_S
+    return False
+
+
+def _described(path: Path) -> list[str]:
+    """The size and digest of a file; a damaged image is found by its decoder."""
+    return [str(path.stat().st_size), "-" if path.suffix in _IMAGES else file_digest(path)]
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if path.is_file())

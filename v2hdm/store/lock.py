@@ -1,16 +1,14 @@
-"""Locks of the operating system on files, which are released by the end of a process, whatever ends it.
+"""Locks of the operating system on files, which the end of a process releases, whatever ends it.
 
-Who uses a cache now: a file that each process holds locked while it does.
-
-A run touches all that it uses, so that what was last used before the oldest run in progress began is used by
-none of them.
+A process that uses a cache holds a file of its own locked there, and touches all that it uses: nothing that
+was last used before the oldest of these locks was taken is used by a run in progress.
 """
 
 from __future__ import annotations
 
 import atexit
 import logging
-import os
+import platform
 import secrets
 import sys
 import time
@@ -22,9 +20,18 @@ from typing import IO
 
 _log = logging.getLogger(__name__)
 
+STAGES = "stages"
+"""Folder within a cache of what runs keep, and of the locks of those in progress."""
+
+IN_USE = f"{STAGES}/in_use"
+HOST = platform.node() or "this host"
+_ENDING = ".lock"
+_TRIES = 9
+_used: Counter[Path] = Counter()
+
 
 def take_lock(stream: IO[str]) -> bool:
-    """Lock an open file without waiting; whether it was free. Where none can be held, a warning says so."""
+    """Lock an open file without waiting and report whether it was free; a warning where none can be held."""
     try:
         if sys.platform == "win32":
             import msvcrt
@@ -43,30 +50,20 @@ def take_lock(stream: IO[str]) -> bool:
     return True
 
 
-STAGES = "stages"
-"""Folder within a cache of what runs keep, and of their leases."""
-
-_FOLDER = "in_use"
-_ENDING = ".lease"
-_TRIES = 9
-_held: Counter[Path] = Counter()
-
-
 @contextmanager
-def lease(cache: Path) -> Iterator[None]:
-    """Tell others, within, that a cache is in use, if anything can be written there."""
-    path = cache / STAGES / _FOLDER / f"{os.getpid()}-{secrets.token_hex(4)}{_ENDING}"
-    stream = _opened(path)
+def in_use(cache: Path) -> Iterator[None]:
+    """Protect from pruning what is used in a cache within this block, if anything can be written there."""
+    path, here = cache / IN_USE / f"{secrets.token_hex(8)}{_ENDING}", cache.resolve()
+    stream = _created(path)
     if stream is None:
         yield
         return
-    here = cache.resolve()
-    _held[here] += 1
+    _used[here] += 1
     try:
         take_lock(stream)
         yield
     finally:
-        _held[here] -= 1
+        _used[here] -= 1
         stream.close()
         with suppress(OSError):
             path.unlink(missing_ok=True)
@@ -74,49 +71,41 @@ def lease(cache: Path) -> Iterator[None]:
                 folder.rmdir()
 
 
-def _opened(path: Path) -> IO[str] | None:
-    """A new file, open; None where none can be made. Whoever leaves may remove its folder meanwhile."""
-    for _ in range(_TRIES):
+def use_until_exit(cache: Path) -> None:
+    """Protect what is used in a cache until this process ends, unless it does so already."""
+    if not _used[cache.resolve()]:
+        held = ExitStack()
+        held.enter_context(in_use(cache))
+        atexit.register(held.close)
+
+
+def unused_before(cache: Path) -> float:
+    """The time, s since 1970, before which nothing was last used that a run in progress uses."""
+    earliest = time.time()
+    for path in (cache / IN_USE).glob(f"*{_ENDING}"):
+        with suppress(OSError):  # given up meanwhile
+            began_s = path.stat().st_mtime
+            if _is_left(path):
+                path.unlink(missing_ok=True)
+            else:
+                earliest = min(earliest, began_s)
+    return earliest
+
+
+def _created(path: Path) -> IO[str] | None:
+    for _ in range(_TRIES):  # whoever leaves may remove the folder meanwhile
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             return path.open("x", encoding="utf-8")
         except FileNotFoundError:
             continue
         except OSError:
-            return None
+            break
     return None
 
 
-def hold_lease(cache: Path) -> None:
-    """Tell others, until this process ends, that a cache is in use, unless it tells them already."""
-    if _held[cache.resolve()]:
-        return
-    held = ExitStack()
-    held.enter_context(lease(cache))
-    atexit.register(held.close)
-
-
-def unused_before(cache: Path) -> float:
-    """What was last used before this time, s since 1970, is used by no run in progress.
-
-    Leases of processes that have died are removed.
-    """
-    earliest = time.time()
-    for path in sorted((cache / STAGES / _FOLDER).glob(f"*{_ENDING}")):
-        try:
-            began_s = path.stat().st_mtime
-        except OSError:  # given up meanwhile
-            continue
-        if _is_left(path):
-            with suppress(OSError):
-                path.unlink(missing_ok=True)
-        else:
-            earliest = min(earliest, began_s)
-    return earliest
-
-
 def _is_left(path: Path) -> bool:
-    """Whether the process that held a lease has ended; a lease that cannot be looked at counts as held."""
+    """Whether the process that held a lock has ended; one that cannot be looked at counts as held."""
     try:
         with path.open(encoding="utf-8") as stream:
             return take_lock(stream)
