@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -95,8 +96,15 @@ def test_what_killed_runs_have_left_goes(cache: Path) -> None:
     partial = cache / "stages" / "detect" / ".some-host-0123456789abcdef.part"
     partial.write_bytes(b"half")
     os.utime(partial, (1000, 1000))
+    for name, used_s in (("old", 1000.0), ("new", time.time())):
+        folder = cache / f".bag-{name}.some-host-01234567.part" / "front"
+        folder.mkdir(parents=True)
+        (folder / "0.png").write_bytes(b"half")
+        for path in (folder / "0.png", folder, folder.parent):
+            os.utime(path, (used_s, used_s))
     prune(cache, 1e9)
     assert not partial.exists()
+    assert [path.name for path in cache.glob(".*.part")] == [".bag-new.some-host-01234567.part"]
     assert left(cache) == KEYS
 
 

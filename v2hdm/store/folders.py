@@ -1,8 +1,8 @@
 """Folders of a cache that are ours: rendered drives, imports from bags and videos, downloads.
 
-Each holds a list of the files that we wrote, ``.v2hdm-cache.json``; only these are ever removed. The list's
-time of change is that of the folder's last use. An import is whole or absent: its list of contents, with size
-and hash of every file, shows whether it is damaged, and a damaged one is made anew.
+Each holds a list of the files that we wrote, ``.v2hdm-cache.json``, with their sizes and hashes; only these
+are ever removed. The list's time of change is that of the folder's last use. An import is whole or absent; a
+damaged one is made anew.
 """
 
 from __future__ import annotations
@@ -28,10 +28,9 @@ LIST = ".v2hdm-cache.json"
 
 _ABOUT = "files that v2hdm wrote here, which it may remove to make room; touched when they are used"
 
-_VERSION = 2
+_VERSION = 3
 """Raised whenever an import comes out as other files."""
 
-_CONTENTS = "contents.txt"
 _IMAGES = (".png", ".jpg", ".jpeg")
 _WRITER = f"{HOST}-{secrets.token_hex(4)}"
 _STALE_S = 3600.0
@@ -45,16 +44,10 @@ def note_use(folder: Path) -> None:
     """
     use_until_exit(folder.parent)
     with suppress(OSError):
-        path = folder / LIST
-        if path.is_file():
-            os.utime(path)
-            return
-        files = _files(folder)
-        names = [one.relative_to(folder).as_posix() for one in files]
-        content = {"about": _ABOUT, "bytes": sum(one.stat().st_size for one in files), "files": names}
-        partial = folder / f".{_WRITER}.part"
-        partial.write_text(json.dumps(content) + "\n", encoding="utf-8")
-        partial.replace(path)
+        if (folder / LIST).is_file():
+            os.utime(folder / LIST)
+        else:
+            _write_list(folder)
 
 
 def size_of(folder: Path) -> int | None:
@@ -87,7 +80,7 @@ def remove_empty(folder: Path) -> None:
 
 def _ours(folder: Path) -> list[Path]:
     names = _listed(folder).get("files")
-    if not isinstance(names, list):
+    if not isinstance(names, list | dict):
         return []
     listed = [folder / name for name in names if isinstance(name, str) and "\0" not in name]
     # The list may lie: nothing outside of the folder is ours, whatever way leads there.
@@ -125,13 +118,10 @@ def entry_folder(cache: Path, files: Sequence[Path], label: str, settings: Any) 
 
 def is_whole(folder: Path) -> bool:
     """Whether ``folder`` is an import with all of its files: images by their size, the rest by content."""
+    files = _listed(folder).get("files")
     try:
-        lines = (folder / _CONTENTS).read_text(encoding="utf-8").splitlines()
-        entries = [line.split(" ", 2) for line in lines[1:]]
-        return lines[0] == str(len(entries)) and all(
-            [size, digest] == _described(folder / name) for size, digest, name in entries
-        )
-    except (OSError, ValueError, IndexError):
+        return isinstance(files, dict) and all(_described(folder / name) == files[name] for name in files)
+    except (OSError, ValueError):
         return False
 
 
@@ -141,7 +131,7 @@ def begin_entry(folder: Path) -> Path:
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         for left in folder.parent.glob(f".{folder.name}.*.part"):
-            if left == partial or _is_stale(left):
+            if left == partial or is_stale(left):
                 shutil.rmtree(left, ignore_errors=True)
         partial.mkdir()
     except OSError as failure:
@@ -150,12 +140,10 @@ def begin_entry(folder: Path) -> Path:
 
 
 def finish_entry(folder: Path) -> None:
-    """Put what was filled in its place, with its list of contents."""
+    """Put the folder that was filled in its place, with its list."""
     partial = _partial(folder)
     try:
-        files = _files(partial)
-        lines = [" ".join([*_described(path), path.relative_to(partial).as_posix()]) for path in files]
-        (partial / _CONTENTS).write_text("\n".join([str(len(lines)), *lines]) + "\n", encoding="utf-8")
+        _write_list(partial)
         if folder.exists() and not is_whole(folder):
             shutil.rmtree(folder)
         if folder.exists():  # another process was faster
@@ -183,16 +171,24 @@ def _partial(folder: Path) -> Path:
     return folder.with_name(f".{folder.name}.{_WRITER}.part")
 
 
-def _is_stale(folder: Path) -> bool:
+def is_stale(folder: Path) -> bool:
+    """Whether nothing in an unfinished import was written for long: its process was killed."""
     with suppress(OSError):  # it is being written, or gone
         return time.time() - max(one.stat().st_mtime for one in [folder, *folder.rglob("*")]) > _STALE_S
     return False
 
 
-def _described(path: Path) -> list[str]:
+def _write_list(folder: Path) -> None:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    described = {path.relative_to(folder).as_posix(): _described(path) for path in files}
+    size = sum(size for size, _ in described.values())
+    partial = folder / f".{_WRITER}.part"
+    partial.write_text(
+        json.dumps({"about": _ABOUT, "bytes": size, "files": described}) + "\n", encoding="utf-8"
+    )
+    partial.replace(folder / LIST)
+
+
+def _described(path: Path) -> list[Any]:
     """The size and digest of a file; a damaged image is found by its decoder."""
-    return [str(path.stat().st_size), "-" if path.suffix in _IMAGES else file_digest(path)]
-
-
-def _files(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.rglob("*") if path.is_file())
+    return [path.stat().st_size, "-" if path.suffix in _IMAGES else file_digest(path)]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import re
+import shutil
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -15,7 +16,7 @@ from functools import partial
 from pathlib import Path
 
 from v2hdm.store.cache import ENDING, checked
-from v2hdm.store.folders import LIST, remove_ours, size_of
+from v2hdm.store.folders import LIST, is_stale, remove_ours, size_of
 from v2hdm.store.lock import STAGES, unused_before
 from v2hdm.store.remote import RemoteFolder
 
@@ -69,6 +70,12 @@ def _items_on_disk(cache: Path) -> list[Item]:
         with suppress(OSError):  # another process has removed it
             about, remove = path.stat(), partial(path.unlink, missing_ok=True)
             found.append(Item(kind, path, about.st_size, about.st_mtime, path.read_bytes, remove))
+    for folder in cache.glob(".*.part"):
+        with suppress(OSError):
+            if _PARTIAL.fullmatch(folder.name) and folder.is_dir() and is_stale(folder):
+                left = sum(one.stat().st_size for one in folder.rglob("*"))
+                remove = partial(shutil.rmtree, folder)
+                found.append(Item(LEFT, folder, left, folder.stat().st_mtime, bytes, remove))
     for listing in cache.glob(f"*/{LIST}"):
         folder, size = listing.parent, size_of(listing.parent)
         with suppress(OSError):
