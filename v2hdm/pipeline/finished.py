@@ -53,7 +53,7 @@ class RunResult:
 
     @property
     def place(self) -> str:
-        """Where the results are, as a user is told."""
+        """Where the results are, to be shown."""
         return self.url or str(self.folder)
 
 
@@ -88,12 +88,12 @@ def take_or_make(config: RunConfig, work: Work, take: bool, progress: Progress) 
         if isinstance(place, RemoteFolder):
             place.check()
     folder, behind = (cache, None) if isinstance(cache, Path) else (Path(config.local_cache), cache)
-    local, kept = _local(config, folder, progress), StageCache(folder, behind, config.resume)
+    local, stages = _local(config, folder, progress), StageCache(folder, behind, config.resume)
     if isinstance(output, RemoteFolder):
-        return _take_or_upload(local, output, kept, work, take, progress)
+        return _take_or_upload(local, output, stages, work, take, progress)
     local.output = str(output)
-    there = finished(local, kept) if take else None
-    return (work(local, kept), False) if there is None else (there, True)
+    there = finished(local, stages) if take else None
+    return (work(local, stages), False) if there is None else (there, True)
 
 
 def note_finished(result: RunResult, key: str, cache: StageCache) -> None:

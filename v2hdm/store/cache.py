@@ -3,7 +3,7 @@
 An entry is a file, ``<cache>/stages/<stage>/<key>.v2hdm``, written whole or not at all and checked by its
 checksum whenever it is read: a damaged one counts as absent. Its time of change is that of its last use.
 Several processes, on several machines, may share a cache. Its bytes hold no name of a class or function: the
-type that the reader asks for decides what they become, so that nothing in a file can choose what is run.
+type that the reader asks for decides what they become, so that nothing in a file can choose code to run.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ _VERSION = 3
 _IMAGES = (".png", ".jpg", ".jpeg")
 _WRITER = f"{HOST}-{secrets.token_hex(4)}"
 _STALE_S = 3600.0
-"""What nothing was written to for so long was left by a process that was killed."""
+"""A folder that nothing was written to for so long was left by a process that was killed."""
 
 
 def note_use(folder: Path) -> None:

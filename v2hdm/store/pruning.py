@@ -37,7 +37,7 @@ class Item:
 
     Attributes:
         kind: a stage, or one of the kinds above.
-        path: of the file or folder; within its store for what is kept at one.
+        path: of the file or folder; of an object, within its store.
         size: in bytes.
         used_s: its last use, s since 1970; at a store, when it was written.
         read, remove: its bytes, and its end; what is gone already is removed.
