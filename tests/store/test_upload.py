@@ -147,7 +147,12 @@ def test_a_second_writer_is_refused_until_the_first_has_finished(memory: RemoteF
     assert put(memory, "other host", map=b"3")
 
 
-def test_of_two_writers_that_begin_at_once_one_is_refused(memory: RemoteFolder) -> None:
+@pytest.mark.parametrize(
+    ("calls", "says"), [(2, "is being written by other host"), (99, "another process has just put a result")]
+)
+def test_of_two_writers_that_begin_at_once_one_is_refused(
+    calls: int, says: str, memory: RemoteFolder
+) -> None:
     class Files:
         """Another writer begins after this one has looked, and before it writes."""
 
@@ -158,14 +163,15 @@ def test_of_two_writers_that_begin_at_once_one_is_refused(memory: RemoteFolder) 
             if name == "pipe_file" and not self.begun:
                 self.begun = True
                 with suppress(Stop):
-                    upload(stopping(memory, 2), {"map": b"1"}, "other host", quiet)
+                    upload(stopping(memory, calls), {"map": b"1"}, "other host", quiet)
             return getattr(self.files, name)
 
     slow = memory.below("run")
     slow._files = Files(slow._files)
-    with pytest.raises(ConfigError, match="is being written by other host"):
+    with pytest.raises(ConfigError, match=says):
         upload(slow, {"map": b"2"}, "us", quiet)
     assert there(memory).get("map") in (None, b"1")
+    assert is_whole_at(memory.below("run")) == (calls == 99)
 
 
 def test_a_list_that_is_damaged_is_told(memory: RemoteFolder) -> None:

@@ -95,7 +95,7 @@ def upload(place: RemoteFolder, contents: Mapping[str, bytes | Path], writer: st
         ConfigError: as :func:`refuse_upload`; or another's object has a name of ours.
     """
     new = {name: _Entry.of(name, content) for name, content in contents.items()}
-    ours = refuse_upload(place, writer)
+    listing, ours = place.read(LIST), refuse_upload(place, writer)
     for name in sorted(set(new) & set(place.listed()) - set(ours)):
         raise _foreign(place, name)
     begun = _listing([*ours.values(), *new.values()], writer)
@@ -104,6 +104,9 @@ def upload(place: RemoteFolder, contents: Mapping[str, bytes | Path], writer: st
         if holder not in ("", writer):
             raise _of_another(place, holder)
         place.write(UNFINISHED, begun)
+    if place.read(LIST) != listing:
+        place.remove(UNFINISHED)
+        raise ConfigError(f"{place}: another process has just put a result there; start again")
     place.remove(LIST)
     for name in sorted(set(ours) - set(new)):
         place.remove(name)
