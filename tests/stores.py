@@ -10,23 +10,21 @@ from typing import Any
 import fsspec
 import pytest
 
-from v2hdm.store.objects import bucket, lease
-from v2hdm.store.objects.bucket import Bucket
+from v2hdm.store import remote
+from v2hdm.store.remote import RemoteFolder
 
 
 @pytest.fixture
-def memory() -> Iterator[Bucket]:
+def memory() -> Iterator[RemoteFolder]:
     """An empty store in memory."""
-    yield Bucket.at(f"memory://{secrets.token_hex(4)}/place", "output=")
+    yield RemoteFolder.at(f"memory://{secrets.token_hex(4)}/place", "output=")
     fsspec.filesystem("memory").store.clear()
 
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Seconds become hundredths."""
-    monkeypatch.setattr(lease, "BEAT_S", 0.05)
-    monkeypatch.setattr(lease, "SILENT_S", 0.5)
-    monkeypatch.setattr(bucket, "_WAITS_S", (0.01, 0.01))
+    monkeypatch.setattr(remote, "_WAITS_S", (0.01, 0.01))
 
 
 @pytest.fixture(scope="session")

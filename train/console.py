@@ -16,7 +16,7 @@ from train.config import TrainConfig, check_training
 from train.distributed import Team, joined_team
 from train.loop import Trainer
 from v2hdm.progress import share_of_work
-from v2hdm.store.outputs import locked_folder
+from v2hdm.store.results import locked_folder
 
 
 def train(config: TrainConfig) -> None:

@@ -24,7 +24,7 @@ from v2hdm.errors import WorkerError
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _PATIENCE_S = 5.0
-"""How long a process that was told to end may take for it."""
+"""How long a process may take to end."""
 
 _Job = TypeVar("_Job")
 _Result = TypeVar("_Result")
@@ -43,7 +43,7 @@ def share_out(
     Processes are spawned: a fork would inherit the locks of other libraries' threads.
 
     Args:
-        work: does one job; what it raises is raised here, with the traceback of its process as a note.
+        work: does one job; an exception of it is raised here, with the traceback of its process as a note.
         jobs: what to do.
         processes: how many to start at most.
         start: called in each process first, with ``arguments``.
@@ -53,7 +53,7 @@ def share_out(
     Raises:
         WorkerError: a process died.
     """
-    crew: dict[Connection, BaseProcess] = {}
+    workers: dict[Connection, BaseProcess] = {}
     try:
         with undisturbed_starts():
             context = multiprocessing.get_context("spawn")
@@ -62,10 +62,10 @@ def share_out(
                 process = context.Process(target=_serve, args=(theirs, start, arguments, work), daemon=True)
                 process.start()
                 theirs.close()
-                crew[ours] = process
-        _hand_out(jobs, crew, take)
+                workers[ours] = process
+        _hand_out(jobs, workers, take)
     finally:
-        _end(crew)
+        _end(workers)
 
 
 @contextmanager
@@ -89,9 +89,11 @@ def undisturbed_starts() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _hand_out(jobs: Sequence[Any], crew: dict[Connection, BaseProcess], take: Callable[[Any], None]) -> None:
+def _hand_out(
+    jobs: Sequence[Any], workers: dict[Connection, BaseProcess], take: Callable[[Any], None]
+) -> None:
     """Keep every process busy with one job after the other."""
-    left, idle = deque(enumerate(jobs)), list(crew)
+    left, idle = deque(enumerate(jobs)), list(workers)
     doing: dict[Connection, int] = {}
     done: dict[int, Any] = {}
     taken = 0
@@ -102,13 +104,13 @@ def _hand_out(jobs: Sequence[Any], crew: dict[Connection, BaseProcess], take: Ca
             try:
                 line.send(job)
             except OSError:
-                raise _death(crew[line]) from None
-        told = set(wait(list(doing)))
-        for line in [line for line in doing if line in told]:
+                raise _death(workers[line]) from None
+        ready = set(wait(list(doing)))
+        for line in [line for line in doing if line in ready]:
             try:
                 result, failure = line.recv()
             except (EOFError, OSError):
-                raise _death(crew[line]) from None
+                raise _death(workers[line]) from None
             if failure is not None:
                 raise failure
             done[doing.pop(line)] = result
@@ -126,11 +128,11 @@ def _death(process: BaseProcess) -> WorkerError:
     )
 
 
-def _end(crew: dict[Connection, BaseProcess]) -> None:
-    for line, process in crew.items():
+def _end(workers: dict[Connection, BaseProcess]) -> None:
+    for line, process in workers.items():
         line.close()
         process.terminate()
-    for process in crew.values():
+    for process in workers.values():
         process.join(_PATIENCE_S)
         if process.is_alive():
             process.kill()
@@ -143,8 +145,9 @@ def _serve(
     arguments: tuple[object, ...],
     work: Callable[[Any], Any],
 ) -> None:
-    """Do what comes along ``line`` until it is closed, or the first failure has been told."""
-    signal.signal(signal.SIGTERM, _leave)
+    """Do what comes along ``line`` until it is closed, or the first failure has been reported."""
+    # Ended by an exception, it tidies away what is being written.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())
     try:
         start(*arguments)
         while (job := _next(line)) is not None:
@@ -161,8 +164,3 @@ def _next(line: Connection) -> tuple[Any] | None:
         return (line.recv(),)
     except (EOFError, OSError):
         return None
-
-
-def _leave(*_: object) -> None:
-    """End by an exception, so that what is being written is tidied away."""
-    sys.exit()

@@ -37,8 +37,7 @@ from v2hdm.pipeline.survey import take_survey
 from v2hdm.pipeline.telling import silent
 from v2hdm.pipeline.viewer import Unwatched
 from v2hdm.pipeline.write import write_results
-from v2hdm.store.cache.room import Room
-from v2hdm.store.cache.store import Store
+from v2hdm.store.cache import StageCache
 from v2hdm.verdict import Verdict
 from v2hdm.verdict.results.solution import check_result
 
@@ -89,13 +88,20 @@ def mapping(drive: Path, images: int, cameras: tuple[str, ...]) -> Iterator[Samp
     contents, options = Contents.of([read]), MappingOptions()
     tell = partial(silent, "detect")
     with TemporaryDirectory(prefix="endurance-") as scratch:
-        kept = Room(Store(Path(scratch) / "cache"))
+        kept = StageCache(Path(scratch) / "cache")
         found = detect_in_pieces(read, contents, DetectorOptions(), kept, os.cpu_count() or 1, tell)
         inspection = inspect(read, 0.5, 1, tell)
         drive_read, survey = inspection.drive, take_survey(read, options)
         for done in itertools.count(len(read.images), len(read.images)):
             sets = map_camera_sets(
-                drive_read, contents.key(drive_read), found, survey, None, Room(None), silent, Unwatched()
+                drive_read,
+                contents.key(drive_read),
+                found,
+                survey,
+                None,
+                StageCache(None),
+                silent,
+                Unwatched(),
             )
             methods = {name: one.methods for name, one in sets.items()}
             verdict = Verdict.of(check_result(drive_read, methods, inspection.ground))

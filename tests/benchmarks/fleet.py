@@ -47,8 +47,7 @@ from v2hdm.pipeline.config import DriveConfig, RunConfig
 from v2hdm.pipeline.inspect import inspect_each
 from v2hdm.pipeline.keys import read_visits
 from v2hdm.pipeline.telling import silent
-from v2hdm.store.cache.keys import key_of
-from v2hdm.store.cache.room import Room
+from v2hdm.store.cache import StageCache, key_of
 
 OPTIONS = SolveOptions(coarse=False)
 _TICKS = os.sysconf("SC_CLK_TCK")
@@ -230,7 +229,7 @@ def visits(folders: Sequence[Path], repeats: int) -> None:
             began = time.perf_counter()
             drives, contents = read_visits(config, config.drive.paths, crew)
             max_gap_s = config.drive.max_gap_s
-            found[who] = inspect_each(drives, contents, max_gap_s, Room(None), 1, silent, crew)
+            found[who] = inspect_each(drives, contents, max_gap_s, StageCache(None), 1, silent, crew)
             wall[who].append(time.perf_counter() - began)
             print(f"  reading and checks {who}: {wall[who][-1]:.2f} s", flush=True)
     here, there = (min(times) for times in wall.values())

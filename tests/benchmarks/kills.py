@@ -29,7 +29,7 @@ import v2hdm.pipeline.work  # noqa: F401  # loaded once, before any run is forke
 from tests.ports import short_port
 from v2hdm.pipeline import DriveConfig, RunConfig, run
 from v2hdm.simulate import render_drive
-from v2hdm.store.cache.pruning import items_of
+from v2hdm.store.pruning import items_of
 
 Start = Callable[[Path, DriveConfig], int]
 """Starts a run of a drive within a folder; returns its process."""

@@ -18,8 +18,8 @@ from v2hdm.experiment.plan import ExperimentConfig, jobs
 from v2hdm.experiment.run import run_experiment
 from v2hdm.mapping.methods import run_methods
 from v2hdm.records import HdMap, Truth
-from v2hdm.store.cache.keys import key_of
-from v2hdm.store.outputs import growing_folder
+from v2hdm.store.cache import key_of
+from v2hdm.store.results import growing_folder
 
 
 def finished(output: Path) -> ExperimentConfig:

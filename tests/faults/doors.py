@@ -17,18 +17,17 @@ from v2hdm.errors import DriveError
 from v2hdm.io.calibration import write_camera_info
 from v2hdm.io.trajectory import read_image_list, write_image_list
 from v2hdm.simulate import render_drive
-from v2hdm.store.cache.keys import code_key
-from v2hdm.store.cache.leases import STAGES
-from v2hdm.store.cache.pruning import LEFT, items_of, remove_damaged
+from v2hdm.store.cache import code_key
 from v2hdm.store.files import dump_yaml, load_yaml, replace_text
-from v2hdm.store.listing import LIST
+from v2hdm.store.inputs import LIST
+from v2hdm.store.lock import IN_USE, STAGES
+from v2hdm.store.pruning import LEFT, items_of, remove_damaged
 
 IMAGES = 16
 """Of the drive's one camera: enough for a map, few enough for a second or two a run."""
 
 HERE = "work/here/"
 _FORMATS = "geojson,csv,gpkg,lanelet2,dxf"
-_LEASES = f"{STAGES}/in_use"
 
 
 @dataclass(frozen=True)
@@ -262,7 +261,7 @@ def cache_defects(cache: Path) -> list[str]:
     strange = [
         path.name
         for path in (cache / STAGES).rglob("*")
-        if path.is_file() and path not in known and _LEASES not in path.as_posix()
+        if path.is_file() and path not in known and IN_USE not in path.as_posix()
     ]
     left = [item.path.name for item in items if item.kind == LEFT]
     damaged = [item.path.name for item in remove_damaged(items)]

@@ -33,7 +33,7 @@ from v2hdm.records import (
     Trajectory,
 )
 from v2hdm.report.outputs import write_json
-from v2hdm.store.outputs import result_folder
+from v2hdm.store.results import result_folder
 
 INFO = CameraInfo(
     "front",

@@ -20,7 +20,7 @@ from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.pipeline import DriveConfig, RunConfig, RunResult, detections, run, work
 from v2hdm.pipeline import inspect as inspection
-from v2hdm.store.cache.pruning import items_of
+from v2hdm.store.pruning import items_of
 
 SAME = ("map.geojson", "trajectory.tum", "excluded.geojson", "residuals.csv")
 
@@ -135,14 +135,14 @@ def test_an_image_that_changed_is_looked_at_again_and_no_other_piece(
 KILLED = """
 import os, signal, sys
 from v2hdm.pipeline import DriveConfig, RunConfig, detections, run
-original, kept = detections.Room.keep, []
-def keep(room, stage, *rest):
-    found = original(room, stage, *rest)
+original, kept = detections.StageCache.put, []
+def put(cache, stage, *rest):
+    found = original(cache, stage, *rest)
     kept.append(stage)
     if kept.count("detect") == 1:
         os.kill(os.getpid(), signal.SIGKILL)
     return found
-detections.Room.keep = keep
+detections.StageCache.put = put
 drive = DriveConfig(path=sys.argv[1])
 run(RunConfig(name="short", drive=drive, output=sys.argv[2], cache=sys.argv[3], workers=1))
 """

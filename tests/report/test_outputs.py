@@ -15,8 +15,8 @@ import pytest
 from tests.faults.judge import full_disk
 from v2hdm.errors import ConfigError
 from v2hdm.report.outputs import write_json
-from v2hdm.store.listing import LIST
-from v2hdm.store.outputs import added_to, files_of_result, growing_folder, result_folder
+from v2hdm.store.inputs import LIST
+from v2hdm.store.results import added_to, files_of_result, growing_folder, result_folder
 
 ROOT = Path(__file__).parents[2]
 
@@ -129,7 +129,7 @@ def test_an_earlier_result_that_a_kill_left_aside_is_put_back(tmp_path: Path) ->
 HOLDER = """
 import sys, time
 from pathlib import Path
-from v2hdm.store.outputs import result_folder
+from v2hdm.store.results import result_folder
 with result_folder(Path(sys.argv[1])) as folder:
     print("held", flush=True)
     time.sleep(60)

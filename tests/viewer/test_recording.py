@@ -23,8 +23,7 @@ from v2hdm.pipeline import DriveConfig, RunConfig, run
 from v2hdm.pipeline.detections import detect_in_pieces
 from v2hdm.pipeline.keys import Contents
 from v2hdm.records import ImageDetections
-from v2hdm.store.cache.room import Room
-from v2hdm.store.cache.store import Store
+from v2hdm.store.cache import StageCache
 from v2hdm.viewer import FILE, RerunViewer, check_viewer
 
 ROOT = Path(__file__).parents[2]
@@ -164,6 +163,6 @@ def test_images_are_shown_as_they_are_looked_at(small_drive: Path, tmp_path: Pat
         shown.append([one.image for one in found])
 
     for _ in range(2):
-        room = Room(Store(tmp_path))
-        detect_in_pieces(drive, Contents.of([drive]), DetectorOptions(), room, 1, lambda *_: None, show=show)
+        cache = StageCache(tmp_path)
+        detect_in_pieces(drive, Contents.of([drive]), DetectorOptions(), cache, 1, lambda *_: None, show=show)
     assert shown == [[], [0], [1], [2], [0, 1, 2]]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from v2hdm.cli.door import ShowVersion, answer_signals, open_door
 
 if TYPE_CHECKING:
-    from v2hdm.store.cache.pruning import Kept
+    from v2hdm.store.pruning import Item
 
 _INTERRUPTED = "interrupted; what was removed so far is made anew when it is needed"
 _GB = 1e9
@@ -26,35 +26,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _work(parsed: argparse.Namespace) -> None:
     from v2hdm.errors import ConfigError
-    from v2hdm.store.cache.distant import items_at
-    from v2hdm.store.cache.pruning import items_of, prune, remove_damaged, remove_to
-    from v2hdm.store.objects.bucket import place_of
+    from v2hdm.store.pruning import items_of, prune, remove_damaged
+    from v2hdm.store.remote import place_of
 
     cache = place_of(parsed.cache, "--cache")
-
-    def kept() -> Sequence[Kept]:
-        return items_of(cache) if isinstance(cache, Path) else items_at(cache)
-
     if isinstance(cache, Path) and not cache.is_dir():
         raise ConfigError(f"{cache}: no such folder; give the cache of your runs with --cache")
     if parsed.what == "list":
-        _show(kept(), "last used" if isinstance(cache, Path) else "last written")
+        _show(items_of(cache), "last used" if isinstance(cache, Path) else "last written")
     elif parsed.what == "prune":
         if not parsed.gb >= 0:
             raise ConfigError(f"--gb {parsed.gb:g}: give 0 or more")
-        limit = parsed.gb * _GB
-        removed = prune(cache, limit) if isinstance(cache, Path) else remove_to(kept(), limit)
-        freed, left = sum(item.size for item in removed), sum(item.size for item in kept())
+        removed = prune(cache, parsed.gb * _GB)
+        freed, left = sum(item.size for item in removed), sum(item.size for item in items_of(cache))
         print(f"removed {len(removed)} entries of {_size(freed)}; {_size(left)} are left")
     else:
-        items = kept()
+        items = items_of(cache)
         damaged = remove_damaged(items)
         for item in damaged:
             print(f"{item.path}: is damaged and was removed; the next run makes it anew")
         print(f"read {len(items)} entries, {len(damaged)} of them damaged")
 
 
-def _show(items: Sequence[Kept], when: str) -> None:
+def _show(items: Sequence[Item], when: str) -> None:
     kinds = sorted({item.kind for item in items})
     print(f"{'what':<20}{'entries':>8}{'size':>12}  {when}")
     for kind in kinds:

@@ -34,10 +34,8 @@ from v2hdm.pipeline.keys import Contents, model_key
 from v2hdm.records import Drive, HdMap, ImageDetections, Marking, Truth
 from v2hdm.report.metrics import driven_past, extrinsic_metrics, growth_figures
 from v2hdm.simulate import rendered_drive, surveyed_cameras
-from v2hdm.store.cache.keys import code_key, file_digest, key_of
-from v2hdm.store.cache.room import Room
-from v2hdm.store.cache.store import Store
-from v2hdm.store.files import whole_file
+from v2hdm.store.cache import StageCache, code_key, key_of
+from v2hdm.store.files import file_digest, whole_file
 
 _FASTEST = 1  # level of gzip: a fifth of the size already, at a tenth of the time of the default
 
@@ -142,12 +140,12 @@ def _find(job: Job, workers: int, progress: Progress) -> None:
     drive = read_drive(folder, job.site.drive)
     truth = read_truth(drive)
     store(job.folder / SETTING_FILE, setting_key(job), _setting(job, drive, truth))
-    cache, contents = Store(job.cache), Contents.of([drive])
-    room, max_gap_s = Room(cache), job.site.drive.max_gap_s
+    cache, contents = StageCache(job.cache), Contents.of([drive])
+    max_gap_s = job.site.drive.max_gap_s
     with cache.in_use():
-        (inspection,) = inspect_each([drive], contents, max_gap_s, room, workers, progress)
+        (inspection,) = inspect_each([drive], contents, max_gap_s, cache, workers, progress)
         detections = detect_in_pieces(
-            inspection.drive, contents, job.detector, room, workers, partial(progress, "detect")
+            inspection.drive, contents, job.detector, cache, workers, partial(progress, "detect")
         )
     for recipe in job.options:
         path, key = job.folder / recipe_file(recipe), recipe_key(job, recipe)

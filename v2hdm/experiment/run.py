@@ -24,7 +24,7 @@ from v2hdm.experiment.plan import ExperimentConfig, Job, jobs
 from v2hdm.experiment.summary import by_port, claims, results_table, write_tables, write_words
 from v2hdm.report.terminal import DriveProgress, drive_bars, new_table, plain
 from v2hdm.store.files import replace_text
-from v2hdm.store.outputs import growing_folder, listed_files
+from v2hdm.store.results import growing_folder, listed_files
 from v2hdm.workers import share_out
 
 _OPTION = "output="

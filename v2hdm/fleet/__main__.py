@@ -30,7 +30,7 @@ def _fleet(parsed: argparse.Namespace) -> int:
     from v2hdm.fleet.plan import exit_code
     from v2hdm.fleet.run import FleetOptions, fleet_on_terminal
     from v2hdm.settings import check_workers
-    from v2hdm.store.objects.bucket import is_url
+    from v2hdm.store.remote import is_url
 
     check_workers(parsed.workers)
     overrides = [one for one in parsed.drives if "=" in one and not Path(one).exists()]

@@ -14,7 +14,7 @@ from v2hdm.adjust.parts import Team
 from v2hdm.errors import WorkerError
 from v2hdm.fleet.cluster import RETRIES
 from v2hdm.fleet.parts import RayTeam
-from v2hdm.store.cache.room import Line, log_again, recorded
+from v2hdm.store.cache import Line, log_again, recorded
 
 _Result = TypeVar("_Result")
 

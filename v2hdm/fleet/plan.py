@@ -21,7 +21,7 @@ from v2hdm.io.safe.texts import shown, take_name
 from v2hdm.pipeline import RunConfig
 from v2hdm.pipeline.config import run_name
 from v2hdm.report.terminal import new_table
-from v2hdm.store.objects.bucket import place_of
+from v2hdm.store.remote import place_of
 
 ERROR = "ERROR"
 """Status of a drive of which there is no result."""

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +13,9 @@ from rich.console import Console
 from v2hdm.fleet.cluster import LOCAL, NO_GPU, RETRIES, Shares, cluster, wants_gpu
 from v2hdm.fleet.plan import STYLES, Job, Row, as_csv, as_json, as_table, plan, plan_site
 from v2hdm.report.terminal import DriveProgress, drive_bars, plain
-from v2hdm.store.objects.bucket import place_of
-from v2hdm.store.objects.results import GrowingObjects, growing_objects
-from v2hdm.store.outputs import GrowingFolder, growing_folder
+from v2hdm.store.remote import place_of
+from v2hdm.store.results import GrowingFolder, growing_folder
+from v2hdm.store.upload import RemoteTable
 
 ALL = "fleet"
 """In place of a drive's name, for the progress of the fleet."""
@@ -65,7 +64,7 @@ def run_fleet(
     """
     settings = [*overrides, "resume=false"] if options.again else overrides
     todo = plan(files, settings) if options.site is None else plan_site(files, settings, options.site)
-    with _growing(options.folder, progress) as folder:
+    with _growing(options.folder) as folder:
         table = _Table(folder, todo.sources, progress)
         for row in todo.refused:
             table.add(row)
@@ -75,22 +74,20 @@ def run_fleet(
         return table.rows
 
 
-def _growing(
-    place: Path | str, progress: DriveProgress
-) -> AbstractContextManager[GrowingFolder | GrowingObjects]:
+def _growing(place: Path | str) -> AbstractContextManager[GrowingFolder | RemoteTable]:
     """The folder of the table, or its place at an object store."""
     there = place_of(str(place), "--table")
     if isinstance(there, Path):
         return growing_folder(there, "--table")
     there.check()
-    return growing_objects(there, partial(progress, ALL, "listen"))
+    return nullcontext(RemoteTable(there))
 
 
 class _Table:
     """The rows so far, on disk as well."""
 
     def __init__(
-        self, folder: GrowingFolder | GrowingObjects, sources: Sequence[str], progress: DriveProgress
+        self, folder: GrowingFolder | RemoteTable, sources: Sequence[str], progress: DriveProgress
     ) -> None:
         self._folder, self._sources, self._progress = folder, sources, progress
         self._rows: dict[str, Row] = {}

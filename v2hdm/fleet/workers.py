@@ -22,10 +22,9 @@ from v2hdm.errors import DriveError, WorkerError
 from v2hdm.fleet.cluster import DETECTORS_A_GPU
 from v2hdm.fleet.plan import Job, Row
 from v2hdm.pipeline import RunConfig
-from v2hdm.pipeline.finished import RunResult
-from v2hdm.pipeline.places import in_place
+from v2hdm.pipeline.finished import RunResult, take_or_make
 from v2hdm.records import Drive, ImageDetections
-from v2hdm.store.cache.store import Store
+from v2hdm.store.cache import StageCache
 
 IMAGES_A_BATCH = 8
 """Images that an actor detects in at one call: seconds of work against a millisecond of Ray's."""
@@ -178,7 +177,7 @@ def map_drive(job: Job, detectors: Sequence[Any], progress: Any, folder: str) ->
     try:
         report = DriveProgress(progress, job.name)
         mapped = partial(_mapped, job, detectors, report)
-        result, kept = in_place(job.config, mapped, job.config.resume, report)
+        result, kept = take_or_make(job.config, mapped, job.config.resume, report)
     except Exception as error:  # a drive that fails is a row, and the others go on
         line = told(error)
         if line is not None:
@@ -189,7 +188,7 @@ def map_drive(job: Job, detectors: Sequence[Any], progress: Any, folder: str) ->
 
 
 def _mapped(
-    job: Job, detectors: Sequence[Any], report: DriveProgress, config: RunConfig, store: Store
+    job: Job, detectors: Sequence[Any], report: DriveProgress, config: RunConfig, cache: StageCache
 ) -> RunResult:
     # They load torch, which a finished result does not need.
     from v2hdm.fleet.crew import RayCrew
@@ -200,4 +199,4 @@ def _mapped(
     if len(config.drive.paths) > 1:
         crew = RayCrew(len(detectors), str(Path.cwd()))
     detect = partial(detect_by, detectors)
-    return map_drives(config, store, job.config_yaml, report, detect=detect, crew=crew)
+    return map_drives(config, cache, job.config_yaml, report, detect=detect, crew=crew)

@@ -13,7 +13,7 @@ from v2hdm import __version__
 from v2hdm.io.drive import ReadOptions
 from v2hdm.io.drive.of_result import told_of
 from v2hdm.records import Drive
-from v2hdm.store.cache.keys import library_versions
+from v2hdm.store.cache import library_versions
 
 
 def describe_run(name: str, drive: Drive, paths: Sequence[Path], options: ReadOptions) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from v2hdm.pipeline.viewer import Viewer
 from v2hdm.pipeline.write import BEST
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.check_points import CheckTable
-from v2hdm.store.cache.room import Room
+from v2hdm.store.cache import StageCache
 
 _log = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ def map_camera_sets(
     detections: Sequence[ImageDetections],
     survey: Survey,
     base: Base | None,
-    room: Room,
+    cache: StageCache,
     progress: Progress,
     viewer: Viewer,
     crew: Crew = ALONE,
@@ -65,7 +65,7 @@ def map_camera_sets(
         detections: what was found in its images.
         survey: control points for the mapping; check points, held against the finished map of all cameras.
         base: an earlier map that is brought up to date with all cameras.
-        room: keeps the results.
+        cache: keeps the results.
         progress: told how many sets are done.
         viewer: shown the results of each set.
         crew: maps the sets, and what belongs to one visit of several.
@@ -75,7 +75,7 @@ def map_camera_sets(
         AdjustError: the adjustment fails.
     """
     sets = camera_sets(drive)
-    begun = room.key(drive_key, list(detections), survey.mapping)
+    begun = cache.key(drive_key, list(detections), survey.mapping)
     jobs = []
     for number, (name, cameras) in enumerate(sets.items()):
         last = number == len(sets) - 1
@@ -88,10 +88,10 @@ def map_camera_sets(
         # A single set is mapped here, where all that it needs is; others, too, where a GPU is.
         shared_out = len(sets) > 1 and survey.mapping.device == "cpu"
         begin = partial(crew.begin if shared_out else ALONE.begin, work)
-        jobs.append((room.key(begun, name, cameras, steps, of_last), begin))
+        jobs.append((cache.key(begun, name, cameras, steps, of_last), begin))
     progress("map", 0, len(sets))
     found = {}
-    for name, mapped in zip(sets, room.each_made(STAGE, MappedSet, jobs), strict=True):
+    for name, mapped in zip(sets, cache.get_or_make_each(STAGE, MappedSet, jobs), strict=True):
         found[name] = mapped
         viewer.mapped(name, mapped.methods)
         progress("map", len(found), len(sets))

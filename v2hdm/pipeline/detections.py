@@ -18,8 +18,7 @@ from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.pipeline.keys import Contents, model_key
 from v2hdm.records import Drive, ImageDetections
-from v2hdm.store.cache.keys import key_of
-from v2hdm.store.cache.room import Room
+from v2hdm.store.cache import StageCache, key_of
 
 _log = logging.getLogger(__name__)
 
@@ -35,7 +34,7 @@ def detect_in_pieces(
     drive: Drive,
     contents: Contents,
     options: DetectorOptions,
-    room: Room,
+    cache: StageCache,
     workers: int,
     progress: Callable[[int, int], None],
     detect: Detect = detect_images,
@@ -47,7 +46,7 @@ def detect_in_pieces(
         drive: what to look at.
         contents: of its images.
         options: detector settings.
-        room: keeps what was found.
+        cache: keeps what was found.
         workers: processes, one thread each.
         progress: called as ``progress(done, total)`` with numbers of images.
         detect: takes the place of processes of this machine.
@@ -56,8 +55,8 @@ def detect_in_pieces(
     Raises:
         V2hdmError: as :func:`v2hdm.detection.batch.detect_all`.
     """
-    detector_key = room.key(options, model_key(options))
-    masks = room.made(
+    detector_key = cache.key(options, model_key(options))
+    masks = cache.get_or_make(
         "own_vehicle",
         key_of(detector_key, contents.key(drive)),
         _Masks,
@@ -66,7 +65,7 @@ def detect_in_pieces(
     )
     drive = with_masks(drive, masks)
     keys = _keys(drive, contents, detector_key)
-    pieces = {start: room.take(STAGE, key, _Piece) for start, key in keys.items()}
+    pieces = {start: cache.get(STAGE, key, _Piece) for start, key in keys.items()}
     missing = [start for start, piece in pieces.items() if piece is None]
     total = len(drive.images)
     todo = [i for start in missing for i in range(start, min(start + PIECE, total))]
@@ -84,7 +83,7 @@ def detect_in_pieces(
         start = found.image - found.image % PIECE
         begun.append(replace(found, image=found.image - start))
         if len(begun) == min(PIECE, total - start):
-            pieces[start] = room.keep(STAGE, keys[start], _Piece, begun)
+            pieces[start] = cache.put(STAGE, keys[start], _Piece, begun)
             begun.clear()
         progress(total - len(todo) + done, total)
 

@@ -15,7 +15,7 @@ from v2hdm.io.drive import join_drives, with_clock_offsets
 from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.pipeline.keys import Contents
 from v2hdm.records import Camera, Drive
-from v2hdm.store.cache.room import Room
+from v2hdm.store.cache import StageCache
 from v2hdm.verdict import Finding, Status, clock_corrections, input_findings
 
 log = logging.getLogger(__name__)
@@ -73,7 +73,7 @@ def inspect_each(
     drives: Sequence[Drive],
     contents: Contents,
     max_gap_s: float,
-    room: Room,
+    cache: StageCache,
     workers: int,
     progress: Callable[[str, int, int], None],
     crew: Crew = ALONE,
@@ -84,7 +84,7 @@ def inspect_each(
         drives: as they were read.
         contents: of their images.
         max_gap_s: as there.
-        room: keeps what is found.
+        cache: keeps what is found.
         workers: as there.
         progress: told how far the checks of each drive are.
         crew: inspects.
@@ -93,8 +93,8 @@ def inspect_each(
     for drive in drives:
         tell = partial(progress, "check" if len(drives) == 1 else f"check {drive.name}")
         work = partial(inspect, drive, max_gap_s, workers, tell)
-        jobs.append((room.key(contents.key(drive), max_gap_s), partial(crew.begin, work)))
-    return list(room.each_made("check", Inspection, jobs))
+        jobs.append((cache.key(contents.key(drive), max_gap_s), partial(crew.begin, work)))
+    return list(cache.get_or_make_each("check", Inspection, jobs))
 
 
 def join(inspections: Sequence[Inspection]) -> Inspection:

@@ -1,4 +1,4 @@
-"""What a run is made of, as digests: its drives by the content of their images, its files by theirs."""
+"""Digests of everything that a run is made of: drives by the content of their images, files by theirs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from v2hdm.errors import DriveError
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.pipeline.config import RunConfig, run_name
 from v2hdm.records import Drive, Image
-from v2hdm.store.cache.keys import file_digest, key_of
+from v2hdm.store.cache import key_of
+from v2hdm.store.files import file_digest
 
 if TYPE_CHECKING:
     from v2hdm.mapping.crew import Crew  # loads torch, which a finished result does not need
@@ -27,45 +28,34 @@ class Contents:
 
     @classmethod
     def of(cls, drives: Iterable[Drive]) -> Contents:
-        """Those of all images of some drives.
-
-        Raises:
-            DriveError: an image cannot be read.
-        """
+        """Digests of all images of some drives; raises DriveError where one cannot be read."""
         try:
             return cls({image.path: file_digest(image.path) for drive in drives for image in drive.images})
         except OSError as failure:
             raise DriveError(f"{failure.filename}: cannot be read ({failure.strerror})") from None
 
     def of_images(self, images: Iterable[Image]) -> list[str]:
-        """Those of some images, in their order."""
+        """Digests of some images, in their order."""
         return [self.digests[image.path] for image in images]
 
     def key(self, drive: Drive) -> str:
-        """The key of a drive: its records and what its images show."""
+        """The key of a drive: its records and the content of its images."""
         return key_of(drive, self.of_images(drive.images))
 
 
 def model_key(options: DetectorOptions) -> str | None:
-    """SHA-256 of the network that a detector is told to use, None for the shipped one, which is code."""
+    """SHA-256 of the network that a detector uses, None for the shipped one, which is code."""
     return None if options.model is None else file_digest(Path(options.model))
 
 
 def base_files(path: Path) -> tuple[Path, tuple[Path, ...], Path]:
-    """Of an earlier map, a folder or its ``map.geojson``: the map, trajectories, and what it left out."""
+    """The map, trajectories and exclusions of an earlier map, given as a folder or its ``map.geojson``."""
     hd_map = path / "map.geojson" if path.is_dir() else path
     return hd_map, tuple(sorted(hd_map.parent.glob("trajectory*.tum"))), hd_map.parent / "excluded.geojson"
 
 
 def result_key(config: RunConfig, drives: Sequence[Drive], contents: Contents, code: str) -> str:
-    """The key of a run's whole result: all that it depends on, and nothing else.
-
-    Args:
-        config: of the run.
-        drives: as they were read.
-        contents: of their images.
-        code: key of the code.
-    """
+    """The key of a run's whole result: all that it depends on, and nothing else; ``code`` is the code's."""
     asked = replace(
         config, name=run_name(config), output="", cache="", local_cache="", cache_gb=0.0, resume=True,
         workers=0, drive=replace(config.drive, path=None, cache=""),
@@ -87,11 +77,7 @@ def result_key(config: RunConfig, drives: Sequence[Drive], contents: Contents, c
 
 
 def read_visits(config: RunConfig, paths: Sequence[Path], crew: Crew) -> tuple[list[Drive], Contents]:
-    """The drives of a run, each read by ``crew``, and the contents of their images.
-
-    Raises:
-        DriveError: one cannot be read.
-    """
+    """The drives of a run, each read by ``crew``, and the contents of their images; raises DriveError."""
     begun = [crew.begin(partial(_read_visit, path, config.drive)) for path in paths]
     read = [wait() for wait in begun]
     digests = {path: digest for _, contents in read for path, digest in contents.digests.items()}
@@ -104,9 +90,5 @@ def _read_visit(path: Path, options: ReadOptions) -> tuple[Drive, Contents]:
 
 
 def read_drives(config: RunConfig, paths: Sequence[Path]) -> list[Drive]:
-    """The drives of a run.
-
-    Raises:
-        DriveError: one cannot be read.
-    """
+    """The drives of a run; raises DriveError where one cannot be read."""
     return [read_drive(path, config.drive) for path in paths]

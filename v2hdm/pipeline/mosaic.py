@@ -12,7 +12,7 @@ from v2hdm.io.drive.of_result import drive_of
 from v2hdm.mosaic.result import RESOLUTION_M, write_mosaic
 from v2hdm.pipeline.admit import check_device
 from v2hdm.records import Drive
-from v2hdm.store.outputs import added_to
+from v2hdm.store.results import added_to
 
 
 def drive_of_result(folder: Path, path: Path | None = None) -> Drive:

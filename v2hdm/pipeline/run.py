@@ -7,11 +7,10 @@ result of just that lies in its place, nothing else is loaded or done.
 from __future__ import annotations
 
 from v2hdm.pipeline.config import RunConfig
-from v2hdm.pipeline.finished import RunResult
-from v2hdm.pipeline.places import in_place
+from v2hdm.pipeline.finished import RunResult, take_or_make
 from v2hdm.pipeline.telling import Progress, silent
 from v2hdm.pipeline.viewer import Viewer
-from v2hdm.store.cache.store import Store
+from v2hdm.store.cache import StageCache
 
 
 def run(
@@ -29,13 +28,13 @@ def run(
         V2hdmError: The configuration, the drive or the detector is at fault, or no map can be made.
     """
 
-    def work(config: RunConfig, store: Store) -> RunResult:
+    def work(config: RunConfig, cache: StageCache) -> RunResult:
         # Loads torch and much else, which takes seconds.
         from v2hdm.detection.network import check_device
         from v2hdm.pipeline.work import map_drives
 
         check_device(config.detector.device)
 
-        return map_drives(config, store, config_yaml, progress, viewer)
+        return map_drives(config, cache, config_yaml, progress, viewer)
 
-    return in_place(config, work, config.resume and viewer is None, progress)[0]
+    return take_or_make(config, work, config.resume and viewer is None, progress)[0]

@@ -34,7 +34,7 @@ from v2hdm.io.drive import READERS, read_drive
 from v2hdm.records import CameraInfo, Drive
 from v2hdm.store.files import forget_stdout, whole_file
 from v2hdm.store.inputs import note_input, refuse_input
-from v2hdm.store.outputs import GrowingFolder, growing_folder
+from v2hdm.store.results import GrowingFolder, growing_folder
 
 _ROUGH_RANGE_M = 40.0
 """Without a calibration distances may be wrong by a factor of two: nothing may be dropped for being far."""

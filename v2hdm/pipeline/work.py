@@ -40,9 +40,8 @@ from v2hdm.report.check_points import write_check_points
 from v2hdm.report.outputs import result_folder, write_json
 from v2hdm.report.page.document import write_page
 from v2hdm.simulate import rendered_drive
-from v2hdm.store.cache.pruning import make_room
-from v2hdm.store.cache.room import Room
-from v2hdm.store.cache.store import Store
+from v2hdm.store.cache import StageCache
+from v2hdm.store.pruning import prune_to_limit
 from v2hdm.verdict import Finding, Status, Verdict
 from v2hdm.verdict.results.solution import check_result
 from v2hdm.verdict.results.survey import check_known_sizes
@@ -55,7 +54,7 @@ class _Task:
     """A run while it is worked on; ``seconds`` says how long each step took."""
 
     config: RunConfig
-    room: Room
+    cache: StageCache
     folder: Path
     about: Mapping[str, Any]
     seconds: dict[str, float]
@@ -71,34 +70,33 @@ class _Task:
 
 def map_drives(
     config: RunConfig,
-    store: Store,
+    cache: StageCache,
     config_yaml: str,
     progress: Progress,
     viewer: Viewer | None = None,
     detect: Detect = detect_images,
     crew: Crew = ALONE,
 ) -> RunResult:
-    """Do what :func:`v2hdm.pipeline.run.run` says, with what ``store`` keeps.
+    """Do what :func:`v2hdm.pipeline.run.run` says, with what ``cache`` keeps.
 
     ``detect`` takes the place of detection in processes of this machine, ``crew`` that of this process where
     work can be parted.
     """
     name = admit(config)
     base = None if config.map.base is None else read_base(Path(config.map.base))
-    with store.in_use():
+    with cache.in_use():
         with (
             result_folder(Path(config.output) / name) as folder,
             logging_to(log_file(folder / "run.log")),
         ):
             log.info("v2hdm %s, run %s", __version__, name)
             (folder / "config.yaml").write_text(config_yaml or f"{config!r}\n", encoding="utf-8")
-            room = Room(store, config.resume)
             hands = viewer or Unwatched(), detect, crew
-            result, key = _write(config, name, base, room, folder, progress, *hands)
+            result, key = _write(config, name, base, cache, folder, progress, *hands)
             for line in result.verdict.lines:
                 log.info("%s", line)
-        note_finished(result, key, store)
-        make_room(store.cache, config.cache_gb)
+        note_finished(result, key, cache)
+        prune_to_limit(Path(config.cache), config.cache_gb)
     return result
 
 
@@ -106,7 +104,7 @@ def _write(
     config: RunConfig,
     name: str,
     base: Base | None,
-    room: Room,
+    cache: StageCache,
     folder: Path,
     progress: Progress,
     viewer: Viewer,
@@ -129,13 +127,13 @@ def _write(
     if base is not None:
         check_together(base, whole, config.map.base or "")
     survey = take_survey(whole, config.mapping)
-    key = result_key(config, drives, contents, room.key())
+    key = result_key(config, drives, contents, cache.key())
     about = describe_run(name, whole, paths, config.drive)
     mapped = replace(config, mapping=survey.mapping)
-    task = _Task(mapped, room, folder, about, seconds, progress, viewer, detect, crew)
+    task = _Task(mapped, cache, folder, about, seconds, progress, viewer, detect, crew)
     with timed(seconds, "check"):
         max_gap_s, workers = config.drive.max_gap_s, _workers(config)
-        inspection = join(inspect_each(drives, contents, max_gap_s, room, workers, progress, crew))
+        inspection = join(inspect_each(drives, contents, max_gap_s, cache, workers, progress, crew))
     try:
         return _map_and_judge(task, inspection, contents, survey, base), key
     except (MappingError, AdjustError) as failure:
@@ -154,7 +152,7 @@ def _map_and_judge(
             task.viewer.begun(task.folder, drive)
             detections = _detect(task, drive, contents)
         with timed(seconds, "map"):
-            hands = task.room, progress, task.viewer, task.crew
+            hands = task.cache, progress, task.viewer, task.crew
             sets = map_camera_sets(drive, contents.key(drive), detections, survey, base, *hands)
     methods = {name: one.methods for name, one in sets.items()}
     best, checked = list(methods.values())[-1][BEST], list(sets.values())[-1].checked
@@ -214,7 +212,7 @@ def _detect(task: _Task, drive: Drive, contents: Contents) -> list[ImageDetectio
     tell = partial(task.progress, "detect")
     workers = _workers(task.config)
     detections = detect_in_pieces(
-        drive, contents, task.config.detector, task.room, workers, tell, task.detect, task.viewer.detected
+        drive, contents, task.config.detector, task.cache, workers, tell, task.detect, task.viewer.detected
     )
     markings = sum(len(found.markings) for found in detections)
     lanes = sum(len(found.lanes) for found in detections)

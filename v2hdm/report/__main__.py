@@ -23,7 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _report(parsed: argparse.Namespace) -> None:
     from v2hdm.io.drive.of_result import drive_of
     from v2hdm.report.page.document import write_page
-    from v2hdm.store.outputs import added_to
+    from v2hdm.store.results import added_to
 
     drive = drive_of(parsed.folder, parsed.drive)
     with added_to(parsed.folder, "folder") as folder:

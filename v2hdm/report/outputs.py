@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from v2hdm.store.files import replace_text
-from v2hdm.store.outputs import result_folder
+from v2hdm.store.results import result_folder
 
 __all__ = ["result_folder", "write_json"]
 

@@ -1,12 +1,13 @@
-"""Reading and writing files so that a user can mend what is wrong with them.
+"""Reading and writing files so that a user can correct what is wrong with them.
 
-Every reader takes the :class:`~v2hdm.errors.V2hdmError` child to raise, so that a damaged drive
-and a damaged map report as what they are. Writers never leave half a file behind.
+Every reader takes the :class:`~v2hdm.errors.V2hdmError` child to raise, so that a damaged drive and a damaged
+map report as what they are; ``where`` names the place in its message. Writers never leave half a file behind.
 """
 
 from __future__ import annotations
 
 import difflib
+import hashlib
 import os
 import re
 import sys
@@ -27,9 +28,11 @@ from v2hdm.store.inputs import refuse_input
 __all__ = [
     "check_keys",
     "dump_yaml",
+    "file_digest",
     "forget_stdout",
     "load_json",
     "load_yaml",
+    "observed_writes",
     "read_text",
     "refuse_url",
     "replace_text",
@@ -38,36 +41,35 @@ __all__ = [
     "take_mapping",
     "take_number",
     "take_text",
-    "told_of_files",
     "whole_file",
 ]
 
 _URL = re.compile(r"[a-z][a-z0-9+.-]+:/")
 _LARGEST = sys.float_info.max
 
-Tell = Callable[[Path, Path], None]
-_tell: ContextVar[Tell | None] = ContextVar("told of each file before it is there", default=None)
+Observer = Callable[[Path, Path], None]
+_observer: ContextVar[Observer | None] = ContextVar("sees each file before it is there", default=None)
 
 
 @contextmanager
-def told_of_files(tell: Tell) -> Iterator[None]:
-    """Within, ``tell`` is given each new file and the path whose place it is about to take; it may refuse."""
-    token = _tell.set(tell)
+def observed_writes(observer: Observer) -> Iterator[None]:
+    """Within, ``observer`` is given each new file and the path that it is about to take; it may refuse."""
+    token = _observer.set(observer)
     try:
         yield
     finally:
-        _tell.reset(token)
+        _observer.reset(token)
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A hidden name beside ``path`` to write to: readers see the old file or the whole new one.
+    """A hidden name beside ``path`` to write to, which takes its place when the block succeeds.
 
-    What was written takes the place of ``path`` when the block succeeds; else nothing of it is left. The
-    folder is created when absent.
+    Readers see the old file or the whole new one. After an error nothing new is left. The folder is created
+    when absent.
 
     Raises:
-        ConfigError: ``path`` is an input of this door, or no plain file.
+        ConfigError: ``path`` is an input of this command, or no plain file.
         OSError: it cannot be written there; the error names ``path``.
     """
     refuse_url(path)
@@ -79,8 +81,8 @@ def whole_file(path: Path) -> Iterator[Path]:
     try:
         yield partial
         refuse_input(path)
-        if (tell := _tell.get()) is not None:
-            tell(partial, path)
+        if (observer := _observer.get()) is not None:
+            observer(partial, path)
         partial.replace(path)
     except OSError as failure:
         # Calls on an open file name none, and the hidden name is of no use to anybody.
@@ -92,11 +94,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def refuse_url(path: Path) -> None:
-    """Refuse a URL that was taken for a path: it would be a folder called ``s3:``.
-
-    Raises:
-        ConfigError: it is one.
-    """
+    """Raise ConfigError for a URL that was taken for a path: it would be a folder called ``s3:``."""
     if _URL.match(str(path)):
         raise ConfigError(
             f"{path}: no URL is written to here, only as output=, cache= and --table of v2hdm.map and "
@@ -108,6 +106,12 @@ def replace_text(path: Path, text: str) -> None:
     """Write ``text`` to ``path`` as :func:`whole_file` does."""
     with whole_file(path) as partial:
         partial.write_text(text, encoding="utf-8")
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file's content, in hexadecimal."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def load_yaml(path: Path, error: type[V2hdmError]) -> dict[str, Any]:
@@ -165,11 +169,7 @@ def check_keys(
 
 
 def take_array(content: object, shape: tuple[int, ...], where: str, error: type[V2hdmError]) -> FloatArray:
-    """``content`` as a finite float64 array of ``shape``, in which -1 stands for any length.
-
-    Raises:
-        V2hdmError: of type ``error``, when it is not numeric, not finite or shaped otherwise.
-    """
+    """``content`` as a finite float64 array of ``shape``, in which -1 is any length, else an ``error``."""
     wanted = " x ".join("N" if length < 0 else str(length) for length in shape)
     try:
         raw = np.array(content)
@@ -178,8 +178,7 @@ def take_array(content: object, shape: tuple[int, ...], where: str, error: type[
         array = raw.astype(np.float64)
     except (TypeError, ValueError, OverflowError):
         raise error(f"{where}: expected {wanted} numbers, got {shown(content)}") from None
-    fits = array.ndim == len(shape) and all(w in (-1, n) for w, n in zip(shape, array.shape, strict=True))
-    if not fits:
+    if array.ndim != len(shape) or any(w not in (-1, n) for w, n in zip(shape, array.shape, strict=True)):
         got = " x ".join(map(str, array.shape)) or "a single number"
         raise error(f"{where}: expected {wanted} numbers, got {got}")
     if not np.isfinite(array).all():

@@ -1,19 +1,31 @@
-"""Inputs of a door are never written over.
+"""Files that a command reads: none is written over by it, and a result's file that was changed is reported.
 
-Each reader notes what it reads and each writer asks before it replaces a file. Outside of a door nothing is
-noted: a program that reads a map, changes it and writes it back means to.
+Each reader notes what it reads and each writer asks before it replaces a file. Outside of a command nothing
+is noted: a program that reads a map, changes it and writes it back means to.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
+import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
 
 from v2hdm.errors import ConfigError
 
-_noted: ContextVar[set[tuple[int, int]] | None] = ContextVar("inputs of this door", default=None)
+_log = logging.getLogger(__name__)
+
+LIST = ".v2hdm-results.jsonl"
+"""Name of the list of our files in a folder of results: a head, then a line of JSON for each file written."""
+
+_DEEPEST = 3
+"""Folders above a file that may have a list: ours lie at most two folders deep."""
+
+_noted: ContextVar[set[tuple[int, int]] | None] = ContextVar("inputs of this command", default=None)
+_reported: set[tuple[Path, str]] = set()
 
 
 @contextmanager
@@ -34,11 +46,7 @@ def note_input(path: Path) -> None:
 
 
 def refuse_input(path: Path) -> None:
-    """Refuse to write over what has been noted.
-
-    Raises:
-        ConfigError: ``path`` is one of the files that this door reads.
-    """
+    """Raise ConfigError where ``path`` is one of the files that this command reads."""
     noted = _noted.get()
     if noted and _identity(path) in noted:
         raise ConfigError(f"{path}: is one of the inputs and is not written over; name another output")
@@ -50,3 +58,35 @@ def _identity(path: Path) -> tuple[int, int] | None:
     except (OSError, ValueError):
         return None
     return about.st_dev, about.st_ino
+
+
+def warn_if_changed(path: Path, data: bytes) -> None:
+    """Warn, once, of a file of a result that holds other ``data`` than we wrote: edited, or damaged.
+
+    It is read all the same: a map that was corrected by hand is a map.
+    """
+    with suppress(OSError, RuntimeError):
+        path = path.resolve()
+        folder = next((one for one in path.parents[:_DEEPEST] if (one / LIST).is_file()), None)
+        if folder is None:
+            return
+        written = _written(folder / LIST, path.relative_to(folder).as_posix())
+        digest = hashlib.sha256(data).hexdigest()
+        if written and digest not in written and (path, digest) not in _reported:
+            _reported.add((path, digest))
+            _log.warning(
+                "%s: is not as we wrote it, so it was edited since or is damaged; if nobody edited it, "
+                "make it anew",
+                path,
+            )
+
+
+def _written(listing: Path, name: str) -> set[str]:
+    """Digests of everything written under a name; a torn or foreign line holds none."""
+    found = set()
+    for line in listing.read_text(encoding="utf-8", errors="replace").splitlines()[1:]:
+        with suppress(ValueError, TypeError, LookupError, RecursionError):
+            entry = json.loads(line)
+            if entry["file"] == name:
+                found.add(str(entry["sha256"]))
+    return found

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from v2hdm.io.importers.imported import begin_entry, cannot_write, drop_entry, finish_entry
+from v2hdm.store.folders import begin_entry, cannot_write, drop_entry, finish_entry
 
 
 @contextmanager

@@ -14,9 +14,12 @@ import numpy as np
 from v2hdm.errors import DriveError
 from v2hdm.extras import need
 from v2hdm.io.importers import new_entry
-from v2hdm.io.importers.imported import entry_folder, is_whole
 from v2hdm.io.safe.pixels import png
 from v2hdm.io.trajectory import write_image_list
+from v2hdm.store.folders import (
+    entry_folder,
+    is_whole,
+)
 
 _log = logging.getLogger(__name__)
 

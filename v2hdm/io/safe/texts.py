@@ -18,8 +18,7 @@ import numpy as np
 import yaml
 
 from v2hdm.errors import V2hdmError
-from v2hdm.store.inputs import note_input
-from v2hdm.store.listing import tell_if_changed
+from v2hdm.store.inputs import note_input, warn_if_changed
 
 MOST_BYTES = 1 << 30  # of a text file; an hour of poses at 100 Hz is 30 MB
 MOST_YAML_BYTES = 1 << 24  # ours have kilobytes, and PyYAML takes a second for half a megabyte
@@ -54,7 +53,7 @@ def read_bytes(path: Path, error: type[V2hdmError], most: int = MOST_BYTES) -> b
     except (OSError, ValueError) as failure:  # ValueError: a path with a zero byte
         reason = getattr(failure, "strerror", None) or failure
         raise error(f"{path}: cannot be read ({reason}); check the path and its permissions") from None
-    tell_if_changed(path, data)
+    warn_if_changed(path, data)
     return data
 
 

@@ -30,8 +30,8 @@ from v2hdm.simulate.port.config import AlteredConfig, PortConfig
 from v2hdm.simulate.port.route import measured_disturbances, pose_noise
 from v2hdm.simulate.render.renderer import RENDERER_VERSION
 from v2hdm.simulate.render.scene import Box
-from v2hdm.store.cache.folders import note_use
 from v2hdm.store.files import whole_file
+from v2hdm.store.folders import note_use
 from v2hdm.workers import share_out
 
 _SAMPLES = 5

@@ -23,18 +23,11 @@ from v2hdm.io.importers.bag import messages as kinds
 from v2hdm.io.importers.bag.messages import IMAGE_KINDS, VIDEO, VideoDecoder, file_of
 from v2hdm.io.importers.bag.reading import Bag, Message, bag_files, open_bag
 from v2hdm.io.importers.bag.tf import TF_STATIC, TF_TOPIC, Edge, Frames, frame_name, transform_rows
-from v2hdm.io.importers.imported import (
-    begin_entry,
-    cannot_write,
-    drop_entry,
-    entry_folder,
-    finish_entry,
-    is_whole,
-)  # fmt: skip
 from v2hdm.io.importers.tables import Readings
 from v2hdm.io.safe.pixels import png
 from v2hdm.io.trajectory import write_image_list
 from v2hdm.records import FloatArray
+from v2hdm.store.folders import begin_entry, cannot_write, drop_entry, entry_folder, finish_entry, is_whole
 
 _log = logging.getLogger(__name__)
 

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from tests.drive.example import make_map
-from v2hdm.io.maps import read_geojson, write_geojson
-from v2hdm.store.outputs import result_folder
+from v2hdm.io.maps import read_geojson
+from v2hdm.io.maps.geojson import write_geojson
+from v2hdm.store.results import result_folder
 
 
 @pytest.fixture

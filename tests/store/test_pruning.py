@@ -6,15 +6,17 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
-from v2hdm.cli import cache as door
-from v2hdm.store.cache.folders import LIST, note_use
-from v2hdm.store.cache.leases import lease
-from v2hdm.store.cache.pruning import DRIVES, items_of, prune
-from v2hdm.store.cache.store import Store
+from v2hdm.cli import cache as command
+from v2hdm.store.cache import StageCache, entry_name
+from v2hdm.store.folders import LIST, note_use
+from v2hdm.store.lock import IN_USE, in_use
+from v2hdm.store.pruning import DRIVES, items_of, prune
+from v2hdm.store.remote import RemoteFolder
 
 KEYS = [f"{number:064x}" for number in range(4)]
 
@@ -22,18 +24,18 @@ KEYS = [f"{number:064x}" for number in range(4)]
 @pytest.fixture
 def cache(tmp_path: Path) -> Path:
     """Four entries of 1 kB, the first one not used for longest, beside files that are not ours."""
-    store = Store(tmp_path / "cache")
+    cache = StageCache(tmp_path / "cache")
     for age, key in enumerate(KEYS):
-        store.put("detect", key, bytes(1000))
-        os.utime(store.path("detect", key), (1000 + age, 1000 + age))
-    (store.folder / "detect" / "notes.txt").write_text("mine")
-    (store.cache / "drive").mkdir()
-    (store.cache / "drive" / "image.jpg").write_bytes(bytes(9000))
-    return store.cache
+        cache.put("detect", key, bytes, bytes(1000))
+        os.utime(cache.path("detect", key), (1000 + age, 1000 + age))
+    (tmp_path / "cache" / "stages" / "detect" / "notes.txt").write_text("mine")
+    (tmp_path / "cache" / "drive").mkdir()
+    (tmp_path / "cache" / "drive" / "image.jpg").write_bytes(bytes(9000))
+    return tmp_path / "cache"
 
 
 def left(cache: Path) -> list[str]:
-    return [key for key in KEYS if Store(cache).path("detect", key).is_file()]
+    return [key for key in KEYS if StageCache(cache).path("detect", key).is_file()]
 
 
 def test_what_was_not_used_for_longest_goes_first(cache: Path) -> None:
@@ -50,22 +52,22 @@ def test_what_is_not_ours_stays(cache: Path) -> None:
 
 
 def test_nothing_goes_that_a_run_in_progress_has_used(cache: Path) -> None:
-    with lease(cache):
-        Store(cache).get("detect", KEYS[0])
+    with in_use(cache):
+        StageCache(cache).get("detect", KEYS[0], bytes)
         prune(cache, 0)
         assert left(cache) == KEYS[:1]
-    Store(cache).put("detect", KEYS[1], b"")
-    os.utime(Store(cache).path("detect", KEYS[0]), (1000, 1000))
+    StageCache(cache).put("detect", KEYS[1], bytes, b"")
+    os.utime(StageCache(cache).path("detect", KEYS[0]), (1000, 1000))
     prune(cache, 0)
     assert KEYS[0] not in left(cache)
 
 
 def test_a_run_in_another_process_protects_its_entries_until_it_is_killed(cache: Path) -> None:
     code = (
-        "import sys, time; from pathlib import Path; from v2hdm.store.cache.store import Store\n"
-        "store = Store(Path(sys.argv[1]))\n"
-        "with store.in_use():\n"
-        f"    store.get('detect', '{KEYS[3]}'); print('in use', flush=True); time.sleep(60)\n"
+        "import sys, time; from pathlib import Path; from v2hdm.store.cache import StageCache\n"
+        "cache = StageCache(Path(sys.argv[1]))\n"
+        "with cache.in_use():\n"
+        f"    cache.get('detect', '{KEYS[3]}', bytes); print('in use', flush=True); time.sleep(60)\n"
     )
     process = subprocess.Popen([sys.executable, "-c", code, str(cache)], stdout=subprocess.PIPE)
     try:
@@ -79,11 +81,11 @@ def test_a_run_in_another_process_protects_its_entries_until_it_is_killed(cache:
         process.stdout.close()
     prune(cache, 0)
     assert not left(cache)
-    assert not list((cache / "stages").glob("in_use/*"))
+    assert not list((cache / IN_USE).glob("*"))
 
 
-def test_a_lease_that_cannot_be_looked_at_counts_as_held(cache: Path) -> None:
-    held = cache / "stages" / "in_use" / "1-00000000.lease"
+def test_a_lock_that_cannot_be_looked_at_counts_as_held(cache: Path) -> None:
+    held = cache / IN_USE / "0123456789abcdef.lock"
     held.parent.mkdir()
     held.mkdir()  # opened, it is an error that is not its absence
     os.utime(held, (1001, 1001))
@@ -91,11 +93,18 @@ def test_a_lease_that_cannot_be_looked_at_counts_as_held(cache: Path) -> None:
 
 
 def test_what_killed_runs_have_left_goes(cache: Path) -> None:
-    partial = cache / "stages" / "detect" / f".{'a' * 16}.{'b' * 8}.part"
+    partial = cache / "stages" / "detect" / ".some-host-0123456789abcdef.part"
     partial.write_bytes(b"half")
     os.utime(partial, (1000, 1000))
+    for name, used_s in (("old", 1000.0), ("new", time.time())):
+        folder = cache / f".bag-{name}.some-host-01234567.part" / "front"
+        folder.mkdir(parents=True)
+        (folder / "0.png").write_bytes(b"half")
+        for path in (folder / "0.png", folder, folder.parent):
+            os.utime(path, (used_s, used_s))
     prune(cache, 1e9)
     assert not partial.exists()
+    assert [path.name for path in cache.glob(".*.part")] == [".bag-new.some-host-01234567.part"]
     assert left(cache) == KEYS
 
 
@@ -135,17 +144,17 @@ def test_a_list_that_names_files_elsewhere_removes_none_of_them(tmp_path: Path) 
     assert not (folder / "drive.yaml").exists()
 
 
-def test_the_door_lists_verifies_and_prunes(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert door.main(["list", "--cache", str(cache)]) == 0
+def test_the_command_lists_verifies_and_prunes(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command.main(["list", "--cache", str(cache)]) == 0
     assert "detect" in capsys.readouterr().out
-    path = Store(cache).path("detect", KEYS[1])
+    path = StageCache(cache).path("detect", KEYS[1])
     path.write_bytes(path.read_bytes()[:-1] + b"x")
-    assert door.main(["verify", "--cache", str(cache)]) == 0
+    assert command.main(["verify", "--cache", str(cache)]) == 0
     printed = capsys.readouterr().out
     assert str(path) in printed
     assert "read 4 entries, 1 of them damaged" in printed
     assert not path.exists()
-    assert door.main(["prune", "--cache", str(cache), "--gb", "0"]) == 0
+    assert command.main(["prune", "--cache", str(cache), "--gb", "0"]) == 0
     assert "removed 3 entries" in capsys.readouterr().out
     assert not left(cache)
 
@@ -154,12 +163,30 @@ def test_the_door_lists_verifies_and_prunes(cache: Path, capsys: pytest.CaptureF
     ("arguments", "says"),
     [(["list", "--cache", "nowhere"], "no such folder"), (["prune", "--gb", "-1"], "give 0 or more")],
 )
-def test_the_door_tells_in_one_line(
+def test_the_command_reports_in_one_line(
     arguments: list[str], says: str, cache: Path, capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     monkeypatch.chdir(cache.parent)
-    assert door.main(arguments) == 2
+    assert command.main(arguments) == 2
     error = capsys.readouterr().err
     assert says in error
     assert error.count("\n") == 1
+
+
+def test_the_command_lists_verifies_and_prunes_a_store(
+    memory: RemoteFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for key in KEYS[:3]:
+        memory.write(entry_name("detect", key), b"no entry")
+    StageCache(tmp_path, memory).put("map", KEYS[0], bytes, bytes(1000))
+    memory.write("stages/detect/notes", b"mine")
+    memory.write("notes", b"mine")
+    assert command.main(["list", "--cache", str(memory)]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert [line.split()[:2] for line in printed[1:]] == [["detect", "3"], ["map", "1"], ["all", "4"]]
+    assert command.main(["verify", "--cache", str(memory)]) == 0
+    assert "read 4 entries, 3 of them damaged" in capsys.readouterr().out
+    assert command.main(["prune", "--cache", str(memory), "--gb", "0"]) == 0
+    assert "removed 1 entries" in capsys.readouterr().out
+    assert set(memory.listed()) == {"stages/detect/notes", "notes"}

@@ -1,14 +1,13 @@
 """Folders of results: each belongs to one process at a time, and only what is ours is ever replaced.
 
-A folder that we wrote holds a list of our files with their hashes, ``.v2hdm-results.jsonl``. What is not on
-the list is the user's and stays through a rerun; where a file on it was changed, the rerun is refused. A
-lock beside the folder is held by the process that writes and released by its end, whatever ends it.
+A folder that we wrote holds a list of our files with their hashes, ``.v2hdm-results.jsonl``. Files that are
+not on the list are the user's and stay through a rerun; where a file on it was changed, the rerun is refused.
+A lock beside the folder is held by the process that writes and released by its end, whatever ends it.
 """
 
 from __future__ import annotations
 
 import errno
-import hashlib
 import json
 import logging
 import os
@@ -18,13 +17,16 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from v2hdm.errors import ConfigError
-from v2hdm.store.files import refuse_url, told_of_files, whole_file
-from v2hdm.store.listing import LIST
-from v2hdm.store.locks import take_lock
+from v2hdm.store.files import file_digest, observed_writes, refuse_url, whole_file
+from v2hdm.store.folders import remove_empty
+from v2hdm.store.inputs import LIST
+from v2hdm.store.lock import HOST, take_lock
 
 _log = logging.getLogger(__name__)
 
 _HEAD = {"about": "files that v2hdm wrote here; a rerun replaces these and no others"}
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
+"""The disk is at fault, whatever was being written."""
 
 
 @contextmanager
@@ -38,30 +40,26 @@ def result_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
         ConfigError: The folder cannot be written, holds something that is no earlier result of ours, or
             another process is writing it.
     """
-    target = _resolved(folder, option)
-    with ExitStack() as stack:
+    with locked_folder(folder, option) as target:
+        unfinished, previous = _hidden(target, "part"), _hidden(target, "previous")
         with _explained(folder, option):
-            stack.enter_context(_parents(target))
-            stack.enter_context(_locked(target, folder, option))
-            unfinished, previous = _hidden(target, "part"), _hidden(target, "previous")
             _recover(target, unfinished, previous, option)
-            ours = _ours(target, folder, option)
+            listed = _listed(target, folder, option)
+            _refuse_changed(target, folder, listed or {}, option)
             unfinished.mkdir()
-            (unfinished / LIST).write_text(json.dumps(_HEAD) + "\n", encoding="utf-8")
+            _write_list(unfinished, [])
         try:
-            yield unfinished
+            with _explained(folder, option, _FULL):
+                yield unfinished
             with _explained(folder, option):
-                _list(unfinished)
-                if ours is not None:
-                    _bring_over(target, unfinished, ours)
+                files = sorted(path for path in unfinished.rglob("*") if path.is_file() and path.name != LIST)
+                _write_list(unfinished, files)
+                if listed is not None:
+                    _bring_over(target, unfinished, {LIST, *listed})
                     target.replace(previous)
                 elif target.exists():
                     target.rmdir()
                 unfinished.replace(target)
-        except OSError as failure:
-            if failure.errno in _FULL:
-                raise _cannot_write(folder, failure, option) from None
-            raise
         finally:
             shutil.rmtree(unfinished, ignore_errors=True)
             if target.exists():
@@ -72,18 +70,12 @@ def result_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
 def added_to(folder: Path, option: str) -> Iterator[Path]:
     """A finished result to write further files into, each listed before it is there.
 
-    Args:
-        folder: of the result.
-        option: which says what folder it is, for errors.
-
     Raises:
         ConfigError: the folder is no result of ours, a file that is to be replaced in it is not ours, it
-            cannot be written, or another process is writing it.
+            cannot be written, or another process is writing it; the ``option`` says which folder it is.
     """
-    target = _resolved(folder, option)
-    with ExitStack() as stack:
+    with locked_folder(folder, option) as target:
         with _explained(folder, option):
-            stack.enter_context(_locked(target, folder, option))
             if _listed(target, folder, option) is None:
                 raise ConfigError(f"{folder}: is no result of ours; give another {option}")
         with listed_files(folder, option):
@@ -94,7 +86,7 @@ def added_to(folder: Path, option: str) -> Iterator[Path]:
 def listed_files(folder: Path, option: str) -> Iterator[None]:
     """Within, each file that is written whole into a folder of ours is put on its list before it is there.
 
-    Listed first, a file is ours whenever the work is cut off; what it was before stays ours as well.
+    Listed first, a file is ours whenever the work is cut off; its content before stays ours as well.
 
     Raises:
         ConfigError: a file that is to be replaced is not ours, or the folder cannot be written.
@@ -106,32 +98,14 @@ def listed_files(folder: Path, option: str) -> Iterator[None]:
         if not (place := path.resolve()).is_relative_to(target):
             return
         name = place.relative_to(target).as_posix()
-        if path.exists() and _digest(path) not in ours.get(name, ()):
+        if path.exists() and file_digest(path) not in ours.get(name, ()):
             raise ConfigError(f"{folder / name}: is no file of ours; move it, or give another {option}")
-        digest = _digest(partial)
+        digest = file_digest(partial)
         _append(target / LIST, json.dumps({"file": name, "sha256": digest}) + "\n")
         ours.setdefault(name, []).append(digest)
 
-    try:
-        with told_of_files(list_file):
-            yield
-    except OSError as failure:
-        if failure.errno in _FULL:
-            raise _cannot_write(folder, failure, option) from None
-        raise
-
-
-def _append(path: Path, line: str) -> None:
-    """Append a line, or nothing: half of one would damage the list."""
-    size = path.stat().st_size
-    try:
-        with path.open("ab", buffering=0) as stream:
-            data = line.encode()
-            if stream.write(data) < len(data):
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-    except OSError:
-        os.truncate(path, size)
-        raise
+    with _explained(folder, option, _FULL), observed_writes(list_file):
+        yield
 
 
 class GrowingFolder:
@@ -162,39 +136,36 @@ def growing_folder(folder: Path, option: str) -> Iterator[GrowingFolder]:
     Raises:
         ConfigError: as :func:`result_folder`.
     """
-    target = _resolved(folder, option)
-    with ExitStack() as stack:
+    with locked_folder(folder, option) as target:
         with _explained(folder, option):
-            stack.enter_context(_parents(target))
-            stack.enter_context(_locked(target, folder, option))
-            there = _listed(target, folder, option)
+            is_new = _listed(target, folder, option) is None
             target.mkdir(exist_ok=True)
-            if there is None:
-                (target / LIST).write_text(json.dumps(_HEAD) + "\n", encoding="utf-8")
+            if is_new:
+                _write_list(target, [])
         growing = GrowingFolder(target, folder, option)
         try:
             with listed_files(folder, option):
                 yield growing
         finally:
-            if there is None and not growing.has_files:
+            if is_new and not growing.has_files:
                 (target / LIST).unlink(missing_ok=True)
                 with suppress(OSError):
                     target.rmdir()
 
 
 @contextmanager
-def locked_folder(folder: Path, option: str = "output=") -> Iterator[None]:
-    """Keep other processes of ours from writing ``folder`` at the same time.
+def locked_folder(folder: Path, option: str = "output=") -> Iterator[Path]:
+    """Where ``folder`` leads, which no other process of ours writes within this block.
 
     Raises:
-        ConfigError: one does already; the message names it.
+        ConfigError: one does already, which the message names; or it is nothing that can be replaced.
     """
     target = _resolved(folder, option)
     with ExitStack() as stack:
         with _explained(folder, option):
             stack.enter_context(_parents(target))
             stack.enter_context(_locked(target, folder, option))
-        yield
+        yield target
 
 
 def files_of_result(folder: Path) -> dict[str, str]:
@@ -209,7 +180,7 @@ def files_of_result(folder: Path) -> dict[str, str]:
 def is_whole(folder: Path, files: Mapping[str, str]) -> bool:
     """Whether a result folder holds these files of ours, unchanged, and none is missing."""
     return bool(files) and all(
-        (folder / name).is_file() and _digest(folder / name) == digest for name, digest in files.items()
+        (folder / name).is_file() and file_digest(folder / name) == digest for name, digest in files.items()
     )
 
 
@@ -218,28 +189,21 @@ def drop_result(folder: Path) -> None:
     with suppress(OSError, ConfigError):
         for name in [*files_of_result(folder), LIST]:
             (folder / name).unlink(missing_ok=True)
-        below = sorted((one for one in folder.rglob("*") if one.is_dir()), key=lambda one: -len(one.parts))
-        for one in [*below, folder]:
-            one.rmdir()
-
-
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
-"""The disk is at fault, whatever was being written."""
+        remove_empty(folder)
 
 
 @contextmanager
-def _explained(folder: Path, option: str) -> Iterator[None]:
+def _explained(folder: Path, option: str, only: tuple[int, ...] = ()) -> Iterator[None]:
+    """Report failures of the disk, all or those of ``only`` some kinds, as the output folder's."""
     try:
         yield
     except OSError as failure:
-        raise _cannot_write(folder, failure, option) from None
-
-
-def _cannot_write(folder: Path, failure: OSError, option: str) -> ConfigError:
-    return ConfigError(
-        f"output folder {folder} cannot be written: {failure.strerror}; nothing new is left: free space "
-        f"or give another {option}"
-    )
+        if only and failure.errno not in only:
+            raise
+        raise ConfigError(
+            f"output folder {folder} cannot be written: {failure.strerror}; nothing new is left: free space "
+            f"or give another {option}"
+        ) from None
 
 
 def _resolved(folder: Path, option: str) -> Path:
@@ -273,97 +237,6 @@ def _parents(target: Path) -> Iterator[None]:
                 parent.rmdir()
 
 
-def _recover(target: Path, unfinished: Path, previous: Path, option: str) -> None:
-    """Tidy up after a process that was killed: its work is dropped, an earlier result put back."""
-    for left in (unfinished, previous):
-        if left.exists() and not (left / LIST).is_file() and any(left.iterdir()):
-            raise ConfigError(
-                f"{left}: is in the way of our work and not ours; move it, or give another {option}"
-            )
-    if previous.exists() and not target.exists():
-        previous.replace(target)
-    for left in (unfinished, previous):
-        if left.exists():
-            shutil.rmtree(left)
-
-
-def _ours(target: Path, shown: Path, option: str) -> set[str] | None:
-    """Names of our files in ``target``; None if there is nothing yet.
-
-    Raises:
-        ConfigError: it holds something and is not ours, or a file of ours was changed.
-    """
-    listed = _listed(target, shown, option)
-    for name, digests in (listed or {}).items():
-        path = target / name
-        if path.is_file() and _digest(path) not in digests:
-            raise ConfigError(
-                f"{shown / name}: was changed after we wrote it and is not replaced; move it, or give "
-                f"another {option}"
-            )
-    return None if listed is None else set(listed)
-
-
-def _listed(target: Path, shown: Path, option: str) -> dict[str, list[str]] | None:
-    """By name of a file of ours in ``target`` what we wrote there, the last at the end; None if it is empty.
-
-    Raises:
-        ConfigError: it holds something and is not ours.
-    """
-    if not target.exists() or not any(target.iterdir()):
-        return None
-    marker = target / LIST
-    if not marker.is_file():
-        raise ConfigError(
-            f"output folder {shown} holds files that are no results of ours: give another {option}"
-        )
-    listed: dict[str, list[str]] = {}
-    try:
-        for line in marker.read_text(encoding="utf-8").splitlines()[1:]:
-            entry = json.loads(line)
-            listed.setdefault(str(entry["file"]), []).append(str(entry["sha256"]))
-    except (ValueError, TypeError, LookupError, RecursionError):
-        raise ConfigError(f"{shown / LIST}: is damaged; give another {option}") from None
-    return listed
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def _list(folder: Path) -> None:
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != LIST)
-    entries = [{"file": path.relative_to(folder).as_posix(), "sha256": _digest(path)} for path in files]
-    (folder / LIST).write_text(
-        "".join(json.dumps(entry) + "\n" for entry in [_HEAD, *entries]), encoding="utf-8"
-    )
-
-
-def _bring_over(earlier: Path, new: Path, ours: set[str]) -> None:
-    """Give what the user has put into an ``earlier`` result to the ``new`` one as well."""
-    for root, folders, files in os.walk(earlier):
-        here = Path(root)
-        links = [name for name in folders if (here / name).is_symlink()]
-        names = [path for path in map(here.joinpath, (*files, *links)) if not _is_ours(path, earlier, ours)]
-        if names or not (files or folders):
-            (new / here.relative_to(earlier)).mkdir(parents=True, exist_ok=True)
-        for path in names:
-            place = new / path.relative_to(earlier)
-            while place.exists() or place.is_symlink():
-                place = place.with_name(f"{place.stem}.kept{place.suffix}")
-                _log.warning("%s is not ours; it is kept as %s", path, place.name)
-            try:
-                os.link(path, place, follow_symlinks=False)
-            except OSError:  # a file system without links
-                shutil.copy2(path, place, follow_symlinks=False)
-
-
-def _is_ours(path: Path, folder: Path, ours: set[str]) -> bool:
-    name = path.relative_to(folder).as_posix()
-    return name == LIST or name in ours
-
-
 @contextmanager
 def _locked(target: Path, shown: Path, option: str) -> Iterator[None]:
     """Hold the lock of ``target``, a file beside it, until the block or the process ends."""
@@ -386,12 +259,98 @@ def _locked(target: Path, shown: Path, option: str) -> Iterator[None]:
     try:
         stream.seek(0)
         stream.truncate()
-        stream.write(
-            f"process {os.getpid()} on {os.uname().nodename if hasattr(os, 'uname') else 'this host'}\n"
-        )
+        stream.write(f"process {os.getpid()} on {HOST}\n")
         stream.flush()
         yield
     finally:
         path.unlink(missing_ok=True)
         with suppress(OSError):
             stream.close()
+
+
+def _recover(target: Path, unfinished: Path, previous: Path, option: str) -> None:
+    """Tidy up after a process that was killed: its work is dropped, an earlier result put back."""
+    for left in (unfinished, previous):
+        if left.exists() and not (left / LIST).is_file() and any(left.iterdir()):
+            raise ConfigError(
+                f"{left}: is in the way of our work and not ours; move it, or give another {option}"
+            )
+    if previous.exists() and not target.exists():
+        previous.replace(target)
+    for left in (unfinished, previous):
+        if left.exists():
+            shutil.rmtree(left)
+
+
+def _listed(target: Path, shown: Path, option: str) -> dict[str, list[str]] | None:
+    """Digests of our files in ``target`` by their names, the last at the end; None if it is empty.
+
+    Raises:
+        ConfigError: it holds something and is not ours.
+    """
+    if not target.exists() or not any(target.iterdir()):
+        return None
+    marker = target / LIST
+    if not marker.is_file():
+        raise ConfigError(
+            f"output folder {shown} holds files that are no results of ours: give another {option}"
+        )
+    listed: dict[str, list[str]] = {}
+    try:
+        for line in marker.read_text(encoding="utf-8").splitlines()[1:]:
+            entry = json.loads(line)
+            listed.setdefault(str(entry["file"]), []).append(str(entry["sha256"]))
+    except (ValueError, TypeError, LookupError, RecursionError):
+        raise ConfigError(f"{shown / LIST}: is damaged; give another {option}") from None
+    return listed
+
+
+def _refuse_changed(target: Path, shown: Path, listed: Mapping[str, list[str]], option: str) -> None:
+    for name, digests in listed.items():
+        if (target / name).is_file() and file_digest(target / name) not in digests:
+            raise ConfigError(
+                f"{shown / name}: was changed after we wrote it and is not replaced; move it, or give "
+                f"another {option}"
+            )
+
+
+def _write_list(folder: Path, files: list[Path]) -> None:
+    entries = [{"file": path.relative_to(folder).as_posix(), "sha256": file_digest(path)} for path in files]
+    text = "".join(json.dumps(entry) + "\n" for entry in [_HEAD, *entries])
+    (folder / LIST).write_text(text, encoding="utf-8")
+
+
+def _append(path: Path, line: str) -> None:
+    """Append a line, or nothing: half of one would damage the list."""
+    size = path.stat().st_size
+    try:
+        with path.open("ab", buffering=0) as stream:
+            data = line.encode()
+            if stream.write(data) < len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+    except OSError:
+        os.truncate(path, size)
+        raise
+
+
+def _bring_over(earlier: Path, new: Path, ours: set[str]) -> None:
+    """Give what the user has put into an ``earlier`` result to the ``new`` one as well."""
+    for root, folders, files in os.walk(earlier):
+        here = Path(root)
+        links = [name for name in folders if (here / name).is_symlink()]
+        theirs = [
+            path
+            for path in map(here.joinpath, (*files, *links))
+            if path.relative_to(earlier).as_posix() not in ours
+        ]
+        if theirs or not (files or folders):
+            (new / here.relative_to(earlier)).mkdir(parents=True, exist_ok=True)
+        for path in theirs:
+            place = new / path.relative_to(earlier)
+            while place.exists() or place.is_symlink():
+                place = place.with_name(f"{place.stem}.kept{place.suffix}")
+                _log.warning("%s is not ours; it is kept as %s", path, place.name)
+            try:
+                os.link(path, place, follow_symlinks=False)
+            except OSError:  # a file system without links
+                shutil.copy2(path, place, follow_symlinks=False)

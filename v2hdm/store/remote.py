@@ -1,8 +1,14 @@
-"""Objects below a URL: read, written whole, created once, listed, removed; what fails is told in one line."""
+"""Folders at object stores, by URL: objects are read, written whole, created once, listed and removed.
+
+A put replaces an object at once or not at all, and an object can be created once; nothing else is asked of a
+store. Whatever fails there is one line. A drive at a store is downloaded once.
+"""
 
 from __future__ import annotations
 
 import errno
+import hashlib
+import json
 import logging
 import time
 from collections.abc import Callable, Mapping
@@ -12,10 +18,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import unquote
 
-from v2hdm.errors import ConfigError
+from v2hdm.errors import ConfigError, DriveError
 from v2hdm.extras import need
+from v2hdm.store.folders import begin_entry, cannot_write, drop_entry, finish_entry, is_whole, note_use
 
 _Answer = TypeVar("_Answer")
+Report = Callable[[int, int], None]
+"""Called as ``report(done, total)`` with numbers of objects."""
+
 _log = logging.getLogger(__name__)
 
 _MEMORY = "memory"
@@ -28,12 +38,14 @@ _PACKAGES = {
 }  # fmt: skip
 """Protocols of stores that replace an object at once, and the package that speaks each."""
 
-_FOLDER = "file"
 _NOTHING = ".v2hdm-nothing"
 """A prefix that nobody writes to: cheap to list."""
 
 _WAITS_S = (1.0, 4.0)
 """Between the tries of a call that may work the next time, beside those that the packages make themselves."""
+
+_AT_ONCE = 32
+"""Objects of one call, downloaded side by side."""
 
 _FINAL = (errno.EINVAL, errno.EPERM, errno.ENAMETOOLONG, errno.EMSGSIZE)
 _TOKENS = ("ETag", "etag", "md5Hash", "modified", "created")
@@ -46,12 +58,8 @@ def is_url(place: str) -> bool:
     return "://" in place
 
 
-def place_of(text: str, option: str) -> Path | Bucket:
-    """The folder or the store that a user's setting names; ``file://`` names a folder.
-
-    Args:
-        text: of the setting.
-        option: which names it, for errors.
+def place_of(text: str, option: str) -> Path | RemoteFolder:
+    """The folder or the store that the setting ``option`` names; ``file://`` names a folder.
 
     Raises:
         ConfigError: it is no place that we can write to.
@@ -59,15 +67,15 @@ def place_of(text: str, option: str) -> Path | Bucket:
     if not is_url(text):
         return Path(text)
     protocol, rest = text.split("://", 1)
-    if protocol == _FOLDER:
-        if not rest.startswith("/"):
-            raise ConfigError(f"{option} {text}: a folder is named as in file:///data/results")
-        return Path(unquote(rest))
-    return Bucket.at(text, option)
+    if protocol != "file":
+        return RemoteFolder.at(text, option)
+    if not rest.startswith("/"):
+        raise ConfigError(f"{option} {text}: a folder is named as in file:///data/results")
+    return Path(unquote(rest))
 
 
 @dataclass(frozen=True)
-class Thing:
+class RemoteFile:
     """An object as it is listed: bytes, a token that changes with it, when it was written (s since 1970)."""
 
     size: int
@@ -75,7 +83,7 @@ class Thing:
     written_s: float
 
 
-class Bucket:
+class RemoteFolder:
     """The objects below one URL, by what their names are there.
 
     Every call is tried again where that may help, and raises a :class:`ConfigError` that names the URL.
@@ -86,7 +94,7 @@ class Bucket:
         self._files, self._root, self.url, self._option = files, root.rstrip("/"), url.rstrip("/"), option
 
     @classmethod
-    def at(cls, url: str, option: str) -> Bucket:
+    def at(cls, url: str, option: str) -> RemoteFolder:
         """The objects below a URL.
 
         Raises:
@@ -117,22 +125,15 @@ class Bucket:
         return self.url
 
     def check(self) -> None:
-        """Ask once, so that what is wrong is told before any work.
+        """Ask once, so that what is wrong is reported before any work: as :meth:`listed`."""
+        self._in_bucket("", lambda: self._find(f"{self._root}/{_NOTHING}"))
 
-        Raises:
-            ConfigError: there is no such bucket, or it cannot be listed.
-        """
-        try:
-            self._call("", lambda: self._find(f"{self._root}/{_NOTHING}"))
-        except FileNotFoundError:
-            raise self._no_bucket() from None
-
-    def below(self, name: str) -> Bucket:
+    def below(self, name: str) -> RemoteFolder:
         """The objects whose names begin with ``name`` and a slash."""
-        return Bucket(self._files, f"{self._root}/{name}", f"{self.url}/{name}", self._option)
+        return RemoteFolder(self._files, f"{self._root}/{name}", f"{self.url}/{name}", self._option)
 
     def read(self, name: str) -> bytes | None:
-        """What an object holds; None where there is none."""
+        """The content of an object; None where there is none."""
         try:
             data: bytes = self._call(name, lambda: self._files.cat_file(f"{self._root}/{name}"))
         except FileNotFoundError:
@@ -157,10 +158,7 @@ class Bucket:
 
     def write(self, name: str, content: bytes | Path) -> None:
         """Put an object, given as bytes or as a file, in whatever one of that name has been."""
-        try:
-            self._call(name, lambda: self._put(name, content, "overwrite"))
-        except FileNotFoundError:
-            raise self._no_bucket() from None
+        self._in_bucket(name, lambda: self._put(name, content, "overwrite"))
 
     def create(self, name: str, content: bytes | Path) -> bool:
         """Put an object where there is none of that name; whether there was none.
@@ -168,25 +166,20 @@ class Bucket:
         Where an earlier try may have worked whose answer was lost, the object there is compared.
         """
         try:
-            self._call(name, lambda: self._put(name, content, "create"))
+            self._in_bucket(name, lambda: self._put(name, content, "create"))
         except FileExistsError:
             return self.read(name) == (content if isinstance(content, bytes) else content.read_bytes())
-        except FileNotFoundError:
-            raise self._no_bucket() from None
         return True
 
-    def listed(self) -> dict[str, Thing]:
+    def listed(self) -> dict[str, RemoteFile]:
         """All objects, by name.
 
         Raises:
             ConfigError: there is no such bucket, or it cannot be listed.
         """
         begin = f"{self._root}/"
-        try:
-            found = self._call("", lambda: self._find(self._root))
-        except FileNotFoundError:
-            raise self._no_bucket() from None
-        return {name[len(begin) :]: _thing(about) for name, about in found.items() if name.startswith(begin)}
+        found = self._in_bucket("", lambda: self._find(self._root))
+        return {name[len(begin) :]: _listed(one) for name, one in found.items() if name.startswith(begin)}
 
     def remove(self, name: str) -> None:
         """Remove an object, if it is there."""
@@ -213,55 +206,81 @@ class Bucket:
         found: dict[str, Any] = self._files.find(path, detail=True)
         return found
 
+    def _in_bucket(self, name: str, work: Callable[[], _Answer]) -> _Answer:
+        try:
+            return self._call(name, work)
+        except FileNotFoundError:
+            raise ConfigError(
+                f"{self.url}: no such bucket or container; make it, or give another {self._option}"
+            ) from None
+
     def _call(self, name: str, work: Callable[[], _Answer]) -> _Answer:
+        where = f"{self.url}/{name}" if name else self.url
         for wait_s in (*_WAITS_S, None):
             try:
                 return work()
             except (FileNotFoundError, FileExistsError):
                 raise
             except Exception as failure:  # each package has errors of its own
-                if wait_s is None or _is_final(failure):
-                    raise self._told(name, failure) from None
-                _log.warning("%s: %s; trying again in %g s", self._named(name), _first_line(failure), wait_s)
+                refused = isinstance(failure, PermissionError) or "Credential" in type(failure).__name__
+                final = refused or (isinstance(failure, OSError) and failure.errno in _FINAL)
+                if wait_s is None or final:
+                    advice = f"check the network and start again, or give another {self._option}"
+                    if refused:
+                        advice = "check the credentials, as the package that speaks to the store takes them"
+                    raise ConfigError(f"{where}: does not work ({_first_line(failure)}); {advice}") from None
+                _log.warning("%s: %s; trying again in %g s", where, _first_line(failure), wait_s)
                 time.sleep(wait_s)
         raise AssertionError
-
-    def _told(self, name: str, failure: Exception) -> ConfigError:
-        if isinstance(failure, PermissionError) or "Credential" in type(failure).__name__:
-            advice = "check the credentials, as the package that speaks to the store takes them"
-        else:
-            advice = f"check the network and start again, or give another {self._option}"
-        return ConfigError(f"{self._named(name)}: does not work ({_first_line(failure)}); {advice}")
-
-    def _named(self, name: str) -> str:
-        return f"{self.url}/{name}" if name else self.url
-
-    def _no_bucket(self) -> ConfigError:
-        return ConfigError(
-            f"{self.url}: no such bucket or container; make it, or give another {self._option}"
-        )
-
-
-def _is_final(failure: Exception) -> bool:
-    """Whether another try is in vain."""
-    if isinstance(failure, PermissionError) or "Credential" in type(failure).__name__:
-        return True
-    return isinstance(failure, OSError) and failure.errno in _FINAL
 
 
 def _first_line(failure: Exception) -> str:
     return " ".join(str(failure).split())[:_MESSAGE_LETTERS] or type(failure).__name__
 
 
-def _thing(about: dict[str, Any]) -> Thing:
+def _listed(about: dict[str, Any]) -> RemoteFile:
     token = next((str(about[key]) for key in _TOKENS if about.get(key) is not None), "")
     written = next((about[key] for key in _TIMES if about.get(key) is not None), 0.0)
-    return Thing(int(about["size"]), token.strip('"'), _seconds(written))
+    if isinstance(written, str):
+        written = datetime.fromisoformat(written)
+    written_s = written.timestamp() if isinstance(written, datetime) else float(written)
+    return RemoteFile(int(about["size"]), token.strip('"'), written_s)
 
 
-def _seconds(time_: object) -> float:
-    if isinstance(time_, str):
-        time_ = datetime.fromisoformat(time_)
-    if isinstance(time_, datetime):
-        return time_.timestamp()
-    return float(time_) if isinstance(time_, int | float) else 0.0
+def download(drive: RemoteFolder, cache: Path, report: Report) -> Path:
+    """The folder in ``cache`` that holds what is below a URL now, copied once for each content it has had.
+
+    Raises:
+        DriveError: there is no drive, a name of it leads out of its folder, or the copy cannot be written.
+        ConfigError: the store failed.
+    """
+    there = {name: one for name, one in drive.listed().items() if not name.endswith("/")}
+    if not there:
+        raise DriveError(f"{drive}: no such drive; give the URL of a drive's folder")
+    wrong = next((name for name in there if {"", ".", ".."} & set(name.split("/")) or "\\" in name), None)
+    if wrong is not None:
+        raise DriveError(f"{drive}: the name {wrong!r} is none of a file in a folder; rename the object")
+    called, names = drive.url.rsplit("/", 1)[-1], sorted(there)
+    versions = [(name, there[name].size, there[name].token) for name in names]
+    digest = hashlib.sha256(json.dumps([drive.url, versions]).encode()).hexdigest()
+    entry = cache / f"{called}-{digest[:12]}"
+    if is_whole(entry):
+        note_use(entry)
+        return entry / called
+    size_mb = sum(one.size for one in there.values()) / 1e6
+    _log.info("%s: copying %d objects of %.1f MB to %s", drive, len(there), size_mb, entry)
+    partial = begin_entry(entry) / called
+    try:
+        for begin in range(0, len(names), _AT_ONCE):
+            some = names[begin : begin + _AT_ONCE]
+            drive.fetch({name: partial / name for name in some})
+            for name in some:
+                if (partial / name).stat().st_size != there[name].size:
+                    raise DriveError(f"{drive}/{name}: changes while it is copied; start again")
+            report(begin + len(some), len(names))
+        finish_entry(entry)
+    except OSError as failure:
+        raise cannot_write(entry, failure) from None
+    finally:
+        drop_entry(entry)
+    return entry / called

@@ -11,11 +11,11 @@ from omegaconf import OmegaConf
 from v2hdm.cli.config import Job
 from v2hdm.errors import ConfigError
 from v2hdm.store.files import whole_file
-from v2hdm.store.objects.bucket import Bucket, place_of
-from v2hdm.store.outputs import result_folder
+from v2hdm.store.remote import RemoteFolder, place_of
+from v2hdm.store.results import result_folder
 
 
-def test_what_was_put_is_read_listed_and_removed(memory: Bucket, tmp_path: Path) -> None:
+def test_what_was_put_is_read_listed_and_removed(memory: RemoteFolder, tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"12345")
     memory.write("c/b", tmp_path / "file")
     memory.write("a", b"x")
@@ -30,23 +30,23 @@ def test_what_was_put_is_read_listed_and_removed(memory: Bucket, tmp_path: Path)
     assert (tmp_path / "deep" / "copy").read_bytes() == b"12345"
 
 
-def test_an_object_is_created_once(memory: Bucket) -> None:
+def test_an_object_is_created_once(memory: RemoteFolder) -> None:
     assert memory.create("a", b"first")
     assert not memory.create("a", b"other")
     assert memory.read("a") == b"first"
 
 
-def test_a_create_whose_answer_was_lost_counts(memory: Bucket) -> None:
+def test_a_create_whose_answer_was_lost_counts(memory: RemoteFolder) -> None:
     assert memory.create("a", b"first")
     assert memory.create("a", b"first")
 
 
-def test_a_name_that_begins_alike_is_not_below(memory: Bucket) -> None:
+def test_a_name_that_begins_alike_is_not_below(memory: RemoteFolder) -> None:
     memory.write("run2/map", b"x")
     assert not memory.below("run").listed()
 
 
-def test_a_token_changes_with_the_object(memory: Bucket) -> None:
+def test_a_token_changes_with_the_object(memory: RemoteFolder) -> None:
     memory.write("a", b"x")
     before = memory.listed()["a"]
     memory.write("a", b"y")
@@ -68,7 +68,7 @@ class Failing:
 @pytest.mark.usefixtures("quick")
 def test_what_fails_for_a_moment_is_tried_again(caplog: pytest.LogCaptureFixture) -> None:
     failing = Failing(OSError("reset by peer"), TimeoutError())
-    assert Bucket(failing, "b", "s3://b", "output=").read("a") == b"b/a"
+    assert RemoteFolder(failing, "b", "s3://b", "output=").read("a") == b"b/a"
     assert [one.levelname for one in caplog.records] == ["WARNING"] * 2
 
 
@@ -88,7 +88,7 @@ def test_what_fails_for_a_moment_is_tried_again(caplog: pytest.LogCaptureFixture
 def test_what_goes_on_failing_is_one_line(failures: list[Exception], says: str, left: int) -> None:
     failing = Failing(*failures)
     with pytest.raises(ConfigError, match=says) as told:
-        Bucket(failing, "b", "s3://b", "output=").read("a")
+        RemoteFolder(failing, "b", "s3://b", "output=").read("a")
     assert "\n" not in str(told.value)
     assert len(failing.failures) == left
 
@@ -128,7 +128,7 @@ def test_a_folder_may_be_named_by_a_url() -> None:
 
 
 def test_s3_does_what_the_store_in_memory_does(s3: Any, tmp_path: Path) -> None:
-    place = Bucket.at("s3://bucket/place", "output=")
+    place = RemoteFolder.at("s3://bucket/place", "output=")
     assert not place.listed()
     test_what_was_put_is_read_listed_and_removed(place, tmp_path)
     test_an_object_is_created_once(place.below("once"))
@@ -138,7 +138,7 @@ def test_s3_does_what_the_store_in_memory_does(s3: Any, tmp_path: Path) -> None:
 
 
 def test_a_bucket_that_is_not_there_is_told(s3: Any) -> None:
-    nowhere = Bucket.at("s3://nowhere/results", "output=")
+    nowhere = RemoteFolder.at("s3://nowhere/results", "output=")
     for work in (nowhere.check, lambda: nowhere.write("a", b"x"), lambda: nowhere.create("a", b"x")):
         with pytest.raises(ConfigError, match="no such bucket or container"):
             work()

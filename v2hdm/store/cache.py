@@ -1,0 +1,323 @@
+"""The stage cache: results of stages, kept under a digest of everything that they were made from.
+
+An entry is a file, ``<cache>/stages/<stage>/<key>.v2hdm``, written whole or not at all and checked by its
+checksum whenever it is read: a damaged one counts as absent. Its time of change is that of its last use.
+Several processes, on several machines, may share a cache. Its bytes hold no name of a class or function: the
+type that the reader asks for decides what they become, so that nothing in a file can choose code to run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import platform
+import secrets
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, TypeVar, get_origin
+
+import numpy as np
+
+from v2hdm.errors import ConfigError
+from v2hdm.extras import need
+from v2hdm.store.files import file_digest
+from v2hdm.store.lock import HOST, STAGES, in_use
+from v2hdm.store.remote import RemoteFolder
+
+_log = logging.getLogger(__name__)
+_Value = TypeVar("_Value")
+_Answer = TypeVar("_Answer")
+Line = tuple[str, int, str]
+"""Name of a logger, level, message."""
+
+ENDING = ".v2hdm"
+"""Of an entry's name, after its key."""
+
+LIBRARIES = (
+    "torch", "kornia", "numpy", "scipy", "onnxruntime", "onnxruntime-gpu", "opencv-python-headless", "numba",
+)  # fmt: skip
+"""Libraries that the figures of a run depend on."""
+
+_HEAD = b"v2hdm entry 1\n"
+_START = len(_HEAD) + hashlib.sha256().digest_size
+_PACKAGE = Path(__file__).parents[1]
+_CODE = {".py", ".yaml", ".json", ".onnx", ".html", ".js", ".css"}
+"""Files of the package that decide what comes out: sources, catalogue, weights, templates."""
+
+_NUMBERS = "biufc"
+"""Kinds of numpy's element types that are numbers; objects are none."""
+
+
+class CodecError(ValueError):
+    """Bytes are not those of a value of the type that was asked for."""
+
+
+def encode(value: Any) -> bytes:
+    """The bytes of dataclasses, enumerations, paths, numpy arrays and plain values.
+
+    Equal values of one type and order have equal bytes.
+
+    Raises:
+        TypeError: it holds something that cannot be kept.
+    """
+    data: bytes = _encoder().encode(value)
+    return data
+
+
+def decode(data: bytes, kind: type[_Value]) -> _Value:
+    """The value of type ``kind`` that :func:`encode` made ``data`` of; arrays are laid out row by row.
+
+    Raises:
+        CodecError: the bytes are of no such value.
+    """
+    codec = _codec()
+    try:
+        value: _Value = codec.msgpack.decode(data, type=kind, dec_hook=_special)
+    except (codec.DecodeError, ValueError, TypeError, RecursionError) as failure:
+        raise CodecError(str(failure)) from None
+    return value
+
+
+def _codec() -> Any:
+    return need("msgspec", "map", "the stage cache", ConfigError)
+
+
+@cache
+def _encoder() -> Any:
+    return _codec().msgpack.Encoder(enc_hook=_plain)
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.ndarray) and value.dtype.kind in _NUMBERS:
+        return value.dtype.str, value.shape, np.ascontiguousarray(value).tobytes()
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"{type(value).__name__} cannot be kept")
+
+
+def _special(kind: Any, content: Any) -> object:
+    kind = get_origin(kind) or kind
+    if kind is np.ndarray:
+        name, shape, data = content
+        dtype = np.dtype(name)
+        if dtype.kind not in _NUMBERS:
+            raise ValueError(f"an array of {dtype} is not read")
+        return np.frombuffer(data, dtype).reshape(shape).copy()
+    if isinstance(kind, type) and issubclass(kind, Path):
+        return kind(content)
+    raise TypeError(f"{kind} cannot be kept")
+
+
+def key_of(*parts: object) -> str:
+    """SHA-256 in hexadecimal of parts that :func:`encode` takes."""
+    return hashlib.sha256(encode(parts)).hexdigest()
+
+
+@cache
+def code_key() -> str:
+    """Key of this package's files and of the versions of what it computes with: any change makes anew."""
+    files = sorted(path for path in _PACKAGE.rglob("*") if path.suffix in _CODE)
+    content = [(path.relative_to(_PACKAGE).as_posix(), file_digest(path)) for path in files]
+    return key_of(content, library_versions())
+
+
+def library_versions() -> dict[str, str]:
+    """Versions by name of Python, of the libraries that are installed, and the system."""
+    found = {"Python": platform.python_version()}
+    for package in LIBRARIES:
+        with suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found | {"system": f"{platform.system()} {platform.machine()}"}
+
+
+class StageCache:
+    """The entries of a cache folder, and of the store ``behind`` it, of which it holds copies then.
+
+    What a stage hands on has always been through the codec, and what was logged while it was made is logged
+    again: a run that goes on with entries cannot tell them from results of its own.
+
+    Args:
+        folder: of the cache; None keeps nothing.
+        behind: holds entries of the same names.
+        resume: whether entries are taken; otherwise everything is made anew, and kept.
+    """
+
+    def __init__(self, folder: Path | None, behind: RemoteFolder | None = None, resume: bool = True) -> None:
+        self.folder, self._behind, self._resume = folder, behind, resume
+        self._can_write = folder is not None
+        self.hits: list[str] = []
+        """Stages whose entries were there."""
+
+    @property
+    def local(self) -> StageCache:
+        """The folder alone: for what is true of this machine's folders only."""
+        return StageCache(self.folder)
+
+    def in_use(self) -> AbstractContextManager[None]:
+        """Protect from pruning what is read or written within."""
+        return nullcontext() if self.folder is None else in_use(self.folder)
+
+    def key(self, *parts: object) -> str:
+        """The key of what this version of the code makes of ``parts``."""
+        return key_of(code_key(), *parts)
+
+    def path(self, stage: str, key: str) -> Path:
+        """Where the entry of a stage belongs."""
+        return (self.folder or Path()) / entry_name(stage, key)
+
+    def get_or_make(self, stage: str, key: str, kind: type[_Value], make: Callable[[], _Value]) -> _Value:
+        """The result of a stage, of type ``kind``: its entry, or else what ``make`` makes."""
+        return next(self.get_or_make_each(stage, kind, [(key, lambda: make)]))
+
+    def get_or_make_each(
+        self, stage: str, kind: type[_Value], jobs: Sequence[tuple[str, Callable[[], Callable[[], _Value]]]]
+    ) -> Iterator[_Value]:
+        """Several results of a stage, in order; all that are missing are begun before one is waited for.
+
+        A job is a key, and what begins to make the result and returns what waits for it.
+        """
+        found = [self.get(stage, key, kind) for key, _ in jobs]
+        begun = [begin() if one is None else None for one, (_, begin) in zip(found, jobs, strict=True)]
+        for one, wait, (key, _) in zip(found, begun, jobs, strict=True):
+            if wait is not None:
+                with recorded() as lines:
+                    value = wait()
+                yield self.put(stage, key, kind, value, lines)
+            elif one is not None:
+                yield one
+
+    def get(self, stage: str, key: str, kind: type[_Value]) -> _Value | None:
+        """The entry of a stage under ``key``; None where there is none that is whole."""
+        data = self._read(stage, key) if self._resume and self.folder is not None else None
+        if data is None:
+            return None
+        try:
+            lines, content = decode(data, tuple[list[Line], bytes])
+            value = decode(content, kind)
+        except CodecError:
+            self._drop(stage, key)
+            return None
+        log_again(lines)
+        self.hits.append(stage)
+        return value
+
+    def put(
+        self, stage: str, key: str, kind: type[_Value], value: _Value, lines: list[Line] | None = None
+    ) -> _Value:
+        """Keep ``value`` under ``key`` and return it as :meth:`get` will.
+
+        Where nothing can be written, a warning says so, once.
+        """
+        content = encode(value)
+        if self.folder is not None:
+            entry = encode((lines or [], content))
+            entry = _HEAD + hashlib.sha256(entry).digest() + entry
+            self._write(stage, key, entry)
+            self._ask_behind(lambda behind: behind.write(entry_name(stage, key), entry))
+        return decode(content, kind)
+
+    def _read(self, stage: str, key: str) -> bytes | None:
+        """The content of an entry, which is copied from the store behind where it is only there."""
+        path, data = self.path(stage, key), None
+        try:
+            data = path.read_bytes() if path.is_file() else None  # a pipe would be waited for
+        except FileNotFoundError:
+            pass
+        except OSError as failure:
+            _log.warning("%s: cannot be read (%s); it is made anew", path, failure.strerror)
+        if data is not None and checked(data) is None:
+            self._drop(stage, key)
+            return None
+        if data is not None:
+            with suppress(OSError):  # a cache that may only be read
+                os.utime(path)
+            return checked(data)
+        data = self._ask_behind(lambda behind: behind.read(entry_name(stage, key)))
+        if data is not None and checked(data) is None:
+            self._drop(stage, key)
+        elif data is not None:
+            self._write(stage, key, data)
+            return checked(data)
+        return None
+
+    def _write(self, stage: str, key: str, entry: bytes) -> None:
+        path = self.path(stage, key)
+        partial = path.with_name(f".{HOST}-{secrets.token_hex(8)}.part")
+        if not self._can_write:
+            return
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                with partial.open("xb") as stream:
+                    stream.write(entry)
+                partial.replace(path)
+            finally:
+                partial.unlink(missing_ok=True)
+        except OSError as failure:
+            self._can_write = False
+            _log.warning(
+                "%s: nothing can be kept there (%s), so that a later run begins anew; free space or set "
+                "another cache=",
+                path.parents[1], failure.strerror,
+            )  # fmt: skip
+
+    def _drop(self, stage: str, key: str) -> None:
+        path = self.path(stage, key)
+        _log.warning("%s: is damaged; it is made anew", path)
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+        self._ask_behind(lambda behind: behind.remove(entry_name(stage, key)))
+
+    def _ask_behind(self, question: Callable[[RemoteFolder], _Answer]) -> _Answer | None:
+        """The answer of the store behind; one that fails is reported once and left alone from then on."""
+        if self._behind is None:
+            return None
+        try:
+            return question(self._behind)
+        except ConfigError as failure:
+            self._behind = None
+            _log.warning("%s; the run goes on without that cache", failure)
+            return None
+
+
+def entry_name(stage: str, key: str) -> str:
+    """The path of an entry within its cache."""
+    return f"{STAGES}/{stage}/{key}{ENDING}"
+
+
+def checked(data: bytes) -> bytes | None:
+    """The content of an entry's file, None where it is damaged."""
+    content = data[_START:]
+    return content if data[:_START] == _HEAD + hashlib.sha256(content).digest() else None
+
+
+class _Recorder(logging.Handler):
+    def __init__(self) -> None:
+        super().__init__(logging.DEBUG)
+        self.lines: list[Line] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append((record.name, record.levelno, record.getMessage()))
+
+
+def log_again(lines: Sequence[Line]) -> None:
+    """Log what was :func:`recorded`."""
+    for name, level, message in lines:
+        logging.getLogger(name).log(level, "%s", message)
+
+
+@contextmanager
+def recorded() -> Iterator[list[Line]]:
+    """Record what this library logs within."""
+    recorder, logger = _Recorder(), logging.getLogger("v2hdm")
+    logger.addHandler(recorder)
+    try:
+        yield recorder.lines
+    finally:
+        logger.removeHandler(recorder)

@@ -1,0 +1,194 @@
+"""Folders of a cache that are ours: rendered drives, imports from bags and videos, downloads.
+
+Each holds a list of the files that we wrote, ``.v2hdm-cache.json``, with their sizes and hashes; only these
+are ever removed. The list's time of change is that of the folder's last use. An import is whole or absent; a
+damaged one is made anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import secrets
+import shutil
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from v2hdm.errors import ConfigError, DriveError
+from v2hdm.io.safe.texts import read_json
+from v2hdm.store.files import file_digest
+from v2hdm.store.lock import HOST, use_until_exit
+
+LIST = ".v2hdm-cache.json"
+"""Name of the list in a folder."""
+
+_ABOUT = "files that v2hdm wrote here, which it may remove to make room; touched when they are used"
+
+_VERSION = 3
+"""Raised whenever an import comes out as other files."""
+
+_IMAGES = (".png", ".jpg", ".jpeg")
+_WRITER = f"{HOST}-{secrets.token_hex(4)}"
+_STALE_S = 3600.0
+"""A folder that nothing was written to for so long was left by a process that was killed."""
+
+
+def note_use(folder: Path) -> None:
+    """Record that a folder is in use now, and list what in it is ours where that was never done.
+
+    A folder that cannot be written is used as it is. The folder's cache is in use, too, from now on.
+    """
+    use_until_exit(folder.parent)
+    with suppress(OSError):
+        if (folder / LIST).is_file():
+            os.utime(folder / LIST)
+        else:
+            _write_list(folder)
+
+
+def size_of(folder: Path) -> int | None:
+    """Bytes of our files in a folder, as its list says; None where it is none of our folders."""
+    size = _listed(folder).get("bytes")
+    return size if isinstance(size, int) and size >= 0 else None
+
+
+def remove_ours(folder: Path) -> None:
+    """Remove our files from a folder, and the folder where nothing else is in it.
+
+    Those at its top go first: without them it is neither a drive nor an import.
+
+    Raises:
+        OSError: a file cannot be removed.
+    """
+    for path in sorted(_ours(folder), key=lambda path: (len(path.parts), path)):
+        path.unlink(missing_ok=True)
+    (folder / LIST).unlink(missing_ok=True)
+    remove_empty(folder)
+
+
+def remove_empty(folder: Path) -> None:
+    """Remove the folders in a folder that hold nothing, and itself."""
+    below = sorted((one for one in folder.rglob("*") if one.is_dir()), key=lambda one: -len(one.parts))
+    for one in [*below, folder]:
+        with suppress(OSError):
+            one.rmdir()
+
+
+def _ours(folder: Path) -> list[Path]:
+    names = _listed(folder).get("files")
+    if not isinstance(names, list | dict):
+        return []
+    listed = [folder / name for name in names if isinstance(name, str) and "\0" not in name]
+    # The list may lie: nothing outside of the folder is ours, whatever way leads there.
+    here = folder.resolve()
+    within = {parent for parent in {path.parent for path in listed} if parent.resolve().is_relative_to(here)}
+    return [path for path in listed if path.parent in within and path.is_file() and not path.is_symlink()]
+
+
+def _listed(folder: Path) -> dict[str, Any]:
+    try:
+        content = read_json(folder / LIST, ConfigError)
+    except ConfigError:
+        return {}
+    return content if isinstance(content, dict) and content.get("about") == _ABOUT else {}
+
+
+def entry_folder(cache: Path, files: Sequence[Path], label: str, settings: Any) -> Path:
+    """Where the import of a stream of some source files belongs: named by a hash of all that it is made of.
+
+    Raises:
+        DriveError: a source cannot be looked at.
+    """
+    try:
+        stats = [(file.name, file.stat()) for file in files]
+    except OSError as failure:
+        raise DriveError(f"{failure.filename}: cannot be read ({failure.strerror}); check the path") from None
+    source = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
+    text = json.dumps([_VERSION, source, label, settings], sort_keys=True)
+    words = "".join(letter if letter.isalnum() else "_" for letter in f"{files[0].stem}-{label}").strip("_")
+    folder = cache / f"{words[:60]}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+    if is_whole(folder):
+        note_use(folder)
+    return folder
+
+
+def is_whole(folder: Path) -> bool:
+    """Whether ``folder`` is an import with all of its files: images by their size, the rest by content."""
+    files = _listed(folder).get("files")
+    try:
+        return isinstance(files, dict) and all(_described(folder / name) == files[name] for name in files)
+    except (OSError, ValueError):
+        return False
+
+
+def begin_entry(folder: Path) -> Path:
+    """An empty hidden folder to fill for ``folder``; those that killed processes have left are removed."""
+    partial = _partial(folder)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        for left in folder.parent.glob(f".{folder.name}.*.part"):
+            if left == partial or is_stale(left):
+                shutil.rmtree(left, ignore_errors=True)
+        partial.mkdir()
+    except OSError as failure:
+        raise cannot_write(folder, failure) from None
+    return partial
+
+
+def finish_entry(folder: Path) -> None:
+    """Put the folder that was filled in its place, with its list."""
+    partial = _partial(folder)
+    try:
+        _write_list(partial)
+        if folder.exists() and not is_whole(folder):
+            shutil.rmtree(folder)
+        if folder.exists():  # another process was faster
+            shutil.rmtree(partial)
+        else:
+            partial.replace(folder)
+        note_use(folder)
+    except OSError as failure:
+        raise cannot_write(folder, failure) from None
+
+
+def drop_entry(folder: Path) -> None:
+    """Remove what was filled for ``folder`` so far."""
+    shutil.rmtree(_partial(folder), ignore_errors=True)
+
+
+def cannot_write(folder: Path, failure: OSError) -> DriveError:
+    """The error of an import that finds no place."""
+    return DriveError(
+        f"{folder}: cannot write the import ({failure.strerror}); free space or choose another drive.cache"
+    )
+
+
+def _partial(folder: Path) -> Path:
+    return folder.with_name(f".{folder.name}.{_WRITER}.part")
+
+
+def is_stale(folder: Path) -> bool:
+    """Whether nothing in an unfinished import was written for long: its process was killed."""
+    with suppress(OSError):  # it is being written, or gone
+        return time.time() - max(one.stat().st_mtime for one in [folder, *folder.rglob("*")]) > _STALE_S
+    return False
+
+
+def _write_list(folder: Path) -> None:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    described = {path.relative_to(folder).as_posix(): _described(path) for path in files}
+    size = sum(size for size, _ in described.values())
+    partial = folder / f".{_WRITER}.part"
+    partial.write_text(
+        json.dumps({"about": _ABOUT, "bytes": size, "files": described}) + "\n", encoding="utf-8"
+    )
+    partial.replace(folder / LIST)
+
+
+def _described(path: Path) -> list[Any]:
+    """The size and digest of a file; a damaged image is found by its decoder."""
+    return [path.stat().st_size, "-" if path.suffix in _IMAGES else file_digest(path)]
