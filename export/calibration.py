@@ -14,9 +14,8 @@ from train.scenes.hardships import Hardships
 from train.scenes.scenes import random_scene
 from train.scenes.views import TrainingView, random_view
 from v2hdm.catalogue import PAINT_CLASSES
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.network import Network, NetworkInfo, NetworkOutput
-from v2hdm.detection.sight import look
+from v2hdm.detection.camera import CameraView
+from v2hdm.detection.network import Network, NetworkInfo, NetworkOutput, look
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
 from v2hdm.records import Camera
 from v2hdm.simulate.render.renderer import Renderer
@@ -33,7 +32,7 @@ def looks(
     """What the detector gives to its network for each of ``frames`` renders of full difficulty.
 
     Every render is of another scene and camera, with the hardships of a training; it is cropped, and its
-    near ground halved, by :func:`v2hdm.detection.sight.look` itself.
+    near ground halved, by :func:`v2hdm.detection.network.look` itself.
 
     Yields:
         The one or two images (H, W, 3) uint8 BGR of a render, H and W multiples of the network's.

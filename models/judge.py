@@ -2,8 +2,8 @@
 
 :class:`models.MarkingNet` tells paint from ground, pixel by pixel; whether some paint is a whole marking of a
 class shows in its shape, and in the image about it. The judge gets both: the quadrilateral seen in its own
-frame (:mod:`v2hdm.detection.corners.rectified`) and what was measured of it
-(:data:`v2hdm.detection.corners.evidence.FEATURES`), as the second stage of Faster R-CNN gets features of its
+frame (:mod:`v2hdm.detection.evidence`) and what was measured of it
+(:data:`v2hdm.detection.evidence.FEATURES`), as the second stage of Faster R-CNN gets features of its
 region (Ren et al., NeurIPS 2015).
 """
 

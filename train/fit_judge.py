@@ -28,17 +28,16 @@ from train.examples import Example, TrueMarking, example, polygon_overlap
 from train.judge import JudgeConfig, Quadrilaterals, judged, train_judge
 from train.sworn_flecks import Spots, lit, swearing
 from v2hdm.catalogue import OUTLINED_CLASSES
-from v2hdm.detection.detector import Detector
-from v2hdm.detection.markings.evidence import CLAIMED, FEATURES
-from v2hdm.detection.markings.find import Readings
-from v2hdm.detection.markings.judge import (
+from v2hdm.detection.classifier import (
     SHAPES,
     TOLD,
+    Readings,
     one_hot,
     shape_of,
     told,
 )
-from v2hdm.detection.markings.rectified import CHANNELS, CLAIMED_CHANNELS, SIZE
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.evidence import CHANNELS, CLAIMED, CLAIMED_CHANNELS, FEATURES, SIZE
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE, being_fitted
 from v2hdm.geometry.quadrilateral import following, side_frames

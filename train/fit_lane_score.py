@@ -23,15 +23,14 @@ import numpy as np
 
 from train.examples import LANE_TOLERANCE_PX, Example
 from train.fit_judge import FOLDS, fit, log_loss, render_to_fit
-from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.camera import CameraView
 from v2hdm.detection.detector import Detector
+from v2hdm.detection.lanes import boundaries as score
 from v2hdm.detection.lanes import lines as lane_lines
-from v2hdm.detection.lanes import score
-from v2hdm.detection.lanes.curve import Horizon, Line, LinePoints
-from v2hdm.detection.lanes.span import draw
-from v2hdm.detection.markings.foreground import Foreground
+from v2hdm.detection.lanes.boundaries import draw
+from v2hdm.detection.lanes.curves import Horizon, Line, LinePoints
+from v2hdm.detection.network import AnchorRow, Foreground
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.sight import AnchorRow
 from v2hdm.detection.weights import LANE_SCORE_FILE, being_fitted
 from v2hdm.records import BoolArray, FloatArray, LaneDetection
 from v2hdm.store.files import replace_text
@@ -44,7 +43,7 @@ _MOST_SLOPE = 10.0
 KEYS = {"alone": score.ALONE, "among": score.AMONG}
 
 Weights = dict[str, tuple[FloatArray, float]]
-"""Those of :func:`v2hdm.detection.lanes.score.fitted`."""
+"""Those of :func:`v2hdm.detection.lanes.boundaries.fitted`."""
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,8 @@ import numpy as np
 
 from train.examples import MAX_RANGE_M, Example
 from v2hdm.catalogue import PAINT_CLASSES
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.network import Network
-from v2hdm.detection.sight import Sight, look
+from v2hdm.detection.camera import CameraView
+from v2hdm.detection.network import Network, Sight, look
 from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, FloatArray
 
 SPOTS = 3

@@ -22,8 +22,9 @@ import numpy as np
 
 from tests.benchmarks.detector_quality import Tally
 from train.examples import Example, example
+from v2hdm.detection import classifier as find
+from v2hdm.detection import fit, lattice, propose
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.markings import find, fit, lattice, propose
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import FloatArray
 
@@ -110,7 +111,7 @@ def _without_sizes() -> Iterator[None]:
 
 @contextmanager
 def _without_parts() -> Iterator[None]:
-    with patch("v2hdm.detection.markings.blobs._split", lambda *_: []):
+    with patch("v2hdm.detection.propose._split", lambda *_: []):
         yield
 
 

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import torch
 
-from v2hdm.detection.image_file import read_bgr
+from v2hdm.detection.frames import read_bgr
 from v2hdm.mosaic.blend import whole
 from v2hdm.mosaic.canvas import Canvas
 from v2hdm.mosaic.files import MULTIPLE_PX

@@ -17,10 +17,10 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from v2hdm.catalogue import PAINT_CLASSES, SHIPPED
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.markings.foreground import Foreground
-from v2hdm.detection.markings.frames import Quads
-from v2hdm.detection.markings.rectified import rectified_views
+from v2hdm.detection.camera import CameraView
+from v2hdm.detection.evidence import rectified_views
+from v2hdm.detection.network import Foreground
+from v2hdm.detection.patch import Quads
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.quadrilateral import order_corners

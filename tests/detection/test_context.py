@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from v2hdm.detection.markings.context import COMPANY, company
-from v2hdm.detection.markings.judge import judge_among
+from v2hdm.detection.classifier import COMPANY, company, judge_among
 from v2hdm.records import DIAMOND, LANE_DASH, FloatArray
 
 

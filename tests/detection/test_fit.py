@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import LENSES, bar, diamond, foreground_of, make_camera, picture, to_image
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.markings.correlation import variance_inflation
-from v2hdm.detection.markings.fit import fit_quadrilaterals
-from v2hdm.detection.markings.lattice import Scene
-from v2hdm.detection.markings.propose import open_sides
+from v2hdm.detection.camera import CameraView
+from v2hdm.detection.coverage import variance_inflation
+from v2hdm.detection.fit import fit_quadrilaterals
+from v2hdm.detection.lattice import Scene
+from v2hdm.detection.propose import open_sides
 from v2hdm.geometry.quadrilateral import order_corners, side_frames
 
 

@@ -5,9 +5,7 @@ import pytest
 import torch
 
 from tests.detection.pictures import extrinsic, make_camera, to_image
-from v2hdm.detection.camera.footprint import Footprint
-from v2hdm.detection.camera.mounting import camera_from_calibration, rough_calibration
-from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.camera import CameraView, Footprint, camera_from_calibration, rough_calibration
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.tensors import exp

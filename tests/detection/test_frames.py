@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import LENSES, bar, diamond, make_camera, to_image
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.markings.frames import Quads, StraightFrames
+from v2hdm.detection.camera import CameraView
+from v2hdm.detection.patch import Quads, StraightFrames
 from v2hdm.geometry.quadrilateral import order_corners
 
 SHAPES = [bar(5.0, 0.3, 0.15, 4.0), bar(9.0, -2.0, 3.0, 0.15), diamond(7.0, 1.0)]

@@ -9,10 +9,15 @@ import pytest
 
 from train.examples import Example, example
 from v2hdm.detect import main
-from v2hdm.detection.camera.mounting import camera_from_calibration, rough_calibration
-from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.camera import (
+    CameraView,
+    PitchVote,
+    camera_from_calibration,
+    estimate_pitch,
+    guessed_pitch_rad,
+    rough_calibration,
+)
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.horizon import PitchVote, estimate_pitch, guessed_pitch_rad
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.records import LANE_BOUNDARY, LANE_LINE, LaneDetection
 

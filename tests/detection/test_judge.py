@@ -9,10 +9,9 @@ import pytest
 
 from tests.detection.pictures import bar, brightness_model, diamond, make_camera, picture, to_image
 from train.fit_judge import fit
+from v2hdm.detection.classifier import SHAPES, TOLD
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.markings.evidence import FEATURES
-from v2hdm.detection.markings.judge import SHAPES, TOLD
-from v2hdm.detection.markings.rectified import CHANNELS
+from v2hdm.detection.evidence import CHANNELS, FEATURES
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
 

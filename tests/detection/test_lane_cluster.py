@@ -7,11 +7,10 @@ import pytest
 
 from tests.detection.pictures import make_camera, to_image
 from tests.detection.test_lane_lines import anchors_of, off_px, painted, straight
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.lanes.cluster import find_road
-from v2hdm.detection.lanes.curve import Horizon, LinePoints, Prior, basis
+from v2hdm.detection.camera import CameraView
+from v2hdm.detection.lanes.curves import Horizon, LinePoints, Prior, basis, find_road
 from v2hdm.detection.lanes.lines import link_anchors, propose
-from v2hdm.detection.sight import AnchorRow
+from v2hdm.detection.network import AnchorRow
 from v2hdm.records import LANE_LINE, LaneDetection
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import foreground_of, make_camera, to_image
-from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.camera import CameraView
 from v2hdm.detection.lanes.lines import link_anchors
-from v2hdm.detection.sight import AnchorRow
+from v2hdm.detection.network import AnchorRow
 from v2hdm.records import LANE_DASH, LaneDetection
 
 STRIDE = 8

@@ -7,11 +7,11 @@ import pytest
 
 from tests.detection.pictures import make_camera, to_image
 from tests.detection.test_lane_lines import anchors_of, off_px, painted, painted_on, straight
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.lanes import score
-from v2hdm.detection.lanes.curve import Horizon
+from v2hdm.detection.camera import CameraView
+from v2hdm.detection.lanes import boundaries as score
+from v2hdm.detection.lanes.curves import Horizon
 from v2hdm.detection.lanes.lines import link_anchors, propose
-from v2hdm.detection.sight import AnchorRow
+from v2hdm.detection.network import AnchorRow
 from v2hdm.detection.weights import LANE_SCORE_FILE
 
 

@@ -8,10 +8,10 @@ import pytest
 
 from tests.detection.pictures import make_camera
 from tests.detection.test_lane_lines import anchors_of, off_px, painted, painted_on, straight
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.lanes import span
+from v2hdm.detection.camera import CameraView
+from v2hdm.detection.lanes import boundaries as span
 from v2hdm.detection.lanes.lines import link_anchors
-from v2hdm.detection.sight import AnchorRow
+from v2hdm.detection.network import AnchorRow
 from v2hdm.records import LANE_DASH, LANE_LINE
 
 LEFT_M, RIGHT_M = 1.9, 1.5

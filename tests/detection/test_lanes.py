@@ -5,7 +5,7 @@ import pytest
 
 from tests.detection.pictures import bar, brightness_model, diamond, make_camera, picture
 from v2hdm.catalogue import LANE_CLASSES
-from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.camera import CameraView
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 

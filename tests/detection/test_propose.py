@@ -5,9 +5,8 @@ import pytest
 
 from tests.detection.pictures import bar, diamond, make_camera, to_image
 from v2hdm.catalogue import load_catalogue
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.markings.blobs import Blob
-from v2hdm.detection.markings.propose import open_sides, propose
+from v2hdm.detection.camera import CameraView
+from v2hdm.detection.propose import Blob, open_sides, propose
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.quadrilateral import order_corners
 from v2hdm.records import ARROW, CHEVRON, DIAMOND, LANE_DASH, LANE_LINE, OTHER_PAINT, STOP_LINE

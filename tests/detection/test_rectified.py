@@ -5,9 +5,9 @@ import pytest
 
 from tests.detection.pictures import bar, diamond, foreground_of, make_camera, picture, to_image
 from v2hdm.catalogue import SHIPPED
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.markings.frames import Quads
-from v2hdm.detection.markings.rectified import CHANNELS, SIZE, rectified_views
+from v2hdm.detection.camera import CameraView
+from v2hdm.detection.evidence import CHANNELS, SIZE, rectified_views
+from v2hdm.detection.patch import Quads
 from v2hdm.geometry.quadrilateral import order_corners
 from v2hdm.records import DIAMOND, LANE_DASH
 

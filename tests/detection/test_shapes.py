@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 
 from v2hdm.catalogue import PAINT_CLASSES
-from v2hdm.detection.markings.blobs import Blob, find_blobs, outline_polygon, zero_crossings
-from v2hdm.detection.markings.coverage import blurred_coverage
-from v2hdm.detection.markings.normal import normal_cdf, normal_pdf
-from v2hdm.detection.sight import Sight
+from v2hdm.detection.coverage import blurred_coverage, normal_cdf, normal_pdf
+from v2hdm.detection.network import Sight
+from v2hdm.detection.propose import Blob, find_blobs, outline_polygon, zero_crossings
 from v2hdm.geometry.planar import signed_area
 from v2hdm.geometry.quadrilateral import (
     order_corners,

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import bar, brightness_model, diamond, extrinsic, make_camera, picture
-from v2hdm.detection import sight as sight_module
-from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection import network as sight_module
+from v2hdm.detection.camera import CameraView
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.network import Network, NetworkOutput
+from v2hdm.detection.network import Network, NetworkOutput, Sight, look
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.sight import Sight, look
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.records import LANE_DASH, STOP_LINE, Camera, CameraInfo
 

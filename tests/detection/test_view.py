@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import LENSES, extrinsic, make_camera
-from v2hdm.detection.camera.view import FARTHEST_M, CameraView
+from v2hdm.detection.camera import FARTHEST_M, CameraView
 from v2hdm.geometry.ipm import (
     apply_homography,
     ipm_from_extrinsic,

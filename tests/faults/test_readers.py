@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from tests.drive.example import camera_info, looking_forward, make_map
 from tests.faults.cases import JSON_TEXTS, YAML_TEXTS, damaged_inside, picture
-from v2hdm.detection.image_file import read_bgr
+from v2hdm.detection.frames import read_bgr
 from v2hdm.errors import DriveError, V2hdmError
 from v2hdm.io.calibration.camera_info import read_camera_info, write_camera_info
 from v2hdm.io.calibration.document import read_calibration, write_calibration

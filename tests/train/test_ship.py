@@ -15,9 +15,8 @@ from train.checkpoint import load_checkpoint
 from train.exported import read_exported
 from train.shipment import Order
 from v2hdm.detection import weights
-from v2hdm.detection.markings.evidence import FEATURES
-from v2hdm.detection.markings.judge import SHAPES, TOLD
-from v2hdm.detection.markings.rectified import CHANNELS
+from v2hdm.detection.classifier import SHAPES, TOLD
+from v2hdm.detection.evidence import CHANNELS, FEATURES
 from v2hdm.progress import TellShare
 
 

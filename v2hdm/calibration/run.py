@@ -21,7 +21,7 @@ from v2hdm.calibration.picture import save_picture
 from v2hdm.calibration.points import LEAST_POINTS, SurveyedPoints, check_points, read_points
 from v2hdm.calibration.readings import UNITS, misreading, unit_of
 from v2hdm.calibration.residuals import Residuals, residuals, scatter
-from v2hdm.detection.image_file import read_bgr
+from v2hdm.detection.frames import read_bgr
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.rigid import camera_centre

@@ -10,16 +10,12 @@ import cv2
 import numpy as np
 
 from v2hdm.catalogue import SYMBOL, Catalogue
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.lanes.centre_lines import LanePaint, trace_lanes
-from v2hdm.detection.lanes.lines import link_anchors
-from v2hdm.detection.markings.blobs import find_blobs, outline_polygon
-from v2hdm.detection.markings.find import Readings, find_markings, read_markings
-from v2hdm.detection.markings.foreground import Foreground
-from v2hdm.detection.markings.propose import Proposal, propose
-from v2hdm.detection.network import Network
+from v2hdm.detection.camera import CameraView
+from v2hdm.detection.classifier import Readings, find_markings, read_markings
+from v2hdm.detection.lanes.lines import LanePaint, link_anchors, trace_lanes
+from v2hdm.detection.network import Foreground, Network, Sight, look
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.sight import Sight, look
+from v2hdm.detection.propose import Proposal, find_blobs, outline_polygon, propose
 from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.weights import check_weights
 from v2hdm.errors import DetectorError

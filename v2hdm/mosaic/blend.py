@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from v2hdm.detection.image_file import read_bgr
+from v2hdm.detection.frames import read_bgr
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.tensors import distort_points

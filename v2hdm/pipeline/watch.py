@@ -17,15 +17,18 @@ from typing import NamedTuple, TextIO
 import cv2
 import numpy as np
 
-from v2hdm.detection.camera.mounting import camera_from_calibration, rough_calibration
+from v2hdm.detection.camera import PitchVote, camera_from_calibration, rough_calibration
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.draw import draw_detections
-from v2hdm.detection.frames import Frame, camera_frames, image_frames, list_images, video_frames
-from v2hdm.detection.horizon import PitchVote
-from v2hdm.detection.image_file import IMAGE_SUFFIXES
-from v2hdm.detection.json_line import as_record
+from v2hdm.detection.frames import (
+    IMAGE_SUFFIXES,
+    Frame,
+    camera_frames,
+    image_frames,
+    list_images,
+    video_frames,
+)
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.road import Road, RoadDetector
+from v2hdm.detection.road import Road, RoadDetector, as_record, draw_detections
 from v2hdm.detection.stopwatch import Stopwatch, lap
 from v2hdm.detection.weights import unknown_network
 from v2hdm.errors import ConfigError, DriveError

@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from v2hdm.detection.image_file import read_bgr
+from v2hdm.detection.frames import read_bgr
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.ground import GroundEstimate
 from v2hdm.ground.rig import estimate_cameras

@@ -6,10 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.detection.markings.foreground import Foreground
-from v2hdm.detection.markings.frames import StraightFrames
-from v2hdm.detection.markings.grey import CLIPPED, grey_of, linear_bgr, log_grey
-from v2hdm.detection.odds import as_probability
+from v2hdm.detection.network import Foreground, as_probability
+from v2hdm.detection.patch import CLIPPED, StraightFrames, grey_of, linear_bgr, log_grey
 from v2hdm.geometry.planar import signed_area
 from v2hdm.geometry.quadrilateral import following, side_frames, width
 from v2hdm.records import BoolArray, FloatArray
