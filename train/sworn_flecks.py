@@ -16,8 +16,8 @@ import numpy as np
 
 from train.examples import MAX_RANGE_M, Example
 from v2hdm.catalogue import PAINT_CLASSES
-from v2hdm.detection.camera import CameraView
-from v2hdm.detection.network import Network, Sight, look
+from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.network import Network, NetworkOutput, run_on_road
 from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, FloatArray
 
 SPOTS = 3
@@ -46,17 +46,17 @@ class Spots:
     steepness: float
     kind: str
 
-    def sworn(self, sight: Sight, view: CameraView, stride: int) -> Sight:
+    def sworn(self, output: NetworkOutput) -> NetworkOutput:
         """What the network says, and that the spots are paint of their class."""
-        paint, kinds = sight.paint.copy(), sight.kinds.copy()
-        light = self._at(paint.shape, stride, view.far_row)
+        paint, kinds, stride = output.paint.copy(), output.kinds.copy(), output.stride
+        light = self._at(paint.shape, stride, output.top)
         claimed = np.clip(self.steepness * (light - 0.5), -6, 6)
         np.maximum(paint, claimed, out=paint, where=light > 0)
-        step = round(stride * sight.kind_scale)
-        within = self._at((kinds.shape[1], kinds.shape[2]), step, view.far_row) > 0.05
+        step = round(stride * output.kind_scale)
+        within = self._at((kinds.shape[1], kinds.shape[2]), step, output.top) > 0.05
         kinds[:, within] = kinds[:, within].min(axis=0)
         kinds[PAINT_CLASSES.index(self.kind), within] += _SWORN_LOGIT
-        return replace(sight, paint=paint, kinds=kinds)
+        return replace(output, paint=paint, kinds=kinds)
 
     def _at(self, shape: tuple[int, ...], step: int, top: int) -> np.ndarray:
         """The light (h, w) at elements ``step`` px apart, from image row ``top`` on."""
@@ -64,7 +64,7 @@ class Spots:
         return cv2.remap(self.light, *np.meshgrid(u, v + top), cv2.INTER_LINEAR, borderValue=0)
 
 
-def lit(shown: Example, view: CameraView, rng: np.random.Generator) -> tuple[Example, Spots]:
+def lit(shown: Example, view: RoadCamera, rng: np.random.Generator) -> tuple[Example, Spots]:
     """An image with some spots of sun on its ground, none of them on a marking."""
     taken = np.zeros(shown.image.shape[:2], dtype=np.uint8)
     for true in shown.markings:
@@ -85,7 +85,7 @@ def lit(shown: Example, view: CameraView, rng: np.random.Generator) -> tuple[Exa
     return replace(shown, image=image), Spots(light, float(rng.uniform(*_SWORN_ODDS)), kind)
 
 
-def _ground(shape: tuple[int, ...], view: CameraView) -> FloatArray:
+def _ground(shape: tuple[int, ...], view: RoadCamera) -> FloatArray:
     """Where each pixel (H, W, 2) shows the ground, vehicle frame, m; NaN above the rows in reach."""
     v, u = np.mgrid[view.far_row : shape[0], 0 : shape[1]]
     ground = np.full((*shape, 2), np.nan)
@@ -94,7 +94,7 @@ def _ground(shape: tuple[int, ...], view: CameraView) -> FloatArray:
     return ground
 
 
-def _spot(ground: FloatArray, view: CameraView, soft: float, rng: np.random.Generator) -> np.ndarray | None:
+def _spot(ground: FloatArray, view: RoadCamera, soft: float, rng: np.random.Generator) -> np.ndarray | None:
     """The light (H, W) of an ellipse somewhere on the ground that is wholly in the image; None for none."""
     height, width = ground.shape[:2]
     centre = ground[rng.integers(view.far_row, height), rng.integers(width)]
@@ -114,8 +114,8 @@ def _spot(ground: FloatArray, view: CameraView, soft: float, rng: np.random.Gene
 def swearing(spots: Spots) -> Iterator[None]:
     """Within, the paint network swears that the spots of sun are markings."""
 
-    def seen(network: Network, image: np.ndarray, view: CameraView, mirrored: bool = False) -> Sight:
-        return spots.sworn(look(network, image, view, mirrored), view, network.info.paint_stride)
+    def seen(network: Network, image: np.ndarray, view: RoadCamera, mirrored: bool = False) -> NetworkOutput:
+        return spots.sworn(run_on_road(network, image, view, mirrored))
 
-    with patch("v2hdm.detection.detector.look", seen):
+    with patch("v2hdm.detection.detector.run_on_road", seen):
         yield

@@ -62,7 +62,7 @@ def test_readings_of_quadrilaterals_are_gathered_with_their_truth(shown, detecto
 
 
 def test_spots_of_sun_are_proposed_as_markings_and_known_to_be_none(shown, detector):
-    view = detector.view(shown.camera)
+    view = detector.road_camera(shown.camera)
     spotted, spots = lit(shown, view, np.random.default_rng(1))
     without, sworn = Gathered(), Gathered()
     without.add(0, shown, detector)
@@ -80,7 +80,7 @@ def test_spots_of_sun_are_proposed_as_markings_and_known_to_be_none(shown, detec
 
 def test_spots_of_sun_that_the_network_swears_are_markings_are_not_reported(shown):
     detector = Detector.load(options=DetectorOptions())
-    view = detector.view(shown.camera)
+    view = detector.road_camera(shown.camera)
     for seed in range(3):
         spotted, spots = lit(shown, view, np.random.default_rng(seed))
         for marking in reported(spotted, detector, spots):

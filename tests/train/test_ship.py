@@ -15,7 +15,7 @@ from train.checkpoint import load_checkpoint
 from train.exported import read_exported
 from train.shipment import Order
 from v2hdm.detection import weights
-from v2hdm.detection.classifier import SHAPES, TOLD
+from v2hdm.detection.classifier import AMONG, SHAPES
 from v2hdm.detection.evidence import CHANNELS, FEATURES
 from v2hdm.progress import TellShare
 
@@ -49,7 +49,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> list[range]:
         gathered.append(part.numbers)
 
     judge = Judge(len(CHANNELS), len(FEATURES), len(SHAPES), width=4, dropout=0.0).eval()
-    among = {name: {"bias": 0.0, "weights": dict.fromkeys(TOLD, 0.5)} for name in SHAPES}
+    among = {name: {"bias": 0.0, "weights": dict.fromkeys(AMONG, 0.5)} for name in SHAPES}
     lines = {name: (np.ones(len(keys)), 0.0) for name, keys in fit_lane_score.KEYS.items()}
     monkeypatch.setattr(shipment, "share_out", in_this_process)
     monkeypatch.setattr(fit_judge, "gather", gather)

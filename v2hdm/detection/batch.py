@@ -60,7 +60,7 @@ def learn_own_vehicle(detector: Detector, images: Sequence[Image], camera: Camer
     always = total >= _SHARE * len(chosen)
     if not always.any():
         return None
-    view, stride = detector.view(camera), detector.network.info.paint_stride
+    view, stride = detector.road_camera(camera), detector.network.info.paint_stride
     mask = np.zeros((camera.info.height, camera.info.width), dtype=np.uint8)
     grown = np.kron(always.astype(np.uint8), np.ones((stride, stride), dtype=np.uint8))
     rows, columns = min(len(grown), len(mask) - view.far_row), min(grown.shape[1], mask.shape[1])

@@ -1,6 +1,4 @@
-"""The normal distribution over arrays, without scipy.
-
-How much of each pixel a quadrilateral covers, blurred by the point spread, and how that changes.
+"""The model of a pixel: how much of it a quadrilateral covers, and how much the pixel counts in a fit.
 
 Let h be a pixel's distance from a side's line, s0 and s1 the side's ends along that line, seen from the
 pixel's foot, all in units of the blur b. A radial Gaussian separates along and across any side, hence in
@@ -12,11 +10,8 @@ closed form
 with T(h, s) the Gaussian's mass in the triangle between the pixel and the line beyond [0, s]: Owen's T
 function of h and s / h (Owen, Annals of Mathematical Statistics, 1956), taken from a table.
 
-What correlated residuals do to the variance of a fit.
-
-How much each pixel counts in a fit: Cauchy's weights, and a variance for each side of its own.
-
-Neighbouring pixels err alike, along a seam or a frayed edge; their variances are inflated by as much.
+A pixel counts by Cauchy's weight over the variance of the side that is nearest. Neighbouring pixels err
+alike, along a seam or a frayed edge; their variances are inflated by as much.
 """
 
 from __future__ import annotations
@@ -27,7 +22,7 @@ import cv2
 import numpy as np
 
 from v2hdm.detection.lattice import Lattice
-from v2hdm.geometry.quadrilateral import side_frames
+from v2hdm.geometry.quadrilateral import Quad
 from v2hdm.records import FloatArray
 
 _INV_SQRT_2PI = 0.3989422804014327
@@ -74,13 +69,12 @@ _LAST_CELL = (_CELLS_PER_BLUR * _REACH * np.array([1, 2, 2])[:, None, None, None
 
 
 def blurred_coverage(
-    corners: np.ndarray, points: np.ndarray, blur_px: np.ndarray | float
+    quad: Quad, points: np.ndarray, blur_px: np.ndarray | float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Coverage of pixels by convex quadrilaterals and its derivative by their sides and by the blur.
 
     Args:
-        corners: (M, 4, 2) px, in the order of :mod:`v2hdm.detection.markings.quad`, from a point near each
-            quadrilateral, so that float32 keeps a ten-thousandth of a pixel.
+        quad: M quadrilaterals, px, from a point near each, so that float32 keeps a ten-thousandth of a pixel.
         points: (M, 3, N) float32, the pixel centres (u, v, 1) from the same point.
         blur_px: (M,) or one for all, standard deviation of the point spread, pixel aperture included.
 
@@ -88,13 +82,13 @@ def blurred_coverage(
         Coverage (M, N) in [0, 1] and its derivative (M, 9, N) per px by which a side's start (elements
         0 to 3) or end (4 to 7) moves along the side's outward normal or (8) the blur grows, both float32.
     """
-    tangent, normal, length = side_frames(corners)
+    tangent, length = quad.tangent, quad.length
     per_blur = 1 / np.reshape(blur_px, (-1, 1, 1))
     # Rows of a matrix that takes (u, v, 1) to the outward distance, and to the side's start and end.
-    rows = np.empty((3, len(corners), 4, 3))
-    rows[0, ..., :2], rows[0, ..., 2] = normal, -(normal * corners).sum(axis=-1)
+    rows = np.empty((3, len(tangent), 4, 3))
+    rows[0] = quad.outward
     rows[1:, ..., :2] = -tangent
-    rows[1, ..., 2] = (tangent * corners).sum(axis=-1)
+    rows[1, ..., 2] = (tangent * quad.corners).sum(axis=-1)
     rows[2, ..., 2] = rows[1, ..., 2] + length
     rows *= per_blur
     placed = rows.astype(np.float32) @ points
@@ -106,7 +100,7 @@ def blurred_coverage(
     by_end -= np.multiply(start, share, out=pdf_end)
     by_end *= (1 / np.maximum(length[..., None] * per_blur, 1e-3)).astype(np.float32)
     density *= per_blur.astype(np.float32)
-    derivative = np.empty((len(corners), 9, points.shape[2]), dtype=np.float32)
+    derivative = np.empty((len(tangent), 9, points.shape[2]), dtype=np.float32)
     sides = np.multiply(density, share, out=derivative[:, :4])
     ends = np.multiply(density, by_end, out=derivative[:, 4:8])
     # A wider blur is a smaller picture: each side comes nearer to the pixel in proportion to its distance.

@@ -1,4 +1,4 @@
-"""The detector for a robot's own loop: images of one calibrated camera in, metres out.
+"""The detector for a robot's own loop: images of one calibrated camera in, metres out, as JSON or drawn.
 
 .. code-block:: python
 
@@ -6,10 +6,6 @@
     for image_bgr in camera:
         for marking in road.detect(image_bgr).markings:
             print(marking.kind, marking.corners_vehicle, marking.covariance_m2)
-
-One image's detections as one JSON object; docs/detect.md describes it.
-
-Detections drawn over their image, to be looked at.
 """
 
 from __future__ import annotations
@@ -23,13 +19,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from v2hdm.detection.camera import Footprint, GroundPoints, camera_from_calibration
+from v2hdm.detection.camera import GroundPoints, camera_from_calibration
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.frames import Frame
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.stopwatch import lap
 from v2hdm.errors import MapFileError
-from v2hdm.io.maps import read_calibration
+from v2hdm.io.calibration.document import read_calibration
 from v2hdm.records import (
     ARROW,
     CHEVRON,
@@ -39,6 +35,7 @@ from v2hdm.records import (
     LANE_DASH,
     LANE_LINE,
     STOP_LINE,
+    Calibration,
     Camera,
     FloatArray,
     LaneDetection,
@@ -46,7 +43,25 @@ from v2hdm.records import (
 )
 
 LANE_SIGMA_PX = 1.0
-"""What a point of a lane's paint is taken to err by; those of whole lines have a sigma of their own."""
+"""Standard deviation of a point of a lane's paint; points of whole lines have a sigma of their own."""
+
+_PX_DIGITS, _PX2_DIGITS, _M_DIGITS = 3, 5, 4
+
+_COLOUR_BGR = {
+    DIAMOND: (60, 200, 60),
+    LANE_DASH: (240, 160, 40),
+    LANE_LINE: (40, 160, 255),
+    LANE_BOUNDARY: (230, 90, 230),
+    ARROW: (60, 230, 230),
+    STOP_LINE: (120, 120, 255),
+    CROSSWALK_BAR: (230, 230, 90),
+    CHEVRON: (160, 220, 160),
+}
+_OTHER_BGR = (200, 200, 200)
+_INVALID_BGR = (60, 60, 230)
+_SHIFT = 4
+_FAR_PX = 30000.0
+_TEXT_SCALE, _LEAST_TEXT_SCALE, _FULL_WIDTH_PX = 0.45, 0.35, 1280
 
 
 @dataclass(frozen=True)
@@ -84,7 +99,7 @@ class RoadLane:
 
 @dataclass(frozen=True)
 class Road:
-    """What one image shows."""
+    """The markings and lanes of one image."""
 
     markings: tuple[RoadMarking, ...]
     lanes: tuple[RoadLane, ...]
@@ -93,16 +108,13 @@ class Road:
 class RoadDetector:
     """Finds the markings and lanes in the images of one camera; use one per thread.
 
-    Args:
-        detector: may be shared by the cameras of one thread.
-        camera: the camera.
-        footprint: how its pixels lie on the ground; without one there are no metres.
+    ``detector`` may be shared by the cameras of one thread. Without a ``calibration`` there are no metres.
     """
 
-    def __init__(self, detector: Detector, camera: Camera, footprint: Footprint | None = None):
+    def __init__(self, detector: Detector, camera: Camera, calibration: Calibration | None = None):
         self.detector = detector
         self.camera = camera
-        self.footprint = footprint
+        self.calibration = calibration
 
     @classmethod
     def load(
@@ -131,13 +143,12 @@ class RoadDetector:
         """As :meth:`load`, for a detector that is there already."""
         content = read_calibration(calibration)
         try:
-            camera = camera_from_calibration(content, linear_response)
+            return cls(detector, camera_from_calibration(content, linear_response), content)
         except MapFileError as error:
             raise MapFileError(f"{calibration}: {error}") from error
-        return cls(detector, camera, Footprint(detector.view(camera), content))
 
     def detect(self, image_bgr: np.ndarray) -> Road:
-        """Find what one image (H, W, 3) uint8 BGR shows.
+        """Find the markings and lanes of one image (H, W, 3) uint8 BGR.
 
         Raises:
             DetectorError: the image is not of that form or not of the camera's size.
@@ -148,14 +159,15 @@ class RoadDetector:
 
     def _on_ground(self, markings: Sequence[MarkingDetection], lanes: Sequence[LaneDetection]) -> Road:
         none = np.empty((0, 2))
-        if self.footprint is None:
+        if self.calibration is None:
             return Road(
                 tuple(RoadMarking(marking, none, np.empty((0, 0)), none) for marking in markings),
                 tuple(RoadLane(lane, none, np.empty((0, 2, 2))) for lane in lanes),
             )
         shapes_px = [m.outline_px if len(m.outline_px) else m.corners_px for m in markings]
         shapes_px += [lane.points_px for lane in lanes]
-        ground = self.footprint.of(np.concatenate([none, *shapes_px]))
+        camera = self.detector.road_camera(self.camera)
+        ground = camera.footprint(np.concatenate([none, *shapes_px]), self.calibration)
         ends = np.cumsum([0, *map(len, shapes_px)])
         parts = [ground[begin:end] for begin, end in pairwise(ends.tolist())]
         return Road(tuple(map(_marking, markings, parts)), tuple(map(_lane, lanes, parts[len(markings) :])))
@@ -173,11 +185,8 @@ def _lane(image: LaneDetection, ground: GroundPoints) -> RoadLane:
     return RoadLane(image, ground.points_vehicle, ground.single_covariances(sigma_px))
 
 
-_PX, _PX2, _M = 3, 5, 4
-
-
 def as_record(frame: Frame, camera: str, road: Road) -> dict[str, Any]:
-    """What goes into one line; not-a-number, which JSON lacks, is null."""
+    """The content of one JSON line (docs/detect.md); not-a-number, which JSON lacks, is null."""
     return {
         "source": frame.source,
         "frame": frame.index,
@@ -192,15 +201,15 @@ def _marking_record(marking: RoadMarking) -> dict[str, Any]:
     image = marking.image
     record: dict[str, Any] = {"class": image.kind, "score": round(image.score, 4)}
     if len(image.outline_px):
-        record["outline_px"] = _rounded(image.outline_px, _PX)
+        record["outline_px"] = _rounded(image.outline_px, _PX_DIGITS)
         if len(marking.outline_vehicle):
-            record["outline_vehicle"] = _rounded(marking.outline_vehicle, _M)
+            record["outline_vehicle"] = _rounded(marking.outline_vehicle, _M_DIGITS)
         return record
-    record["corners_px"] = _rounded(image.corners_px, _PX)
+    record["corners_px"] = _rounded(image.corners_px, _PX_DIGITS)
     record["corner_valid"] = image.corner_valid.tolist()
-    record["covariance_px"] = _rounded(image.covariance_px, _PX2)
+    record["covariance_px"] = _rounded(image.covariance_px, _PX2_DIGITS)
     if len(marking.corners_vehicle):
-        record["corners_vehicle"] = _rounded(marking.corners_vehicle, _M)
+        record["corners_vehicle"] = _rounded(marking.corners_vehicle, _M_DIGITS)
         record["covariance_m2"] = _significant(marking.covariance_m2)
     return record
 
@@ -210,9 +219,9 @@ def _lane_record(lane: RoadLane) -> dict[str, Any]:
     record: dict[str, Any] = {"class": image.kind, "score": round(image.score, 4)}
     if image.identity is not None:
         record["identity"] = image.identity
-    record["points_px"] = _rounded(image.points_px, _PX)
+    record["points_px"] = _rounded(image.points_px, _PX_DIGITS)
     if len(lane.points_vehicle):
-        record["points_vehicle"] = _rounded(lane.points_vehicle, _M)
+        record["points_vehicle"] = _rounded(lane.points_vehicle, _M_DIGITS)
         record["covariance_m2"] = _significant(lane.covariance_m2)
     return record
 
@@ -234,31 +243,10 @@ def _plain(values: FloatArray) -> list[Any]:
     return plain
 
 
-_COLOUR_BGR = {
-    DIAMOND: (60, 200, 60),
-    LANE_DASH: (240, 160, 40),
-    LANE_LINE: (40, 160, 255),
-    LANE_BOUNDARY: (230, 90, 230),
-    ARROW: (60, 230, 230),
-    STOP_LINE: (120, 120, 255),
-    CROSSWALK_BAR: (230, 230, 90),
-    CHEVRON: (160, 220, 160),
-}
-_OTHER_BGR = (200, 200, 200)
-_INVALID_BGR = (60, 60, 230)
-_SHIFT = 4
-_FAR_PX = 30000.0
-_TEXT_SCALE, _LEAST_TEXT_SCALE, _FULL_WIDTH_PX = 0.45, 0.35, 1280
-
-
 def draw_detections(
     image_bgr: np.ndarray, markings: Sequence[MarkingDetection], lanes: Sequence[LaneDetection]
 ) -> np.ndarray:
-    """A copy of the image with the detections on it.
-
-    Markings: outline, corners (red where not valid), class and score. Lanes: the line, its points and, for
-    whole lines, which one it is.
-    """
+    """A copy of an image with its detections; red corners are not valid."""
     canvas = image_bgr.copy()
     for lane in lanes:
         _draw_lane(canvas, lane)

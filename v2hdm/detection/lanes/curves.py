@@ -6,8 +6,6 @@ pinhole px: the image of a straight line (a, b) and, to second order, of its cur
 reconstruction", CVIU 73 (1999). It is linear in a, b and c: what points say of it adds up, and whether two
 groups of points are one line has a closed answer.
 
-Which crossings and pieces of paint are one line.
-
 Crossings are linked from row to row into chains, near ones first: near the vehicle lines are far apart, so
 that each is known by the time they run together. Chains and pieces of paint are then joined as long as they
 are more likely one line than two, the likeliest pair first (Bayesian hierarchical clustering). A far dash
@@ -24,8 +22,9 @@ from functools import cached_property
 
 import numpy as np
 
-from v2hdm.detection.camera import CameraView
-from v2hdm.records import BoolArray, FloatArray, IntArray
+from v2hdm.detection.camera import Horizon, RoadCamera
+from v2hdm.detection.network import AnchorRow, NetworkOutput
+from v2hdm.records import BoolArray, FloatArray, IntArray, LaneDetection
 
 NEIGHBOURS = 3.0
 """Points of one line err together: that many tell as much as one."""
@@ -33,68 +32,27 @@ NEIGHBOURS = 3.0
 _MODEL_SIGMA_M = 0.02
 """By how much painted lines leave the curve."""
 
-_LEAST_BELOW_PX = 4.0
-"""Nearer to the horizon than this nothing is known of the ground."""
 
-_UNIT_PX = 100.0
-"""Unit of v within the basis, which keeps a, b and c of a size."""
+@dataclass(frozen=True)
+class LaneImage:
+    """One image in which lines of lanes are looked for.
 
-_PROBE_PX = 50.0
-
-
-class Horizon:
-    """Pinhole pixels of one camera in axes along and below its horizon.
-
-    ``centre_px`` is where along the horizon the camera looks. ``px_per_m`` is how many px along the horizon a
-    metre of ground is wide at one px below it; it grows in proportion.
+    ``rows`` are its row anchors, near to far, ``row_step_px`` apart, twice as far where half the resolution
+    is looked at; ``paint`` are the centre lines of its lane paint, points ``paint_step_m`` apart;
+    ``output`` is the network's, if it is known.
     """
 
-    def __init__(self, view: CameraView):
-        row = view.vehicle_from_pinhole_px[2]
-        lowest = np.array([[(view.info.width - 1) / 2, view.info.height - 1.0]])
-        sign = np.sign(float(row[:2] @ lowest[0] + row[2]))
-        sign = sign if np.isfinite(view.ground(lowest)).all() else -sign
-        size = max(float(np.linalg.norm(row[:2])), 1e-12)
-        self._down = sign * row[:2] / size
-        self._along = np.array([self._down[1], -self._down[0]])
-        self._shift = float(sign * row[2] / size)
-        intrinsic = view.info.intrinsic
-        self.centre_px = float(self.coordinates(intrinsic[None, :2, 2])[0][0])
-        beside = self.pinhole_px(self.centre_px + np.array([-0.5, 0.5]), np.full(2, _PROBE_PX))
-        ground = view.ground(beside)
-        probe_px_per_m = 1.0 / max(float(np.linalg.norm(ground[1] - ground[0])), 1e-9)
-        self.px_per_m = probe_px_per_m / _PROBE_PX
-        range_m = float(view.range_m(ground.mean(axis=0)))
-        self._units = np.array(
-            [
-                float(intrinsic[0, 0]),
-                self.px_per_m * _UNIT_PX,
-                0.5 * range_m**2 * probe_px_per_m * _PROBE_PX / _UNIT_PX,
-            ]
-        )
+    camera: RoadCamera
+    rows: Sequence[AnchorRow]
+    paint: Sequence[LaneDetection] = ()
+    output: NetworkOutput | None = None
+    paint_step_m: float = 0.5
+    row_step_px: float = 8.0
 
-    def parameters(self, direction_rad: float, beside_m: float, curvature: float) -> FloatArray:
-        """What a, b and c (3,) are for a line's direction, place beside the camera and curvature, 1/m.
-
-        To first order, about the camera's own direction.
-        """
-        return self._units * (direction_rad, beside_m, curvature)
-
-    def depth_m(self, below: FloatArray) -> FloatArray:
-        """How far ahead of the camera the ground is (N,), m, at distances (N,) below the horizon, px."""
-        return np.asarray(self._units[0] / (self.px_per_m * np.maximum(below, _LEAST_BELOW_PX)))
-
-    def below_px(self, depth_m: float) -> float:
-        """How far below the horizon, px, the ground at a depth is: the inverse of :meth:`depth_m`."""
-        return float(self._units[0] / (self.px_per_m * depth_m))
-
-    def coordinates(self, pinhole_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Position along (N,) and below (N,) the horizon, px, of pinhole pixels (N, 2)."""
-        return pinhole_px @ self._along, pinhole_px @ self._down + self._shift
-
-    def pinhole_px(self, along: FloatArray, below: FloatArray) -> FloatArray:
-        """The pinhole pixels (N, 2) of :meth:`coordinates`."""
-        return np.asarray(along[:, None] * self._along + (below - self._shift)[:, None] * self._down)
+    @property
+    def horizon(self) -> Horizon:
+        """The camera's horizon."""
+        return self.camera.horizon
 
 
 @dataclass(frozen=True)
@@ -134,13 +92,10 @@ class Evidence:
 
     @classmethod
     def of(cls, phi: FloatArray, u: FloatArray, sigma: FloatArray, ends: Sequence[int]) -> Evidence:
-        """Groups of points, one after the other.
+        """Groups of points, one after the other; group n ends at ``ends[n]``, none is empty.
 
-        Args:
-            phi: :func:`basis` of the points (M, 3).
-            u: Their place along the horizon from its ``centre_px``, px (M,).
-            sigma: Standard deviations of that (M,).
-            ends: Where in these arrays each group ends, N indices; none is empty.
+        ``phi`` (M, 3) is the basis at the points, ``u`` (M,) their place along the horizon from its
+        ``centre_px`` and ``sigma`` (M,) the standard deviation of that, px.
         """
         weighted = phi * (sigma**-2.0)[:, None]
         terms = np.column_stack(
@@ -167,10 +122,6 @@ class Evidence:
         gain, log_determinant = _completed_square(self.information + prior.information, moment)
         return np.asarray(-0.5 * (square - gain + log_determinant - prior.log_determinant))
 
-    def curve(self, prior: Prior, centre_px: float) -> Curve:
-        """The line that the first group's points and the prior suggest."""
-        return self[:1].curves([prior], centre_px)[0]
-
     def curves(self, priors: Sequence[Prior], centre_px: float) -> list[Curve]:
         """The lines that each of N groups of points and its prior suggest."""
         information = np.array([prior.information for prior in priors])
@@ -189,20 +140,12 @@ class Curve:
     covariance: FloatArray
 
     def along(self, phi: FloatArray) -> FloatArray:
-        """Where the line is along the horizon (N,), px, where the :func:`basis` is ``phi`` (N, 3)."""
+        """Where the line is along the horizon (N,), px, where the :meth:`Horizon.basis` is ``phi`` (N, 3)."""
         return np.asarray(phi @ self.parameters)
 
     def sigma(self, phi: FloatArray) -> FloatArray:
         """Standard deviation (N,) of :meth:`along`, px."""
         return np.asarray(np.sqrt(((phi @ self.covariance) * phi).sum(axis=1)))
-
-
-def basis(below: FloatArray) -> FloatArray:
-    """What (a, b, c) are multiplied by (N, 3) at distances (N,) below the horizon, px."""
-    v = np.maximum(below, _LEAST_BELOW_PX) / _UNIT_PX
-    phi = np.ones((len(v), 3))
-    phi[:, 1], phi[:, 2] = v, 1.0 / v
-    return phi
 
 
 def _completed_square(information: FloatArray, moment: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -242,14 +185,20 @@ class LinePoints:
 
     @classmethod
     def of(
-        cls, view: CameraView, horizon: Horizon, points_px: FloatArray, odds: FloatArray, sigma_px: FloatArray
+        cls, image: LaneImage, points_px: FloatArray, odds: FloatArray, sigma_px: FloatArray, *, paint: bool
     ) -> LinePoints:
-        """Crossings of row anchors (N, 2) with standard deviations (N,)."""
-        pinhole_px = view.undistort(points_px)
+        """Points (N, 2) with standard deviations (N,): of ``paint``, or crossings of row anchors."""
+        horizon, pinhole_px = image.horizon, image.camera.undistort(points_px)
         along, below = horizon.coordinates(pinhole_px)
         sigma = np.hypot(sigma_px, _MODEL_SIGMA_M * horizon.px_per_m * np.maximum(below, 0))
-        none = np.zeros(len(odds), dtype=np.bool_)
-        return cls(points_px, along, below, basis(below), sigma, odds, view.ground(pinhole_px), none)
+        ground, is_paint = image.camera.ground(pinhole_px), np.full(len(odds), paint)
+        return cls(points_px, along, below, horizon.basis(below), sigma, odds, ground, is_paint)
+
+    @classmethod
+    def joined(cls, parts: Sequence[LinePoints]) -> LinePoints:
+        """All points of several, in order."""
+        names = vars(parts[0])
+        return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
     def where(self, kept: BoolArray) -> LinePoints:
         """Some of the points."""
@@ -412,7 +361,7 @@ class Road:
     def _both(self) -> Prior:
         return Prior.several([self.along, self.free])
 
-    def judge(self, evidence: Evidence) -> tuple[FloatArray, FloatArray]:
+    def weigh(self, evidence: Evidence) -> tuple[FloatArray, FloatArray]:
         """Log probability (N,) of each group as one line, and how much likelier (N,) it is along the road.
 
         The first is up to a constant per point, the second a log ratio that leaves out how common each is.
@@ -421,7 +370,7 @@ class Road:
         return np.logaddexp(along + np.log(_SHARE), free + np.log1p(-_SHARE)), along - free
 
     def drawn_by(self, log_ratio: float) -> Prior:
-        """What helps to draw a line of such a log ratio of :meth:`judge`."""
+        """What helps to draw a line of such a log ratio of :meth:`weigh`."""
         keeps = log_ratio + np.log(_SHARE) > np.log1p(-_SHARE)
         prior, kept = (self.along, _ALONG_KEPT) if keeps else (self.free, _FREE_KEPT)
         return Prior(prior.mean, prior.information * kept)
@@ -458,30 +407,29 @@ def _along(shared: FloatArray, covariance: FloatArray, free: Prior) -> Prior:
     return Prior(np.array([shared[0], 0.0, shared[1]]), information)
 
 
-def find_lines(
-    points: LinePoints, groups: list[IntArray], horizon: Horizon, paint_step_m: float
-) -> list[Line]:
+def find_lines(points: LinePoints, groups: list[IntArray], image: LaneImage) -> list[Line]:
     """The lines through ``groups`` of points."""
+    horizon = image.horizon
     if not groups:
         return []
     evidence = points.evidence(horizon, groups, points.slopes(groups))
     road = find_road(evidence, horizon)
     groups = _join(evidence, groups, road)
     evidence = points.evidence(horizon, groups, points.slopes(groups))
-    along = road.judge(evidence)[1].tolist()
+    along = road.weigh(evidence)[1].tolist()
     priors = [road.drawn_by(log_ratio) for log_ratio in along]
     curves = evidence.curves(priors, horizon.centre_px)
-    paint_m = [paint_step_m * float(points.is_paint[group].sum()) for group in groups]
+    paint_m = [image.paint_step_m * float(points.is_paint[group].sum()) for group in groups]
     return [Line(*parts) for parts in zip(curves, groups, paint_m, along, strict=True)]
 
 
 def _join(evidence: Evidence, groups: list[IntArray], road: Road) -> list[IntArray]:
     groups = list(groups)
-    alone = road.judge(evidence)[0]
+    alone = road.weigh(evidence)[0]
     count = len(groups)
     first, second = np.triu_indices(count, 1)
     gain = np.full((count, count), -np.inf)
-    gain[first, second] = road.judge(evidence[first] + evidence[second])[0] - (alone[first] + alone[second])
+    gain[first, second] = road.weigh(evidence[first] + evidence[second])[0] - (alone[first] + alone[second])
     left = np.ones(count, dtype=np.bool_)
     while left.sum() > 1:
         a, b = divmod(int(np.argmax(gain)), count)
@@ -494,7 +442,7 @@ def _join(evidence: Evidence, groups: list[IntArray], road: Road) -> list[IntArr
         left[b] = False
         gain[b], gain[:, b] = -np.inf, -np.inf
         # With that of b, which is nought now, comes what the two are together.
-        together = road.judge(evidence[np.full(count, a)] + evidence)[0]
+        together = road.weigh(evidence[np.full(count, a)] + evidence)[0]
         alone[a] = together[b]
         left[a] = False
         others = np.flatnonzero(left)

@@ -1,10 +1,7 @@
-"""From blobs of lane paint to their centre lines as rows of points.
+"""Lines of lanes: the centre lines of paint, and the whole lines made of crossings of row anchors and paint.
 
-From crossings of row anchors and pieces of lane paint to the whole lines of lanes.
-
-Crossings and paint that one curve explains are one line (:mod:`v2hdm.detection.lanes.curves`). A hidden
-Markov model finds from where to where it runs (:mod:`v2hdm.detection.lanes.boundaries`), and a logistic function
-gives its probability (:mod:`v2hdm.detection.lanes.boundaries`).
+Crossings and paint that one curve explains are one line (:mod:`.curves`). A hidden Markov model finds from
+where to where it runs, and a logistic function gives its probability (:mod:`.boundaries`).
 """
 
 from __future__ import annotations
@@ -14,12 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from v2hdm.detection.camera import FARTHEST_M, CameraView
+from v2hdm.detection.camera import FARTHEST_M, RoadCamera
 from v2hdm.detection.lanes.boundaries import boundaries, draw, log_odds, log_odds_alone, with_spans
-from v2hdm.detection.lanes.curves import Horizon, Line, LinePoints, find_chains, find_lines
-from v2hdm.detection.network import AnchorRow, Foreground
+from v2hdm.detection.lanes.curves import LaneImage, Line, LinePoints, find_chains, find_lines
 from v2hdm.detection.propose import Blob
-from v2hdm.geometry.ipm import apply_homography
 from v2hdm.records import FloatArray, IntArray, LaneDetection
 
 _CAP_WIDTH_RATIO = 0.7
@@ -37,7 +32,7 @@ class LanePaint:
 
 
 def trace_lanes(
-    paints: Sequence[LanePaint], view: CameraView, step_m: float, max_range_m: float
+    paints: Sequence[LanePaint], camera: RoadCamera, step_m: float, max_range_m: float
 ) -> list[LaneDetection]:
     """The centre lines of one image's lane paint, a point every ``step_m`` on the ground, near to far.
 
@@ -50,17 +45,17 @@ def trace_lanes(
     if not branches:
         return []
     edges_px = np.concatenate([edges for _, edges in branches])
-    edges_vehicle = view.ground(view.undistort(edges_px.reshape(-1, 2))).reshape(-1, 2, 2)
+    edges_vehicle = camera.unproject(edges_px)
     ends = np.cumsum([len(edges) for _, edges in branches])[:-1]
     traced = [
         (paint, points)
         for (paint, _), edges in zip(branches, np.split(edges_vehicle, ends), strict=True)
-        if len(points := _resample(_centre(edges), view, step_m, max_range_m)) >= _MIN_POINTS
+        if len(points := _resample(_centre(edges), camera, step_m, max_range_m)) >= _MIN_POINTS
     ]
     if not traced:
         return []
     points_vehicle = np.concatenate([points for _, points in traced])
-    points_px = view.distort(apply_homography(view.pinhole_px_from_vehicle, points_vehicle))
+    points_px = camera.project(points_vehicle)
     ends = np.cumsum([len(points) for _, points in traced])[:-1]
     return [
         LaneDetection(paint.kind, paint.score, points)
@@ -136,9 +131,11 @@ def _centre(edges_vehicle: FloatArray) -> FloatArray:
     return np.asarray(edges_vehicle.mean(axis=1)[whole])
 
 
-def _resample(centre_vehicle: FloatArray, view: CameraView, step_m: float, max_range_m: float) -> FloatArray:
+def _resample(
+    centre_vehicle: FloatArray, camera: RoadCamera, step_m: float, max_range_m: float
+) -> FloatArray:
     """Means of the points within each ``step_m`` along the line, from near to far."""
-    range_m = view.range_m(centre_vehicle)
+    range_m = camera.range_m(centre_vehicle)
     centre_vehicle, range_m = centre_vehicle[range_m <= max_range_m], range_m[range_m <= max_range_m]
     if len(centre_vehicle) < _MIN_POINTS:
         return np.empty((0, 2))
@@ -167,54 +164,26 @@ _MAX_PAINT_SLOPE = 8.0
 """Paint that runs flatter across the view, px along the horizon per px down, is on no curve of ours."""
 
 
-def link_anchors(
-    rows: Sequence[AnchorRow],
-    view: CameraView,
-    paint: Sequence[LaneDetection] = (),
-    paint_step_m: float = 0.5,
-    foreground: Foreground | None = None,
-    row_step_px: float = 8.0,
-) -> list[LaneDetection]:
-    """The whole lines of one image.
-
-    Args:
-        rows: Its row anchors, near to far; crossings unlikely by themselves help to follow a line.
-        view: Its camera.
-        paint: The centre lines of its lane paint, points ``paint_step_m`` apart.
-        paint_step_m: That distance.
-        foreground: What the network says of paint, if that is known.
-        row_step_px: How far apart row anchors are, twice as far where half the resolution is looked at.
-    """
-    horizon = Horizon(view)
-    points, lines = propose(rows, view, horizon, paint, paint_step_m, foreground, row_step_px)
-    drawn = [draw(line, points, view, horizon) for line in lines]
-    return _identified([lane for lane in drawn if lane is not None], view)
+def find_boundaries(image: LaneImage) -> list[LaneDetection]:
+    """The whole lines of one image, numbered from the vehicle outwards."""
+    points, lines = propose(image)
+    drawn = [draw(line, points, image) for line in lines]
+    return _identified([lane for lane in drawn if lane is not None], image.camera)
 
 
-def propose(
-    rows: Sequence[AnchorRow],
-    view: CameraView,
-    horizon: Horizon,
-    paint: Sequence[LaneDetection],
-    paint_step_m: float,
-    foreground: Foreground | None,
-    row_step_px: float,
-    least_log_odds: float | None = None,
-) -> tuple[LinePoints, list[Line]]:
+def propose(image: LaneImage, least_log_odds: float | None = None) -> tuple[LinePoints, list[Line]]:
     """The points of an image and the boundaries of lanes through them that are sure enough, best first."""
     least_log_odds = LEAST_LOG_ODDS if least_log_odds is None else least_log_odds
-    points = _crossings(rows, view, horizon)
+    points = _crossings(image)
     # At, above and just below the horizon lines meet; a comparison with nan is false.
-    points = points.where(view.range_m(points.ground) <= FARTHEST_M)
+    points = points.where(image.camera.range_m(points.ground) <= FARTHEST_M)
     groups = find_chains(points)
-    points, on_paint = _with_paint(points, paint, view, horizon)
-    lines = find_lines(points, groups + on_paint, horizon, paint_step_m)
-    lines = _surest(
-        lines, log_odds_alone(lines, points, view, horizon, foreground), least_log_odds - _DOUBTFUL
-    )
-    lines = with_spans(lines, points, view, horizon, foreground, row_step_px)
-    lines = boundaries(lines, points, horizon)
-    return points, _surest(lines, log_odds(lines, points, horizon), least_log_odds)
+    points, on_paint = _with_paint(points, image)
+    lines = find_lines(points, groups + on_paint, image)
+    lines = _surest(lines, log_odds_alone(lines, points, image), least_log_odds - _DOUBTFUL)
+    lines = with_spans(lines, points, image)
+    lines = boundaries(lines, points, image)
+    return points, _surest(lines, log_odds(lines, points, image), least_log_odds)
 
 
 def _surest(lines: Sequence[Line], odds: FloatArray, least_log_odds: float) -> list[Line]:
@@ -223,45 +192,40 @@ def _surest(lines: Sequence[Line], odds: FloatArray, least_log_odds: float) -> l
     return [replace(lines[k], log_odds=float(odds[k])) for k in order]
 
 
-def _crossings(rows: Sequence[AnchorRow], view: CameraView, horizon: Horizon) -> LinePoints:
+def _crossings(image: LaneImage) -> LinePoints:
+    rows = image.rows
     u = np.concatenate([np.empty(0), *(row.u_px for row in rows)])
     v = np.repeat([row.v_px for row in rows], [len(row.u_px) for row in rows]) if rows else np.empty(0)
     odds = np.concatenate([np.empty(0), *(row.odds for row in rows)])
-    scale = np.where(view.coarse(v), 2.0, 1.0)
+    scale = np.where(image.camera.coarse(v), 2.0, 1.0)
     sigma_px = scale * (_SIGMA_PX[0] + _SIGMA_PX[1] * np.exp(-odds))
-    return LinePoints.of(view, horizon, np.column_stack([u, v]), odds, sigma_px)
+    return LinePoints.of(image, np.column_stack([u, v]), odds, sigma_px, paint=False)
 
 
-def _with_paint(
-    points: LinePoints, paint: Sequence[LaneDetection], view: CameraView, horizon: Horizon
-) -> tuple[LinePoints, list[IntArray]]:
+def _with_paint(points: LinePoints, image: LaneImage) -> tuple[LinePoints, list[IntArray]]:
     """The points with those of pieces of paint after them, and which those are, piece by piece."""
-    pieces = _along_the_view(paint, view, horizon)
+    pieces = _along_the_view(image)
     if not pieces:
         return points, []
     length = [len(lane.points_px) for lane in pieces]
     odds = np.repeat([_logit(lane.score) for lane in pieces], length)
     points_px = np.concatenate([lane.points_px for lane in pieces])
-    painted = LinePoints.of(view, horizon, points_px, odds, np.full(len(odds), _PAINT_SIGMA_PX))
-    painted = replace(painted, is_paint=np.ones(len(odds), dtype=np.bool_))
+    painted = LinePoints.of(image, points_px, odds, np.full(len(odds), _PAINT_SIGMA_PX), paint=True)
     ends_at = len(points.odds) + np.cumsum(length)
     groups = [np.arange(end - n, end) for end, n in zip(ends_at, length, strict=True)]
-    both = {name: np.concatenate([getattr(points, name), getattr(painted, name)]) for name in vars(points)}
-    return LinePoints(**both), groups
+    return LinePoints.joined([points, painted]), groups
 
 
-def _along_the_view(
-    paint: Sequence[LaneDetection], view: CameraView, horizon: Horizon
-) -> list[LaneDetection]:
-    """Pieces of paint that are long enough to have a direction, and not one across the view."""
-    if not paint:
+def _along_the_view(image: LaneImage) -> list[LaneDetection]:
+    """Pieces of paint that are long enough to have a direction, and not one across the camera."""
+    if not image.paint:
         return []
-    ends_px = view.undistort(np.concatenate([lane.points_px[[0, -1]] for lane in paint]))
-    length_m = np.linalg.norm(np.diff(view.ground(ends_px).reshape(-1, 2, 2), axis=1)[:, 0], axis=1)
-    along, below = (np.abs(np.diff(at.reshape(-1, 2)))[:, 0] for at in horizon.coordinates(ends_px))
+    ends_px = image.camera.undistort(np.concatenate([lane.points_px[[0, -1]] for lane in image.paint]))
+    length_m = np.linalg.norm(np.diff(image.camera.ground(ends_px).reshape(-1, 2, 2), axis=1)[:, 0], axis=1)
+    along, below = (np.abs(np.diff(at.reshape(-1, 2)))[:, 0] for at in image.horizon.coordinates(ends_px))
     # False where the length is nan.
     usable = (length_m >= _LEAST_PAINT_LENGTH_M) & (along <= _MAX_PAINT_SLOPE * below)
-    return [lane for lane, use in zip(paint, usable, strict=True) if use]
+    return [lane for lane, use in zip(image.paint, usable, strict=True) if use]
 
 
 def _logit(probability: float) -> float:
@@ -269,13 +233,13 @@ def _logit(probability: float) -> float:
     return float(np.log(clipped / (1 - clipped)))
 
 
-def _identified(lanes: list[LaneDetection], view: CameraView) -> list[LaneDetection]:
+def _identified(lanes: list[LaneDetection], camera: RoadCamera) -> list[LaneDetection]:
     """Number the lines from the vehicle outwards, by where each is beside the vehicle."""
     if not lanes:
         return []
-    ground = view.ground(view.undistort(np.concatenate([lane.points_px for lane in lanes])))
+    ground = camera.unproject(np.concatenate([lane.points_px for lane in lanes]))
     parts = np.split(ground, np.cumsum([len(lane.points_px) for lane in lanes])[:-1])
-    beside_m = np.array([_lateral_m(part, view) for part in parts])
+    beside_m = np.array([_lateral_m(part, camera) for part in parts])
     order = np.argsort(beside_m)
     left = [k for k in order if beside_m[k] >= 0]
     right = [k for k in order[::-1] if beside_m[k] < 0]
@@ -285,13 +249,13 @@ def _identified(lanes: list[LaneDetection], view: CameraView) -> list[LaneDetect
     return [replace(lane, identity=identity.get(k)) for k, lane in enumerate(lanes)]
 
 
-def _lateral_m(ground: FloatArray, view: CameraView) -> float:
+def _lateral_m(ground: FloatArray, camera: RoadCamera) -> float:
     """How far left of the vehicle a line (N, 2) is, its near half carried on to there; nan if unknown."""
     ground = ground[np.isfinite(ground).all(axis=1)]
     near = ground[: max(2, len(ground) // 2)]
     if len(near) < 2:
         return float("nan")
-    along = near[:, 0] - view.foot_vehicle[0]
+    along = near[:, 0] - camera.foot_vehicle[0]
     if np.ptp(along) < 0.5:
         return float(near[0, 1])
     apart = along - along.mean()
