@@ -29,7 +29,7 @@ _LINEAR_FROM_SRGB = np.where(_CODED <= 0.04045, _CODED / 12.92, ((_CODED + 0.055
 Edges fitted to coded values lie outwards of those of a bright marking by about a fifth of the blur.
 """
 
-_AROUND, _SPARE_PX = np.array([[-0.4, 1.4, 1.4, -0.4], [-1.1, -1.1, 2.1, 2.1]]), 16
+_AROUND, _SPARE_PX = np.array([[-1.0, 2.0, 2.0, -1.0], [-2.0, -2.0, 3.0, 3.0]]), 16
 """Corners of a patch, in longer and shorter sides of its marking's outline, and the px beyond."""
 
 _BOW_PX = 0.25
