@@ -55,7 +55,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> list[range]:
     monkeypatch.setattr(fit_judge, "gather", gather)
     monkeypatch.setattr(fit_judge, "fit_all", lambda gathered, tell: (tell(0.5), (judge, among))[1])
     monkeypatch.setattr(fit_lane_score, "see", lambda part: [None] * len(part.numbers))
-    monkeypatch.setattr(fit_lane_score, "fit_to", lambda images, step_m: lines)
+    monkeypatch.setattr(fit_lane_score, "fit_to", lambda images: lines)
     return gathered
 
 

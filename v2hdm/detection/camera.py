@@ -28,7 +28,7 @@ FARTHEST_M = 60.0
 """Neither markings nor lines are looked for beyond this: networks are shown none beyond 50 m."""
 
 _SURROUNDINGS_PX = 24
-"""So far above the farthest ground what is there helps to tell what lies on it."""
+"""So far above the farthest ground what is there helps to classify what lies on it."""
 
 FINE_ENOUGH_M = 0.007
 """Ground per pixel, across the view, of which half the resolution shows enough: a dash stays 10 px wide."""
@@ -340,7 +340,7 @@ def rough_calibration(
 ) -> Calibration:
     """A pinhole camera that looks straight ahead, for images of which nothing better is known.
 
-    Good enough to tell markings by their rough size, not to measure with. ``height_m`` is above the ground,
+    Good enough to classify markings by rough size, not to measure with. ``height_m`` is above the ground,
     ``pitch_deg`` below the horizon, ``fov_deg`` the horizontal field of view, ``width`` and ``height`` px.
     """
     focal_px = width / 2 / np.tan(np.deg2rad(fov_deg) / 2)

@@ -150,16 +150,10 @@ def owen_table() -> np.ndarray:
 
 
 def variance_inflation(first: np.ndarray, second: np.ndarray, weight: np.ndarray, most: float) -> FloatArray:
-    """Factor (...) by which a fit's variance grows if its residuals are correlated: (1 + r) / (1 - r).
+    """Factor (...) by which a fit's variance grows if residuals (..., N) correlate with their neighbours.
 
-    That is what a first-order autoregressive process with correlation r does to the variance of a mean
-    (Bartlett, Journal of the Royal Statistical Society, 1946).
-
-    Args:
-        first: residuals (..., N).
-        second: those of their neighbours (..., N).
-        weight: what each pair counts (..., N).
-        most: r is taken to lie between 0 and this.
+    That is (1 + r) / (1 - r), as of a first-order autoregressive process (Bartlett, Journal of the Royal
+    Statistical Society, 1946); pairs have a ``weight`` (..., N), and r is between 0 and ``most``.
     """
     power = (weight * (first * first + second * second)).sum(axis=-1) / 2
     r = np.clip((weight * first * second).sum(axis=-1) / np.maximum(power, 1e-12), 0.0, most)
@@ -185,7 +179,7 @@ _MAX_CORRELATION = 0.7
 def pixel_weights(
     residual: np.ndarray, use: np.ndarray, lattice: Lattice, least_scatter: float
 ) -> tuple[np.ndarray, FloatArray, FloatArray]:
-    """What every pixel (M, N) weighs, 1 / variance; the scatter (M, 4) by side; the mean robust weight (M,).
+    """Weight (M, N) of every pixel, 1 / variance; scatter (M, 4) by side; mean robust weight (M,).
 
     The robust weight is Cauchy's; the variance is that of a side's own pixels, inflated by the correlation of
     neighbours.

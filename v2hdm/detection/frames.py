@@ -1,7 +1,4 @@
-"""One image file as the detector takes it, or a reason why not.
-
-Images one after another: from files, a video or a live camera.
-"""
+"""Images one after another: from files, a video or a live camera."""
 
 from __future__ import annotations
 
@@ -19,8 +16,13 @@ import numpy as np
 from v2hdm.errors import DriveError
 from v2hdm.io.pixels import read_pixels
 
+_log = logging.getLogger(__name__)
+
+_MOST_CAMERAS = 1 << 16
+"""OpenCV takes a larger index for something else."""
+
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
-"""What counts as an image in a folder."""
+"""Suffixes of images in a folder."""
 
 # Depth and channels as stored, so that what does not fit is seen instead of converted without a word.
 _AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
@@ -40,12 +42,6 @@ def read_bgr(path: Path) -> np.ndarray:
     if pixels.ndim == 2:
         pixels = cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR)
     return np.asarray(pixels)
-
-
-_log = logging.getLogger(__name__)
-
-_MOST_CAMERAS = 1 << 16
-"""OpenCV takes a larger index for something else."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +83,7 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def video_frames(path: Path) -> Iterator[Frame]:
-    """Every frame of a video file; one that ends early is told with a warning.
+    """Every frame of a video file; a warning reports one that ends early.
 
     Raises:
         DriveError: OpenCV cannot read it, or it has no frame.
@@ -110,11 +106,9 @@ def video_frames(path: Path) -> Iterator[Frame]:
 
 
 def camera_frames(number: int, size: tuple[int, int] | None = None) -> Iterator[Frame]:
-    """Frames of a live camera until it fails.
+    """Frames of a live camera, by the operating system's index, until it fails.
 
-    Args:
-        number: the index that the operating system gives it.
-        size: width and height to ask the camera for; it may give others.
+    ``size`` is the width and height to ask the camera for; it may give others.
 
     Raises:
         DriveError: it does not open, or gives no more frames.

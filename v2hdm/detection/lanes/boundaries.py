@@ -68,7 +68,7 @@ _ONE_LINE_M = 0.12
 """Lines nearer to each other than this are one."""
 
 _CERTAIN_SIGMA_M = 0.3
-"""Rows on which a line is known worse than this tell nothing of its place beside others."""
+"""Rows on which a line is known worse than this do not show its place beside others."""
 
 _EVEN = 0.5
 """A line is where it is present rather than not."""
@@ -207,17 +207,17 @@ def _forward_backward(likelihood: FloatArray, step_m: FloatArray) -> tuple[Float
     """
     values, right, left, shares = _modes()
     move = np.maximum(((right * np.exp(values * step_m[..., None])[..., None, :]) @ left).real, 0.0)
-    seen = np.exp(likelihood)
-    forward, scale = np.empty_like(seen), np.empty(seen.shape[:2])
-    state = np.broadcast_to(shares, seen[:, 0].shape)
-    for t in range(seen.shape[1]):
-        state = (state if t == 0 else (state[:, None] @ move[:, t - 1])[:, 0]) * seen[:, t]
+    evidence = np.exp(likelihood)
+    forward, scale = np.empty_like(evidence), np.empty(evidence.shape[:2])
+    state = np.broadcast_to(shares, evidence[:, 0].shape)
+    for t in range(evidence.shape[1]):
+        state = (state if t == 0 else (state[:, None] @ move[:, t - 1])[:, 0]) * evidence[:, t]
         scale[:, t] = state.sum(axis=1)
         state = state / scale[:, t, None]
         forward[:, t] = state
     after = np.ones_like(state)
-    for t in range(seen.shape[1] - 2, -1, -1):
-        after = (move[:, t] @ (after * seen[:, t + 1])[..., None])[..., 0] / scale[:, t + 1, None]
+    for t in range(evidence.shape[1] - 2, -1, -1):
+        after = (move[:, t] @ (after * evidence[:, t + 1])[..., None])[..., 0] / scale[:, t + 1, None]
         forward[:, t] *= after
     return forward, np.log(scale).sum(axis=1)
 
@@ -342,12 +342,12 @@ def features_among(lines: Sequence[Line], points: LinePoints, image: LaneImage) 
 def _span_features(line: Line, points: LinePoints) -> tuple[float, float, float, float]:
     span, own = line.span, points.below[line.members]
     assert span is not None
-    seen = (span.below >= own.min()) & (span.below <= own.max())
+    between = (span.below >= own.min()) & (span.below <= own.max())
     return (
         float(np.sqrt(max(span.log_likelihood, 0.0))),
         float(span.length_m @ span.present),
-        float(span.length_m[seen] @ span.painted[seen]),
-        float(span.painted[seen].sum() / max(seen.sum(), 1)),
+        float(span.length_m[between] @ span.painted[between]),
+        float(span.painted[between].sum() / max(between.sum(), 1)),
     )
 
 

@@ -27,7 +27,7 @@ from v2hdm.detection.network import AnchorRow, NetworkOutput
 from v2hdm.records import BoolArray, FloatArray, IntArray, LaneDetection
 
 NEIGHBOURS = 3.0
-"""Points of one line err together: that many tell as much as one."""
+"""Points of one line err together: that many are worth as much as one."""
 
 _MODEL_SIGMA_M = 0.02
 """By how much painted lines leave the curve."""
@@ -57,7 +57,7 @@ class LaneImage:
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of a line before it is seen: ``mean`` (3,) and ``information`` (3, 3) of a, b and c.
+    """Prior knowledge of a line: ``mean`` (3,) and ``information`` (3, 3) of a, b and c.
 
     Here and in :class:`Evidence` a counts from the horizon's ``centre_px``. Several at once are (P, 1, 3) and
     (P, 1, 3, 3).
@@ -80,7 +80,7 @@ class Prior:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What N groups of points say of their lines, each summed up.
+    """The evidence of N groups of points for their lines, each summed up.
 
     ``information`` (N, 3, 3), ``moment`` (N, 3) and ``square`` (N,) are the weighted sums of the outer
     products of the basis, of basis times u, and of u squared. That of the same line adds.
@@ -215,7 +215,7 @@ class LinePoints:
         )
 
     def evidence(self, horizon: Horizon, groups: list[IntArray], slopes: FloatArray) -> Evidence:
-        """What each of N groups of points, on lines of such ``slopes`` (N,), says of its line."""
+        """The evidence of each of N groups of points, on lines of such ``slopes`` (N,)."""
         members, count = np.concatenate(groups), [len(group) for group in groups]
         sigma = self.sigma_px[members] * np.repeat(np.hypot(1, slopes), count) * np.sqrt(NEIGHBOURS)
         u = self.along[members] - horizon.centre_px
