@@ -32,7 +32,7 @@ def evidence_of(view: RoadCamera, lines_px: list[np.ndarray]):
     points = LinePoints.of(LaneImage(view, []), points_px, ones, ones, paint=False)
     ends = np.cumsum([len(line) for line in lines_px])
     groups = [np.arange(end - len(line), end) for end, line in zip(ends, lines_px, strict=True)]
-    return points.evidence(view.horizon, groups, points.slopes(groups)), view.horizon
+    return points.evidence(view.horizon, groups), view.horizon
 
 
 def seen(view: RoadCamera, line_px: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The detector over a whole drive, in worker processes, and the part of each image that is the vehicle itself.
+"""The detector over a whole drive, in worker processes, and which part of each image is the vehicle.
 
 Bonnets, mirrors and reflections on the windscreen are bright, straight-edged and at one place in every image.
 A marking on the ground passes through the image as the vehicle drives; only a line along the way stays, and

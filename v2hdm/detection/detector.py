@@ -13,7 +13,7 @@ from v2hdm.catalogue import SYMBOL, Catalogue
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.classifier import Readings, find_markings, read_markings
 from v2hdm.detection.lanes.curves import LaneImage
-from v2hdm.detection.lanes.lines import LanePaint, find_boundaries, trace_lanes
+from v2hdm.detection.lanes.lines import find_boundaries, trace_lanes
 from v2hdm.detection.network import Network, NetworkOutput, run_on_road
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.propose import Proposal, find_blobs, outline_polygon, propose
@@ -116,7 +116,7 @@ class Detector:
         """An image in which boundaries of lanes are looked for: row anchors and centre lines of paint."""
         step_m, lane_classes = self.options.lane_step_m, set(self.catalogue.lane_paint)
         paint = [
-            LanePaint(piece.blob, piece.kind, own)
+            (piece, own)
             for piece in found.pieces
             if piece.blob.traced and piece.kind in lane_classes and not piece.blob.touches_symbol
             if (own := piece.score_of(lane_classes)) >= self.options.min_score

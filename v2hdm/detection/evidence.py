@@ -87,16 +87,10 @@ def gather(
     readings: Sequence[tuple[int, str]],
     catalogue: Catalogue,
 ) -> FloatArray:
-    """The :data:`FEATURES` (R, F) of R readings, each of one of M quadrilaterals as one class.
+    """The :data:`FEATURES` (R, F) of R readings, each the index of one of M quadrilaterals and a class.
 
-    Args:
-        fit: the quadrilaterals.
-        output: the network's output on the image.
-        quads: the fitted quadrilaterals in the image.
-        ground: the same on the ground, m; NaN above the horizon.
-        proposals: the pieces of paint they come from.
-        readings: index of the quadrilateral and class of each.
-        catalogue: the classes.
+    ``quads`` are those of the ``fit`` in the image, ``ground`` on the ground, m, NaN above the horizon;
+    ``proposals`` are the pieces of paint they come from.
     """
     sides = np.sort(np.nan_to_num(ground.length, nan=1.0), axis=1)
     log_sides = np.log(np.clip(sides, *_SIZE_LIMITS_M))
@@ -143,13 +137,7 @@ def rectified_views(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pictures (R, C, 20, 20) float32, whose channels are :data:`CHANNELS`, and the side (R,) at their top.
 
-    Args:
-        patches: the pixels about M markings.
-        quads: their quadrilaterals.
-        ground: the same on the ground, m; NaN above the horizon.
-        readings: index of the quadrilateral and class of each; columns of its picture run along the longer
-            sides of all but diamonds.
-        catalogue: all classes.
+    Columns run along the longer sides of all but diamonds; arguments are as of :func:`gather`.
     """
     # All readings of a quadrilateral as a diamond share a picture, and so do those as anything else.
     key = np.array([2 * m + (kind == DIAMOND) for m, kind in readings], dtype=np.intp)

@@ -56,15 +56,9 @@ class Patches:
     """The pixels about each of M markings, cut out of an image (H, W, 3) uint8 once.
 
     Fit and classifier look at these alone. A patch that turns out too small, since the fit went far from the
-    outline, is cut anew.
-
-    Args:
-        image_bgr: the image.
-        camera: its camera.
-        output: the network's output on it.
-        owner: 1 + the index of the piece of paint (h, w) that each element of the output's paint is of.
-        corners_px: outlines of the markings (M, 4, 2), recorded px.
-        own: the first and last piece of paint (M, 2) of each marking; pixels of others take no part.
+    outline, is cut anew. ``corners_px`` (M, 4, 2) are the markings' outlines, ``owner`` (h, w) is 1 + the
+    index of the piece of paint that each element of the output's paint is of, and ``own`` (M, 2) the first and last
+    piece of each marking: pixels of others take no part.
     """
 
     def __init__(

@@ -222,12 +222,9 @@ class _Groups:
 def find_blobs(
     output: NetworkOutput, reach_px: int = 0, catalogue: Catalogue = SHIPPED
 ) -> tuple[list[Blob], np.ndarray]:
-    """Split the paint of one image into blobs.
+    """Split the paint of one image into blobs; nothing is split within the groups of the catalogue's classes.
 
-    Args:
-        output: the network's output on the image.
-        reach_px: image row; blobs that lie above it as a whole are too far away to be of use.
-        catalogue: has the groups of the classes, within which nothing is split.
+    Blobs that lie above the image row ``reach_px`` as a whole are too far away to be of use.
 
     Returns:
         The blobs, and a map (h, w) int16 with 1 + the index of the blob that covers each element of

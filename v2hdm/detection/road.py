@@ -126,11 +126,8 @@ class RoadDetector:
     ) -> RoadDetector:
         """A detector for the camera of a calibration YAML that ``python -m v2hdm.map`` wrote.
 
-        Args:
-            calibration: the YAML file.
-            model: ONNX file; None takes the one that is shipped.
-            options: settings of the detector.
-            linear_response: the camera's grey values are proportional to radiance, not sRGB-coded.
+        ``model`` is an ONNX file, None the shipped one; ``linear_response`` says that grey values are
+        proportional to radiance, not sRGB-coded.
 
         Raises:
             MapFileError: the calibration is missing, damaged or cannot be right.

@@ -214,10 +214,11 @@ class LinePoints:
             np.add.reduceat(down * along, begins) / np.maximum(np.add.reduceat(down**2, begins), 1)
         )
 
-    def evidence(self, horizon: Horizon, groups: list[IntArray], slopes: FloatArray) -> Evidence:
-        """The evidence of each of N groups of points, on lines of such ``slopes`` (N,)."""
+    def evidence(self, horizon: Horizon, groups: list[IntArray]) -> Evidence:
+        """The evidence of each of N groups of points, roughly a line each."""
         members, count = np.concatenate(groups), [len(group) for group in groups]
-        sigma = self.sigma_px[members] * np.repeat(np.hypot(1, slopes), count) * np.sqrt(NEIGHBOURS)
+        across = np.hypot(1, self.slopes(groups))
+        sigma = self.sigma_px[members] * np.repeat(across, count) * np.sqrt(NEIGHBOURS)
         u = self.along[members] - horizon.centre_px
         return Evidence.of(self.phi[members], u, sigma, np.cumsum(count).tolist())
 
@@ -412,10 +413,10 @@ def find_lines(points: LinePoints, groups: list[IntArray], image: LaneImage) -> 
     horizon = image.horizon
     if not groups:
         return []
-    evidence = points.evidence(horizon, groups, points.slopes(groups))
+    evidence = points.evidence(horizon, groups)
     road = find_road(evidence, horizon)
     groups = _join(evidence, groups, road)
-    evidence = points.evidence(horizon, groups, points.slopes(groups))
+    evidence = points.evidence(horizon, groups)
     along = road.weigh(evidence)[1].tolist()
     priors = [road.drawn_by(log_ratio) for log_ratio in along]
     curves = evidence.curves(priors, horizon.centre_px)

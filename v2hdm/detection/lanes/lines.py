@@ -7,14 +7,14 @@ where to where it runs, and a logistic function gives its probability (:mod:`.bo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from v2hdm.detection.camera import FARTHEST_M, RoadCamera
 from v2hdm.detection.lanes.boundaries import boundaries, draw, log_odds, log_odds_alone, with_spans
 from v2hdm.detection.lanes.curves import LaneImage, Line, LinePoints, find_chains, find_lines
-from v2hdm.detection.propose import Blob
+from v2hdm.detection.propose import Blob, Proposal
 from v2hdm.records import FloatArray, IntArray, LaneDetection
 
 _CAP_WIDTH_RATIO = 0.7
@@ -22,26 +22,17 @@ _MIN_POINTS = 2
 _ROWS_MIN_ASPECT = 0.35
 
 
-@dataclass(frozen=True)
-class LanePaint:
-    """A blob that is lane paint of class ``kind``."""
-
-    blob: Blob
-    kind: str
-    score: float
-
-
 def trace_lanes(
-    paints: Sequence[LanePaint], camera: RoadCamera, step_m: float, max_range_m: float
+    paints: Sequence[tuple[Proposal, float]], camera: RoadCamera, step_m: float, max_range_m: float
 ) -> list[LaneDetection]:
-    """The centre lines of one image's lane paint, a point every ``step_m`` on the ground, near to far.
+    """The centre lines of lane paint with its score, a point every ``step_m`` on the ground, near to far.
 
     A blob is cut by image rows (by columns where it lies flat); each cut's two edge points are
     taken to the ground by the camera's initial IPM and averaged there, so perspective does not pull
     the centre. Cuts through the slanted ends, narrower than the rest, are left out. A blob of two
     lines that touch gives one row of points for each branch.
     """
-    branches = [(paint, edges) for paint in paints for edges in _branches(paint.blob)]
+    branches = [(paint, edges) for paint in paints for edges in _branches(paint[0].blob)]
     if not branches:
         return []
     edges_px = np.concatenate([edges for _, edges in branches])
@@ -58,8 +49,8 @@ def trace_lanes(
     points_px = camera.project(points_vehicle)
     ends = np.cumsum([len(points) for _, points in traced])[:-1]
     return [
-        LaneDetection(paint.kind, paint.score, points)
-        for (paint, _), points in zip(traced, np.split(points_px, ends), strict=True)
+        LaneDetection(piece.kind, score, points)
+        for ((piece, score), _), points in zip(traced, np.split(points_px, ends), strict=True)
     ]
 
 
