@@ -26,10 +26,10 @@ from v2hdm.catalogue import Catalogue
 from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.evidence import gather, rectified_views
 from v2hdm.detection.fit import TYPICAL_BLUR_PX, Fit, fit_quadrilaterals
-from v2hdm.detection.network import NetworkOutput, as_probability, open_session
+from v2hdm.detection.network import as_probability, open_session
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.patch import ImageQuads, Patches
-from v2hdm.detection.propose import Proposal, open_sides
+from v2hdm.detection.propose import Proposals, open_sides
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
 from v2hdm.geometry.quadrilateral import Quad
 from v2hdm.records import DIAMOND, LANE_DASH, FloatArray, MarkingDetection
@@ -99,23 +99,18 @@ class Readings:
 
 
 def read_markings(
-    image_bgr: np.ndarray,
-    camera: RoadCamera,
-    output: NetworkOutput,
-    owner: np.ndarray,
-    proposals: Sequence[Proposal],
-    catalogue: Catalogue,
-    blur_px: float | None,
+    image_bgr: np.ndarray, found: Proposals, catalogue: Catalogue, blur_px: float | None
 ) -> Readings | None:
     """Fit the proposals with four corners and gather the evidence for their classes; None for none."""
-    tried = [(proposal, kinds) for proposal in proposals if (kinds := proposal.kinds(catalogue))]
+    camera, output = found.camera, found.output
+    tried = [(proposal, kinds) for proposal in found.pieces if (kinds := proposal.kinds(catalogue))]
     if not tried:
         return None
     chosen = [proposal for proposal, _ in tried]
     start = np.stack([p.corners_pinhole_px for p in chosen if p.corners_pinhole_px is not None])
     start_px = camera.distort(start.reshape(-1, 2)).reshape(start.shape)
     own = np.array([(p.index, p.index + p.blob.parts) for p in chosen])
-    patches = Patches(image_bgr, camera, output, owner, start_px, own)
+    patches = Patches(image_bgr, camera, output, found.owner, start_px, own)
     cut = open_sides(start_px, camera)
     fit = fit_quadrilaterals(patches, camera, start_px, cut, blur_px or TYPICAL_BLUR_PX)
     quads, ground = ImageQuads.of(camera, fit.corners_px), Quad(camera.unproject(fit.corners_px))

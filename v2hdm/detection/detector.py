@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,7 +16,7 @@ from v2hdm.detection.lanes.curves import LaneImage
 from v2hdm.detection.lanes.lines import find_boundaries, trace_lanes
 from v2hdm.detection.network import Network, NetworkOutput, run_on_road
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.propose import Proposal, find_blobs, outline_polygon, propose
+from v2hdm.detection.propose import Proposals, find_blobs, outline_polygon, propose
 from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.weights import check_weights
 from v2hdm.errors import DetectorError
@@ -25,19 +25,6 @@ from v2hdm.records import BoolArray, Camera, LaneDetection, MarkingDetection
 
 _NO_PAINT = -20.0
 """Log odds of paint where the vehicle itself is."""
-
-
-@dataclass(frozen=True)
-class Proposals:
-    """One image between network and fit: the network's output, and the ``pieces`` of paint in it.
-
-    ``owner`` (h, w) is 1 + the index of the piece that each element of the output's paint is of, 0 for none.
-    """
-
-    camera: RoadCamera
-    output: NetworkOutput
-    pieces: Sequence[Proposal]
-    owner: np.ndarray
 
 
 class Detector:
@@ -127,15 +114,7 @@ class Detector:
 
     def read(self, image_bgr: np.ndarray, found: Proposals) -> Readings | None:
         """Fit an image's proposals, and gather the evidence for each; None where there is none."""
-        return read_markings(
-            image_bgr,
-            found.camera,
-            found.output,
-            found.owner,
-            found.pieces,
-            self.catalogue,
-            self.options.blur_px,
-        )
+        return read_markings(image_bgr, found, self.catalogue, self.options.blur_px)
 
     def markings_paint(self, image_bgr: np.ndarray, camera: Camera) -> BoolArray:
         """Where (h, w) the network sees paint of markings, not of lanes, a cell every ``paint_stride`` px.

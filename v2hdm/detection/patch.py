@@ -57,8 +57,8 @@ class Patches:
 
     Fit and classifier look at these alone. A patch that turns out too small, since the fit went far from the
     outline, is cut anew. ``corners_px`` (M, 4, 2) are the markings' outlines, ``owner`` (h, w) is 1 + the
-    index of the piece of paint that each element of the output's paint is of, and ``own`` (M, 2) the first and last
-    piece of each marking: pixels of others take no part.
+    index of the piece of paint that each element of the output's paint is of, and ``own`` (M, 2) the
+    first and last piece of each marking: pixels of others take no part.
     """
 
     def __init__(

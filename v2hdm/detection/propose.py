@@ -127,6 +127,19 @@ class Proposal:
         return sorted(found, key=lambda name: -self.share[name])
 
 
+@dataclass(frozen=True)
+class Proposals:
+    """One image between network and fit: the network's output, and the ``pieces`` of paint in it.
+
+    ``owner`` (h, w) is 1 + the index of the piece that each element of the output's paint is of, 0 for none.
+    """
+
+    camera: RoadCamera
+    output: NetworkOutput
+    pieces: Sequence[Proposal]
+    owner: np.ndarray
+
+
 def propose(
     blobs: Sequence[Blob], camera: RoadCamera, catalogue: Catalogue, max_range_m: float
 ) -> list[Proposal]:
