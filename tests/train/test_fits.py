@@ -90,7 +90,7 @@ def test_spots_of_sun_that_the_network_swears_are_markings_are_not_reported(show
 
 
 def test_lines_of_lanes_are_proposed_with_their_truth(shown, detector):
-    found = proposed(seen(shown, detector), detector.options.lane_step_m)
+    found = proposed(seen(shown, detector))
     assert found is not None
     assert len(found.lines) == len(found.alone) == len(found.true)
     assert found.true.any()
@@ -117,8 +117,7 @@ def test_what_is_seen_of_lanes_comes_back_from_another_process():
     seen_there: list[fit_lane_score.Seen] = []
     part = fit_lane_score.Part(range(3), 100, weights.NETWORK_FILE)
     share_out(fit_lane_score.see, [part], 1, cv2.setNumThreads, (1,), seen_there.extend)
-    step_m = DetectorOptions().lane_step_m
-    lines = [found.lines for image in seen_there if (found := proposed(image, step_m)) is not None]
+    lines = [found.lines for image in seen_there if (found := proposed(image)) is not None]
     assert len(seen_there) == 3
     assert sum(map(len, lines)) > 0
 
