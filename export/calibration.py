@@ -14,9 +14,8 @@ from train.scenes.hardships import Hardships
 from train.scenes.scenes import random_scene
 from train.scenes.views import TrainingView, random_view
 from v2hdm.catalogue import PAINT_CLASSES
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.network import Network, NetworkInfo, NetworkOutput
-from v2hdm.detection.sight import look
+from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.network import Network, NetworkInfo, RawOutput, run_on_road
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
 from v2hdm.records import Camera
 from v2hdm.simulate.render.renderer import Renderer
@@ -33,7 +32,7 @@ def looks(
     """The network's input for each of ``frames`` renders of full difficulty.
 
     Every render is of another scene and camera, with the hardships of a training; it is cropped, and its
-    near ground halved, by :func:`v2hdm.detection.sight.look` itself.
+    near ground halved, by :func:`v2hdm.detection.network.run_on_road` itself.
 
     Yields:
         The one or two images (H, W, 3) uint8 BGR of a render, H and W multiples of the network's.
@@ -46,7 +45,7 @@ def looks(
         view = random_view(rng, width, height)
         rendered = Renderer(scene).render(view.info, view.cam_from_map, rng, view.optics, view.motion)
         onlooker = _Onlooker()
-        look(onlooker, rendered.image, CameraView(_camera(view), MULTIPLE))
+        run_on_road(onlooker, rendered.image, RoadCamera(_camera(view), MULTIPLE))
         yield onlooker.seen
 
 
@@ -65,7 +64,7 @@ class _Onlooker(Network):
         self.info = NetworkInfo(PAINT_CLASSES, MULTIPLE, PAINT_STRIDE, KIND_STRIDE, LANE_STRIDE)
         self.seen: list[NDArray[np.uint8]] = []
 
-    def run(self, image_bgr: np.ndarray) -> NetworkOutput:
+    def run(self, image_bgr: np.ndarray) -> RawOutput:
         self.seen.append(np.ascontiguousarray(image_bgr))
         height, width = image_bgr.shape[:2]
         shapes = (
@@ -73,4 +72,4 @@ class _Onlooker(Network):
             (len(PAINT_CLASSES), height // KIND_STRIDE, width // KIND_STRIDE),
             (2, height // LANE_STRIDE, width // LANE_STRIDE),
         )
-        return NetworkOutput(*(np.full(shape, -9.0, dtype=np.float32) for shape in shapes))
+        return RawOutput(*(np.full(shape, -9.0, dtype=np.float32) for shape in shapes))

@@ -11,7 +11,7 @@ import torch
 
 from export.onnx_file import graph_of, write_labelled
 from models.judge import Judge
-from v2hdm.detection.markings.judge import JUDGE_INPUTS, JUDGE_OUTPUTS
+from v2hdm.detection.classifier import JUDGE_INPUTS, JUDGE_OUTPUTS
 from v2hdm.errors import DetectorError
 
 _OPSET = 20

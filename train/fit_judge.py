@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
@@ -24,24 +23,23 @@ import numpy as np
 
 from export.judge_file import write_judge
 from models.judge import Judge
+from train.confident_spots import Spots, lit
 from train.examples import Example, TrueMarking, example, polygon_overlap
 from train.judge import JudgeConfig, Quadrilaterals, judged, train_judge
-from train.sworn_flecks import Spots, lit, swearing
 from v2hdm.catalogue import OUTLINED_CLASSES
-from v2hdm.detection.detector import Detector
-from v2hdm.detection.markings.evidence import CLAIMED, FEATURES
-from v2hdm.detection.markings.find import Readings
-from v2hdm.detection.markings.judge import (
+from v2hdm.detection.classifier import (
+    AMONG,
     SHAPES,
-    TOLD,
+    Readings,
+    features_among,
     one_hot,
     shape_of,
-    told,
 )
-from v2hdm.detection.markings.rectified import CHANNELS, CLAIMED_CHANNELS, SIZE
+from v2hdm.detection.detector import Detector
+from v2hdm.detection.evidence import CHANNELS, CLAIMED, CLAIMED_CHANNELS, FEATURES, SIZE
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE, being_fitted
-from v2hdm.geometry.quadrilateral import following, side_frames
+from v2hdm.geometry.quadrilateral import Quad, following
 from v2hdm.records import BoolArray, FloatArray
 from v2hdm.store.files import replace_text, whole_file
 
@@ -79,13 +77,14 @@ class Gathered:
 
     def add(self, index: int, shown: Example, detector: Detector, spots: Spots | None = None) -> None:
         """The detector's proposals in one image, whose network is confident that ``spots`` are markings."""
-        with swearing(spots) if spots is not None else nullcontext():
-            seen = detector.see(shown.image, shown.camera)
-        readings = detector.read(shown.image, seen)
+        output = detector.run_network(shown.image, shown.camera)
+        if spots is not None:
+            output = spots.claimed(output)
+        readings = detector.read(shown.image, detector.propose(output, shown.camera))
         if readings is None:
             return
         look = 1 + max(self.look, default=-1)
-        corners_px, _ = readings.fit.in_image()
+        corners_px = readings.fit.corners_px
         variance = readings.fit.side_variance()
         for row, (m, kind) in enumerate(zip(readings.quadrilateral.tolist(), readings.kinds, strict=True)):
             true, marking = is_true(shown, kind, corners_px[m])
@@ -146,11 +145,10 @@ def side_errors(readings: Readings, m: int, corners_px: FloatArray, true: TrueMa
         return np.full(4, np.nan)
     turned = [np.roll(true.polygon_px[::way], shift, axis=0) for shift in range(4) for way in (1, -1)]
     nearest = min(turned, key=lambda corners: float(np.abs(corners - corners_px).sum()))
-    corners = readings.fit.corners[m]
+    quad = Quad(readings.fit.quad.corners[m])
     placed = readings.fit.frames.take(np.array([m])).from_image(nearest[None])[0]
-    _, normal, _ = side_frames(corners)
-    middle, true_middle = ((each + following(each)) / 2 for each in (corners, placed))
-    return np.asarray(((true_middle - middle) * normal).sum(axis=-1))
+    middle, true_middle = ((each + following(each)) / 2 for each in (quad.corners, placed))
+    return np.asarray(((true_middle - middle) * quad.normal).sum(axis=-1))
 
 
 def render_to_fit(number: int, images: int, seed: int) -> tuple[int, Example]:
@@ -203,7 +201,7 @@ def gather(part: Part) -> Part:
             gathered.add(index, shown, detectors[1])
         if number % LIT_EVERY == 0:
             rng = np.random.default_rng([SEED, number])
-            spotted, spots = lit(shown, detectors[0].view(shown.camera), rng)
+            spotted, spots = lit(shown, detectors[0].road_camera(shown.camera), rng)
             gathered.add(index, spotted, detectors[0], spots)
     gathered.save(part.path)
     return part
@@ -247,7 +245,7 @@ def fit_all(
         tell((k + 1) / (FOLDS + 1))
     _print_sides(asked, side_sigma_px)
     seen_through = (odds < 0)[spotted & known & ~true]
-    print(f"seen through: {seen_through.mean():.3f} of what is sworn and false", flush=True)
+    print(f"seen through: {seen_through.mean():.3f} of the false claims", flush=True)
     return train_judge(asked.take(lessons), CONFIG), fit_among(gathered, odds)
 
 
@@ -272,10 +270,10 @@ def fit_among(gathered: Gathered, odds: FloatArray) -> dict[str, dict[str, objec
     fold = np.array(gathered.image) % FOLDS
     _print_worth("alone", odds[known], true[known])
     look, ground = np.array(gathered.look), np.array(gathered.ground)
-    features = np.zeros((len(odds), len(TOLD)))
+    features = np.zeros((len(odds), len(AMONG)))
     for number in range(1 + look.max()):
         mine = np.flatnonzero(look == number)
-        features[mine] = told(odds[mine], ground[mine], [gathered.kind[m] for m in mine])
+        features[mine] = features_among(odds[mine], ground[mine], [gathered.kind[m] for m in mine])
     shape = np.array([shape_of(kind) for kind in gathered.kind])
     fitted, left_out = _fit_each(features, shape, true, known, fold)
     _print_worth("among others", left_out[known], true[known])
@@ -292,14 +290,14 @@ def _fit_each(
         mine = known & (shape == name)
         weights, bias = fit(features[mine], true[mine])
         effect[name] = weights * features[mine].std(axis=0)
-        named = dict(zip(TOLD, weights.round(4).tolist(), strict=True))
+        named = dict(zip(AMONG, weights.round(4).tolist(), strict=True))
         fitted[name] = {"bias": round(bias, 4), "weights": named}
         for k in range(FOLDS):
             others, these = mine & (fold != k), (shape == name) & (fold == k)
             weights, bias = fit(features[others], true[others])
             left_out[these] = features[these] @ weights + bias
     print(f"{'':16s} " + " ".join(f"{name:>9s}" for name in SHAPES))
-    for row, name in enumerate(TOLD):
+    for row, name in enumerate(AMONG):
         print(f"{name:16s} " + " ".join(f"{effect[shape][row]:+9.2f}" for shape in SHAPES))
     return fitted, left_out
 

@@ -17,23 +17,19 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from unittest.mock import patch
 
 import numpy as np
 
 from train.examples import LANE_TOLERANCE_PX, Example
 from train.fit_judge import FOLDS, fit, log_loss, render_to_fit
-from v2hdm.detection.camera.view import CameraView
 from v2hdm.detection.detector import Detector
+from v2hdm.detection.lanes import boundaries as score
 from v2hdm.detection.lanes import lines as lane_lines
-from v2hdm.detection.lanes import score
-from v2hdm.detection.lanes.curve import Horizon, Line, LinePoints
-from v2hdm.detection.lanes.span import draw
-from v2hdm.detection.markings.foreground import Foreground
+from v2hdm.detection.lanes.boundaries import draw
+from v2hdm.detection.lanes.curves import LaneImage, Line, LinePoints
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.sight import AnchorRow
 from v2hdm.detection.weights import LANE_SCORE_FILE, being_fitted
-from v2hdm.records import BoolArray, FloatArray, LaneDetection
+from v2hdm.records import BoolArray, FloatArray
 from v2hdm.store.files import replace_text
 
 SEED = 921
@@ -44,39 +40,21 @@ _MOST_SLOPE = 10.0
 KEYS = {"alone": score.ALONE, "among": score.AMONG}
 
 Weights = dict[str, tuple[FloatArray, float]]
-"""The weights of :func:`v2hdm.detection.lanes.score.fitted`."""
+"""The weights of :func:`v2hdm.detection.lanes.boundaries.fitted`."""
 
 
 @dataclass(frozen=True)
 class Seen:
     """The evidence for the lanes of one image, and the truth."""
 
-    rows: list[AnchorRow]
-    paint: list[LaneDetection]
-    view: CameraView
-    foreground: Foreground
-    row_step_px: float
+    image: LaneImage
     lanes_px: list[FloatArray]
 
 
 def seen(shown: Example, detector: Detector) -> Seen:
     """The evidence for lanes in the network's output and the paint of an image."""
-    kept: list[Seen] = []
-
-    def spy(
-        rows: list[AnchorRow],
-        view: CameraView,
-        paint: list[LaneDetection],
-        _: float,
-        foreground: Foreground,
-        row_step_px: float,
-    ) -> list[LaneDetection]:
-        kept.append(Seen(rows, list(paint), view, foreground, row_step_px, shown.lanes_px))
-        return []
-
-    with patch("v2hdm.detection.detector.link_anchors", spy):
-        detector.detect(shown.image, shown.camera)
-    return kept[0]
+    found = detector.propose(detector.run_network(shown.image, shown.camera), shown.camera)
+    return Seen(detector.lane_image(found), shown.lanes_px)
 
 
 @dataclass
@@ -86,22 +64,20 @@ class Proposed:
     image: Seen
     points: LinePoints
     lines: list[Line]
-    horizon: Horizon
     alone: FloatArray = field(init=False)
     true: BoolArray = field(init=False)
 
     def __post_init__(self) -> None:
-        view, foreground = self.image.view, self.image.foreground
-        self.alone = score.features_alone(self.lines, self.points, view, self.horizon, foreground)
+        self.alone = score.features_alone(self.lines, self.points, self.image.image)
         self.true = np.array([self._is_true(line) for line in self.lines], dtype=np.bool_)
 
     def among(self, odds: FloatArray) -> FloatArray:
         """The features (N, F) of the lines among each other, of such log odds (N,) alone."""
         lines = [replace(line, log_odds=float(o)) for line, o in zip(self.lines, odds, strict=True)]
-        return score.features_among(lines, self.points, self.horizon)
+        return score.features_among(lines, self.points, self.image.image)
 
     def _is_true(self, line: Line) -> bool:
-        drawn = draw(line, self.points, self.image.view, self.horizon)
+        drawn = draw(line, self.points, self.image.image)
         if drawn is None:
             return False
         own = self.points.points_px[line.members, 1]
@@ -110,20 +86,10 @@ class Proposed:
         return max((share_on(lane, line_px) for lane in self.image.lanes_px), default=0.0) >= LEAST_SHARE
 
 
-def proposed(image: Seen, paint_step_m: float) -> Proposed | None:
+def proposed(image: Seen) -> Proposed | None:
     """The lines that are proposed in an image; None where there is nothing to make any of."""
-    horizon = Horizon(image.view)
-    points, lines = lane_lines.propose(
-        image.rows,
-        image.view,
-        horizon,
-        image.paint,
-        paint_step_m,
-        image.foreground,
-        image.row_step_px,
-        -np.inf,
-    )
-    return Proposed(image, points, lines, horizon) if lines else None
+    points, lines = lane_lines.propose(image.image, -np.inf)
+    return Proposed(image, points, lines) if lines else None
 
 
 def share_on(lane_px: FloatArray, points_px: FloatArray) -> float:
@@ -139,8 +105,8 @@ def share_on(lane_px: FloatArray, points_px: FloatArray) -> float:
 class Gathered:
     """The lines proposed in all images, by the weights that there are."""
 
-    def __init__(self, images: Sequence[Seen], paint_step_m: float):
-        self._images = [found for image in images if (found := proposed(image, paint_step_m)) is not None]
+    def __init__(self, images: Sequence[Seen]):
+        self._images = [found for image in images if (found := proposed(image)) is not None]
         self._alone = np.concatenate([image.alone for image in self._images])
         self._count = [len(image.lines) for image in self._images]
         self._fold = np.repeat(np.arange(len(self._count)) % FOLDS, self._count)
@@ -200,16 +166,15 @@ def write(weights: Weights, folder: Path) -> None:
     replace_text(folder / LANE_SCORE_FILE.name, json.dumps(named, indent=1) + "\n")
 
 
-def fit_to(images: Sequence[Seen], paint_step_m: float) -> Weights:
+def fit_to(images: Sequence[Seen]) -> Weights:
     """The weights fitted to images; prints what they do."""
-    gathered = Gathered(images, paint_step_m)
+    gathered = Gathered(images)
     print(f"{gathered.true.sum()} true, {(~gathered.true).sum()} false lines in {len(images)} images")
     before = gathered.odds(score.fitted())
     print(f"log loss of the weights so far {log_loss(before, gathered.true):.3f}")
     for _ in range(ROUNDS):
         weights, _, _ = gathered.fit()
-        with patch.object(score, "fitted", lambda fitted=weights: fitted):
-            gathered = Gathered(images, paint_step_m)
+        gathered = Gathered([replace(one, image=replace(one.image, score=weights)) for one in images])
     for name, (effect, _) in gathered.effects(weights).items():
         for key, value in zip(KEYS[name], effect, strict=True):
             print(f"{name:6s} {key:16s} {value:+.2f}")

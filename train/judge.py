@@ -46,7 +46,7 @@ class JudgeConfig:
     """How the judge learns; rate and decay are those of AdamW (Loshchilov and Hutter, ICLR 2019).
 
     What it is shown is varied, as other cameras and roads would: each channel of a view by a factor whose
-    logarithm has ``light_sigma``, the evidence by ``evidence_sigma`` of its own deviation. In ``sworn_share``
+    logarithm has ``light_sigma``, the evidence by ``evidence_sigma`` of its own deviation. In ``claimed_share``
     of the cases the paint network claims what it claims of markings on average, so that the image has a say
     of its own where that network is sure and wrong. ``side_weight`` is that of the sides' errors in the loss.
     """
@@ -59,7 +59,7 @@ class JudgeConfig:
     side_weight: float = 0.1
     light_sigma: float = 0.4
     evidence_sigma: float = 0.2
-    sworn_share: float = 0.2
+    claimed_share: float = 0.2
     seed: int = 0
 
 
@@ -86,8 +86,8 @@ def train_judge(known: Quadrilaterals, config: JudgeConfig) -> Judge:
             views, evidence, shape = (part[rows] for part in parts)
             views, sides = _mirrored(views, rng)
             views = _in_other_light(views, config.light_sigma, rng)
-            sworn = torch.from_numpy(rng.random(len(batch)) < config.sworn_share)
-            views, evidence = claims.put(views, evidence, sworn)
+            claimed = torch.from_numpy(rng.random(len(batch)) < config.claimed_share)
+            views, evidence = claims.put(views, evidence, claimed)
             noise = torch.from_numpy(rng.standard_normal(evidence.shape).astype(np.float32))
             odds, log_sigma = judge(views, evidence + config.evidence_sigma * judge.deviation * noise, shape)
             error, variance = (part[rows].gather(1, sides) for part in (side_error, side_variance))

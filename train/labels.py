@@ -18,7 +18,7 @@ from train.labels_tusimple import read_tusimple
 from train.scenes.scenes import TrainingSample
 from train.targets import IGNORE, Targets, targets
 from v2hdm.catalogue import PAINT_CLASSES
-from v2hdm.detection.image_file import read_bgr
+from v2hdm.detection.frames import read_bgr
 from v2hdm.errors import ConfigError, DriveError, LabelError
 from v2hdm.io.safe.pixels import read_header
 

@@ -23,7 +23,6 @@ from train import fit_judge, fit_lane_score
 from train.exported import read_exported
 from train.fit_judge import Gathered
 from v2hdm.detection import weights
-from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import ConfigError
 from v2hdm.progress import TellShare, share_of_work
 from v2hdm.store.files import whole_file
@@ -189,7 +188,7 @@ def _fit_lane_score(order: Order, folder: Path, tell: TellShare) -> None:
 
     tell(_JUDGED, "lane score: looking at renders")
     share_out(fit_lane_score.see, parts, _workers(order), cv2.setNumThreads, (1,), take)
-    fit_lane_score.write(fit_lane_score.fit_to(images, DetectorOptions().lane_step_m), folder)
+    fit_lane_score.write(fit_lane_score.fit_to(images), folder)
 
 
 def _in_parts(images: int) -> list[range]:

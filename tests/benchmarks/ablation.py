@@ -22,8 +22,9 @@ import numpy as np
 
 from tests.benchmarks.detector_quality import Tally
 from train.examples import Example, example
+from v2hdm.detection import classifier as find
+from v2hdm.detection import fit, lattice, propose
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.markings import find, fit, lattice, propose
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.records import FloatArray
 
@@ -76,13 +77,13 @@ def _with_narrow_scatter() -> Iterator[None]:
 
 @contextmanager
 def _without_side_doubt() -> Iterator[None]:
-    judge_alone = find.judge_alone
+    classify_alone = find.classify_alone
 
     def sure(*given: Any) -> tuple[FloatArray, FloatArray]:
-        odds, sigma_px = judge_alone(*given)
+        odds, sigma_px = classify_alone(*given)
         return odds, 0 * sigma_px
 
-    with patch.object(find, "judge_alone", sure):
+    with patch.object(find, "classify_alone", sure):
         yield
 
 
@@ -91,7 +92,7 @@ def _without_context() -> Iterator[None]:
     def alone(odds: FloatArray, *_: Any) -> FloatArray:
         return np.asarray(1 / (1 + np.exp(-odds)))
 
-    with patch.object(find, "judge_among", alone):
+    with patch.object(find, "classify_among", alone):
         yield
 
 
@@ -110,7 +111,7 @@ def _without_sizes() -> Iterator[None]:
 
 @contextmanager
 def _without_parts() -> Iterator[None]:
-    with patch("v2hdm.detection.markings.blobs._split", lambda *_: []):
+    with patch("v2hdm.detection.propose._split", lambda *_: []):
         yield
 
 

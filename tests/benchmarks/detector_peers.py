@@ -29,7 +29,7 @@ import pytest
 from tests.benchmarks.detector_peer_graphs import PEERS
 from train.scenes.scenes import random_scene
 from train.scenes.views import looking
-from v2hdm.detection.image_file import read_bgr
+from v2hdm.detection.frames import read_bgr
 from v2hdm.detection.road import RoadDetector
 from v2hdm.detection.stopwatch import Stopwatch, lap
 from v2hdm.io.calibration import write_calibration

@@ -174,7 +174,7 @@ def counted(examples: Iterable[Example], model: str | None) -> Tally:
         markings, lanes = detector.detect(shown.image, shown.camera)
         tally.add_markings(shown.markings, markings)
         curves = [lane.points_px for lane in lanes if lane.kind == LANE_BOUNDARY]
-        tally.add_lanes(shown.lanes_px, shown.lanes_shown, curves, detector.view(shown.camera).top)
+        tally.add_lanes(shown.lanes_px, shown.lanes_shown, curves, detector.road_camera(shown.camera).top)
     return tally
 
 

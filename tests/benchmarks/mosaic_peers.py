@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import torch
 
-from v2hdm.detection.image_file import read_bgr
+from v2hdm.detection.frames import read_bgr
 from v2hdm.mosaic.blend import whole
 from v2hdm.mosaic.result import MULTIPLE_PX, RESOLUTION_M, ground_of
 from v2hdm.mosaic.shots import Canvas, Lens, Shot

@@ -27,8 +27,8 @@ import numpy as np
 from tests.benchmarks.real_reference import Painted, Reference, centre_of_area, make_reference
 from tests.benchmarks.real_view import View, shaded_share
 from v2hdm.detection.batch import detect_all, read_image
-from v2hdm.detection.draw import draw_detections
 from v2hdm.detection.options import DetectorOptions
+from v2hdm.detection.road import draw_detections
 from v2hdm.io.drive import ReadOptions, read_drive
 from v2hdm.mapping.markings.conclude import Optimised
 from v2hdm.mapping.optimise import Optimiser

@@ -19,7 +19,7 @@ from tests.docs.blocks import blocks, document
 from tests.drive.example import make_drive
 from v2hdm.cli import calibration
 from v2hdm.cli.calibrate import main
-from v2hdm.detection.camera.mounting import camera_from_calibration
+from v2hdm.detection.camera import camera_from_calibration
 from v2hdm.geometry.ipm import apply_homography
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.io.calibration import read_calibration, read_provenance, write_camera_info

@@ -7,7 +7,7 @@ lens, a Gaussian point spread, noise, sRGB coding. It shares no code with the pa
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -17,14 +17,16 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from v2hdm.catalogue import PAINT_CLASSES, SHIPPED
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.markings.foreground import Foreground
-from v2hdm.detection.markings.frames import Quads
-from v2hdm.detection.markings.rectified import rectified_views
+from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.evidence import rectified_views
+from v2hdm.detection.lanes.curves import LaneImage
+from v2hdm.detection.lanes.lines import find_boundaries
+from v2hdm.detection.network import AnchorRow, NetworkOutput
+from v2hdm.detection.patch import ImageQuads, Patches
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic
 from v2hdm.geometry.lens import distort_points, undistort_points
-from v2hdm.geometry.quadrilateral import order_corners
-from v2hdm.records import DIAMOND, Camera, CameraInfo
+from v2hdm.geometry.quadrilateral import Quad, order_corners
+from v2hdm.records import DIAMOND, LANE_DASH, Camera, CameraInfo, LaneDetection
 
 HEIGHT, WIDTH = 360, 640
 OPTICAL_FROM_LEVEL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -61,28 +63,42 @@ def to_image(camera: Camera, points_vehicle: np.ndarray) -> np.ndarray:
     return distort_points(camera.info, apply_homography(pinhole_px_from_vehicle, points_vehicle))
 
 
-def foreground_of(odds: np.ndarray, owner: np.ndarray, top: int) -> Foreground:
-    """Log odds (h, w) of paint and its owners, 2 px apart; what class it is of nobody knows."""
-    kinds = np.zeros((len(PAINT_CLASSES), odds.shape[0] // 2, odds.shape[1] // 2), dtype=np.float32)
-    return Foreground(odds, owner, 2, top, kinds, tuple(PAINT_CLASSES))
+def output_of(odds: np.ndarray, kinds: np.ndarray | None = None) -> NetworkOutput:
+    """Log odds (h, w) of paint all over an image, 2 px apart; nobody knows its classes unless told."""
+    if kinds is None:
+        kinds = np.zeros((len(PAINT_CLASSES), odds.shape[0] // 2, odds.shape[1] // 2), dtype=np.float32)
+    return NetworkOutput(odds, kinds, [], tuple(PAINT_CLASSES), 2, 0)
+
+
+def patches_of(
+    image: np.ndarray, camera: RoadCamera, output: NetworkOutput, corners_px: np.ndarray
+) -> Patches:
+    """The pixels about markings (M, 4, 2), none of which is other markings' paint."""
+    none = np.zeros((len(corners_px), 2), dtype=np.intp)
+    return Patches(image, camera, output, np.zeros(output.paint.shape, np.int16), corners_px, none)
+
+
+def view_of(
+    image: np.ndarray, camera: RoadCamera, output: NetworkOutput, corners_px: np.ndarray, kind: str
+) -> np.ndarray:
+    """The view (C, 20, 20) of a quadrilateral (4, 2) as one class."""
+    corners_px = corners_px[None]
+    quads, ground = ImageQuads.of(camera, corners_px), Quad(camera.unproject(corners_px))
+    patches = patches_of(image, camera, output, corners_px)
+    return rectified_views(patches, quads, ground, [(0, kind)], SHIPPED)[0][0]
 
 
 def crisp_view(kind: str) -> np.ndarray:
     """A marking (C, 20, 20) as its own frame should show it: bright, of its class, and nothing about it."""
     camera = make_camera("pinhole")
     shape = diamond(6.0, 0.0) if kind == DIAMOND else bar(6.0, 0.0, 2.0, 0.4)
-    corners_px = order_corners(to_image(camera, shape))[None]
+    corners_px = order_corners(to_image(camera, shape))
     inside = np.zeros((HEIGHT // 2, WIDTH // 2), dtype=np.float32)
-    cv2.fillConvexPoly(inside, np.round(corners_px[0] / 2).astype(np.int32), 1.0)
-    blank = foreground_of(12 * inside - 6, inside.astype(np.int16), 0)
-    kinds = np.zeros_like(blank.kinds)
+    cv2.fillConvexPoly(inside, np.round(corners_px / 2).astype(np.int32), 1.0)
+    kinds = np.zeros((len(PAINT_CLASSES), HEIGHT // 4, WIDTH // 4), dtype=np.float32)
     kinds[PAINT_CLASSES.index(kind)] = 8.0
-    view = CameraView(camera, 16)
-    ground = view.ground(view.undistort(corners_px[0]))[None]
-    image = picture(camera, [shape])
-    return rectified_views(
-        image, view, replace(blank, kinds=kinds), Quads.seen(view, corners_px), ground, [kind], SHIPPED
-    )[0][0]
+    output = output_of(12 * inside - 6, kinds)
+    return view_of(picture(camera, [shape]), RoadCamera(camera, 16), output, corners_px, kind)
 
 
 def diamond(
@@ -215,3 +231,62 @@ def save_model(
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
     helper.set_model_props(model, {"v2hdm": json.dumps(metadata)})
     onnx.save(model, path)
+
+
+def boundaries_of(
+    rows: list[AnchorRow],
+    view: RoadCamera,
+    paint: Sequence[LaneDetection] = (),
+    output: NetworkOutput | None = None,
+) -> list[LaneDetection]:
+    """The boundaries of lanes found from row anchors, paint and, if it is known, the network's output."""
+    return find_boundaries(LaneImage(view, rows, paint, output))
+
+
+def anchors_of(view: RoadCamera, lines_px: list[np.ndarray], hidden: slice = slice(0, 0)) -> list[AnchorRow]:
+    """What a perfect network says of lines (N, 2), near to far, except on the ``hidden`` anchors."""
+    rows = []
+    for v in np.arange(view.info.height - 4.5, view.top, -STRIDES["lanes"]):
+        u = []
+        for line in lines_px:
+            order = np.argsort(line[:, 1])
+            u.append(np.interp(v, line[order, 1], line[order, 0], left=np.nan, right=np.nan))
+        seen = np.array([x for x in u if 0 <= x < view.info.width])
+        if len(seen):
+            rows.append(AnchorRow(float(v), seen, np.full(len(seen), 4.0)))
+    del rows[hidden]
+    return rows
+
+
+def straight(view: RoadCamera, left_m: float, curvature: float = 0.0) -> np.ndarray:
+    along = np.arange(4.0, 40.0, 0.25)
+    points = np.column_stack([along, left_m + 0.5 * curvature * along**2])
+    return to_image(view.camera, points)
+
+
+def painted(line_px: np.ndarray, view: RoadCamera, near_m: float, far_m: float) -> LaneDetection:
+    """The centre line of a line's paint (N, 2) between two distances, a point every half a metre."""
+    x = view.ground(view.undistort(line_px))[:, 0]
+    seen = (x >= near_m) & (x <= far_m) & view.inside(line_px, 0)
+    return LaneDetection(LANE_DASH, 0.9, line_px[seen][::2])
+
+
+def off_px(lane: LaneDetection, line_px: np.ndarray) -> np.ndarray:
+    """How far the points of a lane are from a true line along their rows, as far as that goes."""
+    order = np.argsort(line_px[:, 1])
+    u, v = lane.points_px.T
+    off = np.interp(v, line_px[order, 1], line_px[order, 0], left=np.nan, right=np.nan) - u
+    return off[np.isfinite(off)]
+
+
+def painted_on(view: RoadCamera, lines_px: list[np.ndarray]) -> NetworkOutput:
+    """Log odds of paint of 5 on lines (N, 2) and of -5 elsewhere."""
+    odds = np.full((view.info.height // 2, view.info.width // 2), -5.0, dtype=np.float32)
+    for line_px in lines_px:
+        at = np.linspace(0, len(line_px) - 1, 16 * len(line_px))
+        for u, v in zip(
+            *(np.interp(at, np.arange(len(line_px)), line_px[:, k]) for k in (0, 1)), strict=True
+        ):
+            if 0 <= u < view.info.width and 0 <= v < view.info.height:
+                odds[int(v / 2), max(int(u / 2) - 2, 0) : int(u / 2) + 3] = 5.0
+    return output_of(odds)

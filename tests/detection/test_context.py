@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from v2hdm.detection.markings.context import COMPANY, company
-from v2hdm.detection.markings.judge import judge_among
+from v2hdm.detection.classifier import COMPANY, classify_among, company
 from v2hdm.records import DIAMOND, LANE_DASH, FloatArray
 
 
@@ -18,14 +17,14 @@ def dash(x: float, y: float, length: float = 2.0, heading: float = 0.0) -> Float
     return box[:, :1] * along + box[:, 1:] * left + (x, y)
 
 
-def told(ground: list[FloatArray], kinds: list[str], probability: list[float]) -> dict[str, FloatArray]:
+def reported(ground: list[FloatArray], kinds: list[str], probability: list[float]) -> dict[str, FloatArray]:
     columns = company(np.stack(ground), kinds, np.array(probability)).T
     return dict(zip(COMPANY, columns, strict=True))
 
 
 def test_diamonds_of_one_stencil_are_alike_and_others_are_not() -> None:
     small, across = diamond(8, 0, 0.6, 0.4), diamond(10, 0, 0.8, 1.2)
-    said = told([diamond(4, 0), diamond(6, 0), small, across], [DIAMOND] * 4, [0.9, 0.8, 0.5, 0.25])
+    said = reported([diamond(4, 0), diamond(6, 0), small, across], [DIAMOND] * 4, [0.9, 0.8, 0.5, 0.25])
     assert said["alike"][:2] == pytest.approx([0.8, 0.9], abs=1e-3)
     assert said["most_alike"] == pytest.approx([0.8, 0.9, 0.0, 0.0], abs=0.01)
     assert said["unlike"][0] == pytest.approx(0.75, abs=0.01)
@@ -33,7 +32,7 @@ def test_diamonds_of_one_stencil_are_alike_and_others_are_not() -> None:
 
 
 def test_neither_another_class_nor_another_reading_of_the_same_paint_is_company() -> None:
-    said = told([diamond(4, 0), diamond(4.1, 0), dash(6, 0)], [DIAMOND, DIAMOND, LANE_DASH], [0.9] * 3)
+    said = reported([diamond(4, 0), diamond(4.1, 0), dash(6, 0)], [DIAMOND, DIAMOND, LANE_DASH], [0.9] * 3)
     assert not any(column.any() for column in said.values())
 
 
@@ -45,8 +44,8 @@ def test_a_dash_has_others_in_its_line_after_a_gap_only() -> None:
         (dash(9, 0, heading=0.5), 0.0),
         (dash(29, 0), 0.0),
     ):
-        assert told([dash(4, 0), other], [LANE_DASH] * 2, [0.5, 0.9])["in_line"][0] == in_line
-    assert not told([diamond(4, 0), diamond(9, 0)], [DIAMOND] * 2, [0.5, 0.9])["in_line"].any()
+        assert reported([dash(4, 0), other], [LANE_DASH] * 2, [0.5, 0.9])["in_line"][0] == in_line
+    assert not reported([diamond(4, 0), diamond(9, 0)], [DIAMOND] * 2, [0.5, 0.9])["in_line"].any()
 
 
 def test_a_row_of_dashes_may_be_an_arc() -> None:
@@ -62,7 +61,7 @@ def test_a_row_of_dashes_may_be_an_arc() -> None:
         (on_circle(6, -0.4), 0.0),
         (on_circle(4), 0.0),
     ):
-        assert told([on_circle(0), other], [LANE_DASH] * 2, [0.5, 0.9])["in_line"][0] == in_line
+        assert reported([on_circle(0), other], [LANE_DASH] * 2, [0.5, 0.9])["in_line"][0] == in_line
 
 
 def test_diamonds_far_apart_may_be_turned_by_a_bend() -> None:
@@ -70,8 +69,8 @@ def test_diamonds_far_apart_may_be_turned_by_a_bend() -> None:
         around = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         return (diamond(0, 0) @ around) + (x, 0)
 
-    near = told([diamond(4, 0), turned(6, 0.5)], [DIAMOND] * 2, [0.5, 0.9])["most_alike"][0]
-    far = told([diamond(4, 0), turned(16, 0.5)], [DIAMOND] * 2, [0.5, 0.9])["most_alike"][0]
+    near = reported([diamond(4, 0), turned(6, 0.5)], [DIAMOND] * 2, [0.5, 0.9])["most_alike"][0]
+    far = reported([diamond(4, 0), turned(16, 0.5)], [DIAMOND] * 2, [0.5, 0.9])["most_alike"][0]
     assert near < 0.05
     assert far > 0.6
 
@@ -87,5 +86,5 @@ def test_a_doubtful_diamond_is_believed_among_others_like_it() -> None:
     field = np.stack([diamond(4.0 + 3 * k, 0) for k in range(4)])
     mixed = field.copy()
     mixed[1:] = 4 + 0.4 * (mixed[1:] - 4)
-    among, apart = (judge_among(odds, ground, kinds)[0] for ground in (field, mixed))
+    among, apart = (classify_among(odds, ground, kinds)[0] for ground in (field, mixed))
     assert 1 - apart > 2 * (1 - among)

@@ -19,8 +19,7 @@ from tests.detection.pictures import HEIGHT, WIDTH, brightness_model, diamond, e
 from v2hdm.detect import main
 from v2hdm.detection import frames
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.draw import draw_detections
-from v2hdm.detection.road import RoadDetector
+from v2hdm.detection.road import RoadDetector, draw_detections
 from v2hdm.detection.stopwatch import Stopwatch, lap
 from v2hdm.io.calibration import Provenance, write_calibration, write_calibration_as
 from v2hdm.pipeline import watch

@@ -4,33 +4,39 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.detection.pictures import LENSES, bar, diamond, foreground_of, make_camera, picture, to_image
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.markings.correlation import variance_inflation
-from v2hdm.detection.markings.fit import fit_quadrilaterals
-from v2hdm.detection.markings.lattice import Scene
-from v2hdm.detection.markings.propose import open_sides
+from tests.detection.pictures import (
+    LENSES,
+    bar,
+    diamond,
+    make_camera,
+    output_of,
+    patches_of,
+    picture,
+    to_image,
+)
+from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.coverage import variance_inflation
+from v2hdm.detection.fit import fit_quadrilaterals
+from v2hdm.detection.propose import open_sides
 from v2hdm.geometry.quadrilateral import order_corners, side_frames
 
 
 def fitted(image, camera, shapes, off_px=1.0, seed=0):
     """The fit, true corners (M, 4, 2) and errors (M, 4, 2), started ``off_px`` away from the truth."""
-    view = CameraView(camera, 16)
+    view = RoadCamera(camera, 16)
     true_px = np.stack([order_corners(to_image(camera, shape)) for shape in shapes])
     start = true_px + off_px * np.random.default_rng(seed).standard_normal(true_px.shape)
-    fit = fit_quadrilaterals(scene_of(image, start), view, start, open_sides(start, view))
-    corners_px, covariance = fit.in_image()
+    fit = fit_quadrilaterals(patches_about(image, view, start), view, start, open_sides(start, view))
+    corners_px, covariance = fit.corners_px, fit.covariance_px()
     return fit, corners_px, covariance, corners_px - true_px
 
 
-def scene_of(image, outlines_px):
-    """The image, of which a network says that the insides of outlines (M, 4, 2) are paint."""
+def patches_about(image, view, outlines_px):
+    """The pixels about outlines (M, 4, 2), of whose insides a network says that they are paint."""
     inside = np.zeros((image.shape[0] // 2, image.shape[1] // 2), dtype=np.float32)
     for outline in outlines_px:
         cv2.fillConvexPoly(inside, np.round(outline / 2).astype(np.int32), 1.0)
-    blank = foreground_of(8 * cv2.GaussianBlur(inside, (0, 0), 1.0) - 4, np.zeros(inside.shape, np.int16), 0)
-    none = np.zeros(len(outlines_px), dtype=np.intp)
-    return Scene(image, blank, none, none)
+    return patches_of(image, view, output_of(8 * cv2.GaussianBlur(inside, (0, 0), 1.0) - 4), outlines_px)
 
 
 def normalised(error, covariance):
@@ -66,7 +72,7 @@ def test_paint_brighter_than_the_sensor_can_say_is_not_drawn_larger(paint):
     camera = make_camera()
     shapes = [diamond(x, y, 1.2, 0.7, 9.0 * y) for x in (6.0, 8.0, 10.0) for y in (-1.9, -0.3, 1.4)]
     fit, _, _, error = fitted(picture(camera, shapes, paint=paint, blur_px=0.9), camera, shapes)
-    _, normal, _ = side_frames(fit.corners)
+    _, normal, _ = side_frames(fit.quad.corners)
     outward = (error * normal).sum(axis=-1)
     assert abs(np.median(outward)) < 0.12
     assert np.median(np.linalg.norm(error, axis=-1)) < 0.25
@@ -128,15 +134,15 @@ def test_an_end_beyond_the_border_is_vague_along_the_dash_and_the_other_end_is_n
     true_px = order_corners(to_image(camera, shape))
     assert true_px[:, 1].max() > camera.info.height + 20
     image = picture(camera, [shape])
-    view = CameraView(camera, 16)
+    view = RoadCamera(camera, 16)
     seen = true_px.copy()
     for low, high in ((0, 3), (1, 2)):
         assert seen[low, 1] > seen[high, 1]
         share = (camera.info.height - 1 - seen[high, 1]) / (seen[low, 1] - seen[high, 1])
         seen[low] = seen[high] + share * (seen[low] - seen[high])
     start = order_corners(seen)[None]
-    fit = fit_quadrilaterals(scene_of(image, start), view, start, open_sides(start, view))
-    corners_px, covariance = fit.in_image()
+    fit = fit_quadrilaterals(patches_about(image, view, start), view, start, open_sides(start, view))
+    corners_px, covariance = fit.corners_px, fit.covariance_px()
     order = np.argsort(corners_px[0][:, 1])
     along = corners_px[0][order[2:]].mean(axis=0) - corners_px[0][order[:2]].mean(axis=0)
     for corner in order[:2]:

@@ -5,9 +5,7 @@ import pytest
 import torch
 
 from tests.detection.pictures import extrinsic, make_camera, to_image
-from v2hdm.detection.camera.footprint import Footprint
-from v2hdm.detection.camera.mounting import camera_from_calibration, rough_calibration
-from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.camera import GroundPoints, RoadCamera, camera_from_calibration, rough_calibration
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.tensors import exp
@@ -20,8 +18,8 @@ def calibrated(lens: str = "plumb_bob", covariance: np.ndarray | None = None) ->
     return Calibration(make_camera(lens).info, extrinsic(), covariance)
 
 
-def footprint(calibration: Calibration) -> Footprint:
-    return Footprint(CameraView(camera_from_calibration(calibration)), calibration)
+def footprint(calibration: Calibration, points_px: np.ndarray) -> GroundPoints:
+    return RoadCamera(camera_from_calibration(calibration)).footprint(points_px, calibration)
 
 
 def moved(calibration: Calibration, tangent: np.ndarray) -> Calibration:
@@ -33,7 +31,7 @@ def moved(calibration: Calibration, tangent: np.ndarray) -> Calibration:
 @pytest.mark.parametrize("lens", ["pinhole", "plumb_bob", "equidistant"])
 def test_corners_land_where_they_are_on_the_ground(lens):
     points_px = to_image(make_camera(lens), CORNERS)
-    found = footprint(calibrated(lens)).of(points_px)
+    found = footprint(calibrated(lens), points_px)
     np.testing.assert_allclose(found.points_vehicle, CORNERS, atol=2e-3)
     np.testing.assert_array_equal(found.joint_covariance(np.zeros((8, 8))), np.zeros((8, 8)))
 
@@ -44,9 +42,9 @@ def test_the_share_of_the_pixels_is_that_of_differences(lens):
     points_px = to_image(make_camera(lens), CORNERS)
     spread = np.random.default_rng(0).normal(0, 0.1, (8, 8))
     covariance_px = spread @ spread.T
-    covariance = footprint(calibration).of(points_px).joint_covariance(covariance_px)
+    covariance = footprint(calibration, points_px).joint_covariance(covariance_px)
     jacobian = np.zeros((8, 8))
-    view = CameraView(camera_from_calibration(calibration))
+    view = RoadCamera(camera_from_calibration(calibration))
     for column in range(8):
         step = np.zeros(8)
         step[column] = 0.5
@@ -61,12 +59,11 @@ def test_the_share_of_the_calibration_is_that_of_differences():
     sigma = np.array([0.02, 0.01, 0.03, 0.002, 0.003, 0.001])
     calibration = calibrated("pinhole", np.diag(sigma**2))
     points_px = to_image(make_camera("pinhole"), CORNERS)
-    covariance = footprint(calibration).of(points_px).joint_covariance(np.zeros((8, 8)))
+    covariance = footprint(calibration, points_px).joint_covariance(np.zeros((8, 8)))
     jacobian = np.zeros((8, 6))
     for column, step in enumerate(1e-5 * np.eye(6)):
         ends = [
-            footprint(moved(calibration, sign * step)).of(points_px).points_vehicle.ravel()
-            for sign in (1, -1)
+            footprint(moved(calibration, sign * step), points_px).points_vehicle.ravel() for sign in (1, -1)
         ]
         jacobian[:, column] = (ends[0] - ends[1]) / 2e-5
     np.testing.assert_allclose(covariance, jacobian @ np.diag(sigma**2) @ jacobian.T, rtol=1e-4, atol=1e-9)
@@ -75,7 +72,7 @@ def test_the_share_of_the_calibration_is_that_of_differences():
 def test_points_of_a_line_have_the_covariance_of_single_corners():
     calibration = calibrated(covariance=np.diag([1e-4, 1e-4, 1e-4, 1e-6, 1e-6, 1e-6]))
     points_px = to_image(make_camera(), CORNERS)
-    found = footprint(calibration).of(points_px)
+    found = footprint(calibration, points_px)
     single, together = found.single_covariances(0.5), found.joint_covariance(0.25 * np.eye(8))
     for n in range(4):
         np.testing.assert_allclose(single[n], together[2 * n : 2 * n + 2, 2 * n : 2 * n + 2], rtol=1e-9)
@@ -84,7 +81,7 @@ def test_points_of_a_line_have_the_covariance_of_single_corners():
 def test_a_point_above_the_horizon_spoils_no_other():
     points_px = to_image(make_camera(), CORNERS)
     points_px[2] = [320.0, 5.0]
-    found = footprint(calibrated()).of(points_px)
+    found = footprint(calibrated(), points_px)
     covariance = found.joint_covariance(np.eye(8))
     assert np.isnan(found.points_vehicle[2]).all()
     others = [0, 1, 2, 3, 6, 7]

@@ -5,36 +5,41 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.detection.pictures import make_camera, to_image
-from tests.detection.test_lane_lines import anchors_of, off_px, painted, straight
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.lanes.cluster import find_road
-from v2hdm.detection.lanes.curve import Horizon, LinePoints, Prior, basis
-from v2hdm.detection.lanes.lines import link_anchors, propose
-from v2hdm.detection.sight import AnchorRow
+from tests.detection.pictures import (
+    anchors_of,
+    boundaries_of,
+    make_camera,
+    off_px,
+    painted,
+    straight,
+    to_image,
+)
+from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.lanes.curves import LaneImage, LinePoints, Prior, find_road
+from v2hdm.detection.lanes.lines import propose
+from v2hdm.detection.network import AnchorRow
 from v2hdm.records import LANE_LINE, LaneDetection
 
 
 @pytest.fixture
-def view() -> CameraView:
-    return CameraView(make_camera())
+def view() -> RoadCamera:
+    return RoadCamera(make_camera())
 
 
-def evidence_of(view: CameraView, lines_px: list[np.ndarray]):
-    horizon = Horizon(view)
+def evidence_of(view: RoadCamera, lines_px: list[np.ndarray]):
     points_px = np.concatenate(lines_px)
     ones = np.ones(len(points_px))
-    points = LinePoints.of(view, horizon, points_px, ones, ones)
+    points = LinePoints.of(LaneImage(view, []), points_px, ones, ones, paint=False)
     ends = np.cumsum([len(line) for line in lines_px])
     groups = [np.arange(end - len(line), end) for end, line in zip(ends, lines_px, strict=True)]
-    return points.evidence(horizon, groups, points.slopes(groups)), horizon
+    return points.evidence(view.horizon, groups), view.horizon
 
 
-def seen(view: CameraView, line_px: np.ndarray) -> np.ndarray:
+def seen(view: RoadCamera, line_px: np.ndarray) -> np.ndarray:
     return line_px[view.inside(line_px, 0)]
 
 
-def ahead(view: CameraView, start: tuple[float, float], end: tuple[float, float]) -> np.ndarray:
+def ahead(view: RoadCamera, start: tuple[float, float], end: tuple[float, float]) -> np.ndarray:
     """A straight line on the ground between two points, in the image."""
     return seen(view, to_image(view.camera, np.linspace(start, end, 60)))
 
@@ -60,7 +65,7 @@ def test_several_priors_at_once_tell_what_each_does_alone(view):
     at_once = evidence.log_evidence(Prior.several(priors))
     np.testing.assert_allclose(at_once, [evidence.log_evidence(prior) for prior in priors], rtol=1e-12)
     curves = evidence.curves(priors, 640.0)
-    alone = [evidence[k : k + 1].curve(prior, 640.0) for k, prior in enumerate(priors)]
+    alone = [evidence[k : k + 1].curves([prior], 640.0)[0] for k, prior in enumerate(priors)]
     for one, other in zip(curves, alone, strict=True):
         np.testing.assert_allclose(one.parameters, other.parameters, rtol=1e-9)
         np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-9)
@@ -71,22 +76,22 @@ def test_the_road_is_what_most_lines_agree_on_not_the_longest_other_one(view, cu
     lines = [seen(view, straight(view, side, curvature)) for side in (-5.0, -1.6, 1.8, 5.2)]
     other = ahead(view, (5.0, -3.0), (30.0, 9.0))
     evidence, horizon = evidence_of(view, [*lines, other])
-    _, along = find_road(evidence, horizon).judge(evidence)
+    _, along = find_road(evidence, horizon).weigh(evidence)
     assert along[:4].min() > 2
     assert along[4] < -10
 
 
 def test_short_dashes_far_away_point_where_the_line_beside_them_does(view):
-    line, horizon = straight(view, 1.6), Horizon(view)
+    line, horizon = straight(view, 1.6), view.horizon
     dashes = [tilted(painted(line, view, *span), 0.7) for span in ((12, 14), (17, 19))]
     near = line[(line[:, 1] > 200) & view.inside(line, 0)]
     off = []
     for beside in ([], [straight(view, -1.8)]):
-        points, lines = propose(
-            anchors_of(view, beside), view, horizon, dashes, 0.5, None, 8.0, least_log_odds=-np.inf
-        )
+        points, lines = propose(LaneImage(view, anchors_of(view, beside), dashes), -np.inf)
         along, below = horizon.coordinates(view.undistort(near))
-        curves = [each.curve.along(basis(below)) for each in lines if points.is_paint[each.members].all()]
+        curves = [
+            each.curve.along(horizon.basis(below)) for each in lines if points.is_paint[each.members].all()
+        ]
         off.append(min(np.abs(curve - along).max() for curve in curves))
     assert off[1] < 8
     assert off[1] < 0.6 * off[0], "by themselves they do not"
@@ -101,7 +106,7 @@ def test_of_two_lines_that_cross_the_surer_one_stays(view):
     line = straight(view, 1.6)
     across = ahead(view, (9.0, 3.2), (20.0, -1.5))
     rows = anchors_of(view, [line])
-    crossed = link_anchors(rows, view, [LaneDetection(LANE_LINE, 0.9, across[::2])])
+    crossed = boundaries_of(rows, view, [LaneDetection(LANE_LINE, 0.9, across[::2])])
     (lane,) = crossed
     assert np.abs(off_px(lane, line)).max() < 3
 
@@ -110,7 +115,7 @@ def test_a_stroke_across_a_line_does_not_draw_it_to_the_middle(view):
     line = straight(view, 1.6)
     stroke = ahead(view, (10.0, 1.3), (12.5, 1.9))
     paint = [painted(line, view, 5, 20), LaneDetection(LANE_LINE, 0.9, stroke[::4])]
-    (lane,) = link_anchors(anchors_of(view, [line]), view, paint)
+    (lane,) = boundaries_of(anchors_of(view, [line]), view, paint)
     assert np.abs(off_px(lane, line)).max() < 1
 
 
@@ -119,5 +124,5 @@ def test_a_line_whose_far_half_bends_away_a_little_stays_one(view):
     rows = anchors_of(view, [near])
     split = rows[len(rows) // 2].v_px
     bent = [AnchorRow(r.v_px, r.u_px + (4.0 if r.v_px < split else 0.0), r.odds) for r in rows]
-    (lane,) = link_anchors(bent, view)
+    (lane,) = boundaries_of(bent, view)
     assert np.ptp(lane.points_px[:, 1]) > 0.9 * (rows[0].v_px - rows[-1].v_px)

@@ -5,23 +5,31 @@ import json
 import numpy as np
 import pytest
 
-from tests.detection.pictures import make_camera, to_image
-from tests.detection.test_lane_lines import anchors_of, off_px, painted, painted_on, straight
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.lanes import score
-from v2hdm.detection.lanes.curve import Horizon
-from v2hdm.detection.lanes.lines import link_anchors, propose
-from v2hdm.detection.sight import AnchorRow
+from tests.detection.pictures import (
+    anchors_of,
+    boundaries_of,
+    make_camera,
+    off_px,
+    painted,
+    painted_on,
+    straight,
+    to_image,
+)
+from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.lanes import boundaries as score
+from v2hdm.detection.lanes.curves import LaneImage
+from v2hdm.detection.lanes.lines import propose
+from v2hdm.detection.network import AnchorRow
 from v2hdm.detection.weights import LANE_SCORE_FILE
 
 
 @pytest.fixture
-def view() -> CameraView:
-    return CameraView(make_camera())
+def view() -> RoadCamera:
+    return RoadCamera(make_camera())
 
 
 def score_of(view, rows, paint=()):
-    (lane,) = link_anchors(rows, view, paint)
+    (lane,) = boundaries_of(rows, view, paint)
     return lane.score
 
 
@@ -61,7 +69,7 @@ def test_crossings_all_over_the_ground_make_lines_less_sure(view):
     alone = score_of(view, rows)
     surest = [
         [
-            max((lane.score for lane in link_anchors(cluttered(view, rows, seed, odds), view)), default=0.0)
+            max((lane.score for lane in boundaries_of(cluttered(view, rows, seed, odds), view)), default=0.0)
             for seed in range(8)
         ]
         for odds in (0.1, 1.0)
@@ -75,7 +83,8 @@ def test_a_line_a_lane_away_makes_one_surer_and_one_too_near_does_not(view):
     alone = score_of(view, anchors_of(view, [line]))
     scores = {
         apart_m: min(
-            lane.score for lane in link_anchors(anchors_of(view, [line, straight(view, 1.6 - apart_m)]), view)
+            lane.score
+            for lane in boundaries_of(anchors_of(view, [line, straight(view, 1.6 - apart_m)]), view)
         )
         for apart_m in (1.0, 3.3)
     }
@@ -86,7 +95,7 @@ def test_a_line_a_lane_away_makes_one_surer_and_one_too_near_does_not(view):
 def test_a_line_a_lane_away_that_runs_another_way_tells_nothing(view):
     line = straight(view, 1.6)
     other = to_image(view.camera, np.linspace((6.0, -1.0), (30.0, -9.0), 100))
-    found = link_anchors(anchors_of(view, [line, other]), view)
+    found = boundaries_of(anchors_of(view, [line, other]), view)
     mine = min(found, key=lambda lane: np.abs(off_px(lane, line)).max())
     assert mine.score == pytest.approx(score_of(view, anchors_of(view, [line])), abs=0.05)
 
@@ -100,20 +109,20 @@ def test_paint_that_the_network_sees_along_it_makes_a_line_surer(view):
     line = straight(view, 1.6)
     rows, paint = anchors_of(view, [line]), [painted(line, view, 5, 8)]
     whole, piece = (
-        link_anchors(rows, view, paint, foreground=painted_on(view, [part]))[0].score
+        boundaries_of(rows, view, paint, output=painted_on(view, [part]))[0].score
         for part in (line, paint[0].points_px)
     )
     assert whole > piece + 0.01
 
 
 def test_the_paint_along_a_line_is_the_mean_of_where_it_is_seen(view):
-    line, horizon = straight(view, 1.6), Horizon(view)
+    line = straight(view, 1.6)
     rows = anchors_of(view, [line])
     near = line[line[:, 1] > np.mean([rows[0].v_px, rows[-1].v_px])]
-    points, lines = propose(rows, view, horizon, (), 0.5, None, 8.0, -np.inf)
+    points, lines = propose(LaneImage(view, rows), -np.inf)
     column = score.ALONE.index("paint_along")
     whole, half, none = (
-        score.features_alone(lines, points, view, horizon, painted_on(view, parts))[0, column]
+        score.features_alone(lines, points, LaneImage(view, rows, (), painted_on(view, parts)))[0, column]
         for parts in ([line], [near], [])
     )
     assert whole == pytest.approx(5, abs=0.5)

@@ -6,12 +6,18 @@ from itertools import product
 import numpy as np
 import pytest
 
-from tests.detection.pictures import make_camera
-from tests.detection.test_lane_lines import anchors_of, off_px, painted, painted_on, straight
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.lanes import span
-from v2hdm.detection.lanes.lines import link_anchors
-from v2hdm.detection.sight import AnchorRow
+from tests.detection.pictures import (
+    anchors_of,
+    boundaries_of,
+    make_camera,
+    off_px,
+    painted,
+    painted_on,
+    straight,
+)
+from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.lanes import boundaries as span
+from v2hdm.detection.network import AnchorRow
 from v2hdm.records import LANE_DASH, LANE_LINE
 
 LEFT_M, RIGHT_M = 1.9, 1.5
@@ -19,8 +25,8 @@ ENDS_M = 14.0
 
 
 @pytest.fixture
-def view() -> CameraView:
-    return CameraView(make_camera())
+def view() -> RoadCamera:
+    return RoadCamera(make_camera())
 
 
 def distance_m(view, line_px):
@@ -73,7 +79,7 @@ def test_the_states_are_as_probable_as_all_sequences_of_them_say():
 
 def test_where_one_strand_has_ended_the_line_passes_to_the_other(view):
     rows, paint, lines = as_seen(view, ENDS_M, LANE_LINE)
-    (lane,) = link_anchors(rows, view, paint, foreground=painted_on(view, lines))
+    (lane,) = boundaries_of(rows, view, paint, output=painted_on(view, lines))
     middle = straight(view, (LEFT_M + RIGHT_M) / 2)
     near, far = part_of(view, straight(view, RIGHT_M), 4, ENDS_M - 3), part_of(view, middle, ENDS_M + 3, 24)
     assert np.abs(off_px(lane, near)).max() < 10, "the middle is 26 px away"
@@ -83,8 +89,8 @@ def test_where_one_strand_has_ended_the_line_passes_to_the_other(view):
 
 def test_strand_whose_paint_goes_on_unseen_keeps_the_line_in_the_middle(view):
     rows, paint, lines = as_seen(view, ENDS_M, LANE_LINE)
-    foreground = painted_on(view, [lines[0], as_seen(view, 4.0, LANE_LINE)[2][1]])
-    (lane,) = link_anchors(rows, view, paint, foreground=foreground)
+    output = painted_on(view, [lines[0], as_seen(view, 4.0, LANE_LINE)[2][1]])
+    (lane,) = boundaries_of(rows, view, paint, output=output)
     middle = straight(view, (LEFT_M + RIGHT_M) / 2)
     assert np.abs(off_px(lane, part_of(view, middle, 4, ENDS_M - 3))).max() < 2
 
@@ -97,8 +103,8 @@ def test_solid_line_ends_where_its_paint_does(view, paint_to_m, ends):
     sure = anchors_of(view, [part_of(view, line, 12, 40)])
     near = [row for row in anchors_of(view, [line]) if row.v_px > sure[0].v_px]
     near = [AnchorRow(row.v_px, row.u_px, np.array([-2.5])) for row in near]
-    foreground = painted_on(view, [part_of(view, line, paint_to_m, 40)])
-    (lane,) = link_anchors([*near, *sure], view, [solid], foreground=foreground)
+    output = painted_on(view, [part_of(view, line, paint_to_m, 40)])
+    (lane,) = boundaries_of([*near, *sure], view, [solid], output=output)
     if ends:
         assert lane.points_px[0, 1] < solid.points_px[0, 1] + 20
     else:
@@ -109,7 +115,7 @@ def test_solid_line_ends_where_its_paint_does(view, paint_to_m, ends):
 def test_dash_is_one_of_many_however_it_is_called(view, kind):
     line = straight(view, 1.6)
     dash = replace(painted(line, view, 12, 15), kind=kind)
-    foreground = painted_on(view, [part_of(view, line, 12, 15), part_of(view, line, 21, 24)])
+    output = painted_on(view, [part_of(view, line, 12, 15), part_of(view, line, 21, 24)])
     rows = anchors_of(view, [line])
-    (lane,) = link_anchors(rows, view, [dash], foreground=foreground)
+    (lane,) = boundaries_of(rows, view, [dash], output=output)
     assert lane.points_px[0, 1] > dash.points_px[0, 1] + 60

@@ -5,7 +5,7 @@ import pytest
 
 from tests.detection.pictures import bar, brightness_model, diamond, make_camera, picture
 from v2hdm.catalogue import LANE_CLASSES
-from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
 
@@ -15,7 +15,7 @@ def lanes_of(tmp_path, shapes, kind="lane_line", lens="plumb_bob", **options):
     camera = make_camera(lens)
     detector = Detector.load(brightness_model(tmp_path, kind), DetectorOptions(**options))
     _, lanes = detector.detect(picture(camera, shapes), camera)
-    view = CameraView(camera)
+    view = RoadCamera(camera)
     pieces = [lane for lane in lanes if lane.kind in LANE_CLASSES]
     return [(lane.kind, view.ground(view.undistort(lane.points_px))) for lane in pieces]
 

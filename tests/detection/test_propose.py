@@ -5,15 +5,14 @@ import pytest
 
 from tests.detection.pictures import bar, diamond, make_camera, to_image
 from v2hdm.catalogue import load_catalogue
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.markings.blobs import Blob
-from v2hdm.detection.markings.propose import open_sides, propose
+from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.propose import Blob, open_sides, propose
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.quadrilateral import order_corners
 from v2hdm.records import ARROW, CHEVRON, DIAMOND, LANE_DASH, LANE_LINE, OTHER_PAINT, STOP_LINE
 
 CATALOGUE = load_catalogue()
-VIEW = CameraView(make_camera("plumb_bob"), 16)
+VIEW = RoadCamera(make_camera("plumb_bob"), 16)
 RHOMBUS = diamond(8.0, 0.0)
 STRIP = bar(8.0, 0.0, 3.0, 0.15)
 

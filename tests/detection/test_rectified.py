@@ -3,26 +3,21 @@
 import numpy as np
 import pytest
 
-from tests.detection.pictures import bar, diamond, foreground_of, make_camera, picture, to_image
-from v2hdm.catalogue import SHIPPED
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.markings.frames import Quads
-from v2hdm.detection.markings.rectified import CHANNELS, SIZE, rectified_views
+from tests.detection.pictures import bar, diamond, make_camera, output_of, picture, to_image, view_of
+from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.evidence import CHANNELS, SIZE
 from v2hdm.geometry.quadrilateral import order_corners
 from v2hdm.records import DIAMOND, LANE_DASH
 
 CAMERA = make_camera("plumb_bob")
-VIEW = CameraView(CAMERA, 16)
+VIEW = RoadCamera(CAMERA, 16)
 GREY, OUTSIDE = CHANNELS.index("log_grey"), CHANNELS.index("outside")
 
 
 def seen(image: np.ndarray, corners_px: np.ndarray, kind: str) -> np.ndarray:
     """The view (C, 20, 20) of a quadrilateral in an image of which the network says nothing."""
-    blank = np.zeros((CAMERA.info.height // 2, CAMERA.info.width // 2), np.float32)
-    foreground = foreground_of(blank, blank.astype(np.int16), 0)
-    ground = VIEW.ground(VIEW.undistort(corners_px))
-    quads = Quads.seen(VIEW, corners_px[None])
-    return rectified_views(image, VIEW, foreground, quads, ground[None], [kind], SHIPPED)[0][0]
+    blank = output_of(np.zeros((CAMERA.info.height // 2, CAMERA.info.width // 2), np.float32))
+    return view_of(image, VIEW, blank, corners_px, kind)
 
 
 def corners_of(shape: np.ndarray) -> np.ndarray:

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from v2hdm.catalogue import PAINT_CLASSES
-from v2hdm.detection.markings.blobs import Blob, find_blobs, outline_polygon, zero_crossings
-from v2hdm.detection.markings.coverage import blurred_coverage
-from v2hdm.detection.markings.normal import normal_cdf, normal_pdf
-from v2hdm.detection.sight import Sight
+from v2hdm.detection.coverage import blurred_coverage, normal_cdf, normal_pdf
+from v2hdm.detection.network import NetworkOutput
+from v2hdm.detection.propose import Blob, find_blobs, outline_polygon, zero_crossings
 from v2hdm.geometry.planar import signed_area
 from v2hdm.geometry.quadrilateral import (
+    Quad,
     order_corners,
     side_frames,
 )
@@ -18,12 +18,12 @@ from v2hdm.geometry.quadrilateral import (
 KITE = order_corners(np.array([[20.3, 10.2], [40.1, 14.9], [19.4, 19.3], [3.2, 15.5]]))
 
 
-def sight_of(labels: np.ndarray) -> Sight:
+def output_of(labels: np.ndarray, top: int = 0) -> NetworkOutput:
     """What a confident network says of a label picture (h, w) at the resolution of its paint."""
     paint = np.where(labels > 0, 5.0, -5.0).astype(np.float32)
     kinds = np.stack([np.where(labels == 1 + c, 5.0, -5.0) for c in range(len(PAINT_CLASSES))])
     coarse = kinds.reshape(len(kinds), labels.shape[0] // 2, 2, labels.shape[1] // 2, 2).mean(axis=(2, 4))
-    return Sight(paint, coarse.astype(np.float32), [])
+    return NetworkOutput(paint, coarse.astype(np.float32), [], tuple(PAINT_CLASSES), 2, top)
 
 
 def test_the_normal_distribution_is_right_to_four_digits():
@@ -47,7 +47,7 @@ def test_blurred_coverage_is_that_of_a_finely_drawn_and_blurred_shape():
     offset = np.stack([u, v], axis=-1)[:, :, None] - KITE
     drawn = ((offset * normal).sum(axis=-1) < 0).all(axis=-1).astype(np.float32)
     drawn = cv2.GaussianBlur(drawn, (0, 0), blur_px * fine)[fine // 2 :: fine, fine // 2 :: fine]
-    coverage, _ = blurred_coverage(KITE[None], lattice(45, 28), blur_px)
+    coverage, _ = blurred_coverage(Quad(KITE[None]), lattice(45, 28), blur_px)
     np.testing.assert_allclose(coverage.reshape(28, 45), drawn, atol=4e-3)
     assert coverage.sum() == pytest.approx(-signed_area(KITE), rel=1e-4)
 
@@ -55,12 +55,12 @@ def test_blurred_coverage_is_that_of_a_finely_drawn_and_blurred_shape():
 def test_the_derivative_of_coverage_is_its_slope():
     """Corner c is the start of side c and the end of side c - 1, and moves each along its normal."""
     points, step = lattice(45, 28), 0.15
-    _, by_side = blurred_coverage(KITE[None], points, 0.7)
+    _, by_side = blurred_coverage(Quad(KITE[None]), points, 0.7)
     _, normal, _ = side_frames(KITE)
     for corner, axis in np.ndindex(4, 2):
         shift = np.zeros((1, 4, 2))
         shift[0, corner, axis] = step
-        moved = [blurred_coverage(KITE + k * shift, points, 0.7)[0] for k in (-2, -1, 1, 2)]
+        moved = [blurred_coverage(Quad(KITE + k * shift), points, 0.7)[0] for k in (-2, -1, 1, 2)]
         difference = (moved[0] - 8 * moved[1] + 8 * moved[2] - moved[3]) / (12 * step)
         before = (corner - 1) % 4
         slope = normal[corner, axis] * by_side[:, corner] + normal[before, axis] * by_side[:, 4 + before]
@@ -75,7 +75,7 @@ def test_zero_crossings_are_interpolated_between_neighbours():
 def test_the_outline_polygon_of_an_arrow_encloses_its_cells():
     labels = np.zeros((40, 60), dtype=int)
     labels[10:30, 20:24] = labels[10:16, 14:30] = 1 + PAINT_CLASSES.index("arrow")
-    blobs, _ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 50)
+    blobs, _ = find_blobs(output_of(labels, 50))
     (arrow,) = blobs
     assert arrow.kind == "arrow"
     polygon = outline_polygon(arrow)
@@ -96,7 +96,7 @@ def test_a_diamond_that_touches_a_line_is_split_from_it():
     labels = np.zeros((40, 60), dtype=int)
     labels[10:30, 20:40] = 1 + PAINT_CLASSES.index("diamond")
     labels[:, 40:44] = 1 + PAINT_CLASSES.index("lane_line")
-    blobs, owner = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
+    blobs, owner = find_blobs(output_of(labels))
     assert blobs[0].parts == 2
     assert sorted(blob.kind for blob in blobs[1:]) == ["diamond", "lane_line"]
     square = next(blob for blob in blobs[1:] if blob.kind == "diamond")
@@ -108,7 +108,7 @@ def test_a_dash_that_looks_like_a_line_here_and_there_stays_one_blob():
     labels = np.zeros((40, 60), dtype=int)
     labels[5:35, 20:24] = 1 + PAINT_CLASSES.index("lane_dash")
     labels[5:14, 20:24] = 1 + PAINT_CLASSES.index("lane_line")
-    blobs, _ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
+    blobs, _ = find_blobs(output_of(labels))
     assert [blob.kind for blob in blobs] == ["lane_dash"]
 
 
@@ -116,13 +116,13 @@ def test_worn_holes_do_not_add_to_the_outline():
     labels = np.zeros((40, 60), dtype=int)
     labels[10:30, 20:40] = 1
     labels[18:22, 28:32] = 0
-    blobs, _ = find_blobs(sight_of(labels), PAINT_CLASSES, 2, top_px=100)
+    blobs, _ = find_blobs(output_of(labels, 100))
     inner = np.abs(blobs[0].outline_px - [2 * 29.5 + 0.5, 100 + 2 * 19.5 + 0.5]).max(axis=1)
     assert inner.min() > 15
 
 
 def test_an_empty_picture_has_no_blobs():
-    blobs, owner = find_blobs(sight_of(np.zeros((8, 8), dtype=int)), PAINT_CLASSES, 2, 0)
+    blobs, owner = find_blobs(output_of(np.zeros((8, 8), dtype=int)))
     assert blobs == []
     assert not owner.any()
 
@@ -131,7 +131,7 @@ def test_a_piece_of_two_classes_comes_whole_and_in_its_parts():
     labels = np.zeros((60, 60), dtype=int)
     labels[20:50, 28:32] = 1 + PAINT_CLASSES.index("lane_dash")
     labels[8:20, 20:40] = 1 + PAINT_CLASSES.index("arrow")
-    blobs, owner = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
+    blobs, owner = find_blobs(output_of(labels))
     assert [blob.parts for blob in blobs] == [2, 0, 0]
     assert sorted(blob.kind for blob in blobs[1:]) == ["arrow", "lane_dash"]
     assert all(blob.touches_symbol for blob in blobs[1:])
@@ -143,7 +143,7 @@ def test_blobs_in_each_others_boxes_keep_to_themselves():
     for k in range(10, 50):
         labels[k, k : k + 4] = 1
     labels[15:20, 40:46] = labels[40:45, 12:18] = 1
-    blobs, owner = find_blobs(sight_of(labels), PAINT_CLASSES, 2, 0)
+    blobs, owner = find_blobs(output_of(labels))
     assert len(blobs) == 3
     for index, blob in enumerate(blobs):
         mine = np.argwhere(owner == index + 1)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tests.faults.cases import JSON_TEXTS, YAML_TEXTS, damaged_inside
 from tests.faults.readers import READERS, refusal
-from v2hdm.detection.image_file import read_bgr
+from v2hdm.detection.frames import read_bgr
 from v2hdm.errors import DriveError, V2hdmError
 from v2hdm.io.safe.texts import parse_json, parse_yaml, shown, take_name
 

@@ -8,6 +8,7 @@ import pytest
 
 from v2hdm.geometry.planar import signed_area
 from v2hdm.geometry.quadrilateral import (
+    Quad,
     align,
     diameters,
     is_convex,
@@ -16,7 +17,6 @@ from v2hdm.geometry.quadrilateral import (
     order_corners,
     quad_from_hull,
     side_frames,
-    width,
 )
 
 DIAMOND = np.array([[0.6, 0.0], [0.0, 0.3], [-0.6, 0.0], [0.0, -0.3]])
@@ -80,7 +80,7 @@ def test_normals_of_image_corners_point_outwards() -> None:
 
 
 def test_the_width_of_a_bar_is_its_breadth() -> None:
-    assert width(order_corners(np.array([[0, 0], [30, 0], [30, 4], [0, 4.0]]))) == pytest.approx(4.0)
+    assert Quad(order_corners(np.array([[0, 0], [30, 0], [30, 4], [0, 4.0]]))).width == pytest.approx(4.0)
 
 
 def test_a_quadrilateral_is_found_again_from_points_on_its_outline() -> None:

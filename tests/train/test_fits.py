@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from train import fit_judge, fit_lane_score
+from train.confident_spots import Spots, lit
 from train.examples import Example, TrueMarking, example, polygon_overlap
 from train.fit_judge import Gathered, is_true
 from train.fit_lane_score import proposed, seen
-from train.sworn_flecks import Spots, lit, swearing
 from v2hdm.detection import weights
 from v2hdm.detection.detector import Detector
 from v2hdm.detection.options import DetectorOptions
@@ -36,7 +36,9 @@ def detector() -> Detector:
 
 
 def reported(shown: Example, detector: Detector, spots: Spots) -> list[MarkingDetection]:
-    with swearing(spots):
+    with pytest.MonkeyPatch.context() as patch:
+        run = detector.run_network
+        patch.setattr(detector, "run_network", lambda *given: spots.claimed(run(*given)))
         markings, _ = detector.detect(shown.image, shown.camera)
     return [marking for marking in markings if len(marking.outline_px) == 0]
 
@@ -62,14 +64,14 @@ def test_readings_of_quadrilaterals_are_gathered_with_their_truth(shown, detecto
 
 
 def test_spots_of_sun_are_proposed_as_markings_and_known_to_be_none(shown, detector):
-    view = detector.view(shown.camera)
+    view = detector.road_camera(shown.camera)
     spotted, spots = lit(shown, view, np.random.default_rng(1))
-    without, sworn = Gathered(), Gathered()
+    without, with_spots = Gathered(), Gathered()
     without.add(0, shown, detector)
-    sworn.add(0, spotted, detector, spots)
+    with_spots.add(0, spotted, detector, spots)
     assert (spots.light > 0).any()
-    assert all(sworn.lit)
-    assert sworn.true.count(False) > without.true.count(False)
+    assert all(with_spots.lit)
+    assert with_spots.true.count(False) > without.true.count(False)
     plain = [m for m in detector.detect(shown.image, shown.camera)[0] if len(m.outline_px) == 0]
     before, after = found(shown, plain), found(shown, reported(spotted, detector, spots))
     assert len(before) > 3
@@ -78,9 +80,9 @@ def test_spots_of_sun_are_proposed_as_markings_and_known_to_be_none(shown, detec
     np.testing.assert_array_equal(spotted.image[unlit], shown.image[unlit])
 
 
-def test_spots_of_sun_that_the_network_swears_are_markings_are_not_reported(shown):
+def test_spots_of_sun_that_the_network_takes_for_markings_are_not_reported(shown):
     detector = Detector.load(options=DetectorOptions())
-    view = detector.view(shown.camera)
+    view = detector.road_camera(shown.camera)
     for seed in range(3):
         spotted, spots = lit(shown, view, np.random.default_rng(seed))
         for marking in reported(spotted, detector, spots):
@@ -90,7 +92,7 @@ def test_spots_of_sun_that_the_network_swears_are_markings_are_not_reported(show
 
 
 def test_lines_of_lanes_are_proposed_with_their_truth(shown, detector):
-    found = proposed(seen(shown, detector), detector.options.lane_step_m)
+    found = proposed(seen(shown, detector))
     assert found is not None
     assert len(found.lines) == len(found.alone) == len(found.true)
     assert found.true.any()
@@ -117,8 +119,7 @@ def test_what_is_seen_of_lanes_comes_back_from_another_process():
     seen_there: list[fit_lane_score.Seen] = []
     part = fit_lane_score.Part(range(3), 100, weights.NETWORK_FILE)
     share_out(fit_lane_score.see, [part], 1, cv2.setNumThreads, (1,), seen_there.extend)
-    step_m = DetectorOptions().lane_step_m
-    lines = [found.lines for image in seen_there if (found := proposed(image, step_m)) is not None]
+    lines = [found.lines for image in seen_there if (found := proposed(image)) is not None]
     assert len(seen_there) == 3
     assert sum(map(len, lines)) > 0
 

@@ -46,14 +46,14 @@ def test_the_errors_of_sides_are_learnt_one_by_one():
     assert typical[[0, 2]].min() > 3 * typical[[1, 3]].max()
 
 
-def test_where_the_paint_network_swears_the_image_has_a_say_of_its_own():
-    """It claims what is true in training, and later swears that all are: then only the views tell."""
+def test_where_the_paint_network_is_confident_the_image_has_a_say_of_its_own():
+    """It claims what is true in training, and later that all are: then only the views can decide."""
     known, unseen = (replace(quadrilaterals(seed, 1200, 0.5), claimed_features=(0,)) for seed in (5, 6))
     for part, true in ((known, known.true), (unseen, True)):
         part.evidence[:, 0] = np.where(true, 2.0, -2.0)
     told = {}
     for share in (0.0, 0.3):
-        odds, _ = judged(train_judge(known, replace(CONFIG, sworn_share=share, side_weight=0.0)), unseen)
+        odds, _ = judged(train_judge(known, replace(CONFIG, claimed_share=share, side_weight=0.0)), unseen)
         told[share] = np.median(odds[unseen.true]) - np.median(odds[~unseen.true])
     assert told[0.3] > told[0.0] + 0.5
 

@@ -15,9 +15,8 @@ from train.checkpoint import load_checkpoint
 from train.exported import read_exported
 from train.shipment import Order
 from v2hdm.detection import weights
-from v2hdm.detection.markings.evidence import FEATURES
-from v2hdm.detection.markings.judge import SHAPES, TOLD
-from v2hdm.detection.markings.rectified import CHANNELS
+from v2hdm.detection.classifier import AMONG, SHAPES
+from v2hdm.detection.evidence import CHANNELS, FEATURES
 from v2hdm.progress import TellShare
 
 
@@ -50,13 +49,13 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> list[range]:
         gathered.append(part.numbers)
 
     judge = Judge(len(CHANNELS), len(FEATURES), len(SHAPES), width=4, dropout=0.0).eval()
-    among = {name: {"bias": 0.0, "weights": dict.fromkeys(TOLD, 0.5)} for name in SHAPES}
+    among = {name: {"bias": 0.0, "weights": dict.fromkeys(AMONG, 0.5)} for name in SHAPES}
     lines = {name: (np.ones(len(keys)), 0.0) for name, keys in fit_lane_score.KEYS.items()}
     monkeypatch.setattr(shipment, "share_out", in_this_process)
     monkeypatch.setattr(fit_judge, "gather", gather)
     monkeypatch.setattr(fit_judge, "fit_all", lambda gathered, tell: (tell(0.5), (judge, among))[1])
     monkeypatch.setattr(fit_lane_score, "see", lambda part: [None] * len(part.numbers))
-    monkeypatch.setattr(fit_lane_score, "fit_to", lambda images, step_m: lines)
+    monkeypatch.setattr(fit_lane_score, "fit_to", lambda images: lines)
     return gathered
 
 

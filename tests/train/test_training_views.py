@@ -9,7 +9,7 @@ from train.scenes.paint import rectangle
 from train.scenes.scenes import training_sample
 from train.scenes.views import looking, random_view, turned_aside
 from v2hdm.catalogue import PAINT_CLASSES
-from v2hdm.detection.camera.view import ASIDE_RAD
+from v2hdm.detection.camera import ASIDE_RAD
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.records import LANE_DASH, STOP_LINE
 from v2hdm.simulate.render.scene import Paint, Scene

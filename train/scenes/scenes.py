@@ -46,7 +46,7 @@ _TO_ONE_ASIDE = np.array(
     [0, *(1 + PAINT_CLASSES.index(SEEN_ACROSS.get(kind, kind)) for kind in PAINT_CLASSES)], dtype=np.uint8
 )
 """By label, the answer for a camera on the vehicle's side: the detector knows how its cameras look, and turns
-the names back, see :mod:`v2hdm.detection.sight`."""
+the names back, see :mod:`v2hdm.detection.network`."""
 
 _FLECK_SIZES_M = tuple(float(s) for s in np.geomspace(0.12, 2.5, 10))
 

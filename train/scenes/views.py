@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from v2hdm.detection.camera.view import ASIDE_RAD
+from v2hdm.detection.camera import ASIDE_RAD
 from v2hdm.geometry.lens import distort_points, undistort_points
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import CameraInfo, FloatArray

@@ -23,7 +23,7 @@ from v2hdm.calibration.fit import Fit, Noise, Seen, fit_mountings
 from v2hdm.calibration.picture import save_picture
 from v2hdm.calibration.points import LEAST_POINTS, SurveyedPoints, check_points, read_points
 from v2hdm.calibration.residuals import CHANCE, Residuals, judge_fit, residuals, scatter
-from v2hdm.detection.image_file import read_bgr
+from v2hdm.detection.frames import read_bgr
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.geometry.mounting import centre_sigmas, mounting_angles, mounting_words

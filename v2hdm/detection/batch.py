@@ -1,19 +1,22 @@
-"""The detector over a whole drive, in worker processes."""
+"""The detector over a whole drive, in worker processes, and which part of each image is the vehicle.
+
+Bonnets, mirrors and reflections on the windscreen are bright, straight-edged and at one place in every image.
+A marking on the ground passes through the image as the vehicle drives; only a line along the way stays, and
+lines are left alone.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import cv2
 import numpy as np
 
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.image_file import read_bgr
+from v2hdm.detection.frames import read_bgr
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.own_vehicle import learn_own_vehicle
 from v2hdm.errors import DriveError
 from v2hdm.records import BoolArray, Camera, Drive, Image, ImageDetections
 from v2hdm.workers import share_out
@@ -23,8 +26,60 @@ _worker: tuple[Detector, Drive] | None = None
 _WORKERS_A_GPU = 8
 """Processes that share one: each takes memory of its own there."""
 
+Detect = Callable[[Drive, DetectorOptions, Sequence[int], int, Callable[[ImageDetections], None]], None]
+"""A function that does what :func:`detect_images` does."""
+
 _FEW_IMAGES = 8
 """Fewer are looked at before a process has started."""
+
+_IMAGES = 24
+"""Images that are looked at: a second and a half of work."""
+
+_LEAST_IMAGES = 10
+_APART_M = 2.0
+"""They are at least this far apart, m, so that markings have moved on."""
+
+_SHARE = 0.7
+"""Paint at one place in this share of images is the vehicle: fields of diamonds cover it in a third."""
+
+_MARGIN_PX = 6
+"""The network sees an edge this far from where it is."""
+
+
+def learn_own_vehicle(detector: Detector, images: Sequence[Image], camera: Camera) -> BoolArray | None:
+    """Where (height, width) a camera's images, in driving order, show its vehicle; None for nowhere."""
+    chosen = _spread_out(images)
+    if len(chosen) < _LEAST_IMAGES:
+        return None
+    total: np.ndarray | None = None
+    for image in chosen:
+        pixels = read_bgr(image.path)
+        if pixels.shape[:2] != (camera.info.height, camera.info.width):
+            return None
+        paint = detector.markings_paint(pixels, camera)
+        total = paint.astype(np.int32) if total is None else total + paint
+    assert total is not None
+    always = total >= _SHARE * len(chosen)
+    if not always.any():
+        return None
+    top, stride = detector.road_camera(camera).far_row, detector.network.info.paint_stride
+    mask = np.zeros((camera.info.height, camera.info.width), dtype=np.uint8)
+    grown = np.kron(always.astype(np.uint8), np.ones((stride, stride), dtype=np.uint8))
+    rows, columns = min(len(grown), len(mask) - top), min(grown.shape[1], mask.shape[1])
+    mask[top : top + rows, :columns] = grown[:rows, :columns]
+    size = 2 * _MARGIN_PX + 1
+    return np.asarray(cv2.dilate(mask, np.ones((size, size), np.uint8)) > 0)
+
+
+def _spread_out(images: Sequence[Image]) -> list[Image]:
+    """Up to :data:`_IMAGES` images, evenly spread over those taken far enough apart."""
+    apart: list[Image] = []
+    for image in images:
+        place = image.map_from_vehicle[:2, 3]
+        if not apart or np.linalg.norm(place - apart[-1].map_from_vehicle[:2, 3]) >= _APART_M:
+            apart.append(image)
+    at = np.unique(np.linspace(0, len(apart) - 1, min(_IMAGES, len(apart))).round().astype(np.intp))
+    return [apart[k] for k in at.tolist()]
 
 
 def read_image(image: Image, camera: Camera) -> np.ndarray:
@@ -51,13 +106,8 @@ def detect_all(
 ) -> list[ImageDetections]:
     """Detect in every image of a drive, in the drive's order.
 
-    The result does not depend on ``workers``.
-
-    Args:
-        drive: what to look at.
-        options: detector settings.
-        workers: processes, one thread each; 1 stays in this process.
-        progress: called as ``progress(done, total)`` after each image.
+    The result does not depend on the number of ``workers``: processes, one thread each; 1 stays in this
+    process. ``progress(done, total)`` is called after each image.
 
     Raises:
         DriveError: an image is missing, damaged or of the wrong size.
@@ -77,20 +127,6 @@ def detect_all(
     return results
 
 
-class Detect(Protocol):
-    """Does what :func:`detect_images` does."""
-
-    def __call__(
-        self,
-        drive: Drive,
-        options: DetectorOptions,
-        images: Sequence[int],
-        workers: int,
-        take: Callable[[ImageDetections], None],
-    ) -> None:
-        """``take`` is called in the order of ``images``."""
-
-
 def detect_images(
     drive: Drive,
     options: DetectorOptions,
@@ -100,12 +136,7 @@ def detect_images(
 ) -> None:
     """Detect in some images of a drive whose cameras know their own vehicle.
 
-    Args:
-        drive: what to look at.
-        options: detector settings.
-        images: which images, as indices.
-        workers: processes, one thread each; 1 stays in this process.
-        take: called with what was found in each image, in the order of ``images``.
+    ``images`` are indices; ``take`` is called with the detections of each, in their order.
 
     Raises:
         V2hdmError: as :func:`detect_all`.
@@ -157,7 +188,7 @@ def _work(index: int) -> ImageDetections:
 
 
 def detect_image(detector: Detector, drive: Drive, index: int) -> ImageDetections:
-    """What a detector finds in image ``index`` of a drive whose cameras know their own vehicle.
+    """The detections of image ``index`` of a drive whose cameras know their own vehicle.
 
     Raises:
         DriveError: the image is missing, damaged or of the wrong size.

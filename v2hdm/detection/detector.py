@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from v2hdm.catalogue import SYMBOL, Catalogue
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.lanes.centre_lines import LanePaint, trace_lanes
-from v2hdm.detection.lanes.lines import link_anchors
-from v2hdm.detection.markings.blobs import find_blobs, outline_polygon
-from v2hdm.detection.markings.find import Readings, find_markings, read_markings
-from v2hdm.detection.markings.foreground import Foreground
-from v2hdm.detection.markings.propose import Proposal, propose
-from v2hdm.detection.network import Network
+from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.classifier import Readings, find_markings, read_markings
+from v2hdm.detection.lanes.curves import LaneImage
+from v2hdm.detection.lanes.lines import find_boundaries, trace_lanes
+from v2hdm.detection.network import Network, NetworkOutput, run_on_road
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.sight import Sight, look
+from v2hdm.detection.propose import Proposals, find_blobs, outline_polygon, propose
 from v2hdm.detection.stopwatch import lap
 from v2hdm.detection.weights import check_weights
 from v2hdm.errors import DetectorError
@@ -28,16 +25,6 @@ from v2hdm.records import BoolArray, Camera, LaneDetection, MarkingDetection
 
 _NO_PAINT = -20.0
 """Log odds of paint where the vehicle itself is."""
-
-
-@dataclass(frozen=True)
-class Seen:
-    """One image between network and judge: what the network says of it, and what is proposed."""
-
-    view: CameraView
-    sight: Sight
-    proposals: Sequence[Proposal]
-    foreground: Foreground
 
 
 class Detector:
@@ -50,9 +37,7 @@ class Detector:
         self.network = network
         self.options = options
         self.catalogue = catalogue or network.info.catalogue
-        self._lane_classes = set(self.catalogue.lane_paint)
-        self._views: dict[str, CameraView] = {}
-        self._reach_px: dict[str, int] = {}
+        self._cameras: dict[str, tuple[RoadCamera, int]] = {}
 
     @classmethod
     def load(cls, path: str | Path | None = None, options: DetectorOptions | None = None) -> Detector:
@@ -74,118 +59,99 @@ class Detector:
         Raises:
             DetectorError: the image is not of that form or not of the camera's size.
         """
-        seen = self.see(image_bgr, camera)
+        output = self.run_network(image_bgr, camera)
+        with lap("propose"):
+            found = self.propose(output, camera)
         with lap("lanes"):
-            lanes = self._lanes(seen)
+            image = self.lane_image(found)
+            lanes = (*image.paint, *find_boundaries(image))
         with lap("fit"):
-            readings = self.read(image_bgr, seen)
+            readings = self.read(image_bgr, found)
         with lap("judge"):
-            markings = find_markings(readings, seen.view, self.options)
-        symbols = [
-            self._symbol(proposal, seen.view) for proposal in seen.proposals if not proposal.blob.parts
-        ]
-        markings += [s for s in symbols if s is not None and not _is_among(s, markings)]
-        return tuple(markings), tuple(lanes)
+            markings = find_markings(readings, found.camera, self.options)
+        return (*markings, *self._symbols(found, markings)), lanes
 
-    def see(self, image_bgr: np.ndarray, camera: Camera) -> Seen:
-        """Run the network on one image and propose markings.
+    def run_network(self, image_bgr: np.ndarray, camera: Camera) -> NetworkOutput:
+        """Run the network on one image; what shows the vehicle itself is no paint.
 
         Raises:
-            DetectorError: the image is not of that form or not of the camera's size.
+            DetectorError: the image is not of the right form or not of the camera's size.
         """
-        view = self.view(camera)
+        road_camera = self.road_camera(camera)
         _check_image(image_bgr, camera)
-        info = self.network.info
         with lap("net"):
-            sight = look(self.network, image_bgr, view, self.options.mirrored)
-        sight = self._without_own_vehicle(sight, view)
-        with lap("propose"):
-            reach_px = self._reach_px[camera.info.name]
-            blobs, owner = find_blobs(
-                sight, info.classes, info.paint_stride, view.far_row, reach_px, self.catalogue
-            )
-            proposals = propose(blobs, view, self.catalogue, self.options.max_range_m)
-        foreground = Foreground(
-            sight.paint, owner, info.paint_stride, view.far_row, sight.kinds, info.classes
+            output = run_on_road(self.network, image_bgr, road_camera, self.options.mirrored)
+        mask = camera.own_vehicle
+        if mask is None:
+            return output
+        first, stride = np.array([output.top, 0]), output.stride
+        rows, columns = (
+            np.minimum(stride * np.arange(count) + stride // 2 + start, last - 1)
+            for count, start, last in zip(output.paint.shape, first.tolist(), mask.shape, strict=True)
         )
-        return Seen(view, sight, proposals, foreground)
+        paint = np.where(mask[np.ix_(rows, columns)], np.float32(_NO_PAINT), output.paint)
+        return replace(output, paint=paint)
+
+    def propose(self, output: NetworkOutput, camera: Camera) -> Proposals:
+        """The pieces of paint of one image, each with the classes that it may be of."""
+        road_camera, reach_px = self.road_camera(camera), self._cameras[camera.info.name][1]
+        blobs, owner = find_blobs(output, reach_px, self.catalogue)
+        pieces = propose(blobs, road_camera, self.catalogue, self.options.max_range_m)
+        return Proposals(road_camera, output, pieces, owner)
+
+    def lane_image(self, found: Proposals) -> LaneImage:
+        """An image in which boundaries of lanes are looked for: row anchors and centre lines of paint."""
+        step_m, lane_classes = self.options.lane_step_m, set(self.catalogue.lane_paint)
+        paint = [
+            (piece, own)
+            for piece in found.pieces
+            if piece.blob.traced and piece.kind in lane_classes and not piece.blob.touches_symbol
+            if (own := piece.score_of(lane_classes)) >= self.options.min_score
+        ]
+        lines = trace_lanes(paint, found.camera, step_m, self.options.max_range_m)
+        stride = self.network.info.lane_stride
+        return LaneImage(found.camera, found.output.anchors, lines, found.output, step_m, stride)
+
+    def read(self, image_bgr: np.ndarray, found: Proposals) -> Readings | None:
+        """Fit an image's proposals, and gather the evidence for each; None where there is none."""
+        return read_markings(image_bgr, found, self.catalogue, self.options.blur_px)
 
     def markings_paint(self, image_bgr: np.ndarray, camera: Camera) -> BoolArray:
         """Where (h, w) the network sees paint of markings, not of lanes, a cell every ``paint_stride`` px.
 
-        The first row of cells is at the image row ``view(camera).far_row``.
+        The first row of cells is at the image row ``road_camera(camera).far_row``.
         """
-        view, info = self.view(camera), self.network.info
-        sight = look(self.network, image_bgr, view)
-        lanes = [name in self._lane_classes for name in info.classes]
-        lead = sight.kinds[~np.array(lanes)].max(axis=0) - sight.kinds[np.array(lanes)].max(axis=0)
-        size = sight.paint.shape[1], sight.paint.shape[0]
-        return np.asarray((sight.paint > 0) & (cv2.resize(lead, size, interpolation=cv2.INTER_LINEAR) > 0))
+        output = run_on_road(self.network, image_bgr, self.road_camera(camera))
+        lanes = np.isin(output.classes, self.catalogue.lane_paint)
+        lead = output.kinds[~lanes].max(axis=0) - output.kinds[lanes].max(axis=0)
+        size = output.paint.shape[1], output.paint.shape[0]
+        return np.asarray((output.paint > 0) & (cv2.resize(lead, size, interpolation=cv2.INTER_LINEAR) > 0))
 
-    def _without_own_vehicle(self, sight: Sight, view: CameraView) -> Sight:
-        """What the network says, but of the vehicle itself."""
-        mask = view.camera.own_vehicle
-        if mask is None:
-            return sight
-        rows, columns = (
-            np.minimum(stride * np.arange(count) + stride // 2 + first, last - 1)
-            for stride, count, first, last in (
-                (self.network.info.paint_stride, sight.paint.shape[0], view.far_row, mask.shape[0]),
-                (self.network.info.paint_stride, sight.paint.shape[1], 0, mask.shape[1]),
-            )
-        )
-        return replace(sight, paint=np.where(mask[np.ix_(rows, columns)], np.float32(_NO_PAINT), sight.paint))
-
-    def read(self, image_bgr: np.ndarray, seen: Seen) -> Readings | None:
-        """Fit an image's proposals, and gather the evidence for each; None where there is none."""
-        return read_markings(
-            image_bgr, seen.view, seen.proposals, seen.foreground, self.catalogue, self.options.blur_px
-        )
-
-    def view(self, camera: Camera) -> CameraView:
+    def road_camera(self, camera: Camera) -> RoadCamera:
         """The tables of a camera, built at its first use."""
-        view = self._views.get(camera.info.name)
-        if view is None or view.camera is not camera:
-            view = CameraView(camera, self.network.info.multiple)
-            self._views[camera.info.name] = view
-            self._reach_px[camera.info.name] = view.first_row_within(self.options.max_range_m)
-        return view
+        known, _ = self._cameras.get(camera.info.name, (None, 0))
+        if known is None or known.camera is not camera:
+            known = RoadCamera(camera, self.network.info.multiple)
+            self._cameras[camera.info.name] = known, known.first_row_within(self.options.max_range_m)
+        return known
 
-    def _lanes(self, seen: Seen) -> list[LaneDetection]:
-        step_m, view = self.options.lane_step_m, seen.view
-        lanes = trace_lanes(self._lane_paint(seen.proposals), view, step_m, self.options.max_range_m)
-        stride = self.network.info.lane_stride
-        return lanes + link_anchors(seen.sight.anchors, view, lanes, step_m, seen.foreground, stride)
-
-    def _lane_paint(self, proposals: Sequence[Proposal]) -> list[LanePaint]:
-        found = []
-        for proposal in proposals:
-            if not proposal.blob.traced:
-                continue
-            own = sum(proposal.blob.class_score.get(name, 0.0) for name in self._lane_classes)
-            is_lane = proposal.kind in self._lane_classes and own >= self.options.min_score
-            if is_lane and not proposal.blob.touches_symbol:
-                found.append(LanePaint(proposal.blob, proposal.kind, own))
-        return found
-
-    def _symbol(self, proposal: Proposal, view: CameraView) -> MarkingDetection | None:
-        """A marking that has an outline but no four corners, within range."""
-        kind = proposal.kind
-        score = proposal.blob.class_score.get(kind, 0.0)
-        if self.catalogue.classes[kind].family != SYMBOL or score < self.options.min_score:
-            return None
-        ground = proposal.outline_vehicle
-        if not np.isfinite(ground).all() or view.range_m(ground.mean(axis=0)) > self.options.max_range_m:
-            return None
+    def _symbols(self, found: Proposals, quads: Sequence[MarkingDetection]) -> list[MarkingDetection]:
+        """Markings within range with an outline but no four corners that are none of the quadrilaterals."""
+        centres = [quad.corners_px.mean(axis=0) for quad in quads]
         nothing = np.full((4, 2), np.nan), np.full((8, 8), np.nan), np.zeros(4, dtype=np.bool_)
-        return MarkingDetection(kind, score, *nothing, outline_polygon(proposal.blob))
-
-
-def _is_among(symbol: MarkingDetection, quads: Sequence[MarkingDetection]) -> bool:
-    """Whether a symbol is the same paint as one of the quadrilaterals."""
-    centres = [quad.corners_px.mean(axis=0) for quad in quads]
-    polygon = symbol.outline_px.astype(np.float32)
-    return any(cv2.pointPolygonTest(polygon, centre.tolist(), False) > 0 for centre in centres)
+        symbols = []
+        for piece in found.pieces:
+            score, ground = piece.score_of([piece.kind]), piece.outline_vehicle
+            is_symbol = self.catalogue.classes[piece.kind].family == SYMBOL and not piece.blob.parts
+            if not is_symbol or score < self.options.min_score or not np.isfinite(ground).all():
+                continue
+            if found.camera.range_m(ground.mean(axis=0)) > self.options.max_range_m:
+                continue
+            symbol = MarkingDetection(piece.kind, score, *nothing, outline_polygon(piece.blob))
+            polygon = symbol.outline_px.astype(np.float32)
+            if not any(cv2.pointPolygonTest(polygon, centre.tolist(), False) > 0 for centre in centres):
+                symbols.append(symbol)
+        return symbols
 
 
 def _check_image(image_bgr: np.ndarray, camera: Camera) -> None:

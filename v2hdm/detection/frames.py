@@ -13,13 +13,35 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from v2hdm.detection.image_file import IMAGE_SUFFIXES, read_bgr
 from v2hdm.errors import DriveError
+from v2hdm.io.safe.pixels import read_pixels
 
 _log = logging.getLogger(__name__)
 
 _MOST_CAMERAS = 1 << 16
 """OpenCV takes a larger index for something else."""
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
+"""Suffixes of images in a folder."""
+
+# Depth and channels as stored, so that what does not fit is seen instead of converted without a word.
+_AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
+
+
+def read_bgr(path: Path) -> np.ndarray:
+    """Decode an image file, in colour or grey, to (H, W, 3) uint8 BGR.
+
+    Raises:
+        DriveError: the file is missing, truncated, damaged or not of 8 bits.
+    """
+    pixels = read_pixels(path, _AS_STORED)
+    if pixels.dtype != np.uint8:
+        raise DriveError(
+            f"{path}: the image has {8 * pixels.dtype.itemsize} bits a channel; convert it to 8 bits"
+        )
+    if pixels.ndim == 2:
+        pixels = cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR)
+    return np.asarray(pixels)
 
 
 @dataclass(frozen=True)
@@ -61,7 +83,7 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def video_frames(path: Path) -> Iterator[Frame]:
-    """Every frame of a video file; one that ends early is told with a warning.
+    """Every frame of a video file; a warning reports one that ends early.
 
     Raises:
         DriveError: OpenCV cannot read it, or it has no frame.
@@ -84,11 +106,9 @@ def video_frames(path: Path) -> Iterator[Frame]:
 
 
 def camera_frames(number: int, size: tuple[int, int] | None = None) -> Iterator[Frame]:
-    """Frames of a live camera until it fails.
+    """Frames of a live camera, by the operating system's index, until it fails.
 
-    Args:
-        number: the index that the operating system gives it.
-        size: width and height to ask the camera for; it may give others.
+    ``size`` is the width and height to ask the camera for; it may give others.
 
     Raises:
         DriveError: it does not open, or gives no more frames.

@@ -1,10 +1,16 @@
-"""The ONNX network: loaded, checked, run on a band of an image."""
+"""The paint and lane network: an ONNX file, run on the rows of an image that show road.
+
+A metre of ground near the vehicle fills so many pixels that half of them, in each direction, show all that
+the network needs; corners are refined on the image itself afterwards. So far ground is looked at in full
+resolution and near ground in half of it, which halves the time.
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -13,28 +19,50 @@ import numpy as np
 import onnxruntime
 
 from v2hdm.catalogue import SHIPPED, Catalogue
+from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.weights import NETWORK_FILE
 from v2hdm.errors import ConfigError, DetectorError
-
-DEFAULT_MODEL = NETWORK_FILE
+from v2hdm.records import SEEN_ACROSS, FloatArray
 
 METADATA_KEY = "v2hdm"
-"""Under which key of the file's ``metadata_props`` its label is, as JSON."""
+"""Key of the file's ``metadata_props`` that holds its label, as JSON."""
 
 _OUTPUTS = ["paint", "kinds", "lanes"]
 
 _PROVIDERS: dict[str, tuple[str, dict[str, str]]] = {
     "cpu": ("CPUExecutionProvider", {}),
-    # float32 as on the CPU, and one algorithm each time: what is found does not depend on the process.
+    # float32 as on the CPU, and one algorithm each time: detections do not depend on the process.
     "cuda": ("CUDAExecutionProvider", {"use_tf32": "0", "cudnn_conv_algo_search": "HEURISTIC"}),
 }
-_BEHIND = {"cpu": [], "cuda": ["CPUExecutionProvider"]}
+_FALLBACK = {"cpu": [], "cuda": ["CPUExecutionProvider"]}
 """For the few operations that a device does not have."""
+
+_OVERLAP_PX = 64
+"""Overlap of the two resolutions, so that either has its surroundings where they are joined."""
+
+_GRID_PX = 16
+"""The seam is on the grid of all outputs; the network's own multiple may be larger."""
+
+_MIRRORED = np.array([1.0, -1.0], dtype=np.float32)[:, None, None]
+"""Factors of a lane output (2, h, w), log odds and offset, in the mirror."""
+
+_LEAST_LOG_ODDS = -3.0
+"""Crossings of lanes' lines less likely than this are left out; unlikely ones help to follow a known line."""
+
+_MOST_ODDS = 6.0
+"""Log odds beyond this differ by chance only."""
+
+_MOST_EXPONENT = 30.0
+
+
+def as_probability(odds: np.ndarray) -> np.ndarray:
+    """Probabilities, in the shape and precision of the log odds."""
+    return np.asarray(1 / (1 + np.exp(-np.clip(odds, -_MOST_EXPONENT, _MOST_EXPONENT))))
 
 
 @dataclass(frozen=True)
 class NetworkInfo:
-    """What a model file says of itself.
+    """The label of a model file.
 
     ``classes`` are those of the channels of ``kinds``; inputs are padded to ``multiple`` px; the strides are
     the numbers of px per element of each output. ``catalogue`` describes the classes.
@@ -47,10 +75,15 @@ class NetworkInfo:
     lane_stride: int
     catalogue: Catalogue = SHIPPED
 
+    @property
+    def strides(self) -> tuple[int, int, int]:
+        """Pixels per element of paint, kinds and lanes."""
+        return self.paint_stride, self.kind_stride, self.lane_stride
+
 
 @dataclass(frozen=True)
-class NetworkOutput:
-    """What the network says of an image.
+class RawOutput:
+    """The network's output on one image.
 
     Element (i, j) of an output of stride s belongs to the image point (s * j + (s - 1) / 2, likewise i).
     ``paint`` (h, w) float32: log odds of paint. ``kinds`` (K, h', w') float32: logits of its class.
@@ -63,8 +96,68 @@ class NetworkOutput:
     lanes: np.ndarray
 
 
+@dataclass(frozen=True)
+class AnchorRow:
+    """The crossings of lanes' lines on one image row ``v_px``: columns (N,) px and log odds (N,)."""
+
+    v_px: float
+    u_px: FloatArray
+    odds: FloatArray
+
+
+@dataclass(frozen=True)
+class NetworkOutput:
+    """The network's output on the rows of an image that show road.
+
+    ``paint`` (h, w) and ``kinds`` (K, h', w'), logits of the ``classes``, are as in :class:`RawOutput`; they
+    start at image row ``top``, ``stride`` px per element of paint. ``anchors`` run from near to far.
+    """
+
+    paint: np.ndarray
+    kinds: np.ndarray
+    anchors: list[AnchorRow]
+    classes: tuple[str, ...]
+    stride: int
+    top: int
+
+    @cached_property
+    def kind_scale(self) -> float:
+        """Elements of ``paint`` per element of ``kinds``, in each direction."""
+        return float(self.paint.shape[1] / self.kinds.shape[2])
+
+    def odds_at(self, points_px: FloatArray) -> FloatArray:
+        """Log odds of paint, at most 6 either way, at recorded px (..., 2); outside, those of the border."""
+        found = self._sample(self.paint, self.stride, points_px)
+        return np.asarray(np.clip(found, -_MOST_ODDS, _MOST_ODDS), np.float64).reshape(points_px.shape[:-1])
+
+    def shares_at(self, points_px: FloatArray) -> FloatArray:
+        """Probability of each of the classes, were it paint, at recorded px (M, ..., 2): (M, K, ...)."""
+        stride = self.stride * self.kind_scale
+        logits = np.stack([self._sample(plane, stride, points_px) for plane in self.kinds])
+        odds = np.exp(logits - logits.max(axis=0))
+        shares = (odds / odds.sum(axis=0)).reshape(len(odds), *points_px.shape[:-1])
+        return np.asarray(np.moveaxis(shares, 0, 1), dtype=np.float64)
+
+    def class_probability(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Probability (K, N) of each class at elements of ``paint``."""
+        scale, width = self.kind_scale, self.kinds.shape[2]
+        place = (rows / scale).astype(np.intp) * width + (columns / scale).astype(np.intp)
+        odds = self.kinds.reshape(len(self.kinds), -1).take(place, axis=1)
+        odds -= odds.max(axis=0)
+        np.exp(odds, out=odds)
+        odds /= odds.sum(axis=0)
+        return np.asarray(odds)
+
+    def _sample(self, plane: np.ndarray, stride: float, points_px: FloatArray) -> np.ndarray:
+        """Values (M, N) of a plane (h, w), elements ``stride`` px apart, at recorded px (M, ..., 2)."""
+        middle, rows = (stride - 1) / 2, len(points_px)
+        u = ((points_px[..., 0] - middle) / stride).astype(np.float32).reshape(rows, -1)
+        v = ((points_px[..., 1] - self.top - middle) / stride).astype(np.float32).reshape(rows, -1)
+        return np.asarray(cv2.remap(plane, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+
 class Network:
-    """The paint and lane network: uint8 BGR images in, :class:`NetworkOutput` out."""
+    """The paint and lane network: uint8 BGR images in, :class:`RawOutput` out."""
 
     def __init__(self, path: Path | None = None, threads: int = 1, device: str = "cpu"):
         """Load a model file, to be run on ``cpu`` or ``cuda``.
@@ -73,23 +166,21 @@ class Network:
             DetectorError: there is no such file, it is not an ONNX model or not one of ours, or the device is
                 not there.
         """
-        self.path = DEFAULT_MODEL if path is None else Path(path)
+        self.path = NETWORK_FILE if path is None else Path(path)
         self._session = open_session(self.path, threads, device)
         self.info = _read_info(self._session, self.path)
 
-    def run(self, image_bgr: np.ndarray) -> NetworkOutput:
+    def run(self, image_bgr: np.ndarray) -> RawOutput:
         """Look at an image (H, W, 3) uint8 of any size.
 
         Raises:
-            DetectorError: the network refused the image, or what it says is not what its label promises.
+            DetectorError: the network refused the image, or its output is not what its label promises.
         """
         height, width = image_bgr.shape[:2]
-        multiple = self.info.multiple
+        below, right = -height % self.info.multiple, -width % self.info.multiple
         padded = image_bgr
-        if height % multiple or width % multiple:
-            padded = cv2.copyMakeBorder(
-                image_bgr, 0, -height % multiple, 0, -width % multiple, cv2.BORDER_REPLICATE
-            )
+        if below or right:
+            padded = cv2.copyMakeBorder(image_bgr, 0, below, 0, right, cv2.BORDER_REPLICATE)
         try:
             outputs = self._session.run(_OUTPUTS, {"image": np.ascontiguousarray(padded)[None]})
         except Exception as error:  # onnxruntime raises classes of its own that are not exported
@@ -97,39 +188,113 @@ class Network:
                 f"{self.path}: the network failed on a {width}x{height} image ({_one_line(error)}); "
                 "export it again with dynamic sizes"
             ) from error
-        paint, kinds, lanes = (
-            self._cropped(name, output, channels, stride, padded.shape, (height, width))
-            for name, output, channels, stride in zip(
-                _OUTPUTS,
-                outputs,
-                (1, len(self.info.classes), 2),
-                (self.info.paint_stride, self.info.kind_stride, self.info.lane_stride),
-                strict=True,
-            )
-        )
+        found = []
+        channels = (1, len(self.info.classes), 2)
+        for name, output, count, stride in zip(_OUTPUTS, outputs, channels, self.info.strides, strict=True):
+            expected = (1, count, padded.shape[0] // stride, padded.shape[1] // stride)
+            if output.shape != expected:
+                raise DetectorError(
+                    f"{self.path}: {name} is {output.shape} where {expected} was promised; export it again"
+                )
+            found.append(np.asarray(output[0, :, : -(-height // stride), : -(-width // stride)]))
         # A sum meets every value: not-a-number among the weights of an output spreads over all of it.
-        if not all(np.isfinite(output[0].sum()) for output in (paint, kinds, lanes)):
+        if not all(np.isfinite(output[0].sum()) for output in found):
             raise DetectorError(
                 f"{self.path}: the network gives values that are not finite; export an earlier checkpoint"
             )
-        return NetworkOutput(paint[0], kinds, lanes)
+        paint, kinds, lanes = found
+        return RawOutput(paint[0], kinds, lanes)
 
-    def _cropped(
-        self,
-        name: str,
-        output: np.ndarray,
-        channels: int,
-        stride: int,
-        padded: tuple[int, ...],
-        size: tuple[int, int],
-    ) -> np.ndarray:
-        """One output (C, h, w) without the padding."""
-        expected = (1, channels, padded[0] // stride, padded[1] // stride)
-        if output.shape != expected:
-            raise DetectorError(
-                f"{self.path}: {name} is {output.shape} where {expected} was promised; export it again"
-            )
-        return np.asarray(output[0, :, : -(-size[0] // stride), : -(-size[1] // stride)])
+
+def run_on_road(
+    network: Network, image_bgr: np.ndarray, camera: RoadCamera, mirrored: bool = False
+) -> NetworkOutput:
+    """Run the network on the rows of an image (H, W, 3) that show ground in reach.
+
+    ``mirrored`` runs it on the mirror image, too, and takes the mean of both outputs.
+    """
+    info, top = network.info, camera.far_row
+    band = image_bgr[top:]
+    run = partial(_run_twice, network) if mirrored else network.run
+    seam = _seam_row(network, camera)
+    if seam is None:
+        output = run(band)
+        paint, kinds, anchors = output.paint, output.kinds, _anchor_rows(output.lanes, network, top, 1)
+    else:
+        far = run(band[: seam + _OVERLAP_PX])
+        near_top = seam - _OVERLAP_PX
+        half = cv2.resize(band[near_top:], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        near = run(half)
+        anchors = [r for r in _anchor_rows(near.lanes, network, top + near_top, 2) if r.v_px >= top + seam]
+        anchors += [r for r in _anchor_rows(far.lanes, network, top, 1) if r.v_px < top + seam]
+        paint = _joined(far.paint[None], near.paint[None], seam, near_top, info.paint_stride)[0]
+        kinds = _joined(far.kinds, near.kinds, seam, near_top, info.kind_stride)
+    # Seen from the side a dash lies across the view, as a stop line does seen from the front, and the other
+    # way round: the network knows of the view alone.
+    if camera.aside and set(SEEN_ACROSS) <= set(info.classes):
+        kinds = kinds[[info.classes.index(SEEN_ACROSS.get(name, name)) for name in info.classes]]
+    return NetworkOutput(paint, kinds, anchors, info.classes, info.paint_stride, top)
+
+
+def _run_twice(network: Network, image_bgr: np.ndarray) -> RawOutput:
+    """The mean of the outputs on an image (H, W, 3) and on its mirror image."""
+    width, info = image_bgr.shape[1], network.info
+    # Only whole elements have mirror images on the same grid.
+    padded = cv2.copyMakeBorder(image_bgr, 0, 0, 0, -width % info.multiple, cv2.BORDER_REPLICATE)
+    one, other = network.run(padded), network.run(np.ascontiguousarray(padded[:, ::-1]))
+    paint = (one.paint + other.paint[:, ::-1]) / 2
+    kinds = (one.kinds + other.kinds[..., ::-1]) / 2
+    (odds, offset), (odds_too, offset_too) = one.lanes, other.lanes[..., ::-1] * _MIRRORED
+    # Where a line crosses a cell only that output knows that sees it cross.
+    weight = 1 / (1 + np.exp(np.clip(odds_too - odds, -30, 30)))
+    lanes = np.stack([(odds + odds_too) / 2, weight * offset + (1 - weight) * offset_too])
+    columns = [-(-width // stride) for stride in info.strides]
+    return RawOutput(*(a[..., :n] for a, n in zip((paint, kinds, lanes), columns, strict=True)))
+
+
+def _seam_row(network: Network, camera: RoadCamera) -> int | None:
+    """Row of the band from which half the resolution will do; None if that saves nothing."""
+    grid = max(_GRID_PX, network.info.multiple)
+    height = camera.info.height - camera.far_row
+    if camera.fine_row is None or camera.info.width % (2 * grid) or height % grid:
+        return None
+    seam = -(-max(camera.fine_row - camera.far_row, 0) // grid) * grid
+    seam += (height - seam) % (2 * grid)
+    worth = height - seam >= 3 * _OVERLAP_PX
+    return seam if worth and seam >= _OVERLAP_PX else None
+
+
+def _joined(far: np.ndarray, near: np.ndarray, seam: int, near_top: int, stride: int) -> np.ndarray:
+    """Planes (K, h, w), ``stride`` px per element: far ones above the seam, near ones, doubled, below it."""
+    first, overlap = seam // stride, (seam - near_top) // stride
+    height = first - overlap + 2 * near.shape[1]
+    joined = np.empty((len(far), height, 2 * near.shape[2]), dtype=np.float32)
+    joined[:, :first] = far[:, :first]
+    for whole, plane in zip(joined, near, strict=True):
+        doubled = cv2.resize(plane, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
+        whole[first:] = doubled[overlap:]
+    return joined
+
+
+def _anchor_rows(lanes: np.ndarray, network: Network, top_px: int, scale: int) -> list[AnchorRow]:
+    """Peaks along each row of ``lanes`` (2, h, w), near to far, of an image reduced by ``scale``."""
+    odds, offset = lanes
+    peak = odds > _LEAST_LOG_ODDS
+    peak[:, 1:] &= odds[:, 1:] >= odds[:, :-1]
+    peak[:, :-1] &= odds[:, :-1] > odds[:, 1:]
+    i, j = np.nonzero(peak)
+    stride = network.info.lane_stride
+    u = stride * (j + np.clip(offset[i, j], -0.5, 0.5) + 0.5) - 0.5
+    v = stride * np.arange(len(odds)) + (stride - 1) / 2
+    # Pixel p of the reduced image is centred on scale * p + (scale - 1) / 2 of the image.
+    u, v = scale * u + (scale - 1) / 2, scale * v + (scale - 1) / 2 + top_px
+    found = odds[i, j].astype(np.float64)
+    bounds = np.searchsorted(i, np.arange(len(odds) + 1))
+    return [
+        AnchorRow(float(v[row]), u[part], found[part])
+        for row in range(len(odds) - 1, -1, -1)
+        if (part := slice(bounds[row], bounds[row + 1])).stop > part.start
+    ]
 
 
 def check_device(device: str) -> None:
@@ -164,7 +329,7 @@ def open_session(path: Path, threads: int, device: str = "cpu") -> Any:
     try:
         provider, settings = _PROVIDERS[device]
         session = onnxruntime.InferenceSession(
-            str(path), options, providers=[(provider, settings), *_BEHIND[device]]
+            str(path), options, providers=[(provider, settings), *_FALLBACK[device]]
         )
     except Exception as error:
         raise DetectorError(
@@ -207,10 +372,9 @@ def _read_info(session: Any, path: Path) -> NetworkInfo:
             f"{path}: unknown classes {unknown}, known are {', '.join(info.catalogue.names)}; "
             "use another model"
         )
-    strides = (info.paint_stride, info.kind_stride, info.lane_stride)
-    if min(strides) < 1 or any(info.multiple % stride for stride in strides):
+    if min(info.strides) < 1 or any(info.multiple % stride for stride in info.strides):
         raise DetectorError(
-            f"{path}: strides {strides} do not divide multiple {info.multiple}; export it again"
+            f"{path}: strides {info.strides} do not divide multiple {info.multiple}; export it again"
         )
     if info.kind_stride % info.paint_stride:
         raise DetectorError(

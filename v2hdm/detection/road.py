@@ -1,4 +1,4 @@
-"""The detector for a robot's own loop: images of one calibrated camera in, metres out.
+"""The detector for a robot's own loop: images of one calibrated camera in, metres out, as JSON or drawn.
 
 .. code-block:: python
 
@@ -14,20 +14,54 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 
-from v2hdm.detection.camera.footprint import Footprint, GroundPoints
-from v2hdm.detection.camera.mounting import camera_from_calibration
+from v2hdm.detection.camera import GroundPoints, camera_from_calibration
 from v2hdm.detection.detector import Detector
+from v2hdm.detection.frames import Frame
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.stopwatch import lap
 from v2hdm.errors import MapFileError
 from v2hdm.io.calibration import read_calibration
-from v2hdm.records import Camera, FloatArray, LaneDetection, MarkingDetection
+from v2hdm.records import (
+    ARROW,
+    CHEVRON,
+    CROSSWALK_BAR,
+    DIAMOND,
+    LANE_BOUNDARY,
+    LANE_DASH,
+    LANE_LINE,
+    STOP_LINE,
+    Calibration,
+    Camera,
+    FloatArray,
+    LaneDetection,
+    MarkingDetection,
+)
 
 LANE_SIGMA_PX = 1.0
-"""What a point of a lane's paint is taken to err by; those of whole lines have a sigma of their own."""
+"""Standard deviation of a point of a lane's paint; points of whole lines have a sigma of their own."""
+
+_PX_DIGITS, _PX2_DIGITS, _M_DIGITS = 3, 5, 4
+
+_COLOUR_BGR = {
+    DIAMOND: (60, 200, 60),
+    LANE_DASH: (240, 160, 40),
+    LANE_LINE: (40, 160, 255),
+    LANE_BOUNDARY: (230, 90, 230),
+    ARROW: (60, 230, 230),
+    STOP_LINE: (120, 120, 255),
+    CROSSWALK_BAR: (230, 230, 90),
+    CHEVRON: (160, 220, 160),
+}
+_OTHER_BGR = (200, 200, 200)
+_INVALID_BGR = (60, 60, 230)
+_SHIFT = 4
+_FAR_PX = 30000.0
+_TEXT_SCALE, _LEAST_TEXT_SCALE, _FULL_WIDTH_PX = 0.45, 0.35, 1280
 
 
 @dataclass(frozen=True)
@@ -65,7 +99,7 @@ class RoadLane:
 
 @dataclass(frozen=True)
 class Road:
-    """What one image shows."""
+    """The markings and lanes of one image."""
 
     markings: tuple[RoadMarking, ...]
     lanes: tuple[RoadLane, ...]
@@ -74,16 +108,13 @@ class Road:
 class RoadDetector:
     """Finds the markings and lanes in the images of one camera; use one per thread.
 
-    Args:
-        detector: may be shared by the cameras of one thread.
-        camera: the camera.
-        footprint: how its pixels lie on the ground; without one there are no metres.
+    ``detector`` may be shared by the cameras of one thread. Without a ``calibration`` there are no metres.
     """
 
-    def __init__(self, detector: Detector, camera: Camera, footprint: Footprint | None = None):
+    def __init__(self, detector: Detector, camera: Camera, calibration: Calibration | None = None):
         self.detector = detector
         self.camera = camera
-        self.footprint = footprint
+        self.calibration = calibration
 
     @classmethod
     def load(
@@ -95,11 +126,8 @@ class RoadDetector:
     ) -> RoadDetector:
         """A detector for the camera of a calibration YAML that ``python -m v2hdm.map`` wrote.
 
-        Args:
-            calibration: the YAML file.
-            model: ONNX file; None takes the one that is shipped.
-            options: settings of the detector.
-            linear_response: the camera's grey values are proportional to radiance, not sRGB-coded.
+        ``model`` is an ONNX file, None the shipped one; ``linear_response`` says that grey values are
+        proportional to radiance, not sRGB-coded.
 
         Raises:
             MapFileError: the calibration is missing, damaged or cannot be right.
@@ -112,13 +140,12 @@ class RoadDetector:
         """As :meth:`load`, for a detector that is there already."""
         content = read_calibration(calibration)
         try:
-            camera = camera_from_calibration(content, linear_response)
+            return cls(detector, camera_from_calibration(content, linear_response), content)
         except MapFileError as error:
             raise MapFileError(f"{calibration}: {error}") from error
-        return cls(detector, camera, Footprint(detector.view(camera), content))
 
     def detect(self, image_bgr: np.ndarray) -> Road:
-        """Find what one image (H, W, 3) uint8 BGR shows.
+        """Find the markings and lanes of one image (H, W, 3) uint8 BGR.
 
         Raises:
             DetectorError: the image is not of that form or not of the camera's size.
@@ -129,14 +156,15 @@ class RoadDetector:
 
     def _on_ground(self, markings: Sequence[MarkingDetection], lanes: Sequence[LaneDetection]) -> Road:
         none = np.empty((0, 2))
-        if self.footprint is None:
+        if self.calibration is None:
             return Road(
                 tuple(RoadMarking(marking, none, np.empty((0, 0)), none) for marking in markings),
                 tuple(RoadLane(lane, none, np.empty((0, 2, 2))) for lane in lanes),
             )
         shapes_px = [m.outline_px if len(m.outline_px) else m.corners_px for m in markings]
         shapes_px += [lane.points_px for lane in lanes]
-        ground = self.footprint.of(np.concatenate([none, *shapes_px]))
+        camera = self.detector.road_camera(self.camera)
+        ground = camera.footprint(np.concatenate([none, *shapes_px]), self.calibration)
         ends = np.cumsum([0, *map(len, shapes_px)])
         parts = [ground[begin:end] for begin, end in pairwise(ends.tolist())]
         return Road(tuple(map(_marking, markings, parts)), tuple(map(_lane, lanes, parts[len(markings) :])))
@@ -152,3 +180,113 @@ def _marking(image: MarkingDetection, ground: GroundPoints) -> RoadMarking:
 def _lane(image: LaneDetection, ground: GroundPoints) -> RoadLane:
     sigma_px = LANE_SIGMA_PX if image.sigma_px is None else image.sigma_px
     return RoadLane(image, ground.points_vehicle, ground.single_covariances(sigma_px))
+
+
+def as_record(frame: Frame, camera: str, road: Road) -> dict[str, Any]:
+    """The content of one JSON line (docs/detect.md); not-a-number, which JSON lacks, is null."""
+    return {
+        "source": frame.source,
+        "frame": frame.index,
+        "stamp_s": None if frame.stamp_s is None else round(frame.stamp_s, 6),
+        "camera": camera,
+        "markings": [_marking_record(marking) for marking in road.markings],
+        "lanes": [_lane_record(lane) for lane in road.lanes],
+    }
+
+
+def _marking_record(marking: RoadMarking) -> dict[str, Any]:
+    image = marking.image
+    record: dict[str, Any] = {"class": image.kind, "score": round(image.score, 4)}
+    if len(image.outline_px):
+        record["outline_px"] = _rounded(image.outline_px, _PX_DIGITS)
+        if len(marking.outline_vehicle):
+            record["outline_vehicle"] = _rounded(marking.outline_vehicle, _M_DIGITS)
+        return record
+    record["corners_px"] = _rounded(image.corners_px, _PX_DIGITS)
+    record["corner_valid"] = image.corner_valid.tolist()
+    record["covariance_px"] = _rounded(image.covariance_px, _PX2_DIGITS)
+    if len(marking.corners_vehicle):
+        record["corners_vehicle"] = _rounded(marking.corners_vehicle, _M_DIGITS)
+        record["covariance_m2"] = _significant(marking.covariance_m2)
+    return record
+
+
+def _lane_record(lane: RoadLane) -> dict[str, Any]:
+    image = lane.image
+    record: dict[str, Any] = {"class": image.kind, "score": round(image.score, 4)}
+    if image.identity is not None:
+        record["identity"] = image.identity
+    record["points_px"] = _rounded(image.points_px, _PX_DIGITS)
+    if len(lane.points_vehicle):
+        record["points_vehicle"] = _rounded(lane.points_vehicle, _M_DIGITS)
+        record["covariance_m2"] = _significant(lane.covariance_m2)
+    return record
+
+
+def _rounded(values: FloatArray, digits: int) -> list[Any]:
+    return _plain(np.round(values, digits))
+
+
+def _significant(values: FloatArray) -> list[Any]:
+    """Four significant digits: a covariance spans many powers of ten."""
+    return _plain(np.array([float(f"{value:.4g}") for value in values.ravel()]).reshape(values.shape))
+
+
+def _plain(values: FloatArray) -> list[Any]:
+    finite = np.isfinite(values)
+    plain: list[Any] = values.tolist()
+    if not finite.all():
+        plain = np.where(finite, values.astype(object), np.array(None)).tolist()
+    return plain
+
+
+def draw_detections(
+    image_bgr: np.ndarray, markings: Sequence[MarkingDetection], lanes: Sequence[LaneDetection]
+) -> np.ndarray:
+    """A copy of an image with its detections; red corners are not valid."""
+    canvas = image_bgr.copy()
+    for lane in lanes:
+        _draw_lane(canvas, lane)
+    for marking in markings:
+        _draw_marking(canvas, marking)
+    return canvas
+
+
+def _draw_lane(canvas: np.ndarray, lane: LaneDetection) -> None:
+    colour = _COLOUR_BGR.get(lane.kind, _OTHER_BGR)
+    points = _fixed(lane.points_px)
+    if not len(points):
+        return
+    cv2.polylines(canvas, [points], False, colour, 1, cv2.LINE_AA, _SHIFT)
+    for point in points:
+        cv2.circle(canvas, point.tolist(), 2 << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
+    if lane.identity is not None:
+        _write(canvas, f"{lane.identity:+d}", lane.points_px[0], colour)
+
+
+def _draw_marking(canvas: np.ndarray, marking: MarkingDetection) -> None:
+    colour = _COLOUR_BGR.get(marking.kind, _OTHER_BGR)
+    shape_px = marking.outline_px if len(marking.outline_px) else marking.corners_px
+    shape = _fixed(shape_px)
+    cv2.polylines(canvas, [shape], True, colour, 1, cv2.LINE_AA, _SHIFT)
+    if not len(marking.outline_px):
+        for corner, valid in zip(shape, marking.corner_valid, strict=True):
+            dot = colour if valid else _INVALID_BGR
+            cv2.circle(canvas, corner.tolist(), 3 << _SHIFT, dot, 1, cv2.LINE_AA, _SHIFT)
+    right_px = shape_px[np.argmax(shape_px[:, 0])]
+    _write(canvas, f"{marking.kind} {marking.score:.2f}", right_px, colour)
+
+
+def _write(canvas: np.ndarray, text: str, at_px: FloatArray, colour: tuple[int, int, int]) -> None:
+    """Text to the right of a point, with a shadow so that it shows on paint."""
+    scale = max(_LEAST_TEXT_SCALE, _TEXT_SCALE * min(1.0, canvas.shape[1] / _FULL_WIDTH_PX))
+    u, v = (int(c) for c in np.clip(np.nan_to_num(at_px), -_FAR_PX, _FAR_PX))
+    for shift, tone in ((1, (0, 0, 0)), (0, colour)):
+        at = (u + 6 + shift, v + 4 + shift)
+        cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, tone, 1, cv2.LINE_AA)
+
+
+def _fixed(points_px: FloatArray) -> np.ndarray:
+    """Points as OpenCV's fixed-point integers."""
+    near = np.clip(np.nan_to_num(points_px), -_FAR_PX, _FAR_PX)
+    return np.asarray(np.round(near * (1 << _SHIFT)).astype(np.int32))

@@ -1,8 +1,4 @@
-"""Where the time of a detection goes, by stage, for whoever asks.
-
-Code that works marks its stages with :func:`lap`; that costs nothing to speak of until a
-:class:`Stopwatch` runs.
-"""
+"""Time spent in each stage of a detection; :func:`lap` costs nothing until a :class:`Stopwatch` runs."""
 
 from __future__ import annotations
 

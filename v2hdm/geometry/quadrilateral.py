@@ -8,6 +8,8 @@ The other functions hold for both. Side ``e`` runs from corner ``e`` to corner `
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import cv2
@@ -22,6 +24,92 @@ _TURN = np.array([-1.0, 1.0])
 
 SHIFTS = (np.arange(4)[:, None] + np.arange(4)[None, :]) % 4
 """Row s lists, for corner c of one quadrilateral, corner (c + s) mod 4 of the other."""
+
+
+_LEAST_SINE = 1e-3
+"""Of the angle of two sides that meet; parallel ones meet nowhere."""
+
+_CORNER = np.arange(4)
+_END = 4 + (_CORNER - 1) % 4
+"""Each corner is the start of its own side and the end of the one before, in this place among the moves."""
+
+
+@dataclass(frozen=True)
+class Quad:
+    """Quadrilaterals ``corners`` (..., 4, 2) with all that follows from them, each worked out once.
+
+    The sides' normals point outwards in an image and inwards in the map.
+    """
+
+    corners: FloatArray
+
+    @cached_property
+    def _sides(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        return side_frames(self.corners)
+
+    @property
+    def tangent(self) -> FloatArray:
+        """Unit direction (..., 4, 2) of each side."""
+        return self._sides[0]
+
+    @property
+    def normal(self) -> FloatArray:
+        """Unit normal (..., 4, 2) of each side."""
+        return self._sides[1]
+
+    @property
+    def length(self) -> FloatArray:
+        """Length (..., 4) of each side."""
+        return self._sides[2]
+
+    @cached_property
+    def area(self) -> FloatArray:
+        """Area (...)."""
+        return np.asarray(np.abs(signed_area(self.corners)))
+
+    @cached_property
+    def width(self) -> FloatArray:
+        """Mean extent (...) across the longest side."""
+        return np.asarray(self.area / self.length.max(axis=-1))
+
+    @cached_property
+    def lengthwise(self) -> BoolArray:
+        """Whether (...) the first and third side are the longer ones."""
+        length = self.length
+        return np.asarray(length[..., 0] + length[..., 2] >= length[..., 1] + length[..., 3])
+
+    @cached_property
+    def outward(self) -> FloatArray:
+        """Rows (..., 4, 3) that take (x, y, 1) of an image to the distance outside each side."""
+        offset = -(self.normal * self.corners).sum(axis=-1)
+        return np.concatenate([self.normal, offset[..., None]], axis=-1)
+
+    @cached_property
+    def corner_from_side(self) -> FloatArray:
+        """Moves (M, 8) of the sides' starts and ends along their normals to moves (M, 8) of the corners."""
+        tangent = self.tangent
+        before = preceding(tangent)
+        determinant = before[..., 0] * tangent[..., 1] - before[..., 1] * tangent[..., 0]
+        determinant = np.where(np.abs(determinant) < _LEAST_SINE, -_LEAST_SINE, determinant)[..., None]
+        jacobian = np.zeros((len(tangent), 4, 2, 8))
+        # Each lies along the other's line.
+        jacobian[:, _CORNER, :, _CORNER] = (-before / determinant).swapaxes(0, 1)
+        jacobian[:, _CORNER, :, _END] = (tangent / determinant).swapaxes(0, 1)
+        return jacobian.reshape(-1, 8, 8)
+
+    def moved(self, by_side: FloatArray) -> Quad:
+        """The quadrilaterals whose sides' starts and ends have moved by (M, 8) along the normals."""
+        return Quad(self.corners + (self.corner_from_side @ by_side[..., None]).reshape(-1, 4, 2))
+
+    def long_first(self, lengthwise: BoolArray | None = None) -> Quad:
+        """The corners from a longer side on, or from the second where not ``lengthwise`` (M,)."""
+        along = self.lengthwise if lengthwise is None else lengthwise
+        return Quad(np.where(along[..., None, None], self.corners, following(self.corners)))
+
+    def at(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        """Points (..., N, 2) at shares ``a`` (N,) along the first side and ``b`` (N,) along the fourth."""
+        weight = np.stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b], axis=1)
+        return np.asarray(weight @ self.corners)
 
 
 class Alignment(NamedTuple):
@@ -79,12 +167,6 @@ def side_frames(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray
     tangent = along / np.maximum(length, 1e-9)[..., None]
     normal = tangent[..., ::-1] * _TURN
     return tangent, normal, length
-
-
-def width(corners: FloatArray) -> FloatArray:
-    """Mean extent (...) of quadrilaterals (..., 4, 2) across their longest side."""
-    _, _, length = side_frames(corners)
-    return np.asarray(np.abs(signed_area(corners)) / length.max(axis=-1))
 
 
 def long_axis(corners: FloatArray) -> FloatArray:

@@ -24,7 +24,7 @@ import torch
 from kornia.geometry.transform import remap
 from torch import Tensor
 
-from v2hdm.detection.image_file import read_bgr
+from v2hdm.detection.frames import read_bgr
 from v2hdm.errors import ConfigError, DriveError
 from v2hdm.geometry import tensors
 from v2hdm.geometry.ipm import apply_homography

@@ -17,15 +17,19 @@ from typing import NamedTuple, TextIO
 import cv2
 import numpy as np
 
-from v2hdm.detection.camera.mounting import camera_from_calibration, rough_calibration
+from v2hdm.detection.camera import camera_from_calibration, rough_calibration
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.draw import draw_detections
-from v2hdm.detection.frames import Frame, camera_frames, image_frames, list_images, video_frames
-from v2hdm.detection.horizon import PitchVote
-from v2hdm.detection.image_file import IMAGE_SUFFIXES
-from v2hdm.detection.json_line import as_record
+from v2hdm.detection.frames import (
+    IMAGE_SUFFIXES,
+    Frame,
+    camera_frames,
+    image_frames,
+    list_images,
+    video_frames,
+)
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.road import Road, RoadDetector
+from v2hdm.detection.pitch import PitchVote
+from v2hdm.detection.road import Road, RoadDetector, as_record, draw_detections
 from v2hdm.detection.stopwatch import Stopwatch, lap
 from v2hdm.detection.weights import unknown_network
 from v2hdm.errors import ConfigError, DriveError
@@ -204,7 +208,7 @@ def _found(
         yield frame, road, found
         if road is not rough:
             continue
-        pitch_rad = vote.add([lane.image for lane in found.lanes], detector.view(road.camera))
+        pitch_rad = vote.add([lane.image for lane in found.lanes], detector.road_camera(road.camera))
         if pitch_rad is not None:
             rough = _rough_road(frame, parsed, detector, lens, float(np.rad2deg(pitch_rad)))
 
@@ -251,7 +255,7 @@ def _check_size(frame: Frame, road: RoadDetector) -> None:
     info = road.camera.info
     height, width = frame.pixels.shape[:2]
     if (width, height) != (info.width, info.height):
-        where = "the calibration" if road.footprint else "what is known"
+        where = "the calibration" if road.calibration else "what is known"
         raise DriveError(
             f"{frame.source}: the image is {width}x{height}, but {where} of camera '{info.name}' is for "
             f"{info.width}x{info.height}; give images of that size, or the calibration of these"

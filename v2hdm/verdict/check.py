@@ -11,7 +11,7 @@ from pathlib import Path
 
 import cv2
 
-from v2hdm.detection.image_file import read_bgr
+from v2hdm.detection.frames import read_bgr
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.ground.estimate import estimate_cameras
 from v2hdm.ground.motion import trajectory_of_images

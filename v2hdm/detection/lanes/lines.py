@@ -1,8 +1,7 @@
-"""From crossings of row anchors and pieces of lane paint to the whole lines of lanes.
+"""Lines of lanes: the centre lines of paint, and the whole lines made of crossings of row anchors and paint.
 
-Crossings and paint that one curve explains are one line (:mod:`v2hdm.detection.lanes.cluster`). A hidden
-Markov model finds from where to where it runs (:mod:`v2hdm.detection.lanes.span`), and a logistic function
-gives its probability (:mod:`v2hdm.detection.lanes.score`).
+Crossings and paint that one curve explains are one line (:mod:`.curves`). A hidden Markov model finds from
+where to where it runs, and a logistic function gives its probability (:mod:`.boundaries`).
 """
 
 from __future__ import annotations
@@ -12,14 +11,133 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2hdm.detection.camera.view import FARTHEST_M, CameraView
-from v2hdm.detection.lanes.cluster import find_chains, find_lines
-from v2hdm.detection.lanes.curve import Horizon, Line, LinePoints
-from v2hdm.detection.lanes.score import log_odds, log_odds_alone
-from v2hdm.detection.lanes.span import boundaries, draw, with_spans
-from v2hdm.detection.markings.foreground import Foreground
-from v2hdm.detection.sight import AnchorRow
+from v2hdm.detection.camera import FARTHEST_M, RoadCamera
+from v2hdm.detection.lanes.boundaries import boundaries, draw, log_odds, log_odds_alone, with_spans
+from v2hdm.detection.lanes.curves import LaneImage, Line, LinePoints, find_chains, find_lines
+from v2hdm.detection.propose import Blob, Proposal
 from v2hdm.records import FloatArray, IntArray, LaneDetection
+
+_CAP_WIDTH_RATIO = 0.7
+_MIN_POINTS = 2
+_ROWS_MIN_ASPECT = 0.35
+
+
+def trace_lanes(
+    paints: Sequence[tuple[Proposal, float]], camera: RoadCamera, step_m: float, max_range_m: float
+) -> list[LaneDetection]:
+    """The centre lines of lane paint with its score, a point every ``step_m`` on the ground, near to far.
+
+    A blob is cut by image rows (by columns where it lies flat); each cut's two edge points are
+    taken to the ground by the camera's initial IPM and averaged there, so perspective does not pull
+    the centre. Cuts through the slanted ends, narrower than the rest, are left out. A blob of two
+    lines that touch gives one row of points for each branch.
+    """
+    branches = [(paint, edges) for paint in paints for edges in _branches(paint[0].blob)]
+    if not branches:
+        return []
+    edges_px = np.concatenate([edges for _, edges in branches])
+    edges_vehicle = camera.unproject(edges_px)
+    ends = np.cumsum([len(edges) for _, edges in branches])[:-1]
+    traced = [
+        (paint, points)
+        for (paint, _), edges in zip(branches, np.split(edges_vehicle, ends), strict=True)
+        if len(points := _resample(_centre(edges), camera, step_m, max_range_m)) >= _MIN_POINTS
+    ]
+    if not traced:
+        return []
+    points_vehicle = np.concatenate([points for _, points in traced])
+    points_px = camera.project(points_vehicle)
+    ends = np.cumsum([len(points) for _, points in traced])[:-1]
+    return [
+        LaneDetection(piece.kind, score, points)
+        for ((piece, score), _), points in zip(traced, np.split(points_px, ends), strict=True)
+    ]
+
+
+def _branches(blob: Blob) -> list[FloatArray]:
+    """The two edges (n, 2, 2), recorded px, of each branch of a blob, cut by cut."""
+    height, width = blob.level.shape
+    by_rows = height >= _ROWS_MIN_ASPECT * width
+    order = [1, 0] if by_rows else [0, 1]
+    return [
+        blob.origin_px + blob.stride * np.stack([chain[:, [0, 1]], chain[:, [0, 2]]], axis=1)[..., order]
+        for chain in _chains(_cuts(blob.level if by_rows else blob.level.T))
+    ]
+
+
+def _cuts(level: np.ndarray) -> FloatArray:
+    """Runs (R, 3) of row, start and end column of where a field (h, w) is positive, in order."""
+    i, j = np.nonzero((level[:, :-1] > 0) != (level[:, 1:] > 0))
+    crossing = j + level[i, j] / (level[i, j] - level[i, j + 1])
+    return np.column_stack([i[::2], crossing[::2], crossing[1::2]]).astype(np.float64)
+
+
+def _chains(runs: FloatArray) -> list[FloatArray]:
+    """Runs linked from row to row where they overlap (n, 3), each chain one branch of the blob."""
+    if len(runs) < _MIN_POINTS:
+        return []
+    above, below = runs[:-1], runs[1:]
+    linked = (below[:, 0] == above[:, 0] + 1) & (above[:, 1] < below[:, 2]) & (below[:, 1] < above[:, 2])
+    if linked.all():
+        return [runs]
+    breaks = np.flatnonzero(np.diff(runs[:, 0])) + 1
+    return _branching_chains(np.split(runs, breaks))
+
+
+def _branching_chains(cuts: list[FloatArray]) -> list[FloatArray]:
+    """The chains of a blob some rows of which hold several runs; ``cuts`` has the runs row by row."""
+    open_chains: list[list[FloatArray]] = []
+    closed: list[list[FloatArray]] = []
+    for runs in cuts:
+        following: list[list[FloatArray]] = []
+        taken = set()
+        for run in runs:
+            match = next(
+                (
+                    c
+                    for c, chain in enumerate(open_chains)
+                    if c not in taken and chain[-1][1] < run[2] and run[1] < chain[-1][2]
+                ),
+                None,
+            )
+            if match is None:
+                following.append([run])
+            else:
+                taken.add(match)
+                open_chains[match].append(run)
+                following.append(open_chains[match])
+        closed += [chain for c, chain in enumerate(open_chains) if c not in taken]
+        open_chains = following
+    return [np.array(chain) for chain in closed + open_chains if len(chain) >= _MIN_POINTS]
+
+
+def _centre(edges_vehicle: FloatArray) -> FloatArray:
+    """Centres (n, 2) of cuts between two edge points on the ground (n, 2, 2), caps left out."""
+    width_m = np.linalg.norm(edges_vehicle[:, 1] - edges_vehicle[:, 0], axis=1)
+    finite = np.isfinite(width_m)
+    if not finite.any():
+        return np.empty((0, 2))
+    typical_m = float(np.median(width_m[finite]))
+    whole = finite & (width_m > _CAP_WIDTH_RATIO * typical_m) & (width_m < typical_m / _CAP_WIDTH_RATIO)
+    return np.asarray(edges_vehicle.mean(axis=1)[whole])
+
+
+def _resample(
+    centre_vehicle: FloatArray, camera: RoadCamera, step_m: float, max_range_m: float
+) -> FloatArray:
+    """Means of the points within each ``step_m`` along the line, from near to far."""
+    range_m = camera.range_m(centre_vehicle)
+    centre_vehicle, range_m = centre_vehicle[range_m <= max_range_m], range_m[range_m <= max_range_m]
+    if len(centre_vehicle) < _MIN_POINTS:
+        return np.empty((0, 2))
+    if range_m[0] > range_m[-1]:
+        centre_vehicle = centre_vehicle[::-1]
+    gap_m = np.linalg.norm(np.diff(centre_vehicle, axis=0), axis=1)
+    bins = np.floor(np.concatenate([[0.0], np.cumsum(gap_m)]) / step_m)
+    starts = np.flatnonzero(np.diff(bins, prepend=-1.0))
+    counts = np.diff(np.append(starts, len(bins)))
+    return np.asarray(np.add.reduceat(centre_vehicle, starts, axis=0) / counts[:, None])
+
 
 LEAST_LOG_ODDS = -0.5
 """Lines less sure are not given. A bound of -1.4 gives .7 points more of TuSimple's accuracy and 40 % more
@@ -37,54 +155,26 @@ _MAX_PAINT_SLOPE = 8.0
 """Paint that runs flatter across the view, px along the horizon per px down, is on no curve of ours."""
 
 
-def link_anchors(
-    rows: Sequence[AnchorRow],
-    view: CameraView,
-    paint: Sequence[LaneDetection] = (),
-    paint_step_m: float = 0.5,
-    foreground: Foreground | None = None,
-    row_step_px: float = 8.0,
-) -> list[LaneDetection]:
-    """The whole lines of one image.
-
-    Args:
-        rows: Its row anchors, near to far; crossings unlikely by themselves help to follow a line.
-        view: Its camera.
-        paint: The centre lines of its lane paint, points ``paint_step_m`` apart.
-        paint_step_m: That distance.
-        foreground: What the network says of paint, if that is known.
-        row_step_px: How far apart row anchors are, twice as far where half the resolution is looked at.
-    """
-    horizon = Horizon(view)
-    points, lines = propose(rows, view, horizon, paint, paint_step_m, foreground, row_step_px)
-    drawn = [draw(line, points, view, horizon) for line in lines]
-    return _identified([lane for lane in drawn if lane is not None], view)
+def find_boundaries(image: LaneImage) -> list[LaneDetection]:
+    """The whole lines of one image, numbered from the vehicle outwards."""
+    points, lines = propose(image)
+    drawn = [draw(line, points, image) for line in lines]
+    return _identified([lane for lane in drawn if lane is not None], image.camera)
 
 
-def propose(
-    rows: Sequence[AnchorRow],
-    view: CameraView,
-    horizon: Horizon,
-    paint: Sequence[LaneDetection],
-    paint_step_m: float,
-    foreground: Foreground | None,
-    row_step_px: float,
-    least_log_odds: float | None = None,
-) -> tuple[LinePoints, list[Line]]:
+def propose(image: LaneImage, least_log_odds: float | None = None) -> tuple[LinePoints, list[Line]]:
     """The points of an image and the boundaries of lanes through them that are sure enough, best first."""
     least_log_odds = LEAST_LOG_ODDS if least_log_odds is None else least_log_odds
-    points = _crossings(rows, view, horizon)
+    points = _crossings(image)
     # At, above and just below the horizon lines meet; a comparison with nan is false.
-    points = points.where(view.range_m(points.ground) <= FARTHEST_M)
+    points = points.where(image.camera.range_m(points.ground) <= FARTHEST_M)
     groups = find_chains(points)
-    points, on_paint = _with_paint(points, paint, view, horizon)
-    lines = find_lines(points, groups + on_paint, horizon, paint_step_m)
-    lines = _surest(
-        lines, log_odds_alone(lines, points, view, horizon, foreground), least_log_odds - _DOUBTFUL
-    )
-    lines = with_spans(lines, points, view, horizon, foreground, row_step_px)
-    lines = boundaries(lines, points, horizon)
-    return points, _surest(lines, log_odds(lines, points, horizon), least_log_odds)
+    points, on_paint = _with_paint(points, image)
+    lines = find_lines(points, groups + on_paint, image)
+    lines = _surest(lines, log_odds_alone(lines, points, image), least_log_odds - _DOUBTFUL)
+    lines = with_spans(lines, points, image)
+    lines = boundaries(lines, points, image)
+    return points, _surest(lines, log_odds(lines, points, image), least_log_odds)
 
 
 def _surest(lines: Sequence[Line], odds: FloatArray, least_log_odds: float) -> list[Line]:
@@ -93,45 +183,40 @@ def _surest(lines: Sequence[Line], odds: FloatArray, least_log_odds: float) -> l
     return [replace(lines[k], log_odds=float(odds[k])) for k in order]
 
 
-def _crossings(rows: Sequence[AnchorRow], view: CameraView, horizon: Horizon) -> LinePoints:
+def _crossings(image: LaneImage) -> LinePoints:
+    rows = image.rows
     u = np.concatenate([np.empty(0), *(row.u_px for row in rows)])
     v = np.repeat([row.v_px for row in rows], [len(row.u_px) for row in rows]) if rows else np.empty(0)
     odds = np.concatenate([np.empty(0), *(row.odds for row in rows)])
-    scale = np.where(view.coarse(v), 2.0, 1.0)
+    scale = np.where(image.camera.coarse(v), 2.0, 1.0)
     sigma_px = scale * (_SIGMA_PX[0] + _SIGMA_PX[1] * np.exp(-odds))
-    return LinePoints.of(view, horizon, np.column_stack([u, v]), odds, sigma_px)
+    return LinePoints.of(image, np.column_stack([u, v]), odds, sigma_px, paint=False)
 
 
-def _with_paint(
-    points: LinePoints, paint: Sequence[LaneDetection], view: CameraView, horizon: Horizon
-) -> tuple[LinePoints, list[IntArray]]:
+def _with_paint(points: LinePoints, image: LaneImage) -> tuple[LinePoints, list[IntArray]]:
     """The points with those of pieces of paint after them, and which those are, piece by piece."""
-    pieces = _along_the_view(paint, view, horizon)
+    pieces = _along_the_view(image)
     if not pieces:
         return points, []
     length = [len(lane.points_px) for lane in pieces]
     odds = np.repeat([_logit(lane.score) for lane in pieces], length)
     points_px = np.concatenate([lane.points_px for lane in pieces])
-    painted = LinePoints.of(view, horizon, points_px, odds, np.full(len(odds), _PAINT_SIGMA_PX))
-    painted = replace(painted, is_paint=np.ones(len(odds), dtype=np.bool_))
+    painted = LinePoints.of(image, points_px, odds, np.full(len(odds), _PAINT_SIGMA_PX), paint=True)
     ends_at = len(points.odds) + np.cumsum(length)
     groups = [np.arange(end - n, end) for end, n in zip(ends_at, length, strict=True)]
-    both = {name: np.concatenate([getattr(points, name), getattr(painted, name)]) for name in vars(points)}
-    return LinePoints(**both), groups
+    return LinePoints.joined([points, painted]), groups
 
 
-def _along_the_view(
-    paint: Sequence[LaneDetection], view: CameraView, horizon: Horizon
-) -> list[LaneDetection]:
-    """Pieces of paint that are long enough to have a direction, and not one across the view."""
-    if not paint:
+def _along_the_view(image: LaneImage) -> list[LaneDetection]:
+    """Pieces of paint that are long enough to have a direction, and not one across the camera."""
+    if not image.paint:
         return []
-    ends_px = view.undistort(np.concatenate([lane.points_px[[0, -1]] for lane in paint]))
-    length_m = np.linalg.norm(np.diff(view.ground(ends_px).reshape(-1, 2, 2), axis=1)[:, 0], axis=1)
-    along, below = (np.abs(np.diff(at.reshape(-1, 2)))[:, 0] for at in horizon.coordinates(ends_px))
+    ends_px = image.camera.undistort(np.concatenate([lane.points_px[[0, -1]] for lane in image.paint]))
+    length_m = np.linalg.norm(np.diff(image.camera.ground(ends_px).reshape(-1, 2, 2), axis=1)[:, 0], axis=1)
+    along, below = (np.abs(np.diff(at.reshape(-1, 2)))[:, 0] for at in image.horizon.coordinates(ends_px))
     # False where the length is nan.
     usable = (length_m >= _LEAST_PAINT_LENGTH_M) & (along <= _MAX_PAINT_SLOPE * below)
-    return [lane for lane, use in zip(paint, usable, strict=True) if use]
+    return [lane for lane, use in zip(image.paint, usable, strict=True) if use]
 
 
 def _logit(probability: float) -> float:
@@ -139,13 +224,13 @@ def _logit(probability: float) -> float:
     return float(np.log(clipped / (1 - clipped)))
 
 
-def _identified(lanes: list[LaneDetection], view: CameraView) -> list[LaneDetection]:
+def _identified(lanes: list[LaneDetection], camera: RoadCamera) -> list[LaneDetection]:
     """Number the lines from the vehicle outwards, by where each is beside the vehicle."""
     if not lanes:
         return []
-    ground = view.ground(view.undistort(np.concatenate([lane.points_px for lane in lanes])))
+    ground = camera.unproject(np.concatenate([lane.points_px for lane in lanes]))
     parts = np.split(ground, np.cumsum([len(lane.points_px) for lane in lanes])[:-1])
-    beside_m = np.array([_lateral_m(part, view) for part in parts])
+    beside_m = np.array([_lateral_m(part, camera) for part in parts])
     order = np.argsort(beside_m)
     left = [k for k in order if beside_m[k] >= 0]
     right = [k for k in order[::-1] if beside_m[k] < 0]
@@ -155,13 +240,13 @@ def _identified(lanes: list[LaneDetection], view: CameraView) -> list[LaneDetect
     return [replace(lane, identity=identity.get(k)) for k, lane in enumerate(lanes)]
 
 
-def _lateral_m(ground: FloatArray, view: CameraView) -> float:
+def _lateral_m(ground: FloatArray, camera: RoadCamera) -> float:
     """How far left of the vehicle a line (N, 2) is, its near half carried on to there; nan if unknown."""
     ground = ground[np.isfinite(ground).all(axis=1)]
     near = ground[: max(2, len(ground) // 2)]
     if len(near) < 2:
         return float("nan")
-    along = near[:, 0] - view.foot_vehicle[0]
+    along = near[:, 0] - camera.foot_vehicle[0]
     if np.ptp(along) < 0.5:
         return float(near[0, 1])
     apart = along - along.mean()

@@ -9,10 +9,9 @@ import pytest
 
 from train.examples import Example, example
 from v2hdm.detect import main
-from v2hdm.detection.camera.mounting import camera_from_calibration, rough_calibration
-from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.camera import RoadCamera, camera_from_calibration, rough_calibration
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.horizon import PitchVote, estimate_pitch, guessed_pitch_rad
+from v2hdm.detection.pitch import PitchVote, estimate_pitch, guessed_pitch_rad
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.records import LANE_BOUNDARY, LANE_LINE, LaneDetection
 
@@ -22,12 +21,12 @@ RENDERED = (9, 12)
 """Streets of the renders to fit to, seen nearly level."""
 
 
-def view_of(pitch_deg: float) -> CameraView:
+def view_of(pitch_deg: float) -> RoadCamera:
     calibration = rough_calibration("camera", 1280, 720, HEIGHT_M, pitch_deg, FOV_DEG)
-    return CameraView(camera_from_calibration(calibration))
+    return RoadCamera(camera_from_calibration(calibration))
 
 
-def line(view: CameraView, left_m: float, turned_rad: float = 0.0, sway_px: float = 0.0) -> LaneDetection:
+def line(view: RoadCamera, left_m: float, turned_rad: float = 0.0, sway_px: float = 0.0) -> LaneDetection:
     """A straight line on the ground, so far left of the camera, as it is seen."""
     along = np.linspace(4.0, 25.0, 60)
     ground = np.column_stack([along, left_m + np.tan(turned_rad) * along, np.ones_like(along)])
@@ -92,14 +91,14 @@ def test_rendered_views_are_corrected_to_within_a_degree_or_left_alone(detector,
     for index in RENDERED:
         shown = rendered(index)
         true = extrinsic_from_ipm(shown.camera.info, shown.camera.ipm[shown.camera.initial_ipm])
-        pitch_rad = guessed_pitch_rad(CameraView(shown.camera))
+        pitch_rad = guessed_pitch_rad(RoadCamera(shown.camera))
         height_m = float(-(true[:3, :3].T @ true[:3, 3])[2])
         guess = rough_calibration("c", 1280, 720, height_m, np.rad2deg(pitch_rad) + off_deg, FOV_DEG)
         info = replace(shown.camera.info, name=f"{index} {off_deg}")
         camera = camera_from_calibration(replace(guess, info=info))
         _, lanes = detector.detect(shown.image, camera)
         assert any(lane.kind == LANE_BOUNDARY for lane in lanes)
-        told = estimate_pitch(lanes, detector.view(camera))
+        told = estimate_pitch(lanes, detector.road_camera(camera))
         if told is not None:
             corrected += 1
             assert abs(told.pitch_rad - pitch_rad) < np.deg2rad(1.0)
@@ -112,7 +111,7 @@ def test_a_stream_without_a_calibration_takes_the_pitch_that_its_lines_show(tmp_
     for n in range(5):
         cv2.imwrite(str(tmp_path / f"{n}.png"), shown.image)
     (focal_px, _, _), (_, _, centre_px), _ = shown.camera.info.intrinsic
-    horizon_px = centre_px - focal_px * np.tan(guessed_pitch_rad(CameraView(shown.camera)))
+    horizon_px = centre_px - focal_px * np.tan(guessed_pitch_rad(RoadCamera(shown.camera)))
     # A rough camera has its principal point in the middle of the image.
     pitch_deg = np.rad2deg(np.arctan((359.5 - horizon_px) / focal_px))
     fov_deg = np.rad2deg(2 * np.arctan(640 / focal_px))

@@ -13,14 +13,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection.camera import RoadCamera
 from v2hdm.records import FloatArray, LaneDetection
 
 _GUESS_SIGMA_RAD = np.deg2rad(6.0)
 """Standard deviation of a guess of the pitch."""
 
 _PARALLEL_SIGMA_RAD = 0.015
-"""Standard deviation of the directions of one road's lines; 0.012 rad in lanes/cluster, whose camera is
+"""Standard deviation of the directions of one road's lines; 0.012 rad in lanes/curves, whose camera is
 known."""
 
 _POINT_SIGMA_PX = 1.0
@@ -47,16 +47,14 @@ class Pitch:
     sigma_rad: float
 
 
-def estimate_pitch(lanes: Sequence[LaneDetection], view: CameraView) -> Pitch | None:
-    """The pitch of the camera from the lines found under a guess of it; None where they do not tell it.
+def estimate_pitch(lanes: Sequence[LaneDetection], camera: RoadCamera) -> Pitch | None:
+    """The pitch of a camera, from the lines of its images; None where they do not show it.
 
-    Args:
-        lanes: Lines and pieces of paint of one image, or of several of the same camera.
-        view: The camera as guessed; only its intrinsics and, weakly, its pitch are used.
+    ``camera`` is as guessed; only its intrinsics and, weakly, its pitch are used.
     """
-    lines = [line for lane in lanes if (line := _straight(lane, view)) is not None]
-    focal_px = float(view.info.intrinsic[1, 1])
-    guess_px = -focal_px * np.tan(guessed_pitch_rad(view))
+    lines = [line for lane in lanes if (line := _straight(lane, camera)) is not None]
+    focal_px = float(camera.info.intrinsic[1, 1])
+    guess_px = -focal_px * np.tan(guessed_pitch_rad(camera))
     if len(lines) < 2:
         return None
     place, slope, covariance = (np.array(column) for column in zip(*lines, strict=True))
@@ -80,30 +78,30 @@ def estimate_pitch(lanes: Sequence[LaneDetection], view: CameraView) -> Pitch | 
 class PitchVote:
     """Collects the pitch of each image of a stream that shows one, until several agree."""
 
-    _told: list[float] = field(default_factory=list)
+    _found: list[float] = field(default_factory=list)
     _settled: bool = False
 
-    def add(self, lanes: Sequence[LaneDetection], view: CameraView) -> float | None:
+    def add(self, lanes: Sequence[LaneDetection], camera: RoadCamera) -> float | None:
         """The pitch, rad, with the first image at which the last ones agree; None before and after that."""
-        told = None if self._settled else estimate_pitch(lanes, view)
-        if told is None:
+        found = None if self._settled else estimate_pitch(lanes, camera)
+        if found is None:
             return None
-        self._told.append(told.pitch_rad)
-        last = self._told[-_VOTES:]
+        self._found.append(found.pitch_rad)
+        last = self._found[-_VOTES:]
         self._settled = len(last) == _VOTES and float(np.ptp(last)) < _AGREE_RAD
         return float(np.mean(last)) if self._settled else None
 
 
-def guessed_pitch_rad(view: CameraView) -> float:
-    """The pitch of a camera as its view has it: how far its axis points below the horizon."""
-    ahead = view.pinhole_px_from_vehicle[:, 0]
-    direction = np.linalg.solve(view.info.intrinsic, ahead)
+def guessed_pitch_rad(camera: RoadCamera) -> float:
+    """How far a camera's axis points below the horizon by its IPM, rad."""
+    ahead = camera.pinhole_px_from_vehicle[:, 0]
+    direction = np.linalg.solve(camera.info.intrinsic, ahead)
     return float(np.arctan2(-direction[1] * np.sign(direction[2]), abs(direction[2])))
 
 
-def _straight(lane: LaneDetection, view: CameraView) -> tuple[float, float, FloatArray] | None:
+def _straight(lane: LaneDetection, camera: RoadCamera) -> tuple[float, float, FloatArray] | None:
     """A line's place on the principal point's row, its slope, and their covariance (2, 2); None if flat."""
-    points = view.undistort(lane.points_px) - view.info.intrinsic[:2, 2]
+    points = camera.undistort(lane.points_px) - camera.info.intrinsic[:2, 2]
     u, v = points.T
     down = v - v.mean()
     spread = float(down @ down)

@@ -1,4 +1,4 @@
-"""The pixels that tell where a marking's sides are: a lattice over a band along them."""
+"""The pixels that show where a marking's sides are: a coarse grid all over it, a lattice about its sides."""
 
 from __future__ import annotations
 
@@ -6,12 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.detection.markings.foreground import Foreground
-from v2hdm.detection.markings.frames import StraightFrames
-from v2hdm.detection.markings.grey import CLIPPED, grey_of, linear_bgr, log_grey
-from v2hdm.detection.odds import as_probability
-from v2hdm.geometry.planar import signed_area
-from v2hdm.geometry.quadrilateral import following, side_frames, width
+from v2hdm.detection.network import as_probability
+from v2hdm.detection.patch import LensFrames, Patches
+from v2hdm.geometry.quadrilateral import Quad
 from v2hdm.records import BoolArray, FloatArray
 
 KNOTS = 6
@@ -29,6 +26,15 @@ _END_PX = 2.0
 _MOST_ENDS = 1 / 3
 """What has two ends that make up no more than this share of its length is slim; an end reaches so far past
 its corners."""
+
+_SEARCH_ALONG, _SEARCH_ACROSS = 40, 12
+"""Rows and columns of the coarse grid on which a fit begins."""
+
+_MARGIN_ALONG, _MARGIN_ACROSS = 0.2, 0.4
+"""How far it reaches beyond a quadrilateral, in its lengths and widths."""
+
+_GREY_FIRST = 1.2
+"""By how many times clearer red or blue must be for grey to be left: grey has the least noise."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +59,29 @@ class Lattice:
     hats: np.ndarray
     across: np.ndarray
 
+    @classmethod
+    def about(
+        cls,
+        frames: LensFrames,
+        quad: Quad,
+        pixels: FloatArray,
+        looked: tuple[np.ndarray, np.ndarray, np.ndarray],
+        neighbours: np.ndarray,
+    ) -> Lattice:
+        """Pixels (M, N, 2) about quadrilaterals in their frames, of which :meth:`Patches.look` is known."""
+        light, used, limited = looked
+        points = np.ones((len(pixels), 3, pixels.shape[1]), dtype=np.float32)
+        points[:, :2] = frames.from_image(pixels).swapaxes(1, 2)
+        outside = quad.outward.astype(np.float32) @ points
+        inside = np.asarray(outside.max(axis=1) < 0, dtype=np.float32)
+        of_side = np.asarray(outside.argmax(axis=1)[..., None] == np.arange(4), dtype=np.float32)
+        hats, across = _light_basis(quad, points)
+        clipped = limited.sum(axis=1) / np.maximum(used.sum(axis=1), 1)
+        values = _clearest(light, used, inside)
+        return cls(
+            points, values, used, limited, clipped, neighbours, of_side * used[..., None], hats, across
+        )
+
     def take(self, rows: BoolArray) -> Lattice:
         """The markings under the mask (M,)."""
         if rows.all():
@@ -69,42 +98,42 @@ class Lattice:
         return np.asarray(np.where(count > 0, median, np.float32(0)))
 
 
-@dataclass(frozen=True)
-class Scene:
-    """The image that markings are fitted to, the network's word on it, and which paint is whose.
+def lay_grid(
+    patches: Patches, frames: LensFrames, corners_px: FloatArray
+) -> tuple[Lattice, np.ndarray, FloatArray]:
+    """A coarse grid all over quadrilaterals ``corners_px`` (M, 4, 2), recorded px, and beyond them.
 
-    ``image_bgr`` (H, W, 3) uint8; ``first_blob`` and ``last_blob`` (M,) are the blobs that a marking's own
-    paint is of: pixels of all others are left out.
+    Returns:
+        The lattice, the network's probability of paint there (M, N), and how far apart its points are (M,),
+        px.
     """
-
-    image_bgr: np.ndarray
-    foreground: Foreground
-    first_blob: np.ndarray
-    last_blob: np.ndarray
-
-    def look(self, u: np.ndarray, v: np.ndarray, marking: np.ndarray, linear_response: bool) -> _Pixels:
-        """Log grey, red and blue (3, n) of pixels of markings (n,), which take part, which are clipped."""
-        use = (u >= 0) & (u < self.image_bgr.shape[1]) & (v >= 0) & (v < self.image_bgr.shape[0])
-        u, v = np.where(use, u, 0), np.where(use, v, 0)
-        use &= ~self.foreground.others_at(u, v, self.first_blob[marking], self.last_blob[marking])
-        coded = self.image_bgr[v, u]
-        bgr = linear_bgr(coded, linear_response)
-        light = log_grey(np.stack([grey_of(bgr), bgr[:, 2], bgr[:, 0]]))
-        return light, use, use & (coded >= CLIPPED).any(axis=1)
-
-
-_Pixels = tuple[np.ndarray, BoolArray, BoolArray]
+    quad = Quad(frames.from_image(corners_px))
+    a, b = (
+        np.linspace(-margin, 1 + margin, count)
+        for margin, count in ((_MARGIN_ALONG, _SEARCH_ALONG), (_MARGIN_ACROSS, _SEARCH_ACROSS))
+    )
+    a, b = (part.ravel() for part in np.meshgrid(a, b))
+    pixels = np.clip(np.round(frames.to_px(quad.long_first().at(a, b))), -(10**6), 10**6)
+    shape = pixels.shape[:2]
+    u, v = pixels.reshape(-1, 2).astype(np.intp).T
+    light, use, clipped = patches.look(u, v, np.repeat(np.arange(shape[0]), shape[1]))
+    looked = (light.reshape(3, *shape), use.reshape(shape).astype(np.float32), clipped.reshape(shape))
+    paint = as_probability(patches.output.odds_at(pixels)).astype(np.float32)
+    spacing = quad.length.max(axis=1) * (1 + 2 * _MARGIN_ALONG) / _SEARCH_ALONG
+    none = np.zeros((0, *shape), dtype=np.intp)
+    return Lattice.about(frames, quad, pixels, looked, none), paint, spacing
 
 
-def lay_lattice(scene: Scene, frames: StraightFrames, corners_px: FloatArray) -> Lattice:
+def lay_lattice(patches: Patches, frames: LensFrames, corners_px: FloatArray) -> Lattice:
     """The pixels about the sides of quadrilaterals ``corners_px`` (M, 4, 2), recorded px."""
     bow_px = frames.bow_px(corners_px)
     spare = np.ceil(bow_px)[:, None].astype(np.intp) + int(_OUTSIDE_PX)
     low = np.floor(corners_px.min(axis=1)).astype(np.intp) - spare
     size = np.ceil(corners_px.max(axis=1)).astype(np.intp) + spare + 1 - low
-    columns, rows = _lattice(corners_px - low[:, None], size)
+    in_box = Quad(corners_px - low[:, None])
+    columns, rows = _columns_and_rows(in_box, size)
     across, down = columns.shape[1], rows.shape[1]
-    band = _in_band(corners_px - low[:, None], bow_px, columns, rows)
+    band = _in_band(in_box, bow_px, columns, rows)
     band[..., -1] = band[:, -1] = False
     cell = np.flatnonzero(band)
     marking, within = np.divmod(cell, across * down)
@@ -128,77 +157,17 @@ def lay_lattice(scene: Scene, frames: StraightFrames, corners_px: FloatArray) ->
     # Where a band is thinned, the next in its row is the neighbour.
     thinned = np.flatnonzero((thin[marking[:-1]] > 1) & (marking[1:] == marking[:-1]) & (i[1:] == i[:-1]))
     neighbours[0, marking[thinned], place[thinned]] = place[thinned] + 1
-    light, use, clipped = scene.look(u, v, marking, frames.view.camera.linear_response)
+    light, use, clipped = patches.look(u, v, marking)
     planes = np.zeros((3, *shape), dtype=np.float32)
     planes[:, marking, place] = light
     used, limited = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.bool_)
     used[marking, place], limited[marking, place] = use, clipped
-    return _lattice_of(frames, frames.from_image(corners_px), pixels, (planes, used, limited), neighbours)
-
-
-_SEARCH_ALONG, _SEARCH_ACROSS = 40, 12
-"""Rows and columns of the coarse grid on which a fit begins."""
-
-_MARGIN_ALONG, _MARGIN_ACROSS = 0.2, 0.4
-"""How far it reaches beyond a quadrilateral, in its lengths and widths."""
-
-
-def lay_grid(
-    scene: Scene, frames: StraightFrames, corners_px: FloatArray
-) -> tuple[Lattice, np.ndarray, FloatArray]:
-    """A coarse grid all over quadrilaterals ``corners_px`` (M, 4, 2), recorded px, and beyond them.
-
-    Returns:
-        The lattice, the network's probability of paint there (M, N), and how far apart its points are (M,),
-        px.
-    """
-    corners = frames.from_image(corners_px)
-    length = side_frames(corners)[2]
-    lengthwise = length[:, 0] + length[:, 2] >= length[:, 1] + length[:, 3]
-    ordered = np.where(lengthwise[:, None, None], corners, following(corners))
-    a, b = (
-        np.linspace(-margin, 1 + margin, count)
-        for margin, count in ((_MARGIN_ALONG, _SEARCH_ALONG), (_MARGIN_ACROSS, _SEARCH_ACROSS))
-    )
-    a, b = (part.ravel() for part in np.meshgrid(a, b))
-    weight = np.stack([(1 - a) * (1 - b), a * (1 - b), a * b, (1 - a) * b], axis=1)
-    pixels = np.round(frames.to_px(weight @ ordered))
-    pixels = np.clip(pixels, -(10**6), 10**6)
-    shape = pixels.shape[:2]
-    marking = np.repeat(np.arange(shape[0]), shape[1])
-    u, v = pixels.reshape(-1, 2).astype(np.intp).T
-    light, use, clipped = scene.look(u, v, marking, frames.view.camera.linear_response)
-    parts = (light.reshape(3, *shape), use.reshape(shape).astype(np.float32), clipped.reshape(shape))
-    paint = as_probability(scene.foreground.odds_at(pixels)).astype(np.float32)
-    spacing = length.max(axis=1) * (1 + 2 * _MARGIN_ALONG) / _SEARCH_ALONG
-    none = np.zeros((0, *shape), dtype=np.intp)
-    return _lattice_of(frames, corners, pixels, parts, none), paint, spacing
-
-
-def _lattice_of(
-    frames: StraightFrames,
-    corners: FloatArray,
-    pixels: FloatArray,
-    looked: tuple[np.ndarray, np.ndarray, np.ndarray],
-    neighbours: np.ndarray,
-) -> Lattice:
-    """A lattice of pixels (M, N, 2) about quadrilaterals (M, 4, 2) in their frames."""
-    light, used, limited = looked
-    points = np.ones((len(pixels), 3, pixels.shape[1]), dtype=np.float32)
-    points[:, :2] = frames.from_image(pixels).swapaxes(1, 2)
-    values = _clearest(light, used, _inside(corners, points))
-    hats, slope = _light_basis(corners, points)
-    of_side = _of_side(corners, points) * used[..., None]
-    clipped = limited.sum(axis=1) / np.maximum(used.sum(axis=1), 1)
-    return Lattice(points, values, used, limited, clipped, neighbours, of_side, hats, slope)
-
-
-_GREY_FIRST = 1.2
-"""By how many times clearer red or blue must be for grey to be left: grey has the least noise."""
+    quad = Quad(frames.from_image(corners_px))
+    return Lattice.about(frames, quad, pixels, (planes, used, limited), neighbours)
 
 
 def _clearest(light: np.ndarray, used: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Of log grey, red and blue (3, M, N) the one (M, N) that tells a marking's inside best from its outside.
+    """Log grey, red or blue (M, N), in which a marking's inside differs most from its outside, of (3, M, N).
 
     Yellow paint on light ground is as bright in grey, but darker in blue.
     """
@@ -213,30 +182,11 @@ def _clearest(light: np.ndarray, used: np.ndarray, inside: np.ndarray) -> np.nda
     return np.asarray(light[clear.argmax(axis=0), np.arange(light.shape[1])])
 
 
-def _inside(corners: FloatArray, points: np.ndarray) -> np.ndarray:
-    """Which points (M, 3, N) lie inside quadrilaterals (M, 4, 2), float32 1 or 0."""
-    return np.asarray((_outward(corners) @ points).max(axis=1) < 0, dtype=np.float32)
-
-
-def _outward(corners: FloatArray) -> np.ndarray:
-    """Rows (M, 4, 3) that take (x, y, 1) to the distance outside each side."""
-    _, normal, _ = side_frames(corners)
-    rows = np.concatenate([normal, -(normal * corners).sum(axis=-1)[..., None]], axis=-1)
-    return rows.astype(np.float32)
-
-
-def _of_side(corners: FloatArray, points: np.ndarray) -> np.ndarray:
-    """Which side (M, N, 4), 1 or 0, every point (M, 3, N) is nearest to."""
-    nearest = (_outward(corners) @ points).argmax(axis=1)
-    return np.asarray(nearest[..., None] == np.arange(4), dtype=np.float32)
-
-
-def _light_basis(corners: FloatArray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _light_basis(quad: Quad, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Hat functions (M, KNOTS, N) along the longest side, and a slope (M, N) across it."""
-    tangent, _, length = side_frames(corners)
-    along = tangent[np.arange(len(corners)), length.argmax(axis=1)]
+    along = quad.tangent[np.arange(len(points)), quad.length.argmax(axis=1)]
     axes = np.stack([along, along[:, ::-1] * [-1.0, 1.0]], axis=1)
-    within = corners @ axes.swapaxes(1, 2)
+    within = quad.corners @ axes.swapaxes(1, 2)
     middle = (within.max(axis=1) + within.min(axis=1)) / 2
     half = np.ptp(within, axis=1) / 2 + _OUTSIDE_PX
     rows = np.concatenate([axes / half[..., None], -(middle / half)[..., None]], axis=-1).astype(np.float32)
@@ -253,24 +203,20 @@ def _near_the_next(places: np.ndarray, size: np.ndarray) -> BoolArray:
     return np.asarray(apart == np.where(within, apart, apart.max()).min(axis=1, keepdims=True))
 
 
-def _lattice(corners: FloatArray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _columns_and_rows(quad: Quad, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Columns (M, W) and rows (M, H) that leave about ``_MAX_PIXELS`` of the bands about sides, or some more.
 
     Neighbouring pixels say nearly the same, so a large marking needs only some of them; columns or rows
     are left out along the marking's longer extent, the finer sampling staying across it. Of a slim one few
-    are left out at its two ends, which tell how long it is, but more between.
-
-    Args:
-        corners: (M, 4, 2) px from the box's first pixel.
-        size: (M, 2) the box, px.
+    are left out at its two ends, which show how long it is, but more between. ``size`` (M, 2) is that of the
+    box from whose first pixel the corners count, px.
     """
-    each = np.arange(len(corners))
+    each = np.arange(len(size))
     along = np.where(size[:, 0] >= size[:, 1], 0, 1)
-    step, band = _lattice_steps(corners, along)
-    place, extent = np.sort(corners[each, :, along], axis=1), size[each, along]
-    thick = width(corners)
-    head = np.ceil(np.minimum(place[:, 1], place[:, 0] + thick) + _END_PX).astype(np.intp)
-    tail = np.floor(np.maximum(place[:, 2], place[:, 3] - thick) - _END_PX).astype(np.intp)
+    step, band = _lattice_steps(quad, along)
+    place, extent = np.sort(quad.corners[each, :, along], axis=1), size[each, along]
+    head = np.ceil(np.minimum(place[:, 1], place[:, 0] + quad.width) + _END_PX).astype(np.intp)
+    tail = np.floor(np.maximum(place[:, 2], place[:, 3] - quad.width) - _END_PX).astype(np.intp)
     slim = (step[each, along] > 1) & (head + extent - tail < _MOST_ENDS * extent)
     per_place = band / extent
     between = np.ceil(per_place * (tail - head) / _MAX_BETWEEN).astype(np.intp)
@@ -279,7 +225,7 @@ def _lattice(corners: FloatArray, size: np.ndarray) -> tuple[np.ndarray, np.ndar
     step[each[slim], along[slim]] = np.maximum(between[slim], 1)
     outer = np.ones_like(step)
     outer[each[slim], along[slim]] = at_ends[slim]
-    bounds = np.zeros((len(corners), 2, 2), dtype=np.intp)
+    bounds = np.zeros((len(size), 2, 2), dtype=np.intp)
     bounds[..., 1] = size
     bounds[each[slim], along[slim]] = np.column_stack([head, tail])[slim]
     columns, rows = (_steps(bounds[:, axis], step[:, axis], outer[:, axis], size[:, axis]) for axis in (0, 1))
@@ -301,11 +247,10 @@ def _steps(bounds: np.ndarray, step: np.ndarray, outer: np.ndarray, size: np.nda
     return np.asarray(np.where(k < first, k * outer, np.where(k < first + between, middle, last)))
 
 
-def _lattice_steps(corners: FloatArray, along: np.ndarray) -> tuple[np.ndarray, FloatArray]:
+def _lattice_steps(quad: Quad, along: np.ndarray) -> tuple[np.ndarray, FloatArray]:
     """Steps (M, 2) along u and v that leave about ``_MAX_PIXELS`` of the band (M,) px about the sides."""
-    _, _, length = side_frames(corners)
-    longest, area = length.max(axis=1), np.abs(signed_area(corners))
-    band = area + _OUTSIDE_PX * (length.sum(axis=1) + 4 * _OUTSIDE_PX)
+    longest, area = quad.length.max(axis=1), quad.area
+    band = area + _OUTSIDE_PX * (quad.length.sum(axis=1) + 4 * _OUTSIDE_PX)
     band -= np.maximum(longest - 2 * _INSIDE_PX, 0) * np.maximum(area / longest - 2 * _INSIDE_PX, 0)
     ratio = np.maximum(band / _MAX_PIXELS, 1.0)
     longer = np.ceil(ratio / np.maximum(ratio / 4, 1))
@@ -315,18 +260,13 @@ def _lattice_steps(corners: FloatArray, along: np.ndarray) -> tuple[np.ndarray, 
     return step, band
 
 
-def _in_band(corners: FloatArray, bow_px: FloatArray, columns: np.ndarray, rows: np.ndarray) -> BoolArray:
-    """Which pixels (M, H, W) of a lattice are near the nearest side of quadrilaterals (M, 4, 2).
-
-    The sides are bowed by up to ``bow_px`` (M,).
-    """
-    _, normal, _ = side_frames(corners)
-    offset = (normal * corners).sum(axis=-1).astype(np.float32)
-    normal = normal.astype(np.float32)
+def _in_band(quad: Quad, bow_px: FloatArray, columns: np.ndarray, rows: np.ndarray) -> BoolArray:
+    """Which pixels (M, H, W) of a lattice are near a side; sides are bowed by up to ``bow_px`` (M,)."""
+    outward = quad.outward.astype(np.float32)
     u, v = columns[:, None, :].astype(np.float32), rows[:, :, None].astype(np.float32)
-    reach = np.full((len(corners), rows.shape[1], columns.shape[1]), -np.inf, dtype=np.float32)
+    reach = np.full((len(u), rows.shape[1], columns.shape[1]), -np.inf, dtype=np.float32)
     for side in range(4):
-        by_row = normal[:, side, 1, None, None] * v - offset[:, side, None, None]
-        np.maximum(reach, normal[:, side, 0, None, None] * u + by_row, out=reach)
+        by_u, by_v, offset = outward[:, side, :, None, None].swapaxes(0, 1)
+        np.maximum(reach, by_u * u + (by_v * v + offset), out=reach)
     spare = bow_px.astype(np.float32)[:, None, None]
     return np.asarray((reach < spare + np.float32(_OUTSIDE_PX)) & (reach > -spare - np.float32(_INSIDE_PX)))

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from tests.detection.pictures import bar, brightness_model, diamond, extrinsic, make_camera, picture
-from v2hdm.detection import sight as sight_module
-from v2hdm.detection.camera.view import CameraView
+from v2hdm.detection import network as network_module
+from v2hdm.detection.camera import RoadCamera
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.network import Network, NetworkOutput
+from v2hdm.detection.network import Network, NetworkOutput, RawOutput, run_on_road
 from v2hdm.detection.options import DetectorOptions
-from v2hdm.detection.sight import Sight, look
 from v2hdm.geometry.ipm import ipm_from_extrinsic
 from v2hdm.records import LANE_DASH, STOP_LINE, Camera, CameraInfo
 
@@ -28,7 +27,7 @@ def large_camera(width: int = 1280, height: int = 720) -> Camera:
 class LineNetwork(Network):
     """Finds, on every row anchor, the columns where an image's red channel turns from 0 to 255."""
 
-    def run(self, image_bgr: np.ndarray) -> NetworkOutput:
+    def run(self, image_bgr: np.ndarray) -> RawOutput:
         output = super().run(image_bgr)
         stride = self.info.lane_stride
         lanes = output.lanes.copy()
@@ -39,19 +38,19 @@ class LineNetwork(Network):
             cell = edge / stride
             if 0 < cell < lanes.shape[2]:
                 lanes[:, row, int(cell)] = 5.0, cell - int(cell) - 0.5
-        return NetworkOutput(output.paint, output.kinds, lanes)
+        return RawOutput(output.paint, output.kinds, lanes)
 
 
 def test_both_resolutions_say_the_same_of_the_same_place(tmp_path):
     camera = large_camera()
-    view = CameraView(camera)
+    view = RoadCamera(camera)
     network = Network(brightness_model(tmp_path))
     image = picture(camera, [diamond(5.0, 0.0)])
-    twice = look(network, image, view)
-    assert sight_module._seam_row(network, view) is not None
+    twice = run_on_road(network, image, view)
+    assert network_module._seam_row(network, view) is not None
     view.fine_row = None
-    assert sight_module._seam_row(network, view) is None
-    once = look(network, image, view)
+    assert network_module._seam_row(network, view) is None
+    once = run_on_road(network, image, view)
     assert twice.paint.shape == once.paint.shape
     assert twice.kinds.shape == once.kinds.shape
     both, either = ((once.paint > 0) & (twice.paint > 0)).sum(), ((once.paint > 0) | (twice.paint > 0)).sum()
@@ -65,7 +64,7 @@ def test_row_anchors_of_the_two_resolutions_lie_on_one_line(tmp_path):
     image = np.zeros((camera.info.height, camera.info.width, 3), dtype=np.uint8)
     for v in range(camera.info.height):
         image[v, int(200 + 0.5 * v) :, 2] = 255
-    rows = look(LineNetwork(brightness_model(tmp_path)), image, CameraView(camera)).anchors
+    rows = run_on_road(LineNetwork(brightness_model(tmp_path)), image, RoadCamera(camera)).anchors
     v = np.array([row.v_px for row in rows])
     u = np.array([row.u_px[0] for row in rows])
     assert (np.diff(v) < 0).all()
@@ -76,18 +75,20 @@ def test_row_anchors_of_the_two_resolutions_lie_on_one_line(tmp_path):
 @pytest.mark.parametrize(("width", "height"), [(1280, 720), (1242, 375), (1288, 722), (640, 480)])
 def test_the_parts_cover_the_band_whatever_the_image_size(tmp_path, width, height):
     camera = large_camera(width, height)
-    view = CameraView(camera)
-    sight = look(Network(brightness_model(tmp_path)), np.zeros((height, width, 3), dtype=np.uint8), view)
+    view = RoadCamera(camera)
+    sight = run_on_road(
+        Network(brightness_model(tmp_path)), np.zeros((height, width, 3), dtype=np.uint8), view
+    )
     rows = height - view.far_row
     assert sight.paint.shape == (-(-rows // 2), -(-width // 2))
     assert sight.kinds.shape[1:] == (-(-rows // 4), -(-width // 4))
 
 
-def looked_at(image: np.ndarray, mirrored: bool) -> Sight:
+def looked_at(image: np.ndarray, mirrored: bool) -> NetworkOutput:
     """What the shipped network says of an image, looked at whole."""
-    view = CameraView(large_camera(image.shape[1], image.shape[0]))
+    view = RoadCamera(large_camera(image.shape[1], image.shape[0]))
     view.fine_row = None
-    return look(Network(), image, view, mirrored)
+    return run_on_road(Network(), image, view, mirrored)
 
 
 def test_with_its_mirror_image_the_network_says_the_same_of_both_sides():

@@ -9,10 +9,9 @@ import pytest
 
 from tests.detection.pictures import bar, brightness_model, diamond, make_camera, picture, to_image
 from train.fit_judge import fit
+from v2hdm.detection.classifier import AMONG, SHAPES
 from v2hdm.detection.detector import Detector
-from v2hdm.detection.markings.evidence import FEATURES
-from v2hdm.detection.markings.judge import SHAPES, TOLD
-from v2hdm.detection.markings.rectified import CHANNELS
+from v2hdm.detection.evidence import CHANNELS, FEATURES
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.detection.weights import CONFIDENCE_FILE, JUDGE_FILE
 
@@ -45,7 +44,7 @@ def test_judge_and_weights_are_those_of_the_evidence_that_is_gathered():
     assert label["shapes"] == [*SHAPES]
     fitted = json.loads(CONFIDENCE_FILE.read_text())
     assert set(fitted) == set(SHAPES)
-    assert all(set(fitted[shape]["weights"]) == set(TOLD) for shape in SHAPES)
+    assert all(set(fitted[shape]["weights"]) == set(AMONG) for shape in SHAPES)
 
 
 def test_an_end_worn_to_shreds_is_trusted_less_than_a_clean_one(tmp_path):

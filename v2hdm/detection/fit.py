@@ -1,31 +1,30 @@
 """One fit for every marking, near and far: a quadrilateral in the log of the image's grey values.
 
-In frames in which the lens bends nothing (:mod:`.frames`), the log grey of a pixel is modelled as
-``light(s) + c x + log(1 + (exp(k) - 1) C)``: C is the quadrilateral's coverage blurred by the point spread, k
-the log contrast of paint over ground, ``light`` a piecewise linear function along the marking and c a slope
-across it. A shadow is a factor on paint and ground alike, so it goes into the light and moves no side.
-Gauss-Newton with Cauchy weights finds the ends of the four sides, blur, contrast and light.
+In frames in which the lens bends nothing, the log grey of a pixel is modelled as ``light(s) + c x + log(1 +
+(exp(k) - 1) C)``: C is the quadrilateral's coverage blurred by the point spread, k the log contrast of paint
+over ground, ``light`` a piecewise linear function along the marking and c a slope across it. A shadow is a
+factor on paint and ground alike, so it goes into the light and moves no side. Gauss-Newton with Cauchy
+weights finds the ends of the four sides, blur, contrast and light, of all markings of an image at once.
 
 Nothing is ever "not found". Every side has the residual variance of its own pixels, the outline that the
 network drew is a weak observation of every side, and a side at the image's border is all but free. A crack
 along one side, clipped paint, an occluder or the border thereby show as a large covariance in the direction
-that they hide.
+that they hide. A corner is where two sides meet, so that its covariance follows from theirs: where the end of
+a side is vague, the corner may lie far along it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.markings.coverage import blurred_coverage
-from v2hdm.detection.markings.fitted import Fit, corner_from_side
-from v2hdm.detection.markings.frames import StraightFrames
-from v2hdm.detection.markings.lattice import KNOTS, Lattice, Scene, lay_grid, lay_lattice
-from v2hdm.detection.markings.robust import add_paint, pixel_weights
-from v2hdm.geometry.planar import signed_area
-from v2hdm.geometry.quadrilateral import is_convex_px, side_frames
+from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.coverage import add_paint, blurred_coverage, pixel_weights
+from v2hdm.detection.lattice import KNOTS, Lattice, lay_grid, lay_lattice
+from v2hdm.detection.patch import LensFrames, Patches
+from v2hdm.geometry.quadrilateral import Quad, is_convex_px
 from v2hdm.records import BoolArray, FloatArray
 
 TYPICAL_BLUR_PX = 0.75
@@ -42,8 +41,7 @@ _SEARCH_SIGMA = 0.1
 """How far the network's outline is from the end of a side before the search, in lengths of the marking."""
 
 _CLOSURE_SHARE, _CLOSURE_M = 0.03, 0.005
-"""By how much the sum of a marking's opposite corners differs, in parts of the root of its area, at least in
-m.
+"""Standard deviation of the sum of opposite corners, in parts of the root of the area and at least in m.
 
 Stencils are true to 5 mm; a guess of the mounting that is 2 degrees off makes 3 % of a parallelogram.
 """
@@ -65,7 +63,7 @@ _BEYOND_PX = 6.0
 """How far beyond the border a side that it cuts is started, px: farther than the blur reaches."""
 
 _CONTRAST, _CONTRAST_SIGMA = 0.95, 1.0
-"""Log contrast of paint over ground: FIT's measurement on asphalt, widened for worn and for fresh paint."""
+"""Log contrast of paint over ground, as measured on asphalt, widened for worn and for fresh paint."""
 
 _MOST_CONTRAST = 4.0
 """Log contrast of white paint on the blackest ground."""
@@ -107,7 +105,7 @@ STATISTICS = (
     "log_last_step",
     "log_gap",
 )
-"""Names of the columns of :attr:`~v2hdm.detection.markings.fitted.Fit.statistics`.
+"""Names of the columns of :attr:`Fit.statistics`.
 
 Log contrast of paint over ground; scatter of log grey over contrast, over all and on the worst side; mean
 robust weight; share of clipped pixels; blur, px; log of the standard deviation of the two ends and of the two
@@ -115,75 +113,147 @@ long sides, px; log of the longest way of a corner from the outline and of the l
 it is from a parallelogram on the ground, in the deviation that is expected.
 """
 
+_ALTERNATING = np.array([1.0, -1.0, 1.0, -1.0])
+_DIFFERENCE = np.diff(np.eye(KNOTS), axis=0)
+_ROUGHNESS = _DIFFERENCE.T @ _DIFFERENCE + 1e-6 * np.eye(KNOTS)
+
+_TILT_SHARE = 0.5
+"""A side that is off as a whole is askew by this share of that."""
+
+_WHOLE_SIDES = np.kron([[1.0, 1.0], [1.0, 1.0]], np.eye(4)) + _TILT_SHARE**2 * np.kron(
+    [[1.0, -1.0], [-1.0, 1.0]], np.eye(4)
+)
+"""Covariance of the starts and ends of sides that are off as a whole by one."""
+
+_CORNER = np.arange(4)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """M fitted quadrilaterals ``quad`` in their ``frames``.
+
+    ``side_covariance`` (M, 8, 8), px^2, is that of the moves of the sides' starts and ends along their
+    outward normals. ``statistics`` (M, len(STATISTICS)) say how well the model explains the pixels.
+    ``open_sides`` (M, 4) are those cut by the image's border.
+    """
+
+    frames: LensFrames
+    quad: Quad
+    side_covariance: FloatArray
+    statistics: FloatArray
+    open_sides: BoolArray
+
+    @cached_property
+    def corners_px(self) -> FloatArray:
+        """Corners (M, 4, 2), recorded px."""
+        return self.frames.to_px(self.quad.corners)
+
+    def covariance_px(self, side_sigma_px: FloatArray | None = None) -> FloatArray:
+        """Covariance (M, 8, 8) of the corners, px^2.
+
+        ``side_sigma_px`` (M, 4) is how far each side as a whole may be off besides, for reasons that
+        residuals do not show, px.
+        """
+        by_side = self.side_covariance
+        if side_sigma_px is not None:
+            sigma = np.tile(side_sigma_px, 2)
+            by_side = by_side + sigma[:, :, None] * _WHOLE_SIDES * sigma[:, None, :]
+        jacobian = self.quad.corner_from_side
+        covariance = jacobian @ by_side @ jacobian.swapaxes(1, 2) + self._second_order(by_side)
+        jacobian = self.frames.jacobian(self.quad.corners)
+        return np.asarray(jacobian @ covariance @ jacobian.swapaxes(1, 2))
+
+    def side_variance(self) -> FloatArray:
+        """Variance (M, 4), px^2, of the place of each side's middle along its normal."""
+        start, end, both = self._ends(self.side_covariance)
+        return np.asarray((start + end + 2 * both) / 4)
+
+    def _ends(self, by_side: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Variances (M, 4) of each side's start and end, and their covariance."""
+        start, end = by_side[:, _CORNER, _CORNER], by_side[:, _CORNER + 4, _CORNER + 4]
+        return start, end, by_side[:, _CORNER, _CORNER + 4]
+
+    def _second_order(self, by_side: FloatArray) -> FloatArray:
+        """Covariance (M, 8, 8), px^2, that the error of a side's direction adds where its end is vague.
+
+        A corner that may lie far along a side is off across it by its way times the error of the side's
+        direction.
+        """
+        start, end, both = self._ends(by_side)
+        normal = self.quad.normal
+        tilt = np.maximum(start + end - 2 * both, 0) / np.maximum(self.quad.length, 1.0) ** 2
+        out = np.zeros((len(normal), 4, 2, 4, 2))
+        # Corner c runs along side c if the end of side c - 1 is vague, along side c - 1 if the start of c is.
+        for of, slack in ((_CORNER, np.roll(end, 1, axis=1)), (_CORNER - 1, start)):
+            variance = tilt[:, of] * slack
+            outer = normal[:, of, :, None] * normal[:, of, None, :]
+            out[:, _CORNER, :, _CORNER] += (variance[..., None, None] * outer).swapaxes(0, 1)
+        return out.reshape(-1, 8, 8)
+
 
 def fit_quadrilaterals(
-    scene: Scene,
-    view: CameraView,
+    patches: Patches,
+    camera: RoadCamera,
     corners_px: FloatArray,
     open_sides: BoolArray,
     blur_px: float = TYPICAL_BLUR_PX,
 ) -> Fit:
-    """Fit quadrilaterals that start at ``corners_px`` (M, 4, 2), the network's outlines.
+    """Fit quadrilaterals that start at ``corners_px`` (M, 4, 2), the network's outlines, recorded px.
 
     The first steps look at a coarse grid all over each, and at the network's probability of paint there as a
-    second picture of the same shape; the last at the pixels about its sides.
-
-    Args:
-        scene: the image, and which of its paint is each marking's own.
-        view: the camera.
-        corners_px: starting corners, recorded px.
-        open_sides: (M, 4) sides that the image's border cuts.
-        blur_px: the point spread's standard deviation, pixel aperture included.
+    second picture of the same shape; the last at the pixels about its sides. ``open_sides`` (M, 4) are those
+    that the image's border cuts, ``blur_px`` is the point spread's sigma, pixel aperture included.
     """
-    frames = StraightFrames.about(view, corners_px)
-    drawn = frames.from_image(corners_px)
+    frames = LensFrames.about(camera, corners_px)
     # Out of sight, so that the pixels at the border say nothing of where such a side is.
     beyond_px = np.tile(np.where(open_sides, _BEYOND_PX, 0.0), 2)
-    start = drawn + (corner_from_side(drawn) @ beyond_px[..., None]).reshape(-1, 4, 2)
-    corners_px = frames.to_px(start)
-    length_px = side_frames(start)[2].max(axis=1)
-    grid, paint, spacing_px = lay_grid(scene, frames, corners_px)
-    state = _State.at(start, np.maximum(_SEARCH_BLUR * spacing_px, _LEAST_SEARCH_BLUR_PX), blur_px, frames)
-    state.outline_sigma_px = np.tile(np.where(open_sides, _OPEN_SIGMA, _SEARCH_SIGMA) * length_px[:, None], 2)
+    start = Quad(frames.from_image(corners_px)).moved(beyond_px)
+    corners_px = frames.to_px(start.corners)
+    length_px = start.length.max(axis=1)[:, None]
+
+    grid, paint, spacing_px = lay_grid(patches, frames, corners_px)
+    search_blur_px = np.maximum(_SEARCH_BLUR * spacing_px, _LEAST_SEARCH_BLUR_PX)
+    sigma_px = np.tile(np.where(open_sides, _OPEN_SIGMA, _SEARCH_SIGMA) * length_px, 2)
+    state = _State.at(start, search_blur_px, blur_px, sigma_px, frames)
     state.settle(grid, _SEARCH_STEPS, paint)
-    lost = ~_sound(state.corners, start)
-    state.corners[lost] = start[lost]
-    searched_px = frames.to_px(state.corners)
+    searched = state.quad.corners.copy()
+    lost = ~_sound(state.quad, start)
+    searched[lost] = start.corners[lost]
+    searched_px = frames.to_px(searched)
     # Beyond the image a lens model may fold.
-    folded = ~view.inside(searched_px, -_OPEN_SIGMA * _OUTLINE_SIGMA_PX).all(axis=1) & ~open_sides.any(axis=1)
-    folded |= ~(np.ptp(searched_px, axis=1).max(axis=1) < 2 * np.ptp(corners_px, axis=1).max(axis=1))
-    state.corners[folded], searched_px[folded] = start[folded], corners_px[folded]
-    searched = state.corners.copy()
-    lattice = lay_lattice(scene, frames, searched_px)
-    sigma_px = np.where(open_sides, _OPEN_SIGMA * length_px[:, None], _OUTLINE_SIGMA_PX)
-    inward_px = np.repeat(
-        -_BLOOM * blur_px * np.minimum(lattice.clipped / _MUCH_CLIPPED, 1.0)[:, None], 8, axis=1
+    folded = ~camera.inside(searched_px, -_OPEN_SIGMA * _OUTLINE_SIGMA_PX).all(axis=1) & ~open_sides.any(
+        axis=1
     )
-    begun = searched + (corner_from_side(searched) @ inward_px[..., None]).reshape(-1, 4, 2)
-    state = _State.at(begun, np.full(len(start), blur_px), blur_px, frames)
-    state.outline_sigma_px = np.tile(sigma_px, 2)
+    folded |= ~(np.ptp(searched_px, axis=1).max(axis=1) < 2 * np.ptp(corners_px, axis=1).max(axis=1))
+    searched[folded], searched_px[folded] = start.corners[folded], corners_px[folded]
+
+    lattice = lay_lattice(patches, frames, searched_px)
+    found = Quad(searched)
+    inward_px = -_BLOOM * blur_px * np.minimum(lattice.clipped / _MUCH_CLIPPED, 1.0)
+    begun = found.moved(np.repeat(inward_px[:, None], 8, axis=1))
+    sigma_px = np.tile(np.where(open_sides, _OPEN_SIGMA * length_px, _OUTLINE_SIGMA_PX), 2)
+    state = _State.at(begun, np.full(len(searched), blur_px), blur_px, sigma_px, frames)
     system = state.settle(lattice, _STEPS)
     covariance = np.linalg.inv(system.information)[:, :8, :8]
     last = system.by_side
     covariance = covariance + last[:, :, None] * last[:, None, :] + _MODEL_SIGMA_PX**2 * np.eye(8)
-    astray = ~_sound(state.corners, searched)
-    state.corners[astray] = searched[astray]
-    covariance[astray] = np.einsum("mi,ij->mij", state.outline_sigma_px[astray] ** 2, np.eye(8))
-    moved_px = np.abs(state.corners - start).max(axis=(1, 2))
+    astray = ~_sound(state.quad, found)
+    corners = state.quad.corners.copy()
+    corners[astray] = searched[astray]
+    covariance[astray] = np.einsum("mi,ij->mij", sigma_px[astray] ** 2, np.eye(8))
+    state.quad = Quad(corners)
+    moved_px = np.abs(corners - start.corners).max(axis=(1, 2))
     statistics = _statistics(state, system, lattice, covariance, moved_px)
-    return Fit(frames, state.corners, covariance, statistics, open_sides)
+    return Fit(frames, state.quad, covariance, statistics, open_sides)
 
 
-def _sound(corners: FloatArray, before: FloatArray) -> BoolArray:
-    """Which quadrilaterals (M, 4, 2) are convex and share about the place and size of those ``before``."""
-    size = np.ptp(before, axis=1).max(axis=1)
-    moved = np.abs(corners.mean(axis=1) - before.mean(axis=1)).max(axis=1)
-    area = np.abs(signed_area(corners)) / np.maximum(np.abs(signed_area(before)), 1e-6)
-    near = (
-        (moved < _MOST_MOVED * size + 2 * _OUTLINE_SIGMA_PX)
-        & (area < _MOST_GROWTH)
-        & (area > 1 / _MOST_GROWTH)
-    )
+def _sound(quad: Quad, before: Quad) -> BoolArray:
+    """Which quadrilaterals (M,) are convex and share about the place and size of those ``before``."""
+    corners, old = quad.corners, before.corners
+    moved = np.abs(corners.mean(axis=1) - old.mean(axis=1)).max(axis=1)
+    area = quad.area / np.maximum(before.area, 1e-6)
+    near = moved < _MOST_MOVED * np.ptp(old, axis=1).max(axis=1) + 2 * _OUTLINE_SIGMA_PX
+    near &= (area < _MOST_GROWTH) & (area > 1 / _MOST_GROWTH)
     return np.asarray(is_convex_px(corners) & np.isfinite(corners).all(axis=(1, 2)) & near)
 
 
@@ -207,43 +277,48 @@ class _System:
 
 @dataclass
 class _State:
-    """The unknowns of M markings: corners, blur, contrast, light (M, KNOTS) and its slope across.
+    """The unknowns of M markings: quadrilateral, blur, contrast, light (M, KNOTS) and its slope across.
 
     ``outline`` (M, 4, 2) are the corners that the network drew, ``outline_sigma_px`` (M, 8) how far its
     sides' starts and ends are off along their normals. ``closure`` (M, 2, 8) takes the corners to p0 - p1 +
     p2 - p3 on the ground in its standard deviation, ``gap`` (M, 2) is that of the outline.
     """
 
-    corners: FloatArray
+    quad: Quad
     blur_px: FloatArray
-    contrast: FloatArray
-    expected_contrast: FloatArray
-    light: FloatArray
-    slope: FloatArray
     expected_blur_px: float
     outline: FloatArray
     outline_sigma_px: FloatArray
     closure: FloatArray
     gap: FloatArray
+    contrast: FloatArray
+    expected_contrast: FloatArray
+    light: FloatArray
+    slope: FloatArray
 
     @classmethod
     def at(
-        cls, corners: FloatArray, blur_px: FloatArray, expected_blur_px: float, frames: StraightFrames
+        cls,
+        quad: Quad,
+        blur_px: FloatArray,
+        expected_blur_px: float,
+        outline_sigma_px: FloatArray,
+        frames: LensFrames,
     ) -> _State:
-        """Of starting corners (M, 4, 2); light and contrast are not known yet (nan)."""
-        count = len(corners)
-        contrast, slope = np.full(count, _CONTRAST), np.zeros(count)
-        light, sigma = np.full((count, KNOTS), np.nan), np.ones((count, 8))
-        closure, gap = _closure(corners, frames)
-        start = corners.copy(), blur_px.copy(), contrast, contrast.copy(), light, slope, expected_blur_px
-        return cls(*start, corners, sigma, closure, gap)
+        """The state at a start; light and contrast are not known yet (nan)."""
+        count = len(blur_px)
+        outline = quad.corners, outline_sigma_px, *_closure(quad.corners, frames)
+        contrast, light = np.full(count, _CONTRAST), np.full((count, KNOTS), np.nan)
+        return cls(
+            quad, blur_px, expected_blur_px, *outline, contrast, contrast.copy(), light, np.zeros(count)
+        )
 
     def settle(self, lattice: Lattice, steps: int, paint: np.ndarray | None = None) -> _System:
         """Gauss-Newton until each marking's step is small; the system is that of its last step.
 
         With the network's probability of ``paint`` (M, N) that is a second picture, and the blur is held.
         """
-        running = np.arange(len(self.corners))
+        running = np.arange(len(self.blur_px))
         system: _System | None = None
         wide_scatter = _FINAL_SCATTER if paint is None else _WIDE_SCATTER
         for number in range(steps):
@@ -263,16 +338,19 @@ class _State:
         return system
 
     def _take(self, rows: np.ndarray) -> _State:
-        return _State(*(v[rows] if isinstance(v, np.ndarray) else v for v in vars(self).values()))
+        parts = {name: v[rows] for name, v in vars(self).items() if isinstance(v, np.ndarray)}
+        return _State(Quad(self.quad.corners[rows]), expected_blur_px=self.expected_blur_px, **parts)
 
     def _put(self, rows: np.ndarray, other: _State) -> None:
-        for name, value in vars(self).items():
-            if isinstance(value, np.ndarray):
-                value[rows] = getattr(other, name)
+        for name in ("blur_px", "contrast", "expected_contrast", "light", "slope"):
+            getattr(self, name)[rows] = getattr(other, name)
+        corners = self.quad.corners.copy()
+        corners[rows] = other.quad.corners
+        self.quad = Quad(corners)
 
     def step(self, lattice: Lattice, paint: np.ndarray | None, least_scatter: float) -> _System:
         """One Gauss-Newton step, in place; the robust scale is ``least_scatter`` or more."""
-        coverage, by_shape = blurred_coverage(self.corners, lattice.points, self.blur_px)
+        coverage, by_shape = blurred_coverage(self.quad, lattice.points, self.blur_px)
         hats, across = lattice.hats, lattice.across
         if np.isnan(self.light).any():
             self._first_light(lattice, coverage)
@@ -300,7 +378,7 @@ class _State:
         moved = np.linalg.solve(information, gradient[..., None])[..., 0]
         most_px = _MAX_STEP * self.blur_px[:, None]
         by_side = np.clip(moved[:, :_BLUR], -most_px, most_px)
-        self.corners += (corner_from_side(self.corners) @ by_side[..., None]).reshape(-1, 4, 2)
+        self.quad = self.quad.moved(by_side)
         if paint is None:
             self.blur_px = np.clip(self.blur_px + moved[:, _BLUR], *_BLUR_LIMITS_PX)
         self.contrast = self.contrast + np.clip(moved[:, _K], -0.5, 0.5)
@@ -325,19 +403,19 @@ class _State:
 
     def open_gap(self) -> FloatArray:
         """The sum p0 - p1 + p2 - p3 of the corners on the ground (M, 2), in its deviation."""
-        return np.asarray((self.closure @ (self.corners - self.outline).reshape(-1, 8, 1))[..., 0] + self.gap)
+        moved = (self.quad.corners - self.outline).reshape(-1, 8, 1)
+        return np.asarray((self.closure @ moved)[..., 0] + self.gap)
 
     def _add_priors(self, information: FloatArray, gradient: FloatArray, *, hold_blur: bool) -> None:
         """Add the outline, the typical blur and contrast, and that light changes little."""
-        _, normal, _ = side_frames(self.corners)
-        off = self.outline - self.corners
+        normal, off = self.quad.normal, self.outline - self.quad.corners
         start = (off * normal).sum(axis=-1)
         end = (np.roll(off, -1, axis=1) * normal).sum(axis=-1)
         stiffness = 1 / self.outline_sigma_px**2
         place = np.arange(8)
         information[:, place, place] += stiffness
         gradient[:, :8] += stiffness * np.concatenate([start, end], axis=1)
-        by_side = self.closure @ corner_from_side(self.corners)
+        by_side = self.closure @ self.quad.corner_from_side
         open_ = self.open_gap()
         information[:, :8, :8] += by_side.swapaxes(1, 2) @ by_side
         gradient[:, :8] -= (by_side.swapaxes(1, 2) @ open_[..., None])[..., 0]
@@ -352,28 +430,23 @@ class _State:
         gradient[:, _SLOPE] -= self.slope / _LIGHT_STEP**2
 
 
-def _closure(corners: FloatArray, frames: StraightFrames) -> tuple[FloatArray, FloatArray]:
+def _closure(corners: FloatArray, frames: LensFrames) -> tuple[FloatArray, FloatArray]:
     """The gap p0 - p1 + p2 - p3 on the ground, in its deviation: derivative (M, 2, 8) and value (M, 2).
 
     It is 0 for parallelograms, as all markings are painted. 0 where a corner shows no ground.
     """
     pinhole = frames.to_pinhole(corners)
     flat = pinhole.reshape(-1, 2)
-    ground = frames.view.ground(flat).reshape(corners.shape)
-    by_corner = frames.view.ground_jacobian(flat).reshape(-1, 4, 2, 2) @ np.linalg.inv(frames.scale)[:, None]
-    size_m = np.sqrt(np.abs(signed_area(ground)))
+    ground = frames.camera.ground(flat).reshape(corners.shape)
+    by_corner = (
+        frames.camera.ground_jacobian(flat).reshape(-1, 4, 2, 2) @ np.linalg.inv(frames.scale)[:, None]
+    )
+    size_m = np.sqrt(Quad(ground).area)
     sigma_m = np.asarray(np.maximum(_CLOSURE_SHARE * size_m, _CLOSURE_M))[:, None, None]
     derivative = (_ALTERNATING[:, None, None] * by_corner).transpose(0, 2, 1, 3).reshape(-1, 2, 8) / sigma_m
     gap = _ALTERNATING @ ground / sigma_m[..., 0]
     known = np.isfinite(derivative).all(axis=(1, 2)) & np.isfinite(gap).all(axis=1)
     return np.where(known[:, None, None], derivative, 0.0), np.where(known[:, None], gap, 0.0)
-
-
-_ALTERNATING = np.array([1.0, -1.0, 1.0, -1.0])
-
-
-_DIFFERENCE = np.diff(np.eye(KNOTS), axis=0)
-_ROUGHNESS = _DIFFERENCE.T @ _DIFFERENCE + 1e-6 * np.eye(KNOTS)
 
 
 def _statistics(
@@ -383,8 +456,7 @@ def _statistics(
     side_sigma = (
         np.sqrt(np.maximum(covariance[:, np.arange(8), np.arange(8)], 1e-8)).reshape(-1, 2, 4).mean(axis=1)
     )
-    length = side_frames(state.corners)[2]
-    lengthwise = length[:, 0] + length[:, 2] >= length[:, 1] + length[:, 3]
+    lengthwise = state.quad.lengthwise
     pairs = (side_sigma[:, :2] + side_sigma[:, 2:]) / 2
     long, end = np.where(lengthwise, pairs[:, 0], pairs[:, 1]), np.where(lengthwise, pairs[:, 1], pairs[:, 0])
     columns = {

@@ -6,19 +6,15 @@ from what it does alone would believe it where it is wrong.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from unittest.mock import patch
 
 import cv2
 import numpy as np
 
 from train.examples import MAX_RANGE_M, Example
 from v2hdm.catalogue import PAINT_CLASSES
-from v2hdm.detection.camera.view import CameraView
-from v2hdm.detection.network import Network
-from v2hdm.detection.sight import Sight, look
+from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.network import NetworkOutput
 from v2hdm.records import CROSSWALK_BAR, DIAMOND, LANE_DASH, FloatArray
 
 SPOTS = 3
@@ -32,10 +28,10 @@ _GAIN = (1.3, 3.5)
 _BOUND_PX = 6
 """Distance of spots from markings, which must not change, px."""
 
-_SWORN_ODDS = (4.0, 16.0)
+_CLAIM_ODDS = (4.0, 16.0)
 """How fast the network's log odds of paint rise with the light of a spot."""
 
-_SWORN_LOGIT = 8.0
+_CLAIM_LOGIT = 8.0
 _CLAIMED = {DIAMOND: 0.6, LANE_DASH: 0.2, CROSSWALK_BAR: 0.2}
 
 
@@ -47,17 +43,17 @@ class Spots:
     steepness: float
     kind: str
 
-    def sworn(self, sight: Sight, view: CameraView, stride: int) -> Sight:
+    def claimed(self, output: NetworkOutput) -> NetworkOutput:
         """The network's output, in which the spots are confident paint of their class."""
-        paint, kinds = sight.paint.copy(), sight.kinds.copy()
-        light = self._at(paint.shape, stride, view.far_row)
+        paint, kinds, stride = output.paint.copy(), output.kinds.copy(), output.stride
+        light = self._at(paint.shape, stride, output.top)
         claimed = np.clip(self.steepness * (light - 0.5), -6, 6)
         np.maximum(paint, claimed, out=paint, where=light > 0)
-        step = round(stride * sight.kind_scale)
-        within = self._at((kinds.shape[1], kinds.shape[2]), step, view.far_row) > 0.05
+        step = round(stride * output.kind_scale)
+        within = self._at((kinds.shape[1], kinds.shape[2]), step, output.top) > 0.05
         kinds[:, within] = kinds[:, within].min(axis=0)
-        kinds[PAINT_CLASSES.index(self.kind), within] += _SWORN_LOGIT
-        return replace(sight, paint=paint, kinds=kinds)
+        kinds[PAINT_CLASSES.index(self.kind), within] += _CLAIM_LOGIT
+        return replace(output, paint=paint, kinds=kinds)
 
     def _at(self, shape: tuple[int, ...], step: int, top: int) -> np.ndarray:
         """The light (h, w) at elements ``step`` px apart, from image row ``top`` on."""
@@ -65,7 +61,7 @@ class Spots:
         return cv2.remap(self.light, *np.meshgrid(u, v + top), cv2.INTER_LINEAR, borderValue=0)
 
 
-def lit(shown: Example, view: CameraView, rng: np.random.Generator) -> tuple[Example, Spots]:
+def lit(shown: Example, view: RoadCamera, rng: np.random.Generator) -> tuple[Example, Spots]:
     """An image with some spots of sun on its ground, none of them on a marking."""
     taken = np.zeros(shown.image.shape[:2], dtype=np.uint8)
     for true in shown.markings:
@@ -83,10 +79,10 @@ def lit(shown: Example, view: CameraView, rng: np.random.Generator) -> tuple[Exa
     gain = 1 + (rng.uniform(*_GAIN) - 1) * light[..., None]
     image = np.clip(np.round(shown.image * gain), 0, 255).astype(np.uint8)
     kind = str(rng.choice(list(_CLAIMED), p=list(_CLAIMED.values())))
-    return replace(shown, image=image), Spots(light, float(rng.uniform(*_SWORN_ODDS)), kind)
+    return replace(shown, image=image), Spots(light, float(rng.uniform(*_CLAIM_ODDS)), kind)
 
 
-def _ground(shape: tuple[int, ...], view: CameraView) -> FloatArray:
+def _ground(shape: tuple[int, ...], view: RoadCamera) -> FloatArray:
     """Where each pixel (H, W, 2) shows the ground, vehicle frame, m; NaN above the rows in reach."""
     v, u = np.mgrid[view.far_row : shape[0], 0 : shape[1]]
     ground = np.full((*shape, 2), np.nan)
@@ -95,7 +91,7 @@ def _ground(shape: tuple[int, ...], view: CameraView) -> FloatArray:
     return ground
 
 
-def _spot(ground: FloatArray, view: CameraView, soft: float, rng: np.random.Generator) -> np.ndarray | None:
+def _spot(ground: FloatArray, view: RoadCamera, soft: float, rng: np.random.Generator) -> np.ndarray | None:
     """The light (H, W) of an ellipse somewhere on the ground that is wholly in the image; None for none."""
     height, width = ground.shape[:2]
     centre = ground[rng.integers(view.far_row, height), rng.integers(width)]
@@ -109,14 +105,3 @@ def _spot(ground: FloatArray, view: CameraView, soft: float, rng: np.random.Gene
     light = (fade * fade * (3 - 2 * fade)).astype(np.float32)
     border = np.concatenate([light[0], light[-1], light[:, 0], light[:, -1]])
     return light if light.any() and not border.any() else None
-
-
-@contextmanager
-def swearing(spots: Spots) -> Iterator[None]:
-    """Within, the network is confident that the spots of sun are markings."""
-
-    def seen(network: Network, image: np.ndarray, view: CameraView, mirrored: bool = False) -> Sight:
-        return spots.sworn(look(network, image, view, mirrored), view, network.info.paint_stride)
-
-    with patch("v2hdm.detection.detector.look", seen):
-        yield

@@ -1,8 +1,13 @@
-"""From the network's outputs to blobs of paint: what is connected, of which class, its soft outline."""
+"""Proposals: connected pieces of paint, the classes each may be of, and a quadrilateral around it.
+
+The class of a proposal is a matter of odds, never of a rule: the network's share of each class times how well
+the size on the ground suits it. All classes with four corners that are not negligible are handed to the
+classifier.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -10,8 +15,10 @@ import cv2
 import numpy as np
 
 from v2hdm.catalogue import OTHER, SHIPPED, SYMBOL, Catalogue
-from v2hdm.detection.odds import as_probability
-from v2hdm.detection.sight import Sight
+from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.network import NetworkOutput, as_probability
+from v2hdm.geometry.planar import rectangle_size
+from v2hdm.geometry.quadrilateral import following, is_convex_px, quad_from_hull
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _MIN_CELLS = 5
@@ -33,6 +40,24 @@ _MOST_PARTS = 12
 """Parts that are looked at of one piece: more are the grains of bad light."""
 
 _OUTLINE_SCALE = 4
+
+_LEAST_CERTAINTY = 0.3
+"""Least mean probability of paint of a piece; below it one in fifty is a marking."""
+
+_LEAST_CLASS_SHARE = 0.02
+"""Least share of a class, by network and size, with which it is proposed."""
+
+_CLASS_DOUBT = 0.05
+"""Share of its certainty about classes that the network may give to wrong ones."""
+
+_GROUP_DOUBT = 0.1
+"""Share of a group's certainty that each of its classes may have: seen from near by a dash is like a line."""
+
+_LEAST_FILL = 0.5
+"""Least share of a quadrilateral that its piece of paint fills: a triangle fills half."""
+
+_BORDER_PX = 3.0
+"""A side this near to the image's border is cut by it: the network's outline is coarser than this."""
 
 
 @dataclass(frozen=True)
@@ -58,14 +83,131 @@ class Blob:
     traced: bool = True
 
     @property
-    def cells(self) -> int:
-        """How many elements it covers."""
-        return int(np.count_nonzero(self.level > 0))
+    def kind(self) -> str:
+        """The likeliest class."""
+        return max(self.class_score, key=self.class_score.__getitem__)
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A piece of paint: ``blob`` and its ``index``, the ``share`` of each class by network and size.
+
+    ``outline_vehicle`` (N, 2), m, is its outline on the ground. ``corners_pinhole_px`` (4, 2) is the tightest
+    quadrilateral around it, of which it fills ``fill``; None where there is none.
+    """
+
+    blob: Blob
+    index: int
+    share: Mapping[str, float]
+    outline_vehicle: FloatArray
+    corners_pinhole_px: FloatArray | None
+    fill: float
 
     @property
     def kind(self) -> str:
         """The likeliest class."""
-        return max(self.class_score, key=self.class_score.__getitem__)
+        return max(self.share, key=self.share.__getitem__)
+
+    @property
+    def certainty(self) -> float:
+        """Mean probability of paint."""
+        return sum(self.blob.class_score.values())
+
+    def score_of(self, kinds: Iterable[str]) -> float:
+        """Mean probability of some classes, by the network alone."""
+        return sum(self.blob.class_score.get(kind, 0.0) for kind in kinds)
+
+    def kinds(self, catalogue: Catalogue) -> list[str]:
+        """The classes with four corners that it may be of, the likeliest first."""
+        if self.corners_pinhole_px is None or self.fill < _LEAST_FILL:
+            return []
+        found = [
+            k for k in self.share if catalogue.classes[k].cornered and self.share[k] >= _LEAST_CLASS_SHARE
+        ]
+        return sorted(found, key=lambda name: -self.share[name])
+
+
+@dataclass(frozen=True)
+class Proposals:
+    """One image between network and fit: the network's output, and the ``pieces`` of paint in it.
+
+    ``owner`` (h, w) is 1 + the index of the piece that each element of the output's paint is of, 0 for none.
+    """
+
+    camera: RoadCamera
+    output: NetworkOutput
+    pieces: Sequence[Proposal]
+    owner: np.ndarray
+
+
+def propose(
+    blobs: Sequence[Blob], camera: RoadCamera, catalogue: Catalogue, max_range_m: float
+) -> list[Proposal]:
+    """The proposals of one image's pieces of paint."""
+    if not blobs:
+        return []
+    outlines = camera.undistort(np.concatenate([blob.outline_px for blob in blobs]))
+    on_ground = camera.ground(outlines)
+    ends = np.cumsum([0, *(len(blob.outline_px) for blob in blobs)]).tolist()
+    found = []
+    for index, (blob, (begin, end)) in enumerate(zip(blobs, pairwise(ends), strict=True)):
+        if sum(blob.class_score.values()) < _LEAST_CERTAINTY:
+            continue
+        ground = on_ground[begin:end]
+        whole = bool(camera.inside(blob.outline_px, _BORDER_PX).all())
+        share = _shares(blob, *rectangle_size(ground), catalogue, whole=whole)
+        start = _tightest(outlines[begin:end])
+        if start is not None and not _within(start[0], camera, max_range_m):
+            start = None
+        found.append(Proposal(blob, index, share, ground, *(start or (None, 0.0))))
+    return found
+
+
+def open_sides(corners_px: FloatArray, camera: RoadCamera) -> BoolArray:
+    """Which sides (M, 4) of quadrilaterals (M, 4, 2), recorded px, the image's border cuts."""
+    return ~camera.inside((corners_px + following(corners_px)) / 2, _BORDER_PX)
+
+
+def _shares(
+    blob: Blob, length_m: float, width_m: float, catalogue: Catalogue, *, whole: bool
+) -> dict[str, float]:
+    """Share of each class of the catalogue, by network and size."""
+    certainty = max(sum(blob.class_score.values()), 1e-9)
+    known = {name: score for name, score in blob.class_score.items() if name in catalogue.classes}
+    groups: dict[str, float] = {}
+    for name, score in known.items():
+        group = catalogue.classes[name].group
+        groups[group] = groups.get(group, 0.0) + score
+    likely = {
+        name: (
+            score / certainty
+            + _CLASS_DOUBT / len(known)
+            + _GROUP_DOUBT * groups[catalogue.classes[name].group] / certainty
+        )
+        * float(np.exp(catalogue.classes[name].size_log_likelihood(length_m, width_m, whole=whole)))
+        for name, score in known.items()
+    }
+    total = max(sum(likely.values()), 1e-12)
+    return {name: value / total for name, value in likely.items()}
+
+
+def _within(corners: FloatArray, camera: RoadCamera, max_range_m: float) -> bool:
+    """Whether a quadrilateral (4, 2), pinhole px, is convex, on the ground and in range."""
+    if not is_convex_px(corners):
+        return False
+    ground = camera.ground(corners)
+    return bool(np.isfinite(ground).all() and camera.range_m(ground.mean(axis=0)) <= max_range_m)
+
+
+def _tightest(outline_pinhole_px: FloatArray) -> tuple[FloatArray, float] | None:
+    """The tightest quadrilateral around the hull of an outline (N, 2), and how much of it the hull fills."""
+    first = outline_pinhole_px[0]
+    hull = cv2.convexHull((outline_pinhole_px - first).astype(np.float32))
+    quad = quad_from_hull(hull)
+    if quad is None:
+        return None
+    area_px2 = float(cv2.contourArea(quad.astype(np.float32)))
+    return quad + first, cv2.contourArea(hull) / max(area_px2, 1e-6)
 
 
 @dataclass(frozen=True)
@@ -91,61 +233,44 @@ class _Groups:
 
 
 def find_blobs(
-    sight: Sight,
-    classes: Sequence[str],
-    stride: int,
-    top_px: int,
-    reach_px: int = 0,
-    catalogue: Catalogue = SHIPPED,
+    output: NetworkOutput, reach_px: int = 0, catalogue: Catalogue = SHIPPED
 ) -> tuple[list[Blob], np.ndarray]:
-    """Split the paint of one image into blobs.
+    """Split the paint of one image into blobs; nothing is split within the groups of the catalogue's classes.
 
-    Args:
-        sight: what the network says of a band of the image.
-        classes: names of the channels of its ``kinds``.
-        stride: recorded pixels per element of its ``paint``.
-        top_px: image row at which the band starts.
-        reach_px: image row; blobs that lie above it as a whole are too far away to be of use.
-        catalogue: tells the groups of the classes, within which nothing is split.
+    Blobs that lie above the image row ``reach_px`` as a whole are too far away to be of use.
 
     Returns:
         The blobs, and a map (h, w) int16 with 1 + the index of the blob that covers each element of
         ``paint``, that of the part where a piece has parts, 0 for none.
     """
     # A frame of no paint around it lets every outline close.
-    level = cv2.copyMakeBorder(sight.paint, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-1.0)
-    corner_px = np.array([(stride - 1) / 2 - stride, (stride - 1) / 2 - stride + top_px])
-    level, contours, piece = _connected(level, (reach_px - top_px) / stride + 1)
-    said = _hearsay(sight, classes, piece, level, len(contours))
+    level = cv2.copyMakeBorder(output.paint, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-1.0)
+    contours, piece = _connected(level, (reach_px - output.top) / output.stride + 1)
+    cells, score = _class_scores(output, piece, level, len(contours))
     outlines = _outlines(level, piece, len(contours))
     owner = np.zeros_like(piece)
-    groups = _Groups.of(classes, catalogue)
+    groups = _Groups.of(output.classes, catalogue)
     blobs: list[Blob] = []
-    wholes, stats, whole_of = _doubtful(level, contours, said.cells)
+    wholes, stats, whole_of = _doubtful(level, contours, cells)
     first_of_whole: dict[int, int] = {}
     for index in np.argsort(whole_of, kind="stable").tolist():
-        if said.cells[index] < _MIN_CELLS:
+        if cells[index] < _MIN_CELLS:
             continue
         label = int(whole_of[index])
         if label and label not in first_of_whole:
             first_of_whole[label] = len(blobs)
-            x, y, w, h = stats[label, : cv2.CC_STAT_AREA].tolist()
-            box = (slice(y - 1, y + h + 1), slice(x - 1, x + w + 1))
-            first_px = corner_px + stride * np.array([x - 1.0, y - 1.0])
-            mask, raised = wholes[box] == label, level[box] - np.float32(_DOUBTFUL)
-            whole = _blob(mask, raised, sight, (y - 1, x - 1), classes, first_px, stride)
-            blobs.append(replace(whole, traced=False))
-        x, y, w, h = cv2.boundingRect(contours[index])
-        box = (slice(y - 1, y + h + 1), slice(x - 1, x + w + 1))
-        origin_px = corner_px + stride * np.array([x - 1.0, y - 1.0])
+            box = _framed(*stats[label, : cv2.CC_STAT_AREA].tolist())
+            raised = level[box] - np.float32(_DOUBTFUL)
+            blobs.append(replace(_blob(wholes[box] == label, raised, output, box), traced=False))
+        box = _framed(*cv2.boundingRect(contours[index]))
         inside = piece[box] == index + 1
-        scores = dict(zip(classes, said.score[:, index].tolist(), strict=True))
-        outline_px = corner_px + stride * outlines[index]
-        parts = _split(inside, level[box], sight, box, classes, origin_px, stride, groups)
-        signed = _signed(inside, level[box])
+        parts = _split(inside, level[box], output, box, groups)
+        scores = dict(zip(output.classes, score[:, index].tolist(), strict=True))
+        outline_px = _origin_px(output, 0, 0) + output.stride * outlines[index]
+        signed, origin_px = _signed(inside, level[box]), _origin_px(output, box[0].start, box[1].start)
         by_class = any(part.traced for part in parts)
         blobs.append(
-            Blob(scores, signed, origin_px, stride, outline_px, parts=len(parts), traced=not by_class)
+            Blob(scores, signed, origin_px, output.stride, outline_px, parts=len(parts), traced=not by_class)
         )
         owner[box][inside] = len(blobs)
         for part in parts:
@@ -155,6 +280,17 @@ def find_blobs(
             first = first_of_whole[label]
             blobs[first] = replace(blobs[first], parts=len(blobs) - 1 - first)
     return blobs, owner[1:-1, 1:-1]
+
+
+def _framed(x: int, y: int, width: int, height: int) -> tuple[slice, slice]:
+    """Rows and columns of a box with one element around it."""
+    return slice(y - 1, y + height + 1), slice(x - 1, x + width + 1)
+
+
+def _origin_px(output: NetworkOutput, row: int, column: int) -> FloatArray:
+    """Recorded px (2,) of an element of the framed ``paint``."""
+    first = (output.stride - 1) / 2 - output.stride
+    return np.array([first + output.stride * column, first + output.top + output.stride * row])
 
 
 def _doubtful(
@@ -174,52 +310,33 @@ def _doubtful(
     own = labels[at[:, 1], at[:, 0]].astype(np.int64)
     sure = np.bincount(own, cells, len(stats)) / np.maximum(stats[:, cv2.CC_STAT_AREA], 1)
     several = np.bincount(own, minlength=len(stats)) > 1
-    asked = (several | (sure < _MOST_SURE)) & (sure > _LEAST_SURE)
-    return labels, stats, np.where(asked[own], own, 0)
+    unclear = (several | (sure < _MOST_SURE)) & (sure > _LEAST_SURE)
+    return labels, stats, np.where(unclear[own], own, 0)
 
 
-def _connected(level: np.ndarray, least_row: float) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
-    """Contours of paint that reaches ``least_row``, and a map of 1 + the number of each, holes filled.
-
-    They are zero crossings of the level that comes first.
-    """
+def _connected(level: np.ndarray, least_row: float) -> tuple[list[np.ndarray], np.ndarray]:
+    """Contours of paint that reaches ``least_row``, and a map of 1 + the number of each, holes filled."""
     contours, _ = cv2.findContours((level > 0).view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    kept = [c for c in contours if len(c) >= 4 and _end_row(c) >= least_row]
+    kept = [c for c in contours if len(c) >= 4 and c[:, 0, 1].max() + 1 >= least_row]
     piece = np.zeros(level.shape, dtype=np.int16)
     for index, contour in enumerate(kept):
         cv2.drawContours(piece, [contour], -1, index + 1, cv2.FILLED)
-    return level, kept, piece
+    return kept, piece
 
 
-def _end_row(contour: np.ndarray) -> int:
-    """The row below the last one that a contour reaches."""
-    _, y, _, height = cv2.boundingRect(contour)
-    return int(y + height)
-
-
-@dataclass(frozen=True)
-class _Hearsay:
-    """What the network says of B pieces of paint.
-
-    ``cells`` (B,) are their sizes, ``score`` (K, B) the mean probability of each class.
-    """
-
-    cells: np.ndarray
-    score: FloatArray
-
-
-def _hearsay(
-    sight: Sight, classes: Sequence[str], piece: np.ndarray, level: np.ndarray, count: int
-) -> _Hearsay:
+def _class_scores(
+    output: NetworkOutput, piece: np.ndarray, level: np.ndarray, count: int
+) -> tuple[np.ndarray, FloatArray]:
+    """Sizes (B,) of pieces of paint in cells, and the mean probability (K, B) of each class."""
     at = np.flatnonzero(piece > 0)
     own = piece.ravel()[at] - 1
     cells = np.bincount(own, minlength=count)
     share = 1 / np.maximum(cells, 1)
     certainty = np.bincount(own, as_probability(level.ravel()[at]), count) * share
     i, j = np.divmod(at, piece.shape[1])
-    probability = _class_probability(sight, i - 1, j - 1)
+    probability = output.class_probability(i - 1, j - 1)
     score = np.stack([np.bincount(own, plane, count) for plane in probability]) * share
-    return _Hearsay(cells, certainty * score)
+    return cells, certainty * score
 
 
 def _outlines(level: np.ndarray, piece: np.ndarray, count: int) -> list[FloatArray]:
@@ -241,76 +358,51 @@ def _outlines(level: np.ndarray, piece: np.ndarray, count: int) -> list[FloatArr
 
 
 def _split(
-    inside: BoolArray,
-    level: np.ndarray,
-    sight: Sight,
-    box: tuple[slice, slice],
-    classes: Sequence[str],
-    origin_px: FloatArray,
-    stride: int,
-    groups: _Groups,
+    inside: BoolArray, level: np.ndarray, output: NetworkOutput, box: tuple[slice, slice], groups: _Groups
 ) -> list[Blob]:
     """The parts that a piece (h, w) may be: those of different groups of classes, or else of sure paint."""
     rows, columns = np.nonzero(inside)
-    probability = _class_probability(sight, rows + box[0].start - 1, columns + box[1].start - 1)
+    probability = output.class_probability(rows + box[0].start - 1, columns + box[1].start - 1)
     group_of = groups.of_class
     votes = np.bincount(group_of[probability.argmax(axis=0)], minlength=len(groups.least_share)) / len(rows)
     present = np.flatnonzero(votes >= groups.least_share)
     levels = [level - _SURE]
     if len(present) > 1:
-        levels = [np.minimum(level, _lead(sight, group_of == group, box)) for group in present]
-    corner = (box[0].start, box[1].start)
+        levels = [np.minimum(level, _lead(output, group_of == group, box)) for group in present]
     parts = []
     for own_level in levels:
         _, labels, stats, _ = cv2.connectedComponentsWithStats(((own_level > 0) & inside).view(np.uint8))
         for label in np.flatnonzero(stats[:, cv2.CC_STAT_AREA] >= _MIN_CELLS)[:_MOST_PARTS].tolist():
             if label:
-                parts.append(_blob(labels == label, own_level, sight, corner, classes, origin_px, stride))
+                parts.append(_blob(labels == label, own_level, output, box))
     if len(parts) < 2:
         return []
     touches = any(part.kind in groups.symbols for part in parts)
     return [replace(part, touches_symbol=touches, traced=len(present) > 1) for part in parts]
 
 
-def _blob(
-    mask: BoolArray,
-    level: np.ndarray,
-    sight: Sight,
-    corner: tuple[int, int],
-    classes: Sequence[str],
-    origin_px: FloatArray,
-    stride: int,
-) -> Blob:
-    """The blob of a mask (h, w), a piece of the frame from row and column ``corner`` on."""
+def _blob(mask: BoolArray, level: np.ndarray, output: NetworkOutput, box: tuple[slice, slice]) -> Blob:
+    """The blob of a mask (h, w), a box of the framed ``paint``."""
     rows, columns = np.nonzero(mask)
-    probability = _class_probability(sight, rows + corner[0] - 1, columns + corner[1] - 1)
+    probability = output.class_probability(rows + box[0].start - 1, columns + box[1].start - 1)
     scores = probability.mean(axis=1) * as_probability(level[mask]).mean()
     signed = _signed(mask, level)
     top, left = max(int(rows.min()) - 1, 0), max(int(columns.min()) - 1, 0)
     near = signed[top : int(rows.max()) + 2, left : int(columns.max()) + 2]
-    outline_px = origin_px + stride * (np.array([left, top]) + zero_crossings(near))
-    return Blob(dict(zip(classes, scores.tolist(), strict=True)), signed, origin_px, stride, outline_px)
+    origin_px = _origin_px(output, box[0].start, box[1].start)
+    outline_px = origin_px + output.stride * (np.array([left, top]) + zero_crossings(near))
+    named = dict(zip(output.classes, scores.tolist(), strict=True))
+    return Blob(named, signed, origin_px, output.stride, outline_px)
 
 
-def _class_probability(sight: Sight, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Probability (K, N) of each class at elements of ``paint``."""
-    scale, width = sight.kind_scale, sight.kinds.shape[2]
-    place = (rows / scale).astype(np.intp) * width + (columns / scale).astype(np.intp)
-    odds = sight.kinds.reshape(len(sight.kinds), -1).take(place, axis=1)
-    odds -= odds.max(axis=0)
-    np.exp(odds, out=odds)
-    odds /= odds.sum(axis=0)
-    return np.asarray(odds)
-
-
-def _lead(sight: Sight, mine: BoolArray, box: tuple[slice, slice]) -> np.ndarray:
+def _lead(output: NetworkOutput, mine: BoolArray, box: tuple[slice, slice]) -> np.ndarray:
     """By how much the best class of ``mine`` (K,) leads the best of the rest, in logits.
 
     It is interpolated to the elements of the framed ``paint`` in a box, (h, w).
     """
-    scale = sight.kind_scale
+    scale = output.kind_scale
     near = tuple(slice(max(int((p.start - 2) / scale) - 1, 0), int(p.stop / scale) + 2) for p in box)
-    kinds = sight.kinds[:, *near]
+    kinds = output.kinds[:, *near]
     lead = kinds[mine].max(axis=0) - kinds[~mine].max(axis=0)
     v, u = (
         (np.arange(part.start, part.stop, dtype=np.float32) - 0.5) / np.float32(scale) - (0.5 + first.start)

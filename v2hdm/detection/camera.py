@@ -1,0 +1,377 @@
+"""A camera over a road: its lens, the ground that its pixels show, its horizon, and where it is mounted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from v2hdm.errors import MapFileError
+from v2hdm.geometry.ipm import (
+    apply_homography,
+    apply_in_front,
+    extrinsic_from_ipm,
+    facing_ipm,
+    ground_from_pinhole_px,
+    homography_jacobian,
+    ipm_from_extrinsic,
+)
+from v2hdm.geometry.lens import distort_points, has_distortion, undistort_points
+from v2hdm.geometry.rigid import camera_centre
+from v2hdm.records import DISTORTION_COEFFICIENTS, BoolArray, Calibration, Camera, CameraInfo, FloatArray
+
+_LUT_STEP_PX = 4
+_HORIZON_MARGIN_PX = 16
+
+FARTHEST_M = 60.0
+"""Neither markings nor lines are looked for beyond this: networks are shown none beyond 50 m."""
+
+_SURROUNDINGS_PX = 24
+"""So far above the farthest ground what is there helps to classify what lies on it."""
+
+FINE_ENOUGH_M = 0.007
+"""Ground per pixel, across the view, of which half the resolution shows enough: a dash stays 10 px wide."""
+
+ASIDE_RAD = np.deg2rad(60)
+"""A camera that looks farther than this off the way that its vehicle drives, ahead or back, looks aside."""
+
+_LEAST_BELOW_PX = 4.0
+"""Nearer to the horizon than this nothing is known of the ground."""
+
+CURVE_UNIT_PX = 100.0
+"""Unit of the distance below the horizon in the basis of lanes' curves: their parameters are alike."""
+
+_PROBE_PX = 50.0
+
+_ROTATION_TOLERANCE = 1e-6
+_BELOW_M = 0.1
+_FARTHEST_MOUNT_M = 100.0
+
+
+class RoadCamera:
+    """One camera with fast lens and ground mappings, and the rows worth looking at.
+
+    Recorded pixels are those of the image, pinhole pixels those without distortion. ``top`` is the first of
+    the image rows below the horizon of the camera's initial IPM (with a margin, since that IPM is coarse; the
+    rows from there on are a multiple of ``multiple`` where the image is tall enough). ``far_row``, by a
+    multiple of ``multiple`` below ``top``, is the one from which on ground within :data:`FARTHEST_M` shows.
+    From ``fine_row`` on (None if there is no such row) a pixel is less than :data:`FINE_ENOUGH_M` of ground
+    wide. ``aside`` cameras look across the way that the vehicle drives. ``foot_vehicle`` (2,) lies below the
+    camera. Points far from any lens singularity are assumed.
+    """
+
+    def __init__(self, camera: Camera, multiple: int = 16):
+        self.camera = camera
+        self.info = camera.info
+        self.vehicle_from_pinhole_px: FloatArray = camera.ipm[camera.initial_ipm]
+        self.pinhole_px_from_vehicle: FloatArray = np.asarray(np.linalg.inv(self.vehicle_from_pinhole_px))
+        self.distorted = has_distortion(camera.info)
+        self._pinhole_lut = _build_pinhole_lut(camera.info) if self.distorted else None
+        self._ground_from_pinhole_px = facing_ipm(
+            self.vehicle_from_pinhole_px, camera.roi_vehicle.mean(axis=0)
+        )
+        cam_from_vehicle = extrinsic_from_ipm(self.info, self.vehicle_from_pinhole_px)
+        ahead, left, _ = cam_from_vehicle[2, :3]
+        self.aside = bool(np.arctan2(abs(left), abs(ahead)) > ASIDE_RAD)
+        self.foot_vehicle = camera_centre(cam_from_vehicle)[:2]
+        self.top = self._top_row(multiple)
+        spare = max(self.first_row_within(FARTHEST_M) - _SURROUNDINGS_PX - self.top, 0)
+        self.far_row = self.top + spare // multiple * multiple
+        self.fine_row = self._fine_row()
+
+    def undistort(self, points_px: FloatArray) -> FloatArray:
+        """Recorded pixels (N, 2) to pinhole pixels, from a table; within 1e-2 px of the lens model."""
+        points = np.asarray(points_px, dtype=np.float64).reshape(-1, 2)
+        if self._pinhole_lut is None or not len(points):
+            return points.copy()
+        rows, columns = self._pinhole_lut.shape[:2]
+        cell = points / _LUT_STEP_PX
+        first = np.minimum(np.maximum(np.floor(cell).astype(np.intp), 0), (columns - 2, rows - 2))
+        right, down = np.hsplit(cell - first, 2)
+        at = first[:, 0] + columns * first[:, 1]
+        lut = self._pinhole_lut.reshape(-1, 2)
+        upper = lut.take(at, axis=0) * (1 - right) + lut.take(at + 1, axis=0) * right
+        at += columns
+        lower = lut.take(at, axis=0) * (1 - right) + lut.take(at + 1, axis=0) * right
+        return np.asarray(upper * (1 - down) + lower * down)
+
+    def distort(self, points_pinhole_px: FloatArray) -> FloatArray:
+        """Pinhole pixels (N, 2) to recorded pixels."""
+        return distort_points(self.info, points_pinhole_px)
+
+    def distort_jacobian(self, points_pinhole_px: FloatArray) -> FloatArray:
+        """Derivative (N, 2, 2) of :meth:`distort`, by central differences over one pixel."""
+        points = np.asarray(points_pinhole_px, dtype=np.float64).reshape(-1, 2)
+        if not self.distorted:
+            return np.broadcast_to(np.eye(2), (len(points), 2, 2)).copy()
+        steps = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
+        moved = self.distort((points[:, None] + steps).reshape(-1, 2)).reshape(-1, 4, 2)
+        return np.stack([moved[:, 0] - moved[:, 1], moved[:, 2] - moved[:, 3]], axis=2)
+
+    def ground(self, points_pinhole_px: FloatArray) -> FloatArray:
+        """Where pinhole pixels (N, 2) meet the ground, vehicle frame, m; NaN at and above the horizon."""
+        return apply_in_front(self._ground_from_pinhole_px, points_pinhole_px)
+
+    def ground_jacobian(self, points_pinhole_px: FloatArray) -> FloatArray:
+        """Derivative (N, 2, 2) of :meth:`ground`, m per px; NaN where that is NaN."""
+        return homography_jacobian(self._ground_from_pinhole_px, points_pinhole_px)
+
+    def unproject(self, points_px: FloatArray) -> FloatArray:
+        """Where recorded pixels (..., 2) meet the ground, vehicle frame, m; NaN at and above the horizon."""
+        return self.ground(self.undistort(points_px.reshape(-1, 2))).reshape(points_px.shape)
+
+    def project(self, points_vehicle: FloatArray) -> FloatArray:
+        """Ground points (N, 2), m, as recorded pixels (N, 2)."""
+        return self.distort(apply_homography(self.pinhole_px_from_vehicle, points_vehicle))
+
+    def range_m(self, points_vehicle: FloatArray) -> FloatArray:
+        """Distance on the ground from below the camera; NaN stays NaN."""
+        return np.asarray(np.linalg.norm(points_vehicle - self.foot_vehicle, axis=-1))
+
+    def coarse(self, rows_px: FloatArray) -> BoolArray:
+        """Which rows (N,) lie so near that they are looked at in half the resolution."""
+        return np.asarray(rows_px >= (np.inf if self.fine_row is None else self.fine_row))
+
+    def inside(self, points_px: FloatArray, border_px: float) -> BoolArray:
+        """Which recorded points (..., 2) lie at least ``border_px`` inside the image."""
+        u, v = points_px[..., 0], points_px[..., 1]
+        across = (u >= border_px) & (u <= self.info.width - 1 - border_px)
+        return np.asarray(across & (v >= border_px) & (v <= self.info.height - 1 - border_px))
+
+    def footprint(self, points_px: FloatArray, calibration: Calibration) -> GroundPoints:
+        """Recorded pixels (N, 2) on the ground with their derivatives; best called once for all of an image.
+
+        A pinhole pixel shows the ground point X where ``px(cam_from_vehicle X)`` equals it. Perturbing the
+        pixel and, on the left, the transform, and holding that equality, gives ``dX = B (dpx - P [I | -[p]x]
+        dxi)``, where ``P`` is the derivative of the projection at the camera point ``p`` and ``B`` the
+        inverse of that along the ground. Left out is how the vehicle's body pitches and rolls on
+        its suspension, and that no road is a plane.
+        """
+        pinhole_px = self.undistort(points_px)
+        points_vehicle = self.ground(pinhole_px)
+        intrinsic, matrix = calibration.info.intrinsic, calibration.cam_from_vehicle
+        cam = points_vehicle @ matrix[:3, :2].T + matrix[:3, 3]
+        project = np.zeros((len(cam), 2, 3))
+        project[:, :, :2] = intrinsic[:2, :2]
+        project[:, :, 2] = intrinsic[:2, 2] - pinhole_px
+        project /= cam[:, 2, None, None]
+        by_pinhole = _inverse(project @ matrix[:3, :2])
+        moved = np.zeros((len(cam), 3, 6))
+        moved[:, range(3), range(3)] = 1.0
+        x, y, z = cam.T
+        moved[:, 0, 4], moved[:, 0, 5] = z, -y
+        moved[:, 1, 3], moved[:, 1, 5] = -z, x
+        moved[:, 2, 3], moved[:, 2, 4] = y, -x
+        by_px = by_pinhole @ _inverse(self.distort_jacobian(pinhole_px))
+        covariance = np.zeros((6, 6)) if calibration.covariance is None else calibration.covariance
+        return GroundPoints(points_vehicle, by_px, -by_pinhole @ project @ moved, covariance)
+
+    @cached_property
+    def horizon(self) -> Horizon:
+        """The camera's horizon."""
+        return Horizon(self)
+
+    def first_row_within(self, range_m: float) -> int:
+        """The uppermost row from ``top`` on that shows ground within ``range_m`` of the camera's foot."""
+        near = self.range_m(self._row_grid_vehicle()) <= range_m
+        return max(self.top, int(np.argmax(near.any(axis=1)))) if near.any() else self.info.height
+
+    def _row_grid_vehicle(self) -> FloatArray:
+        """Ground points (H, 9, 2) of every row at nine columns, vehicle frame; nan above the horizon."""
+        columns = np.linspace(0, self.info.width - 1, 9)
+        rows = np.arange(self.info.height, dtype=np.float64)
+        return self.unproject(np.stack(np.meshgrid(columns, rows), axis=-1))
+
+    def _top_row(self, multiple: int) -> int:
+        on_ground = np.any(np.isfinite(self._row_grid_vehicle()).all(axis=2), axis=1)
+        height = self.info.height - max(0, int(np.argmax(on_ground)) - _HORIZON_MARGIN_PX)
+        return self.info.height - min(-(-height // multiple) * multiple, self.info.height)
+
+    def _fine_row(self) -> int | None:
+        middle = (self.info.width - 1) / 2
+        rows = np.arange(self.top, self.info.height, dtype=np.float64)
+        left, right = (
+            self.unproject(np.column_stack([np.full_like(rows, middle + side), rows])) for side in (-0.5, 0.5)
+        )
+        coarse = ~(np.linalg.norm(right - left, axis=1) <= FINE_ENOUGH_M)
+        first = int(np.flatnonzero(coarse)[-1]) + 1 if coarse.any() else 0
+        return self.top + first if first < len(rows) else None
+
+
+def _build_pinhole_lut(info: CameraInfo) -> FloatArray:
+    """Pinhole pixel of every ``_LUT_STEP_PX``-th recorded pixel, one cell beyond the image's far border."""
+    columns = np.arange(0, info.width + _LUT_STEP_PX, _LUT_STEP_PX, dtype=np.float64)
+    rows = np.arange(0, info.height + _LUT_STEP_PX, _LUT_STEP_PX, dtype=np.float64)
+    grid_px = np.stack(np.meshgrid(columns, rows), axis=-1)
+    return undistort_points(info, grid_px.reshape(-1, 2)).reshape(*grid_px.shape)
+
+
+@dataclass(frozen=True)
+class GroundPoints:
+    """Points on the ground plane: ``points_vehicle`` (N, 2), m, nan where a pixel shows no ground.
+
+    ``by_px`` (N, 2, 2) and ``by_mounting`` (N, 2, 6) are their derivatives by the recorded pixel and by the
+    tangent of ``cam_from_vehicle``, whose covariance is ``mounting_covariance`` (6, 6).
+    """
+
+    points_vehicle: FloatArray
+    by_px: FloatArray
+    by_mounting: FloatArray
+    mounting_covariance: FloatArray
+
+    def __getitem__(self, part: slice) -> GroundPoints:
+        """Some of the points."""
+        return GroundPoints(
+            self.points_vehicle[part], self.by_px[part], self.by_mounting[part], self.mounting_covariance
+        )
+
+    def joint_covariance(self, covariance_px: FloatArray) -> FloatArray:
+        """Covariance (2N, 2N), m^2, of the stacked points (x0, y0, x1, ...).
+
+        ``covariance_px`` (2N, 2N) is that of their pixels (u0, v0, u1, ...). The rows and columns of points
+        that are not on the ground are nan.
+        """
+        count = len(self.points_vehicle)
+        blocks = np.zeros((count, 2, count, 2))
+        blocks[range(count), :, range(count)] = self.by_px
+        jacobian = blocks.reshape(2 * count, 2 * count)
+        stacked = self.by_mounting.reshape(2 * count, 6)
+        return np.asarray(
+            jacobian @ covariance_px @ jacobian.T + stacked @ self.mounting_covariance @ stacked.T
+        )
+
+    def single_covariances(self, sigma_px: float | FloatArray) -> FloatArray:
+        """Covariance (N, 2, 2), m^2, of points whose pixels are off by ``sigma_px``, one or (N,)."""
+        covariance = np.square(sigma_px)[..., None, None] * self.by_px @ np.swapaxes(self.by_px, 1, 2)
+        return np.asarray(
+            covariance + self.by_mounting @ self.mounting_covariance @ np.swapaxes(self.by_mounting, 1, 2)
+        )
+
+
+def _inverse(matrices: FloatArray) -> FloatArray:
+    """Inverses (N, 2, 2), by Cramer's rule so that nan stays where it is."""
+    (a, b), (c, d) = matrices[:, 0].T, matrices[:, 1].T
+    adjugate = np.stack([np.stack([d, -b], axis=1), np.stack([-c, a], axis=1)], axis=1)
+    return np.asarray(adjugate / (a * d - b * c)[:, None, None])
+
+
+class Horizon:
+    """Pinhole pixels of one camera in axes along and below its horizon.
+
+    ``centre_px`` is where along the horizon the camera looks. ``px_per_m`` is how many px along the horizon a
+    metre of ground is wide at one px below it; it grows in proportion.
+    """
+
+    def __init__(self, camera: RoadCamera):
+        row = camera.vehicle_from_pinhole_px[2]
+        lowest = np.array([[(camera.info.width - 1) / 2, camera.info.height - 1.0]])
+        sign = np.sign(float(row[:2] @ lowest[0] + row[2]))
+        sign = sign if np.isfinite(camera.ground(lowest)).all() else -sign
+        size = max(float(np.linalg.norm(row[:2])), 1e-12)
+        self._down = sign * row[:2] / size
+        self._along = np.array([self._down[1], -self._down[0]])
+        self._shift = float(sign * row[2] / size)
+        intrinsic = camera.info.intrinsic
+        self.centre_px = float(self.coordinates(intrinsic[None, :2, 2])[0][0])
+        beside = self.pinhole_px(self.centre_px + np.array([-0.5, 0.5]), np.full(2, _PROBE_PX))
+        ground = camera.ground(beside)
+        probe_px_per_m = 1.0 / max(float(np.linalg.norm(ground[1] - ground[0])), 1e-9)
+        self.px_per_m = probe_px_per_m / _PROBE_PX
+        range_m = float(camera.range_m(ground.mean(axis=0)))
+        by_curvature = 0.5 * range_m**2 * probe_px_per_m * _PROBE_PX / CURVE_UNIT_PX
+        self._units = np.array([float(intrinsic[0, 0]), self.px_per_m * CURVE_UNIT_PX, by_curvature])
+
+    def parameters(self, direction_rad: float, beside_m: float, curvature: float) -> FloatArray:
+        """The a, b and c (3,) of a line's direction, place beside the camera and curvature, 1/m.
+
+        To first order, about the camera's own direction.
+        """
+        return self._units * (direction_rad, beside_m, curvature)
+
+    def basis(self, below: FloatArray) -> FloatArray:
+        """The factors (N, 3) of a curve's a, b and c at distances (N,) below the horizon, px."""
+        v = np.maximum(below, _LEAST_BELOW_PX) / CURVE_UNIT_PX
+        phi = np.ones((len(v), 3))
+        phi[:, 1], phi[:, 2] = v, 1.0 / v
+        return phi
+
+    def depth_m(self, below: FloatArray) -> FloatArray:
+        """How far ahead of the camera the ground is (N,), m, at distances (N,) below the horizon, px."""
+        return np.asarray(self._units[0] / (self.px_per_m * np.maximum(below, _LEAST_BELOW_PX)))
+
+    def below_px(self, depth_m: float) -> float:
+        """How far below the horizon, px, the ground at a depth is: the inverse of :meth:`depth_m`."""
+        return float(self._units[0] / (self.px_per_m * depth_m))
+
+    def coordinates(self, pinhole_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Position along (N,) and below (N,) the horizon, px, of pinhole pixels (N, 2)."""
+        return pinhole_px @ self._along, pinhole_px @ self._down + self._shift
+
+    def pinhole_px(self, along: FloatArray, below: FloatArray) -> FloatArray:
+        """The pinhole pixels (N, 2) of :meth:`coordinates`."""
+        return np.asarray(along[:, None] * self._along + (below - self._shift)[:, None] * self._down)
+
+
+def camera_from_calibration(calibration: Calibration, linear_response: bool = False) -> Camera:
+    """A camera whose IPM is the one of a finished calibration.
+
+    Raises:
+        MapFileError: the calibration cannot be that of a camera that looks at the ground.
+    """
+    info = calibration.info
+    problem = _problem(calibration)
+    if problem:
+        raise MapFileError(f"calibration of camera '{info.name}': {problem}")
+    ipm = ipm_from_extrinsic(info, calibration.cam_from_vehicle)
+    below_px = np.array([[info.intrinsic[0, 2], info.height - 1.0]])
+    lowest = apply_in_front(ground_from_pinhole_px(info.intrinsic, calibration.cam_from_vehicle), below_px)[0]
+    if not np.isfinite(lowest).all():
+        raise MapFileError(
+            f"calibration of camera '{info.name}': the image's lowest row is above the horizon; "
+            "mend cam_from_vehicle"
+        )
+    roi_vehicle = lowest + _BELOW_M * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    return Camera(info, {"calibrated": ipm}, "calibrated", roi_vehicle, linear_response=linear_response)
+
+
+def rough_calibration(
+    name: str, width: int, height: int, height_m: float, pitch_deg: float, fov_deg: float
+) -> Calibration:
+    """A pinhole camera that looks straight ahead, for images of which nothing better is known.
+
+    Good enough to classify markings by rough size, not to measure with. ``height_m`` is above the ground,
+    ``pitch_deg`` below the horizon, ``fov_deg`` the horizontal field of view, ``width`` and ``height`` px.
+    """
+    focal_px = width / 2 / np.tan(np.deg2rad(fov_deg) / 2)
+    intrinsic = np.array([[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]])
+    c, s = np.cos(np.deg2rad(pitch_deg)), np.sin(np.deg2rad(pitch_deg))
+    cam_from_vehicle = np.eye(4)
+    cam_from_vehicle[:3, :3] = [[0, -1, 0], [-s, 0, -c], [c, 0, -s]]
+    cam_from_vehicle[:3, 3] = -cam_from_vehicle[:3, :3] @ [0, 0, height_m]
+    return Calibration(CameraInfo(name, width, height, intrinsic), cam_from_vehicle)
+
+
+def _problem(calibration: Calibration) -> str | None:
+    """The reason why a calibration cannot be used, if there is one."""
+    info, cam_from_vehicle = calibration.info, calibration.cam_from_vehicle
+    rotation = cam_from_vehicle[:3, :3]
+    count = DISTORTION_COEFFICIENTS.get(info.distortion_model)
+    if count is None:
+        known = ", ".join(DISTORTION_COEFFICIENTS)
+        return f"unknown distortion_model '{info.distortion_model}'; known are {known}"
+    if len(info.distortion) != count:
+        return f"{info.distortion_model} has {count} coefficients, not {len(info.distortion)}; mend them"
+    if info.width < 1 or info.height < 1 or min(info.intrinsic[0, 0], info.intrinsic[1, 1]) <= 0:
+        return "image size and focal lengths must be positive; mend them"
+    if np.abs(cam_from_vehicle).max() > _FARTHEST_MOUNT_M:
+        return f"cam_from_vehicle puts the camera beyond {_FARTHEST_MOUNT_M:g} m from the vehicle; mend it"
+    if (
+        np.abs(rotation @ rotation.T - np.eye(3)).max() > _ROTATION_TOLERANCE
+        or np.linalg.det(rotation) < 0
+        or not np.array_equal(cam_from_vehicle[3], [0, 0, 0, 1])
+    ):
+        return "cam_from_vehicle is no rotation and translation; write it again with `python -m v2hdm.map`"
+    if camera_centre(cam_from_vehicle)[2] <= 0:
+        return "cam_from_vehicle puts the camera on or under the ground; mend it"
+    return None

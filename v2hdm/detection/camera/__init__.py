@@ -1,1 +1,0 @@
-"""A camera as the detector knows it: lens, ground, the band of rows that shows road."""

@@ -1,0 +1,443 @@
+"""Boundaries of lanes: where along each line it is painted, in a gap or has ended, and its probability.
+
+A hidden Markov model on rows of the image, from far to near. Its states are *ended*, *gap*, *solid* and
+*dash*; the rates at which one becomes another are per metre of ground. The evidence of a row is two log odds
+of the network: of the surest crossing on the line and of the surest paint about it. The forward and backward
+pass (L. Rabiner, "A tutorial on hidden Markov models", Proc. IEEE 77, 1989) gives the probability of each
+state on each row and the likelihood of the line over that of ground without one. Two lines that are painted
+side by side are the strands of one double line: it runs along their middle where both are present, else
+along the one that is.
+
+How probable it is that a line is one of a lane is a logistic function of its features: first of each line
+alone, then with its span and among the others of its image. A road's lines run beside each other, a lane
+apart: kerbs, joints and edges of shadows run closer. The weights, in ``lane_score.json``, belong to the
+network. ``python -m train.ship`` fits them to renders which no benchmark shows.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from v2hdm.detection.camera import FARTHEST_M
+from v2hdm.detection.lanes.curves import NEIGHBOURS, LaneImage, Line, LinePoints, Span
+from v2hdm.detection.network import as_probability
+from v2hdm.detection.weights import LANE_SCORE_FILE
+from v2hdm.records import LANE_BOUNDARY, LANE_DASH, BoolArray, FloatArray, IntArray, LaneDetection
+
+DRAWN_STEP_PX = 8.0
+"""Rows of the image from one point of a line to the next, px."""
+
+_ENDED, _GAP, _SOLID, _DASH = range(4)
+_DASH_STAGES = 3
+"""Stages of a dash: its length is Erlang's distribution, which scatters about the mean by 58 %."""
+
+_STATES = _DASH + _DASH_STAGES
+_DASH_M, _GAP_M = 3.6, 5.1
+"""Mean lengths of dashes and of the gaps between them, m, in the renders (train/scenes/paint)."""
+
+_SOLID_M, _DASHED_M, _ENDED_M = 100.0, 120.0, 60.0
+"""Mean lengths, m, of solid lines, of rows of dashes, and of bare ground from one line to the next on a
+curve; fitted to renders. After the ground a solid line is as likely as a row of dashes."""
+
+_CROSSING_WEIGHT, _CROSSING_EVEN, _CROSSING_RANGE = 0.05, -2.7, (-3.0, 6.7)
+"""A crossing of log odds x, clipped to the range, adds weight * (x - even) to a line's log likelihood.
+Weights are small because rows err together; all six numbers are fitted to renders."""
+
+_PAINT_WEIGHT, _PAINT_EVEN, _PAINT_RANGE = 0.3, -1.0, (-4.0, 4.0)
+"""The same for paint and the log likelihoods of *solid* and *dash*."""
+
+_HALF_WIDTH_M, _LEAST_HALF_WIDTH_PX = 0.06, 4.0
+_ACROSS = np.linspace(-1.0, 1.0, 7)
+"""Paint of a line is looked for so far to either side of its curve, at so many places."""
+
+_CROSSING_M = 0.3
+"""Lines that lie so far to the left of another one here and so far to its right there cross it."""
+
+_DOUBLE_M = 0.75
+"""Lines nearer than this are one boundary: two strands if both show paint abreast, else one line twice."""
+
+_LEAST_ABREAST_M = 1.0
+"""Both strands of a double line show paint on so much ground abreast."""
+
+_ONE_LINE_M = 0.12
+"""Lines nearer to each other than this are one."""
+
+_CERTAIN_SIGMA_M = 0.3
+"""Rows on which a line is known worse than this do not show its place beside others."""
+
+_EVEN = 0.5
+"""A line is where it is present rather than not."""
+
+_SMOOTH_PX = 24.0
+_FREEDOM_M = 0.03
+"""A line follows its points within such a distance, and by so much."""
+
+_EXTENSION_SIGMA = 0.03
+"""Beyond its own points a line is drawn while it is known within this share of the image's width."""
+
+ALONE = (
+    "best_crossings",
+    "log_length_m",
+    "log_length_px",
+    "log_rows",
+    "along_road",
+    "paint_odds",
+    "paint_along",
+    "dash_share",
+)
+"""Features of a line by itself: log odds of its three surest crossings; its length on the ground, in the
+image and down the image (upright things are as tall as they are long); the log ratio of its being along the
+road; the log odds of its surest paint; the mean log odds of paint along it, and the share of that which the
+network takes for dashes."""
+
+SPAN = ("likelihood", "present_m", "painted_m", "painted_share")
+"""Features of a line's span: the root of its log likelihood, the length of ground on which it is present,
+that on which it shows paint between its points, and the share of rows there that do."""
+
+AMONG = ("alone", "near_horizon", *SPAN, "a_lane_apart", "too_near")
+"""Features of a line among others: its log odds alone, how far from the horizon it begins, its span; and of
+the others that run beside it, weighed by their probability, the likest one a lane away and the number of
+those nearer than a lane can be."""
+
+_NO_PAINT = -3.0
+"""Log odds of the surest paint of a line that shows none."""
+
+_BEST = 3
+_MOST_LOG_RATIO = 6.0
+_UNKNOWN = (2.3, 0.4)
+"""The last two of a line in an image of which the paint is not known: the median of true lines."""
+
+_PLACES = 24
+_ON_M = np.linspace(-0.25, 0.25, 7)
+"""Paint of a line, be it a double one, is within such a distance of where it is drawn."""
+
+_LEAST_WEIGHT = 0.05
+"""Places without paint have this weight, that of paint being one."""
+
+_LANE_M, _LANE_SIGMA_M = 3.2, 0.65
+"""Lanes of roads are 2.5 to 4 m wide."""
+
+_TOO_NEAR_M = 1.8
+_MOST_NEAR = 2.0
+"""More lines than this add nothing."""
+
+_CHANGE_M, _CHANGE_SHARE = 0.15, 0.06
+"""The distance between lines that run beside each other changes by so much and by this share of it."""
+
+
+def with_spans(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> list[Line]:
+    """The lines through an image's points with their :class:`Span`."""
+    if not lines:
+        return []
+    camera, horizon = image.camera, image.horizon
+    corners = np.array([[0.0, camera.info.height - 1.0], [camera.info.width - 1.0, camera.info.height - 1.0]])
+    lowest = float(horizon.coordinates(camera.undistort(corners))[1].max())
+    below = np.arange(horizon.below_px(FARTHEST_M), lowest + DRAWN_STEP_PX, DRAWN_STEP_PX)
+    along = np.array([line.curve.parameters for line in lines]) @ horizon.basis(below).T
+    beside_m = (along - horizon.centre_px) / (horizon.px_per_m * below)
+    step_m = np.hypot(np.diff(horizon.depth_m(below)), np.diff(beside_m, axis=1))
+    half_px = np.maximum(_HALF_WIDTH_M * horizon.px_per_m * below, _LEAST_HALF_WIDTH_PX)
+    across = along[..., None] + half_px[:, None] * _ACROSS
+    rows = np.broadcast_to(below[:, None], across.shape)
+    places_px = camera.distort(horizon.pinhole_px(across.ravel(), rows.ravel())).reshape(*across.shape, 2)
+    likelihood = np.zeros((*along.shape, _STATES))
+    crossing = _crossings(lines, points, image, below)
+    likelihood[..., _GAP:] = _evidence(crossing, _CROSSING_WEIGHT, _CROSSING_EVEN, _CROSSING_RANGE)[..., None]
+    if image.output is not None:
+        paint = image.output.odds_at(places_px).max(axis=2)
+        paint = _evidence(paint, _PAINT_WEIGHT, _PAINT_EVEN, _PAINT_RANGE)
+        likelihood[..., _SOLID:] += paint[..., None]
+    middle_px = places_px[:, :, len(_ACROSS) // 2]
+    likelihood *= camera.inside(middle_px, 0)[..., None]
+    states, total = _forward_backward(likelihood, step_m)
+    length_m = (np.pad(step_m, [(0, 0), (0, 1)]) + np.pad(step_m, [(0, 0), (1, 0)])) / 2
+    present, painted = 1 - states[..., _ENDED], states[..., _SOLID:].sum(axis=2)
+    each = zip(lines, present, painted, length_m, total.tolist(), strict=True)
+    return [replace(line, span=Span(below, *rest)) for line, *rest in each]
+
+
+def _evidence(odds: FloatArray, weight: float, even: float, bounds: tuple[float, float]) -> FloatArray:
+    return np.asarray(weight * (np.clip(odds, *bounds) - even))
+
+
+def _crossings(lines: Sequence[Line], points: LinePoints, image: LaneImage, below: FloatArray) -> FloatArray:
+    """Log odds (N, T) of the surest crossing of each line near each row; -inf where there is none."""
+    out = np.full((len(lines), len(below)), -np.inf)
+    for k, line in enumerate(lines):
+        own = line.members[~points.is_paint[line.members]]
+        coarse = image.camera.coarse(points.points_px[own, 1])
+        reach_px = np.where(coarse, image.row_step_px, image.row_step_px / 2)
+        near = np.abs(below[:, None] - points.below[own]) <= reach_px + 1
+        out[k] = np.where(near, points.odds[own], -np.inf).max(axis=1, initial=-np.inf)
+    return out
+
+
+def _rates() -> FloatArray:
+    """Changes of state per metre of ground (S, S); rows sum up to nought."""
+    rates = np.zeros((_STATES, _STATES))
+    rates[_ENDED, _SOLID] = rates[_ENDED, _GAP] = 0.5 / _ENDED_M
+    rates[_GAP:, _ENDED] = 1 / _DASHED_M
+    rates[_SOLID, _ENDED] = 1 / _SOLID_M
+    rates[_GAP, _DASH] = 1 / _GAP_M
+    stages = [*range(_DASH, _STATES), _GAP]
+    rates[stages[:-1], stages[1:]] = _DASH_STAGES / _DASH_M
+    return np.asarray(rates - np.diag(rates.sum(axis=1)))
+
+
+@cache
+def _modes() -> tuple[np.ndarray, np.ndarray, np.ndarray, FloatArray]:
+    """Eigenvalues (S,), right and left eigenvectors (S, S) of the rates; shares (S,) of the states."""
+    values, right = np.linalg.eig(_rates())
+    left = np.linalg.inv(right)
+    shares = left[np.argmax(values.real)].real
+    return values, right, left, shares / shares.sum()
+
+
+def _forward_backward(likelihood: FloatArray, step_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Probability of each state (N, T, S) and log likelihood (N,) of all rows.
+
+    Args:
+        likelihood: Logarithms of those of each row in each state (N, T, S).
+        step_m: Ground from each row to the next (N, T - 1).
+    """
+    values, right, left, shares = _modes()
+    move = np.maximum(((right * np.exp(values * step_m[..., None])[..., None, :]) @ left).real, 0.0)
+    evidence = np.exp(likelihood)
+    forward, scale = np.empty_like(evidence), np.empty(evidence.shape[:2])
+    state = np.broadcast_to(shares, evidence[:, 0].shape)
+    for t in range(evidence.shape[1]):
+        state = (state if t == 0 else (state[:, None] @ move[:, t - 1])[:, 0]) * evidence[:, t]
+        scale[:, t] = state.sum(axis=1)
+        state = state / scale[:, t, None]
+        forward[:, t] = state
+    after = np.ones_like(state)
+    for t in range(evidence.shape[1] - 2, -1, -1):
+        after = (move[:, t] @ (after * evidence[:, t + 1])[..., None])[..., 0] / scale[:, t + 1, None]
+        forward[:, t] *= after
+    return forward, np.log(scale).sum(axis=1)
+
+
+def boundaries(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> list[Line]:
+    """The lines, best first, without those that repeat or cross a better one; a double one has a strand."""
+    kept: list[Line] = []
+    for line in lines:
+        for k, other in enumerate(kept):
+            relation = _relation(line, other, points, image)
+            if relation == _DOUBLES and other.strand is None:
+                kept[k] = replace(other, strand=line)
+            if relation != _APART:
+                break
+        else:
+            kept.append(line)
+    return kept
+
+
+_APART, _REPEATS, _DOUBLES = range(3)
+
+
+def _relation(line: Line, other: Line, points: LinePoints, image: LaneImage) -> int:
+    """Whether a line is apart from another, repeats or crosses it, or is the other strand of a double one."""
+    assert line.span is not None
+    assert other.span is not None
+    phi, px_per_m = image.horizon.basis(line.span.below), image.horizon.px_per_m * line.span.below
+    sigma_m, other_sigma_m = (each.curve.sigma(phi) / px_per_m for each in (line, other))
+    offset_m = (line.curve.along(phi) - other.curve.along(phi)) / px_per_m
+    known = (sigma_m < _CERTAIN_SIGMA_M) & (other_sigma_m < _CERTAIN_SIGMA_M)
+    shown, other_shown = (_shown(each, points, line.span.below) for each in (line, other))
+    from_row = max(int(np.argmax(shown)), int(np.argmax(other_shown)))
+    crossed = offset_m[from_row:][(known & (shown | other_shown))[from_row:]]
+    if (crossed < -_CROSSING_M).any() and (crossed > _CROSSING_M).any():
+        return _REPEATS
+    there = shown & other_shown if (shown & other_shown).any() else shown
+    there = there & (other_sigma_m < _CERTAIN_SIGMA_M)
+    if not there.any() or np.abs(offset_m[there]).max() > _DOUBLE_M:
+        return _APART
+    abreast_m = float((line.span.length_m * line.span.painted) @ other.span.painted)
+    abreast_m = min(abreast_m, line.paint_m, other.paint_m)
+    is_double = abreast_m >= _LEAST_ABREAST_M and abs(np.median(offset_m[there])) > _ONE_LINE_M
+    return _DOUBLES if is_double else _REPEATS
+
+
+def _shown(line: Line, points: LinePoints, below: FloatArray) -> BoolArray:
+    """Which rows (T,) lie between the nearest and the farthest point of a line; one at least."""
+    own = points.below[line.members]
+    rows = np.arange(len(below))
+    first, last = np.searchsorted(below, (own.min(), own.max()))
+    return np.asarray((rows >= min(first, len(below) - 1)) & (rows <= last), dtype=np.bool_)
+
+
+def draw(line: Line, points: LinePoints, image: LaneImage) -> LaneDetection | None:
+    """A line's points in the image, near to far, with their standard deviations; None if it has not two.
+
+    A double line is drawn along its middle where both strands are present, and along the one that goes on.
+    """
+    assert line.span is not None
+    camera, below, present = image.camera, line.span.below, line.span.present
+    along, sigma = _followed(points, line, image, below)
+    if line.strand is not None and line.strand.span is not None:
+        other = line.strand.span.present
+        beside, beside_sigma = _followed(points, line.strand, image, below)
+        share = other / np.maximum(present + other, 1e-9)
+        along, sigma = along + share * (beside - along), sigma + share * (beside_sigma - sigma)
+        present = np.maximum(present, other)
+    rows, drawn = np.arange(len(below)), np.flatnonzero(present > _EVEN)
+    if not len(drawn):
+        return None
+    points_px = camera.distort(image.horizon.pinhole_px(along, below))
+    own = points.below[line.members]
+    kept = (rows >= drawn[0]) & (rows <= drawn[-1]) & camera.inside(points_px, -DRAWN_STEP_PX)
+    kept &= (sigma < _EXTENSION_SIGMA * camera.info.width) | ((below >= own.min()) & (below <= own.max()))
+    if kept.sum() < 2:
+        return None
+    score = float(as_probability(np.array(line.log_odds)))
+    return LaneDetection(LANE_BOUNDARY, score, points_px[kept][::-1], sigma_px=sigma[kept][::-1])
+
+
+def _followed(
+    points: LinePoints, line: Line, image: LaneImage, at: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Where a line is along the horizon and its standard deviation (N,), px, ``at`` (N,) px below it.
+
+    The mean of the points around, weighted, and of the curve, as good as lines follow curves.
+    """
+    phi = image.horizon.basis(at)
+    curve_sigma, along = line.curve.sigma(phi), line.curve.along(phi)
+    members = line.members
+    off = points.along[members] - line.curve.along(points.phi[members])
+    near = np.maximum(1 - np.abs(at[:, None] - points.below[members]) / _SMOOTH_PX, 0)
+    weight = near / (NEIGHBOURS * points.sigma_px[members] ** 2)
+    own = 1 / (curve_sigma**2 + (_FREEDOM_M * image.horizon.px_per_m * at) ** 2)
+    total = weight.sum(axis=1) + own
+    return along + weight @ off / total, np.sqrt(1 / total)
+
+
+def log_odds_alone(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> FloatArray:
+    """Log odds (N,) of N lines through an image's points, each by itself."""
+    weights, bias = (image.score or fitted())["alone"]
+    return np.asarray(features_alone(lines, points, image) @ weights + bias)
+
+
+def log_odds(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> FloatArray:
+    """Log odds (N,) of N lines, all there are in an image; they have their spans and their log odds alone."""
+    weights, bias = (image.score or fitted())["among"]
+    return np.asarray(features_among(lines, points, image) @ weights + bias)
+
+
+def features_among(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> FloatArray:
+    """The features (N, F) of N lines, all there are in an image, in the order of :data:`AMONG`."""
+    if not lines:
+        return np.empty((0, len(AMONG)))
+    far = [points.below[line.members].min() for line in lines]
+    spans = [_span_features(line, points) for line in lines]
+    return np.column_stack(
+        [[line.log_odds for line in lines], np.log(far), spans, _company(points, lines, image)]
+    )
+
+
+def _span_features(line: Line, points: LinePoints) -> tuple[float, float, float, float]:
+    span, own = line.span, points.below[line.members]
+    assert span is not None
+    between = (span.below >= own.min()) & (span.below <= own.max())
+    return (
+        float(np.sqrt(max(span.log_likelihood, 0.0))),
+        float(span.length_m @ span.present),
+        float(span.length_m[between] @ span.painted[between]),
+        float(span.painted[between].sum() / max(between.sum(), 1)),
+    )
+
+
+def features_alone(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> FloatArray:
+    """The features (N, F) of N lines by themselves, in the order of :data:`ALONE`."""
+    if not lines:
+        return np.empty((0, len(ALONE)))
+    members = np.concatenate([line.members for line in lines])
+    count = np.array([len(line.members) for line in lines])
+    begins = np.cumsum(count) - count
+    is_paint, odds = points.is_paint[members], points.odds[members]
+    at_px, ground = points.points_px[members], points.ground[members]
+    size_m = np.maximum.reduceat(ground, begins) - np.minimum.reduceat(ground, begins)
+    size = np.maximum.reduceat(at_px, begins) - np.minimum.reduceat(at_px, begins)
+    size = size / image.camera.info.width
+    length_m = np.hypot(*size_m.T)
+    paint_odds = np.maximum.reduceat(np.where(is_paint, odds, -np.inf), begins)
+    ratio = np.array([line.log_ratio for line in lines])
+    columns = (
+        _best_crossings(np.where(is_paint, -np.inf, odds), begins, count),
+        np.log(length_m + 0.1),
+        np.log(np.hypot(*size.T) + 0.005),
+        np.log(size[:, 1] + 0.005),
+        np.clip(ratio, -_MOST_LOG_RATIO, _MOST_LOG_RATIO),
+        np.where(np.isfinite(paint_odds), paint_odds, _NO_PAINT),
+        _paint_along(lines, points, image),
+    )
+    return np.column_stack(columns).astype(np.float64)
+
+
+def _best_crossings(odds: FloatArray, begins: IntArray, count: IntArray) -> FloatArray:
+    """Mean log odds (N,) of the surest crossings of each line, 0 where it has none; paint's are -inf."""
+    order = np.lexsort((-odds, np.repeat(np.arange(len(count)), count)))
+    first = begins[:, None] + np.minimum(np.arange(_BEST), count[:, None] - 1)
+    best = odds[order[first]]
+    there = np.isfinite(best) & (np.arange(_BEST) < count[:, None])
+    return np.asarray(np.where(there, best, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1))
+
+
+def _paint_along(lines: Sequence[Line], points: LinePoints, image: LaneImage) -> FloatArray:
+    """Mean log odds of paint along each line between its points, and the share of dashes in that (N, 2)."""
+    output, horizon = image.output, image.horizon
+    if output is None:
+        return np.tile(_UNKNOWN, (len(lines), 1))
+    own = [points.below[line.members] for line in lines]
+    below = np.linspace([b.min() for b in own], [b.max() for b in own], _PLACES, axis=1)
+    phi = horizon.basis(below.ravel()).reshape(len(lines), _PLACES, 3)
+    along = np.einsum("npk,nk->np", phi, np.array([line.curve.parameters for line in lines]))
+    across = along[..., None] + horizon.px_per_m * below[..., None] * _ON_M
+    rows = np.broadcast_to(below[..., None], across.shape)
+    places_px = image.camera.distort(horizon.pinhole_px(across.ravel(), rows.ravel())).reshape(
+        *across.shape, 2
+    )
+    paint = output.odds_at(places_px).max(axis=2)
+    weight = as_probability(paint) + _LEAST_WEIGHT
+    dashes = output.shares_at(places_px[:, :, len(_ON_M) // 2])[:, output.classes.index(LANE_DASH)]
+    return np.column_stack([paint.mean(axis=1), (dashes * weight).sum(axis=1) / weight.sum(axis=1)])
+
+
+def _company(points: LinePoints, lines: Sequence[Line], image: LaneImage) -> FloatArray:
+    """How much the likest other line is a lane away, and how many are too near (N, 2)."""
+    if len(lines) < 2:
+        return np.zeros((len(lines), 2))
+    apart = _apart_m(points, lines, image)
+    gap = np.abs(apart[1])
+    change = np.ptp(apart, axis=0) / (_CHANGE_M + _CHANGE_SHARE * gap)
+    beside = as_probability(np.array([line.log_odds for line in lines])) * np.exp(-0.5 * change**2)
+    np.fill_diagonal(beside, 0.0)
+    lane = beside * np.exp(-0.5 * ((gap - _LANE_M) / _LANE_SIGMA_M) ** 2)
+    near = np.where(gap < _TOO_NEAR_M, beside, 0.0).sum(axis=1)
+    return np.column_stack([lane.max(axis=1), np.minimum(near, _MOST_NEAR)])
+
+
+def _apart_m(points: LinePoints, lines: Sequence[Line], image: LaneImage) -> FloatArray:
+    """How far lines are apart along the horizon (3, N, N), m, at the far end, middle and near end of each."""
+    parameters = np.array([line.curve.parameters for line in lines])
+    spans = np.array([np.ptp(points.below[line.members]) for line in lines])
+    low = np.array([points.below[line.members].min() for line in lines])
+    below = (low + spans * np.array([[0.0], [0.5], [1.0]])).ravel()
+    horizon = image.horizon
+    # Each line's own rows, at which all the others are looked at.
+    rows = (horizon.basis(below) / (horizon.px_per_m * below)[:, None]).reshape(3, len(lines), 3)
+    return np.asarray(np.einsum("sik,ijk->sij", rows, parameters[:, None] - parameters))
+
+
+@cache
+def fitted() -> dict[str, tuple[FloatArray, float]]:
+    """Weights and bias of the logistic functions of a line ``alone`` and ``among`` others, from the file."""
+    content = json.loads(LANE_SCORE_FILE.read_text(encoding="utf-8"))
+    return {
+        name: (np.array([content[name]["weights"][key] for key in keys]), float(content[name]["bias"]))
+        for name, keys in (("alone", ALONE), ("among", AMONG))
+    }

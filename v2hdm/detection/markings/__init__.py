@@ -1,1 +1,0 @@
-"""From paint to markings: propose, fit, judge."""

@@ -1,0 +1,234 @@
+"""The pixels about each marking, cut out of their image once, and frames in which the lens bends nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+from v2hdm.detection.camera import RoadCamera
+from v2hdm.detection.network import NetworkOutput
+from v2hdm.geometry.quadrilateral import Quad, block_diagonal, following
+from v2hdm.records import BoolArray, FloatArray
+
+_GREY_WEIGHTS_BGR = (0.114, 0.587, 0.299)
+"""Weights of ITU-R BT.601."""
+
+_CLIPPED = 250
+"""Codes from here on are those of a sensor at its limit, noise and white balance allowed for."""
+
+_DARK = 0.01
+"""Added to radiance before taking logarithms: in shade a step is as large as in the sun, noise is not."""
+
+_CODED = np.arange(256) / 255
+_LINEAR_FROM_SRGB = np.where(_CODED <= 0.04045, _CODED / 12.92, ((_CODED + 0.055) / 1.055) ** 2.4)
+"""Radiance of sRGB codes (IEC 61966-2-1).
+
+Edges fitted to coded values lie outwards of those of a bright marking by about a fifth of the blur.
+"""
+
+_AROUND, _SPARE_PX = np.array([[-1.0, 2.0, 2.0, -1.0], [-2.0, -2.0, 3.0, 3.0]]), 16
+"""Corners of a patch, in longer and shorter sides of its marking's outline, and the px beyond."""
+
+_BOW_PX = 0.25
+"""A lens that bows the sides of a quadrilateral by less is as good as none."""
+
+
+def linear_bgr(coded: np.ndarray, linear_response: bool) -> np.ndarray:
+    """Pixels (..., 3) uint8 in [0, 1], proportional to radiance; float32."""
+    table = _CODED if linear_response else _LINEAR_FROM_SRGB
+    return np.asarray(table.astype(np.float32)[coded])
+
+
+def grey_of(bgr: np.ndarray) -> np.ndarray:
+    """Grey values (...) of linear pixels (..., 3)."""
+    return np.asarray(bgr @ np.array(_GREY_WEIGHTS_BGR, dtype=np.float32))
+
+
+def log_light(values: np.ndarray) -> np.ndarray:
+    """Logarithms of radiance, float32, in which light and shade differ by a constant."""
+    return np.asarray(np.log(np.maximum(values, 0) + np.float32(_DARK)))
+
+
+class Patches:
+    """The pixels about each of M markings, cut out of an image (H, W, 3) uint8 once.
+
+    Fit and classifier look at these alone. A patch that turns out too small, since the fit went far from the
+    outline, is cut anew. ``corners_px`` (M, 4, 2) are the markings' outlines, ``owner`` (h, w) is 1 + the
+    index of the piece of paint that each element of the output's paint is of, and ``own`` (M, 2) the
+    first and last piece of each marking: pixels of others take no part.
+    """
+
+    def __init__(
+        self,
+        image_bgr: np.ndarray,
+        camera: RoadCamera,
+        output: NetworkOutput,
+        owner: np.ndarray,
+        corners_px: FloatArray,
+        own: np.ndarray,
+    ):
+        self.output = output
+        self._last_px = np.array([image_bgr.shape[1] - 1, image_bgr.shape[0] - 1])
+        self._image, self._owner, self._own = image_bgr, owner, own
+        self._linear_response = camera.camera.linear_response
+        around = Quad(corners_px).long_first().at(*_AROUND)
+        low = np.clip(around.min(axis=1) - _SPARE_PX, 0, self._last_px).astype(int).tolist()
+        high = np.clip(around.max(axis=1) + _SPARE_PX, 0, self._last_px).astype(int).tolist()
+        self._boxes = [(*first, *last) for first, last in zip(low, high, strict=True)]
+        self._pixels = [_cut(image_bgr, box) for box in self._boxes]
+
+    def look(
+        self, u: np.ndarray, v: np.ndarray, marking: np.ndarray
+    ) -> tuple[np.ndarray, BoolArray, BoolArray]:
+        """Log grey, red and blue (3, n) of pixels of markings (n,), which take part, which are clipped.
+
+        The pixels of one marking come after those of another, in the markings' order.
+        """
+        use = (u >= 0) & (u <= self._last_px[0]) & (v >= 0) & (v <= self._last_px[1])
+        u, v = np.clip(u, 0, self._last_px[0]), np.clip(v, 0, self._last_px[1])
+        coded = np.empty((len(u), 3), dtype=np.uint8)
+        ends = np.searchsorted(marking, np.arange(len(self._own) + 1)).tolist()
+        for m, (begin, end) in enumerate(pairwise(ends)):
+            if begin < end:
+                own_u, own_v = u[begin:end], v[begin:end]
+                box = own_u.min(), own_v.min(), own_u.max(), own_v.max()
+                patch, left, top = self._patch(m, *map(int, box))
+                coded[begin:end] = patch[own_v - top, own_u - left]
+        use &= ~self._foreign(u, v, marking)
+        bgr = linear_bgr(coded, self._linear_response)
+        light = log_light(np.stack([grey_of(bgr), bgr[:, 2], bgr[:, 0]]))
+        return light, use, use & (coded >= _CLIPPED).any(axis=1)
+
+    def light_at(self, marking: np.ndarray, points_px: FloatArray) -> np.ndarray:
+        """Radiance (S, n, n, 3), BGR, at points (S, n, n, 2) about markings (S,), interpolated."""
+        coded = np.empty((*points_px.shape[:-1], 3), dtype=np.uint8)
+        places = np.ascontiguousarray(np.moveaxis(points_px, -1, 1), dtype=np.float32)
+        flat = places.reshape(*places.shape[:2], -1)
+        low = np.clip(flat.min(axis=2), 0, self._last_px).astype(np.intp)
+        high = np.clip(flat.max(axis=2) + 1, 0, self._last_px).astype(np.intp)
+        for picture, m, (u, v), *box in zip(coded, marking.tolist(), places, low, high, strict=True):
+            patch, left, top = self._patch(m, *np.concatenate(box).tolist())
+            u, v = u - np.float32(left), v - np.float32(top)
+            cv2.remap(patch, u, v, cv2.INTER_LINEAR, dst=picture, borderMode=cv2.BORDER_REPLICATE)
+        return linear_bgr(coded, self._linear_response)
+
+    def outside(self, points_px: FloatArray) -> BoolArray:
+        """Which points (..., 2) are outside the image."""
+        return np.asarray(((points_px < 0) | (points_px > self._last_px)).any(axis=-1))
+
+    def _foreign(self, u: np.ndarray, v: np.ndarray, marking: np.ndarray) -> BoolArray:
+        """Which pixels (n,) of markings (n,) are paint of other pieces than the marking's own."""
+        (rows, columns), stride = self._owner.shape, self.output.stride
+        row = np.clip((v - self.output.top) // stride, 0, rows - 1)
+        owner = self._owner[row, np.minimum(u // stride, columns - 1)]
+        first, last = self._own[marking].T
+        return np.asarray((owner > 0) & ((owner < first + 1) | (owner > last + 1)))
+
+    def _patch(
+        self, marking: int, left: int, top: int, right: int, bottom: int
+    ) -> tuple[np.ndarray, int, int]:
+        """The pixels (h, w, 3) of a patch that reaches as far as asked, with their first column and row."""
+        patch, (low_u, low_v, high_u, high_v) = self._pixels[marking], self._boxes[marking]
+        if left < low_u or top < low_v or right > high_u or bottom > high_v:
+            box = min(left, low_u), min(top, low_v), max(right, high_u), max(bottom, high_v)
+            patch = self._pixels[marking] = _cut(self._image, box)
+            self._boxes[marking] = box
+        return patch, *self._boxes[marking][:2]
+
+
+def _cut(image_bgr: np.ndarray, box: tuple[int, int, int, int]) -> np.ndarray:
+    """The pixels (h, w, 3), a view, from the column and row of a box's first corner to those of its last."""
+    left, top, right, bottom = box
+    return image_bgr[top : bottom + 1, left : right + 1]
+
+
+@dataclass(frozen=True)
+class LensFrames:
+    """One frame for each of M markings: pinhole px from its middle in the image, scaled to recorded ones.
+
+    So a recorded pixel, and what blurs it, is about as large and as round in them as in the image, also near
+    the border of a wide lens. ``middle`` (M, 2) is in pinhole px, ``scale`` (M, 2, 2) leads to recorded ones.
+    """
+
+    camera: RoadCamera
+    middle: FloatArray
+    scale: FloatArray
+
+    @classmethod
+    def about(cls, camera: RoadCamera, corners_px: FloatArray) -> LensFrames:
+        """The frames of markings with recorded ``corners_px`` (M, 4, 2)."""
+        # Beyond the image a lens model may fold, and has no scale.
+        within = np.clip(corners_px.mean(axis=1), 0.0, [camera.info.width - 1, camera.info.height - 1])
+        middle = camera.undistort(within)
+        return cls(camera, middle, camera.distort_jacobian(middle))
+
+    def take(self, rows: np.ndarray) -> LensFrames:
+        """Some of the frames, which may come several times."""
+        return LensFrames(self.camera, self.middle[rows], self.scale[rows])
+
+    def from_image(self, points_px: FloatArray) -> FloatArray:
+        """Recorded points (M, N, 2) of each marking."""
+        pinhole = self.camera.undistort(points_px.reshape(-1, 2)).reshape(points_px.shape)
+        return np.asarray((pinhole - self.middle[:, None]) @ self.scale.swapaxes(1, 2))
+
+    def to_pinhole(self, points: FloatArray) -> FloatArray:
+        """Pinhole px (M, N, 2) of points (M, N, 2) of each marking."""
+        return np.asarray(points @ np.linalg.inv(self.scale).swapaxes(1, 2) + self.middle[:, None])
+
+    def to_px(self, points: FloatArray) -> FloatArray:
+        """Recorded px (M, N, 2) of points (M, N, 2) of each marking."""
+        return self.camera.distort(self.to_pinhole(points).reshape(-1, 2)).reshape(points.shape)
+
+    def jacobian(self, corners: FloatArray) -> FloatArray:
+        """Derivative (M, 8, 8) of the recorded px of corners (M, 4, 2) by the corners."""
+        slope = self.camera.distort_jacobian(self.to_pinhole(corners).reshape(-1, 2)).reshape(-1, 4, 2, 2)
+        return block_diagonal(slope @ np.linalg.inv(self.scale)[:, None])
+
+    def bow_px(self, corners_px: FloatArray) -> FloatArray:
+        """By how much (M,) the lens bows the sides of quadrilaterals with recorded corners (M, 4, 2)."""
+        corners = self.from_image(corners_px)
+        recorded = self.to_px((corners + following(corners)) / 2)
+        chords = (corners_px + following(corners_px)) / 2
+        return np.asarray(np.linalg.norm(recorded - chords, axis=-1).max(axis=1))
+
+
+@dataclass(frozen=True)
+class ImageQuads(Quad):
+    """M quadrilaterals of an image, in coordinates in which their sides are straight.
+
+    Those are recorded px, but for quadrilaterals that are ``bowed`` (M,) by the lens: ``frames`` (of them
+    alone).
+    """
+
+    bowed: BoolArray
+    frames: LensFrames | None
+
+    @classmethod
+    def of(cls, camera: RoadCamera, corners_px: FloatArray) -> ImageQuads:
+        """Those with recorded corners (M, 4, 2)."""
+        if not camera.distorted:
+            return cls(corners_px, np.zeros(len(corners_px), dtype=np.bool_), None)
+        frames = LensFrames.about(camera, corners_px)
+        bowed = frames.bow_px(corners_px) > _BOW_PX
+        frames, corners = frames.take(bowed), corners_px.copy()
+        corners[bowed] = frames.from_image(corners_px[bowed])
+        return cls(corners, bowed, frames)
+
+    def take(self, rows: np.ndarray) -> ImageQuads:
+        """Some of them, which may come several times."""
+        bowed = self.bowed[rows]
+        place = np.cumsum(self.bowed) - 1
+        frames = None if self.frames is None else self.frames.take(place[rows][bowed])
+        return ImageQuads(self.corners[rows], bowed, frames)
+
+    def px(self, points: FloatArray) -> FloatArray:
+        """Recorded px (M, ..., 2) of points (M, ..., 2) laid out about each one's corners."""
+        if self.frames is None or not self.bowed.any():
+            return points
+        points = points.copy()
+        flat = points[self.bowed].reshape(int(self.bowed.sum()), -1, 2)
+        points[self.bowed] = self.frames.to_px(flat).reshape(-1, *points.shape[1:])
+        return points
