@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from v2hdm.adjust import kernels
+from v2hdm.adjust.engines import numba as kernels
 
 ROOT = Path(__file__).parents[2]
 
@@ -63,16 +63,16 @@ torch.optim.Optimizer.shut = type("Wrapper", (), {"__wrapped__": Shut()})()
 def test_without_numba_torch_does_the_work():
     """Nothing is said, and the result is the same to rounding."""
     before = "sys.modules['numba'] = None"
-    after = "assert 'v2hdm.adjust.kernels.passes' not in sys.modules"
+    after = "assert 'v2hdm.adjust.engines.numba.passes' not in sys.modules"
     assert cost_in_a_fresh_process(before, after) == pytest.approx(cost_in_a_fresh_process(), rel=1e-9)
 
 
 KERNEL = """
 from pathlib import Path
-from v2hdm.adjust.kernels import build
+from v2hdm.adjust.engines.numba import build
 build.PLACES = (Path({place!r}),)
 import numpy as np
-from v2hdm.adjust.kernels.prepare import median
+from v2hdm.adjust.engines.numba.prepare import median
 print(median(np.arange(7.0)))
 """
 

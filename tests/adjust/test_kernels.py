@@ -8,9 +8,9 @@ import torch
 
 from tests.adjust.scene import make_scene, with_late_clocks
 from v2hdm.adjust import ControlPoints, Drift, KnownLengths, PoseSigma, SolveOptions, solve
-from v2hdm.adjust import kernels as fast
 from v2hdm.adjust.descent import Objective
-from v2hdm.adjust.kernels import pool
+from v2hdm.adjust.engines import numba as fast
+from v2hdm.adjust.engines.numba import pool
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.problem import LOSSES, POSE_STATES
 from v2hdm.adjust.reduced import ReducedSystem, Spread, make_plan
@@ -20,8 +20,8 @@ from v2hdm.adjust.whitening import _eliminate, factorise
 from v2hdm.geometry import tensors as transform
 
 if fast.available():
-    from v2hdm.adjust.kernels.motion import move
-    from v2hdm.adjust.kernels.prepare import median
+    from v2hdm.adjust.engines.numba.motion import move
+    from v2hdm.adjust.engines.numba.prepare import median
 
 pytestmark = pytest.mark.skipif(not fast.available(), reason="numba, the extra 'fast', is not installed")
 

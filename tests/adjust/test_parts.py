@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from tests.adjust.site import site
-from v2hdm.adjust import ControlPoints, KnownLengths, Problem, Solution, SolveOptions, Status, kernels, solve
+from v2hdm.adjust import ControlPoints, KnownLengths, Problem, Solution, SolveOptions, Status, solve
+from v2hdm.adjust.engines import numba as kernels
 from v2hdm.adjust.parts import Local, solve_in_parts
 from v2hdm.adjust.parts.condense import Base
 from v2hdm.adjust.parts.split import split

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from tests.adjust.scene import Scene, exp, make_scene, pose_errors, project, with_late_clocks
-from v2hdm.adjust import Drift, Observations, PoseSigma, Problem, SolveOptions, Status, kernels, solve
+from v2hdm.adjust import Drift, Observations, PoseSigma, Problem, SolveOptions, Status, solve
+from v2hdm.adjust.engines import numba as kernels
 from v2hdm.errors import AdjustError
 
 DRIFTING = PoseSigma(0.02, 0.001, 0.003, 0.01, position_drift=Drift(0.018, 30.0))

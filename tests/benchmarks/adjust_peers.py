@@ -42,7 +42,7 @@ from tests.benchmarks.adjust_native import (
 )
 from tests.benchmarks.adjust_scaling import driven_on
 from v2hdm.adjust import PoseSigma, Problem, SolveOptions, solve
-from v2hdm.adjust.kernels import available
+from v2hdm.adjust.engines.numba import available
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.start import back_project
 

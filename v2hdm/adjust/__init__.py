@@ -2,7 +2,7 @@
 
 ``solve(problem, options) -> solution``: numpy in, numpy out; torch's LBFGS on whitened variables
 inside. :mod:`v2hdm.adjust.problem` states the model. What is done to every observation torch does, or
-:mod:`v2hdm.adjust.kernels` where numba is installed.
+:mod:`v2hdm.adjust.engines.numba` where numba is installed.
 """
 
 from v2hdm.adjust.gating import Excluded, Verdict

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from v2hdm.adjust.kernels import passes_over
+from v2hdm.adjust.engines.numba import passes_over
 
 if TYPE_CHECKING:
-    from v2hdm.adjust.kernels.passes import Passes
+    from v2hdm.adjust.engines.numba.passes import Passes
 
 # Observations that are computed at once: their intermediate results stay in the processor's cache, and
 # beside the whole take no memory.

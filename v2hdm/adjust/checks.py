@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.adjust.kernels import available
+from v2hdm.adjust.engines.numba import available
 from v2hdm.adjust.problem import LOSSES, POSE_STATES, SOLVERS, Problem, SolveOptions
 from v2hdm.errors import AdjustError
 from v2hdm.records import FloatArray, IntArray
@@ -40,7 +40,7 @@ def _observations_are_sound(problem: Problem) -> bool:
     """Whether one compiled pass finds no fault in any observation; False where there is none to be had."""
     if not available():
         return False
-    from v2hdm.adjust.kernels.prepare import are_sound
+    from v2hdm.adjust.engines.numba.prepare import are_sound
 
     return are_sound(problem, _SYMMETRIC_TO, _MAX_SLOPE)
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
-from v2hdm.adjust.kernels.pool import one_thread_in_torch
+from v2hdm.adjust.engines.numba.pool import one_thread_in_torch
 from v2hdm.adjust.lbfgs import minimise, predicted_gap
 from v2hdm.adjust.reduced import Plan, make_plan
 from v2hdm.adjust.residuals import (

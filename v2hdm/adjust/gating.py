@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from v2hdm.adjust.kernels import available
+from v2hdm.adjust.engines.numba import available
 from v2hdm.adjust.problem import Observations
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
@@ -71,7 +71,7 @@ def noise_scale(mahalanobis2: FloatArray) -> float:
 def _median(values: FloatArray) -> float:
     """The median of values from 0 up, to seven digits."""
     if available():
-        from v2hdm.adjust.kernels.prepare import median
+        from v2hdm.adjust.engines.numba.prepare import median
 
         return median(values)
     return float(np.median(values.astype(np.float32), overwrite_input=True))
@@ -121,7 +121,7 @@ def judge(
 def _count_accepted(corner: IntArray, accepted: BoolArray, corners: int) -> tuple[IntArray, IntArray]:
     """How often each corner was seen, and how many of its observations are accepted."""
     if available():
-        from v2hdm.adjust.kernels.prepare import count_accepted
+        from v2hdm.adjust.engines.numba.prepare import count_accepted
 
         return count_accepted(corner, accepted, corners)
     return np.bincount(corner, minlength=corners), np.bincount(corner[accepted], minlength=corners)

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays, CameraQuadratic, Lengths
-from v2hdm.adjust.kernels import available
+from v2hdm.adjust.engines.numba import available
 from v2hdm.adjust.pose_prior import state_components, state_prior
 from v2hdm.adjust.problem import Problem
 from v2hdm.errors import AdjustError
@@ -101,7 +101,7 @@ def _corners_in_route_order(problem: Problem) -> tuple[IntArray, BoolArray]:
 def _first_frames(problem: Problem) -> IntArray:
     """The first frame (N,) that saw each corner."""
     if available():
-        from v2hdm.adjust.kernels.prepare import first_frames
+        from v2hdm.adjust.engines.numba.prepare import first_frames
 
         return first_frames(problem)
     out = np.full(problem.corner_count, len(problem.map_from_vehicle))
@@ -114,7 +114,7 @@ def _sorted_observations(
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
     """Observations (K,) by corner, then camera, then frame; the corner and the pair of each."""
     if available():
-        from v2hdm.adjust.kernels.prepare import sorted_observations
+        from v2hdm.adjust.engines.numba.prepare import sorted_observations
 
         order, corner, pair, again = sorted_observations(problem, rank)
         if again >= 0:
@@ -152,7 +152,7 @@ def _refuse_twice(problem: Problem, first: int, second: int) -> None:
 def _whitened(problem: Problem, order: NDArray[np.int32]) -> tuple[FloatArray, FloatArray]:
     """``measured`` (2, K) and ``root_information`` (3, K) of :class:`Arrays`."""
     if available():
-        from v2hdm.adjust.kernels.prepare import whitened
+        from v2hdm.adjust.engines.numba.prepare import whitened
 
         return whitened(problem, order)
     seen = problem.observations

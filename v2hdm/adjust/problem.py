@@ -28,7 +28,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.adjust.kernels import available
+from v2hdm.adjust.engines.numba import available
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 POSE_STATES: tuple[str, ...] = ("x", "y", "height", "roll", "pitch", "heading")
@@ -64,7 +64,7 @@ class Observations:
 def on_line(covariance_px: FloatArray) -> BoolArray:
     """Whether covariances (K, 2, 2) are as good as those of a line of the image."""
     if available():
-        from v2hdm.adjust.kernels.prepare import on_line as compiled
+        from v2hdm.adjust.engines.numba.prepare import on_line as compiled
 
         return compiled(covariance_px, _LINE_RATIO + 2 + 1 / _LINE_RATIO)
     xx, yx, yy = covariance_px[:, 0, 0], covariance_px[:, 1, 0], covariance_px[:, 1, 1]

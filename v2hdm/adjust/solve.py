@@ -14,9 +14,9 @@ from v2hdm.adjust.checks import check_model, check_options, check_problem
 from v2hdm.adjust.coarse import coarse_extrinsics, is_near, is_worth_a_look
 from v2hdm.adjust.covariance import Covariance
 from v2hdm.adjust.descent import Descent, descend, open_descent
+from v2hdm.adjust.engines.numba import available
+from v2hdm.adjust.engines.numba.pool import one_thread_in_torch
 from v2hdm.adjust.gating import as_of_point, judge, noise_scale
-from v2hdm.adjust.kernels import available
-from v2hdm.adjust.kernels.pool import one_thread_in_torch
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.origin import nearby_origin, shifted
 from v2hdm.adjust.problem import Problem, SolveOptions

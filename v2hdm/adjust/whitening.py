@@ -49,7 +49,7 @@ from v2hdm.adjust.tiles import TiledCholesky
 from v2hdm.errors import AdjustError
 
 if TYPE_CHECKING:
-    from v2hdm.adjust.kernels.evaluate import Base
+    from v2hdm.adjust.engines.numba.evaluate import Base
 
 WEIGHT_FLOOR = 1e-6
 """Keeps a corner factorable whose sightings a robust loss has all but switched off."""

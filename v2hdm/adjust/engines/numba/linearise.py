@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from v2hdm.adjust.kernels.build import inlined, kernel
-from v2hdm.adjust.kernels.layout import Layout
-from v2hdm.adjust.kernels.parts import (
+from v2hdm.adjust.engines.numba.build import inlined, kernel
+from v2hdm.adjust.engines.numba.layout import Layout
+from v2hdm.adjust.engines.numba.parts import (
     add_corner_priors,
     add_force,
     add_loss,
@@ -37,7 +37,7 @@ class Linearisation(NamedTuple):
         carried: (Q, D) the same by the cameras' unknowns, where they have none.
         rows: (2 N, D) then L^-1 W', one corner after the other; else (0, D).
         whitened: (N, 2) the gradient by the corners, L^-1 g.
-        lower, joint: the factors of V, :func:`v2hdm.adjust.kernels.parts.factorise_unit`.
+        lower, joint: the factors of V, :func:`v2hdm.adjust.engines.numba.parts.factorise_unit`.
         own: J'J by pair (R, 21) or, where pairs move with their camera alone, by camera (Q C, 21).
         tip: (Q, D, D) B'B of the cameras' unknowns, its lower triangle.
         failed: (Q,) units whose block has no factor.

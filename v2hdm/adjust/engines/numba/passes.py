@@ -11,10 +11,10 @@ from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.corner_factor import INSEPARABLE, CornerFactor, Joint
-from v2hdm.adjust.kernels import evaluate, frames, linearise, look, motion
-from v2hdm.adjust.kernels.build import kernel
-from v2hdm.adjust.kernels.layout import LOSS_CODES, Layout, make_layout
-from v2hdm.adjust.kernels.pool import share
+from v2hdm.adjust.engines.numba import evaluate, frames, linearise, look, motion
+from v2hdm.adjust.engines.numba.build import kernel
+from v2hdm.adjust.engines.numba.layout import LOSS_CODES, Layout, make_layout
+from v2hdm.adjust.engines.numba.pool import share
 from v2hdm.adjust.reduced import Coupled, ReducedSystem, Spread
 from v2hdm.adjust.residuals import Estimate, Gradient, Loss, Sums, cam_from_map
 from v2hdm.adjust.whitening import Elimination, Evaluated, Whitening

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from v2hdm.adjust.arrays import Arrays
-from v2hdm.adjust.kernels.build import kernel
+from v2hdm.adjust.engines.numba.build import kernel
 from v2hdm.records import FloatArray, IntArray
 
 LOSS_CODES = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.adjust.kernels.build import inlined, kernel
+from v2hdm.adjust.engines.numba.build import inlined, kernel
 from v2hdm.adjust.problem import Problem
 from v2hdm.records import BoolArray, FloatArray, IntArray
 

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from v2hdm.adjust.kernels.build import inlined, kernel
-from v2hdm.adjust.kernels.layout import Layout
-from v2hdm.adjust.kernels.parts import (
+from v2hdm.adjust.engines.numba.build import inlined, kernel
+from v2hdm.adjust.engines.numba.layout import Layout
+from v2hdm.adjust.engines.numba.parts import (
     add_corner_priors,
     add_force,
     add_loss,
@@ -58,7 +58,7 @@ class Scratch(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """What :func:`evaluate` computes, as in :class:`~v2hdm.adjust.kernels.linearise.Linearisation`.
+    """What :func:`evaluate` computes, as in :class:`~v2hdm.adjust.engines.numba.linearise.Linearisation`.
 
     ``corners`` (N, 2) are those moved; ``whitened`` (N, 2) is the gradient by their whitened variables.
     """

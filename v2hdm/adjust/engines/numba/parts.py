@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 from v2hdm.adjust.corner_factor import CORNER_FLOOR, PIVOT_FLOOR
-from v2hdm.adjust.kernels.build import inlined
-from v2hdm.adjust.kernels.layout import Layout
+from v2hdm.adjust.engines.numba.build import inlined
+from v2hdm.adjust.engines.numba.layout import Layout
 from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import FloatArray, IntArray
 

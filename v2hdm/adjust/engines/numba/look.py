@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from v2hdm.adjust.kernels.build import kernel
-from v2hdm.adjust.kernels.layout import Layout
-from v2hdm.adjust.kernels.parts import see, whiten
+from v2hdm.adjust.engines.numba.build import kernel
+from v2hdm.adjust.engines.numba.layout import Layout
+from v2hdm.adjust.engines.numba.parts import see, whiten
 from v2hdm.adjust.start import MIN_DEPRESSION_SINE
 from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import BoolArray, FloatArray, IntArray

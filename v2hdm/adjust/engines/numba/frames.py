@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from v2hdm.adjust.kernels.build import inlined, kernel
-from v2hdm.adjust.kernels.evaluate import Base
-from v2hdm.adjust.kernels.layout import Layout
-from v2hdm.adjust.kernels.linearise import couple, differentiate
-from v2hdm.adjust.kernels.parts import solve_unit_rows, weigh
+from v2hdm.adjust.engines.numba.build import inlined, kernel
+from v2hdm.adjust.engines.numba.evaluate import Base
+from v2hdm.adjust.engines.numba.layout import Layout
+from v2hdm.adjust.engines.numba.linearise import couple, differentiate
+from v2hdm.adjust.engines.numba.parts import solve_unit_rows, weigh
 from v2hdm.adjust.whitening import WEIGHT_FLOOR
 from v2hdm.records import FloatArray, IntArray
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from v2hdm.adjust.arrays import Arrays
-    from v2hdm.adjust.kernels.passes import Passes
+    from v2hdm.adjust.engines.numba.passes import Passes
 
 _wanted = True
 
@@ -47,6 +47,6 @@ def passes_over(arrays: Arrays) -> Passes | None:
     """The kernels over a problem, or None where torch has to do their work."""
     if not available() or arrays.measured.device.type != "cpu":
         return None
-    from v2hdm.adjust.kernels.passes import Passes
+    from v2hdm.adjust.engines.numba.passes import Passes
 
     return Passes(arrays)
