@@ -33,9 +33,8 @@ from tests.adjust.scene import Scene, make_scene
 from tests.benchmarks.adjust_accuracy import PAPER, ROBUST, WHITE, street
 from tests.benchmarks.adjust_native import NativeOptions, build, solve_native
 from v2hdm.adjust import Problem, SolveOptions, solve
-from v2hdm.adjust.coarse import coarse_extrinsics
 from v2hdm.adjust.layout import make_arrays
-from v2hdm.adjust.start import back_project
+from v2hdm.adjust.start import back_project, coarse_extrinsics
 from v2hdm.errors import AdjustError
 
 # Ends are the same if their costs and their corners are: relative, and root mean square in m.

@@ -5,7 +5,6 @@ inside. :mod:`v2hdm.adjust.problem` states the model. What is done to every obse
 :mod:`v2hdm.adjust.engines.numba` where numba is installed.
 """
 
-from v2hdm.adjust.gating import Excluded, Verdict
 from v2hdm.adjust.observability import Observability, observability, observed
 from v2hdm.adjust.problem import (
     ControlPoints,
@@ -17,10 +16,11 @@ from v2hdm.adjust.problem import (
     SolveOptions,
 )
 from v2hdm.adjust.pulls import PosePulls, pose_pulls
+from v2hdm.adjust.score_tests import Fault, Suspect, suspects
 from v2hdm.adjust.selection import MODELS, Model, Selection, select_model, with_model
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
-from v2hdm.adjust.suspect import Fault, Suspect, suspects
+from v2hdm.adjust.validation import Excluded, Verdict
 
 __all__ = [
     "MODELS",

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from v2hdm.adjust.covariance import Covariance
-from v2hdm.adjust.gating import Excluded, Verdict, VerdictArray, excluded
 from v2hdm.adjust.problem import Observations
 from v2hdm.adjust.robust import loss
+from v2hdm.adjust.validation import Excluded, Verdict, VerdictArray, excluded
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 

@@ -11,19 +11,16 @@ from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.checks import check_model, check_options, check_problem
-from v2hdm.adjust.coarse import coarse_extrinsics, is_near, is_worth_a_look
 from v2hdm.adjust.covariance import Covariance
 from v2hdm.adjust.descent import Descent, descend, open_descent
 from v2hdm.adjust.engines.numba import available
 from v2hdm.adjust.engines.numba.pool import one_thread_in_torch
-from v2hdm.adjust.gating import as_of_point, judge, noise_scale
-from v2hdm.adjust.layout import make_arrays
-from v2hdm.adjust.origin import nearby_origin, shifted
+from v2hdm.adjust.layout import make_arrays, nearby_origin, shifted
 from v2hdm.adjust.problem import Problem, SolveOptions
 from v2hdm.adjust.residuals import Estimate, Loss, cost_and_gradient, frame_tangent, observe, pair_table
 from v2hdm.adjust.solution import Solution, Status
-from v2hdm.adjust.start import back_project
-from v2hdm.adjust.variance import VarianceFactors, variance_factors
+from v2hdm.adjust.start import back_project, coarse_extrinsics, is_near, is_worth_a_look
+from v2hdm.adjust.validation import VarianceFactors, as_of_point, judge, noise_scale, variance_factors
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.tensors import NEAR_M, exp

@@ -13,11 +13,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from v2hdm.adjust.layout import make_arrays
+from v2hdm.adjust.layout import make_arrays, state_components
 from v2hdm.adjust.parts.solve import solve_in_parts
 from v2hdm.adjust.parts.split import is_shared
 from v2hdm.adjust.parts.team import Local, Team
-from v2hdm.adjust.pose_prior import state_components
 from v2hdm.adjust.problem import Problem, SolveOptions
 from v2hdm.adjust.reduced import make_plan
 from v2hdm.adjust.solution import Solution

@@ -14,8 +14,7 @@ from torch import Tensor
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.checks import check_model, check_options, check_problem
 from v2hdm.adjust.descent import RENEWAL, RENEWAL_WITH_STATES, Descent, go_down, total
-from v2hdm.adjust.layout import make_arrays
-from v2hdm.adjust.origin import nearby_origin, shifted
+from v2hdm.adjust.layout import make_arrays, nearby_origin, shifted
 from v2hdm.adjust.parts.condense import Base, HandedOn
 from v2hdm.adjust.parts.shared import Shared, SharedPriors
 from v2hdm.adjust.parts.split import Part, split

@@ -1,6 +1,6 @@
 """After the solve: what the drive says of its own inputs, and how well everything fits.
 
-The inputs are tested one at a time (:mod:`v2hdm.adjust.suspect`); what was contradicted and could be done
+The inputs are tested one at a time (:mod:`v2hdm.adjust.score_tests`); what was contradicted and could be done
 without has been dropped (:mod:`v2hdm.mapping.remedy`) and is told here. Everything else that a wrong input
 shows in is measured as well, so that a fault that nobody thought of is not silent. docs/verdict.md has what
 clean and spoilt drives measure.
