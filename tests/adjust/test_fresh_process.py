@@ -63,7 +63,7 @@ torch.optim.Optimizer.shut = type("Wrapper", (), {"__wrapped__": Shut()})()
 def test_without_numba_torch_does_the_work():
     """Nothing is said, and the result is the same to rounding."""
     before = "sys.modules['numba'] = None"
-    after = "assert 'v2hdm.adjust.engines.numba.passes' not in sys.modules"
+    after = "assert 'v2hdm.adjust.engines.numba.engine' not in sys.modules"
     assert cost_in_a_fresh_process(before, after) == pytest.approx(cost_in_a_fresh_process(), rel=1e-9)
 
 

@@ -19,11 +19,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.problem import CameraPrior, ControlPoints, KnownLengths, Observations, Problem, SolveOptions
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
-from v2hdm.adjust.start import back_project
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.rigid import exp, inverse, left_jacobian, log
 from v2hdm.records import FloatArray, IntArray
@@ -170,7 +170,8 @@ class IncrementalMap:
         cameras = np.unique(sighted.observations.camera)
         problem = self._problem([sighted], cameras)
         arrays = make_arrays(problem, (), "cpu")
-        corners, fixed = back_project(arrays, torch.from_numpy(problem.cam_from_vehicle))
+        engine = make_engine(self._options.engine, arrays)
+        corners, fixed = engine.back_project(torch.from_numpy(problem.cam_from_vehicle))
         out = np.full(corners.shape, np.nan)
         known = fixed.numpy()
         out[arrays.corner_order.numpy()[known]] = corners.numpy()[known]

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays, CameraQuadratic, Lengths
-from v2hdm.adjust.engines.numba import available
+from v2hdm.adjust.engines.numba.prepare import first_frames, sorted_observations, whitened
 from v2hdm.adjust.problem import POSE_STATES, PoseSigma, Problem
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.tensors import inverse
@@ -129,8 +129,6 @@ def state_prior(
     return transition, information_root
 
 
-# Rows that are laid out at once.
-_ROWS = 1 << 18
 # Corners that known lengths may join; time and memory grow with the square and the cube.
 _MOST_JOINED = 256
 
@@ -155,7 +153,8 @@ def make_arrays(
     rank = np.empty_like(corner_order)
     rank[corner_order] = np.arange(len(corner_order))
     order, corner, pair = _sorted_observations(problem, rank)
-    measured, root = _whitened(problem, order)
+    seen = problem.observations
+    measured, root = whitened(order, seen.camera, seen.pinhole_px, seen.covariance_px, problem.intrinsic)
     components = state_components(problem.pose_sigmas, pose_states)
     transition, information_root = state_prior(problem.map_from_vehicle, components, problem.visit_of_frame)
     centre, centre_root = _centre_prior(problem)
@@ -169,6 +168,7 @@ def make_arrays(
         measured=real(measured),
         root_information=real(root),
         vehicle_from_map=inverse(real(problem.map_from_vehicle)),
+        visit=index(np.asarray(problem.visit_of_frame, dtype=np.int64)),
         states=tuple(component.column for component in components[0]),
         centre=real(centre),
         centre_information_root=real(centre_root),
@@ -191,7 +191,8 @@ def _corners_in_route_order(problem: Problem) -> tuple[IntArray, BoolArray]:
     Corners that known lengths join come side by side, where the first of them belongs.
     """
     count, lengths = problem.corner_count, problem.lengths
-    first_frame = _first_frames(problem)
+    seen, frames = problem.observations, len(problem.map_from_vehicle)
+    first_frame = first_frames(seen.corner, seen.frame, count, frames)
     if lengths is None or not len(lengths.first):
         return np.argsort(first_frame, kind="stable"), np.zeros(count, dtype=bool)
     edges = coo_matrix((np.ones(len(lengths.first)), (lengths.first, lengths.second)), shape=(count, count))
@@ -202,52 +203,20 @@ def _corners_in_route_order(problem: Problem) -> tuple[IntArray, BoolArray]:
             f"known lengths join {largest} corners, which would be solved for as one block: state those "
             f"within a marking, at most {_MOST_JOINED} corners together"
         )
-    unit_frame = np.full(unit.max() + 1, len(problem.map_from_vehicle))
+    unit_frame = np.full(unit.max() + 1, frames)
     np.minimum.at(unit_frame, unit, first_frame)
     order = np.lexsort((first_frame, unit, unit_frame[unit]))
     return order, np.concatenate([[False], np.diff(unit[order]) == 0])
-
-
-def _first_frames(problem: Problem) -> IntArray:
-    """The first frame (N,) that saw each corner."""
-    if available():
-        from v2hdm.adjust.engines.numba.prepare import first_frames
-
-        return first_frames(problem)
-    out = np.full(problem.corner_count, len(problem.map_from_vehicle))
-    np.minimum.at(out, problem.observations.corner, problem.observations.frame)
-    return out
 
 
 def _sorted_observations(
     problem: Problem, rank: IntArray
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
     """Observations (K,) by corner, then camera, then frame; the corner and the pair of each."""
-    if available():
-        from v2hdm.adjust.engines.numba.prepare import sorted_observations
-
-        order, corner, pair, again = sorted_observations(problem, rank)
-        if again >= 0:
-            _refuse_twice(problem, *sorted(order[again - 1 : again + 1].tolist()))
-        return order, corner, pair
-    seen = problem.observations
-    pairs = len(problem.intrinsic) * len(problem.map_from_vehicle)
-    key = rank[seen.corner]
-    for size, number in ((len(problem.intrinsic), seen.camera), (len(problem.map_from_vehicle), seen.frame)):
-        key *= size
-        key += number
-    # No two keys are equal, or it is an error: the order need not be stable.
-    order = np.argsort(key).astype(np.int32)
-    corner, pair = np.empty_like(order), np.empty_like(order)
-    last = -1
-    for begin in range(0, len(key), _ROWS):
-        part = slice(begin, begin + _ROWS)
-        keys = key[order[part]]
-        same = np.flatnonzero(np.diff(keys, prepend=last) == 0)
-        if len(same):
-            _refuse_twice(problem, *sorted(order[begin + same[0] - 1 : begin + same[0] + 1].tolist()))
-        last = keys[-1]
-        corner[part], pair[part] = np.divmod(keys, pairs)
+    seen, frames = problem.observations, len(problem.map_from_vehicle)
+    order, corner, pair, again = sorted_observations(rank, seen.camera, seen.frame, seen.corner, frames)
+    if again >= 0:
+        _refuse_twice(problem, *sorted(order[again - 1 : again + 1].tolist()))
     return order, corner, pair
 
 
@@ -257,32 +226,6 @@ def _refuse_twice(problem: Problem, first: int, second: int) -> None:
         f"observations {first} and {second} are the same corner {seen.corner[first]} in frame "
         f"{seen.frame[first]} of camera {seen.camera[first]}: keep one of them"
     )
-
-
-def _whitened(problem: Problem, order: NDArray[np.int32]) -> tuple[FloatArray, FloatArray]:
-    """``measured`` (2, K) and ``root_information`` (3, K) of :class:`Arrays`."""
-    if available():
-        from v2hdm.adjust.engines.numba.prepare import whitened
-
-        return whitened(problem, order)
-    seen = problem.observations
-    measured, root = np.empty((2, len(order))), np.empty((3, len(order)))
-    for begin in range(0, len(order), _ROWS):
-        part = slice(begin, begin + _ROWS)
-        rows = order[part]
-        intrinsic = problem.intrinsic[seen.camera[rows]]
-        focal, principal = intrinsic[:, :2], intrinsic[:, 2:]
-        measured[:, part] = ((seen.pinhole_px[rows] - principal) / focal).T
-        root[:, part] = _root_information(seen.covariance_px[rows], focal)
-    return measured, root
-
-
-def _root_information(covariance_px: FloatArray, focal: FloatArray) -> FloatArray:
-    """Inverse Cholesky factors (3, K) of covariances (K, 2, 2): a, b, c of :class:`Arrays`."""
-    first = np.sqrt(covariance_px[:, 0, 0])
-    below = covariance_px[:, 1, 0] / first
-    last = np.sqrt(covariance_px[:, 1, 1] - below**2)
-    return np.stack([focal[:, 0] / first, -below * focal[:, 0] / (first * last), focal[:, 1] / last])
 
 
 def _control(problem: Problem) -> tuple[FloatArray, FloatArray]:

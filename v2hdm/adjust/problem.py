@@ -28,7 +28,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.adjust.engines.numba import available
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 POSE_STATES: tuple[str, ...] = ("x", "y", "height", "roll", "pitch", "heading")
@@ -37,8 +36,13 @@ POSE_STATES: tuple[str, ...] = ("x", "y", "height", "roll", "pitch", "heading")
 _LINE_RATIO = 1e3
 """Ratio of an observation's two variances from which it is one of a line: a point's is below 200."""
 
+# With the variances a > b: a b = det, a + b = trace, so a / b > q where trace^2 > det (q + 2 + 1 / q).
+LINE_EXCESS = _LINE_RATIO + 2 + 1 / _LINE_RATIO
+"""Squared trace over determinant of a covariance from which an observation is one of a line."""
+
 LOSSES: tuple[str, ...] = ("none", "huber", "cauchy", "geman_mcclure")
 SOLVERS: tuple[str, ...] = ("lbfgs", "lm")
+ENGINES: tuple[str, ...] = ("auto", "numba", "torch")
 
 
 @dataclass(frozen=True)
@@ -58,18 +62,8 @@ class Observations:
     @property
     def on_line(self) -> BoolArray:
         """Which observations (K,) say on which line of the image their corner lies, and not where on it."""
-        return on_line(self.covariance_px)
-
-
-def on_line(covariance_px: FloatArray) -> BoolArray:
-    """Whether covariances (K, 2, 2) are as good as those of a line of the image."""
-    if available():
-        from v2hdm.adjust.engines.numba.prepare import on_line as compiled
-
-        return compiled(covariance_px, _LINE_RATIO + 2 + 1 / _LINE_RATIO)
-    xx, yx, yy = covariance_px[:, 0, 0], covariance_px[:, 1, 0], covariance_px[:, 1, 1]
-    # With the variances a > b: a b = det, a + b = trace, so a / b > q where trace^2 > det (q + 2 + 1 / q).
-    return np.asarray((xx + yy) ** 2 > (xx * yy - yx**2) * (_LINE_RATIO + 2 + 1 / _LINE_RATIO))
+        xx, yx, yy = (self.covariance_px[:, row, column] for row, column in ((0, 0), (1, 0), (1, 1)))
+        return np.asarray((xx + yy) ** 2 > (xx * yy - yx**2) * LINE_EXCESS)
 
 
 @dataclass(frozen=True)
@@ -218,6 +212,8 @@ class SolveOptions:
         max_refreshes: how often the problem is whitened anew at most; ``lm`` does so at each step, and is
             limited by its evaluations alone.
         max_evaluations: of cost and gradient, over all refreshes.
+        engine: who evaluates and linearises, of :data:`ENGINES`: ``numba`` by compiled kernels on the CPU,
+            ``torch`` by autograd anywhere; ``auto`` is numba on the CPU, torch elsewhere.
         device: torch device to compute on.
     """
 
@@ -231,4 +227,5 @@ class SolveOptions:
     gap_tolerance: float = 1e-11
     max_refreshes: int = 20
     max_evaluations: int = 500
+    engine: str = "auto"
     device: str = "cpu"

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from v2hdm.adjust.model import state_residual
 from v2hdm.adjust.problem import POSE_STATES
-from v2hdm.adjust.residuals import state_residual
 from v2hdm.adjust.solution import Solution
 from v2hdm.records import FloatArray, IntArray
 
@@ -37,5 +37,5 @@ class PosePulls:
 def pose_pulls(solution: Solution) -> PosePulls:
     """The pulls on the poses of a solution; none where it estimates no state of a frame."""
     descent = solution.covariance.descent
-    pulls = state_residual(descent.arrays, descent.estimate.frame_state)
-    return PosePulls(np.array(descent.arrays.states, dtype=np.int64), pulls.cpu().numpy())
+    pulls = state_residual(descent.engine.arrays, descent.estimate.frame_state)
+    return PosePulls(np.array(descent.engine.arrays.states, dtype=np.int64), pulls.cpu().numpy())

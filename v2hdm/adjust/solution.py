@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from v2hdm.adjust.covariance import Covariance
+from v2hdm.adjust.model import Loss, robustified
 from v2hdm.adjust.problem import Observations
-from v2hdm.adjust.robust import loss
 from v2hdm.adjust.validation import Excluded, Verdict, VerdictArray, excluded
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
@@ -100,7 +100,8 @@ class Solution:
     @property
     def weight(self) -> FloatArray:
         """What the robust loss left of each observation (K,), 0 to 1."""
-        _, weight = loss(self.loss, torch.as_tensor(self.mahalanobis2), self.loss_scale)
+        robust = Loss(self.loss, self.loss_scale)
+        _, weight = robustified(robust, torch.as_tensor(self.mahalanobis2))
         return np.asarray(weight.numpy())
 
     @property

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from v2hdm.adjust.engines.numba import available
+from v2hdm.adjust.engines.numba.prepare import count_accepted, median
 from v2hdm.adjust.problem import Observations
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
@@ -69,16 +69,7 @@ class Excluded:
 
 def noise_scale(mahalanobis2: FloatArray) -> float:
     """How many times as large as stated the noise's variance is, by the median; at least 1."""
-    return max(1.0, _median(mahalanobis2) / _MEDIAN_SQUARED)
-
-
-def _median(values: FloatArray) -> float:
-    """The median of values from 0 up, to seven digits."""
-    if available():
-        from v2hdm.adjust.engines.numba.prepare import median
-
-        return median(values)
-    return float(np.median(values.astype(np.float32), overwrite_input=True))
+    return max(1.0, median(mahalanobis2) / _MEDIAN_SQUARED)
 
 
 def as_of_point(squared_of_line: FloatArray) -> FloatArray:
@@ -86,7 +77,7 @@ def as_of_point(squared_of_line: FloatArray) -> FloatArray:
     return np.asarray(-2 * chi2.logsf(squared_of_line, 1))
 
 
-def judge(
+def classify(
     observations: Observations,
     mahalanobis2: FloatArray,
     behind: BoolArray,
@@ -112,7 +103,7 @@ def judge(
     verdict[mahalanobis2 > gate] = Verdict.CONTRADICTS
     verdict[behind] = Verdict.BEHIND_CAMERA
     count = int(observations.corner.max()) + 1
-    seen, left = _count_accepted(observations.corner, verdict == Verdict.ACCEPTED, count)
+    seen, left = count_accepted(observations.corner, verdict == Verdict.ACCEPTED, count)
     alone = (left == 1) & (seen > 1)
     for begin in range(0, len(verdict) if alone.any() else 0, _ROWS):
         part = slice(begin, begin + _ROWS)
@@ -120,15 +111,6 @@ def judge(
             Verdict.UNCONFIRMED
         )
     return verdict
-
-
-def _count_accepted(corner: IntArray, accepted: BoolArray, corners: int) -> tuple[IntArray, IntArray]:
-    """How often each corner was seen, and how many of its observations are accepted."""
-    if available():
-        from v2hdm.adjust.engines.numba.prepare import count_accepted
-
-        return count_accepted(corner, accepted, corners)
-    return np.bincount(corner, minlength=corners), np.bincount(corner[accepted], minlength=corners)
 
 
 def excluded(
