@@ -1,13 +1,9 @@
-"""What a process pays for its first solve, and what it does without numba or a place to keep kernels."""
+"""What a process pays for its first solve, and what it does without a place to keep kernels."""
 
 import os
 import subprocess
 import sys
 from pathlib import Path
-
-import pytest
-
-from v2hdm.adjust.engines import numba as kernels
 
 ROOT = Path(__file__).parents[2]
 
@@ -60,13 +56,6 @@ torch.optim.Optimizer.shut = type("Wrapper", (), {"__wrapped__": Shut()})()
     assert cost_in_a_fresh_process(before) == cost_in_a_fresh_process()
 
 
-def test_without_numba_torch_does_the_work():
-    """Nothing is said, and the result is the same to rounding."""
-    before = "sys.modules['numba'] = None"
-    after = "assert 'v2hdm.adjust.engines.numba.engine' not in sys.modules"
-    assert cost_in_a_fresh_process(before, after) == pytest.approx(cost_in_a_fresh_process(), rel=1e-9)
-
-
 KERNEL = """
 from pathlib import Path
 from v2hdm.adjust.engines.numba import build
@@ -77,7 +66,6 @@ print(median(np.arange(7.0)))
 """
 
 
-@pytest.mark.skipif(not kernels.available(), reason="numba, the extra 'fast', is not installed")
 def test_kernels_are_kept_and_where_they_cannot_be_they_are_compiled(tmp_path):
     """In a folder that is a file, or from damaged files, a process compiles for itself and says nothing."""
     blocked, kept = tmp_path / "file", tmp_path / "kept"

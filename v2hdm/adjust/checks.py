@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from v2hdm.adjust.engines import is_numba
-from v2hdm.adjust.engines.numba.prepare import are_sound
 from v2hdm.adjust.problem import ENGINES, LOSSES, POSE_STATES, SOLVERS, Problem, SolveOptions
 from v2hdm.errors import AdjustError
 from v2hdm.records import FloatArray, IntArray
@@ -39,6 +38,8 @@ def check_problem(problem: Problem) -> None:
 
 def _observations_are_sound(problem: Problem) -> bool:
     """Whether one compiled pass finds no fault in any observation."""
+    from v2hdm.adjust.engines.numba.prepare import are_sound  # loads numba
+
     seen = problem.observations
     indices = seen.camera, seen.frame, seen.corner
     limits = len(problem.map_from_vehicle), problem.corner_count, _SYMMETRIC_TO, _MAX_SLOPE

@@ -19,7 +19,6 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays, CameraQuadratic, Lengths
-from v2hdm.adjust.engines.numba.prepare import first_frames, sorted_observations, whitened
 from v2hdm.adjust.problem import POSE_STATES, PoseSigma, Problem
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.tensors import inverse
@@ -149,6 +148,8 @@ def make_arrays(
     def index(values: NDArray[Any]) -> Tensor:
         return torch.as_tensor(values, device=device)
 
+    from v2hdm.adjust.engines.numba.prepare import whitened  # loads numba
+
     corner_order, joined = _corners_in_route_order(problem)
     rank = np.empty_like(corner_order)
     rank[corner_order] = np.arange(len(corner_order))
@@ -190,6 +191,8 @@ def _corners_in_route_order(problem: Problem) -> tuple[IntArray, BoolArray]:
 
     Corners that known lengths join come side by side, where the first of them belongs.
     """
+    from v2hdm.adjust.engines.numba.prepare import first_frames  # loads numba
+
     count, lengths = problem.corner_count, problem.lengths
     seen, frames = problem.observations, len(problem.map_from_vehicle)
     first_frame = first_frames(seen.corner, seen.frame, count, frames)
@@ -213,6 +216,8 @@ def _sorted_observations(
     problem: Problem, rank: IntArray
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
     """Observations (K,) by corner, then camera, then frame; the corner and the pair of each."""
+    from v2hdm.adjust.engines.numba.prepare import sorted_observations  # loads numba
+
     seen, frames = problem.observations, len(problem.map_from_vehicle)
     order, corner, pair, again = sorted_observations(rank, seen.camera, seen.frame, seen.corner, frames)
     if again >= 0:

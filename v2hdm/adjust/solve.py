@@ -15,7 +15,6 @@ from v2hdm.adjust.descent import Descent, descend, open_descent
 from v2hdm.adjust.engine import Engine
 from v2hdm.adjust.engines import is_numba, make_engine
 from v2hdm.adjust.engines.numba.pool import one_thread_in_torch
-from v2hdm.adjust.engines.numba.prepare import on_line
 from v2hdm.adjust.layout import make_arrays, nearby_origin, shifted
 from v2hdm.adjust.model import Estimate, Loss, frame_tangent
 from v2hdm.adjust.problem import LINE_EXCESS, Problem, SolveOptions
@@ -119,6 +118,8 @@ def report(
     began: float,
 ) -> Solution:
     """What came of it, on the map of ``problem``, whose point ``origin_map`` is the origin of the arrays."""
+    from v2hdm.adjust.engines.numba.prepare import on_line  # loads numba
+
     robust = Loss(options.loss, options.loss_scale)
     engine, estimate, terms = descent.engine, descent.estimate, descent.terms
     arrays = engine.arrays

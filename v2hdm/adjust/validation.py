@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from v2hdm.adjust.engines.numba.prepare import count_accepted, median
 from v2hdm.adjust.problem import Observations
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
@@ -69,6 +68,8 @@ class Excluded:
 
 def noise_scale(mahalanobis2: FloatArray) -> float:
     """How many times as large as stated the noise's variance is, by the median; at least 1."""
+    from v2hdm.adjust.engines.numba.prepare import median  # loads numba
+
     return max(1.0, median(mahalanobis2) / _MEDIAN_SQUARED)
 
 
@@ -98,6 +99,8 @@ def classify(
         probability: share of sound observations that one is ready to lose.
         scale: of the noise's variance, :func:`noise_scale`.
     """
+    from v2hdm.adjust.engines.numba.prepare import count_accepted  # loads numba
+
     gate = -2 * np.log(probability) * scale
     verdict = np.full(len(mahalanobis2), Verdict.ACCEPTED, dtype=np.int8)
     verdict[mahalanobis2 > gate] = Verdict.CONTRADICTS
