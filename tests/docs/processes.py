@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[2]
 LOADED = (
     "torch", "kornia", "scipy.optimize", "hydra", "matplotlib.pyplot", "rasterio", "pyogrio", "ezdxf",
     "v2hdm.config", "v2hdm.console", "v2hdm.checkup", "v2hdm.watch", "v2hdm.mosaicking", "v2hdm.localization",
-    "v2hdm.precalibration", "v2hdm.adjust.engines.numba", "rosbags.highlevel",
+    "v2hdm.precalibration", "v2hdm.adjust.engines.numba.engine", "rosbags.highlevel",
 )  # fmt: skip
 
 CLIENT = """#!{python} -IS

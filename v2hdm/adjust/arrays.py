@@ -13,7 +13,7 @@ from torch import Tensor
 # Observations that are computed at once: their intermediate results stay in the processor's cache, and
 # beside the whole take no memory.
 _RUN = 1 << 14
-_RUN_ON_DEVICE = 1 << 22
+_RUN_ON_DEVICE = 1 << 20
 
 
 @dataclass(frozen=True)

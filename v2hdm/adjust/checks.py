@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.adjust.engines import is_numba
 from v2hdm.adjust.problem import ENGINES, LOSSES, POSE_STATES, SOLVERS, Problem, SolveOptions
 from v2hdm.errors import AdjustError
 from v2hdm.records import FloatArray, IntArray
@@ -117,7 +116,7 @@ def check_options(options: SolveOptions) -> None:
         if getattr(options, name) not in choices:
             chosen = getattr(options, name)
             raise AdjustError(f"unknown {name} '{chosen}': choose from {', '.join(choices)}")
-    if is_numba(options.engine, options.device) and not is_numba("auto", options.device):
+    if options.engine == "numba" and not options.on_cpu:
         raise AdjustError("engine=numba computes on the CPU: choose engine=torch, or device=cpu")
     if not 0 < options.gate_probability < 1:
         raise AdjustError(f"gate_probability is {options.gate_probability}: give a share between 0 and 1")

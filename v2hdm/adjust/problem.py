@@ -170,7 +170,7 @@ class Problem:
     pose_sigma: PoseSigma | tuple[PoseSigma, ...] = PoseSigma()
     corners_start: FloatArray | None = None
     twist_vehicle: FloatArray | None = None
-    clock_sigma_s: float = 0.02
+    clock_sigma_s: float = 0.01
     control: ControlPoints | None = None
     lengths: KnownLengths | None = None
     camera_prior: CameraPrior | None = None
@@ -220,7 +220,7 @@ class SolveOptions:
     pose_states: tuple[str, ...] = POSE_STATES
     clock_offset: bool = False
     loss: str = "cauchy"
-    loss_scale: float = 3.0
+    loss_scale: float = 2.0
     gate_probability: float = 1e-4
     solver: str = "lbfgs"
     coarse: bool = True
@@ -229,3 +229,8 @@ class SolveOptions:
     max_evaluations: int = 500
     engine: str = "auto"
     device: str = "cpu"
+
+    @property
+    def on_cpu(self) -> bool:
+        """Whether the device is the CPU."""
+        return self.device.split(":")[0] == "cpu"

@@ -1,9 +1,9 @@
 """The reduced system of frame states, kept corners and cameras, all other corners eliminated, in tiles.
 
-S = U - B' B (see :mod:`v2hdm.adjust.whitening`). Vectors of the reduced unknowns hold the tiles in
+S = U - B' B (:mod:`v2hdm.adjust.whitening`). Vectors of the reduced unknowns hold the tiles in
 elimination order, padded to whole tiles, then the cameras' unknowns. Tiles are of frames along the route or
-of *kept* corners: where several drives pass the same corners, eliminating these first would couple the frames of
-all drives with one another, and it takes less to eliminate each drive's frames before them.
+of *kept* corners: where several drives pass the same corners, eliminating these first would couple the frames
+of all drives with one another, and it takes less to eliminate each drive's frames before them.
 """
 
 from __future__ import annotations

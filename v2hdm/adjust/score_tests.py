@@ -79,7 +79,7 @@ _UNITS = {
 
 
 @dataclass(frozen=True)
-class Suspect:
+class ScoreTest:
     """One fault, as the residuals see it.
 
     Attributes:
@@ -224,7 +224,7 @@ def _prior_residuals(
     )
 
 
-def suspects(problem: Problem, solution: Solution) -> tuple[Suspect, ...]:
+def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:
     """Every fault that ``problem`` can have, each tested by itself at its ``solution``; largest gain first.
 
     Where residuals are larger than the model says, sigmas are larger, and gains smaller, by as much.
@@ -237,14 +237,14 @@ def suspects(problem: Problem, solution: Solution) -> tuple[Suspect, ...]:
     return tuple(sorted(inflated, key=lambda suspect: -suspect.gain))
 
 
-def _test(hypothesis: _Hypothesis, bench: _Bench) -> Suspect:
+def _test(hypothesis: _Hypothesis, bench: _Bench) -> ScoreTest:
     column = hypothesis.column(bench)
     coupling, own = bench.coupling(column), column.dot(column)
     left = own - float(coupling.square().sum())
     # What the descent has left of the gradient counts where a fault is nearly what something else can be.
     slope = column.dot(bench.residuals) - float(coupling @ bench.whitening.gradient)
     told = own > 0 and left > _LEAST_TOLD * own
-    return Suspect(
+    return ScoreTest(
         hypothesis.fault,
         hypothesis.camera,
         hypothesis.axis,
@@ -283,7 +283,7 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
         yield _Hypothesis(Fault.SIZE, _size(arrays.lengths.length_m == length_m), item=item)
 
 
-def _control_points(problem: Problem, solution: Solution) -> Iterator[Suspect]:
+def _control_points(problem: Problem, solution: Solution) -> Iterator[ScoreTest]:
     """Each surveyed point against what everything else says of its corner.
 
     What the adjustment leaves between a point and its corner has the covariance of the point less that of
@@ -301,7 +301,7 @@ def _control_points(problem: Problem, solution: Solution) -> Iterator[Suspect]:
         gain = float(off @ np.linalg.solve(expected, off))
         # Without the point its corner would lie farther from it, by the share that it had of the information.
         apart = float(np.linalg.norm(sigma_m**2 * np.linalg.solve(expected, off)))
-        yield Suspect(Fault.CONTROL, -1, -1, m, apart, apart / max(gain, 1e-12) ** 0.5, gain)
+        yield ScoreTest(Fault.CONTROL, -1, -1, m, apart, apart / max(gain, 1e-12) ** 0.5, gain)
 
 
 def _lens(camera: int, power: int) -> Callable[[_Bench], _Column]:

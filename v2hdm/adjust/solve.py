@@ -13,7 +13,7 @@ from v2hdm.adjust.checks import check_model, check_options, check_problem
 from v2hdm.adjust.covariance import Covariance
 from v2hdm.adjust.descent import Descent, descend, open_descent
 from v2hdm.adjust.engine import Engine
-from v2hdm.adjust.engines import is_numba, make_engine
+from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.engines.numba.pool import one_thread_in_torch
 from v2hdm.adjust.layout import make_arrays, nearby_origin, shifted
 from v2hdm.adjust.model import Estimate, Loss, frame_tangent
@@ -42,7 +42,8 @@ def solve(problem: Problem, options: SolveOptions | None = None) -> Solution:
     check_options(options)
     check_problem(problem)
     check_model(problem, options)
-    with one_thread_in_torch(len(problem.observations.corner), is_numba(options.engine, options.device)):
+    compiled = options.on_cpu and options.engine != "torch"
+    with one_thread_in_torch(len(problem.observations.corner), compiled):
         return _solve(problem, options, began)
 
 
