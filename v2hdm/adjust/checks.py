@@ -40,9 +40,14 @@ def _observations_are_sound(problem: Problem) -> bool:
     from v2hdm.adjust.engines.numba.prepare import are_sound  # loads numba
 
     seen = problem.observations
-    indices = seen.camera, seen.frame, seen.corner
-    limits = len(problem.map_from_vehicle), problem.corner_count, _SYMMETRIC_TO, _MAX_SLOPE
-    return are_sound(*indices, seen.pinhole_px, seen.covariance_px, problem.intrinsic, *limits)
+    return are_sound(
+        *(seen.camera, seen.frame, seen.corner),
+        *(seen.pinhole_px, seen.covariance_px, problem.intrinsic),
+        frames=len(problem.map_from_vehicle),
+        corners=problem.corner_count,
+        symmetric_to=_SYMMETRIC_TO,
+        max_slope=_MAX_SLOPE,
+    )
 
 
 def _check_control(problem: Problem) -> None:

@@ -139,7 +139,8 @@ def ground_points(cam_from_map: Tensor, measured: Tensor) -> Tensor:
 def depression_sine(cam_from_map: Tensor, measured: Tensor) -> Tensor:
     """How steeply rays (2, k), at depth 1, descend to the ground: sines (k,), negative above the horizon."""
     ray = pad(measured.T, (0, 1), value=1.0)
-    return -(ray * cam_from_map[:, :3, 2]).sum(1) / ray.norm(dim=1)
+    sine: Tensor = -(ray * cam_from_map[:, :3, 2]).sum(1) / ray.norm(dim=1)
+    return sine
 
 
 def centre_residual(arrays: Arrays, cam_from_vehicle: Tensor) -> Tensor:
@@ -173,7 +174,8 @@ def control_residual(arrays: Arrays, corners_map: Tensor) -> Tensor:
 def length_residual(arrays: Arrays, first_map: Tensor, second_map: Tensor) -> Tensor:
     """Distances (M,) of corners (M, 2) against the known lengths."""
     known = arrays.lengths
-    return ((first_map - second_map).norm(dim=1) - known.length_m) * known.information_root
+    distance_m = torch.linalg.vector_norm(first_map - second_map, dim=1)
+    return (distance_m - known.length_m) * known.information_root
 
 
 def camera_offset(prior: CameraQuadratic, cam_from_vehicle: Tensor, clock_s: Tensor) -> Tensor:

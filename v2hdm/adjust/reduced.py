@@ -206,7 +206,7 @@ class ReducedSystem:
             place = int(plan.position[plan.frame_tiles + tile])
             self.matrix.diagonal[place].diagonal().add_(pad.to(lower.dtype))
         border = self.spread.by_camera(run, coupling).flatten(0, 1)
-        for tile, part in enumerate(border.split(2 * each)):
+        for tile, part in enumerate(torch.split(border, 2 * each)):
             place = int(plan.position[plan.frame_tiles + tile])
             self.matrix.tiles[TIP, place][:, : len(part)] += part.mT
 
@@ -217,7 +217,7 @@ class ReducedSystem:
 
     def _scatter(self, rows: Tensor, columns: Tensor, values: Tensor) -> None:
         """Add values at rows and columns of the tiles; of two that mirror each other the lower one counts."""
-        rows, columns = torch.broadcast_tensors(rows, columns)
+        rows, columns = torch.broadcast_tensors(rows, columns)  # type: ignore[no-untyped-call]
         low, high = torch.minimum(rows, columns), torch.maximum(rows, columns)
         size, tile = self.plan.size, low // self.plan.size * self.plan.tile_count + high // self.plan.size
         keys, at = self.matrix.addresses
