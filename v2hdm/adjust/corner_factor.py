@@ -17,7 +17,7 @@ PIVOT_FLOOR = 1e-12
 """Least pivot of a corner's second coordinate, as a share of its own information."""
 
 INSEPARABLE = "corners joined by known lengths cannot be solved for together: state their sigma_m larger"
-"""What a block is reported as that has no factor."""
+"""The error of a block that has no factor."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class CornerFactor:
     joint: tuple[Joint, ...]
 
     def part(self, corners: slice) -> CornerFactor:
-        """That of some corners, which are joined to no others."""
+        """The factor of some corners, which are joined to no others."""
         inside = []
         for group in self.joint:
             chosen = (group.begin >= corners.start) & (group.begin < corners.stop)
@@ -51,7 +51,7 @@ class CornerFactor:
         return CornerFactor(self.lower[:, corners], tuple(inside))
 
     def take(self, corners: Tensor) -> CornerFactor:
-        """That of corners (n,), ascending, with all that they are joined to."""
+        """The factor of corners (n,), ascending, with all that they are joined to."""
         inside = []
         for group in self.joint:
             place = torch.searchsorted(corners, group.begin).clamp(max=len(corners) - 1)

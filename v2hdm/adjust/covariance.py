@@ -39,7 +39,7 @@ class Covariance:
         return self.descent.whitening
 
     def extrinsic(self) -> FloatArray:
-        """Of each camera's left tangent (C, 6, 6): translation m, rotation rad."""
+        """Covariance (C, 6, 6) of each camera's left tangent: translation m, rotation rad."""
         # The extrinsics come last, so the tip of L_S is the factor of their marginal information.
         joint = torch.cholesky_inverse(self.whitening.reduced_factor.tip)
         each = self.whitening.engine.arrays.camera_unknowns

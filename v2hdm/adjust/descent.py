@@ -85,7 +85,7 @@ class Objective:
         return total(self.whitening.terms), self.whitening.gradient
 
     def point(self, whitened: Tensor) -> Point:
-        """What whitened variables stand for; known where they were evaluated last."""
+        """The point that whitened variables stand for; known where they were evaluated last."""
         if not bool(whitened.any()):
             return Point(whitened, self.whitening.estimate, self.whitening.terms)
         if self._last is None or not torch.equal(self._last.whitened, whitened):

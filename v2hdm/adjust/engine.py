@@ -1,4 +1,4 @@
-"""What an engine does for the solver: it evaluates, linearises and eliminates a problem's corners.
+"""The interface of engines: they evaluate and linearise a problem and eliminate its corners.
 
 The solver knows no observation. It asks an :class:`Engine` made for one problem
 (:func:`v2hdm.adjust.engines.make_engine`), either ``torch``, which differentiates :mod:`v2hdm.adjust.model`,

@@ -237,7 +237,7 @@ class IncrementalMap:
             self._earlier = earlier
 
     def _without(self, marking: int, sighted: Sighted) -> _Quadratic | None:
-        """What the other markings say; None where that takes a solve of all of them.
+        """The quadratic without a marking; None where that takes a solve of all others.
 
         So it does where little is left, for what a marking shared with others is then much of it.
         """

@@ -1,8 +1,7 @@
-"""An origin near the drive: in UTM coordinates a solver would lose seven digits to the distance of theirs.
+"""From a checked problem to its :class:`~v2hdm.adjust.arrays.Arrays`.
 
-How the errors of the recorded poses are modelled: states of a frame, and how they follow one another.
-
-From a checked problem to its :class:`~v2hdm.adjust.arrays.Arrays`, some rows at a time.
+The origin is near the drive: in UTM coordinates a solver would lose seven digits to the distance of theirs. The
+errors of the recorded poses become states of the frames, with what each state says about the next frame's.
 """
 
 from __future__ import annotations

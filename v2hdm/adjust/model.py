@@ -174,7 +174,7 @@ def control_residual(arrays: Arrays, corners_map: Tensor) -> Tensor:
 def length_residual(arrays: Arrays, first_map: Tensor, second_map: Tensor) -> Tensor:
     """Distances (M,) of corners (M, 2) against the known lengths."""
     known = arrays.lengths
-    distance_m = torch.linalg.vector_norm(first_map - second_map, dim=1)
+    distance_m: Tensor = torch.linalg.vector_norm(first_map - second_map, dim=1)
     return (distance_m - known.length_m) * known.information_root
 
 

@@ -1,7 +1,4 @@
-"""What the drive itself says about each extrinsic, and what rests on the survey alone.
-
-How far the recorded poses had to give way, in the standard deviations stated for them.
-"""
+"""How well a drive determines each extrinsic, and how far the recorded poses had to give way."""
 
 from __future__ import annotations
 

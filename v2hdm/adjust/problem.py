@@ -1,4 +1,4 @@
-r"""What is estimated from what: the model, as plain numpy records.
+r"""The problem as plain numpy records: observations, unknowns and priors.
 
 Unknown are, in the frames of :mod:`v2hdm.geometry`,
 
@@ -31,7 +31,7 @@ import numpy as np
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 POSE_STATES: tuple[str, ...] = ("x", "y", "height", "roll", "pitch", "heading")
-"""What a frame can deviate in, in the order of its tangent."""
+"""The axes in which a frame can deviate, in the order of its tangent."""
 
 _LINE_RATIO = 1e3
 """Ratio of an observation's two variances from which it is one of a line: a point's is below 200."""
@@ -104,7 +104,7 @@ class KnownLengths:
 
 @dataclass(frozen=True)
 class CameraPrior:
-    """What earlier markings say of the cameras: a quadratic in their tangents and clock offsets.
+    """A prior on the cameras by earlier markings: a quadratic in their tangents and clock offsets.
 
     With ``cam_from_vehicle = exp(tangent) @ base`` (C, 4, 4), each camera's tangent and, where it is
     estimated, clock offset in s are ``mean`` (C, 6 + Q), with the joint ``information``

@@ -40,12 +40,12 @@ from v2hdm.geometry.tensors import exp, inverse
 _STEP = 1e-3
 """Step of central differences, in the unit of the fault (s or rad): millimetres of motion."""
 
-_LEAST_TOLD = 1e-9
+_LEAST_OBSERVABLE = 1e-9
 """Share of a fault's own information, left by all else, below which rounding alone is left of it."""
 
 
 class Fault(Enum):
-    """What may be wrong, and the unit of its value."""
+    """An input that may be wrong, and the unit of its value."""
 
     CLOCK = "clock"  # images were taken later than they say
     FOCAL = "focal"  # share by which the focal length is longer than stated
@@ -89,7 +89,7 @@ class ScoreTest:
             image (principal).
         item: which of the problem's control points, known lengths or (clock) visits; -1 for none or all.
         value: by how much, true minus stated.
-        sigma: how well the drive tells, inf where it cannot.
+        sigma: how well the drive observes it, inf where it cannot.
         gain: by how much twice the cost would fall: chi-square with one degree of freedom.
     """
 
@@ -243,15 +243,15 @@ def _test(hypothesis: _Hypothesis, bench: _Bench) -> ScoreTest:
     left = own - float(coupling.square().sum())
     # What the descent has left of the gradient counts where a fault is nearly what something else can be.
     slope = column.dot(bench.residuals) - float(coupling @ bench.whitening.gradient)
-    told = own > 0 and left > _LEAST_TOLD * own
+    observable = own > 0 and left > _LEAST_OBSERVABLE * own
     return ScoreTest(
         hypothesis.fault,
         hypothesis.camera,
         hypothesis.axis,
         hypothesis.item,
-        value=-slope / left if told else 0.0,
-        sigma=float(left**-0.5) if told else float("inf"),
-        gain=slope**2 / left if told else 0.0,
+        value=-slope / left if observable else 0.0,
+        sigma=float(left**-0.5) if observable else float("inf"),
+        gain=slope**2 / left if observable else 0.0,
     )
 
 
@@ -296,7 +296,7 @@ def _control_points(problem: Problem, solution: Solution) -> Iterator[ScoreTest]
     for m, (point, sigma_m) in enumerate(zip(control.points_map, control.sigma_m, strict=True)):
         off = solution.corners_map[control.corner[m]] - point
         expected = np.diag(sigma_m**2) - covariance[m]
-        if np.linalg.eigvalsh(expected).min() <= _LEAST_TOLD * np.max(sigma_m) ** 2:
+        if np.linalg.eigvalsh(expected).min() <= _LEAST_OBSERVABLE * np.max(sigma_m) ** 2:
             continue
         gain = float(off @ np.linalg.solve(expected, off))
         # Without the point its corner would lie farther from it, by the share that it had of the information.

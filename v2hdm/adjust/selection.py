@@ -1,6 +1,4 @@
-"""A part of a problem as a problem of its own.
-
-Which model of the poses' errors a drive calls for, judged by observations that it did not see.
+"""The model of the poses' errors that a drive calls for, chosen by observations held out of the solve.
 
 Every model is fitted to most of the observations of a stretch of the drive and predicts the others. What
 it predicts best is right, in the one sense that a drive without ground truth can tell: a model that
@@ -68,7 +66,7 @@ def restrict(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
 
 @dataclass(frozen=True)
 class Model:
-    """What is estimated of the poses beside map and extrinsics."""
+    """The pose errors that are estimated beside map and extrinsics."""
 
     pose_states: tuple[str, ...] = ()
     clock_offset: bool = False
@@ -107,7 +105,7 @@ class Selection:
 
     @property
     def sentence(self) -> str:
-        """What was chosen over what."""
+        """One sentence on the choice."""
         if not self.scores:
             return f"pose model '{self.name}', since too few observations repeat to choose by them"
         scores = ", ".join(f"{name} {score:.2f}" for name, score in self.scores.items())

@@ -1,4 +1,4 @@
-"""What a solve returns: the estimate, how it went, and how sure it is."""
+"""The result of a solve: the estimate, how it went, and how sure it is."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class Solution:
 
     @property
     def weight(self) -> FloatArray:
-        """What the robust loss left of each observation (K,), 0 to 1."""
+        """The weight (K,), 0 to 1, that the robust loss leaves each observation."""
         robust = Loss(self.loss, self.loss_scale)
         _, weight = robustified(robust, torch.as_tensor(self.mahalanobis2))
         return np.asarray(weight.numpy())
@@ -110,7 +110,7 @@ class Solution:
         return np.asarray(self.verdict == Verdict.ACCEPTED)
 
     def excluded(self, observations: Observations) -> tuple[Excluded, ...]:
-        """What was left out of ``observations``, those of the problem, and why; worst first."""
+        """The excluded of ``observations``, those of the problem, and why; worst first."""
         return excluded(observations, self.mahalanobis2, self.verdict)
 
     @property

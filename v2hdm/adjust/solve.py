@@ -118,7 +118,7 @@ def report(
     spent: int,
     began: float,
 ) -> Solution:
-    """What came of it, on the map of ``problem``, whose point ``origin_map`` is the origin of the arrays."""
+    """The solution on the map of ``problem``, whose point ``origin_map`` is the origin of the arrays."""
     from v2hdm.adjust.engines.numba.prepare import on_line  # loads numba
 
     robust = Loss(options.loss, options.loss_scale)
@@ -192,7 +192,7 @@ def _status(descent: Descent, options: SolveOptions, behind: bool) -> Status:
 def _variance_factors(
     arrays: Arrays, terms: dict[str, Tensor], squared: FloatArray, scale: float
 ) -> VarianceFactors:
-    """Those of a solve whose cost consists of ``terms``, and whose noise has the ``scale``."""
+    """Variance factors of a solve whose cost has these ``terms`` and whose noise has the ``scale``."""
     of_priors = 2 * sum(float(value) for name, value in terms.items() if name != "observations")
     centres = int((arrays.centre_information_root > 0).sum())
     surveyed = int((arrays.control_information > 0).sum())

@@ -41,7 +41,7 @@ class Pattern:
     below: tuple[tuple[int, ...], ...]
 
     def multiplications(self, size: int, tip: int) -> float:
-        """Those of a factorisation, in tiles of ``size`` rows and a tip of ``tip``."""
+        """Multiplications of a factorisation, in tiles of ``size`` rows and a tip of ``tip``."""
         heights = np.array([len(below) for below in self.below], dtype=float) * size + tip
         return float(np.sum(size**3 / 6 + heights * size**2 / 2 + heights**2 * size / 2))
 

@@ -1,7 +1,4 @@
-"""Which observations the solution stands on, and why the others were left out.
-
-How many times as large as stated variances are, by what an adjustment leaves of its residuals.
-"""
+"""Validation of observations by their residuals, and of the stated variances by all of them."""
 
 from __future__ import annotations
 
@@ -25,7 +22,7 @@ _ROWS = 1 << 18
 
 
 class Verdict(IntEnum):
-    """What became of an observation; :attr:`reason` says it in words."""
+    """The verdict on an observation; :attr:`reason` says it in words."""
 
     ACCEPTED = 0
     CONTRADICTS = 1
@@ -59,7 +56,7 @@ class Excluded:
 
     @property
     def sentence(self) -> str:
-        """What was left out and why."""
+        """One sentence on the observation and the reason."""
         return (
             f"observation {self.observation} (corner {self.corner}, camera {self.camera}, "
             f"frame {self.frame}): {self.verdict.reason} ({self.distance_sigma:.1f} sigma)"

@@ -218,8 +218,8 @@ def _evidence(
     sightings: Sightings,
 ) -> SolveEvidence:
     factors, window_s = along_route(settled, sightings.frame[settled.row], sightings.stamp_s)
-    pulls = pose_innovations(settled.solution)
-    largest = np.abs(pulls.pulls).max(axis=1, initial=0.0)
+    innovations = pose_innovations(settled.solution)
+    largest = np.abs(innovations.normalised).max(axis=1, initial=0.0)
     frames_s = sightings.stamp_s[np.unique(sightings.frame[settled.row])]
     return SolveEvidence(
         suspects=found,
@@ -230,7 +230,7 @@ def _evidence(
         variance_factor=overall_factor(settled),
         along_route=factors,
         window_s=window_s,
-        pose_pulls=pulls.rms(),
+        pose_pulls=innovations.rms(),
         worst_pull=float(largest.max()),
         worst_pull_s=float(frames_s[int(largest.argmax())]),
         clock_s=_clocks(final),

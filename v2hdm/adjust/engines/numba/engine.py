@@ -16,6 +16,7 @@ from v2hdm.adjust.corner_factor import INSEPARABLE, CornerFactor, Joint
 from v2hdm.adjust.engine import Evaluated
 from v2hdm.adjust.engines.numba import evaluate, frames, linearise, motion, observe
 from v2hdm.adjust.engines.numba.build import kernel
+from v2hdm.adjust.engines.numba.evaluate import Evaluation
 from v2hdm.adjust.engines.numba.layout import LOSS_CODES, Layout, make_layout
 from v2hdm.adjust.engines.numba.pool import share
 from v2hdm.adjust.engines.numba.tables import Sums, cam_from_map, prior_blocks_of, spread_of, with_priors
@@ -397,7 +398,7 @@ class NumbaLinearised:
     def _loss(self) -> tuple[int, float]:
         return LOSS_CODES[self._robust.name], float(self._robust.scale)
 
-    def _room(self, width: int) -> evaluate.Evaluation:
+    def _room(self, width: int) -> Evaluation:
         chunks, touched = len(self._engine.layout.chunk) - 1, len(self._engine.layout.touched)
         return evaluate.Evaluation(
             costs=np.zeros((chunks, 3)),

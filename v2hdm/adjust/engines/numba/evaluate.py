@@ -39,7 +39,7 @@ class Base(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """What :func:`evaluate` works in: numbers of pairs (P,), a unit's linearised observations and steps."""
+    """The workspace of :func:`evaluate`: numbers of pairs (P,), a unit's observations and steps."""
 
     slot: IntArray
     known: FloatArray
@@ -58,7 +58,7 @@ class Scratch(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """What :func:`evaluate` computes, as in :class:`~v2hdm.adjust.engines.numba.linearise.Linearisation`.
+    """The output of :func:`evaluate`, as in :class:`~v2hdm.adjust.engines.numba.linearise.Linearisation`.
 
     ``corners`` (N, 2) are those moved; ``whitened`` (N, 2) is the gradient by their whitened variables.
     """

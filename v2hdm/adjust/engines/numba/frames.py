@@ -36,7 +36,7 @@ class TileMap(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """What is worked in: by tile (G,) the last unit that touched it and its place, a list of tiles, and more.
+    """The workspace: by tile (G,) the last unit that touched it and its place, a list of tiles, and more.
 
     ``low`` and ``high`` are the columns of each touched tile that are not zero, ``jacobian`` and ``coupling``
     those of an observation, ``rows`` the unit's of all touched tiles and of the cameras.

@@ -1,4 +1,4 @@
-"""What the kernels have in common: an observation, a loss, the factor of a unit's corners.
+"""Common parts of the kernels: an observation, a loss, the factor of a unit's corners.
 
 The formulas are the closed forms of :mod:`~v2hdm.adjust.model` and :mod:`~v2hdm.adjust.corner_factor`, which
 tests hold these to. A pair's table is its ``cam_from_map``, row by row (16,).

@@ -16,7 +16,7 @@ from v2hdm.adjust.engines.numba.build import kernel
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 LOSS_CODES = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
-"""What the kernels call the losses of :data:`v2hdm.adjust.problem.LOSSES`."""
+"""Codes of the losses of :data:`v2hdm.adjust.problem.LOSSES`."""
 
 
 class Layout(NamedTuple):

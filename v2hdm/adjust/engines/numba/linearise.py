@@ -29,7 +29,7 @@ from v2hdm.records import FloatArray, IntArray
 
 
 class Linearisation(NamedTuple):
-    """What :func:`linearise` computes; R pairs are touched in all chunks together, Q chunks.
+    """The output of :func:`linearise`; R pairs are touched in all chunks together, Q chunks.
 
     Attributes:
         costs: (Q, 3) of observations, survey and known lengths.
@@ -58,7 +58,7 @@ class Linearisation(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """What :func:`linearise` works in: the number of each pair (P,), and derivatives and blocks of a unit."""
+    """The workspace of :func:`linearise`: numbers of pairs (P,), derivatives and blocks of a unit."""
 
     slot: IntArray
     jacobian: FloatArray

@@ -65,7 +65,7 @@ def back_project(
 
 
 class Report(NamedTuple):
-    """What is said of the problem's observations (K,), in its order: see :class:`v2hdm.adjust.Solution`."""
+    """The report on the problem's observations (K,), in its order: see :class:`v2hdm.adjust.Solution`."""
 
     residual_px: FloatArray
     mahalanobis2: FloatArray

@@ -1,4 +1,4 @@
-"""What is done once to a problem's observations, each in one pass: checks, the layout, verdicts."""
+"""Passes over a problem's observations before and after a solve: checks, the layout, verdicts."""
 
 from __future__ import annotations
 

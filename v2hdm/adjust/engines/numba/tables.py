@@ -1,4 +1,4 @@
-"""What acts on few numbers, pairs and priors, in closed form: an evaluation is no slower for them.
+"""Closed forms for pairs and priors, which are few: an evaluation is no slower for them.
 
 With ``A = [r1 r2 t]`` of a pair's ``cam_from_map`` a corner l lies at p = A (l_x, l_y, 1) in the camera. A
 gradient of the cost by p is a force, so that of a pair by its left tangent is a *wrench*: the sums of the
@@ -65,7 +65,7 @@ def spread_of(arrays: Arrays, estimate: Estimate) -> Spread:
 
 @dataclass(frozen=True)
 class Sums:
-    """What kernels add up over observations and corners.
+    """Sums over observations and corners.
 
     Attributes:
         observations, control, lengths: the costs of the observations, the survey and the known lengths.
