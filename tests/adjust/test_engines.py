@@ -17,7 +17,6 @@ from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.engines.autograd import TorchEngine
 from v2hdm.adjust.engines.numba import pool
 from v2hdm.adjust.engines.numba.motion import move
-from v2hdm.adjust.engines.numba.prepare import median
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.problem import LOSSES, POSE_STATES, CameraPrior
@@ -229,15 +228,6 @@ def test_results_do_not_depend_on_the_number_of_threads(pose_states, monkeypatch
         assert one.cost == found[0].cost
         np.testing.assert_array_equal(one.corners_map, found[0].corners_map)
         np.testing.assert_array_equal(one.map_from_vehicle, found[0].map_from_vehicle)
-
-
-@pytest.mark.parametrize("count", [1, 2, 5, 1000, 1001])
-def test_the_median_is_that_of_numpy(count):
-    values = np.random.default_rng(count).chisquare(2, count) * 10.0 ** np.arange(count % 7)[-1:].sum()
-    values[: count // 4] = 0.0
-    assert median(values) == pytest.approx(np.median(values), rel=1e-6)
-    values[0] = np.nan
-    assert np.isnan(median(values))
 
 
 def test_cameras_move_as_they_do_in_torch():

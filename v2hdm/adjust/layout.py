@@ -1,7 +1,7 @@
 """From a checked problem to its :class:`~v2hdm.adjust.arrays.Arrays`.
 
-The origin is near the drive: in UTM coordinates a solver would lose seven digits to the distance of theirs. The
-errors of the recorded poses become states of the frames, with what each state says about the next frame's.
+The origin is near the drive: in UTM coordinates a solver would lose seven digits to the distance of theirs.
+The errors of the recorded poses become states of the frames, each expected from those of the frame before.
 """
 
 from __future__ import annotations

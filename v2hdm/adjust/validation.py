@@ -65,9 +65,8 @@ class Excluded:
 
 def noise_scale(mahalanobis2: FloatArray) -> float:
     """How many times as large as stated the noise's variance is, by the median; at least 1."""
-    from v2hdm.adjust.engines.numba.prepare import median  # loads numba
-
-    return max(1.0, median(mahalanobis2) / _MEDIAN_SQUARED)
+    median = float(np.median(mahalanobis2.astype(np.float32), overwrite_input=True))
+    return max(1.0, median / _MEDIAN_SQUARED)
 
 
 def as_of_point(squared_of_line: FloatArray) -> FloatArray:
@@ -96,14 +95,13 @@ def classify(
         probability: share of sound observations that one is ready to lose.
         scale: of the noise's variance, :func:`noise_scale`.
     """
-    from v2hdm.adjust.engines.numba.prepare import count_accepted  # loads numba
-
     gate = -2 * np.log(probability) * scale
     verdict = np.full(len(mahalanobis2), Verdict.ACCEPTED, dtype=np.int8)
     verdict[mahalanobis2 > gate] = Verdict.CONTRADICTS
     verdict[behind] = Verdict.BEHIND_CAMERA
     count = int(observations.corner.max()) + 1
-    seen, left = count_accepted(observations.corner, verdict == Verdict.ACCEPTED, count)
+    seen = np.bincount(observations.corner, minlength=count)
+    left = np.bincount(observations.corner[verdict == Verdict.ACCEPTED], minlength=count)
     alone = (left == 1) & (seen > 1)
     for begin in range(0, len(verdict) if alone.any() else 0, _ROWS):
         part = slice(begin, begin + _ROWS)

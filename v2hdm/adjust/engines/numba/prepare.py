@@ -7,11 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.adjust.engines.numba.build import inlined, kernel
+from v2hdm.adjust.engines.numba.build import kernel
 from v2hdm.records import BoolArray, FloatArray, IntArray
-
-# Numbers of float32 are ordered as their bits are, sixteen of which are looked at in a pass.
-_BINS = 1 << 16
 
 
 def are_sound(
@@ -73,19 +70,6 @@ def on_line(covariance_px: FloatArray, excess: float) -> BoolArray:
     out = np.empty(len(covariance_px), dtype=np.bool_)
     _on_line(_real(covariance_px), excess, out)
     return out
-
-
-def median(values: FloatArray) -> float:
-    """The median of values from 0 up, to the seven digits of a float32; NaN where one of them is."""
-    bins = np.zeros((3, _BINS), dtype=np.int64)
-    return float(_median(_real(values), bins))
-
-
-def count_accepted(corner: IntArray, accepted: BoolArray, corners: int) -> tuple[IntArray, IntArray]:
-    """How often each corner was seen, and how many of its observations are accepted."""
-    seen, left = np.zeros(corners, dtype=np.int64), np.zeros(corners, dtype=np.int64)
-    _count_accepted(_index(corner), accepted, seen, left)
-    return seen, left
 
 
 def _index(values: IntArray) -> IntArray:
@@ -211,41 +195,3 @@ def _on_line(covariance_px: FloatArray, excess: float, out: BoolArray) -> None:
     for k in range(len(out)):
         xx, yx, yy = covariance_px[k, 0, 0], covariance_px[k, 1, 0], covariance_px[k, 1, 1]
         out[k] = (xx + yy) * (xx + yy) > (xx * yy - yx * yx) * excess
-
-
-@kernel
-def _count_accepted(corner: IntArray, accepted: BoolArray, seen: IntArray, left: IntArray) -> None:
-    for k in range(len(corner)):
-        seen[corner[k]] += 1
-        left[corner[k]] += accepted[k]
-
-
-@kernel
-def _median(values: FloatArray, bins: IntArray) -> float:
-    for value in values:
-        if not value >= 0:
-            return math.nan
-        bins[0, np.float32(value + 0.0).view(np.int32) >> 16] += 1
-    low, low_rank = _find(bins[0], (len(values) - 1) // 2)
-    high, high_rank = _find(bins[0], len(values) // 2)
-    for value in values:
-        bits = np.float32(value + 0.0).view(np.int32)
-        if bits >> 16 == low:
-            bins[1, bits & 0xFFFF] += 1
-        if bits >> 16 == high:
-            bins[2, bits & 0xFFFF] += 1
-    first, _ = _find(bins[1], low_rank)
-    second, _ = _find(bins[2], high_rank)
-    one = np.int32((low << 16) | first).view(np.float32)
-    other = np.int32((high << 16) | second).view(np.float32)
-    return float((one + other) / 2)
-
-
-@inlined
-def _find(counts: IntArray, rank: int) -> tuple[int, int]:
-    """The bin that holds what has so many before it, and how many of these are in the bin."""
-    at = 0
-    while rank >= counts[at]:
-        rank -= counts[at]
-        at += 1
-    return at, rank
