@@ -45,7 +45,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(MAP_INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
-	$(INSTALL) -e '.[map,fast]'
+	$(INSTALL) -e '.[map]'
 	@touch $@
 
 # The development packages include those for mapping.

@@ -37,10 +37,10 @@ def test_an_observation_takes_52_bytes_and_the_factorised_hessian_none(pose_stat
     problem = street()
     count = len(problem.observations.corner)
     whitening = solve(problem, SolveOptions(pose_states=pose_states)).covariance.whitening
-    own = [part for part in tensors(whitening.arrays) if part.shape[-1:] == (count,)]
+    own = [part for part in tensors(whitening.engine.arrays) if part.shape[-1:] == (count,)]
     assert sum(part.element_size() * part.numel() for part in own) == 52 * count
-    outside = dataclasses.replace(whitening, arrays=None)
-    assert all(part.shape[k] != count for part in tensors(outside) for k in range(part.ndim))
+    outside = [vars(whitening.linearised), dataclasses.replace(whitening, engine=None)]
+    assert all(count not in part.shape for record in outside for part in tensors(record))
 
 
 def test_runs_hold_every_observation_once_in_order_and_part_no_corners_that_lengths_join(monkeypatch):

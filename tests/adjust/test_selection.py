@@ -7,7 +7,7 @@ import pytest
 
 from tests.adjust.scene import make_scene, with_late_clocks
 from v2hdm.adjust import MODELS, PoseSigma, SolveOptions, select_model, solve
-from v2hdm.adjust.subset import restrict
+from v2hdm.adjust.selection import restrict
 from v2hdm.errors import AdjustError
 
 STILL = PoseSigma(position_m=1e-5, heading_rad=1e-6, roll_pitch_rad=1e-6, height_m=1e-5)

@@ -8,11 +8,22 @@ import numpy as np
 import pytest
 
 from tests.adjust.scene import Scene, exp, make_scene, pose_errors, project, with_late_clocks
-from v2hdm.adjust import Drift, Observations, PoseSigma, Problem, SolveOptions, Status, kernels, solve
+from tests.adjust.site import DRIFTING, SCATTERING, site
+from v2hdm.adjust import (
+    ControlPoints,
+    KnownLengths,
+    Observations,
+    PoseSigma,
+    Problem,
+    SolveOptions,
+    Status,
+    score_faults,
+    solve,
+)
+from v2hdm.adjust.engines import make_engine
+from v2hdm.adjust.layout import make_arrays
+from v2hdm.adjust.problem import POSE_STATES
 from v2hdm.errors import AdjustError
-
-DRIFTING = PoseSigma(0.02, 0.001, 0.003, 0.01, position_drift=Drift(0.018, 30.0))
-SCATTERING = PoseSigma(0.03, 0.002, 0.003, 0.01)
 
 
 def joined(first: Problem, second: Problem) -> Problem:
@@ -108,8 +119,7 @@ def test_every_visit_has_clocks_of_its_own(states: tuple[str, ...]) -> None:
     sigma_s = np.sqrt(found.covariance.clock_s2())
     assert (sigma_s < 0.003).all()
     assert (np.abs(found.clock_offset_s - offsets_s) < 4 * sigma_s).all()
-    with kernels.reference():
-        plain = solve(joined(*problems), options)
+    plain = solve(joined(*problems), replace(options, engine="torch"))
     assert plain.clock_offset_s == pytest.approx(found.clock_offset_s, abs=1e-6)
 
 
@@ -120,3 +130,63 @@ def test_visits_that_are_not_numbered_in_order_are_refused(street: Scene) -> Non
         solve(replace(problem, visit=problem.visit[::-1]))
     with pytest.raises(AdjustError, match="visit 1 has no pose_sigma"):
         solve(replace(problem, pose_sigma=(PoseSigma(),)))
+
+
+def with_knowledge(problem: Problem) -> Problem:
+    """A survey and known lengths, some of them between corners of several drives and of one, and clocks."""
+    start = solve(problem, SolveOptions(coarse=False)).corners_map
+    first, second = np.array([0, 8, 9, 30]), np.array([1, 9, 10, problem.corner_count - 1])
+    length = np.linalg.norm(start[first] - start[second], axis=1)
+    surveyed = np.array([3, 40])
+    twist = np.zeros((len(problem.map_from_vehicle), 6))
+    twist[:, 0] = 4 + np.sin(np.arange(len(twist)) / 5)
+    return replace(
+        problem,
+        control=ControlPoints(surveyed, start[surveyed] + 0.01, np.full((2, 2), 0.005)),
+        lengths=KnownLengths(first, second, length + 0.003, np.full(len(first), 0.002)),
+        twist_vehicle=twist,
+    )
+
+
+@pytest.mark.parametrize(("overlap", "known", "loss"), [(40, False, "cauchy"), (12, True, "huber")])
+def test_drives_whose_shared_corners_are_kept_are_adjusted_as_with_all_corners_eliminated(
+    overlap: int, known: bool, loss: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = site(3, 40, overlap)
+    options = SolveOptions(coarse=False, loss=loss, clock_offset=known)
+    if known:
+        problem = with_knowledge(problem)
+    whole = solve(problem, options)
+    monkeypatch.setattr("v2hdm.adjust.engines.numba.engine._WORTH_ANOTHER_ORDER", 0.0)
+    monkeypatch.setattr("v2hdm.adjust.engines.numba.engine._CLEARLY_LESS", 1e9)
+    kept = solve(problem, options)
+    plans = [one.covariance.whitening.plan for one in (whole, kept)]
+    assert not len(plans[0].kept)
+    assert 0 < len(plans[1].kept) <= problem.corner_count
+    assert whole.status is kept.status is Status.CONVERGED
+    assert whole.evaluations == kept.evaluations
+    for name in ("corners_map", "cam_from_vehicle", "map_from_vehicle", "clock_offset_s"):
+        assert getattr(kept, name) == pytest.approx(getattr(whole, name), abs=1e-11), name
+    corners = np.array([0, 7, problem.corner_count - 1])
+    for name, given in (("corner_covariance", corners), ("extrinsic_covariance", None)):
+        one, other = (getattr(solution, name) for solution in (kept, whole))
+        if given is not None:
+            one, other = one(given), other(given)
+        assert one == pytest.approx(other, rel=1e-6, abs=1e-12)
+    assert kept.covariance.gain() == pytest.approx(whole.covariance.gain(), rel=1e-6, abs=1e-9)
+    scores = [score_faults(problem, one) for one in (kept, whole)]
+    for one, other in zip(*scores, strict=True):
+        assert (one.fault, one.camera, one.axis) == (other.fault, other.camera, other.axis)
+        assert one.gain == pytest.approx(other.gain, rel=1e-5, abs=1e-6)
+
+
+def test_many_drives_of_one_way_take_less_with_their_corners_kept() -> None:
+    crowd = make_engine("numba", make_arrays(site(6, 100, 100), POSE_STATES, "cpu"))
+    plan = crowd.plan()
+    eliminated = make_engine("torch", crowd.arrays).plan()
+    assert len(plan.kept) == crowd.arrays.corner_count
+    tip = crowd.arrays.camera_count * crowd.arrays.camera_unknowns
+    spent = [one.pattern.multiplications(one.size, tip) for one in (plan, eliminated)]
+    assert spent[0] < 0.15 * spent[1]
+    chain = make_engine("numba", make_arrays(site(2, 60, 10), POSE_STATES, "cpu"))
+    assert not len(chain.plan().kept)

@@ -10,10 +10,10 @@ import torch
 from tests.adjust.scene import make_scene
 from v2hdm.adjust import ControlPoints, Drift, KnownLengths, PoseSigma, SolveOptions, solve
 from v2hdm.adjust.descent import Objective
+from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.layout import make_arrays
+from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.problem import POSE_STATES
-from v2hdm.adjust.reduced import make_plan
-from v2hdm.adjust.residuals import Estimate, Loss
 from v2hdm.adjust.tiles import TIP, TiledMatrix, factorise_tiles, find_pattern
 from v2hdm.adjust.whitening import factorise
 
@@ -47,7 +47,8 @@ def test_where_all_residuals_vanish_the_whitened_hessian_is_the_identity(pose_st
         torch.as_tensor(scene.corners_map)[arrays.corner_order],
         arrays.no_clock(),
     )
-    objective = Objective(factorise(arrays, make_plan(arrays), estimate, Loss("none", 1.0)))
+    engine = make_engine("auto", arrays)
+    objective = Objective(factorise(engine, engine.plan(), estimate, Loss("none", 1.0)))
     direction = torch.randn(
         objective.whitening.size, generator=torch.Generator().manual_seed(0), dtype=torch.float64
     )
@@ -80,10 +81,11 @@ def dense(tiles, pattern, size, tip):
         [list(range(6))],
     ],
 )
-def test_the_tiled_factor_is_that_of_the_dense_matrix(cliques):
+@pytest.mark.parametrize("least_degree", [False, True])
+def test_the_tiled_factor_is_that_of_the_dense_matrix(cliques, least_degree):
     size, tip, count = 5, 4, 6
     generator = torch.Generator().manual_seed(1)
-    pattern = find_pattern(count, cliques)
+    pattern = find_pattern(count, cliques, least_degree)
     arrow = TiledMatrix.zeros(pattern, size, tip, torch.zeros((), dtype=torch.float64))
     tiles = arrow.tiles
     for tile in (*arrow.diagonal, arrow.tip):

@@ -25,10 +25,10 @@ from tests.adjust.scene import Scene, make_scene
 from v2hdm.adjust import ControlPoints, Drift, Observations, PoseSigma, SolveOptions, solve
 from v2hdm.adjust.covariance import Covariance
 from v2hdm.adjust.descent import Descent
+from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.layout import make_arrays
+from v2hdm.adjust.model import Estimate, Loss
 from v2hdm.adjust.problem import POSE_STATES
-from v2hdm.adjust.reduced import make_plan
-from v2hdm.adjust.residuals import Estimate, Loss
 from v2hdm.adjust.whitening import factorise
 
 PAPER = SolveOptions(pose_states=(), loss="none")
@@ -103,9 +103,10 @@ def squared_bound_m2(scene: Scene, pose_states: tuple[str, ...] = POSE_STATES) -
         torch.as_tensor(scene.corners_map)[arrays.corner_order],
         arrays.no_clock(),
     )
-    whitening = factorise(arrays, make_plan(arrays), truth, Loss("none", 1.0))
+    engine = make_engine("auto", arrays)
+    whitening = factorise(engine, engine.plan(), truth, Loss("none", 1.0))
     at_truth = Descent(
-        arrays=arrays,
+        engine=engine,
         plan=whitening.plan,
         estimate=truth,
         robust=whitening.robust,

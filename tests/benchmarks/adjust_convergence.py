@@ -33,9 +33,9 @@ from tests.adjust.scene import Scene, make_scene
 from tests.benchmarks.adjust_accuracy import PAPER, ROBUST, WHITE, street
 from tests.benchmarks.adjust_native import NativeOptions, build, solve_native
 from v2hdm.adjust import Problem, SolveOptions, solve
-from v2hdm.adjust.coarse import coarse_extrinsics
+from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.layout import make_arrays
-from v2hdm.adjust.start import back_project
+from v2hdm.adjust.start import coarse_extrinsics
 from v2hdm.errors import AdjustError
 
 # Ends are the same if their costs and their corners are: relative, and root mean square in m.
@@ -72,9 +72,10 @@ def by_ceres(problem: Problem, options: NativeOptions, coarse: bool = False) -> 
     """Ceres from the weighted back-projection, after our coarse stage if wanted, its time not counted."""
     extrinsics = torch.as_tensor(problem.cam_from_vehicle)
     arrays = make_arrays(problem, (), "cpu")
+    engine = make_engine("auto", arrays)
     if coarse:
-        extrinsics, _ = coarse_extrinsics(arrays, extrinsics)
-    corners, fixed = back_project(arrays, extrinsics)
+        extrinsics, _ = coarse_extrinsics(engine, extrinsics)
+    corners, fixed = engine.back_project(extrinsics)
     if not bool(fixed.all()):
         raise AdjustError("a corner has no ray below the horizon")
     start = np.empty((problem.corner_count, 2))

@@ -19,7 +19,7 @@ from tests.adjust.scene import make_scene
 from tests.benchmarks.adjust_scaling import driven_on
 from v2hdm.adjust import Observations, Problem, Solution, SolveOptions, solve
 from v2hdm.adjust.incremental import IncrementalMap, Sighted
-from v2hdm.adjust.subset import restrict
+from v2hdm.adjust.selection import restrict
 
 CORNERS = 4
 DECADES = (10, 100, 1000, 10_000)

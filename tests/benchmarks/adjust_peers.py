@@ -42,9 +42,8 @@ from tests.benchmarks.adjust_native import (
 )
 from tests.benchmarks.adjust_scaling import driven_on
 from v2hdm.adjust import PoseSigma, Problem, SolveOptions, solve
-from v2hdm.adjust.kernels import available
+from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.layout import make_arrays
-from v2hdm.adjust.start import back_project
 
 GTSAM_LIMIT = 120_000
 """Observations above which GTSAM takes gigabytes: a factor object each."""
@@ -85,7 +84,7 @@ def street(observations: int) -> Problem:
     ).problem
     problem = driven_on(one, -(-observations // len(one.observations.corner))) if frames == 400 else one
     arrays = make_arrays(problem, (), "cpu")
-    corners, _ = back_project(arrays, torch.as_tensor(problem.cam_from_vehicle))
+    corners, _ = make_engine("auto", arrays).back_project(torch.as_tensor(problem.cam_from_vehicle))
     start = np.empty((problem.corner_count, 2))
     start[arrays.corner_order.numpy()] = corners.numpy()
     return replace(problem, corners_start=start, pose_sigma=PoseSigma())
@@ -217,12 +216,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     solve(make_scene(0, frames=30).problem, SolveOptions(loss="none") if arguments.states else PAPER)
-    for reason in (
-        ABSENT,
-        GTSAM_ABSENT,
-        build()[1],
-        "" if available() else "numba is left out: the extra 'fast' is missing",
-    ):
+    for reason in (ABSENT, GTSAM_ABSENT, build()[1]):
         if reason:
             print(reason)
     for size in arguments.observations:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,18 +14,14 @@ import torch
 
 pytest.importorskip("ray", reason="ray, the extra 'fleet', is not installed")
 
+
 from tests.fleet.test_fleet import written
-from tests.mapping.test_crew import two_visits
 from v2hdm import pipeline
 from v2hdm.errors import DriveError, WorkerError
 from v2hdm.fleet.crew import RayCrew
-from v2hdm.fleet.parts import RayTeam
 from v2hdm.fleet.plan import Row, plan_site
 from v2hdm.fleet.run import FleetOptions, run_fleet
 from v2hdm.fleet.workers import map_drive
-from v2hdm.mapping.crew import ALONE, Crew
-from v2hdm.mapping.methods import run_methods
-from v2hdm.mapping.options import MappingOptions
 from v2hdm.simulate import PortConfig, render_drive
 from v2hdm.simulate.port.config import RouteConfig, YardConfig
 
@@ -73,7 +69,7 @@ def test_a_site_by_workers_one_of_which_dies_is_the_map_of_one_process(
     monkeypatch.setattr("v2hdm.fleet.run.cluster", here)
     monkeypatch.setattr("v2hdm.fleet.workers.map_drive", mapping)
     files = [written(tmp_path, one.name, one) for one in drives]
-    settings = ["mapping.adjustment=together", "workers=1"]
+    settings = ["workers=1"]
     told: list[tuple[str, str, int, int]] = []
 
     def fleet() -> Row:
@@ -109,32 +105,6 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def test_the_visits_adjusted_by_actors_one_of_which_dies_make_the_same_map(
-    ray: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    killed: list[int] = []
-
-    class Mortal(RayTeam):
-        def ask(self, question: str, bases: Sequence[Any], *arguments: Sequence[Any]) -> list[Any]:
-            if question == "evaluate" and not killed:
-                killed.append(ray.get(self.actors[0].process.remote()))
-                os.kill(killed[0], signal.SIGKILL)
-            return super().ask(question, bases, *arguments)
-
-    monkeypatch.setattr("v2hdm.fleet.crew.RayTeam", Mortal)
-    drive, detections = two_visits(tmp_path)
-
-    def mapped(how: str, crew: Crew) -> Any:
-        options = MappingOptions(adjustment=how, pose_model="heave", rounds=1)
-        return run_methods(drive, detections, ("front",), options, crew=crew)["Opt"].hd_map.markings
-
-    parted, whole = mapped("parts", RayCrew(2, str(Path.cwd()))), mapped("together", ALONE)
-    assert killed
-    assert [one.kind for one in parted] == [one.kind for one in whole]
-    for one, other in zip(parted, whole, strict=True):
-        assert one.corners_map == pytest.approx(other.corners_map, abs=1e-9)
 
 
 def test_what_is_wrong_in_a_task_is_told_as_by_one_process(

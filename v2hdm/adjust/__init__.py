@@ -1,12 +1,17 @@
 """Bundle adjustment of marking corners, camera extrinsics and vehicle poses on the ground plane.
 
 ``solve(problem, options) -> solution``: numpy in, numpy out; torch's LBFGS on whitened variables
-inside. :mod:`v2hdm.adjust.problem` states the model. What is done to every observation torch does, or
-:mod:`v2hdm.adjust.kernels` where numba is installed.
+inside. :mod:`v2hdm.adjust.problem` says what is estimated from what, :mod:`v2hdm.adjust.model` every
+residual; an engine of :mod:`v2hdm.adjust.engines` evaluates and linearises them.
 """
 
-from v2hdm.adjust.gating import Excluded, Verdict
-from v2hdm.adjust.observability import Observability, observability, observed
+from v2hdm.adjust.observability import (
+    Observability,
+    PoseInnovations,
+    observability,
+    observed,
+    pose_innovations,
+)
 from v2hdm.adjust.problem import (
     ControlPoints,
     Drift,
@@ -16,11 +21,11 @@ from v2hdm.adjust.problem import (
     Problem,
     SolveOptions,
 )
-from v2hdm.adjust.pulls import PosePulls, pose_pulls
+from v2hdm.adjust.score_tests import Fault, ScoreTest, score_faults
 from v2hdm.adjust.selection import MODELS, Model, Selection, select_model, with_model
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
-from v2hdm.adjust.suspect import Fault, Suspect, suspects
+from v2hdm.adjust.validation import Excluded, Verdict
 
 __all__ = [
     "MODELS",
@@ -32,20 +37,20 @@ __all__ = [
     "Model",
     "Observability",
     "Observations",
-    "PosePulls",
+    "PoseInnovations",
     "PoseSigma",
     "Problem",
+    "ScoreTest",
     "Selection",
     "Solution",
     "SolveOptions",
     "Status",
-    "Suspect",
     "Verdict",
     "observability",
     "observed",
-    "pose_pulls",
+    "pose_innovations",
+    "score_faults",
     "select_model",
     "solve",
-    "suspects",
     "with_model",
 ]

@@ -6,20 +6,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from v2hdm.adjust.kernels import passes_over
-
-if TYPE_CHECKING:
-    from v2hdm.adjust.kernels.passes import Passes
-
 # Observations that are computed at once: their intermediate results stay in the processor's cache, and
 # beside the whole take no memory.
 _RUN = 1 << 14
-_RUN_ON_DEVICE = 1 << 22
+_RUN_ON_DEVICE = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -65,8 +59,8 @@ class Run:
         return int(self.corners.stop - self.corners.start)
 
     def sum_by_corner(self, rows: Tensor) -> Tensor:
-        """Sums (n, m) over each corner's observations of values (m, k)."""
-        return rows.new_zeros(len(rows), self.corner_count).index_add_(1, self.corner, rows).T
+        """Sums (n, ...) over each corner's observations of values (k, ...)."""
+        return rows.new_zeros(self.corner_count, *rows.shape[1:]).index_add_(0, self.corner, rows)
 
 
 @dataclass(frozen=True)
@@ -86,6 +80,7 @@ class Arrays:
         measured: (2, K) where it was seen, on the plane at depth 1.
         root_information: (3, K) a, b, c with whitened residual (a dx, b dx + c dy), dx at depth 1.
         vehicle_from_map: (J, 4, 4) as recorded.
+        visit: (J,) the session that each frame is of.
         states: the column of the frame tangent that each state of a frame acts on. Where an error has a
             drift beside its white part, two states act on one column.
         centre, centre_information_root: (C, 3) prior on the camera centres, and 1 / sigma.
@@ -108,6 +103,7 @@ class Arrays:
     measured: Tensor
     root_information: Tensor
     vehicle_from_map: Tensor
+    visit: Tensor
     states: tuple[int, ...]
     centre: Tensor
     centre_information_root: Tensor
@@ -148,11 +144,6 @@ class Arrays:
     def no_clock(self) -> Tensor:
         """Clock offsets (C, Q) of zero."""
         return self.centre.new_zeros(self.camera_count, self.clock_twist.shape[-1])
-
-    @cached_property
-    def passes(self) -> Passes | None:
-        """The compiled kernels over all observations, None where torch has to do their work."""
-        return passes_over(self)
 
     @cached_property
     def unit_bounds(self) -> tuple[Tensor, Tensor]:

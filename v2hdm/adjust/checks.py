@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.adjust.kernels import available
-from v2hdm.adjust.problem import LOSSES, POSE_STATES, SOLVERS, Problem, SolveOptions
+from v2hdm.adjust.problem import ENGINES, LOSSES, POSE_STATES, SOLVERS, Problem, SolveOptions
 from v2hdm.errors import AdjustError
 from v2hdm.records import FloatArray, IntArray
 
@@ -37,12 +36,18 @@ def check_problem(problem: Problem) -> None:
 
 
 def _observations_are_sound(problem: Problem) -> bool:
-    """Whether one compiled pass finds no fault in any observation; False where there is none to be had."""
-    if not available():
-        return False
-    from v2hdm.adjust.kernels.prepare import are_sound
+    """Whether one compiled pass finds no fault in any observation."""
+    from v2hdm.adjust.engines.numba.prepare import are_sound  # loads numba
 
-    return are_sound(problem, _SYMMETRIC_TO, _MAX_SLOPE)
+    seen = problem.observations
+    return are_sound(
+        *(seen.camera, seen.frame, seen.corner),
+        *(seen.pinhole_px, seen.covariance_px, problem.intrinsic),
+        frames=len(problem.map_from_vehicle),
+        corners=problem.corner_count,
+        symmetric_to=_SYMMETRIC_TO,
+        max_slope=_MAX_SLOPE,
+    )
 
 
 def _check_control(problem: Problem) -> None:
@@ -112,10 +117,12 @@ def check_options(options: SolveOptions) -> None:
     unknown = [name for name in options.pose_states if name not in POSE_STATES]
     if unknown:
         raise AdjustError(f"unknown pose state '{unknown[0]}': choose from {', '.join(POSE_STATES)}")
-    if options.loss not in LOSSES:
-        raise AdjustError(f"unknown loss '{options.loss}': choose from {', '.join(LOSSES)}")
-    if options.solver not in SOLVERS:
-        raise AdjustError(f"unknown solver '{options.solver}': choose from {', '.join(SOLVERS)}")
+    for name, choices in (("loss", LOSSES), ("solver", SOLVERS), ("engine", ENGINES)):
+        if getattr(options, name) not in choices:
+            chosen = getattr(options, name)
+            raise AdjustError(f"unknown {name} '{chosen}': choose from {', '.join(choices)}")
+    if options.engine == "numba" and not options.on_cpu:
+        raise AdjustError("engine=numba computes on the CPU: choose engine=torch, or device=cpu")
     if not 0 < options.gate_probability < 1:
         raise AdjustError(f"gate_probability is {options.gate_probability}: give a share between 0 and 1")
     for name in ("gap_tolerance", "max_refreshes", "max_evaluations"):

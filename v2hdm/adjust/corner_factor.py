@@ -17,7 +17,7 @@ PIVOT_FLOOR = 1e-12
 """Least pivot of a corner's second coordinate, as a share of its own information."""
 
 INSEPARABLE = "corners joined by known lengths cannot be solved for together: state their sigma_m larger"
-"""What a block is reported as that has no factor."""
+"""The error of a block that has no factor."""
 
 
 @dataclass(frozen=True)
@@ -41,24 +41,8 @@ class CornerFactor:
     lower: Tensor
     joint: tuple[Joint, ...]
 
-    @classmethod
-    def side_by_side(cls, factors: list[CornerFactor]) -> CornerFactor:
-        """One factor of several runs' corners, in their order."""
-        groups: dict[int, list[Joint]] = {}
-        offset = 0
-        for one in factors:
-            for group in one.joint:
-                moved = Joint(group.begin + offset, group.corners, group.factor)
-                groups.setdefault(group.corners, []).append(moved)
-            offset += one.lower.shape[1]
-        joint = (
-            Joint(torch.cat([g.begin for g in same]), each, torch.cat([g.factor for g in same]))
-            for each, same in groups.items()
-        )
-        return cls(torch.cat([one.lower for one in factors], dim=1), tuple(joint))
-
     def part(self, corners: slice) -> CornerFactor:
-        """That of some corners, which are joined to no others."""
+        """The factor of some corners, which are joined to no others."""
         inside = []
         for group in self.joint:
             chosen = (group.begin >= corners.start) & (group.begin < corners.stop)
@@ -67,7 +51,7 @@ class CornerFactor:
         return CornerFactor(self.lower[:, corners], tuple(inside))
 
     def take(self, corners: Tensor) -> CornerFactor:
-        """That of corners (n,), ascending, with all that they are joined to."""
+        """The factor of corners (n,), ascending, with all that they are joined to."""
         inside = []
         for group in self.joint:
             place = torch.searchsorted(corners, group.begin).clamp(max=len(corners) - 1)
@@ -100,65 +84,53 @@ class CornerFactor:
 
 
 def factorise_corners(
-    arrays: Arrays, corners: slice, blocks: Tensor, by_length: Tensor, damping: float
+    arrays: Arrays, blocks: Tensor, by_length: tuple[Tensor, Tensor], damping: float
 ) -> CornerFactor:
-    """Factorise what the observations, the survey and the known lengths say about ``corners``.
+    """Factorise V.
 
     Args:
         arrays: the problem.
-        corners: which; those that lengths join are all of them among these.
-        blocks: the observations' part (3, n): xx, yx, yy.
-        by_length: derivatives (M, 2) of the lengths' residuals by their first corners.
+        blocks: (N, 2, 2) J'J of the observations and the survey by corner.
+        by_length: derivatives (M, 2) of the lengths' residuals by their first and their second corners.
         damping: added to the diagonal, relative to it.
+
+    Raises:
+        AdjustError: corners that lengths join cannot be solved for together.
     """
-    surveyed = arrays.control_information[corners]
-    xx, yx, yy = blocks[0] + surveyed[:, 0], blocks[1], blocks[2] + surveyed[:, 1]
     grow = 1 + damping
+    xx, yx, yy = blocks[:, 0, 0], blocks[:, 1, 0], blocks[:, 1, 1]
     lower = cholesky_2x2(xx * grow + CORNER_FLOOR, yx, yy * grow + CORNER_FLOOR)
-    joined = arrays.joined[corners]
-    if not bool(joined.any()):
-        return CornerFactor(lower, ())
-    begin = (~joined).nonzero()[:, 0]
-    size = torch.diff(begin, append=begin.new_tensor([len(joined)]))
-    groups = []
-    for corners_each in torch.unique(size[size > 1]).tolist():
-        group = Joint(begin[size == corners_each], corners_each, lower)
-        matrix = _group_blocks(group, torch.stack([xx, yx, yy]))
-        _add_lengths(arrays, corners.start, group, by_length, matrix)
+    units = arrays.unit_bounds[0]
+    size, groups = torch.diff(units), []
+    for corners in torch.unique(size[size > 1]).tolist():
+        group = Joint(units[:-1][size == corners], corners, lower)
+        matrix = blocks.new_zeros(len(group.begin), corners, 2, corners, 2)
+        k = torch.arange(corners, device=blocks.device)
+        matrix[:, k, :, k, :] = blocks[group.index].transpose(0, 1)
+        _add_lengths(arrays, group, by_length, matrix)
+        matrix = matrix.view(len(matrix), 2 * corners, 2 * corners)
         matrix.diagonal(dim1=1, dim2=2).mul_(grow).add_(CORNER_FLOOR)
         factor, failed = torch.linalg.cholesky_ex(matrix)
         if bool(failed.any()):
             raise AdjustError(INSEPARABLE)
-        groups.append(Joint(group.begin, corners_each, factor))
+        groups.append(Joint(group.begin, corners, factor))
     return CornerFactor(lower, tuple(groups))
 
 
-def _group_blocks(group: Joint, blocks: Tensor) -> Tensor:
-    """The corners' own blocks on the diagonals (m, 2g, 2g)."""
-    count, each = group.index.shape
-    matrix = blocks.new_zeros(count, each, 2, each, 2)
-    k = torch.arange(each, device=blocks.device)
-    own = blocks[:, group.index]
-    matrix[:, k, :, k, :] = (
-        torch.stack([own[0], own[1], own[1], own[2]], dim=-1).reshape(count, each, 2, 2).transpose(0, 1)
-    )
-    return matrix.reshape(count, 2 * each, 2 * each)
-
-
-def _add_lengths(arrays: Arrays, offset: int, group: Joint, by_length: Tensor, matrix: Tensor) -> None:
-    """Add J'J of the lengths within the groups."""
-    first, second = arrays.lengths.first - offset, arrays.lengths.second - offset
-    which = torch.searchsorted(group.begin, first, right=True) - 1
-    inside = (which >= 0) & (first < group.begin[which.clamp(min=0)] + group.corners)
-    which, by_first = which[inside], by_length[inside]
-    view = matrix.view(len(matrix), group.corners, 2, group.corners, 2)
-    outer = by_first[:, :, None] * by_first[:, None, :]
-    places = [end[inside] - group.begin[which] for end in (first, second)]
-    for row, by_row in zip(places, (1, -1), strict=True):
-        for column, by_column in zip(places, (1, -1), strict=True):
-            view.permute(0, 1, 3, 2, 4).index_put_(
-                (which, row, column), by_row * by_column * outer, accumulate=True
-            )
+def _add_lengths(arrays: Arrays, group: Joint, by_length: tuple[Tensor, Tensor], matrix: Tensor) -> None:
+    """Add J'J of the lengths within the groups to their blocks (m, g, 2, g, 2)."""
+    known = arrays.lengths
+    which = torch.searchsorted(group.begin, known.first, right=True) - 1
+    inside = (which >= 0) & (known.first < group.begin[which.clamp(min=0)] + group.corners)
+    which = which[inside]
+    ends = [
+        (end[inside] - group.begin[which], by[inside])
+        for end, by in zip((known.first, known.second), by_length, strict=True)
+    ]
+    for row, by_row in ends:
+        for column, by_column in ends:
+            outer = by_row[:, :, None] * by_column[:, None, :]
+            matrix.permute(0, 1, 3, 2, 4).index_put_((which, row, column), outer, accumulate=True)
 
 
 def cholesky_2x2(xx: Tensor, yx: Tensor, yy: Tensor) -> Tensor:

@@ -11,9 +11,7 @@ from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.descent import Descent
-from v2hdm.adjust.linear import coupling, jacobians
 from v2hdm.adjust.reduced import reduced_coupling, to_tiles
-from v2hdm.adjust.residuals import observe
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.records import FloatArray
 
@@ -41,23 +39,23 @@ class Covariance:
         return self.descent.whitening
 
     def extrinsic(self) -> FloatArray:
-        """Of each camera's left tangent (C, 6, 6): translation m, rotation rad."""
+        """Covariance (C, 6, 6) of each camera's left tangent: translation m, rotation rad."""
         # The extrinsics come last, so the tip of L_S is the factor of their marginal information.
         joint = torch.cholesky_inverse(self.whitening.reduced_factor.tip)
-        each = self.whitening.arrays.camera_unknowns
+        each = self.whitening.engine.arrays.camera_unknowns
         starts = range(0, len(joint), each)
         return np.stack([joint[k : k + 6, k : k + 6].cpu().numpy() for k in starts])
 
     def clock_s2(self) -> FloatArray:
         """Variance (C, Q), s^2, of each camera's clock offset at each visit; Q is 0 where none is."""
-        arrays = self.whitening.arrays
+        arrays = self.whitening.engine.arrays
         joint = torch.cholesky_inverse(self.whitening.reduced_factor.tip)
         variance = joint.diagonal().reshape(arrays.camera_count, -1)[:, 6:]
         return np.asarray(variance.cpu().numpy())
 
     def poses(self) -> FloatArray:
         """Variances (J, 6) of each frame's tangent, how well its pose is known; 0 without states."""
-        arrays, whitening = self.whitening.arrays, self.whitening
+        arrays, whitening = self.whitening.engine.arrays, self.whitening
         frames, states = arrays.frame_count, len(arrays.states)
         out = np.zeros((frames, 6))
         columns = torch.tensor(arrays.states, dtype=torch.int64, device=arrays.centre.device)
@@ -83,7 +81,7 @@ class Covariance:
         Frames follow as well. Column by column, x = L_S^-T (0, L_tip' e) is what a change e of the cameras
         does to the reduced unknowns, so that W' x = (L_S^-1 W)' (0, L_tip' e).
         """
-        whitening, arrays = self.whitening, self.whitening.arrays
+        whitening, arrays = self.whitening, self.whitening.engine.arrays
         tip = whitening.reduced_factor.tip
         at_once = max(_NUMBERS_AT_ONCE // (2 * whitening.reduced_factor.size), 1)
         at_once = min(at_once, _CORNERS_AT_ONCE)
@@ -95,7 +93,7 @@ class Covariance:
                 continue
             corners = torch.arange(begin, end, device=tip.device)
             follow = (tip @ _reduced_root(whitening, corners)[-len(tip) :]).mT
-            factor = whitening.corner_factor.part(slice(begin, end))
+            factor = whitening.linearised.corner_factor.part(slice(begin, end))
             gain = factor.solve_transposed(factor.solve(follow.reshape(end - begin, 2, -1)))
             out[arrays.corner_order[begin:end].cpu().numpy()] = gain.cpu().numpy()
             begin = end
@@ -108,7 +106,7 @@ class Covariance:
         return np.concatenate([self._corners(part) for part in parts])
 
     def _corners(self, groups: NDArray[np.int64]) -> FloatArray:
-        arrays = self.whitening.arrays
+        arrays = self.whitening.engine.arrays
         rank = torch.argsort(arrays.corner_order)
         chosen = rank[torch.as_tensor(groups, device=rank.device)]
         # Known lengths tie corners to others outside their group, and V^-1 with them.
@@ -117,9 +115,12 @@ class Covariance:
         root = _reduced_root(self.whitening, corners)
         by_near = root.T[_columns(corners, near)]
         inverse = _corner_inverse(self.whitening, corners)
+        own = inverse.clone()
+        kept = torch.isin(corners, self.whitening.plan.kept).repeat_interleave(2)
+        own[kept] = 0.0
         rows = _columns(corners, chosen)
         spread = _blocks(inverse, rows, _columns(corners, near)) * _once(near)
-        covariance = _blocks(inverse, rows, rows) + spread @ (by_near @ by_near.mT) @ spread.mT
+        covariance = _blocks(own, rows, rows) + spread @ (by_near @ by_near.mT) @ spread.mT
         return np.asarray(covariance.cpu().numpy())
 
 
@@ -154,18 +155,27 @@ def _blocks(matrix: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
 
 
 def _corner_inverse(whitening: Whitening, corners: Tensor) -> Tensor:
-    """V^-1 (2 n, 2 n) of corners (n,), all those with them that known lengths join."""
-    unit = torch.eye(2 * len(corners), dtype=whitening.table.dtype, device=corners.device)
-    factor = whitening.corner_factor.take(corners)
+    """V^-1 (2 n, 2 n) of corners (n,) and all that known lengths join to them; of kept ones 1."""
+    unit = torch.eye(2 * len(corners), dtype=torch.float64, device=corners.device)
+    factor = whitening.linearised.corner_factor.take(corners)
     return factor.solve_transposed(factor.solve(unit.view(len(corners), 2, -1))).flatten(0, 1)
 
 
 def _reduced_root(whitening: Whitening, corners: Tensor) -> Tensor:
-    """L_S^-1 W (D, 2 n) for n corners, ascending."""
-    arrays = whitening.arrays
-    run = arrays.gather(corners)
-    view = observe(run, whitening.table, whitening.estimate.corners_map[corners])
-    root = whitening.weight(view).sqrt()
-    by_pair = coupling(*(rows * root for rows in jacobians(run, view)))
-    right = reduced_coupling(arrays, whitening.plan, whitening.spread, run, by_pair)
+    """L_S^-1 W (D, 2 n) for n corners, ascending; of kept ones -L_S^-1 E, where E picks them."""
+    plan, estimate = whitening.plan, whitening.estimate
+    run = whitening.engine.arrays.gather(corners)
+    coupling = whitening.linearised.coupling(run, estimate.corners_map[corners])
+    kept = torch.isin(corners, plan.kept)
+    if not bool(kept.any()):
+        right = reduced_coupling(plan, whitening.spread, run, coupling)
+        return whitening.reduced_factor.solve(right)
+    coupling[kept[run.corner]] = 0.0
+    right = reduced_coupling(plan, whitening.spread, run, coupling)
+    number = torch.searchsorted(plan.kept, corners[kept])
+    picked = right.new_zeros(len(plan.kept), 2, len(corners), 2)
+    for axis in range(2):
+        picked[number, axis, kept.nonzero()[:, 0], axis] = -1.0
+    frames = right.new_zeros(0, len(whitening.engine.arrays.states), right.shape[1])
+    right[: len(right) - len(whitening.reduced_factor.tip)] += to_tiles(plan, frames, picked.flatten(2))
     return whitening.reduced_factor.solve(right)

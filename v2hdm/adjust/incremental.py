@@ -14,16 +14,17 @@ marking, so that markings that came since do not share them with the others.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
 
+from v2hdm.adjust.engines import make_engine
 from v2hdm.adjust.layout import make_arrays
 from v2hdm.adjust.problem import CameraPrior, ControlPoints, KnownLengths, Observations, Problem, SolveOptions
 from v2hdm.adjust.solution import Solution, Status
 from v2hdm.adjust.solve import solve
-from v2hdm.adjust.start import back_project
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.rigid import exp, inverse, left_jacobian, log
 from v2hdm.records import FloatArray, IntArray
@@ -170,7 +171,8 @@ class IncrementalMap:
         cameras = np.unique(sighted.observations.camera)
         problem = self._problem([sighted], cameras)
         arrays = make_arrays(problem, (), "cpu")
-        corners, fixed = back_project(arrays, torch.from_numpy(problem.cam_from_vehicle))
+        engine = make_engine(self._options.engine, arrays)
+        corners, fixed = engine.back_project(torch.from_numpy(problem.cam_from_vehicle))
         out = np.full(corners.shape, np.nan)
         known = fixed.numpy()
         out[arrays.corner_order.numpy()[known]] = corners.numpy()[known]
@@ -236,7 +238,7 @@ class IncrementalMap:
             self._earlier = earlier
 
     def _without(self, marking: int, sighted: Sighted) -> _Quadratic | None:
-        """What the other markings say; None where that takes a solve of all of them.
+        """The quadratic without a marking; None where that takes a solve of all others.
 
         So it does where little is left, for what a marking shared with others is then much of it.
         """
@@ -334,8 +336,8 @@ class IncrementalMap:
             visit=None if drive.visit is None else drive.visit[frames],
             twist_vehicle=None if twist is None else twist[frames],
             clock_sigma_s=drive.clock_sigma_s,
-            control=_control(sighted, starts),
-            lengths=_lengths(sighted, starts),
+            control=_known([one.control for one in sighted], starts),
+            lengths=_known([one.lengths for one in sighted], starts),
         )
 
 
@@ -360,24 +362,21 @@ def _stacked(parts: Sequence[Observations]) -> Observations:
     return Observations(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-def _control(sighted: Sequence[Sighted], starts: IntArray) -> ControlPoints | None:
-    parts = [(one.control, start) for one, start in zip(sighted, starts, strict=False) if one.control]
-    if not parts:
-        return None
-    return ControlPoints(
-        np.concatenate([one.corner + start for one, start in parts]),
-        np.concatenate([one.points_map for one, _ in parts]),
-        np.concatenate([one.sigma_m for one, _ in parts]),
-    )
+_Known = TypeVar("_Known", ControlPoints, KnownLengths)
 
 
-def _lengths(sighted: Sequence[Sighted], starts: IntArray) -> KnownLengths | None:
-    parts = [(one.lengths, start) for one, start in zip(sighted, starts, strict=False) if one.lengths]
-    if not parts:
+def _known(parts: Sequence[_Known | None], starts: IntArray) -> _Known | None:
+    """What is known of several markings' corners, which begin at ``starts`` among those of all."""
+    given = [(one, start) for one, start in zip(parts, starts, strict=False) if one is not None]
+    if not given:
         return None
-    return KnownLengths(
-        np.concatenate([one.first + start for one, start in parts]),
-        np.concatenate([one.second + start for one, start in parts]),
-        np.concatenate([one.length_m for one, _ in parts]),
-        np.concatenate([one.sigma_m for one, _ in parts]),
-    )
+    columns = {
+        field.name: np.concatenate(
+            [
+                getattr(one, field.name) + (start if field.name in ("corner", "first", "second") else 0)
+                for one, start in given
+            ]
+        )
+        for field in fields(given[0][0])
+    }
+    return type(given[0][0])(**columns)

@@ -1,4 +1,4 @@
-"""What the drive itself says about each extrinsic, and what rests on the survey alone."""
+"""How well a drive determines each extrinsic, and how far the recorded poses had to give way."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.adjust.problem import Problem
+from v2hdm.adjust.model import state_residual
+from v2hdm.adjust.problem import POSE_STATES, Problem
 from v2hdm.adjust.solution import Solution
-from v2hdm.records import FloatArray
+from v2hdm.records import FloatArray, IntArray
 
 AXES: tuple[str, ...] = ("forward", "left", "up", "roll", "pitch", "heading")
 
@@ -79,3 +80,33 @@ def observed(
     variance = np.concatenate([np.diagonal(block, axis1=1, axis2=2) for block in (centre, turn)], axis=1)
     share = np.minimum(variance[:, :3] / centre_sigma_m**2, 1.0)
     return [Observability(np.sqrt(v), s) for v, s in zip(variance, share, strict=True)]
+
+
+@dataclass(frozen=True)
+class PoseInnovations:
+    """Whitened innovations of the frames' states: errors drawn anew, and what is new in a drift.
+
+    Attributes:
+        state: (S,) which of :data:`v2hdm.adjust.POSE_STATES` each is; a state with a drift has two.
+        normalised: (J, S) in sigmas. Their mean square is at most 1 where the sigmas are right.
+    """
+
+    state: IntArray
+    normalised: FloatArray
+
+    def rms(self) -> dict[str, float]:
+        """Root mean square by the state's name, the larger one where it has two."""
+        count = max(len(self.normalised), 1)
+        size = np.sqrt(np.sum(self.normalised**2, axis=0) / count)
+        out: dict[str, float] = {}
+        for state, one in zip(self.state, size, strict=True):
+            name = POSE_STATES[state]
+            out[name] = max(out.get(name, 0.0), float(one))
+        return out
+
+
+def pose_innovations(solution: Solution) -> PoseInnovations:
+    """Normalised innovations of a solution's poses; none where it estimates no state of a frame."""
+    descent = solution.covariance.descent
+    normalised = state_residual(descent.engine.arrays, descent.estimate.frame_state)
+    return PoseInnovations(np.array(descent.engine.arrays.states, dtype=np.int64), normalised.cpu().numpy())

@@ -1,4 +1,4 @@
-r"""What is estimated from what: the model, as plain numpy records.
+r"""The problem as plain numpy records: observations, unknowns and priors.
 
 Unknown are, in the frames of :mod:`v2hdm.geometry`,
 
@@ -28,17 +28,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v2hdm.adjust.kernels import available
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 POSE_STATES: tuple[str, ...] = ("x", "y", "height", "roll", "pitch", "heading")
-"""What a frame can deviate in, in the order of its tangent."""
+"""The axes in which a frame can deviate, in the order of its tangent."""
 
 _LINE_RATIO = 1e3
 """Ratio of an observation's two variances from which it is one of a line: a point's is below 200."""
 
+# With the variances a > b: a b = det, a + b = trace, so a / b > q where trace^2 > det (q + 2 + 1 / q).
+LINE_EXCESS = _LINE_RATIO + 2 + 1 / _LINE_RATIO
+"""Squared trace over determinant of a covariance from which an observation is one of a line."""
+
 LOSSES: tuple[str, ...] = ("none", "huber", "cauchy", "geman_mcclure")
 SOLVERS: tuple[str, ...] = ("lbfgs", "lm")
+ENGINES: tuple[str, ...] = ("auto", "numba", "torch")
 
 
 @dataclass(frozen=True)
@@ -58,18 +62,8 @@ class Observations:
     @property
     def on_line(self) -> BoolArray:
         """Which observations (K,) say on which line of the image their corner lies, and not where on it."""
-        return on_line(self.covariance_px)
-
-
-def on_line(covariance_px: FloatArray) -> BoolArray:
-    """Whether covariances (K, 2, 2) are as good as those of a line of the image."""
-    if available():
-        from v2hdm.adjust.kernels.prepare import on_line as compiled
-
-        return compiled(covariance_px, _LINE_RATIO + 2 + 1 / _LINE_RATIO)
-    xx, yx, yy = covariance_px[:, 0, 0], covariance_px[:, 1, 0], covariance_px[:, 1, 1]
-    # With the variances a > b: a b = det, a + b = trace, so a / b > q where trace^2 > det (q + 2 + 1 / q).
-    return np.asarray((xx + yy) ** 2 > (xx * yy - yx**2) * (_LINE_RATIO + 2 + 1 / _LINE_RATIO))
+        xx, yx, yy = (self.covariance_px[:, row, column] for row, column in ((0, 0), (1, 0), (1, 1)))
+        return np.asarray((xx + yy) ** 2 > (xx * yy - yx**2) * LINE_EXCESS)
 
 
 @dataclass(frozen=True)
@@ -110,7 +104,7 @@ class KnownLengths:
 
 @dataclass(frozen=True)
 class CameraPrior:
-    """What earlier markings say of the cameras: a quadratic in their tangents and clock offsets.
+    """A prior on the cameras by earlier markings: a quadratic in their tangents and clock offsets.
 
     With ``cam_from_vehicle = exp(tangent) @ base`` (C, 4, 4), each camera's tangent and, where it is
     estimated, clock offset in s are ``mean`` (C, 6 + Q), with the joint ``information``
@@ -176,7 +170,7 @@ class Problem:
     pose_sigma: PoseSigma | tuple[PoseSigma, ...] = PoseSigma()
     corners_start: FloatArray | None = None
     twist_vehicle: FloatArray | None = None
-    clock_sigma_s: float = 0.02
+    clock_sigma_s: float = 0.01
     control: ControlPoints | None = None
     lengths: KnownLengths | None = None
     camera_prior: CameraPrior | None = None
@@ -218,17 +212,25 @@ class SolveOptions:
         max_refreshes: how often the problem is whitened anew at most; ``lm`` does so at each step, and is
             limited by its evaluations alone.
         max_evaluations: of cost and gradient, over all refreshes.
+        engine: who evaluates and linearises, of :data:`ENGINES`: ``numba`` by compiled kernels on the CPU,
+            ``torch`` by autograd anywhere; ``auto`` is numba on the CPU, torch elsewhere.
         device: torch device to compute on.
     """
 
     pose_states: tuple[str, ...] = POSE_STATES
     clock_offset: bool = False
     loss: str = "cauchy"
-    loss_scale: float = 3.0
+    loss_scale: float = 2.0
     gate_probability: float = 1e-4
     solver: str = "lbfgs"
     coarse: bool = True
     gap_tolerance: float = 1e-11
     max_refreshes: int = 20
     max_evaluations: int = 500
+    engine: str = "auto"
     device: str = "cpu"
+
+    @property
+    def on_cpu(self) -> bool:
+        """Whether the device is the CPU."""
+        return self.device.split(":")[0] == "cpu"

@@ -1,4 +1,4 @@
-"""Which model of the poses' errors a drive calls for, judged by observations that it did not see.
+"""The model of the poses' errors that a drive calls for, chosen by observations held out of the solve.
 
 Every model is fitted to most of the observations of a stretch of the drive and predicts the others. What
 it predicts best is right, in the one sense that a drive without ground truth can tell: a model that
@@ -13,18 +13,60 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from v2hdm.adjust.problem import Observations, Problem, SolveOptions
+from v2hdm.adjust.problem import ControlPoints, KnownLengths, Observations, Problem, SolveOptions
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.solve import solve
-from v2hdm.adjust.subset import restrict
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.tensors import exp
-from v2hdm.records import BoolArray, FloatArray
+from v2hdm.records import BoolArray, FloatArray, IntArray
+
+
+def restrict(problem: Problem, keep: BoolArray) -> tuple[Problem, IntArray]:
+    """``problem`` with the observations ``keep`` (K,) only, and the corners and frames between them.
+
+    Every camera must keep an observation. Frames are cut off before the first and after the last that
+    is used, so that a drift still runs through the others.
+
+    Returns:
+        The part, and the corners of ``problem`` that its corners are.
+    """
+    seen = problem.observations
+    corners, corner = np.unique(seen.corner[keep], return_inverse=True)
+    frame = seen.frame[keep]
+    used = slice(int(frame.min()), int(frame.max()) + 1)
+    start, twist, control = problem.corners_start, problem.twist_vehicle, problem.control
+    if control is not None:
+        left = np.isin(control.corner, corners)
+        number = np.searchsorted(corners, control.corner[left])
+        control = ControlPoints(number, control.points_map[left], control.sigma_m[left])
+    lengths = problem.lengths
+    if lengths is not None:
+        left = np.isin(lengths.first, corners) & np.isin(lengths.second, corners)
+        first, second = (np.searchsorted(corners, ends[left]) for ends in (lengths.first, lengths.second))
+        lengths = KnownLengths(first, second, lengths.length_m[left], lengths.sigma_m[left])
+    part = replace(
+        problem,
+        map_from_vehicle=problem.map_from_vehicle[used],
+        observations=Observations(
+            camera=seen.camera[keep],
+            frame=frame - used.start,
+            corner=corner.astype(np.int64),
+            pinhole_px=seen.pinhole_px[keep],
+            covariance_px=seen.covariance_px[keep],
+        ),
+        corner_count=len(corners),
+        corners_start=None if start is None else start[corners],
+        twist_vehicle=None if twist is None else twist[used],
+        visit=None if problem.visit is None else problem.visit[used],
+        control=control,
+        lengths=lengths,
+    )
+    return part, corners
 
 
 @dataclass(frozen=True)
 class Model:
-    """What is estimated of the poses beside map and extrinsics."""
+    """The pose errors that are estimated beside map and extrinsics."""
 
     pose_states: tuple[str, ...] = ()
     clock_offset: bool = False
@@ -63,7 +105,7 @@ class Selection:
 
     @property
     def sentence(self) -> str:
-        """What was chosen over what."""
+        """One sentence on the choice."""
         if not self.scores:
             return f"pose model '{self.name}', since too few observations repeat to choose by them"
         scores = ", ".join(f"{name} {score:.2f}" for name, score in self.scores.items())

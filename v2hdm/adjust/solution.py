@@ -1,4 +1,4 @@
-"""What a solve returns: the estimate, how it went, and how sure it is."""
+"""The result of a solve: the estimate, how it went, and how sure it is."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from v2hdm.adjust.covariance import Covariance
-from v2hdm.adjust.gating import Excluded, Verdict, VerdictArray, excluded
+from v2hdm.adjust.model import Loss, robustified
 from v2hdm.adjust.problem import Observations
-from v2hdm.adjust.robust import loss
+from v2hdm.adjust.validation import Excluded, Verdict, VerdictArray, excluded
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 
@@ -99,8 +99,9 @@ class Solution:
 
     @property
     def weight(self) -> FloatArray:
-        """What the robust loss left of each observation (K,), 0 to 1."""
-        _, weight = loss(self.loss, torch.as_tensor(self.mahalanobis2), self.loss_scale)
+        """The weight (K,), 0 to 1, that the robust loss leaves each observation."""
+        robust = Loss(self.loss, self.loss_scale)
+        _, weight = robustified(robust, torch.as_tensor(self.mahalanobis2))
         return np.asarray(weight.numpy())
 
     @property
@@ -109,7 +110,7 @@ class Solution:
         return np.asarray(self.verdict == Verdict.ACCEPTED)
 
     def excluded(self, observations: Observations) -> tuple[Excluded, ...]:
-        """What was left out of ``observations``, those of the problem, and why; worst first."""
+        """The excluded of ``observations``, those of the problem, and why; worst first."""
         return excluded(observations, self.mahalanobis2, self.verdict)
 
     @property

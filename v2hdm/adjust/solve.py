@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -11,23 +10,21 @@ from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
 from v2hdm.adjust.checks import check_model, check_options, check_problem
-from v2hdm.adjust.coarse import coarse_extrinsics, is_near, is_worth_a_look
 from v2hdm.adjust.covariance import Covariance
 from v2hdm.adjust.descent import Descent, descend, open_descent
-from v2hdm.adjust.gating import as_of_point, judge, noise_scale
-from v2hdm.adjust.kernels import available
-from v2hdm.adjust.kernels.pool import one_thread_in_torch
-from v2hdm.adjust.layout import make_arrays
-from v2hdm.adjust.origin import nearby_origin, shifted
-from v2hdm.adjust.problem import Problem, SolveOptions
-from v2hdm.adjust.residuals import Estimate, Loss, cost_and_gradient, frame_tangent, observe, pair_table
+from v2hdm.adjust.engine import Engine
+from v2hdm.adjust.engines import make_engine
+from v2hdm.adjust.engines.numba.pool import one_thread_in_torch
+from v2hdm.adjust.layout import make_arrays, nearby_origin, shifted
+from v2hdm.adjust.model import Estimate, Loss, frame_tangent
+from v2hdm.adjust.problem import LINE_EXCESS, Problem, SolveOptions
 from v2hdm.adjust.solution import Solution, Status
-from v2hdm.adjust.start import back_project
-from v2hdm.adjust.variance import VarianceFactors, variance_factors
+from v2hdm.adjust.start import coarse_extrinsics, is_near, is_worth_a_look
+from v2hdm.adjust.validation import VarianceFactors, as_of_point, classify, noise_scale, variance_factors
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.errors import AdjustError
-from v2hdm.geometry.tensors import NEAR_M, exp
-from v2hdm.records import BoolArray, FloatArray
+from v2hdm.geometry.tensors import exp
+from v2hdm.records import FloatArray
 
 
 def solve(problem: Problem, options: SolveOptions | None = None) -> Solution:
@@ -45,7 +42,7 @@ def solve(problem: Problem, options: SolveOptions | None = None) -> Solution:
     check_options(options)
     check_problem(problem)
     check_model(problem, options)
-    compiled = available() and torch.device(options.device).type == "cpu"
+    compiled = options.on_cpu and options.engine != "torch"
     with one_thread_in_torch(len(problem.observations.corner), compiled):
         return _solve(problem, options, began)
 
@@ -55,11 +52,11 @@ def _solve(problem: Problem, options: SolveOptions, began: float) -> Solution:
     origin_map = nearby_origin(problem)
     near = shifted(problem, -origin_map)
     arrays = make_arrays(near, tuple(options.pose_states), options.device, options.clock_offset)
-    robust = Loss(options.loss, options.loss_scale)
-    start, opening, spent = _start(near, arrays, robust, options)
+    engine, robust = make_engine(options.engine, arrays), Loss(options.loss, options.loss_scale)
+    start, opening, spent = _start(near, engine, robust, options)
     del near
     descent = descend(
-        arrays,
+        engine,
         start,
         robust,
         options.solver,
@@ -73,47 +70,42 @@ def _solve(problem: Problem, options: SolveOptions, began: float) -> Solution:
 
 
 def _start(
-    problem: Problem, arrays: Arrays, robust: Loss, options: SolveOptions
+    problem: Problem, engine: Engine, robust: Loss, options: SolveOptions
 ) -> tuple[Estimate, Whitening | None, int]:
     """Where the descent starts, its first whitening if that is known, and the evaluations spent.
 
-    A coarse stage comes before it where the start is far from the optimum, or the problem is large.
+    A coarse stage comes before it where the start is far from the optimum, or the problem large.
+
+    Raises:
+        AdjustError: none of a corner's rays fixes it.
     """
     cam_from_vehicle = torch.as_tensor(problem.cam_from_vehicle, dtype=torch.float64, device=options.device)
-    if options.coarse and not is_worth_a_look(arrays):
-        estimate, corner = _estimate(problem, arrays, cam_from_vehicle)
-        opening = open_descent(arrays, estimate, robust) if corner is None else None
+    if options.coarse and not is_worth_a_look(engine.arrays):
+        estimate, corner = _estimate(problem, engine, cam_from_vehicle)
+        opening = open_descent(engine, estimate, robust) if corner is None else None
         if opening is not None and is_near(opening):
             return estimate, opening, 0
         del opening
     spent = 0
     if options.coarse:
-        cam_from_vehicle, spent = coarse_extrinsics(arrays, cam_from_vehicle)
-    return start_at(problem, arrays, cam_from_vehicle), None, spent
-
-
-def start_at(problem: Problem, arrays: Arrays, cam_from_vehicle: Tensor) -> Estimate:
-    """The start under some extrinsics.
-
-    Raises:
-        AdjustError: none of its rays fixes a corner.
-    """
-    estimate, corner = _estimate(problem, arrays, cam_from_vehicle)
+        cam_from_vehicle, spent = coarse_extrinsics(engine, cam_from_vehicle)
+    estimate, corner = _estimate(problem, engine, cam_from_vehicle)
     if corner is not None:
         raise AdjustError(
             f"no ray of corner {corner} meets the ground under the starting extrinsics: its observations "
             "lie above the horizon; leave it out or give corners_start"
         )
-    return estimate
+    return estimate, None, spent
 
 
-def _estimate(problem: Problem, arrays: Arrays, cam_from_vehicle: Tensor) -> tuple[Estimate, int | None]:
+def _estimate(problem: Problem, engine: Engine, cam_from_vehicle: Tensor) -> tuple[Estimate, int | None]:
     """The start under some extrinsics, and a corner that none of its rays fixes, if there is any."""
+    arrays = engine.arrays
     state = torch.zeros_like(arrays.state_information_root)
     if problem.corners_start is not None:
         given = torch.as_tensor(problem.corners_start, dtype=torch.float64, device=cam_from_vehicle.device)
         return Estimate(cam_from_vehicle, state, given[arrays.corner_order], arrays.no_clock()), None
-    corners, fixed = back_project(arrays, cam_from_vehicle)
+    corners, fixed = engine.back_project(cam_from_vehicle)
     loose = None if bool(fixed.all()) else int(arrays.corner_order[~fixed].min())
     return Estimate(cam_from_vehicle, state, corners, arrays.no_clock()), loose
 
@@ -126,24 +118,30 @@ def report(
     spent: int,
     began: float,
 ) -> Solution:
-    """What came of it, on the map of ``problem``, whose point ``origin_map`` is the origin of the arrays."""
+    """The solution on the map of ``problem``, whose point ``origin_map`` is the origin of the arrays."""
+    from v2hdm.adjust.engines.numba.prepare import on_line  # loads numba
+
     robust = Loss(options.loss, options.loss_scale)
-    arrays, estimate, terms = descent.arrays, descent.estimate, descent.terms
+    engine, estimate, terms = descent.engine, descent.estimate, descent.terms
+    arrays = engine.arrays
     if descent.robust != robust:
-        terms, _ = cost_and_gradient(arrays, estimate, robust)
-    seen = _seen(problem, arrays, estimate)
-    scale = noise_scale(seen.mahalanobis2)
-    variance = _variance_factors(arrays, terms, seen.mahalanobis2, scale)
+        terms = engine.terms(estimate, robust)
+    residual_px, mahalanobis2, behind = engine.report(estimate, problem.intrinsic[:, :2])
+    lines = on_line(problem.observations.covariance_px, LINE_EXCESS)
+    if lines.any():
+        mahalanobis2[lines] = as_of_point(mahalanobis2[lines])
+    scale = noise_scale(mahalanobis2)
+    variance = _variance_factors(arrays, terms, mahalanobis2, scale)
     corners_map = _unsorted(estimate.corners_map, arrays.corner_order)
     corners_map += origin_map
     return Solution(
-        status=_status(descent, options, bool(seen.behind.any())),
+        status=_status(descent, options, bool(behind.any())),
         cam_from_vehicle=estimate.cam_from_vehicle.cpu().numpy(),
         map_from_vehicle=_adjusted_poses(problem, arrays, estimate),
         corners_map=corners_map,
-        residual_px=seen.residual_px,
-        mahalanobis2=seen.mahalanobis2,
-        verdict=judge(problem.observations, seen.mahalanobis2, seen.behind, options.gate_probability, scale),
+        residual_px=residual_px,
+        mahalanobis2=mahalanobis2,
+        verdict=classify(problem.observations, mahalanobis2, behind, options.gate_probability, scale),
         loss=options.loss,
         loss_scale=options.loss_scale,
         clock_offset_s=_clock_offset_s(problem, estimate),
@@ -155,39 +153,6 @@ def report(
         time_s=time.perf_counter() - began,
         covariance=Covariance(descent),
     )
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """The problem's observations at the solution: what :class:`Solution` says of each, and who lie behind."""
-
-    residual_px: FloatArray
-    mahalanobis2: FloatArray
-    behind: BoolArray
-
-
-def _seen(problem: Problem, arrays: Arrays, estimate: Estimate) -> _Seen:
-    if arrays.passes is not None:
-        out = _Seen(*arrays.passes.report(estimate, problem.intrinsic[:, :2]))
-    else:
-        out = _seen_by_torch(problem, arrays, estimate)
-    on_line = problem.observations.on_line
-    if on_line.any():
-        out.mahalanobis2[on_line] = as_of_point(out.mahalanobis2[on_line])
-    return out
-
-
-def _seen_by_torch(problem: Problem, arrays: Arrays, estimate: Estimate) -> _Seen:
-    count, table = len(arrays.pair), pair_table(arrays, estimate)
-    out = _Seen(np.empty((count, 2)), np.empty(count), np.empty(count, dtype=bool))
-    for run in arrays.runs():
-        view = observe(run, table, estimate.corners_map)
-        rows = arrays.order[run.observations].cpu().numpy()
-        focal = problem.intrinsic[problem.observations.camera[rows], :2]
-        out.residual_px[rows] = view.off.T.cpu().numpy() * focal
-        out.mahalanobis2[rows] = view.squared.cpu().numpy()
-        out.behind[rows] = (view.point[2] <= NEAR_M).cpu().numpy()
-    return out
 
 
 def _adjusted_poses(problem: Problem, arrays: Arrays, estimate: Estimate) -> FloatArray:
@@ -227,7 +192,7 @@ def _status(descent: Descent, options: SolveOptions, behind: bool) -> Status:
 def _variance_factors(
     arrays: Arrays, terms: dict[str, Tensor], squared: FloatArray, scale: float
 ) -> VarianceFactors:
-    """Those of a solve whose cost consists of ``terms``, and whose noise has the ``scale``."""
+    """Variance factors of a solve whose cost has these ``terms`` and whose noise has the ``scale``."""
     of_priors = 2 * sum(float(value) for name, value in terms.items() if name != "observations")
     centres = int((arrays.centre_information_root > 0).sum())
     surveyed = int((arrays.control_information > 0).sum())

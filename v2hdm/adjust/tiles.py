@@ -2,19 +2,24 @@
 
 The frames of a drive, cut into tiles along the route, couple to their neighbours and, where the
 route is driven again, to the tiles of earlier laps; the extrinsics couple to everything and come last,
-as the *tip*. Tiles are ordered by reverse Cuthill-McKee and their fill is found beforehand (the
-elimination tree: George and Liu, Computer Solution of Large Sparse Positive Definite Systems, 1981),
-so time and memory grow with the length of the route. Everything inside a tile is a dense product.
+as the *tip*. Tiles are ordered by reverse Cuthill-McKee or, where many couple, by least degree, and their
+fill is found beforehand (the elimination tree: George and Liu, Computer Solution of Large Sparse Positive
+Definite Systems, 1981), so time and memory grow with the length of the route. Everything inside a tile is a
+dense product.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from heapq import heapify, heappop, heappush
 from itertools import accumulate, combinations
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from torch import Tensor
@@ -35,15 +40,21 @@ class Pattern:
     position: tuple[int, ...]
     below: tuple[tuple[int, ...], ...]
 
+    def multiplications(self, size: int, tip: int) -> float:
+        """Multiplications of a factorisation, in tiles of ``size`` rows and a tip of ``tip``."""
+        heights = np.array([len(below) for below in self.below], dtype=float) * size + tip
+        return float(np.sum(size**3 / 6 + heights * size**2 / 2 + heights**2 * size / 2))
 
-def find_pattern(tile_count: int, cliques: Iterable[list[int]]) -> Pattern:
-    """The pattern of a factor whose matrix couples all tiles of each clique with one another."""
+
+def find_pattern(tile_count: int, cliques: Iterable[Sequence[int]], least_degree: bool = False) -> Pattern:
+    """The pattern of a factor whose matrix couples all tiles of each clique with one another.
+
+    The order is reverse Cuthill-McKee, or ``least_degree``: next comes the tile that couples to the fewest.
+    """
     edges = {pair for clique in cliques for pair in combinations(sorted(clique), 2)}
     position = np.arange(tile_count)
     if edges:
-        first, second = np.array(sorted(edges)).T
-        graph = coo_matrix((np.ones(len(first)), (first, second)), shape=(tile_count, tile_count)).tocsr()
-        order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
+        order = _least_degree(tile_count, edges) if least_degree else _cuthill_mckee(tile_count, edges)
         position[order] = np.arange(tile_count)
     below: list[set[int]] = [set() for _ in range(tile_count)]
     for first_tile, second_tile in edges:
@@ -54,6 +65,36 @@ def find_pattern(tile_count: int, cliques: Iterable[list[int]]) -> Pattern:
             parent = min(rows)
             below[parent] |= rows - {parent}
     return Pattern(tuple(position.tolist()), tuple(tuple(sorted(rows)) for rows in below))
+
+
+def _cuthill_mckee(tile_count: int, edges: set[tuple[int, int]]) -> NDArray[Any]:
+    first, second = np.array(sorted(edges)).T
+    graph = coo_matrix((np.ones(len(first)), (first, second)), shape=(tile_count, tile_count)).tocsr()
+    order: NDArray[Any] = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
+    return order
+
+
+def _least_degree(tile_count: int, edges: set[tuple[int, int]]) -> list[int]:
+    """Eliminate the tile of least degree next, whose neighbours then all couple."""
+    near: list[set[int]] = [set() for _ in range(tile_count)]
+    for first, second in edges:
+        near[first].add(second)
+        near[second].add(first)
+    queue = [(len(tiles), tile) for tile, tiles in enumerate(near)]
+    heapify(queue)
+    order: list[int] = []
+    done = [False] * tile_count
+    while queue:
+        degree, tile = heappop(queue)
+        if done[tile] or degree != len(near[tile]):
+            continue
+        done[tile] = True
+        order.append(tile)
+        for other in near[tile]:
+            near[other] |= near[tile]
+            near[other] -= {tile, other}
+            heappush(queue, (len(near[other]), other))
+    return order
 
 
 @dataclass(frozen=True)
@@ -100,6 +141,18 @@ class TiledMatrix:
             tiles[column, column] = diagonal[column]
         return cls(pattern, values, tuple(begins[:-1]), tuple(panel_at), diagonal, panels, last, tiles)
 
+    @cached_property
+    def addresses(self) -> tuple[Tensor, Tensor]:
+        """Tiles but the tip's, as column times their count plus row, ascending, and where each begins."""
+        count = len(self.diagonal)
+        keys, at = [], []
+        for column, below in enumerate(self.pattern.below):
+            area = self.diagonal[column].numel()
+            keys += [column * count + row for row in (column, *below)]
+            at += [self.diagonal_at[column], *(self.panel_at[column] + n * area for n in range(len(below)))]
+        device = self.values.device
+        return torch.tensor(keys, device=device), torch.tensor(at, device=device)
+
 
 @dataclass(frozen=True)
 class TiledCholesky:
@@ -128,35 +181,22 @@ class TiledCholesky:
 
     def solve(self, right: Tensor) -> Tensor:
         """L^-1 b for b (size, n)."""
-        out = self.solve_above_tip(right)
-        begin = len(out) - len(self.tip)
-        out[begin:] = torch.linalg.solve_triangular(self.tip, out[begin:], upper=False)
-        return out
-
-    def solve_above_tip(self, right: Tensor) -> Tensor:
-        """As :meth:`solve`, but of the tip's rows only what stands above it is taken off."""
         out, begin = right.clone(), 0
         # Above the first row that is not zero there is nothing to solve for.
         first = int(right.any(dim=1).to(torch.uint8).argmax())
         for tile, panel, rows in zip(self.diagonal, self.panels, self.rows, strict=True):
-            if begin + len(tile) <= first:
-                begin += len(tile)
-                continue
-            part = out[begin : begin + len(tile)]
-            part.copy_(torch.linalg.solve_triangular(tile, part, upper=False))
-            out.index_add_(0, rows, panel @ part, alpha=-1)
+            if begin + len(tile) > first:
+                part = out[begin : begin + len(tile)]
+                part.copy_(torch.linalg.solve_triangular(tile, part, upper=False))
+                out.index_add_(0, rows, panel @ part, alpha=-1)
             begin += len(tile)
+        out[begin:] = torch.linalg.solve_triangular(self.tip, out[begin:], upper=False)
         return out
 
     def solve_transposed(self, right: Tensor) -> Tensor:
         """L^-T b for b (size, n)."""
         out, end = right.clone(), self.size - len(self.tip)
         out[end:] = torch.linalg.solve_triangular(self.tip.mT, out[end:], upper=True)
-        return self.solve_transposed_above_tip(out)
-
-    def solve_transposed_above_tip(self, right: Tensor) -> Tensor:
-        """As :meth:`solve_transposed`, of b whose tip's rows are solved for already."""
-        out, end = right.clone(), self.size - len(self.tip)
         for tile, panel, rows in zip(
             reversed(self.diagonal), reversed(self.panels), reversed(self.rows), strict=True
         ):
@@ -168,13 +208,7 @@ class TiledCholesky:
 
 
 def factorise_tiles(matrix: TiledMatrix) -> TiledCholesky | None:
-    """Factorise, overwriting the matrix; None where it is not positive definite."""
-    factor = factorise_above_tip(matrix)
-    return factor if factor is not None and _factorise_tile(matrix.tip) else None
-
-
-def factorise_above_tip(matrix: TiledMatrix) -> TiledCholesky | None:
-    """As :func:`factorise_tiles`, but the tip stays what eliminating all above has left of it.
+    """Factorise, overwriting the matrix; None where it is not positive definite.
 
     Right-looking: each column, once factorised, is subtracted from those it couples to.
     """
@@ -190,6 +224,8 @@ def factorise_above_tip(matrix: TiledMatrix) -> TiledCholesky | None:
                 left, right = matrix.tiles[second, column], matrix.tiles[first, column]
                 matrix.tiles[second, first].addmm_(left, right.mT, alpha=-1)
         rows.append(_row_index(below, len(own), len(matrix.diagonal), len(matrix.tip), panel))
+    if not _factorise_tile(matrix.tip):
+        return None
     return TiledCholesky(matrix.diagonal, matrix.panels, tuple(rows), matrix.tip)
 
 

@@ -10,10 +10,8 @@ from typing import Any, TypeVar
 import ray
 from ray.exceptions import RayTaskError, WorkerCrashedError
 
-from v2hdm.adjust.parts import Team
 from v2hdm.errors import WorkerError
 from v2hdm.fleet.cluster import RETRIES
-from v2hdm.fleet.parts import RayTeam
 from v2hdm.store.cache import Line, log_again, recorded
 
 _Result = TypeVar("_Result")
@@ -28,11 +26,6 @@ class RayCrew:
     def __init__(self, cores: int, folder: str) -> None:
         """``cores`` are those of the cluster; ``folder`` is where relative paths begin."""
         self._cores, self._folder = cores, folder
-        self._team: RayTeam | None = None
-
-    def __reduce__(self) -> tuple[type[RayCrew], tuple[int, str]]:
-        """A task that it is handed to has a team of its own."""
-        return RayCrew, (self._cores, self._folder)
 
     @property
     def workers(self) -> int:
@@ -45,13 +38,6 @@ class RayCrew:
         task: Any = ray.remote(_done).options(num_cpus=_CORES_EACH, max_retries=RETRIES)
         reference = task.remote(work, level, self._folder)
         return lambda: _result(reference)
-
-    def team(self, parts: int) -> Team:
-        """Actors, one a core or a part, that work on one problem after the other and end with the crew."""
-        actors = min(parts, self._cores)
-        if self._team is None or len(self._team.actors) < actors:
-            self._team = RayTeam(actors, 0.0)
-        return self._team
 
 
 def _done(work: Callable[[], _Result], level: int, folder: str) -> tuple[_Result, list[Line]]:

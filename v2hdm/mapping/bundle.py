@@ -41,10 +41,6 @@ HEAVE_SIGMA_M = 0.01
 """How far a vehicle's body moves up and down on its suspension on paved ground."""
 
 
-CLOCK_SIGMA_S = 0.01
-"""How far the clocks of camera and receiver may be apart where nobody says that they are synchronised."""
-
-
 Solve = Callable[[Problem, SolveOptions], Solution]
 
 LEAST_OBSERVATIONS = 200
@@ -72,7 +68,7 @@ class Model:
     variance_factor: float = 1.0
     sizes: SizeOptions = field(default_factory=SizeOptions)
     survey: SurveyOptions = field(default_factory=SurveyOptions)
-    clock_sigma_s: float = CLOCK_SIGMA_S
+    clock_sigma_s: float = Problem.clock_sigma_s
 
 
 @dataclass(frozen=True)

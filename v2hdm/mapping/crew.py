@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol, TypeVar
 
-from v2hdm.adjust.parts import Local, Team
-
 _Result = TypeVar("_Result")
 
 
@@ -23,9 +21,6 @@ class Crew(Protocol):
         What it logs is logged then, and what it raises is raised.
         """
 
-    def team(self, parts: int) -> Team:
-        """Those who adjust so many parts of a problem."""
-
 
 class Alone:
     """This process."""
@@ -35,10 +30,6 @@ class Alone:
     def begin(self, work: Callable[[], _Result]) -> Callable[[], _Result]:
         """Leave ``work`` until it is waited for."""
         return work
-
-    def team(self, parts: int) -> Team:
-        """One part after the other."""
-        return Local()
 
 
 ALONE = Alone()

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from v2hdm.adjust import Fault, Suspect
+from v2hdm.adjust import Fault, ScoreTest
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.evidence import CELLS, WINDOW_OBSERVATIONS, CameraFit, Contradiction
 from v2hdm.mapping.survey import name_of
@@ -20,7 +20,7 @@ CELL_OBSERVATIONS = 40
 
 
 def contradictions(
-    bundle: Bundle, found: Sequence[Suspect], visits: Sequence[str] = ()
+    bundle: Bundle, found: Sequence[ScoreTest], visits: Sequence[str] = ()
 ) -> tuple[Contradiction, ...]:
     """``found`` in the bundle's problem, in the words of the user's inputs; several ``visits`` are named."""
     names = tuple(bundle.camera_index)
@@ -111,7 +111,7 @@ def _cell_bias(places_px: FloatArray, residual_px: FloatArray) -> float:
     return max(biases, default=0.0)
 
 
-def _about(bundle: Bundle, suspect: Suspect, visits: Sequence[str]) -> str:
+def _about(bundle: Bundle, suspect: ScoreTest, visits: Sequence[str]) -> str:
     if suspect.fault is Fault.CLOCK and suspect.item >= 0 and visits:
         return f"in {visits[suspect.item]}"
     if suspect.fault is Fault.SIZE:

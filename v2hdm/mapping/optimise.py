@@ -14,8 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from v2hdm.adjust import Problem, Solution, SolveOptions, Status, select_model
-from v2hdm.adjust.parts import adjust
+from v2hdm.adjust import Status, select_model
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.mapping.association.attach import attach
@@ -132,7 +131,7 @@ class Optimiser:
         model = replace(model, clock_sigma_s=LOOSE_CLOCK_SIGMA_S)
         usable = self._usable(bundle.association, bundle.rig)
         solved = solve_bundle(
-            self._sightings, bundle.association, usable, bundle.rig, self._cameras, model, self._adjust
+            self._sightings, bundle.association, usable, bundle.rig, self._cameras, model
         ).solution
         return [
             {name: float(offset_s[c]) for name, c in bundle.camera_index.items()}
@@ -232,15 +231,11 @@ class Optimiser:
             coarse_model(rig, self._noise_of_visits, self._options)
             if coarse
             else full_model(self._noise_of_visits, self._options, self._pose_model, self._variance_factor),
-            self._adjust,
         )
         status = bundle.solution.status
         if status is Status.UNDETERMINED or not np.isfinite(bundle.solution.corners_map).all():
             raise MappingError(f"the joint optimisation failed ({status.value}): {status.advice}")
         return bundle
-
-    def _adjust(self, problem: Problem, options: SolveOptions) -> Solution:
-        return adjust(problem, options, self._options.adjustment, self._crew.team)
 
     def _reweigh(self, bundle: Bundle) -> None:
         """Take the observations for as good as their residuals under ``bundle`` say.

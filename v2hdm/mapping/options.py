@@ -15,9 +15,6 @@ LEAST_SIGHTINGS = 3
 """Images that must show a marking where nothing else is weighed: in the naive methods, and of a track before
 the incremental map takes it up."""
 
-ADJUSTMENTS: tuple[str, ...] = (AUTO, "together", "parts")
-"""What ``mapping.adjustment`` may be."""
-
 POSE_MODELS: tuple[str, ...] = (AUTO, "paper", "roll_pitch", "full", "heave", "clock")
 """What ``mapping.pose_model`` may be: those of :data:`v2hdm.adjust.MODELS`, or ``auto``."""
 
@@ -155,9 +152,6 @@ class MappingOptions:
     ``loss_scale`` are the robust loss of the solver.
     ``mode`` is ``batch``, or ``incremental``: the drive as the vehicle would map it, marking by marking,
     and in the end solved as ``batch`` does.
-    ``adjustment`` is ``together``, or ``parts``: those of the joint solves of several drives are solved each
-    by itself and joined in what they share, which comes to the same map to rounding; ``auto`` takes them
-    where that is clearly less work.
     ``rounds`` counts association under the optimised extrinsic followed by a joint solve.
     ``device`` is the torch device that the joint solves run on, ``cpu`` or ``cuda``.
     """
@@ -168,7 +162,6 @@ class MappingOptions:
     pose_model: str = AUTO
     loss: str = "cauchy"
     loss_scale: float = 2.0
-    adjustment: str = AUTO
     rounds: int = 2
     device: str = "cpu"
     association: AssociationOptions = field(default_factory=AssociationOptions)
@@ -211,12 +204,6 @@ def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -
         raise ConfigError(
             f"mapping.pose_model is '{options.pose_model}'; choose from {', '.join(POSE_MODELS)}."
         )
-    if options.adjustment not in ADJUSTMENTS:
-        raise ConfigError(
-            f"mapping.adjustment is '{options.adjustment}'; choose from {', '.join(ADJUSTMENTS)}."
-        )
-    if options.adjustment == "parts" and options.device != "cpu":
-        raise ConfigError("mapping.adjustment=parts works on the CPU; set device=cpu or adjustment=auto.")
     from v2hdm.adjust.problem import LOSSES  # brings torch, which settings as such do without
 
     if options.loss not in LOSSES:

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from v2hdm.adjust import Fault, Suspect, pose_pulls, suspects
+from v2hdm.adjust import Fault, ScoreTest, pose_innovations, score_faults
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.io.drive.images import with_clock_offsets
 from v2hdm.mapping.association.groups import Association
@@ -170,13 +170,13 @@ def visit_names(drive: Drive) -> tuple[str, ...]:
     return tuple(visit.name for visit in drive.joined)
 
 
-def _suspects(bundle: Bundle, drive: Drive) -> tuple[Suspect, ...]:
+def _suspects(bundle: Bundle, drive: Drive) -> tuple[ScoreTest, ...]:
     """The inputs that can be tested and were stated at all, the most contradicted first."""
-    found = suspects(bundle.problem, bundle.solution)
+    found = score_faults(bundle.problem, bundle.solution)
     return tuple(one for one in found if _is_stated(one, bundle, drive))
 
 
-def _is_stated(one: Suspect, bundle: Bundle, drive: Drive) -> bool:
+def _is_stated(one: ScoreTest, bundle: Bundle, drive: Drive) -> bool:
     """Whether what is suspected was stated at all: a centre may be unsurveyed, and is then a guess."""
     if one.fault not in (Fault.SURVEY, Fault.LEVER):
         return True
@@ -218,8 +218,8 @@ def _evidence(
     sightings: Sightings,
 ) -> SolveEvidence:
     factors, window_s = along_route(settled, sightings.frame[settled.row], sightings.stamp_s)
-    pulls = pose_pulls(settled.solution)
-    largest = np.abs(pulls.pulls).max(axis=1, initial=0.0)
+    innovations = pose_innovations(settled.solution)
+    largest = np.abs(innovations.normalised).max(axis=1, initial=0.0)
     frames_s = sightings.stamp_s[np.unique(sightings.frame[settled.row])]
     return SolveEvidence(
         suspects=found,
@@ -230,14 +230,14 @@ def _evidence(
         variance_factor=overall_factor(settled),
         along_route=factors,
         window_s=window_s,
-        pose_pulls=pulls.rms(),
+        pose_pulls=innovations.rms(),
         worst_pull=float(largest.max()),
         worst_pull_s=float(frames_s[int(largest.argmax())]),
         clock_s=_clocks(final),
     )
 
 
-def _is_ambiguous(worst: Suspect, found: Sequence[Suspect]) -> bool:
+def _is_ambiguous(worst: ScoreTest, found: Sequence[ScoreTest]) -> bool:
     """Whether the same fault of another camera would explain nearly as much."""
     rivals = [
         one.sigmas
@@ -251,7 +251,7 @@ def _is_ambiguous(worst: Suspect, found: Sequence[Suspect]) -> bool:
     return max(rivals, default=0.0) > AMBIGUOUS_SHARE * worst.sigmas
 
 
-def is_contradicted(one: Suspect | Contradiction) -> bool:
+def is_contradicted(one: ScoreTest | Contradiction) -> bool:
     """Whether an input is off by more than chance and by more than matters, and this drive can tell."""
     told = one.sigma <= TOLD_SIGMA[one.fault]
     return told and one.sigmas > CONTRADICTED_SIGMAS and abs(one.value) > LEAST_VALUE[one.fault]
@@ -268,7 +268,7 @@ def _clocks(bundle: Bundle) -> tuple[dict[str, tuple[float, float]], ...]:
     )
 
 
-def _remedied(inputs: Inputs, worst: Suspect, settled: Bundle) -> Inputs | None:
+def _remedied(inputs: Inputs, worst: ScoreTest, settled: Bundle) -> Inputs | None:
     """The inputs without what ``worst`` says is wrong; None where the drive cannot do without."""
     if worst.fault is Fault.CLOCK:
         if worst.sigma > CLOCK_TOLD_S:

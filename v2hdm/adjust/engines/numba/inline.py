@@ -1,8 +1,7 @@
-"""What the kernels have in common: an observation, a loss, the factor of a unit's corners.
+"""Common parts of the kernels: an observation, a loss, the factor of a unit's corners.
 
-The formulas are those of :mod:`~v2hdm.adjust.residuals`, :mod:`~v2hdm.adjust.linear`,
-:mod:`~v2hdm.adjust.robust` and :mod:`~v2hdm.adjust.corner_factor`, where they are explained, and which tests
-hold these to. A pair's table is its ``cam_from_map``, row by row (16,).
+The formulas are the closed forms of :mod:`~v2hdm.adjust.model` and :mod:`~v2hdm.adjust.corner_factor`, which
+tests hold these to. A pair's table is its ``cam_from_map``, row by row (16,).
 """
 
 from __future__ import annotations
@@ -10,8 +9,8 @@ from __future__ import annotations
 import math
 
 from v2hdm.adjust.corner_factor import CORNER_FLOOR, PIVOT_FLOOR
-from v2hdm.adjust.kernels.build import inlined
-from v2hdm.adjust.kernels.layout import Layout
+from v2hdm.adjust.engines.numba.build import inlined
+from v2hdm.adjust.engines.numba.layout import Layout
 from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import FloatArray, IntArray
 
@@ -158,6 +157,20 @@ def factorise_unit(
         for j in range(i + 1, n):
             joint[at + i * n + j] = 0.0
     return True
+
+
+@inlined
+def keep_unit(size: int, block: FloatArray, lower: FloatArray, c: int, joint: FloatArray, at: int) -> None:
+    """Write a unit's block as it is, in the place of its factor."""
+    n = 2 * size
+    if size == 1:
+        lower[0, c], lower[1, c] = block[0, 0] + CORNER_FLOOR, block[1, 0]
+        lower[2, c] = block[1, 1] + CORNER_FLOOR
+        return
+    for i in range(n):
+        block[i, i] += CORNER_FLOOR
+        for j in range(n):
+            joint[at + i * n + j] = block[i, j] if j <= i else 0.0
 
 
 @inlined

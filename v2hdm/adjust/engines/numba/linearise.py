@@ -7,13 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from v2hdm.adjust.kernels.build import inlined, kernel
-from v2hdm.adjust.kernels.layout import Layout
-from v2hdm.adjust.kernels.parts import (
+from v2hdm.adjust.engine import WEIGHT_FLOOR
+from v2hdm.adjust.engines.numba.build import inlined, kernel
+from v2hdm.adjust.engines.numba.inline import (
     add_corner_priors,
     add_force,
     add_loss,
     factorise_unit,
+    keep_unit,
     length_residual,
     number_touched,
     see,
@@ -23,12 +24,12 @@ from v2hdm.adjust.kernels.parts import (
     weigh,
     whiten,
 )
-from v2hdm.adjust.whitening import WEIGHT_FLOOR
+from v2hdm.adjust.engines.numba.layout import Layout
 from v2hdm.records import FloatArray, IntArray
 
 
 class Linearisation(NamedTuple):
-    """What :func:`linearise` computes; R pairs are touched in all chunks together, Q chunks.
+    """The output of :func:`linearise`; R pairs are touched in all chunks together, Q chunks.
 
     Attributes:
         costs: (Q, 3) of observations, survey and known lengths.
@@ -37,7 +38,7 @@ class Linearisation(NamedTuple):
         carried: (Q, D) the same by the cameras' unknowns, where they have none.
         rows: (2 N, D) then L^-1 W', one corner after the other; else (0, D).
         whitened: (N, 2) the gradient by the corners, L^-1 g.
-        lower, joint: the factors of V, :func:`v2hdm.adjust.kernels.parts.factorise_unit`.
+        lower, joint: the factors of V, see ``inline.factorise_unit``; of kept units V.
         own: J'J by pair (R, 21) or, where pairs move with their camera alone, by camera (Q C, 21).
         tip: (Q, D, D) B'B of the cameras' unknowns, its lower triangle.
         failed: (Q,) units whose block has no factor.
@@ -57,7 +58,7 @@ class Linearisation(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """What :func:`linearise` works in: the number of each pair (P,), and derivatives and blocks of a unit."""
+    """The workspace of :func:`linearise`: numbers of pairs (P,), derivatives and blocks of a unit."""
 
     slot: IntArray
     jacobian: FloatArray
@@ -202,6 +203,12 @@ def linearise(
             add_corner_priors(layout, u, corners, gradient, out.costs[q])
             _add_lengths(layout, u, corners, block)
             joint_at = layout.joint_at[u]
+            if layout.kept[u]:
+                keep_unit(size, block, out.lower, first, out.joint, joint_at)
+                for c in range(first, last):
+                    i = 2 * (c - first)
+                    out.whitened[c, 0], out.whitened[c, 1] = gradient[i], gradient[i + 1]
+                continue
             if not factorise_unit(size, block, growth, out.lower, first, out.joint, joint_at):
                 out.failed[q] += 1.0
                 continue

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from v2hdm.adjust.kernels.build import kernel
-from v2hdm.adjust.kernels.layout import Layout
-from v2hdm.adjust.kernels.parts import see, whiten
-from v2hdm.adjust.start import MIN_DEPRESSION_SINE
+from v2hdm.adjust.engine import WEIGHT_FLOOR
+from v2hdm.adjust.engines.numba.build import kernel
+from v2hdm.adjust.engines.numba.inline import see, weigh, whiten
+from v2hdm.adjust.engines.numba.layout import Layout
+from v2hdm.adjust.engines.numba.linearise import couple, differentiate
+from v2hdm.adjust.model import MIN_DEPRESSION_SINE
 from v2hdm.geometry.tensors import NEAR_M
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
@@ -63,7 +65,7 @@ def back_project(
 
 
 class Report(NamedTuple):
-    """What is said of the problem's observations (K,), in its order: see :class:`v2hdm.adjust.Solution`."""
+    """The report on the problem's observations (K,), in its order: see :class:`v2hdm.adjust.Solution`."""
 
     residual_px: FloatArray
     mahalanobis2: FloatArray
@@ -95,13 +97,52 @@ def report(
 
 
 @kernel
-def squared_residuals(
+def residuals(
     begin: int, end: int, layout: Layout, table: FloatArray, corners: FloatArray, out: FloatArray
 ) -> None:
-    """Squared Mahalanobis distances (K,) of the observations of chunks ``begin`` to ``end``."""
+    """Whitened residuals (2, K) of the observations of chunks ``begin`` to ``end``."""
     for c in range(layout.unit[layout.chunk[begin]], layout.unit[layout.chunk[end]]):
         x, y = corners[c, 0], corners[c, 1]
         for k in range(layout.begin[c], layout.begin[c + 1]):
             _, _, _, _, _, u, v = see(layout, table, k, x, y)
-            r0, r1 = whiten(layout, k, u, v)
-            out[k] = r0 * r0 + r1 * r1
+            out[0, k], out[1, k] = whiten(layout, k, u, v)
+
+
+@kernel
+def pull(
+    layout: Layout,
+    table: FloatArray,
+    corners: FloatArray,
+    by_residual: FloatArray,
+    jacobian: FloatArray,
+    wrench: FloatArray,
+    by_corner: FloatArray,
+) -> None:
+    """Add the gradients by the pairs (P, 6) and by corner (N, 2), from that by the residuals (2, K)."""
+    for c in range(len(corners)):
+        for k in range(layout.begin[c], layout.begin[c + 1]):
+            differentiate(layout, table, k, corners[c, 0], corners[c, 1], jacobian)
+            r0, r1 = by_residual[0, k], by_residual[1, k]
+            by_corner[c, 0] += jacobian[12] * r0 + jacobian[14] * r1
+            by_corner[c, 1] += jacobian[13] * r0 + jacobian[15] * r1
+            for p in range(6):
+                wrench[layout.pair[k], p] += jacobian[p] * r0 + jacobian[6 + p] * r1
+
+
+@kernel
+def couplings(
+    layout: Layout,
+    table: FloatArray,
+    corner: IntArray,
+    corners: FloatArray,
+    code: int,
+    scale: float,
+    jacobian: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write W' (k, 12) of the layout's observations, of the corners (n, 2) that ``corner`` (k,) numbers."""
+    for k in range(len(corner)):
+        x, y = corners[corner[k], 0], corners[corner[k], 1]
+        r0, r1, _, _, _ = differentiate(layout, table, k, x, y, jacobian)
+        weight = weigh(code, scale, r0 * r0 + r1 * r1)
+        couple(jacobian, WEIGHT_FLOOR if weight < WEIGHT_FLOOR else weight, out, k)

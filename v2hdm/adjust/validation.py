@@ -1,7 +1,8 @@
-"""Which observations the solution stands on, and why the others were left out."""
+"""Validation of observations by their residuals, and of the stated variances by all of them."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -9,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from v2hdm.adjust.kernels import available
 from v2hdm.adjust.problem import Observations
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
@@ -22,7 +22,7 @@ _ROWS = 1 << 18
 
 
 class Verdict(IntEnum):
-    """What became of an observation; :attr:`reason` says it in words."""
+    """The verdict on an observation; :attr:`reason` says it in words."""
 
     ACCEPTED = 0
     CONTRADICTS = 1
@@ -56,7 +56,7 @@ class Excluded:
 
     @property
     def sentence(self) -> str:
-        """What was left out and why."""
+        """One sentence on the observation and the reason."""
         return (
             f"observation {self.observation} (corner {self.corner}, camera {self.camera}, "
             f"frame {self.frame}): {self.verdict.reason} ({self.distance_sigma:.1f} sigma)"
@@ -65,16 +65,8 @@ class Excluded:
 
 def noise_scale(mahalanobis2: FloatArray) -> float:
     """How many times as large as stated the noise's variance is, by the median; at least 1."""
-    return max(1.0, _median(mahalanobis2) / _MEDIAN_SQUARED)
-
-
-def _median(values: FloatArray) -> float:
-    """The median of values from 0 up, to seven digits."""
-    if available():
-        from v2hdm.adjust.kernels.prepare import median
-
-        return median(values)
-    return float(np.median(values.astype(np.float32), overwrite_input=True))
+    median = float(np.median(mahalanobis2.astype(np.float32), overwrite_input=True))
+    return max(1.0, median / _MEDIAN_SQUARED)
 
 
 def as_of_point(squared_of_line: FloatArray) -> FloatArray:
@@ -82,7 +74,7 @@ def as_of_point(squared_of_line: FloatArray) -> FloatArray:
     return np.asarray(-2 * chi2.logsf(squared_of_line, 1))
 
 
-def judge(
+def classify(
     observations: Observations,
     mahalanobis2: FloatArray,
     behind: BoolArray,
@@ -108,7 +100,8 @@ def judge(
     verdict[mahalanobis2 > gate] = Verdict.CONTRADICTS
     verdict[behind] = Verdict.BEHIND_CAMERA
     count = int(observations.corner.max()) + 1
-    seen, left = _count_accepted(observations.corner, verdict == Verdict.ACCEPTED, count)
+    seen = np.bincount(observations.corner, minlength=count)
+    left = np.bincount(observations.corner[verdict == Verdict.ACCEPTED], minlength=count)
     alone = (left == 1) & (seen > 1)
     for begin in range(0, len(verdict) if alone.any() else 0, _ROWS):
         part = slice(begin, begin + _ROWS)
@@ -116,15 +109,6 @@ def judge(
             Verdict.UNCONFIRMED
         )
     return verdict
-
-
-def _count_accepted(corner: IntArray, accepted: BoolArray, corners: int) -> tuple[IntArray, IntArray]:
-    """How often each corner was seen, and how many of its observations are accepted."""
-    if available():
-        from v2hdm.adjust.kernels.prepare import count_accepted
-
-        return count_accepted(corner, accepted, corners)
-    return np.bincount(corner, minlength=corners), np.bincount(corner[accepted], minlength=corners)
 
 
 def excluded(
@@ -143,4 +127,42 @@ def excluded(
             verdict=Verdict(int(verdict[k])),
         )
         for k in rows
+    )
+
+
+# Squared residual that one good observation in a thousand exceeds: chi-square, 2 degrees of freedom.
+_OUTLIER_SQUARED = 13.8
+# Mean of half such a variable below that limit: leaving the tail out takes a little off the chi-square.
+_TRIMMED_MEAN = 1 - _OUTLIER_SQUARED / 2 / math.expm1(_OUTLIER_SQUARED / 2)
+
+
+@dataclass(frozen=True)
+class VarianceFactors:
+    """Variances as multiples of the stated ones: of everything, and of the observations alone."""
+
+    all: float
+    observations: float
+
+
+def variance_factors(
+    squared: FloatArray, of_priors: float, free: int, scale: float | None = None
+) -> VarianceFactors:
+    """Chi-square per degree of freedom, of good observations and priors together and of the former.
+
+    What the priors have left of their own degrees of freedom is what the observations have taken of them:
+    the expected chi-square of a prior is the one less the other (Foerstner and Wrobel, Photogrammetric
+    Computer Vision, section 4.2.4, on variance components).
+
+    Args:
+        squared: (K,) squared residuals of the observations, in standard deviations.
+        of_priors: chi-square of the priors.
+        free: unknowns less those that priors other than the poses' hold.
+        scale: :func:`~v2hdm.adjust.validation.noise_scale` of ``squared``, where it is known already.
+    """
+    good = squared <= _OUTLIER_SQUARED * (noise_scale(squared) if scale is None else scale)
+    of_observations = float(squared.sum(where=good)) / _TRIMMED_MEAN
+    redundancy = 2 * int(good.sum()) - free
+    return VarianceFactors(
+        all=(of_observations + of_priors) / max(redundancy, 1),
+        observations=of_observations / max(redundancy - of_priors, 1),
     )

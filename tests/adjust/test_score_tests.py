@@ -14,11 +14,11 @@ from v2hdm.adjust import (
     KnownLengths,
     PoseSigma,
     Problem,
+    ScoreTest,
     SolveOptions,
-    Suspect,
-    pose_pulls,
+    pose_innovations,
+    score_faults,
     solve,
-    suspects,
 )
 
 OPTIONS = SolveOptions(coarse=False, loss="none")
@@ -29,8 +29,8 @@ def scene(seed: int = 3) -> Scene:
     return make_scene(seed, frames=60, every_m=3.0, jitter=POSES, start_error_deg=0.5)
 
 
-def found_of(problem: Problem, fault: Fault, camera: int, axis: int = 0) -> Suspect:
-    found = suspects(problem, solve(problem, OPTIONS))
+def found_of(problem: Problem, fault: Fault, camera: int, axis: int = 0) -> ScoreTest:
+    found = score_faults(problem, solve(problem, OPTIONS))
     (one,) = [s for s in found if (s.fault, s.camera, s.axis) == (fault, camera, axis)]
     return one
 
@@ -43,7 +43,7 @@ def with_focal(problem: Problem, factor: float) -> Problem:
 
 def test_a_right_problem_contradicts_nothing() -> None:
     problem = scene().problem
-    assert all(one.sigmas < 4 for one in suspects(problem, solve(problem, OPTIONS)))
+    assert all(one.sigmas < 4 for one in score_faults(problem, solve(problem, OPTIONS)))
 
 
 def test_the_gain_and_the_value_of_a_focal_length_are_those_of_solving_for_it() -> None:
@@ -60,7 +60,7 @@ def test_the_gain_and_the_value_of_a_focal_length_are_those_of_solving_for_it() 
 
 def test_a_late_clock_is_found_and_named_first() -> None:
     late = with_late_clocks(scene(), np.array([0.06, 0.0])).problem
-    found = suspects(late, solve(late, OPTIONS))
+    found = score_faults(late, solve(late, OPTIONS))
     assert (found[0].fault, found[0].camera) == (Fault.CLOCK, 0)
     assert found[0].value == pytest.approx(0.06, abs=0.01)
     assert found[0].sigmas > 10
@@ -85,7 +85,7 @@ def test_centres_that_are_all_off_alike_are_laid_to_the_point_of_the_poses() -> 
     problem = scene().problem
     assert problem.centre_vehicle is not None
     off = replace(problem, centre_vehicle=problem.centre_vehicle + np.array([1.2, 0.0, 0.0]))
-    first = suspects(off, solve(off, OPTIONS))[0]
+    first = score_faults(off, solve(off, OPTIONS))[0]
     assert (first.fault, first.axis) == (Fault.LEVER, 0)
     assert first.value == pytest.approx(-1.2, abs=0.1)
 
@@ -97,7 +97,7 @@ def test_known_sizes_that_the_paint_does_not_have_are_told_with_those_that_it_ha
     first = np.flatnonzero(np.abs(np.linalg.norm(np.diff(corners, axis=0), axis=1) - side_m) < 1e-6)
     stated = KnownLengths(first, first + 1, np.full(len(first), side_m - 0.05), np.full(len(first), 0.005))
     problem = replace(street.problem, lengths=stated)
-    one = suspects(problem, solve(problem, OPTIONS))[0]
+    one = score_faults(problem, solve(problem, OPTIONS))[0]
     assert one.fault is Fault.SIZE
     assert one.value == pytest.approx(0.05, abs=0.005)
 
@@ -108,7 +108,7 @@ def test_one_surveyed_point_off_is_told_from_all_off() -> None:
     points = street.corners_map[chosen].copy()
     points[1] += (0.2, 0.0)
     control = ControlPoints(chosen, points, np.full((len(chosen), 2), 0.01))
-    one = suspects(p := replace(street.problem, control=control), solve(p, OPTIONS))[0]
+    one = score_faults(p := replace(street.problem, control=control), solve(p, OPTIONS))[0]
     assert (one.fault, one.item) == (Fault.CONTROL, 1)
     assert one.value == pytest.approx(0.2, abs=0.05)
 
@@ -131,7 +131,7 @@ def test_a_pose_that_nothing_was_seen_from_is_as_uncertain_as_stated_and_others_
 
 def test_the_pulls_on_poses_are_at_most_one_where_their_sigmas_are_right_and_more_where_not() -> None:
     problem = scene().problem
-    right = pose_pulls(solve(problem, OPTIONS)).rms()
+    right = pose_innovations(solve(problem, OPTIONS)).rms()
     assert max(right.values()) < 1.2
     small = replace(problem, pose_sigma=PoseSigma(0.01, 0.0001, 0.002, 0.005))
-    assert pose_pulls(solve(small, OPTIONS)).rms()["heading"] > 1.4
+    assert pose_innovations(solve(small, OPTIONS)).rms()["heading"] > 1.4

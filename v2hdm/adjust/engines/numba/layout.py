@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from v2hdm.adjust.arrays import Arrays
-from v2hdm.adjust.kernels.build import kernel
-from v2hdm.records import FloatArray, IntArray
+from v2hdm.adjust.engines.numba.build import kernel
+from v2hdm.records import BoolArray, FloatArray, IntArray
 
 LOSS_CODES = {"none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3}
-"""What the kernels call the losses of :data:`v2hdm.adjust.problem.LOSSES`."""
+"""Codes of the losses of :data:`v2hdm.adjust.problem.LOSSES`."""
 
 
 class Layout(NamedTuple):
@@ -34,6 +34,7 @@ class Layout(NamedTuple):
         length_at: (M + 1,) where each unit's known lengths begin.
         length_first, length_second, length_m, length_root: the lengths, sorted by unit.
         most_seen, most_joined: observations and corners of a unit, at most.
+        kept: (M,) units that are not eliminated: their factor is the identity, and nothing couples to them.
     """
 
     pair: IntArray
@@ -55,6 +56,7 @@ class Layout(NamedTuple):
     length_root: FloatArray
     most_seen: int
     most_joined: int
+    kept: BoolArray
 
 
 def make_layout(arrays: Arrays) -> Layout:
@@ -88,6 +90,7 @@ def make_layout(arrays: Arrays) -> Layout:
         length_root=known.information_root.numpy()[order],
         most_seen=int(np.diff(begin[unit]).max()),
         most_joined=int(joined.max()),
+        kept=np.zeros(len(joined), dtype=np.bool_),
     )
 
 

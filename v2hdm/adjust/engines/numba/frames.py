@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from v2hdm.adjust.kernels.build import inlined, kernel
-from v2hdm.adjust.kernels.evaluate import Base
-from v2hdm.adjust.kernels.layout import Layout
-from v2hdm.adjust.kernels.linearise import couple, differentiate
-from v2hdm.adjust.kernels.parts import solve_unit_rows, weigh
-from v2hdm.adjust.whitening import WEIGHT_FLOOR
+from v2hdm.adjust.engine import WEIGHT_FLOOR
+from v2hdm.adjust.engines.numba.build import inlined, kernel
+from v2hdm.adjust.engines.numba.evaluate import Base
+from v2hdm.adjust.engines.numba.inline import solve_unit_rows, weigh
+from v2hdm.adjust.engines.numba.layout import Layout
+from v2hdm.adjust.engines.numba.linearise import couple, differentiate
 from v2hdm.records import FloatArray, IntArray
 
 
@@ -36,7 +36,7 @@ class TileMap(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """What is worked in: by tile (G,) the last unit that touched it and its place, a list of tiles, and more.
+    """The workspace: by tile (G,) the last unit that touched it and its place, a list of tiles, and more.
 
     ``low`` and ``high`` are the columns of each touched tile that are not zero, ``jacobian`` and ``coupling``
     those of an observation, ``rows`` the unit's of all touched tiles and of the cameras.
@@ -83,6 +83,8 @@ def _touch(layout: Layout, u: int, per_tile: int, mark: IntArray, tiles: IntArra
 def count_edges(layout: Layout, per_tile: int, scratch: Scratch, counts: IntArray) -> None:
     """Count the pairs of tiles that units couple, each as often, and the tiles of a unit at most."""
     for u in range(len(layout.unit) - 1):
+        if layout.kept[u]:
+            continue
         count = _touch(layout, u, per_tile, scratch.mark, scratch.touched)
         counts[0] += count * (count - 1) // 2
         counts[1] = max(counts[1], count)
@@ -93,6 +95,8 @@ def list_edges(layout: Layout, per_tile: int, scratch: Scratch, edges: IntArray)
     """List the pairs that :func:`count_edges` counts, each as one number, lower tile times G plus higher."""
     tiles, tile_count, at = scratch.touched, len(scratch.mark), 0
     for u in range(len(layout.unit) - 1):
+        if layout.kept[u]:
+            continue
         count = _touch(layout, u, per_tile, scratch.mark, tiles)
         for a in range(count):
             for b in range(a):
@@ -150,6 +154,8 @@ def subtract_frames(
     width = len(base.table) // layout.frames * each
     mark, place, touched, low, high, jacobian, w, rows = scratch
     for u in range(len(layout.unit) - 1):
+        if layout.kept[u]:
+            continue
         count = _touch(layout, u, tiles.per_tile, mark, touched)
         wanted = False
         for a in range(count):

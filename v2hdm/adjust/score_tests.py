@@ -23,17 +23,16 @@ import torch
 from torch import Tensor
 
 from v2hdm.adjust.arrays import Arrays
-from v2hdm.adjust.problem import Problem
-from v2hdm.adjust.residuals import (
-    Priors,
-    Tally,
-    by_camera_and_frame,
-    by_unknowns,
+from v2hdm.adjust.engine import WEIGHT_FLOOR
+from v2hdm.adjust.model import (
+    Gradient,
     centre_residual,
+    control_residual,
     length_residual,
-    observe,
-    wrenches,
+    rigid,
+    robustified,
 )
+from v2hdm.adjust.problem import Problem
 from v2hdm.adjust.solution import Solution
 from v2hdm.adjust.whitening import Whitening
 from v2hdm.geometry.tensors import exp, inverse
@@ -41,12 +40,12 @@ from v2hdm.geometry.tensors import exp, inverse
 _STEP = 1e-3
 """Step of central differences, in the unit of the fault (s or rad): millimetres of motion."""
 
-_LEAST_TOLD = 1e-9
+_LEAST_OBSERVABLE = 1e-9
 """Share of a fault's own information, left by all else, below which rounding alone is left of it."""
 
 
 class Fault(Enum):
-    """What may be wrong, and the unit of its value."""
+    """An input that may be wrong, and the unit of its value."""
 
     CLOCK = "clock"  # images were taken later than they say
     FOCAL = "focal"  # share by which the focal length is longer than stated
@@ -80,7 +79,7 @@ _UNITS = {
 
 
 @dataclass(frozen=True)
-class Suspect:
+class ScoreTest:
     """One fault, as the residuals see it.
 
     Attributes:
@@ -90,7 +89,7 @@ class Suspect:
             image (principal).
         item: which of the problem's control points, known lengths or (clock) visits; -1 for none or all.
         value: by how much, true minus stated.
-        sigma: how well the drive tells, inf where it cannot.
+        sigma: how well the drive observes it, inf where it cannot.
         gain: by how much twice the cost would fall: chi-square with one degree of freedom.
     """
 
@@ -144,60 +143,88 @@ class _Hypothesis:
 
 @dataclass(frozen=True)
 class _Bench:
-    """A solution made ready for tests: ``arrays`` hold the robust loss's weights, so least squares remain."""
+    """A solution made ready for tests: with the roots of weights, least squares remain.
+
+    Attributes:
+        whitening: the solution's Hessian.
+        root: (K,) of the weights.
+        residuals: of everything.
+        whitened_px: (2, K) residuals of the observations without weights.
+    """
 
     whitening: Whitening
-    arrays: Arrays
+    root: Tensor
     residuals: _Column
+    whitened_px: Tensor
 
     @classmethod
     def at(cls, whitening: Whitening) -> _Bench:
         """The bench of a solution's Hessian."""
-        arrays, estimate = whitening.arrays, whitening.estimate
-        views = [observe(run, whitening.table, estimate.corners_map) for run in arrays.runs()]
-        root = torch.cat([whitening.weight(view) for view in views]).sqrt()
-        length, _ = length_residual(arrays, estimate.corners_map)
-        off = (estimate.corners_map - arrays.control) * arrays.control_information.sqrt()
-        residuals = _Column(
-            torch.cat([view.residual for view in views], dim=1) * root,
-            centre_residual(arrays, estimate),
-            off,
-            length,
-        )
-        return cls(whitening, replace(arrays, root_information=arrays.root_information * root), residuals)
+        engine, estimate = whitening.engine, whitening.estimate
+        whitened_px = engine.residuals(engine.poses(estimate), estimate.corners_map)
+        _, weight = robustified(whitening.robust, whitened_px.square().sum(0))
+        root = weight.clamp(min=WEIGHT_FLOOR).sqrt()
+        priors = _prior_residuals(engine.arrays, estimate.cam_from_vehicle, estimate.corners_map)
+        return cls(whitening, root, _Column(whitened_px * root, *priors), whitened_px)
 
-    def residual(self, arrays: Arrays, table: Tensor) -> Tensor:
-        """Residuals (2, K) of the observations."""
-        corners_map = self.whitening.estimate.corners_map
-        return torch.cat([observe(run, table, corners_map).residual for run in arrays.runs()], dim=1)
+    @property
+    def arrays(self) -> Arrays:
+        """The problem."""
+        return self.whitening.engine.arrays
+
+    @property
+    def camera(self) -> Tensor:
+        """The camera (K,) of each observation."""
+        return (self.arrays.pair // self.arrays.frame_count).long()
+
+    def whiten(self, off: Tensor) -> Tensor:
+        """Weighted residuals (2, K) of points that are off (2, K) at depth 1."""
+        a, b, c = self.arrays.root_information
+        return torch.stack([a * off[0], b * off[0] + c * off[1]]) * self.root
+
+    @property
+    def projected(self) -> Tensor:
+        """Where the corners are projected (2, K), at depth 1."""
+        a, b, c = self.arrays.root_information
+        first = self.whitened_px[0] / a
+        return self.arrays.measured + torch.stack([first, (self.whitened_px[1] - b * first) / c])
 
     def coupling(self, column: _Column) -> Tensor:
         """N_yp: what the column has in common with all that is estimated, whitened."""
-        arrays, estimate, table = self.arrays, self.whitening.estimate, self.whitening.table
-        tally = Tally(arrays)
+        engine, estimate = self.whitening.engine, self.whitening.estimate
+        zero = [torch.zeros_like(one) for one in (estimate.frame_state, estimate.clock_s)]
+        tangent = estimate.cam_from_vehicle.new_zeros(len(estimate.cam_from_vehicle), 6)
+        leaves = tangent.requires_grad_(), estimate.corners_map.clone().requires_grad_()
+        parts = [column.centre, column.control, column.length]
+        chosen = [n for n, part in enumerate(parts) if part is not None]
+        extrinsic, corners = torch.zeros_like(tangent), torch.zeros_like(estimate.corners_map)
+        if chosen:
+            moved = rigid(leaves[0]) @ estimate.cam_from_vehicle
+            residuals = _prior_residuals(engine.arrays, moved, leaves[1])
+            ends = [residuals[n] for n in chosen]
+            by = [parts[n] for n in chosen]
+            extrinsic, corners = torch.autograd.grad(ends, leaves, by, materialize_grads=True)
+        gradient = Gradient(extrinsic, zero[0], corners, zero[1])
         if column.observations is not None:
-            for run in arrays.runs():
-                view = observe(run, table, estimate.corners_map)
-                tally.pull(run, view, column.observations[:, run.observations])
-        by_corner = tally.by_corner
-        if column.control is not None:
-            by_corner = by_corner + column.control * arrays.control_information.sqrt()
-        if column.length is not None:
-            _, by_first = length_residual(arrays, estimate.corners_map)
-            pull = by_first * column.length[:, None]
-            by_corner = by_corner.index_add(0, arrays.lengths.first, pull)
-            by_corner = by_corner.index_add(0, arrays.lengths.second, pull, alpha=-1)
-        nothing = torch.zeros_like(arrays.centre)
-        priors = Priors(
-            nothing if column.centre is None else column.centre,
-            torch.zeros_like(arrays.state_information_root),
-            arrays.no_clock(),
-        )
-        wrench = by_camera_and_frame(arrays, wrenches(table, tally.by_table))
-        return self.whitening.whiten(by_unknowns(arrays, estimate, wrench, by_corner, priors))
+            seen = engine.pull(estimate, column.observations * self.root)
+            pairs = zip(vars(gradient).values(), vars(seen).values(), strict=True)
+            gradient = Gradient(*(one + other for one, other in pairs))
+        return self.whitening.whiten(gradient)
 
 
-def suspects(problem: Problem, solution: Solution) -> tuple[Suspect, ...]:
+def _prior_residuals(
+    arrays: Arrays, cam_from_vehicle: Tensor, corners_map: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Residuals of the camera centres, the survey and the known lengths, in the order of :class:`_Column`."""
+    known = arrays.lengths
+    return (
+        centre_residual(arrays, cam_from_vehicle),
+        control_residual(arrays, corners_map),
+        length_residual(arrays, corners_map[known.first], corners_map[known.second]),
+    )
+
+
+def score_faults(problem: Problem, solution: Solution) -> tuple[ScoreTest, ...]:
     """Every fault that ``problem`` can have, each tested by itself at its ``solution``; largest gain first.
 
     Where residuals are larger than the model says, sigmas are larger, and gains smaller, by as much.
@@ -210,21 +237,21 @@ def suspects(problem: Problem, solution: Solution) -> tuple[Suspect, ...]:
     return tuple(sorted(inflated, key=lambda suspect: -suspect.gain))
 
 
-def _test(hypothesis: _Hypothesis, bench: _Bench) -> Suspect:
+def _test(hypothesis: _Hypothesis, bench: _Bench) -> ScoreTest:
     column = hypothesis.column(bench)
     coupling, own = bench.coupling(column), column.dot(column)
     left = own - float(coupling.square().sum())
     # What the descent has left of the gradient counts where a fault is nearly what something else can be.
     slope = column.dot(bench.residuals) - float(coupling @ bench.whitening.gradient)
-    told = own > 0 and left > _LEAST_TOLD * own
-    return Suspect(
+    observable = own > 0 and left > _LEAST_OBSERVABLE * own
+    return ScoreTest(
         hypothesis.fault,
         hypothesis.camera,
         hypothesis.axis,
         hypothesis.item,
-        value=-slope / left if told else 0.0,
-        sigma=float(left**-0.5) if told else float("inf"),
-        gain=slope**2 / left if told else 0.0,
+        value=-slope / left if observable else 0.0,
+        sigma=float(left**-0.5) if observable else float("inf"),
+        gain=slope**2 / left if observable else 0.0,
     )
 
 
@@ -256,7 +283,7 @@ def _hypotheses(problem: Problem, arrays: Arrays) -> Iterator[_Hypothesis]:
         yield _Hypothesis(Fault.SIZE, _size(arrays.lengths.length_m == length_m), item=item)
 
 
-def _control_points(problem: Problem, solution: Solution) -> Iterator[Suspect]:
+def _control_points(problem: Problem, solution: Solution) -> Iterator[ScoreTest]:
     """Each surveyed point against what everything else says of its corner.
 
     What the adjustment leaves between a point and its corner has the covariance of the point less that of
@@ -269,12 +296,12 @@ def _control_points(problem: Problem, solution: Solution) -> Iterator[Suspect]:
     for m, (point, sigma_m) in enumerate(zip(control.points_map, control.sigma_m, strict=True)):
         off = solution.corners_map[control.corner[m]] - point
         expected = np.diag(sigma_m**2) - covariance[m]
-        if np.linalg.eigvalsh(expected).min() <= _LEAST_TOLD * np.max(sigma_m) ** 2:
+        if np.linalg.eigvalsh(expected).min() <= _LEAST_OBSERVABLE * np.max(sigma_m) ** 2:
             continue
         gain = float(off @ np.linalg.solve(expected, off))
         # Without the point its corner would lie farther from it, by the share that it had of the information.
         apart = float(np.linalg.norm(sigma_m**2 * np.linalg.solve(expected, off)))
-        yield Suspect(Fault.CONTROL, -1, -1, m, apart, apart / max(gain, 1e-12) ** 0.5, gain)
+        yield ScoreTest(Fault.CONTROL, -1, -1, m, apart, apart / max(gain, 1e-12) ** 0.5, gain)
 
 
 def _lens(camera: int, power: int) -> Callable[[_Bench], _Column]:
@@ -284,17 +311,10 @@ def _lens(camera: int, power: int) -> Callable[[_Bench], _Column]:
     """
 
     def column(bench: _Bench) -> _Column:
-        arrays, corners_map = bench.arrays, bench.whitening.estimate.corners_map
-        parts = []
-        for run in arrays.runs():
-            mine = (run.pair // arrays.frame_count == camera) | (camera < 0)
-            view = observe(run, bench.whitening.table, corners_map)
-            # The projected points, not the measured ones: pixels, whose noise is stated, do not scale.
-            projected = run.measured + view.off
-            dx, dy = projected * projected.square().sum(0) ** power * mine
-            a, b, c = run.root_information
-            parts.append(torch.stack([a * dx, b * dx + c * dy]))
-        return _Column(torch.cat(parts, dim=1))
+        # The projected points, not the measured ones: pixels, whose noise is stated, do not scale.
+        projected = bench.projected
+        mine = (bench.camera == camera) | (camera < 0)
+        return _Column(bench.whiten(projected * projected.square().sum(0) ** power * mine))
 
     return column
 
@@ -304,11 +324,10 @@ def _principal(problem: Problem, camera: int, axis: int) -> Callable[[_Bench], _
     focal_px = torch.as_tensor(problem.intrinsic[:, axis])
 
     def column(bench: _Bench) -> _Column:
-        arrays = bench.arrays
-        seen_by = (arrays.pair // arrays.frame_count).long()
+        seen_by = bench.camera
         off = ((seen_by == camera) | (camera < 0)) / focal_px.to(seen_by.device)[seen_by]
-        a, b, c = arrays.root_information
-        return _Column(torch.stack([a * off, b * off] if axis == 0 else [torch.zeros_like(off), c * off]))
+        none = torch.zeros_like(off)
+        return _Column(bench.whiten(torch.stack([off, none] if axis == 0 else [none, off])))
 
     return column
 
@@ -317,23 +336,18 @@ def _moving(motion: Callable[[Arrays], Tensor]) -> Callable[[_Bench], _Column]:
     """The column of a motion of the vehicle (C, J, 6) in its own frame, by central differences."""
 
     def column(bench: _Bench) -> _Column:
-        tangent = motion(bench.arrays) * _STEP
-        high, low = (bench.residual(bench.arrays, _moved(bench, sign * tangent)) for sign in (1.0, -1.0))
-        return _Column((high - low) / (2 * _STEP))
+        engine, estimate = bench.whitening.engine, bench.whitening.estimate
+        extrinsic, tangent = estimate.cam_from_vehicle[:, None], motion(bench.arrays) * _STEP
+        poses = engine.poses(estimate)
+        high, low = (
+            engine.residuals(
+                extrinsic @ exp(-sign * tangent) @ inverse(extrinsic) @ poses, estimate.corners_map
+            )
+            for sign in (1.0, -1.0)
+        )
+        return _Column((high - low) / (2 * _STEP) * bench.root)
 
     return column
-
-
-def _moved(bench: _Bench, tangent: Tensor) -> Tensor:
-    """The pairs' columns (9, P) where the vehicle is off each pose by ``tangent`` (C, J, 6)."""
-    cameras, frames = tangent.shape[:2]
-    columns = bench.whitening.table.view(3, 3, cameras, frames).permute(2, 3, 1, 0)
-    extrinsic = bench.whitening.estimate.cam_from_vehicle[:, None]
-    motion = extrinsic @ exp(-tangent) @ inverse(extrinsic)
-    turned = motion[..., :3, :3] @ columns
-    turned[..., 2] += motion[..., :3, 3]
-    out: Tensor = turned.permute(3, 2, 0, 1).reshape(9, -1)
-    return out
 
 
 def _clock_motion(problem: Problem, camera: int, visit: int) -> Callable[[Arrays], Tensor]:

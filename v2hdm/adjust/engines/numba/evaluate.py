@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from v2hdm.adjust.kernels.build import inlined, kernel
-from v2hdm.adjust.kernels.layout import Layout
-from v2hdm.adjust.kernels.parts import (
+from v2hdm.adjust.engine import WEIGHT_FLOOR
+from v2hdm.adjust.engines.numba.build import inlined, kernel
+from v2hdm.adjust.engines.numba.inline import (
     add_corner_priors,
     add_force,
     add_loss,
@@ -21,7 +21,7 @@ from v2hdm.adjust.kernels.parts import (
     weigh,
     whiten,
 )
-from v2hdm.adjust.whitening import WEIGHT_FLOOR
+from v2hdm.adjust.engines.numba.layout import Layout
 from v2hdm.records import FloatArray, IntArray
 
 
@@ -39,7 +39,7 @@ class Base(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """What :func:`evaluate` works in: numbers of pairs (P,), a unit's linearised observations and steps."""
+    """The workspace of :func:`evaluate`: numbers of pairs (P,), a unit's observations and steps."""
 
     slot: IntArray
     known: FloatArray
@@ -58,7 +58,7 @@ class Scratch(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """What :func:`evaluate` computes, as in :class:`~v2hdm.adjust.kernels.linearise.Linearisation`.
+    """The output of :func:`evaluate`, as in :class:`~v2hdm.adjust.engines.numba.linearise.Linearisation`.
 
     ``corners`` (N, 2) are those moved; ``whitened`` (N, 2) is the gradient by their whitened variables.
     """
@@ -104,6 +104,69 @@ def _recall(
     known[i, 5], known[i, 6], known[i, 7] = (a * a + b * b) * weight, b * c * weight, c * c * weight
 
 
+@inlined
+def _carry_back(
+    layout: Layout,
+    base: Base,
+    u: int,
+    gradient: FloatArray,
+    known: FloatArray,
+    slot: IntArray,
+    coupled: FloatArray,
+) -> None:
+    """Add W V^-1 g of unit u to the pairs', of its whitened gradient L^-1 g (2g,), which is overwritten."""
+    first, last = layout.unit[u], layout.unit[u + 1]
+    solve_unit_transposed(last - first, base.lower, first, base.joint, layout.joint_at[u], gradient)
+    for c in range(first, last):
+        x, y = gradient[2 * (c - first)], gradient[2 * (c - first) + 1]
+        for k in range(layout.begin[c], layout.begin[c + 1]):
+            j, t = k - layout.begin[first], layout.pair[k]
+            fx, fy, fz = _oppose(
+                known,
+                j,
+                base.table[t, 0] * x + base.table[t, 1] * y,
+                base.table[t, 4] * x + base.table[t, 5] * y,
+                base.table[t, 8] * x + base.table[t, 9] * y,
+            )
+            add_force(coupled, slot[t], known[j, 0], known[j, 1], known[j, 2], fx, fy, fz)
+
+
+@kernel
+def carry(
+    begin: int,
+    end: int,
+    layout: Layout,
+    base: Base,
+    by_corner: FloatArray,
+    code: int,
+    scale: float,
+    scratch: Scratch,
+    out: Evaluation,
+) -> None:
+    """Whiten a gradient (N, 2) by the corners of chunks ``begin`` to ``end``; see :func:`evaluate`."""
+    slot, known, _, gradient = scratch
+    states = len(base.rows) == 0
+    for q in range(begin, end):
+        number_touched(layout, q, slot)
+        for u in range(layout.chunk[q], layout.chunk[q + 1]):
+            first, last = layout.unit[u], layout.unit[u + 1]
+            for c in range(first, last):
+                gradient[2 * (c - first)], gradient[2 * (c - first) + 1] = by_corner[c, 0], by_corner[c, 1]
+            solve_unit(last - first, base.lower, first, base.joint, layout.joint_at[u], gradient)
+            for c in range(first, last):
+                i = 2 * (c - first)
+                out.whitened[c, 0], out.whitened[c, 1] = gradient[i], gradient[i + 1]
+                for p in range(0 if states else base.rows.shape[1]):
+                    out.carried[q, p] += base.rows[2 * c, p] * gradient[i]
+                    out.carried[q, p] += base.rows[2 * c + 1, p] * gradient[i + 1]
+            if states and not layout.kept[u]:
+                for c in range(first, last):
+                    x, y = base.corners[c, 0], base.corners[c, 1]
+                    for k in range(layout.begin[c], layout.begin[c + 1]):
+                        _recall(layout, base.table, k, x, y, code, scale, known, k - layout.begin[first])
+                _carry_back(layout, base, u, gradient, known, slot, out.coupled)
+
+
 @kernel
 def evaluate(
     begin: int,
@@ -144,6 +207,7 @@ def evaluate(
             first, last = layout.unit[u], layout.unit[u + 1]
             size, seen = last - first, layout.begin[first]
             joint_at = layout.joint_at[u]
+            coupled = states and not layout.kept[u]
             for c in range(first, last):
                 x, y = base.corners[c, 0], base.corners[c, 1]
                 sx = sy = 0.0
@@ -151,7 +215,7 @@ def evaluate(
                     for p in range(len(cameras)):
                         sx += base.rows[2 * c, p] * cameras[p]
                         sy += base.rows[2 * c + 1, p] * cameras[p]
-                for k in range(layout.begin[c], layout.begin[c + 1] if states else layout.begin[c]):
+                for k in range(layout.begin[c], layout.begin[c + 1] if coupled else layout.begin[c]):
                     j, t = k - seen, layout.pair[k]
                     _recall(layout, base.table, k, x, y, code, scale, known, j)
                     fx, fy, fz = _oppose(
@@ -166,7 +230,7 @@ def evaluate(
                     sy += ay
                 i = 2 * (c - first)
                 step[i], step[i + 1] = sx, sy
-            if states:
+            if coupled:
                 solve_unit(size, base.lower, first, base.joint, joint_at, step)
             for c in range(first, last):
                 i = 2 * (c - first)
@@ -201,21 +265,8 @@ def evaluate(
                     for p in range(len(cameras)):
                         out.carried[q, p] += base.rows[2 * c, p] * gradient[i]
                         out.carried[q, p] += base.rows[2 * c + 1, p] * gradient[i + 1]
-            if not states:
-                continue
-            solve_unit_transposed(size, base.lower, first, base.joint, joint_at, gradient)
-            for c in range(first, last):
-                x, y = gradient[2 * (c - first)], gradient[2 * (c - first) + 1]
-                for k in range(layout.begin[c], layout.begin[c + 1]):
-                    j, t = k - seen, layout.pair[k]
-                    fx, fy, fz = _oppose(
-                        known,
-                        j,
-                        base.table[t, 0] * x + base.table[t, 1] * y,
-                        base.table[t, 4] * x + base.table[t, 5] * y,
-                        base.table[t, 8] * x + base.table[t, 9] * y,
-                    )
-                    add_force(out.coupled, slot[t], known[j, 0], known[j, 1], known[j, 2], fx, fy, fz)
+            if coupled:
+                _carry_back(layout, base, u, gradient, known, slot, out.coupled)
         if code == 2:
             total += scale * scale * math.log(product)
         out.costs[q, 0] = total / 2

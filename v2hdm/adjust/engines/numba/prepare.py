@@ -1,4 +1,4 @@
-"""What is done once to a problem's observations, each in one pass: checks, the layout, verdicts."""
+"""Passes over a problem's observations before and after a solve: checks, the layout, verdicts."""
 
 from __future__ import annotations
 
@@ -7,72 +7,61 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from v2hdm.adjust.kernels.build import inlined, kernel
-from v2hdm.adjust.problem import Problem
+from v2hdm.adjust.engines.numba.build import kernel
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
-# Numbers of float32 are ordered as their bits are, sixteen of which are looked at in a pass.
-_BINS = 1 << 16
 
-
-def are_sound(problem: Problem, symmetric_to: float, max_slope: float) -> bool:
+def are_sound(
+    camera: IntArray,
+    frame: IntArray,
+    corner: IntArray,
+    pinhole_px: FloatArray,
+    covariance_px: FloatArray,
+    intrinsic: FloatArray,
+    frames: int,
+    corners: int,
+    symmetric_to: float,
+    max_slope: float,
+) -> bool:
     """Whether no check of an observation by itself finds fault; which, and with what, this does not tell."""
-    seen = problem.observations
-    counts = np.zeros(problem.corner_count + len(problem.intrinsic), dtype=np.int64)
-    fine: bool = _are_sound(
-        _index(seen.camera),
-        _index(seen.frame),
-        _index(seen.corner),
-        _real(seen.pinhole_px),
-        _real(seen.covariance_px),
-        _real(problem.intrinsic),
-        len(problem.map_from_vehicle),
-        problem.corner_count,
-        symmetric_to,
-        max_slope,
-        counts,
-    )
-    return fine and bool(counts.all())
+    counts = np.zeros(corners + len(intrinsic), dtype=np.int64)
+    seen = _index(camera), _index(frame), _index(corner), _real(pinhole_px), _real(covariance_px)
+    limits = frames, corners, symmetric_to, max_slope
+    return bool(_are_sound(*seen, _real(intrinsic), *limits, counts)) and bool(counts.all())
 
 
-def first_frames(problem: Problem) -> IntArray:
+def first_frames(corner: IntArray, frame: IntArray, corners: int, frames: int) -> IntArray:
     """The first frame (N,) that saw each corner, J where there is none."""
-    seen = problem.observations
-    out = np.full(problem.corner_count, len(problem.map_from_vehicle))
-    _first_frames(_index(seen.corner), _index(seen.frame), out)
+    out = np.full(corners, frames)
+    _first_frames(_index(corner), _index(frame), out)
     return out
 
 
 def sorted_observations(
-    problem: Problem, rank: IntArray
+    rank: IntArray, camera: IntArray, frame: IntArray, corner: IntArray, frames: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], int]:
-    """Observations (K,) by corner, camera and frame, the corner and the pair of each, and where one is twice.
+    """Observations (K,) by the rank (N,) of their corner, camera and frame; the rank and pair of each.
 
     The last is a place in that order, of an observation that is the same as the one before it, or -1.
     """
-    seen, count = problem.observations, len(problem.observations.corner)
-    order, corner, pair = (np.empty(count, dtype=np.int32) for _ in range(3))
-    at = np.zeros(problem.corner_count + 1, dtype=np.int64)
-    again: int = _sort(
-        rank,
-        _index(seen.camera),
-        _index(seen.frame),
-        _index(seen.corner),
-        len(problem.map_from_vehicle),
-        at,
-        order,
-        corner,
-        pair,
-    )
-    return order, corner, pair, again
+    order, ranked, pair = (np.empty(len(corner), dtype=np.int32) for _ in range(3))
+    at = np.zeros(len(rank) + 1, dtype=np.int64)
+    seen = _index(camera), _index(frame), _index(corner)
+    again: int = _sort(rank, *seen, frames, at, order, ranked, pair)
+    return order, ranked, pair, again
 
 
-def whitened(problem: Problem, order: NDArray[np.int32]) -> tuple[FloatArray, FloatArray]:
+def whitened(
+    order: NDArray[np.int32],
+    camera: IntArray,
+    pinhole_px: FloatArray,
+    covariance_px: FloatArray,
+    intrinsic: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
     """``measured`` (2, K) and ``root_information`` (3, K) of :class:`~v2hdm.adjust.arrays.Arrays`."""
-    seen = problem.observations
     measured, root = np.empty((2, len(order))), np.empty((3, len(order)))
-    camera, intrinsic = _index(seen.camera), _real(problem.intrinsic)
-    _whiten(order, camera, _real(seen.pinhole_px), _real(seen.covariance_px), intrinsic, measured, root)
+    seen = _index(camera), _real(pinhole_px), _real(covariance_px), _real(intrinsic)
+    _whiten(order, *seen, measured, root)
     return measured, root
 
 
@@ -81,19 +70,6 @@ def on_line(covariance_px: FloatArray, excess: float) -> BoolArray:
     out = np.empty(len(covariance_px), dtype=np.bool_)
     _on_line(_real(covariance_px), excess, out)
     return out
-
-
-def median(values: FloatArray) -> float:
-    """The median of values from 0 up, to the seven digits of a float32; NaN where one of them is."""
-    bins = np.zeros((3, _BINS), dtype=np.int64)
-    return float(_median(_real(values), bins))
-
-
-def count_accepted(corner: IntArray, accepted: BoolArray, corners: int) -> tuple[IntArray, IntArray]:
-    """How often each corner was seen, and how many of its observations are accepted."""
-    seen, left = np.zeros(corners, dtype=np.int64), np.zeros(corners, dtype=np.int64)
-    _count_accepted(_index(corner), accepted, seen, left)
-    return seen, left
 
 
 def _index(values: IntArray) -> IntArray:
@@ -219,41 +195,3 @@ def _on_line(covariance_px: FloatArray, excess: float, out: BoolArray) -> None:
     for k in range(len(out)):
         xx, yx, yy = covariance_px[k, 0, 0], covariance_px[k, 1, 0], covariance_px[k, 1, 1]
         out[k] = (xx + yy) * (xx + yy) > (xx * yy - yx * yx) * excess
-
-
-@kernel
-def _count_accepted(corner: IntArray, accepted: BoolArray, seen: IntArray, left: IntArray) -> None:
-    for k in range(len(corner)):
-        seen[corner[k]] += 1
-        left[corner[k]] += accepted[k]
-
-
-@kernel
-def _median(values: FloatArray, bins: IntArray) -> float:
-    for value in values:
-        if not value >= 0:
-            return math.nan
-        bins[0, np.float32(value + 0.0).view(np.int32) >> 16] += 1
-    low, low_rank = _find(bins[0], (len(values) - 1) // 2)
-    high, high_rank = _find(bins[0], len(values) // 2)
-    for value in values:
-        bits = np.float32(value + 0.0).view(np.int32)
-        if bits >> 16 == low:
-            bins[1, bits & 0xFFFF] += 1
-        if bits >> 16 == high:
-            bins[2, bits & 0xFFFF] += 1
-    first, _ = _find(bins[1], low_rank)
-    second, _ = _find(bins[2], high_rank)
-    one = np.int32((low << 16) | first).view(np.float32)
-    other = np.int32((high << 16) | second).view(np.float32)
-    return float((one + other) / 2)
-
-
-@inlined
-def _find(counts: IntArray, rank: int) -> tuple[int, int]:
-    """The bin that holds what has so many before it, and how many of these are in the bin."""
-    at = 0
-    while rank >= counts[at]:
-        rank -= counts[at]
-        at += 1
-    return at, rank

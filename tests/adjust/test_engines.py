@@ -1,0 +1,291 @@
+"""Engines agree: compiled kernels, in closed form, with the model's page, differentiated by autograd."""
+
+import inspect
+from collections import Counter
+from dataclasses import is_dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.adjust.scene import exp, make_scene, with_late_clocks
+from v2hdm.adjust import ControlPoints, Drift, KnownLengths, PoseSigma, SolveOptions, Status, model, solve
+from v2hdm.adjust.descent import Objective
+from v2hdm.adjust.engines import make_engine
+from v2hdm.adjust.engines.autograd import TorchEngine
+from v2hdm.adjust.engines.numba import pool
+from v2hdm.adjust.engines.numba.motion import move
+from v2hdm.adjust.layout import make_arrays
+from v2hdm.adjust.model import Estimate, Loss
+from v2hdm.adjust.problem import LOSSES, POSE_STATES, CameraPrior
+from v2hdm.adjust.reduced import ReducedSystem
+from v2hdm.adjust.whitening import factorise
+from v2hdm.geometry import tensors as transform
+
+POSES = PoseSigma(position_drift=Drift(0.01, 10.0), roll_pitch_drift=Drift(0.003, 2.0))
+MODELS = [((), False), ((), True), (("roll", "pitch"), True), (POSE_STATES, False), (POSE_STATES, True)]
+
+
+def example(*, lengths=True, frames=40, seed=3):
+    """A drive with all that a model can know: clocks, drifts, a survey, lengths, covariances of any shape."""
+    scene = with_late_clocks(make_scene(seed, frames=frames, outliers=0.05), np.array([0.02, -0.01]))
+    problem, rng = scene.problem, np.random.default_rng(0)
+    root = rng.normal(0, 0.1, (len(problem.observations.corner), 2, 2)) + 0.7 * np.eye(2)
+    count = problem.corner_count
+    diamonds = 4 * np.arange(count // 8)
+    first = np.concatenate([diamonds, diamonds + 1, diamonds[:3] + 2])
+    second = np.concatenate([diamonds + 1, diamonds + 2, diamonds[:3] + 3])
+    known = KnownLengths(first, second, np.full(len(first), 0.5), np.full(len(first), 0.004))
+    control = ControlPoints(
+        np.array([3, 17]), scene.corners_map[[3, 17]] + 0.01, np.array([[0.02, 0.03], [0.05, 0.01]])
+    )
+    return replace(
+        problem,
+        observations=replace(problem.observations, covariance_px=root @ root.transpose(0, 2, 1)),
+        pose_sigma=POSES,
+        control=control,
+        lengths=known if lengths else None,
+    )
+
+
+def engines(problem, pose_states, clock=False):
+    """Kernels and autograd over a problem."""
+    arrays = make_arrays(problem, pose_states, "cpu", clock)
+    return make_engine("numba", arrays), make_engine("torch", arrays)
+
+
+def estimate_of(engine, problem, generator, size=0.01, behind=True):
+    """Somewhere near the start, with states and clocks of their own, and a corner behind its camera."""
+
+    def draw(like):
+        return size * torch.randn(like.shape, generator=generator, dtype=torch.float64)
+
+    cameras = torch.as_tensor(problem.cam_from_vehicle)
+    corners, _ = engine.back_project(cameras)
+    corners = corners.clone()
+    corners[5] -= 100.0 if behind else 0.0
+    arrays = engine.arrays
+    state, clock = draw(arrays.state_information_root), draw(arrays.no_clock())
+    cameras = transform.exp(draw(torch.zeros(arrays.camera_count, 6))) @ cameras
+    return Estimate(cameras, state, corners, clock)
+
+
+def assert_same(one, other, share=1e-12):
+    """Equal to a share of the largest of all, in tensors and in records of them."""
+    if isinstance(one, dict):
+        assert list(one) == list(other)
+        for name in one:
+            assert_same(one[name], other[name], share)
+    elif is_dataclass(one):
+        assert_same(vars(one), vars(other), share)
+    elif other.numel():
+        assert float((one - other).abs().max()) <= share * float(other.abs().max())
+
+
+def with_earlier_markings(problem, clock, rng):
+    """The problem, of whose cameras earlier markings say something."""
+    cameras, each = len(problem.intrinsic), 6 + int(clock)
+    root = rng.normal(0, 30.0, (cameras * each, cameras * each))
+    mean = rng.normal(0, 0.01, (cameras, each))
+    base = exp(rng.normal(0, 0.02, (cameras, 6))) @ problem.cam_from_vehicle
+    return replace(problem, camera_prior=CameraPrior(base, mean, root @ root.T))
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 10_000),
+    model=st.sampled_from(MODELS),
+    loss=st.sampled_from(LOSSES),
+    size=st.sampled_from([0.0, 1e-9, 0.01]),
+    lengths=st.booleans(),
+    earlier=st.booleans(),
+    behind=st.booleans(),
+    damping=st.sampled_from([0.0, 0.01]),
+)
+def test_engines_agree_on_every_kind_of_residual(seed, model, loss, size, lengths, earlier, behind, damping):
+    """Cost, gradient and all blocks, of drives with everything that a model can know, to 1e-12."""
+    (pose_states, clock), rng = model, np.random.default_rng(seed)
+    problem = example(lengths=lengths, frames=14, seed=seed % 7)
+    if earlier:
+        problem = with_earlier_markings(problem, clock, rng)
+    numba, by_torch = engines(problem, pose_states, clock)
+    robust = Loss(loss, float(rng.uniform(1, 4)))
+    estimate = estimate_of(numba, problem, torch.Generator().manual_seed(seed), size, behind)
+    assert_same(numba.poses(estimate), by_torch.poses(estimate))
+    poses = numba.poses(estimate)
+    assert_same(numba.residuals(poses, estimate.corners_map), by_torch.residuals(poses, estimate.corners_map))
+    plan = replace(by_torch.plan(), most_tiles=numba.plan().most_tiles)
+    found, systems = [], []
+    for engine in (numba, by_torch):
+        system = ReducedSystem(engine.arrays, plan, engine.spread(estimate))
+        found.append(engine.eliminate(system, estimate, robust, damping))
+        systems.append(system)
+    one, other = found
+    assert_same(systems[0].spread, systems[1].spread)
+    assert_same(numba.prior_blocks(estimate), by_torch.prior_blocks(estimate), 5e-12)
+    assert_same(one.terms, other.terms)
+    assert_same(by_torch.terms(estimate, robust), other.terms)
+    for name in ("extrinsic", "frame_state", "clock_s"):
+        assert_same(getattr(one.gradient, name), getattr(other.gradient, name))
+    assert_same(one.whitened, other.whitened)
+    assert_same(one.coupled, other.coupled)
+    lone = ~numba.arrays.joined & ~numba.arrays.joined.roll(-1)
+    assert_same(one.corner_factor.lower[:, lone], other.corner_factor.lower[:, lone])
+    for group, joint in zip(one.corner_factor.joint, other.corner_factor.joint, strict=True):
+        assert torch.equal(group.begin, joint.begin)
+        assert_same(group.factor, joint.factor)
+    assert_same(systems[0]._own, systems[1]._own)
+    for tile, expected in zip(systems[0].matrix.diagonal, systems[1].matrix.diagonal, strict=True):
+        assert_same(tile.tril(), expected.tril())
+    for panel, expected in zip(systems[0].matrix.panels, systems[1].matrix.panels, strict=True):
+        assert_same(panel, expected)
+    assert_same(systems[0].matrix.tip.tril(), systems[1].matrix.tip.tril())
+    run = numba.arrays.gather(torch.arange(3, 12))
+    corners = estimate.corners_map[3:12]
+    assert_same(one.coupling(run, corners), other.coupling(run, corners))
+    by_residual = torch.as_tensor(rng.normal(0, 1, numba.arrays.measured.shape))
+    assert_same(numba.pull(estimate, by_residual), by_torch.pull(estimate, by_residual))
+    by_corner = torch.as_tensor(rng.normal(0, 1, estimate.corners_map.shape))
+    for mine, theirs in zip(one.carry(by_corner), other.carry(by_corner), strict=True):
+        assert_same(mine, theirs)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize(("pose_states", "clock"), MODELS)
+def test_engines_agree_on_a_step(pose_states, clock, loss):
+    problem = example()
+    numba, by_torch = engines(problem, pose_states, clock)
+    generator = torch.Generator().manual_seed(1)
+    estimate = estimate_of(numba, problem, generator, behind=False)
+    plan = replace(by_torch.plan(), most_tiles=numba.plan().most_tiles)
+    whitening = factorise(numba, plan, estimate, Loss(loss, 3.0))
+    expected = factorise(by_torch, plan, estimate, Loss(loss, 3.0))
+    step = whitening.step(0.001 * torch.randn(whitening.size, generator=generator, dtype=torch.float64))
+    one, other = (made.linearised.evaluate(*step) for made in (whitening, expected))
+    assert_same(one.estimate, other.estimate)
+    assert_same(one.terms, other.terms)
+    # Differences of large sums; and where a corner is hardly known, last digits count a thousand times.
+    for name in ("extrinsic", "frame_state", "clock_s"):
+        assert_same(getattr(one.gradient, name), getattr(other.gradient, name), 1e-9)
+    assert_same(one.whitened, other.whitened, 1e-9)
+    assert_same(one.coupled, other.coupled, 1e-9)
+
+
+@pytest.mark.parametrize(("pose_states", "clock"), MODELS)
+def test_engines_agree_on_the_start_and_on_the_report(pose_states, clock):
+    problem = example(lengths=False)
+    # A pixel above the horizon fixes nothing.
+    problem.observations.pinhole_px[0, 1] = -5000.0
+    numba, by_torch = engines(problem, pose_states, clock)
+    (corners, fixed), (expected, expected_fixed) = (
+        engine.back_project(torch.as_tensor(problem.cam_from_vehicle)) for engine in (numba, by_torch)
+    )
+    # Where a ray meets the ground at 700 m, its last digit is a picometre times the steepness of that.
+    torch.testing.assert_close(corners, expected, rtol=1e-9, atol=1e-11)
+    assert bool((fixed == expected_fixed).all())
+    estimate = estimate_of(numba, problem, torch.Generator().manual_seed(2))
+    focal = problem.intrinsic[:, :2]
+    for one, other in zip(numba.report(estimate, focal), by_torch.report(estimate, focal), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-9)
+
+
+@pytest.mark.parametrize(("pose_states", "clock"), MODELS)
+def test_a_solve_ends_where_that_of_torch_ends(pose_states, clock):
+    problem = example()
+    options = SolveOptions(pose_states=pose_states, clock_offset=clock, gap_tolerance=1e-13)
+    found = solve(problem, options)
+    expected = solve(problem, replace(options, engine="torch"))
+    assert found.cost == pytest.approx(expected.cost, rel=1e-10)
+    assert found.status is expected.status
+    np.testing.assert_allclose(found.corners_map, expected.corners_map, atol=1e-5)
+    np.testing.assert_allclose(
+        found.extrinsic_covariance, expected.extrinsic_covariance, rtol=1e-4, atol=1e-12
+    )
+    groups = np.array([[0, 1, 2, 3], [20, 21, 22, 23]])
+    np.testing.assert_allclose(
+        found.corner_covariance(groups), expected.corner_covariance(groups), rtol=1e-4, atol=1e-12
+    )
+    np.testing.assert_array_equal(found.verdict, expected.verdict)
+
+
+@pytest.mark.parametrize("pose_states", [(), POSE_STATES])
+def test_results_do_not_depend_on_the_number_of_threads(pose_states, monkeypatch):
+    """To the last bit: many small chunks, side by side or one after the other."""
+    monkeypatch.setattr("v2hdm.adjust.arrays._RUN", 200)
+    monkeypatch.setattr(pool, "_WORTH_THREADS", 1)
+    problem = example()
+    options = SolveOptions(pose_states=pose_states)
+    before, found = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            found.append(solve(problem, options))
+    finally:
+        torch.set_num_threads(before)
+    for one in found[1:]:
+        assert one.cost == found[0].cost
+        np.testing.assert_array_equal(one.corners_map, found[0].corners_map)
+        np.testing.assert_array_equal(one.map_from_vehicle, found[0].map_from_vehicle)
+
+
+def test_cameras_move_as_they_do_in_torch():
+    rng = np.random.default_rng(0)
+    tangents = np.concatenate([np.zeros((1, 6)), rng.normal(0, 1e-6, (1, 6)), rng.normal(0, 0.5, (3, 6))])
+    base = transform.exp(torch.as_tensor(rng.normal(0, 1, (5, 6))))
+    moved, jacobian = move(tangents, base.numpy())
+    expected = transform.exp(torch.as_tensor(tangents)) @ base
+    torch.testing.assert_close(torch.from_numpy(moved), expected, rtol=1e-13, atol=1e-13)
+    expected = transform.left_jacobian(torch.as_tensor(tangents))
+    torch.testing.assert_close(torch.from_numpy(jacobian), expected, rtol=1e-13, atol=1e-13)
+
+
+def test_what_is_no_number_stays_none():
+    problem = example()
+    for engine in engines(problem, ()):
+        estimate = estimate_of(engine, problem, torch.Generator().manual_seed(0))
+        whitening = factorise(engine, engine.plan(), estimate, Loss("cauchy", 3.0))
+        cost, _ = Objective(whitening)(torch.full_like(whitening.gradient, float("nan")))
+        assert bool(cost.isnan())
+
+
+@pytest.mark.parametrize(("pose_states", "clock"), [((), False), (POSE_STATES, True)])
+def test_residuals_and_gradients_of_a_solve_by_torch_are_those_of_kornia(monkeypatch, pose_states, clock):
+    """Every evaluation and every linearisation calls kornia, in each run of observations."""
+    calls = Counter()
+
+    def counted(name, function):
+        def call(*arguments):
+            calls[name] += 1
+            return function(*arguments)
+
+        return call
+
+    for name in ("transform_points", "project_points"):
+        monkeypatch.setattr(model, name, counted(name, getattr(model, name)))
+    monkeypatch.setattr(model.Se3, "exp", staticmethod(counted("exp", model.Se3.exp)))
+    evaluated = []
+    at = TorchEngine.cost_and_gradient
+
+    def cost_and_gradient(*arguments):
+        before = Counter(calls)
+        out = at(*arguments)
+        evaluated.append(calls - before)
+        return out
+
+    monkeypatch.setattr(TorchEngine, "cost_and_gradient", cost_and_gradient)
+    options = SolveOptions(pose_states=pose_states, clock_offset=clock, engine="torch")
+    found = solve(example(), options)
+    assert found.status is Status.CONVERGED
+    assert len(evaluated) >= found.evaluations
+    for one in evaluated:
+        assert min(one[name] for name in ("transform_points", "project_points", "exp")) > 0
+    assert calls["project_points"] > len(evaluated)
+
+
+def test_a_model_s_page_writes_no_derivative_and_no_loop():
+    """Of what engines share, the model alone says what a residual is."""
+    source = inspect.getsource(model)
+    assert "jacobian" not in source
+    assert "for run in" not in source

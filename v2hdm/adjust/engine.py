@@ -1,0 +1,118 @@
+"""The interface of engines: they evaluate and linearise a problem and eliminate its corners.
+
+The solver knows no observation. It asks an :class:`Engine` made for one problem
+(:func:`v2hdm.adjust.engines.make_engine`), either ``torch``, which differentiates :mod:`v2hdm.adjust.model`,
+or ``numba``, whose compiled kernels do the same in closed form.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from torch import Tensor
+
+from v2hdm.adjust.arrays import Arrays, Run
+from v2hdm.adjust.corner_factor import CornerFactor
+from v2hdm.adjust.model import Estimate, Gradient, Loss
+from v2hdm.adjust.reduced import Coupled, Plan, PriorBlocks, ReducedSystem, Spread
+from v2hdm.records import BoolArray, FloatArray
+
+WEIGHT_FLOOR = 1e-6
+"""Least weight of an observation in the Hessian: a corner of outliers alone stays factorable."""
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """Cost and gradient after a step.
+
+    Attributes:
+        estimate: where the step led.
+        terms: the cost there, by name.
+        gradient: by the step.
+        whitened, coupled: what :meth:`Linearised.carry` makes of the corners' part.
+    """
+
+    estimate: Estimate
+    terms: dict[str, Tensor]
+    gradient: Gradient
+    whitened: Tensor
+    coupled: Coupled
+
+
+class Linearised(Protocol):
+    """A problem linearised at an estimate, its corners eliminated.
+
+    Attributes:
+        terms, gradient: the cost at the estimate, by name, and its gradient.
+        corner_factor: L, the factor of the corners' own block.
+        whitened, coupled: what :meth:`carry` makes of the gradient's corner part.
+    """
+
+    terms: dict[str, Tensor]
+    gradient: Gradient
+    corner_factor: CornerFactor
+    whitened: Tensor
+    coupled: Coupled
+
+    def evaluate(self, step: Gradient, tangents: Tensor, own: Tensor) -> Evaluated:
+        """Evaluate after a step of the reduced unknowns, with which the corners move.
+
+        Args:
+            step: of the reduced unknowns; its corners are not looked at.
+            tangents: (C, J, 6) left tangents of the pairs under the step.
+            own: (N, 2) whitened variables of the corners.
+        """
+
+    def carry(self, by_corner: Tensor) -> tuple[Tensor, Coupled]:
+        """L^-1 g (N, 2) and W V^-1 g of a gradient g (N, 2) by the corners."""
+
+    def coupling(self, run: Run, corners_map: Tensor) -> Tensor:
+        """W' (k, 2, 6) of a run's observations, of corners (n, 2), by the left tangents of their pairs."""
+
+
+class Engine(Protocol):
+    """The model over one problem's arrays."""
+
+    @property
+    def arrays(self) -> Arrays:
+        """The problem."""
+
+    def over(self, arrays: Arrays) -> Engine:
+        """The same engine over another problem."""
+
+    def plan(self) -> Plan:
+        """How the reduced system is cut into tiles."""
+
+    def back_project(self, cam_from_vehicle: Tensor) -> tuple[Tensor, Tensor]:
+        """Corners (N, 2) by weighted back-projection from recorded poses, and which (N,) a ray fixes."""
+
+    def residuals(self, cam_from_map: Tensor, corners_map: Tensor) -> Tensor:
+        """Whitened residuals (2, K) of the observations, for pairs (C, J, 4, 4)."""
+
+    def poses(self, estimate: Estimate) -> Tensor:
+        """``cam_from_map`` of every pair, (C, J, 4, 4)."""
+
+    def report(self, estimate: Estimate, focal_px: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """In the problem's order: residuals (K, 2) px, their squares in sigmas, who lies behind."""
+
+    def terms(self, estimate: Estimate, robust: Loss) -> dict[str, Tensor]:
+        """The cost, by name."""
+
+    def pull(self, estimate: Estimate, by_residual: Tensor) -> Gradient:
+        """The gradient of a scalar whose gradient by the whitened residuals is ``by_residual`` (2, K)."""
+
+    def spread(self, estimate: Estimate) -> Spread:
+        """How pairs move with frame states and clock offsets."""
+
+    def prior_blocks(self, estimate: Estimate) -> PriorBlocks:
+        """The priors' part of the Gauss-Newton Hessian of the reduced unknowns."""
+
+    def eliminate(
+        self, system: ReducedSystem, estimate: Estimate, robust: Loss, damping: float
+    ) -> Linearised:
+        """Linearise, and subtract the eliminated corners from the reduced system.
+
+        Raises:
+            AdjustError: corners that lengths join cannot be solved for together.
+        """

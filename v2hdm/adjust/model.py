@@ -1,0 +1,221 @@
+r"""The whole model, as one writes it on a blackboard: every residual, in torch and kornia, float64.
+
+The paper (*Monocular Camera Mapping with Pose-Guided Optimization*, IROS 2023) projects the ground corners l
+of markings through the extrinsic T = ``cam_from_vehicle`` and the recorded pose P = ``map_from_vehicle``, and
+minimises the reprojection error over extrinsics and corners together. Each observation k of corner n by
+camera c in frame j has the whitened residual
+
+.. math:: r_k = \Sigma_k^{-1/2} (\pi(T_c\,e^{-q_c v_j}\,e^{-s_j}\,P_j^{-1}\,l_n) - u_k)
+
+which is the paper's for s = 0 and q = 0. Beyond it, frames have states s (what the recorded pose is off,
+some of it drifting) and cameras clock offsets q (images are late, and the vehicle moves with the twist v).
+The cost is half the sum of all squares, where a robust loss takes the squares of the observations.
+
+Tangents are (translation, rotation), as kornia's ``Se3`` has them, and act from the left: exp(x) T.
+No derivative is written here: :mod:`v2hdm.adjust.engines.autograd` takes them by autograd, and what
+:mod:`v2hdm.adjust.engines.numba` computes in closed form is tested against that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from kornia.geometry.camera.perspective import project_points
+from kornia.geometry.liegroup import Se3, So3
+from kornia.geometry.linalg import transform_points
+from torch import Tensor
+from torch.nn.functional import one_hot, pad
+
+from v2hdm.adjust.arrays import Arrays, CameraQuadratic
+from v2hdm.geometry.tensors import NEAR_M, inverse
+
+MIN_DEPRESSION_SINE = 0.01
+"""Below this sine of the depression a ray meets the ground too far away to say where."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A point in the space of unknowns.
+
+    Extrinsics (C, 4, 4), frame states (J, S), corners (N, 2), clock offsets (C, Q) in s.
+    """
+
+    cam_from_vehicle: Tensor
+    frame_state: Tensor
+    corners_map: Tensor
+    clock_s: Tensor
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """A gradient by extrinsic (left tangent, (C, 6)), frame state (J, S), corner (N, 2), clock (C, Q)."""
+
+    extrinsic: Tensor
+    frame_state: Tensor
+    corners_map: Tensor
+    clock_s: Tensor
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A robust loss by name and scale."""
+
+    name: str
+    scale: float
+
+
+def rigid(tangent: Tensor) -> Tensor:
+    """The motions exp(x) (*batch, 4, 4) of tangents x (*batch, 6)."""
+    motion: Tensor = Se3.exp(tangent.reshape(-1, 6)).matrix()
+    return motion.view(*tangent.shape[:-1], 4, 4)
+
+
+def left_tangent(moved: Tensor, base: Tensor) -> Tensor:
+    """The tangent x (*batch, 6) of moved = exp(x) base, to first order in x."""
+    motion = moved @ inverse(base)
+    return torch.cat([motion[..., :3, 3], So3.vee(motion[..., :3, :3])], dim=-1)
+
+
+def frame_tangent(arrays: Arrays, frame_state: Tensor) -> Tensor:
+    """Tangents s (..., J, 6) of the frames by their states (..., J, S); two may act on one axis."""
+    axis = torch.tensor(arrays.states, dtype=torch.int64, device=frame_state.device)
+    return frame_state @ one_hot(axis, 6).to(frame_state.dtype)
+
+
+def cam_from_map(arrays: Arrays, cam_from_vehicle: Tensor, frame_state: Tensor, clock_s: Tensor) -> Tensor:
+    """T exp(-q v) exp(-s) P^-1 of every pair of a camera and a frame, (C, J, 4, 4).
+
+    Args:
+        arrays: the problem.
+        cam_from_vehicle: (C, 4, 4).
+        frame_state: (J, S), or (C, J, S) for states of each pair.
+        clock_s: (C, Q), or (C, J, Q) for offsets of each pair.
+    """
+    camera, vehicle_from_map = cam_from_vehicle[:, None], arrays.vehicle_from_map
+    if arrays.states:
+        vehicle_from_map = rigid(-frame_tangent(arrays, frame_state)) @ vehicle_from_map
+    if arrays.clock_twist.shape[-1]:
+        late = clock_s if clock_s.ndim == 3 else clock_s[:, None]
+        camera = camera @ rigid(-(arrays.clock_twist @ late[..., None])[..., 0])
+    return camera @ vehicle_from_map
+
+
+def before_camera(points_cam: Tensor) -> Tensor:
+    """Points (k, 3) for projection: behind the depth ``NEAR_M`` 1 / z goes on along its tangent.
+
+    An optimiser that throws a point behind the camera so meets a large, finite cost whose gradient leads back
+    to the front, instead of a pole and a mirror image.
+    """
+    depth = points_cam[:, 2:]
+    beyond = 1 + (NEAR_M - depth).clamp(min=0) / NEAR_M
+    return torch.cat([points_cam[:, :2] * beyond, depth.clamp(min=NEAR_M)], dim=1)
+
+
+def points_in_camera(cam_from_map: Tensor, corners_map: Tensor) -> Tensor:
+    """Points (k, 3) in the camera of corners (k, 2) on the ground z = 0, each by a transform of its own."""
+    points_cam: Tensor = transform_points(cam_from_map, pad(corners_map, (0, 1))[:, None])[:, 0]
+    return points_cam
+
+
+def corner_residual(points_cam: Tensor, measured: Tensor, root_information: Tensor) -> Tensor:
+    """The paper's reprojection error (k, 2), whitened; ``measured`` (2, k) is at depth 1."""
+    at_depth_one = torch.eye(3, dtype=points_cam.dtype, device=points_cam.device)
+    x, y = (project_points(before_camera(points_cam), at_depth_one) - measured.T).unbind(1)
+    a, b, c = root_information
+    return torch.stack([a * x, b * x + c * y], dim=1)
+
+
+def ground_points(cam_from_map: Tensor, measured: Tensor) -> Tensor:
+    """Where rays (2, k), at depth 1, meet the ground (k, 2): the inverse homography of the ground, the IPM.
+
+    Above the horizon the points mean nothing (:func:`depression_sine`).
+    """
+    ipm, _ = torch.linalg.inv_ex(cam_from_map[:, :3, [0, 1, 3]])
+    points_map: Tensor = transform_points(ipm, measured.T[:, None])[:, 0]
+    return points_map
+
+
+def depression_sine(cam_from_map: Tensor, measured: Tensor) -> Tensor:
+    """How steeply rays (2, k), at depth 1, descend to the ground: sines (k,), negative above the horizon."""
+    ray = pad(measured.T, (0, 1), value=1.0)
+    sine: Tensor = -(ray * cam_from_map[:, :3, 2]).sum(1) / ray.norm(dim=1)
+    return sine
+
+
+def centre_residual(arrays: Arrays, cam_from_vehicle: Tensor) -> Tensor:
+    """Camera centres o = -R' t against their survey, (C, 3)."""
+    rotation, translation = cam_from_vehicle[:, :3, :3], cam_from_vehicle[:, :3, 3:]
+    return (-(rotation.mT @ translation)[..., 0] - arrays.centre) * arrays.centre_information_root
+
+
+def state_residual(arrays: Arrays, frame_state: Tensor, before: Tensor | None = None) -> Tensor:
+    """Innovations (J, S) of the frame states: s_j - A_j s_(j-1).
+
+    A state that scatters has A = 0; one that drifts is a Gauss-Markov process, A = exp(-d / D) over the
+    driven distance d. ``before`` (J, S) are the states of the frames before, if not those of ``frame_state``.
+    """
+    if before is None:
+        before = torch.cat([torch.zeros_like(frame_state[:1]), frame_state[:-1]])
+    expected = (arrays.state_transition @ before[..., None])[..., 0]
+    return (frame_state - expected) * arrays.state_information_root
+
+
+def clock_residual(arrays: Arrays, clock_s: Tensor) -> Tensor:
+    """Clock offsets (C, Q) against zero."""
+    return clock_s * arrays.clock_information_root
+
+
+def control_residual(arrays: Arrays, corners_map: Tensor) -> Tensor:
+    """Corners (N, 2) against what a survey measured."""
+    return (corners_map - arrays.control) * arrays.control_information.sqrt()
+
+
+def length_residual(arrays: Arrays, first_map: Tensor, second_map: Tensor) -> Tensor:
+    """Distances (M,) of corners (M, 2) against the known lengths."""
+    known = arrays.lengths
+    distance_m: Tensor = torch.linalg.vector_norm(first_map - second_map, dim=1)
+    return (distance_m - known.length_m) * known.information_root
+
+
+def camera_offset(prior: CameraQuadratic, cam_from_vehicle: Tensor, clock_s: Tensor) -> Tensor:
+    """Tangents and clock offsets (C, 6 + Q) against the mean of what earlier markings say of them."""
+    tangent: Tensor = Se3.from_matrix(cam_from_vehicle @ inverse(prior.base)).log()
+    return torch.cat([tangent, clock_s], dim=1) - prior.mean
+
+
+def prior_terms(arrays: Arrays, estimate: Estimate) -> dict[str, Tensor]:
+    """The cost of everything but the observations, by name."""
+    corners, known = estimate.corners_map, arrays.lengths
+    residuals = {
+        "camera_centre": centre_residual(arrays, estimate.cam_from_vehicle),
+        "frame_states": state_residual(arrays, estimate.frame_state),
+        "clock_offsets": clock_residual(arrays, estimate.clock_s),
+        "control_points": control_residual(arrays, corners),
+        "known_lengths": length_residual(arrays, corners[known.first], corners[known.second]),
+    }
+    terms = {name: residual.square().sum() / 2 for name, residual in residuals.items()}
+    if arrays.camera_prior is not None:
+        off = camera_offset(arrays.camera_prior, estimate.cam_from_vehicle, estimate.clock_s).flatten()
+        terms["earlier_markings"] = off @ arrays.camera_prior.information @ off / 2
+    return terms
+
+
+def robustified(robust: Loss, squared: Tensor) -> tuple[Tensor, Tensor]:
+    """The loss rho(s) of squared residuals and its derivative, the weight of reweighted least squares.
+
+    All losses agree with rho(s) = s near 0 (Barron, A General and Adaptive Robust Loss Function, CVPR 2019,
+    alpha = 2, 1, 0, -2, up to the scale's convention); the scale is the residual from which they bend.
+    """
+    if robust.name == "none":
+        return squared, torch.ones_like(squared)
+    cut = robust.scale * robust.scale
+    if robust.name == "huber":
+        norm = squared.clamp(min=cut).sqrt()
+        return torch.where(squared <= cut, squared, 2 * robust.scale * norm - cut), robust.scale / norm
+    ratio = squared / cut
+    if robust.name == "cauchy":
+        return cut * torch.log1p(ratio), 1 / (1 + ratio)
+    if robust.name == "geman_mcclure":
+        return squared / (1 + ratio), (1 + ratio).square().reciprocal()
+    raise ValueError(f"unknown loss '{robust.name}'")
