@@ -22,7 +22,7 @@ _PASSES_M = 0.4
 
 _LEAST_COSINE = np.cos(np.deg2rad(30.0))
 _FIRST, _LAST = 0, 1
-_END_LENGTH_M = 5.0
+_DIRECTION_LENGTH_M = 5.0
 """A bridge leaves a piece in about the direction of so much of its end."""
 
 
@@ -47,7 +47,7 @@ def _shortest_bridge(
     for a, end_a, b, end_b in _gaps(np.stack([ends for _, ends in ended])).tolist():
         before = ended[a][0].turned(end_a == _FIRST)
         after = ended[b][0].turned(end_b == _LAST)
-        between = _bridge(before.points_map[-1], after.points_map[0], guides, tree, options)
+        between = _course_between(before.points_map[-1], after.points_map[0], guides, tree, options)
         if between is not None:
             return a, b, _joined(before, between, after)
     return None
@@ -74,17 +74,17 @@ def _gaps(ends: FloatArray) -> NDArray[np.int64]:
 def _ends(path: Path) -> FloatArray:
     """Position and outward direction (2, 2, 2) of the first and the last end of a path."""
     points = path.points_map
-    return np.array([[points[0], _outward(points[::-1])], [points[-1], _outward(points)]])
+    return np.array([[points[0], _end_direction(points[::-1])], [points[-1], _end_direction(points)]])
 
 
-def _outward(points: FloatArray) -> FloatArray:
+def _end_direction(points: FloatArray) -> FloatArray:
     """Direction (2,) in which a polyline ends, over its last metres."""
     away = np.linalg.norm(points - points[-1], axis=1)
-    direction = points[-1] - points[int(np.argmin(np.abs(away - min(_END_LENGTH_M, float(away.max())))))]
+    direction = points[-1] - points[int(np.argmin(np.abs(away - min(_DIRECTION_LENGTH_M, float(away.max())))))]
     return np.asarray(direction / max(float(np.linalg.norm(direction)), 1e-9))
 
 
-def _bridge(
+def _course_between(
     start: FloatArray, stop: FloatArray, guides: Guides, tree: cKDTree, options: LaneOptions
 ) -> FloatArray | None:
     """Vertices (N, 2) between two ends, where the lines seen run; None unless enough images saw one."""
