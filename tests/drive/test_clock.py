@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.drive.example import make_drive
+from v2hdm.association.sightings import frames_of
 from v2hdm.errors import DriveError
 from v2hdm.io.drive import read_drive, with_clock_offsets
-from v2hdm.mapping.sightings.table import frames_of
 
 
 def test_images_taken_later_than_stamped_lie_further_along_the_route(tmp_path: Path) -> None:

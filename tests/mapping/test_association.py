@@ -8,15 +8,20 @@ import numpy as np
 import pytest
 
 from tests.mapping.scene import Scene, SceneOptions, make_scene
+from v2hdm.association.ground import Located, locate
+from v2hdm.association.groups import (
+    Association,
+    FusedGroups,
+    fuse_groups,
+    keep_rows,
+    merge_groups,
+    same_groups,
+)
+from v2hdm.association.sightings import Rig, Sightings, collect_sightings
+from v2hdm.association.tracks import Uncertainty, build_tracks
 from v2hdm.geometry.quadrilateral import align
-from v2hdm.mapping.association.groups import Association, FusedGroups, fuse_groups, keep_rows, same_groups
-from v2hdm.mapping.association.merge import merge_groups
-from v2hdm.mapping.association.tracks import Uncertainty, build_tracks
 from v2hdm.mapping.optimise import initial_rig
 from v2hdm.mapping.options import AssociationOptions
-from v2hdm.mapping.sightings.location import Located, locate
-from v2hdm.mapping.sightings.rig import Rig
-from v2hdm.mapping.sightings.table import Sightings, collect_sightings
 
 MAX_RANGE_M = 16.0
 

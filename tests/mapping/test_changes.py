@@ -14,14 +14,12 @@ from v2hdm.errors import MappingError
 from v2hdm.geometry.ipm import apply_homography, pinhole_px_from_ground
 from v2hdm.geometry.rigid import inverse
 from v2hdm.io.maps.geojson import read_geojson, write_geojson
-from v2hdm.mapping.changes.decide import Decision, Watched, decide
-from v2hdm.mapping.changes.field import Errors
-from v2hdm.mapping.changes.fuse import fused_markings
-from v2hdm.mapping.changes.lanes import updated_lanes
-from v2hdm.mapping.changes.update import Base
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.results import MethodResult
 from v2hdm.records import Changes, Fate, Lane, Marking
+from v2hdm.site.changes import Base, fused_markings
+from v2hdm.site.fates import Decision, Watched, decide
+from v2hdm.site.map_errors import Errors, updated_lanes
 
 MOVED = {3: (0.1, 0.02), 7: (-0.25, 0.1), 12: (0.4, 0.5), 16: (0.0, -0.9)}
 REMOVED = (5, 10, 14, 21)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.mapping.motion import vehicle_twists
+from v2hdm.mapping.bundle import vehicle_twists
 
 
 def test_a_steady_turn_has_one_twist_everywhere() -> None:

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from tests.mapping.test_symbols import ARROW, INTRINSIC, level_camera, scene
+from v2hdm.association.sightings import NO_SYMBOLS, Rig, Symbols
 from v2hdm.geometry.planar import signed_area
-from v2hdm.mapping.outlines import map_symbols
-from v2hdm.mapping.sightings.rig import Rig
-from v2hdm.mapping.sightings.symbols import NO_SYMBOLS, Symbols
 from v2hdm.records import FloatArray, Marking
+from v2hdm.site.symbols import map_symbols
 
 JITTER_RAD = 0.002
 AT, OFF = np.array([9.0, 1.0]), np.array([0.1, 0.0])

@@ -11,14 +11,12 @@ import pytest
 
 from tests.mapping.scene import Scene, SceneOptions, make_scene
 from tests.mapping.test_methods import MATCH_M, match
-from v2hdm.mapping.association.attach import attach
-from v2hdm.mapping.association.groups import fuse_groups, in_view
+from v2hdm.association.ground import locate, views_of
+from v2hdm.association.groups import attach, fuse_groups, in_view
+from v2hdm.association.sightings import Sightings, collect_sightings
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.optimise import Optimiser, initial_rig
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.mapping.sightings.location import locate
-from v2hdm.mapping.sightings.table import Sightings, collect_sightings
-from v2hdm.mapping.sightings.views import views_of
 from v2hdm.records import HdMap, ImageDetections, Marking, MarkingDetection
 
 CAMERAS = ("front", "rear")

@@ -12,7 +12,7 @@ from v2hdm.adjust import Fault
 from v2hdm.io.drive.trajectory import interpolate
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions, SizeOptions, SurveyOptions
-from v2hdm.mapping.remedy import Inputs
+from v2hdm.mapping.recovery import Inputs
 from v2hdm.mapping.results import MethodResult
 from v2hdm.records import DIAMOND, Drive, FloatArray, Trajectory
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from v2hdm.mapping.options import AcceptanceOptions
-from v2hdm.mapping.site_model.class_shapes import learn_shapes
-from v2hdm.mapping.site_model.places import Counts, Places
-from v2hdm.mapping.site_model.posterior import CLUTTER, OF_CLASS, PART_OF_SYMBOL, Posterior, posterior
-from v2hdm.mapping.site_model.verdict import Judged, judge
+from v2hdm.site.candidates import Counts, Places
+from v2hdm.site.markings import Judged, judge
+from v2hdm.site.posterior import CLUTTER, OF_CLASS, PART_OF_SYMBOL, Posterior, posterior
+from v2hdm.site.shapes import learn_shapes
 
 DIAMOND = np.array([[0.6, 0.0], [0.0, 0.35], [-0.6, 0.0], [0.0, -0.35]])
 DASH = np.array([[1.5, 0.06], [-1.5, 0.06], [-1.5, -0.06], [1.5, -0.06]])

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.mapping.sightings.rig import Rig
-from v2hdm.mapping.sightings.symbols import NO_SYMBOLS, Symbols, images_with_symbol
+from v2hdm.association.sightings import NO_SYMBOLS, Rig, Symbols, images_with_symbol
 
 INTRINSIC = np.array([[800.0, 0.0, 640.0], [0.0, 800.0, 360.0], [0.0, 0.0, 1.0]])
 ARROW = np.array(

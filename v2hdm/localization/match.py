@@ -36,7 +36,7 @@ SHIFT_ROWS = (2 * SHIFTS[..., None] + np.arange(2)).reshape(4, 8)
 _REPEATS = 2.8
 """Factor of a detection's covariance: an edge that shadow or wear misplaces stays so in the next images.
 
-Errors of one corner correlate by about .2 from image to image (:mod:`v2hdm.mapping.site_model.places`); over
+Errors of one corner correlate by about .2 from image to image (:mod:`v2hdm.site.candidates`); over
 the ten frames that the filter remembers that is 1 + 9 x .2.
 """
 

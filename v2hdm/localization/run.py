@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from v2hdm.association.sightings import Sightings, collect_sightings
 from v2hdm.detection.batch import detect_all
 from v2hdm.detection.options import DetectorOptions
 from v2hdm.errors import MapFileError
@@ -26,7 +27,6 @@ from v2hdm.io.maps.geojson import read_geojson
 from v2hdm.localization.figure import save_errors
 from v2hdm.localization.match import Markings, Seen, locate
 from v2hdm.localization.motion import State, predict, start
-from v2hdm.mapping.sightings.table import Sightings, collect_sightings
 from v2hdm.records import Calibration, Drive, FloatArray, HdMap, ImageDetections, Trajectory
 from v2hdm.report.outputs import result_folder, write_json
 from v2hdm.settings import check_workers

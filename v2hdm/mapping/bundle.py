@@ -1,4 +1,7 @@
-"""One joint solve over groups of sightings: to :mod:`v2hdm.adjust` and back."""
+"""How the vehicle moves, from its recorded poses.
+
+One joint solve over groups of sightings: to :mod:`v2hdm.adjust` and back.
+"""
 
 from __future__ import annotations
 
@@ -21,18 +24,34 @@ from v2hdm.adjust import (
     solve,
     with_model,
 )
+from v2hdm.association.ground import locate
+from v2hdm.association.groups import Association, fuse_groups, group_kinds, known_elsewhere, line_only
+from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.errors import MappingError
-from v2hdm.geometry.rigid import camera_centre
-from v2hdm.mapping.association.groups import Association, fuse_groups, known_elsewhere, line_only
-from v2hdm.mapping.association.merge import group_kinds
-from v2hdm.mapping.known_sizes import known_lengths
-from v2hdm.mapping.motion import vehicle_twists
+from v2hdm.geometry.rigid import camera_centre, inverse, log
 from v2hdm.mapping.options import MappingOptions, SizeOptions, SurveyOptions
-from v2hdm.mapping.sightings.location import locate
-from v2hdm.mapping.sightings.rig import Rig
-from v2hdm.mapping.sightings.table import Sightings
-from v2hdm.mapping.survey import control_points
+from v2hdm.mapping.stated import control_points, known_lengths
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, PoseNoise
+
+
+def vehicle_twists(
+    map_from_vehicle: FloatArray, stamp_s: FloatArray, visit: IntArray | None = None
+) -> FloatArray:
+    """Twists (F, 6) of the vehicle in its own frame, m/s then rad/s, at poses (F, 4, 4) at times (F,).
+
+    Central differences, one-sided at the ends of each ``visit`` (F,), of one without; a single pose has no
+    motion.
+    """
+    count = len(stamp_s)
+    before, after = np.maximum(np.arange(count) - 1, 0), np.minimum(np.arange(count) + 1, count - 1)
+    if visit is not None:
+        own = np.arange(count)
+        before = np.where(visit[before] == visit, before, own)
+        after = np.where(visit[after] == visit, after, own)
+    moved = inverse(map_from_vehicle[before]) @ map_from_vehicle[after]
+    elapsed_s = stamp_s[after] - stamp_s[before]
+    return np.asarray(log(moved) / np.where(elapsed_s > 0, elapsed_s, 1.0)[:, None])
+
 
 UNSURVEYED_CENTRE_SIGMA_M = 0.3
 """How well a camera centre is known that nobody has surveyed, but a coarse IPM implies."""

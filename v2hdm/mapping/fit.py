@@ -8,8 +8,8 @@ import numpy as np
 
 from v2hdm.adjust import Fault, Suspect
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.mapping.evidence import CELLS, WINDOW_OBSERVATIONS, CameraFit, Contradiction
-from v2hdm.mapping.survey import name_of
+from v2hdm.mapping.results import CELLS, WINDOW_OBSERVATIONS, CameraFit, Contradiction
+from v2hdm.mapping.stated import name_of
 from v2hdm.records import FloatArray, IntArray
 
 MEDIAN_SQUARED = 2 * float(np.log(2))

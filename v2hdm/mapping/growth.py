@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.mapping.markings.conclude import Optimised
+from v2hdm.mapping.conclude import Optimised
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.results import GrowthStep
-from v2hdm.mapping.site_model.places import Counts, solved_places
-from v2hdm.mapping.site_model.posterior import posterior
 from v2hdm.records import IntArray, Marking
+from v2hdm.site.candidates import Counts, solved_places
+from v2hdm.site.posterior import posterior
 
 
 def grow_map(

@@ -10,14 +10,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from v2hdm.association.groups import Association, FusedGroups, group_kinds, keep_rows, merge_groups
+from v2hdm.association.sightings import Sightings
 from v2hdm.geometry.ipm import apply_in_front, facing_ipm, flat_motion
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.quadrilateral import is_convex
-from v2hdm.mapping.association.groups import Association, FusedGroups, keep_rows
-from v2hdm.mapping.association.merge import group_kinds, merge_groups
 from v2hdm.mapping.options import LEAST_SIGHTINGS, MappingOptions
 from v2hdm.mapping.results import Exclusion
-from v2hdm.mapping.sightings.table import Sightings
 from v2hdm.records import BoolArray, Camera, FloatArray, Marking
 
 

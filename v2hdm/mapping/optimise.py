@@ -16,12 +16,12 @@ import numpy as np
 
 from v2hdm.adjust import Problem, Solution, SolveOptions, Status, select_model
 from v2hdm.adjust.parts import adjust
+from v2hdm.association.ground import Located, Views, locate
+from v2hdm.association.groups import Association, attach, fuse_groups, in_view, merge_groups, same_groups
+from v2hdm.association.sightings import Rig, Sightings, build_rig
+from v2hdm.association.tracks import Uncertainty, build_tracks
 from v2hdm.errors import AdjustError, MappingError
 from v2hdm.geometry.ipm import extrinsic_from_ipm
-from v2hdm.mapping.association.attach import attach
-from v2hdm.mapping.association.groups import Association, fuse_groups, in_view, same_groups
-from v2hdm.mapping.association.merge import merge_groups
-from v2hdm.mapping.association.tracks import Uncertainty, build_tracks
 from v2hdm.mapping.bundle import (
     LEAST_OBSERVATIONS,
     VARIANCE_FACTORS,
@@ -30,14 +30,10 @@ from v2hdm.mapping.bundle import (
     full_model,
     solve_bundle,
 )
+from v2hdm.mapping.conclude import Evidence, Optimised, conclude
 from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mapping.incremental import IncrementalMapper
-from v2hdm.mapping.markings.conclude import Evidence, Optimised, conclude
 from v2hdm.mapping.options import AUTO, MappingOptions
-from v2hdm.mapping.sightings.location import Located, locate
-from v2hdm.mapping.sightings.rig import Rig, build_rig
-from v2hdm.mapping.sightings.table import Sightings
-from v2hdm.mapping.sightings.views import Views
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, PoseNoise, largest_noise
 
 _log = logging.getLogger(__name__)

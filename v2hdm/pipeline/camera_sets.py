@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from v2hdm.io.drive.truth import has_truth
-from v2hdm.mapping.changes.update import Base
 from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.results import MethodResult
@@ -20,6 +19,7 @@ from v2hdm.pipeline.viewer import Viewer
 from v2hdm.pipeline.write import BEST
 from v2hdm.records import Drive, ImageDetections
 from v2hdm.report.check_points import CheckTable
+from v2hdm.site.changes import Base
 from v2hdm.store.cache.room import Room
 
 _log = logging.getLogger(__name__)

@@ -13,7 +13,7 @@ from v2hdm.geometry.ipm import extrinsic_from_ipm, ipm_from_extrinsic
 from v2hdm.io.drive.truth import has_truth, read_truth
 from v2hdm.mapping.methods import run_naive
 from v2hdm.mapping.options import MappingOptions
-from v2hdm.mapping.remedy import Inputs
+from v2hdm.mapping.recovery import Inputs
 from v2hdm.mapping.results import MethodResult
 from v2hdm.records import Drive, HdMap, ImageDetections, Truth
 from v2hdm.report.evaluation import extrinsic_figures, growth_figures, headline, map_figures

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from v2hdm.adjust import Fault
-from v2hdm.mapping.evidence import Contradiction
+from v2hdm.mapping.results import Contradiction
 
 CHECKS: Mapping[Fault, str] = {
     Fault.CLOCK: "clock",

@@ -1,7 +1,7 @@
 """After the solve: what the drive says of its own inputs, and how well everything fits.
 
 The inputs are tested one at a time (:mod:`v2hdm.adjust.suspect`); what was contradicted and could be done
-without has been dropped (:mod:`v2hdm.mapping.remedy`) and is told here. Everything else that a wrong input
+without has been dropped (:mod:`v2hdm.mapping.recovery`) and is told here. Everything else that a wrong input
 shows in is measured as well, so that a fault that nobody thought of is not silent. docs/verdict.md has what
 clean and spoilt drives measure.
 """
@@ -14,11 +14,10 @@ from dataclasses import replace
 import numpy as np
 
 from v2hdm.adjust import Fault
-from v2hdm.mapping.evidence import Contradiction, SolveEvidence
-from v2hdm.mapping.remedy import CLOCK_TOLD_S, CONTRADICTED_SIGMAS, TOLD_SIGMA, is_contradicted
-from v2hdm.mapping.results import MethodResult
-from v2hdm.mapping.site_model.verdict import TOO_UNCERTAIN
+from v2hdm.mapping.recovery import CLOCK_TOLD_S, CONTRADICTED_SIGMAS, TOLD_SIGMA, is_contradicted
+from v2hdm.mapping.results import Contradiction, MethodResult, SolveEvidence
 from v2hdm.records import Drive
+from v2hdm.site.markings import TOO_UNCERTAIN
 from v2hdm.verdict.judgement import judge, passed
 from v2hdm.verdict.results.agreement import check_agreement
 from v2hdm.verdict.results.doubles import check_doubles

@@ -1,0 +1,161 @@
+"""From a solved bundle to its outcome: the accepted markings, the calibrations, the evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from v2hdm.association.ground import Views, locate
+from v2hdm.association.groups import Association, fuse_groups, group_kinds
+from v2hdm.association.sightings import Rig, Sightings
+from v2hdm.geometry.ipm import project_ground
+from v2hdm.mapping.bundle import Bundle
+from v2hdm.mapping.options import AcceptanceOptions
+from v2hdm.mapping.results import Exclusion
+from v2hdm.records import BoolArray, Calibration, Camera, FloatArray, IntArray, Marking
+from v2hdm.site.candidates import solved_places, with_shared_errors
+from v2hdm.site.markings import Seen, judge, with_relative_sigma
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the verdict on the markings rests on.
+
+    ``final`` is the bundle solved over the accepted observations only, ``ungated`` the one before
+    it over all, of which ``inlier`` (K,) were accepted; ``usable`` (S, 4) says the same per corner.
+    """
+
+    sightings: Sightings
+    views: Views
+    cameras: Mapping[str, Camera]
+    final: Bundle
+    ungated: Bundle
+    inlier: BoolArray
+    usable: BoolArray
+
+
+@dataclass(frozen=True)
+class Observed:
+    """K observations: the row (K,) of the sightings, the candidate ``group`` (K,) and its corner (K,)."""
+
+    row: IntArray
+    group: IntArray
+    corner: IntArray
+
+    def only(self, chosen: BoolArray) -> Observed:
+        """Those that are ``chosen`` (K,)."""
+        return Observed(self.row[chosen], self.group[chosen], self.corner[chosen])
+
+
+@dataclass(frozen=True)
+class Optimised:
+    """The outcome of the joint optimisation.
+
+    ``bundle`` holds the adjusted extrinsics and poses; marking m is its group ``groups[m]``;
+    ``usable`` (S, 4) are the accepted corner observations. Reprojection errors are root mean squares
+    over the points seen of the accepted markings, under the optimised and the initial extrinsics.
+    """
+
+    bundle: Bundle
+    usable: BoolArray
+    groups: IntArray
+    markings: tuple[Marking, ...]
+    excluded: tuple[Exclusion, ...]
+    calibrations: Mapping[str, Calibration]
+    reprojection_rmse_px: float
+    initial_reprojection_rmse_px: float
+
+
+def conclude(
+    evidence: Evidence, initial_rig: Rig, jitter_rad: float, options: AcceptanceOptions
+) -> Optimised:
+    """Judge the candidates and put the outcome together.
+
+    Raises:
+        MappingError: No candidate is accepted.
+    """
+    final, ungated = evidence.final, evidence.ungated
+    seen = Seen(
+        kind=group_kinds(final.association, evidence.sightings),
+        sightings=evidence.sightings,
+        rig=final.rig,
+        views=evidence.views,
+        cameras=tuple(evidence.cameras.values()),
+        row=ungated.row,
+        group=ungated.group,
+        accepted=evidence.inlier,
+    )
+    located = locate(evidence.sightings, final.rig)
+    located.informs[:] &= evidence.usable
+    fused = fuse_groups(final.association, located, jitter_rad=0.0)
+    judged = judge(with_shared_errors(solved_places(final), fused), seen, options)
+    scale = max(1.0, final.solution.chi2_per_dof)
+    markings = with_relative_sigma(
+        judged.markings(),
+        final.corner_index[judged.accepted],
+        lambda pairs: scale * final.solution.corner_covariance(pairs),
+    )
+    own_corner = final.association.corner_order()[final.row, final.corner]
+    used = np.isin(final.group, judged.accepted) & evidence.sightings.valid[final.row, own_corner]
+    observed = Observed(final.row, final.group, final.corner)
+    at_start = residuals_under(initial_rig, evidence.sightings, final.association, observed, jitter_rad)
+    return Optimised(
+        bundle=final,
+        usable=evidence.usable,
+        groups=judged.accepted,
+        markings=markings,
+        excluded=judged.exclusions(),
+        calibrations=_calibrations(final, evidence.sightings.cameras, evidence.cameras),
+        reprojection_rmse_px=root_mean_square(final.solution.residual_px[used]),
+        initial_reprojection_rmse_px=root_mean_square(at_start[used]),
+    )
+
+
+def _calibrations(
+    bundle: Bundle, names: Sequence[str], cameras: Mapping[str, Camera]
+) -> dict[str, Calibration]:
+    """Calibrations by camera; one that saw no marking keeps its start and has no covariance."""
+    covariance = bundle.solution.extrinsic_covariance * max(1.0, bundle.solution.chi2_per_dof)
+    return {
+        name: Calibration(
+            info=cameras[name].info,
+            cam_from_vehicle=bundle.rig.cam_from_vehicle[c],
+            covariance=covariance[bundle.camera_index[name]] if name in bundle.camera_index else None,
+        )
+        for c, name in enumerate(names)
+    }
+
+
+def residuals_under(
+    rig: Rig, sightings: Sightings, association: Association, observed: Observed, jitter_rad: float
+) -> FloatArray:
+    """Residuals (K, 2), px, of the observations when ``rig`` and its own best corners hold."""
+    fused = fuse_groups(association, locate(sightings, rig), jitter_rad)
+    poses = rig.map_from_vehicle[sightings.frame[observed.row]]
+    return reprojected(rig, poses, sightings, association, observed, fused.corners_map)
+
+
+def reprojected(
+    rig: Rig,
+    map_from_vehicle: FloatArray,
+    sightings: Sightings,
+    association: Association,
+    observed: Observed,
+    corners_map: FloatArray,
+) -> FloatArray:
+    """Residuals (K, 2), px, of the observations of corners (G, 4, 2) from poses (K, 4, 4)."""
+    camera = sightings.camera[observed.row]
+    cam_from_map = rig.cam_from_vehicle[camera] @ np.linalg.inv(map_from_vehicle)
+    points = corners_map[observed.group, observed.corner]
+    pixel, _ = project_ground(rig.intrinsic[camera], cam_from_map, points[:, None])
+    own_corner = association.corner_order()[observed.row, observed.corner]
+    return np.asarray(pixel[:, 0] - sightings.corners_pinhole_px[observed.row, own_corner])
+
+
+def root_mean_square(residual_px: FloatArray) -> float:
+    """Root mean square length of residuals (K, 2); those that cannot be projected are left out."""
+    squared = np.sum(residual_px**2, axis=1)
+    finite = squared[np.isfinite(squared)]
+    return float(np.sqrt(np.mean(finite))) if len(finite) else float("nan")
