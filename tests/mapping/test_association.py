@@ -17,11 +17,11 @@ from v2hdm.association.groups import (
     merge_groups,
     same_groups,
 )
+from v2hdm.association.options import AssociationOptions
 from v2hdm.association.sightings import Rig, Sightings, collect_sightings
 from v2hdm.association.tracks import Uncertainty, build_tracks
 from v2hdm.geometry.quadrilateral import align
 from v2hdm.mapping.optimise import initial_rig
-from v2hdm.mapping.options import AssociationOptions
 
 MAX_RANGE_M = 16.0
 

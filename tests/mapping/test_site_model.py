@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from v2hdm.mapping.options import AcceptanceOptions
 from v2hdm.site.candidates import Counts, Places
 from v2hdm.site.markings import Judged, judge
+from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.posterior import CLUTTER, OF_CLASS, PART_OF_SYMBOL, Posterior, posterior
 from v2hdm.site.shapes import learn_shapes
 

@@ -16,11 +16,11 @@ from scipy.optimize import linear_sum_assignment
 
 from v2hdm.association.ground import Located
 from v2hdm.association.groups import Association
+from v2hdm.association.options import AssociationOptions
 from v2hdm.association.sightings import NO_SYMBOLS, Rig, Sightings
 from v2hdm.geometry.quadrilateral import SHIFTS, align, diameters, mean_corners
 from v2hdm.geometry.rigid import heading_rad
 from v2hdm.mapping.crew import ALONE, Crew
-from v2hdm.mapping.options import AssociationOptions
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _REFUSED = 1e9

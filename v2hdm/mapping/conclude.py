@@ -12,11 +12,10 @@ from v2hdm.association.groups import Association, fuse_groups, group_kinds
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.mapping.options import AcceptanceOptions
-from v2hdm.mapping.results import Exclusion
 from v2hdm.records import BoolArray, Calibration, Camera, FloatArray, IntArray, Marking
-from v2hdm.site.candidates import solved_places, with_shared_errors
+from v2hdm.site.candidates import Exclusion, Places, with_shared_errors
 from v2hdm.site.markings import Seen, judge, with_relative_sigma
+from v2hdm.site.options import AcceptanceOptions
 
 
 @dataclass(frozen=True)
@@ -111,6 +110,27 @@ def conclude(
         reprojection_rmse_px=root_mean_square(final.solution.residual_px[used]),
         initial_reprojection_rmse_px=root_mean_square(at_start[used]),
     )
+
+
+def solved_places(bundle: Bundle) -> Places:
+    """The corners of every group of ``bundle``.
+
+    Covariances are scaled by chi^2 per degree of freedom where that exceeds one: residuals larger
+    than their stated noise make the map less certain than the noise model claims.
+    """
+    known = bundle.corner_index >= 0
+    covariance = np.full((len(known), 8, 8), np.nan)
+    scale = max(1.0, bundle.solution.chi2_per_dof)
+    for count in range(1, 5):
+        groups = np.flatnonzero(known.sum(axis=1) == count)
+        if not len(groups):
+            continue
+        corner = np.nonzero(known[groups])[1].reshape(-1, count)
+        indices = np.take_along_axis(bundle.corner_index[groups], corner, axis=1)
+        rows = (2 * corner[..., None] + np.arange(2)).reshape(len(groups), -1)
+        blocks = scale * bundle.solution.corner_covariance(indices)
+        covariance[groups[:, None, None], rows[:, :, None], rows[:, None, :]] = blocks
+    return Places.seen(bundle.corners_map, covariance)
 
 
 def _calibrations(

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from v2hdm.mapping.bundle import Bundle
-from v2hdm.mapping.conclude import Optimised
+from v2hdm.mapping.conclude import Optimised, solved_places
 from v2hdm.mapping.optimise import Optimiser
 from v2hdm.mapping.results import GrowthStep
 from v2hdm.records import IntArray, Marking
-from v2hdm.site.candidates import Counts, solved_places
+from v2hdm.site.candidates import Counts
 from v2hdm.site.posterior import posterior
 
 

@@ -19,11 +19,12 @@ import numpy as np
 from v2hdm.adjust import Observations, PoseSigma
 from v2hdm.adjust.incremental import IncrementalMap, Sighted
 from v2hdm.association.groups import Association, group_kinds
+from v2hdm.association.options import LEAST_SIGHTINGS
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.errors import AdjustError
 from v2hdm.geometry.quadrilateral import align, diameters
 from v2hdm.mapping.bundle import Model, drive_problem
-from v2hdm.mapping.options import LEAST_SIGHTINGS, MappingOptions
+from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.stated import control_points, known_lengths
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray
 

@@ -11,13 +11,14 @@ from collections.abc import Mapping
 import numpy as np
 
 from v2hdm.association.groups import Association, FusedGroups, group_kinds, keep_rows, merge_groups
+from v2hdm.association.options import LEAST_SIGHTINGS
 from v2hdm.association.sightings import Sightings
 from v2hdm.geometry.ipm import apply_in_front, facing_ipm, flat_motion
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.quadrilateral import is_convex
-from v2hdm.mapping.options import LEAST_SIGHTINGS, MappingOptions
-from v2hdm.mapping.results import Exclusion
+from v2hdm.mapping.options import MappingOptions
 from v2hdm.records import BoolArray, Camera, FloatArray, Marking
+from v2hdm.site.candidates import Exclusion
 
 
 def naive_markings(

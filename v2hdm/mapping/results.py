@@ -15,6 +15,7 @@ import numpy as np
 from v2hdm.adjust import Fault
 from v2hdm.io.maps.residuals import Residuals
 from v2hdm.records import BoolArray, Calibration, Changes, FloatArray, HdMap, Image, IntArray, Marking
+from v2hdm.site.candidates import Exclusion
 
 WINDOW_OBSERVATIONS = 200
 """Observations of a window along the route: their median varies by a tenth by chance."""
@@ -101,16 +102,6 @@ class SolveEvidence:
     def held_out_loss(self) -> float | None:
         """That of the chosen model, None where too little was seen to hold any of it out."""
         return self.held_out.get(self.pose_model)
-
-
-@dataclass(frozen=True)
-class Exclusion:
-    """One candidate marking that did not enter the map: what, where (2,) in the map, and why."""
-
-    kind: str
-    position_map: FloatArray
-    sightings: int
-    reason: str
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ import numpy as np
 
 from v2hdm.association.groups import FusedGroups, line_only
 from v2hdm.geometry.quadrilateral import block_diagonal
-from v2hdm.mapping.bundle import Bundle
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 UNSEEN_M2 = 1e4
@@ -83,6 +82,16 @@ class Counts:
         return Counts(*(values[rows] for values in vars(self).values()))
 
 
+@dataclass(frozen=True)
+class Exclusion:
+    """One candidate marking that did not enter the map: what, where (2,) in the map, and why."""
+
+    kind: str
+    position_map: FloatArray
+    sightings: int
+    reason: str
+
+
 def with_shared_errors(places: Places, fused: FusedGroups) -> Places:
     """The places, with the errors that all images of a corner share.
 
@@ -101,24 +110,3 @@ def with_shared_errors(places: Places, fused: FusedGroups) -> Places:
     no_point = (fused.seen == 0) & ~unseen[..., 0, 0]
     shared[no_point] = line_only(shared[no_point], UNSEEN_M2**0.5)
     return Places(places.corners_map, places.covariance_m2 + block_diagonal(shared))
-
-
-def solved_places(bundle: Bundle) -> Places:
-    """The corners of every group of ``bundle``.
-
-    Covariances are scaled by chi^2 per degree of freedom where that exceeds one: residuals larger
-    than their stated noise make the map less certain than the noise model claims.
-    """
-    known = bundle.corner_index >= 0
-    covariance = np.full((len(known), 8, 8), np.nan)
-    scale = max(1.0, bundle.solution.chi2_per_dof)
-    for count in range(1, 5):
-        groups = np.flatnonzero(known.sum(axis=1) == count)
-        if not len(groups):
-            continue
-        corner = np.nonzero(known[groups])[1].reshape(-1, count)
-        indices = np.take_along_axis(bundle.corner_index[groups], corner, axis=1)
-        rows = (2 * corner[..., None] + np.arange(2)).reshape(len(groups), -1)
-        blocks = scale * bundle.solution.corner_covariance(indices)
-        covariance[groups[:, None, None], rows[:, :, None], rows[:, None, :]] = blocks
-    return Places.seen(bundle.corners_map, covariance)

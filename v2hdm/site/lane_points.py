@@ -26,8 +26,8 @@ from v2hdm.geometry.ipm import (
 )
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.mapping.options import LaneOptions
 from v2hdm.records import LANE_BOUNDARY, LANE_DASH, BoolArray, Drive, FloatArray, ImageDetections, IntArray
+from v2hdm.site.options import LaneOptions
 
 _CENTRE_SIGMA_PX = 1.0
 """Noise of a detected centre point across its line: about a cell of the network's output."""

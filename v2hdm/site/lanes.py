@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from v2hdm.mapping.options import LaneOptions
 from v2hdm.records import LANE_DASH, LANE_LINE, BoolArray, FloatArray, IntArray, Lane
 from v2hdm.site.lane_points import Guides, LaneCloud, Nodes, find_nodes
+from v2hdm.site.options import LaneOptions
 
 _SAME_DIRECTION = np.cos(np.deg2rad(25.0))
 _MAX_LINK_SPACINGS = 2.5

@@ -15,10 +15,9 @@ from v2hdm.association.ground import Views, easy_views
 from v2hdm.association.sightings import Rig, Sightings, images_with_symbol
 from v2hdm.errors import MappingError
 from v2hdm.geometry.planar import clip_convex, signed_area
-from v2hdm.mapping.options import AcceptanceOptions
-from v2hdm.mapping.results import Exclusion
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
-from v2hdm.site.candidates import Counts, Places
+from v2hdm.site.candidates import Counts, Exclusion, Places
+from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.posterior import CLUTTER, PART_OF_SYMBOL, Posterior, posterior
 
 OF_SYMBOL = "part of a symbol, such as an arrow"

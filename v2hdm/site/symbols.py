@@ -18,10 +18,10 @@ from scipy.spatial import cKDTree
 from skimage.draw import polygon
 from skimage.measure import approximate_polygon, find_contours
 
+from v2hdm.association.options import LEAST_SIGHTINGS
 from v2hdm.association.sightings import Rig, Symbols, outlines_on_ground
 from v2hdm.geometry.planar import signed_area
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.mapping.options import LEAST_SIGHTINGS
 from v2hdm.records import FloatArray, IntArray, Marking, Symbol
 
 _CELL_M = 0.01
