@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from v2hdm.association.sightings import NO_SYMBOLS, Rig, Symbols, images_with_symbol
+from v2hdm.association.ground import images_with_symbol
+from v2hdm.association.sightings import NO_SYMBOLS, Rig, Symbols
 
 INTRINSIC = np.array([[800.0, 0.0, 640.0], [0.0, 800.0, 360.0], [0.0, 0.0, 1.0]])
 ARROW = np.array(

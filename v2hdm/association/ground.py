@@ -1,33 +1,37 @@
-"""Where sightings lie on the ground under given extrinsics and poses, and how certainly.
-
-Which images should have seen a marking.
-"""
+"""Where sightings and symbols lie on the ground under a rig, how certainly, and which images show what."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from v2hdm.association.sightings import Rig, Sightings, frames_of
+from v2hdm.association.sightings import Rig, Sightings, Symbols, frames_of
 from v2hdm.geometry.ipm import (
     apply_homography,
-    apply_in_front,
     direction_covariance,
     flat_motion,
     ground_from_pinhole_px,
-    homography_jacobian,
     project_ground,
 )
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.rigid import camera_centre
+from v2hdm.geometry.tensors import back_project, back_project_with_jacobian
 from v2hdm.records import BoolArray, Camera, Drive, FloatArray, IntArray
 
-# Variance of a ground point, in its better direction, beyond which it is as good as on the horizon, m^2.
 _HORIZON_M2 = 1e4
+"""Variance of a ground point, in its better direction, beyond which it is as good as on the horizon, m^2."""
+
+_SYMBOL_RANGE_M = 16.0
+"""Distance from the vehicle, m, beyond which a symbol's place is too vague to speak against a neighbour."""
+
+_BORDER_PX = 10.0
+"""Width of the image's border, px, within which a marking may be cut."""
 
 
 @dataclass(frozen=True)
@@ -62,13 +66,32 @@ class Located:
         return direction_covariance(self.ray_map, self.height_m[:, None], sigma_rad)
 
 
+def ground_points(map_from_pinhole_px: FloatArray, pinhole_px: FloatArray) -> FloatArray:
+    """Ground points (N, K, 2), m, of pixels (N, K, 2) by IPMs (N, 3, 3); nan at and above the horizon."""
+    points = back_project(torch.tensor(map_from_pinhole_px), torch.tensor(pinhole_px))
+    return np.asarray(points.numpy())
+
+
+def ground_points_with_jacobian(
+    map_from_pinhole_px: FloatArray, pinhole_px: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """:func:`ground_points` and their derivatives (N, K, 2, 2), m/px, by the pixels; nan where they are."""
+    found = back_project_with_jacobian(torch.tensor(map_from_pinhole_px), torch.tensor(pinhole_px))
+    points, jacobian = (one.numpy() for one in found)
+    return points, jacobian
+
+
+def _ipms(rig: Rig, camera: IntArray, frame: IntArray) -> FloatArray:
+    """The IPMs (N, 3, 3), map from pinhole pixels, of cameras (N,) at frames (N,)."""
+    cam_from_map = rig.cam_from_vehicle[camera] @ np.linalg.inv(rig.map_from_vehicle[frame])
+    return ground_from_pinhole_px(rig.intrinsic[camera], cam_from_map)
+
+
 def locate(sightings: Sightings, rig: Rig) -> Located:
     """Back-project every corner of ``sightings`` to z = 0 of the map under ``rig``."""
     camera, frame = sightings.camera, sightings.frame
-    cam_from_map = rig.cam_from_vehicle[camera] @ np.linalg.inv(rig.map_from_vehicle[frame])
-    homographies = ground_from_pinhole_px(rig.intrinsic[camera], cam_from_map)
-    corners_map = apply_in_front(homographies, sightings.corners_pinhole_px)
-    jacobian = homography_jacobian(homographies, sightings.corners_pinhole_px)
+    ipms = _ipms(rig, camera, frame)
+    corners_map, jacobian = ground_points_with_jacobian(ipms, sightings.corners_pinhole_px)
     covariance = jacobian @ sightings.covariance_px @ np.swapaxes(jacobian, -1, -2)
     centre_vehicle = camera_centre(rig.cam_from_vehicle)[camera]
     poses = rig.map_from_vehicle[frame]
@@ -86,7 +109,51 @@ def locate(sightings: Sightings, rig: Rig) -> Located:
     )
 
 
-_BORDER_PX = 10.0
+def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> IntArray:
+    """In how many images a symbol lies along each of the quadrilaterals (G, 4, 2); nan ones have none.
+
+    From some places only the shaft of an arrow is seen, and is a dash as far as its image goes; other images
+    show the whole arrow there. A symbol lies along a quadrilateral whose middle line it mostly covers: an
+    arrow that crosses a stop line does not.
+    """
+    count = np.zeros(len(corners_map), dtype=np.int64)
+    known = np.flatnonzero(np.isfinite(corners_map).all(axis=(1, 2)))
+    centre, points = corners_map.mean(axis=1), _middle_line(corners_map)
+    for ground in outlines_on_ground(symbols, rig):
+        if ground is None:
+            continue
+        middle, size_m = ground.mean(axis=0), float(np.ptp(ground, axis=0).max())
+        polygon = (ground - middle).astype(np.float32)
+        for group in known[np.linalg.norm(centre[known] - middle, axis=1) < size_m]:
+            inside = [
+                cv2.pointPolygonTest(polygon, at, False) >= 0 for at in (points[group] - middle).tolist()
+            ]
+            count[group] += 2 * sum(inside) > len(inside)
+    return count
+
+
+def _middle_line(corners_map: FloatArray) -> FloatArray:
+    """Five points (G, 5, 2) spread evenly over the longer middle lines of quadrilaterals (G, 4, 2)."""
+    sides = (corners_map + np.roll(corners_map, -1, axis=1)) / 2
+    across = np.stack([sides[:, 2] - sides[:, 0], sides[:, 3] - sides[:, 1]], axis=1)
+    longer = np.argmax(np.linalg.norm(across, axis=2), axis=1)
+    way = across[np.arange(len(across)), longer]
+    return np.asarray(corners_map.mean(axis=1)[:, None] + np.linspace(-0.4, 0.4, 5)[:, None] * way[:, None])
+
+
+def outlines_on_ground(symbols: Symbols, rig: Rig) -> list[FloatArray | None]:
+    """The outline (K, 2) of each symbol in the map, None of those too far away."""
+    if not len(symbols.camera):
+        return []
+    length = [len(outline) for outline in symbols.outlines_pinhole_px]
+    of_point = np.repeat(np.arange(len(length)), length)
+    points_px = np.concatenate(symbols.outlines_pinhole_px)
+    ground = ground_points(_ipms(rig, symbols.camera, symbols.frame)[of_point], points_px[:, None])[:, 0]
+    position = rig.map_from_vehicle[symbols.frame, :2, 3]
+    within = np.linalg.norm(ground - position[of_point], axis=1) <= _SYMBOL_RANGE_M
+    outlines = np.split(ground, np.cumsum(length)[:-1])
+    near = [bool(own.all()) for own in np.split(within, np.cumsum(length)[:-1])]
+    return [outline if one else None for outline, one in zip(outlines, near, strict=True)]
 
 
 @dataclass(frozen=True)

@@ -1,23 +1,13 @@
-"""Cameras and frames as the mapping believes them to be.
-
-Arrows, chevrons and other symbols: evidence against the markings that lie upon them.
-
-From some places only the shaft of an arrow is seen, and is a dash as far as its image goes. Other images
-show the whole arrow there.
-
-Detections as one table of arrays: what every later step of the mapping works on.
-"""
+"""Detections as one table of arrays, and the rig that took them: every later step works on these."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from v2hdm.errors import MappingError
-from v2hdm.geometry.ipm import apply_in_front, ground_from_pinhole_px
 from v2hdm.geometry.lens import has_distortion, undistort_points
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, Camera, CameraInfo, Drive, FloatArray, ImageDetections, IntArray
@@ -38,21 +28,6 @@ class Rig:
     def height_m(self) -> FloatArray:
         """Heights (C,) of the camera centres above the ground of the vehicle."""
         return np.asarray(np.maximum(camera_centre(self.cam_from_vehicle)[:, 2], 0.1))
-
-
-def build_rig(
-    infos: Mapping[str, CameraInfo], cam_from_vehicle: Mapping[str, FloatArray], map_from_vehicle: FloatArray
-) -> Rig:
-    """Stack cameras in the order of ``infos`` with the frames' poses (F, 4, 4)."""
-    return Rig(
-        intrinsic=np.stack([info.intrinsic for info in infos.values()]),
-        cam_from_vehicle=np.stack([cam_from_vehicle[name] for name in infos]),
-        map_from_vehicle=map_from_vehicle,
-    )
-
-
-_MAX_RANGE_M = 16.0
-"""Farther from the camera a symbol's place on the ground is too vague to speak against a neighbour."""
 
 
 @dataclass(frozen=True)
@@ -88,55 +63,6 @@ def collect_symbols(
                 outlines.append(undistort_points(drive.cameras[name].info, marking.outline_px))
     indices = np.array(camera, dtype=np.int64), np.array(frame, dtype=np.int64)
     return Symbols(*indices, tuple(outlines), tuple(kinds))
-
-
-def images_with_symbol(symbols: Symbols, rig: Rig, corners_map: FloatArray) -> IntArray:
-    """In how many images a symbol lies along each of the quadrilaterals (G, 4, 2); nan ones have none.
-
-    It lies along one that it holds most of the middle line of: an arrow that crosses a stop line does not.
-    """
-    count = np.zeros(len(corners_map), dtype=np.int64)
-    known = np.flatnonzero(np.isfinite(corners_map).all(axis=(1, 2)))
-    centre, points = corners_map.mean(axis=1), _middle_line(corners_map)
-    for ground in outlines_on_ground(symbols, rig):
-        if ground is None:
-            continue
-        middle, size_m = ground.mean(axis=0), float(np.ptp(ground, axis=0).max())
-        polygon = (ground - middle).astype(np.float32)
-        for group in known[np.linalg.norm(centre[known] - middle, axis=1) < size_m]:
-            inside = [
-                cv2.pointPolygonTest(polygon, at, False) >= 0 for at in (points[group] - middle).tolist()
-            ]
-            count[group] += 2 * sum(inside) > len(inside)
-    return count
-
-
-def _middle_line(corners_map: FloatArray) -> FloatArray:
-    """Five points (G, 5, 2) spread evenly over the longer middle lines of quadrilaterals (G, 4, 2)."""
-    sides = (corners_map + np.roll(corners_map, -1, axis=1)) / 2
-    across = np.stack([sides[:, 2] - sides[:, 0], sides[:, 3] - sides[:, 1]], axis=1)
-    longer = np.argmax(np.linalg.norm(across, axis=2), axis=1)
-    way = across[np.arange(len(across)), longer]
-    return np.asarray(corners_map.mean(axis=1)[:, None] + np.linspace(-0.4, 0.4, 5)[:, None] * way[:, None])
-
-
-def outlines_on_ground(symbols: Symbols, rig: Rig) -> list[FloatArray | None]:
-    """The outline (K, 2) of each symbol in the map, None of those too far away."""
-    if not len(symbols.camera):
-        return []
-    map_from_vehicle = rig.map_from_vehicle[symbols.frame]
-    cam_from_map = rig.cam_from_vehicle[symbols.camera] @ np.linalg.inv(map_from_vehicle)
-    homographies = ground_from_pinhole_px(rig.intrinsic[symbols.camera], cam_from_map)
-    found: list[FloatArray | None] = []
-    for homography, pose, outline in zip(
-        homographies, map_from_vehicle, symbols.outlines_pinhole_px, strict=True
-    ):
-        ground = apply_in_front(homography, outline)
-        near = np.isfinite(ground).all() and (
-            np.linalg.norm(ground - pose[:2, 3], axis=1).max() <= _MAX_RANGE_M
-        )
-        found.append(ground if near else None)
-    return found
 
 
 SIDE_SIGMA_PX = 3.0

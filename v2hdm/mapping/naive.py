@@ -10,10 +10,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from v2hdm.association.ground import ground_points
 from v2hdm.association.groups import Association, FusedGroups, group_kinds, keep_rows, merge_groups
 from v2hdm.association.options import LEAST_SIGHTINGS
 from v2hdm.association.sightings import Sightings
-from v2hdm.geometry.ipm import apply_in_front, facing_ipm, flat_motion
+from v2hdm.geometry.ipm import facing_ipm, flat_motion
 from v2hdm.geometry.planar import inside_convex
 from v2hdm.geometry.quadrilateral import is_convex
 from v2hdm.mapping.options import MappingOptions
@@ -64,9 +65,9 @@ def ipm_corners(
         [facing_ipm(ipm[name], cameras[name].roi_vehicle.mean(axis=0)) for name in sightings.cameras]
     )
     homographies = forward[sightings.camera]
-    corners_vehicle = apply_in_front(homographies, sightings.corners_pinhole_px)
+    corners_vehicle = ground_points(homographies, sightings.corners_pinhole_px)
     to_map = flat_motion(sightings.map_from_vehicle[sightings.frame]) @ homographies
-    return apply_in_front(to_map, sightings.corners_pinhole_px), corners_vehicle
+    return ground_points(to_map, sightings.corners_pinhole_px), corners_vehicle
 
 
 def _inside_roi(

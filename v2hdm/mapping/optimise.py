@@ -13,15 +13,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from v2hdm.adjust import Problem, Solution, SolveOptions, Status, select_model
 from v2hdm.adjust.parts import adjust
 from v2hdm.association.ground import Located, Views, locate
 from v2hdm.association.groups import Association, attach, fuse_groups, in_view, merge_groups, same_groups
-from v2hdm.association.sightings import Rig, Sightings, build_rig
+from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.association.tracks import Uncertainty, build_tracks
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.geometry.ipm import extrinsic_from_ipm
+from v2hdm.geometry.tensors import extrinsic_from_ipm
 from v2hdm.mapping.bundle import (
     LEAST_OBSERVATIONS,
     VARIANCE_FACTORS,
@@ -272,11 +273,10 @@ class Optimiser:
 
 def initial_rig(cameras: Mapping[str, Camera], map_from_vehicle: FloatArray) -> Rig:
     """The extrinsics nearest to each camera's initial IPM, with the recorded poses (F, 4, 4)."""
-    start = {
-        name: extrinsic_from_ipm(camera.info, camera.ipm[camera.initial_ipm])
-        for name, camera in cameras.items()
-    }
-    return build_rig({name: camera.info for name, camera in cameras.items()}, start, map_from_vehicle)
+    intrinsic = np.stack([camera.info.intrinsic for camera in cameras.values()])
+    ipm = np.stack([camera.ipm[camera.initial_ipm] for camera in cameras.values()])
+    start = extrinsic_from_ipm(torch.tensor(intrinsic), torch.tensor(ipm)).numpy()
+    return Rig(intrinsic, start, map_from_vehicle)
 
 
 def _silent(step: str) -> None:

@@ -15,14 +15,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
+from v2hdm.association.ground import ground_points, ground_points_with_jacobian
 from v2hdm.association.sightings import Rig, frames_of
 from v2hdm.geometry.ipm import (
-    apply_in_front,
     direction_covariance,
     facing_ipm,
     flat_motion,
     ground_from_pinhole_px,
-    homography_jacobian,
 )
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import camera_centre
@@ -133,9 +132,9 @@ def collect_lane_points(
     image = np.array([i for i, _, _ in pieces])[piece]
     points_px = _undistort(drive, image, np.concatenate([points for _, _, points in pieces]))
     homographies = ground.map_from_pinhole_px[image]
-    points_map = apply_in_front(homographies, points_px[:, None])[:, 0]
+    points_map, jacobian = ground_points_with_jacobian(homographies, points_px[:, None])
+    points_map, jacobian = points_map[:, 0], jacobian[:, 0]
     tangent = _tangents(points_map, piece, length)
-    jacobian = homography_jacobian(homographies, points_px[:, None])[:, 0]
     centre = ground.centre_map[image]
     ray = points_map - centre[:, :2]
     covariance = _CENTRE_SIGMA_PX**2 * jacobian @ np.swapaxes(jacobian, 1, 2)
@@ -171,7 +170,7 @@ def _guides(
     line = np.repeat(np.arange(len(lines)), [len(points_px) for _, points_px in lines])
     image = image_of_line[line]
     points_px = _undistort(drive, image, np.concatenate([points_px for _, points_px in lines]))
-    points_map = apply_in_front(ground.map_from_pinhole_px[image], points_px[:, None])[:, 0]
+    points_map = ground_points(ground.map_from_pinhole_px[image], points_px[:, None])[:, 0]
     with np.errstate(invalid="ignore"):
         near = np.linalg.norm(points_map - ground.centre_map[image, :2], axis=1) <= max_range_m
     return Guides(points_map[near], line[near].astype(np.int64), image_of_line)

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from v2hdm.association.ground import Views, easy_views
-from v2hdm.association.sightings import Rig, Sightings, images_with_symbol
+from v2hdm.association.ground import Views, easy_views, images_with_symbol
+from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.errors import MappingError
 from v2hdm.geometry.planar import clip_convex, signed_area
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking

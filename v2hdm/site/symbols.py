@@ -18,8 +18,9 @@ from scipy.spatial import cKDTree
 from skimage.draw import polygon
 from skimage.measure import approximate_polygon, find_contours
 
+from v2hdm.association.ground import outlines_on_ground
 from v2hdm.association.options import LEAST_SIGHTINGS
-from v2hdm.association.sightings import Rig, Symbols, outlines_on_ground
+from v2hdm.association.sightings import Rig, Symbols
 from v2hdm.geometry.planar import signed_area
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import FloatArray, IntArray, Marking, Symbol
