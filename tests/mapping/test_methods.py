@@ -24,7 +24,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def results(scene: Scene) -> dict[str, MethodResult]:
-    return run_methods(scene.drive, scene.detections, ("front", "rear"), growth_steps=4)
+    return run_methods(scene.drive, scene.detections, ("front", "rear"))
 
 
 def match(hd_map: HdMap, truth: list[Marking], gate_m: float) -> tuple[list[tuple[int, int]], float]:
@@ -109,16 +109,6 @@ def test_each_exclusion_has_a_place_and_a_reason(results: dict[str, MethodResult
     for exclusion in results["Opt"].excluded:
         assert np.isfinite(exclusion.position_map).all()
         assert exclusion.reason
-
-
-def test_growth_ends_at_the_whole_map(results: dict[str, MethodResult]) -> None:
-    growth = results["Opt"].growth
-    counts = [len(step.markings) for step in growth]
-    assert counts == sorted(counts)
-    assert counts[0] == 2
-    ends = np.stack([marking.corners_map for marking in growth[-1].markings])
-    whole = np.stack([marking.corners_map for marking in results["Opt"].hd_map.markings])
-    np.testing.assert_array_equal(np.sort(ends, axis=0), np.sort(whole, axis=0))
 
 
 def test_lanes_follow_their_lines(scene: Scene, results: dict[str, MethodResult]) -> None:

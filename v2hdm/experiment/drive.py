@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from v2hdm.errors import AdjustError, MappingError
-from v2hdm.experiment.plan import OURS, PAPER, Job
+from v2hdm.experiment.plan import OURS, Job
 from v2hdm.experiment.residuals import residuals
 from v2hdm.experiment.stored import store, stored
 from v2hdm.geometry.ipm import extrinsic_from_ipm
@@ -41,8 +41,6 @@ Tell = Callable[[str, int, int], None]
 """Told a stage, and how many of its steps are done, of how many."""
 
 SETTING_FILE = "drive.json.gz"
-GROWTH_STEPS = 8
-"""Sizes of the growing map at which its error is told."""
 
 
 def setting_key(job: Job) -> str:
@@ -188,9 +186,8 @@ def _mapped(
     for done, (name, members) in enumerate(sets.items()):
         tell(f"map, {recipe}", done, len(sets))
         last = name == list(sets)[-1]
-        steps = GROWTH_STEPS if last and recipe != PAPER else 0
         try:
-            methods = run_methods(drive, detections, members, job.options[recipe], growth_steps=steps)
+            methods = run_methods(drive, detections, members, job.options[recipe])
         except (MappingError, AdjustError) as failure:
             out["failures"].append([name, str(failure)])
             continue
@@ -224,11 +221,11 @@ def _plain_map(markings: Sequence[Marking]) -> dict[str, Any]:
 def _growth(methods: Mapping[str, MethodResult], truth: Truth) -> dict[str, Any]:
     """Number of markings and corner RMSE (m) while the map grows, by method."""
     steps = methods["Opt"].growth
-    growth = {"Opt": growth_figures([HdMap(step.markings) for step in steps], truth)}
+    growth = {"Opt": growth_figures([HdMap(step) for step in steps], truth)}
     for name in NAIVE_IPMS:
         if name in methods:
             markings = methods[name].hd_map.markings
-            growth[name] = growth_figures([HdMap(markings[: len(step.markings)]) for step in steps], truth)
+            growth[name] = growth_figures([HdMap(markings[: len(step)]) for step in steps], truth)
     return growth
 
 

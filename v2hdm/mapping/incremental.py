@@ -26,7 +26,7 @@ from v2hdm.geometry.quadrilateral import align, diameters
 from v2hdm.mapping.bundle import Model, drive_problem
 from v2hdm.mapping.options import MappingOptions
 from v2hdm.mapping.stated import control_points, known_lengths
-from v2hdm.records import BoolArray, Camera, FloatArray, IntArray
+from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
 
 Link = Callable[[Rig, bool], tuple[Association, BoolArray]]
 """Tracks under a rig, coarse or not, and which corners (S, 4) may be used."""
@@ -40,6 +40,9 @@ _FIRST_LINK_MARKINGS = 12
 _LINK_GROWTH = 4
 """How many times as large the map is whenever all is linked and solved anew: over a drive that takes a third
 more than the last time alone."""
+
+_RECORD_GROWTH = 1.6
+"""How many times as large the map is whenever its markings are kept for the figure of its growth."""
 
 _LEAST_CORNERS = 3
 """Corners that fix a marking: all are parallelograms."""
@@ -114,7 +117,23 @@ class IncrementalMapper:
         self._sightings, self._link, self._solve, self._options = sightings, link, solve, options
         self._floor_m, self._model, self._first_rig = position_sigma_m, model, rig
         self._drive = drive_problem(sightings, rig, cameras, model)
+        self.growth: list[tuple[Marking, ...]] = []
+        self._record_at = 2
         self._begin(rig, 0)
+
+    def _record(self) -> None:
+        """Keep the whole markings of the map whenever it has grown by so much: how its error settles."""
+        if len(self._places) < max(self._record_at, self._known):
+            return
+        corners = [self._corners(marking) for marking in range(len(self._places))]
+        self.growth.append(
+            tuple(
+                Marking(self._sightings.kinds[place.kind], own, len(place.images))
+                for own, place in zip(corners, self._places, strict=True)
+                if np.isfinite(own).all()
+            )
+        )
+        self._record_at = int(np.ceil(_RECORD_GROWTH * len(self._places)))
 
     def run(self, progress: Callable[[str], None]) -> Grown:
         """Take up all tracks in the order in which they end.
@@ -182,6 +201,7 @@ class IncrementalMapper:
             marking, turn = self._same_as(track)
             if self._take(track, marking, turn):
                 number[own] = len(self._places) - 1 if marking is None else marking
+                self._record()
                 shift[own] = (shift[own] + turn) % 4
         return Association(number, shift, len(self._places)), ended
 

@@ -26,7 +26,6 @@ from v2hdm.io.maps.residuals import Residuals
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.conclude import Optimised
 from v2hdm.mapping.crew import ALONE, Crew
-from v2hdm.mapping.growth import grow_map
 from v2hdm.mapping.naive import naive_markings
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.recovery import Inputs, Outcome, optimise
@@ -179,7 +178,6 @@ def run_methods(
     cameras: Sequence[str],
     options: MappingOptions | None = None,
     progress: Progress | None = None,
-    growth_steps: int = 0,
     base: Base | None = None,
     grey: Callable[[Image], NDArray[np.float32]] | None = None,
     crew: Crew = ALONE,
@@ -192,7 +190,6 @@ def run_methods(
         cameras: Which cameras to map with, together.
         options: Settings of the mapping.
         progress: Called with the name of each step as it begins.
-        growth_steps: At how many sizes of the growing map ``Opt`` is solved again; 0 for none.
         base: An earlier map that ``Opt`` brings up to date; None where there is none.
         grey: Reads the grey values (H, W) of an image, to look where ``base`` has paint; None does without.
         crew: Who does what belongs to one visit of several.
@@ -218,10 +215,6 @@ def run_methods(
     begin_s = time.perf_counter()
     outcome, optimised = optimise(given, tell)
     optimal = _optimised_result(outcome, optimised, begin_s)
-    if growth_steps:
-        tell("growth of the map")
-        growth = grow_map(outcome.inputs.optimiser, optimised, growth_steps)
-        optimal = replace(optimal, growth=growth)
     if base is not None:
         tell("the earlier map")
         optimal = _brought_up_to_date(base, optimal, outcome, optimised, grey)
@@ -264,6 +257,7 @@ def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> Metho
 def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) -> MethodResult:
     inputs = outcome.inputs
     options, drive, cameras = inputs.options, inputs.drive, inputs.cameras
+    growth = inputs.optimiser.growth
     solution = optimised.bundle.solution
     if solution.status is not Status.CONVERGED:
         _log.warning(
@@ -296,6 +290,7 @@ def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) ->
         excluded=optimised.excluded,
         reprojection_rmse_px=optimised.reprojection_rmse_px,
         initial_reprojection_rmse_px=optimised.initial_reprojection_rmse_px,
+        growth=(*growth, optimised.markings) if growth else (),
         diagnostics={
             "observations": float(len(optimised.bundle.row)),
             "candidates": float(optimised.bundle.association.count),

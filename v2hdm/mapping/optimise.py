@@ -35,7 +35,7 @@ from v2hdm.mapping.conclude import Evidence, Optimised, conclude
 from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mapping.incremental import IncrementalMapper
 from v2hdm.mapping.options import AUTO, MappingOptions
-from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, PoseNoise, largest_noise
+from v2hdm.records import BoolArray, Camera, FloatArray, Marking, PoseNoise, largest_noise
 
 _log = logging.getLogger(__name__)
 
@@ -75,6 +75,7 @@ class Optimiser:
         self._pose_model = SETTLED_MODEL if options.pose_model == AUTO else options.pose_model
         self._variance_factor = 1.0
         self.held_out: Mapping[str, float] = {}
+        self.growth: tuple[tuple[Marking, ...], ...] = ()
         self.camera_names = sightings.cameras
         self.initial_rig = initial_rig(self._cameras, sightings.map_from_vehicle)
 
@@ -164,15 +165,10 @@ class Optimiser:
             coarse_model(self.initial_rig, self._noise_of_visits, self._options),
         )
         grown = mapper.run(progress or _silent)
+        self.growth = tuple(mapper.growth)
         bundle = self._solve(grown.association, grown.usable, grown.rig)
         self._reweigh(bundle)
         return bundle
-
-    def solve_groups(self, optimised: Optimised, groups: IntArray) -> Bundle:
-        """Solve with only some ``groups`` of a finished optimisation, from the initial extrinsics."""
-        association = optimised.bundle.association
-        chosen = np.isin(association.group, groups)
-        return self._solve(association, optimised.usable & chosen[:, None], self.initial_rig)
 
     def _locate(self, rig: Rig) -> Located:
         """Ground positions, restricted to the range within which observations are used."""

@@ -105,14 +105,6 @@ class SolveEvidence:
 
 
 @dataclass(frozen=True)
-class GrowthStep:
-    """The state after the first markings of a drive: their map and the extrinsics by camera."""
-
-    markings: tuple[Marking, ...]
-    cam_from_vehicle: Mapping[str, FloatArray]
-
-
-@dataclass(frozen=True)
 class AdjustedPoses:
     """The vehicle's poses at the images' times, as a solve has adjusted them.
 
@@ -163,7 +155,7 @@ class MethodResult:
     ``calibrations`` are per camera, empty where the method only has an IPM. ``reprojection_rmse_px``
     (and ``initial_reprojection_rmse_px``, under the extrinsic the optimisation started from) are
     over the same accepted corner observations; None for methods that do not reproject.
-    ``growth`` is how the result came about, marking by marking, where that was asked for;
+    ``growth`` are the maps after the first markings, in the incremental mode, the whole map last;
     ``diagnostics`` are named figures for the log and the report; ``certainty`` says of each camera
     in a sentence what the drive determined and what rests on the survey; ``evidence`` is what the checks
     after the solve rest on, ``poses`` the vehicle's poses as the solve has adjusted them, ``clocks`` of
@@ -179,7 +171,7 @@ class MethodResult:
     excluded: tuple[Exclusion, ...] = ()
     reprojection_rmse_px: float | None = None
     initial_reprojection_rmse_px: float | None = None
-    growth: tuple[GrowthStep, ...] = ()
+    growth: tuple[tuple[Marking, ...], ...] = ()
     diagnostics: Mapping[str, float] = field(default_factory=dict)
     certainty: Mapping[str, str] = field(default_factory=dict)
     evidence: SolveEvidence | None = None

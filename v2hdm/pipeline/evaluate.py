@@ -108,13 +108,15 @@ def _naive_under_true_extrinsic(
 
 
 def _growth(methods: Mapping[str, MethodResult], truth: Truth) -> dict[str, list[tuple[int, float]]]:
-    """Corner RMSE (m) over the first n markings, per method; only Opt solves anew at each n.
+    """Corner RMSE (m) over the first n markings per method, in the incremental mode; else empty.
 
-    The other methods keep a marking as it is once it has been passed, so their first n will do.
+    The naive methods keep a marking as it is once it has been passed, so their first n will do.
     """
     steps = methods["Opt"].growth
-    counts = [len(step.markings) for step in steps]
-    growth = {"Opt": growth_figures([HdMap(step.markings) for step in steps], truth)}
+    if not steps:
+        return {}
+    counts = [len(markings) for markings in steps]
+    growth = {"Opt": growth_figures([HdMap(markings) for markings in steps], truth)}
     for name, result in methods.items():
         if name != "Opt":
             growth[name] = growth_figures([HdMap(result.hd_map.markings[:n]) for n in counts], truth)
