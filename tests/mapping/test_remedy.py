@@ -9,7 +9,7 @@ import pytest
 
 from tests.mapping.scene import Scene, SceneOptions, make_scene
 from v2hdm.adjust import Fault
-from v2hdm.io.drive.trajectory import interpolate
+from v2hdm.geometry.trajectory import interpolate
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions, SizeOptions, SurveyOptions
 from v2hdm.mapping.recovery import Inputs

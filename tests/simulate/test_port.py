@@ -5,7 +5,7 @@ from tests.simulate.conftest import FRONT, tiny_port
 from v2hdm.errors import ConfigError
 from v2hdm.geometry.ipm import apply_homography, ipm_from_extrinsic, project_ground
 from v2hdm.geometry.lens import distort_points
-from v2hdm.io.drive.trajectory import interpolate
+from v2hdm.geometry.trajectory import interpolate
 from v2hdm.records import DIAMOND, LANE_DASH, CameraInfo
 from v2hdm.simulate.port.build import Port, build_port
 from v2hdm.simulate.port.calibration import calibrate, cam_from_vehicle, camera_info

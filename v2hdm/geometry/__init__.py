@@ -2,8 +2,9 @@
 
 Modules: :mod:`~v2hdm.geometry.rigid` (rigid motions), :mod:`~v2hdm.geometry.lens` (distortion),
 :mod:`~v2hdm.geometry.ipm` (the camera and the ground plane), :mod:`~v2hdm.geometry.planar` (polygons),
-:mod:`~v2hdm.geometry.quadrilateral` (markings of four corners). :mod:`~v2hdm.geometry.tensors` is their
-differentiable twin in torch and kornia; nothing that runs on the vehicle imports it.
+:mod:`~v2hdm.geometry.quadrilateral` (markings of four corners), :mod:`~v2hdm.geometry.trajectory` (poses at any
+time). :mod:`~v2hdm.geometry.tensors` has what the mapping and the adjustment need of it in torch and kornia;
+nothing that runs on the vehicle imports it.
 
 Frames
     - ``map``: local east-north-up, metres, z up, the ground near z = 0, origin near the site (ROS

@@ -19,7 +19,7 @@ from v2hdm.association.ground import views_of
 from v2hdm.association.groups import Association
 from v2hdm.association.sightings import Sightings, collect_sightings
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.io.drive.clock import with_clock_offsets
+from v2hdm.geometry.trajectory import with_clock_offsets
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.conclude import Optimised
 from v2hdm.mapping.crew import ALONE, Crew

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from v2hdm.io.drive.trajectory import interpolate
+from v2hdm.geometry.trajectory import interpolate
 from v2hdm.io.drive.tum import write_tum
 from v2hdm.mapping.results import AdjustedPoses
 from v2hdm.records import Drive, FloatArray, Trajectory, Visit

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from v2hdm.errors import DriveError
-from v2hdm.io.drive.clock import with_clock_offsets
+from v2hdm.geometry.trajectory import with_clock_offsets
 from v2hdm.io.drive.folder import (
     folder_drive_name,
     is_folder_drive,

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from v2hdm.errors import DriveError
-from v2hdm.io.drive.trajectory import interpolate
+from v2hdm.geometry.trajectory import interpolate
 from v2hdm.io.importers.stamp_units import why_no_pose
 from v2hdm.io.pixels import read_header
 from v2hdm.records import Camera, FloatArray, Image, Trajectory

@@ -18,7 +18,7 @@ from v2hdm.errors import DriveError
 from v2hdm.geometry.geodetic import enu_axes, enu_from_geodetic
 from v2hdm.geometry.ipm import extrinsic_from_ipm
 from v2hdm.geometry.rigid import camera_centre, log
-from v2hdm.io.drive.clock import in_order
+from v2hdm.geometry.trajectory import in_order
 from v2hdm.records import (
     Camera,
     CameraInfo,

@@ -13,8 +13,8 @@ import numpy as np
 
 from v2hdm.errors import MapFileError
 from v2hdm.geometry.rigid import inverse
+from v2hdm.geometry.trajectory import interpolate
 from v2hdm.io.calibration.document import read_calibration
-from v2hdm.io.drive.trajectory import interpolate
 from v2hdm.io.drive.truth import read_truth
 from v2hdm.io.drive.tum import read_tum
 from v2hdm.io.maps.exclusions import ExcludedMarking, read_exclusions

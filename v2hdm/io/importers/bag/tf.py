@@ -10,7 +10,7 @@ import numpy as np
 
 from v2hdm.errors import DriveError
 from v2hdm.geometry.rigid import inverse, rotation_from_quaternion
-from v2hdm.io.drive.trajectory import interpolate
+from v2hdm.geometry.trajectory import interpolate
 from v2hdm.io.importers.poses.rising import in_order
 from v2hdm.records import FloatArray, Trajectory
 

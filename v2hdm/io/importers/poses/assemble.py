@@ -24,7 +24,8 @@ from v2hdm.geometry.geodetic import (
     is_geographic,
 )
 from v2hdm.geometry.rigid import rotation_from_euler
-from v2hdm.io.drive.trajectory import check_geodetic, interpolate
+from v2hdm.geometry.trajectory import interpolate
+from v2hdm.io.drive.trajectory import check_geodetic
 from v2hdm.io.importers.poses.readings import Readings
 from v2hdm.io.importers.poses.settings import PoseSettings
 from v2hdm.io.importers.stamp_units import why_no_pose
