@@ -13,8 +13,8 @@ from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.mapping.bundle import Bundle
 from v2hdm.records import BoolArray, Calibration, Camera, FloatArray, IntArray, Marking
-from v2hdm.site.candidates import Exclusion, Places, with_shared_errors
-from v2hdm.site.markings import Seen, judge, with_relative_sigma
+from v2hdm.site.candidates import Candidates, Exclusion, with_shared_errors
+from v2hdm.site.markings import Support, classify, with_relative_sigma
 from v2hdm.site.options import AcceptanceOptions
 
 
@@ -76,7 +76,7 @@ def conclude(
         MappingError: No candidate is accepted.
     """
     final, ungated = evidence.final, evidence.ungated
-    seen = Seen(
+    seen = Support(
         kind=group_kinds(final.association, evidence.sightings),
         sightings=evidence.sightings,
         rig=final.rig,
@@ -89,30 +89,30 @@ def conclude(
     located = locate(evidence.sightings, final.rig)
     located.informs[:] &= evidence.usable
     fused = fuse_groups(final.association, located, jitter_rad=0.0)
-    judged = judge(with_shared_errors(solved_places(final), fused), seen, options)
+    classified = classify(with_shared_errors(solved_candidates(final), fused), seen, options)
     scale = max(1.0, final.solution.chi2_per_dof)
     markings = with_relative_sigma(
-        judged.markings(),
-        final.corner_index[judged.accepted],
+        classified.markings(),
+        final.corner_index[classified.accepted],
         lambda pairs: scale * final.solution.corner_covariance(pairs),
     )
     own_corner = final.association.corner_order()[final.row, final.corner]
-    used = np.isin(final.group, judged.accepted) & evidence.sightings.valid[final.row, own_corner]
+    used = np.isin(final.group, classified.accepted) & evidence.sightings.valid[final.row, own_corner]
     observed = Observed(final.row, final.group, final.corner)
     at_start = residuals_under(initial_rig, evidence.sightings, final.association, observed, jitter_rad)
     return Optimised(
         bundle=final,
         usable=evidence.usable,
-        groups=judged.accepted,
+        groups=classified.accepted,
         markings=markings,
-        excluded=judged.exclusions(),
+        excluded=classified.exclusions(),
         calibrations=_calibrations(final, evidence.sightings.cameras, evidence.cameras),
         reprojection_rmse_px=root_mean_square(final.solution.residual_px[used]),
         initial_reprojection_rmse_px=root_mean_square(at_start[used]),
     )
 
 
-def solved_places(bundle: Bundle) -> Places:
+def solved_candidates(bundle: Bundle) -> Candidates:
     """The corners of every group of ``bundle``.
 
     Covariances are scaled by chi^2 per degree of freedom where that exceeds one: residuals larger
@@ -130,7 +130,7 @@ def solved_places(bundle: Bundle) -> Places:
         rows = (2 * corner[..., None] + np.arange(2)).reshape(len(groups), -1)
         blocks = scale * bundle.solution.corner_covariance(indices)
         covariance[groups[:, None, None], rows[:, :, None], rows[:, None, :]] = blocks
-    return Places.seen(bundle.corners_map, covariance)
+    return Candidates.seen(bundle.corners_map, covariance)
 
 
 def _calibrations(

@@ -205,21 +205,21 @@ def run_methods(
     check_options(options)
     if options.survey.file is not None:
         raise ConfigError(f"mapping.survey.file is {options.survey.file!r}: read it first, give its points")
-    tell = progress or _silent
-    tell("linking sightings")
+    report = progress or _silent
+    report("linking sightings")
     given = Inputs(drive, detections, cameras, options, crew)
     results: dict[str, MethodResult] = {}
     for name, ipm in _given_ipms(drive, cameras).items():
-        tell(name)
+        report(name)
         results[name] = run_naive(name, given, ipm)
     begin_s = time.perf_counter()
-    outcome, optimised = optimise(given, tell)
+    outcome, optimised = optimise(given, report)
     optimal = _optimised_result(outcome, optimised, begin_s)
     if base is not None:
-        tell("the earlier map")
+        report("the earlier map")
         optimal = _brought_up_to_date(base, optimal, outcome, optimised, grey)
     results["Opt"] = optimal
-    tell("ONI")
+    report("ONI")
     found = optimal.calibrations
     ipm_found = {c: ipm_from_extrinsic(found[c].info, found[c].cam_from_vehicle) for c in cameras}
     results["ONI"] = replace(run_naive("ONI", outcome.inputs, ipm_found), calibrations=found)

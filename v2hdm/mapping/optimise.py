@@ -95,11 +95,11 @@ class Optimiser:
 
     def settle(self, tracks: Association, progress: Callable[[str], None] | None = None) -> Bundle:
         """Associate and solve by turns, until it is settled which sightings are of one marking."""
-        tell = progress or _silent
-        tell("coarse solve")
+        report = progress or _silent
+        report("coarse solve")
         bundle = self._solve_steep(tracks)
         for number in range(1, self._options.rounds + 1):
-            tell(f"joint solve {number}")
+            report(f"joint solve {number}")
             association = self._associate(bundle.rig)
             # The coarse solve takes the poses at their word, which no test of the inputs may rest on.
             if number > 1 and same_groups(association, bundle.association):
@@ -110,11 +110,11 @@ class Optimiser:
 
     def finish(self, bundle: Bundle, progress: Callable[[str], None] | None = None) -> Optimised:
         """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude."""
-        tell = progress or _silent
+        report = progress or _silent
         if self._options.pose_model == AUTO:
-            tell("choice of the pose model")
+            report("choice of the pose model")
             self._pose_model = self._choose_pose_model(bundle)
-        tell("final solve")
+        report("final solve")
         usable, inlier = self._gate(bundle)
         final = self._solve(bundle.association, usable, bundle.rig)
         return conclude(
@@ -239,7 +239,7 @@ class Optimiser:
         """Take the observations for as good as their residuals under ``bundle`` say.
 
         How well the poses are known is on the receiver's data sheet; how well corners are found in this
-        light, on this paint, under what is left of the lens's distortion, only the drive itself can tell.
+        light, on this paint, under what is left of the lens's distortion, only the drive itself can report.
         """
         if len(bundle.row) >= LEAST_OBSERVATIONS:
             factor = self._variance_factor * bundle.solution.observation_factor

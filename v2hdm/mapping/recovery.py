@@ -55,7 +55,7 @@ LEAST_VALUE: Mapping[Fault, float] = {
 }
 """Below this, in the fault's unit, an input is as good as a drive needs it, however sure the drive is."""
 
-TOLD_SIGMA: Mapping[Fault, float] = {
+OBSERVABLE_SIGMA: Mapping[Fault, float] = {
     Fault.CLOCK: 0.02,
     Fault.FOCAL: 0.01,
     Fault.DISTORTION: 0.02,
@@ -77,10 +77,10 @@ AMBIGUOUS_SHARE = 0.8
 """Share of its sigmas from which a fault of one camera may be the other's: a straight road at constant
 speed tells the distance of two centres, or the difference of two clocks, alone."""
 
-CLOCK_TOLD_S = 0.004
+CLOCK_OBSERVABLE_S = 0.004
 """Sigma of a clock offset, s, up to which it is put right: two of them are 8 ms."""
 
-CENTRE_TOLD_M = 0.1
+CENTRE_OBSERVABLE_M = 0.1
 """Sigma of a centre, m, up to which the drive can do without its survey: it moves the whole map."""
 
 MOST_CORRECTIONS = 4
@@ -127,7 +127,7 @@ class Outcome:
     evidence: SolveEvidence
 
 
-def optimise(inputs: Inputs, tell: Callable[[str], None]) -> tuple[Outcome, Optimised]:
+def optimise(inputs: Inputs, report: Callable[[str], None]) -> tuple[Outcome, Optimised]:
     """Optimise a drive, as often as inputs have to be dropped.
 
     Raises:
@@ -138,16 +138,16 @@ def optimise(inputs: Inputs, tell: Callable[[str], None]) -> tuple[Outcome, Opti
     while True:
         optimiser, drive = inputs.optimiser, inputs.drive
         if inputs.options.mode == INCREMENTAL:
-            settled = optimiser.grow(tell)
+            settled = optimiser.grow(report)
         else:
-            settled = optimiser.settle(inputs.tracks, tell)
-        tell("tests of the inputs")
+            settled = optimiser.settle(inputs.tracks, report)
+        report("tests of the inputs")
         found = _suspects(settled, drive)
         worst = next((one for one in found if is_contradicted(one)), None)
-        remedied = None
+        corrected_inputs = None
         if worst is not None and len(corrected) < MOST_CORRECTIONS and not _is_ambiguous(worst, found):
-            remedied = _remedied(inputs, worst, settled)
-        if worst is None or remedied is None:
+            corrected_inputs = _recovered(inputs, worst, settled)
+        if worst is None or corrected_inputs is None:
             break
         told = contradictions(settled, (worst,), visit_names(drive))[0]
         whose, about = " and ".join(told.cameras), f" {told.about}" if told.about else ""
@@ -157,8 +157,8 @@ def optimise(inputs: Inputs, tell: Callable[[str], None]) -> tuple[Outcome, Opti
             told.fault.unit,
         )  # fmt: skip
         corrected.append(told)
-        inputs = remedied
-    optimised = optimiser.finish(settled, tell)
+        inputs = corrected_inputs
+    optimised = optimiser.finish(settled, report)
     corrected = [_as_solved(one, settled) for one in corrected if _is_of_the_map(one, survey, optimised)]
     suspected = contradictions(settled, found, visit_names(drive))
     evidence = _evidence(settled, suspected, corrected, optimiser, optimised.bundle, inputs.sightings)
@@ -252,8 +252,8 @@ def _is_ambiguous(worst: Suspect, found: Sequence[Suspect]) -> bool:
 
 
 def is_contradicted(one: Suspect | Contradiction) -> bool:
-    """Whether an input is off by more than chance and by more than matters, and this drive can tell."""
-    told = one.sigma <= TOLD_SIGMA[one.fault]
+    """Whether an input is off by more than chance and by more than matters, and this drive can report."""
+    told = one.sigma <= OBSERVABLE_SIGMA[one.fault]
     return told and one.sigmas > CONTRADICTED_SIGMAS and abs(one.value) > LEAST_VALUE[one.fault]
 
 
@@ -268,14 +268,14 @@ def _clocks(bundle: Bundle) -> tuple[dict[str, tuple[float, float]], ...]:
     )
 
 
-def _remedied(inputs: Inputs, worst: Suspect, settled: Bundle) -> Inputs | None:
+def _recovered(inputs: Inputs, worst: Suspect, settled: Bundle) -> Inputs | None:
     """The inputs without what ``worst`` says is wrong; None where the drive cannot do without."""
     if worst.fault is Fault.CLOCK:
-        if worst.sigma > CLOCK_TOLD_S:
+        if worst.sigma > CLOCK_OBSERVABLE_S:
             return None
         return _with_clocks(inputs, inputs.optimiser.clock_offsets_s(settled))
     if worst.fault in (Fault.SURVEY, Fault.LEVER):
-        if worst.sigma > CENTRE_TOLD_M:
+        if worst.sigma > CENTRE_OBSERVABLE_M:
             return None
         names = tuple(settled.camera_index)
         return _without_axis(inputs, names if worst.camera < 0 else (names[worst.camera],), worst.axis)

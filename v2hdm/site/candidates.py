@@ -22,8 +22,8 @@ _KNOWN_SIGMA_M = 0.5
 
 
 @dataclass(frozen=True)
-class Places:
-    """Corners ``corners_map`` (G, 4, 2), m, of G places and their joint covariances (G, 8, 8), m^2.
+class Candidates:
+    """Corners ``corners_map`` (G, 4, 2), m, of G candidates and their joint covariances (G, 8, 8), m^2.
 
     A corner that was not seen has the variance :data:`UNSEEN_M2` and lies anywhere near the others.
     """
@@ -32,8 +32,8 @@ class Places:
     covariance_m2: FloatArray
 
     @classmethod
-    def seen(cls, corners_map: FloatArray, covariance_m2: FloatArray) -> Places:
-        """Places of corners (G, 4, 2) and covariances (G, 8, 8) that are nan where a corner was not seen."""
+    def seen(cls, corners_map: FloatArray, covariance_m2: FloatArray) -> Candidates:
+        """Candidates of corners (G, 4, 2) and covariances (G, 8, 8) that are nan where a corner was not seen."""
         unseen = np.asarray(np.isnan(corners_map).any(axis=2))
         count = np.maximum((~unseen).sum(axis=1), 1)
         centre = np.where(unseen[..., None], 0.0, corners_map).sum(axis=1) / count[:, None]
@@ -44,9 +44,9 @@ class Places:
     def __len__(self) -> int:
         return len(self.corners_map)
 
-    def subset(self, rows: IntArray | BoolArray) -> Places:
-        """The places at ``rows``."""
-        return Places(self.corners_map[rows], self.covariance_m2[rows])
+    def subset(self, rows: IntArray | BoolArray) -> Candidates:
+        """The candidates at ``rows``."""
+        return Candidates(self.corners_map[rows], self.covariance_m2[rows])
 
     @property
     def sigma_m(self) -> FloatArray:
@@ -62,10 +62,10 @@ class Places:
 
 @dataclass(frozen=True)
 class Counts:
-    """How often G places were seen, each (G,).
+    """How often G candidates were seen, each (G,).
 
     ``images`` with accepted observations of it; ``observations`` of its corners, of which so many are
-    ``agreeing`` with the joint solution; ``easy_views``, images that had the whole place in easy view, and
+    ``agreeing`` with the joint solution; ``easy_views``, images that had the whole candidate in easy view, and
     ``found``, those among them that it was found in; ``as_symbol``, images in which a symbol
     lies on it.
     """
@@ -78,7 +78,7 @@ class Counts:
     as_symbol: IntArray
 
     def subset(self, rows: IntArray | BoolArray) -> Counts:
-        """Those of the places at ``rows``."""
+        """Those of the candidates at ``rows``."""
         return Counts(*(values[rows] for values in vars(self).values()))
 
 
@@ -92,15 +92,15 @@ class Exclusion:
     reason: str
 
 
-def with_shared_errors(places: Places, fused: FusedGroups) -> Places:
-    """The places, with the errors that all images of a corner share.
+def with_shared_errors(candidates: Candidates, fused: FusedGroups) -> Candidates:
+    """The candidates, with the errors that all images of a corner share.
 
     A worn end, the edge of a shadow and that of other paint stay where they are on the ground. Of errors that
     are correlated by r, n images have a mean of the variance (1 + (n - 1) r) / n (Kish, Survey Sampling,
     1965): about r times that of a single image beside what the adjustment says.
 
     Args:
-        places: (G,) as solved.
+        candidates: (G,) as solved.
         fused: the same corners by their images' own covariances.
     """
     single = np.maximum(fused.seen, 1)[..., None, None] * fused.covariance_m2
@@ -109,4 +109,4 @@ def with_shared_errors(places: Places, fused: FusedGroups) -> Places:
     # Images that are cut alike are wrong alike, so that no number of them says where a corner lies.
     no_point = (fused.seen == 0) & ~unseen[..., 0, 0]
     shared[no_point] = line_only(shared[no_point], UNSEEN_M2**0.5)
-    return Places(places.corners_map, places.covariance_m2 + block_diagonal(shared))
+    return Candidates(candidates.corners_map, candidates.covariance_m2 + block_diagonal(shared))

@@ -1,4 +1,4 @@
-"""Which places become markings of the map, and why the others do not.
+"""Which candidates become markings of the map, and why the others do not.
 
 How sure a marking is beside its neighbours, whatever drift or survey moves all of them alike.
 """
@@ -16,7 +16,7 @@ from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.errors import MappingError
 from v2hdm.geometry.planar import clip_convex, signed_area
 from v2hdm.records import BoolArray, Camera, FloatArray, IntArray, Marking
-from v2hdm.site.candidates import Counts, Exclusion, Places
+from v2hdm.site.candidates import Candidates, Counts, Exclusion
 from v2hdm.site.options import AcceptanceOptions
 from v2hdm.site.posterior import CLUTTER, PART_OF_SYMBOL, Posterior, posterior
 
@@ -37,11 +37,11 @@ _MAX_OVERLAP = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
-class Seen:
-    """What was seen of G places, and under which rig.
+class Support:
+    """What was seen of G candidates, and under which rig.
 
     ``kind`` (G,) is the class of each as an index into ``sightings.kinds``. Observation k
-    is one of row ``row`` (K,) of the sightings and of place ``group`` (K,), and has been ``accepted`` (K,) or
+    is one of row ``row`` (K,) of the sightings and of candidate ``group`` (K,), and has been ``accepted`` (K,) or
     not. ``cameras`` are in the rig's order.
     """
 
@@ -55,11 +55,11 @@ class Seen:
     accepted: BoolArray
 
     def names(self) -> tuple[str, ...]:
-        """The class of each place."""
+        """The class of each candidate."""
         return tuple(self.sightings.kinds[kind] for kind in self.kind)
 
     def counts(self, corners_map: FloatArray) -> Counts:
-        """How often places of corners (G, 4, 2) were seen."""
+        """How often candidates of corners (G, 4, 2) were seen."""
         count = len(self.kind)
         group, image = self.group[self.accepted], self.sightings.image[self.row[self.accepted]]
         shown = np.unique(np.stack([group, image]), axis=1)
@@ -76,21 +76,21 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Judged:
-    """G places, and of each the reason why it is no marking of the map, None if it is one."""
+class Classified:
+    """G candidates, and of each the reason why it is no marking of the map, None if it is one."""
 
     kind: tuple[str, ...]
-    places: Places
+    candidates: Candidates
     images: IntArray
     verdict: list[str | None]
 
     @property
     def accepted(self) -> IntArray:
-        """The places that are markings of the map."""
+        """The candidates that are markings of the map."""
         return np.flatnonzero([reason is None for reason in self.verdict])
 
     def markings(self) -> tuple[Marking, ...]:
-        """The markings of the map, one for each accepted place.
+        """The markings of the map, one for each accepted candidate.
 
         Raises:
             MappingError: There is none.
@@ -100,46 +100,48 @@ class Judged:
         return tuple(
             Marking(
                 kind=self.kind[group],
-                corners_map=self.places.corners_map[group],
+                corners_map=self.candidates.corners_map[group],
                 sightings=int(self.images[group]),
-                covariance_m2=self.places.covariance_m2[group],
+                covariance_m2=self.candidates.covariance_m2[group],
             )
             for group in self.accepted
         )
 
     def exclusions(self) -> tuple[Exclusion, ...]:
-        """What was refused and why; places without a single solved corner were never candidates."""
+        """What was refused and why; candidates without a single solved corner were never candidates."""
         return tuple(
             Exclusion(
                 kind=self.kind[group],
-                position_map=self.places.corners_map[group].mean(axis=0),
+                position_map=self.candidates.corners_map[group].mean(axis=0),
                 sightings=int(self.images[group]),
                 reason=reason,
             )
             for group, reason in enumerate(self.verdict)
-            if reason is not None and np.isfinite(self.places.corners_map[group]).all() and self.images[group]
+            if reason is not None
+            and np.isfinite(self.candidates.corners_map[group]).all()
+            and self.images[group]
         )
 
 
-def judge(solved: Places, seen: Seen, options: AcceptanceOptions) -> Judged:
-    """Decide which of the ``solved`` places are markings of the map, and where their corners are."""
+def classify(solved: Candidates, seen: Support, options: AcceptanceOptions) -> Classified:
+    """Decide which of the ``solved`` candidates are markings of the map, and where their corners are."""
     counts = seen.counts(np.where(solved.known[..., None], solved.corners_map, np.nan))
     first = posterior(solved, seen.kind, counts)
-    # Of a place that lacked a corner the class's shape now says where it should have been seen.
-    counts = seen.counts(first.places.corners_map)
+    # Of a candidate that lacked a corner the class's shape now says where it should have been seen.
+    counts = seen.counts(first.candidates.corners_map)
     found = posterior(solved, seen.kind, counts)
     least = np.log(options.min_probability / (1 - options.min_probability))
     verdict: list[str | None] = [
         None if odds >= least else _reason(found, group) for group, odds in enumerate(found.log_odds)
     ]
-    sigma_m, seen_corners = found.places.sigma_m.max(axis=1), solved.known.sum(axis=1)
+    sigma_m, seen_corners = found.candidates.sigma_m.max(axis=1), solved.known.sum(axis=1)
     # What even the best one has is shared by all: a shift of the whole map speaks against no marking.
     uncertain = sigma_m**2 > np.min(sigma_m, initial=np.inf) ** 2 + options.max_sigma_m**2
     for group in np.flatnonzero(uncertain):
         verdict[group] = TOO_UNCERTAIN if seen_corners[group] == 4 else LACKS_A_CORNER
     for group in _covered(found, np.flatnonzero([reason is None for reason in verdict])):
         verdict[group] = COVERED
-    return Judged(seen.names(), found.places, counts.images, verdict)
+    return Classified(seen.names(), found.candidates, counts.images, verdict)
 
 
 def _reason(found: Posterior, group: int) -> str:
@@ -150,10 +152,10 @@ def _reason(found: Posterior, group: int) -> str:
 
 
 def _covered(found: Posterior, standing: IntArray) -> IntArray:
-    """Those of the places ``standing`` that overlap another one of better odds."""
+    """Those of the candidates ``standing`` that overlap another one of better odds."""
     if len(standing) < 2:
         return np.zeros(0, dtype=np.int64)
-    corners, odds = found.places.corners_map, found.log_odds
+    corners, odds = found.candidates.corners_map, found.log_odds
     centres = corners[standing].mean(axis=1)
     reach_m = 2 * float(np.max(np.linalg.norm(corners[standing] - centres[:, None], axis=2)))
     pairs = standing[cKDTree(centres).query_pairs(reach_m, output_type="ndarray")].reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""The posterior of a place: a marking of its class, of a shape of its own, part of a symbol, or clutter.
+"""The posterior of a candidate: a marking of its class, of a shape of its own, part of a symbol, or clutter.
 
 A hypothesis says how the painted corners scatter about a laid shape (covariance N), and how the solved
 corners scatter about the painted ones: P of the adjustment, and O for edges that all images misplace alike.
@@ -20,7 +20,7 @@ from scipy.special import betaln, logsumexp
 from scipy.stats import norm
 
 from v2hdm.records import BoolArray, FloatArray, IntArray
-from v2hdm.site.candidates import Counts, Places
+from v2hdm.site.candidates import Candidates, Counts
 from v2hdm.site.shapes import (
     SHAPE_SIGMA_M,
     Laid,
@@ -33,10 +33,10 @@ from v2hdm.site.shapes import (
 )
 
 OF_CLASS, OTHER_LENGTH, WRONG_END, WRONG_CORNER, OWN_SHAPE, PART_OF_SYMBOL, CLUTTER = range(7)
-"""What a place may be: the first five are markings."""
+"""What a candidate may be: the first five are markings."""
 
 _PRIOR_COUNT = np.array([14.0, 0.5, 0.5, 0.5, 2.0, 1.0, 1.5])
-"""Dirichlet prior: about how many of twenty places of a class are what, before the drive says."""
+"""Dirichlet prior: about how many of twenty candidates of a class are what, before the drive says."""
 
 _SIZE_SIGMA_M = 1.0
 """Sigma of a side, m, where a marking has a size of its own: any paint on a road is within it."""
@@ -94,39 +94,39 @@ _OWN_SIZE = _SIZE_SIGMA_M**2 * np.kron(np.outer(_FIRST, _FIRST) + np.outer(_SECO
 
 @dataclass(frozen=True)
 class Posterior:
-    """What is known of G places.
+    """What is known of G candidates.
 
-    ``probability`` (G, 7) of each kind; ``log_odds`` (G,) of being a marking; ``places`` are the corners of
+    ``probability`` (G, 7) of each kind; ``log_odds`` (G,) of being a marking; ``candidates`` are the corners of
     what is one. ``evidence`` (G, 4) speaks for a marking and against clutter, in nats: the shape, how many
     images show it, how many of its easy views, and how well they agree.
     """
 
     probability: FloatArray
     log_odds: FloatArray
-    places: Places
+    candidates: Candidates
     evidence: FloatArray
 
 
-def posterior(places: Places, kind: IntArray, counts: Counts) -> Posterior:
-    """What G places of classes ``kind`` (G,) are, given where and how often they were seen."""
-    total = len(places)
+def posterior(candidates: Candidates, kind: IntArray, counts: Counts) -> Posterior:
+    """What G candidates of classes ``kind`` (G,) are, given where and how often they were seen."""
+    total = len(candidates)
     probability, log_odds, evidence = np.zeros((total, 7)), np.zeros(total), np.zeros((total, 4))
-    corners, covariance = places.corners_map.copy(), places.covariance_m2.copy()
+    corners, covariance = candidates.corners_map.copy(), candidates.covariance_m2.copy()
     for one in np.unique(kind):
         own = np.flatnonzero(kind == one)
-        found = _of_class(places.subset(own), counts.subset(own))
+        found = _of_class(candidates.subset(own), counts.subset(own))
         probability[own], log_odds[own], evidence[own] = found.probability, found.log_odds, found.evidence
-        corners[own], covariance[own] = found.places.corners_map, found.places.covariance_m2
-    return Posterior(probability, log_odds, Places(corners, covariance), evidence)
+        corners[own], covariance[own] = found.candidates.corners_map, found.candidates.covariance_m2
+    return Posterior(probability, log_odds, Candidates(corners, covariance), evidence)
 
 
-def _of_class(places: Places, counts: Counts) -> Posterior:
-    """The posterior of the places of one class, which together say what its markings are like."""
+def _of_class(candidates: Candidates, counts: Counts) -> Posterior:
+    """The posterior of the candidates of one class, which together say what its markings are like."""
     share, paint = _PRIOR_COUNT / _PRIOR_COUNT.sum(), learn_paint_error([], [])
-    weight = _weight_before(places, counts)
+    weight = _weight_before(candidates, counts)
     for _ in range(_PASSES):
-        shapes = learn_shapes(places.subset(weight > 0.5))
-        hypotheses = _hypotheses(places, shapes, share, paint)
+        shapes = learn_shapes(candidates.subset(weight > 0.5))
+        hypotheses = _hypotheses(candidates, shapes, share, paint)
         by_kind, sources = np.array([one.kind for one in hypotheses]), _counted(counts, weight)
         shaped = np.stack([one.log_likelihood for one in hypotheses])
         joint = shaped + np.array([one.log_prior for one in hypotheses])[:, None]
@@ -136,7 +136,7 @@ def _of_class(places: Places, counts: Counts) -> Posterior:
         weight = probability[:, :PART_OF_SYMBOL].sum(axis=1)
         share = _PRIOR_COUNT + probability.sum(axis=0)
         share /= share.sum()
-        paint = _paint_error(hypotheses, each, np.asarray(places.known.all(axis=1)))
+        paint = _paint_error(hypotheses, each, np.asarray(candidates.known.all(axis=1)))
     marking = by_kind < PART_OF_SYMBOL
     log_odds = logsumexp(joint[marking], axis=0) - logsumexp(joint[~marking], axis=0)
     by_shape = shaped[marking].max(axis=0) - shaped[by_kind == CLUTTER][0]
@@ -144,10 +144,10 @@ def _of_class(places: Places, counts: Counts) -> Posterior:
     return Posterior(probability, log_odds, _mixture(hypotheses, joint, paint), evidence)
 
 
-def _weight_before(places: Places, counts: Counts) -> FloatArray:
-    """Which places (N,) are taken for markings before anything is known of their class."""
+def _weight_before(candidates: Candidates, counts: Counts) -> FloatArray:
+    """Which candidates (N,) are taken for markings before anything is known of their class."""
     return np.asarray(
-        places.known.all(axis=1) & (2 * counts.agreeing > counts.observations), dtype=np.float64
+        candidates.known.all(axis=1) & (2 * counts.agreeing > counts.observations), dtype=np.float64
     )
 
 
@@ -197,7 +197,7 @@ def _rates(found: IntArray, easy_views: IntArray, hits: float, misses: float) ->
 
 @dataclass(frozen=True)
 class _Hypothesis:
-    """One hypothesis on N ``places``.
+    """One hypothesis on N ``candidates``.
 
     In the ``directions`` (N, 5, 8) the solved corners deviate by ``residual`` (N, 5) from where a shape was
     laid, the painted ones by ``scatter`` (..., 8, 8); all images may misplace these by ``misplaced``
@@ -206,7 +206,7 @@ class _Hypothesis:
 
     kind: int
     log_prior: float
-    places: Places
+    candidates: Candidates
     directions: FloatArray
     residual: FloatArray
     scatter: FloatArray
@@ -217,7 +217,7 @@ class _Hypothesis:
     @cached_property
     def formal(self) -> FloatArray:
         """Covariance (N, 5, 5) of the residual by that of the solved corners alone."""
-        return _within(self.directions, self.places.covariance_m2)
+        return _within(self.directions, self.candidates.covariance_m2)
 
     @property
     def log_likelihood(self) -> FloatArray:
@@ -234,9 +234,9 @@ class _Hypothesis:
         held = np.sum(moved * np.linalg.solve(innovation, moved[..., None])[..., 0], axis=1)
         return np.asarray(both_ways + norm.logcdf(mean / np.sqrt(np.maximum(1 - held, 1e-9))) + np.log(2))
 
-    def corners(self, paint_m2: FloatArray) -> Places:
+    def corners(self, paint_m2: FloatArray) -> Candidates:
         """The corners under the hypothesis (a Kalman update), where edges err by ``paint_m2`` (N,)."""
-        covariance = self.places.covariance_m2 + self.misplaced + paint_m2[:, None, None] * np.eye(8)
+        covariance = self.candidates.covariance_m2 + self.misplaced + paint_m2[:, None, None] * np.eye(8)
         noise = _within(self.directions, self.scatter)
         seen = self.directions @ covariance
         innovation = seen @ np.swapaxes(self.directions, 1, 2) + noise
@@ -244,8 +244,8 @@ class _Hypothesis:
         # Joseph's form: a sum of squares, so that what is nearly known keeps its small variance.
         left = np.eye(8) - gain @ self.directions
         after = left @ covariance @ np.swapaxes(left, 1, 2) + gain @ noise @ np.swapaxes(gain, 1, 2)
-        corners = self.places.corners_map - (gain @ self.residual[..., None]).reshape(-1, 4, 2)
-        return Places(corners, (after + np.swapaxes(after, 1, 2)) / 2)
+        corners = self.candidates.corners_map - (gain @ self.residual[..., None]).reshape(-1, 4, 2)
+        return Candidates(corners, (after + np.swapaxes(after, 1, 2)) / 2)
 
 
 def _within(directions: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -253,9 +253,9 @@ def _within(directions: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def _hypotheses(
-    places: Places, shapes: Sequence[Shape], share: FloatArray, paint: PaintError
+    candidates: Candidates, shapes: Sequence[Shape], share: FloatArray, paint: PaintError
 ) -> list[_Hypothesis]:
-    """All that N places may be, given the shapes of their class."""
+    """All that N candidates may be, given the shapes of their class."""
     out: list[_Hypothesis] = []
     nothing = np.zeros((8, 8))
 
@@ -267,17 +267,19 @@ def _hypotheses(
         misplaced: FloatArray = nothing,
         one_way: FloatArray | None = None,
     ) -> None:
-        off = (places.corners_map - laid.corners_map).reshape(-1, 8, 1)
+        off = (candidates.corners_map - laid.corners_map).reshape(-1, 8, 1)
         residual = (laid.directions @ off)[..., 0]
         prior, paint_m2 = float(np.log(part * share[kind])), paint.sigma_m**2
         out.append(
-            _Hypothesis(kind, prior, places, laid.directions, residual, scatter, misplaced, paint_m2, one_way)
+            _Hypothesis(
+                kind, prior, candidates, laid.directions, residual, scatter, misplaced, paint_m2, one_way
+            )
         )
 
     total = sum(shape.share for shape in shapes)
     for shape in shapes:
         part = shape.share / total
-        laid, otherwise = lay(shape.corners, shape.sigma_m, places)
+        laid, otherwise = lay(shape.corners, shape.sigma_m, candidates)
         scatter: FloatArray = shape.sigma_m**2 * np.eye(8)
         add(OF_CLASS, part / 2, laid, scatter)
         add(OF_CLASS, part / 2, otherwise, scatter)
@@ -297,7 +299,7 @@ def _hypotheses(
         for moved in _CORNERS_MOVED:
             block = _MISPLACED_M**2 * np.kron(np.outer(moved, moved), np.eye(2))
             add(WRONG_CORNER, part / len(_CORNERS_MOVED), laid, scatter, np.asarray(block, np.float64))
-    own = lay(shapes[0].corners, SHAPE_SIGMA_M, places)[0] if shapes else _as_seen(places)
+    own = lay(shapes[0].corners, SHAPE_SIGMA_M, candidates)[0] if shapes else _as_seen(candidates)
     any_size = SHAPE_SIGMA_M**2 * np.eye(8) + _OWN_SIZE
     add(OWN_SHAPE, 1.0, own, any_size)
     add(PART_OF_SYMBOL, 1.0, own, any_size)
@@ -305,11 +307,14 @@ def _hypotheses(
     return out
 
 
-def _as_seen(places: Places) -> Laid:
-    """Every place's own parallelogram."""
-    centre = places.corners_map.mean(axis=1)
-    corners = parallelograms(places.corners_map) + centre[:, None]
-    unturned, unshifted = np.tile(np.eye(2), (len(places), 1, 1)), np.zeros(len(places), dtype=np.int64)
+def _as_seen(candidates: Candidates) -> Laid:
+    """Every candidate's own parallelogram."""
+    centre = candidates.corners_map.mean(axis=1)
+    corners = parallelograms(candidates.corners_map) + centre[:, None]
+    unturned, unshifted = (
+        np.tile(np.eye(2), (len(candidates), 1, 1)),
+        np.zeros(len(candidates), dtype=np.int64),
+    )
     return Laid(corners, unturned, centre, unshifted)
 
 
@@ -344,7 +349,7 @@ def _outer(vectors: FloatArray) -> FloatArray:
 
 
 def _paint_error(hypotheses: Sequence[_Hypothesis], each: FloatArray, whole: BoolArray) -> PaintError:
-    """What the deviations of ``whole`` places (N,) from the shapes of their class say about the paint."""
+    """What the deviations of ``whole`` candidates (N,) from the shapes of their class say about the paint."""
     members = [
         (one.residual[k], one.formal[k])
         for one, probability in zip(hypotheses, each, strict=True)
@@ -354,7 +359,7 @@ def _paint_error(hypotheses: Sequence[_Hypothesis], each: FloatArray, whole: Boo
     return learn_paint_error([residual for residual, _ in members], [formal for _, formal in members])
 
 
-def _mixture(hypotheses: Sequence[_Hypothesis], joint: FloatArray, paint: PaintError) -> Places:
+def _mixture(hypotheses: Sequence[_Hypothesis], joint: FloatArray, paint: PaintError) -> Candidates:
     """The corners as the hypotheses that are markings have them, by mean and covariance of their mixture."""
     markings = [k for k, one in enumerate(hypotheses) if one.kind < PART_OF_SYMBOL]
     weight = np.exp(joint[markings] - logsumexp(joint[markings], axis=0))
@@ -364,11 +369,11 @@ def _mixture(hypotheses: Sequence[_Hypothesis], joint: FloatArray, paint: PaintE
         w[:, None, None] * (one.covariance_m2 + _outer((one.corners_map - mean).reshape(-1, 8)))
         for w, one in zip(weight, each, strict=True)
     )
-    return Places(np.asarray(mean), np.asarray(covariance))
+    return Candidates(np.asarray(mean), np.asarray(covariance))
 
 
 def _paint_m2(hypothesis: _Hypothesis, paint: PaintError) -> FloatArray:
-    """Variance (N,) of the errors that all images share, given how a place deviates from its shape."""
+    """Variance (N,) of the errors that all images share, given how a candidate deviates from its shape."""
     if hypothesis.kind != OF_CLASS:
         return np.full(len(hypothesis.residual), paint.sigma_m**2)
     pairs = zip(hypothesis.residual, hypothesis.formal, strict=True)

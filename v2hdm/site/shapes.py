@@ -27,7 +27,7 @@ from scipy.special import gammaln
 from scipy.stats import chi2
 
 from v2hdm.records import BoolArray, FloatArray, IntArray
-from v2hdm.site.candidates import Places
+from v2hdm.site.candidates import Candidates
 
 _LEAST_MEMBERS = 8
 """Markings of one shape from which the shape is one of the class."""
@@ -70,7 +70,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Laid:
-    """A shape laid on each of N places: ``corners_map`` (N, 4, 2).
+    """A shape laid on each of N candidates: ``corners_map`` (N, 4, 2).
 
     ``shift`` (N,) and ``rotation`` (N, 2, 2) took it there, ``centre`` (N, 2) is its centre, ``directions``
     (N, 5, 8) are orthonormal directions in which corners move other than rigidly.
@@ -101,16 +101,16 @@ def parallelograms(corners: FloatArray) -> FloatArray:
     return np.concatenate([arms, -arms], axis=-2)
 
 
-def lay(shape: FloatArray, sigma_m: float, places: Places) -> tuple[Laid, Laid]:
-    """Move and turn a parallelogram (4, 2) onto ``places``, corners weighted by their full covariances.
+def lay(shape: FloatArray, sigma_m: float, candidates: Candidates) -> tuple[Laid, Laid]:
+    """Move and turn a parallelogram (4, 2) onto ``candidates``, corners weighted by their full covariances.
 
     A parallelogram looks the same from both ends, so that one shift by a corner is all there is to try: the
     better of the two ways comes first.
     """
-    information = np.asarray(np.linalg.inv(places.covariance_m2 + sigma_m**2 * np.eye(8)), np.float64)
-    ways = [_lay(np.roll(shape, -shift, axis=0), places, information) for shift in (0, 1)]
+    information = np.asarray(np.linalg.inv(candidates.covariance_m2 + sigma_m**2 * np.eye(8)), np.float64)
+    ways = [_lay(np.roll(shape, -shift, axis=0), candidates, information) for shift in (0, 1)]
     best = np.argmin(np.stack([way[3] for way in ways]), axis=0)
-    rows = np.arange(len(places))
+    rows = np.arange(len(candidates))
     placed, rotation, centre = (np.stack([way[k] for way in ways]) for k in range(3))
     first, second = (
         Laid(placed[shift, rows], rotation[shift, rows], centre[shift, rows], shift)
@@ -120,14 +120,14 @@ def lay(shape: FloatArray, sigma_m: float, places: Places) -> tuple[Laid, Laid]:
 
 
 def _lay(
-    shape: FloatArray, places: Places, information: FloatArray
+    shape: FloatArray, candidates: Candidates, information: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Placed corners (N, 4, 2), rotations, centres (N, 2) and what is left, squared, in sigmas (N,)."""
-    corners = places.corners_map
+    corners = candidates.corners_map
     # What shifts all corners alike says nothing about their weights.
-    apart = places.covariance_m2.reshape(-1, 4, 2, 4, 2)
+    apart = candidates.covariance_m2.reshape(-1, 4, 2, 4, 2)
     common = np.einsum("naibi->n", apart) / 32
-    weight = 1 / np.maximum(places.sigma_m**2 / 2 - common[:, None], 1e-6)
+    weight = 1 / np.maximum(candidates.sigma_m**2 / 2 - common[:, None], 1e-6)
     total = weight.sum(axis=1, keepdims=True)
     target_centre, own_centre = np.einsum("nc,ncx->nx", weight, corners) / total, weight @ shape / total
     # As complex numbers: the turn is the argument of the weighted sum of targets over shapes.
@@ -163,37 +163,37 @@ def _rigid(corners: FloatArray) -> FloatArray:
     return np.concatenate([shifting, turning], axis=2)
 
 
-def learn_shapes(places: Places) -> tuple[Shape, ...]:
+def learn_shapes(candidates: Candidates) -> tuple[Shape, ...]:
     """The shapes that the markings of a class have, commonest first."""
-    whole = np.flatnonzero(places.known.all(axis=1))
+    whole = np.flatnonzero(candidates.known.all(axis=1))
     least = max(_LEAST_MEMBERS, _LEAST_SHARE * len(whole))
     shapes: list[Shape] = []
     while len(whole) >= least:
-        left = places.subset(whole)
+        left = candidates.subset(whole)
         shape, members = _commonest(left)
         if np.count_nonzero(members) < least:
             break
         sigma_m = _spread_m(shape, left.subset(members))
-        shapes.append(Shape(shape, sigma_m, np.count_nonzero(members) / len(places)))
+        shapes.append(Shape(shape, sigma_m, np.count_nonzero(members) / len(candidates)))
         whole = whole[~members]
     return tuple(shapes)
 
 
-def _commonest(places: Places) -> tuple[FloatArray, BoolArray]:
-    """The shape (4, 2) that most of N places have, and which (N,) have it."""
-    lengths = _lengths(places.corners_map)
+def _commonest(candidates: Candidates) -> tuple[FloatArray, BoolArray]:
+    """The shape (4, 2) that most of N candidates have, and which (N,) have it."""
+    lengths = _lengths(candidates.corners_map)
     limit_m = np.maximum(_MEMBER_M, _MEMBER_SHARE * lengths.max(axis=1))
     apart = np.abs(lengths[:, None] - lengths[None]).max(axis=2)
     typical = int(np.argmax((apart <= limit_m[:, None]).sum(axis=1) - apart.mean(axis=1) / limit_m))
-    shape = parallelograms(places.corners_map[typical])
-    members = np.zeros(len(places), dtype=bool)
+    shape = parallelograms(candidates.corners_map[typical])
+    members = np.zeros(len(candidates), dtype=bool)
     for _ in range(2):
-        laid = lay(shape, _MEMBER_M, places)[0]
-        missed = np.linalg.norm(places.corners_map - laid.corners_map, axis=2).max(axis=1)
+        laid = lay(shape, _MEMBER_M, candidates)[0]
+        missed = np.linalg.norm(candidates.corners_map - laid.corners_map, axis=2).max(axis=1)
         members = np.asarray(missed <= limit_m[typical])
         if not members.any():
             break
-        shape = parallelograms(np.median(laid.in_frame_of_shape(places.corners_map)[members], axis=0))
+        shape = parallelograms(np.median(laid.in_frame_of_shape(candidates.corners_map)[members], axis=0))
     return shape, members
 
 
@@ -205,16 +205,16 @@ def _lengths(corners: FloatArray) -> FloatArray:
     return np.concatenate([pairs, diagonals], axis=1)
 
 
-def _spread_m(shape: FloatArray, places: Places) -> float:
+def _spread_m(shape: FloatArray, candidates: Candidates) -> float:
     """How far the corners of members lie from their shape beyond their own covariances.
 
     The standard deviation under which the median marking is as far from the shape as that of a chi-square
     variable, but no less than what paint allows.
     """
-    laid = lay(shape, SHAPE_SIGMA_M, places)[0]
+    laid = lay(shape, SHAPE_SIGMA_M, candidates)[0]
     directions = laid.directions
-    off = directions @ (places.corners_map - laid.corners_map).reshape(-1, 8, 1)
-    own = directions @ places.covariance_m2 @ np.swapaxes(directions, 1, 2)
+    off = directions @ (candidates.corners_map - laid.corners_map).reshape(-1, 8, 1)
+    own = directions @ candidates.covariance_m2 @ np.swapaxes(directions, 1, 2)
     wanted = float(chi2.median(off.shape[1]))
     low, high = SHAPE_SIGMA_M, float(np.abs(off).max()) + SHAPE_SIGMA_M
     for _ in range(20):

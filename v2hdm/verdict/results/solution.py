@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from v2hdm.adjust import Fault
-from v2hdm.mapping.recovery import CLOCK_TOLD_S, CONTRADICTED_SIGMAS, TOLD_SIGMA, is_contradicted
+from v2hdm.mapping.recovery import CLOCK_OBSERVABLE_S, CONTRADICTED_SIGMAS, OBSERVABLE_SIGMA, is_contradicted
 from v2hdm.mapping.results import Contradiction, MethodResult, SolveEvidence
 from v2hdm.records import Drive
 from v2hdm.site.markings import TOO_UNCERTAIN
@@ -103,7 +103,7 @@ def check_inputs(evidence: SolveEvidence) -> list[Finding]:
 
 
 def _is_told(tested: list[Contradiction]) -> bool:
-    return any(one.sigma <= TOLD_SIGMA[one.fault] for one in tested)
+    return any(one.sigma <= OBSERVABLE_SIGMA[one.fault] for one in tested)
 
 
 def _corrected(one: Contradiction) -> Finding:
@@ -146,7 +146,7 @@ def _agrees(check: str, tested: list[Contradiction]) -> Finding:
     if not _is_told(tested):
         says = "the markings of this drive do not tell it: drive a turn, and past more of them"
         return passed(check, ", ".join(tested[0].cameras), says)
-    told = [one for one in tested if one.sigma <= TOLD_SIGMA[one.fault]]
+    told = [one for one in tested if one.sigma <= OBSERVABLE_SIGMA[one.fault]]
     worst = max(told, key=lambda one: one.sigmas)
     names = ", ".join(worst.cameras)
     if is_contradicted(worst):
@@ -160,7 +160,7 @@ def _untold(evidence: SolveEvidence, raised: set[str]) -> list[Finding]:
     findings = []
     clocks = _of_all(evidence, Fault.CLOCK, Fault.CLOCK)
     loosest_s = max((one.sigma for one in clocks), default=0.0)
-    if loosest_s > CLOCK_TOLD_S and "clock" not in raised:
+    if loosest_s > CLOCK_OBSERVABLE_S and "clock" not in raised:
         sigma_ms = 1e3 * loosest_s
         sure = f"better than {2 * sigma_ms:.0f} ms" if np.isfinite(sigma_ms) else "at all"
         says = (
