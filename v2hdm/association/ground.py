@@ -185,12 +185,8 @@ def easy_views(
 ) -> tuple[IntArray, IntArray]:
     """Pairs (group, image) in which a whole marking lies inside the region of interest and the image.
 
-    Args:
-        views: The images to consider.
-        rig: Extrinsics and poses.
-        cameras: The rig's cameras, for image sizes and regions of interest.
-        corners_map: Markings (G, 4, 2), m; those with nan corners are in no view.
-        within_m: Distance from the camera, m, that takes the place of the region of interest, if given.
+    ``cameras`` are the rig's, for image sizes and regions of interest, in whose place ``within_m`` of
+    distance from the camera counts if given; markings (G, 4, 2) with nan corners are in no view.
     """
     whole = np.flatnonzero(np.isfinite(corners_map).all(axis=(1, 2)))
     groups, images = [], []

@@ -1,14 +1,9 @@
-"""Which sightings belong together, and where the groups lie.
+"""Which sightings belong together, where the groups lie, and groups that turn out to be one marking.
 
-Groups of sightings that turn out to be one marking become one group.
-
-Tracks break at occlusions and shadows, and each lap and each camera makes its own. Under an
-extrinsic that can be trusted they coincide in the map, up to their covariances.
-
-Sightings that show no two corners as points: whose they are, once it is known where markings lie.
-
-A dash that runs through the image from border to border is two lines. Such lines look alike wherever the
-vehicle is, so that they cannot be linked from image to image; but of the markings of the map they fit one.
+Tracks break at occlusions and shadows, and each lap and each camera makes its own. Under an extrinsic that
+can be trusted they coincide in the map, up to their covariances. A dash that runs through the image from
+border to border is two lines, which look alike wherever the vehicle is: such sightings are attached last, to
+the one marking of the map that they fit.
 """
 
 from __future__ import annotations
@@ -95,13 +90,8 @@ def known_elsewhere(association: Association, point: BoolArray, informs: BoolArr
     """Corners (S, 4) that a sighting knows only across their side, and others of its group as points.
 
     Where other paint, a shadow or the image's border cuts a marking, its corner is somewhere on the line of
-    the side, no nearer than the cut. Images that are cut alike are wrong alike, so that their mean is no
-    better than one of them: as soon as another image shows the corner, only the line counts.
-
-    Args:
-        association: the groups.
-        point: corners (S, 4), in the sightings' own order, that are points.
-        informs: those that say anything.
+    the side, no nearer than the cut. Images that are cut alike are wrong alike: as soon as another image
+    shows the corner, only the line counts. ``point`` and ``informs`` (S, 4) are in the sightings' own order.
     """
     grouped = (association.group >= 0)[:, None]
     number = 4 * association.group[:, None] + np.arange(4)
@@ -198,13 +188,13 @@ def merge_groups(
     Two groups with a sighting in the same image are two markings and are never merged.
 
     Args:
-        association: The groups to merge.
-        sightings: The table that they index.
-        fused: Where the groups lie.
-        floor_m: Sigma added to each position for what shifts whole groups: extrinsic, RTK drift.
-        gate_sigmas: Largest distance of two groups in sigmas.
-        max_distance_m: Largest distance of two groups in metres.
-        shape_tolerance: Largest deviation of a corner as a fraction of the marking's diameter.
+        association: the groups to merge.
+        sightings: the table that they index.
+        fused: where the groups lie.
+        floor_m: sigma added to each position for what shifts whole groups: extrinsic, RTK drift.
+        gate_sigmas: largest distance of two groups in sigmas.
+        max_distance_m: largest distance of two groups in metres.
+        shape_tolerance: largest deviation of a corner as a fraction of the marking's diameter.
     """
     if not association.count:
         return association
@@ -315,13 +305,8 @@ def attach(
 ) -> Association:
     """Give each sighting without a group to the one that alone fits it; an image shows a group once.
 
-    Args:
-        association: The groups.
-        sightings: The table that they index.
-        located: Where the sightings lie under ``rig``.
-        rig: Extrinsics and poses.
-        fused: Where the groups lie; only those of four known corners are looked at.
-        jitter_rad: How far the recorded attitude is off.
+    ``located`` is under ``rig``; of the groups only those of four known corners in ``fused`` are looked at;
+    ``jitter_rad`` is how far the recorded attitude is off.
     """
     rows = np.flatnonzero((association.group < 0) & (located.informs.sum(axis=1) >= 2))
     whole = np.flatnonzero(fused.valid.all(axis=1))

@@ -135,10 +135,9 @@ class Sightings:
 
 @dataclass(frozen=True)
 class Frames:
-    """The distinct time stamps of a drive, of each of its visits by itself.
+    """The distinct times of a drive's visits, and the recorded poses then.
 
-    ``frame_of_image`` (I,) indexes ``visit`` (F,), ``stamp_s`` (F,) and ``map_from_vehicle`` (F, 4, 4), the
-    recorded poses.
+    ``frame_of_image`` (I,) indexes ``visit`` (F,), ``stamp_s`` (F,) and ``map_from_vehicle`` (F, 4, 4).
     """
 
     frame_of_image: IntArray
@@ -166,7 +165,7 @@ def collect_sightings(
     """Put the quadrilateral detections of ``cameras`` into one table, lens distortion removed.
 
     Raises:
-        MappingError: The drive has no such camera, or its images hold no usable marking.
+        MappingError: the drive has no such camera, or its images hold no usable marking.
     """
     camera_index = _camera_index(drive, cameras)
     frames = frames_of(drive)
@@ -218,7 +217,7 @@ def camera_of(drive: Drive, name: str) -> Camera:
     """The camera ``name`` of ``drive``.
 
     Raises:
-        MappingError: The drive has no such camera.
+        MappingError: the drive has no such camera.
     """
     if name not in drive.cameras:
         known = ", ".join(drive.cameras)

@@ -31,10 +31,9 @@ _LEAST_TOLERANCE_M = 0.05
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What the gates allow for.
+    """The errors that gates allow for.
 
-    ``direction_rad`` is how wrong an extrinsic's direction may be, ``jitter_rad`` how far roll and
-    pitch stray from their poses from frame to frame, ``position_m`` the noise of the positions.
+    ``direction_rad`` of an extrinsic, ``jitter_rad`` of roll and pitch from frame to frame, ``position_m``.
     """
 
     direction_rad: float
@@ -210,10 +209,7 @@ class _Linker:
     def _near(
         self, last: IntArray, centre_map: FloatArray, size_m: FloatArray, rows: IntArray
     ) -> tuple[IntArray, IntArray]:
-        """Pairs of tracks and ``rows``, by index, of one class and close enough to be of one marking.
-
-        Means over different corners of one marking differ by no more than its diameter.
-        """
+        """Pairs of tracks and ``rows``, by index, of one class and no farther apart than their sizes."""
         apart_m = np.linalg.norm(centre_map[:, None] - self._centre_map[rows], axis=-1)
         reach_m = self._options.max_gate_m + size_m[:, None] + self._size_m[rows]
         alike = self._sightings.kind[last][:, None] == self._sightings.kind[rows]

@@ -39,8 +39,7 @@ def vehicle_twists(
 ) -> FloatArray:
     """Twists (F, 6) of the vehicle in its own frame, m/s then rad/s, at poses (F, 4, 4) at times (F,).
 
-    Central differences, one-sided at the ends of each ``visit`` (F,), of one without; a single pose has no
-    motion.
+    Central differences, one-sided at the ends of each ``visit`` (F,); a single pose has no motion.
     """
     count = len(stamp_s)
     before, after = np.maximum(np.arange(count) - 1, 0), np.minimum(np.arange(count) + 1, count - 1)
@@ -78,11 +77,11 @@ VARIANCE_FACTORS = (0.05, 20.0)
 
 @dataclass(frozen=True)
 class Model:
-    """What a solve estimates and how much noise it reckons with beyond that of the corners.
+    """What a solve estimates, and its noise beyond that of the corners.
 
-    ``floor_px`` is added to every corner in quadrature, px; the sum is multiplied by ``variance_factor``.
-    ``sizes`` are those that the user knows, ``survey`` the corners; ``clock_sigma_s`` holds clock offsets.
-    ``pose_sigma`` is that of each visit.
+    ``floor_px`` is added to every corner in quadrature, and the sum multiplied by ``variance_factor``.
+    ``sizes`` and ``survey`` are stated by the user; ``clock_sigma_s`` is the prior of clock offsets,
+    ``pose_sigma`` that of each visit's poses.
     """
 
     pose_sigma: tuple[PoseSigma, ...]
@@ -132,14 +131,7 @@ class Bundle:
 def full_model(
     pose_noise: Sequence[PoseNoise], options: MappingOptions, poses: str, variance_factor: float = 1.0
 ) -> Model:
-    """Every frame has its own deviation from its recorded pose, in what the pose model ``poses`` says.
-
-    Args:
-        pose_noise: How far the recorded poses of each visit are off.
-        options: Loss and device.
-        poses: One of :data:`v2hdm.adjust.MODELS`.
-        variance_factor: How many times as large as stated the variances of corners are.
-    """
+    """Every frame deviates from its recorded pose by the states of the pose model ``poses``."""
     solver = SolveOptions(
         loss=options.loss, loss_scale=options.loss_scale, coarse=False, device=options.device
     )
@@ -164,10 +156,8 @@ def pose_sigma_of(pose_noise: PoseNoise) -> PoseSigma:
 
 
 def coarse_model(rig: Rig, pose_noise: Sequence[PoseNoise], options: MappingOptions) -> Model:
-    """The recorded poses taken at their word, and their errors as so much noise in the image.
-
-    Only the extrinsics and corners are left to estimate, which takes a fraction of the time and
-    is amply exact for telling markings apart.
+    """The recorded poses are exact, their errors noise in the image: fast, and enough to tell markings
+    apart.
     """
     focal_px = float(np.mean(rig.intrinsic[:, 0, 0]))
     jitter_px = focal_px * max(float(np.hypot(one.roll_pitch_rad, one.heading_rad)) for one in pose_noise)
@@ -189,16 +179,16 @@ def solve_bundle(
     """Estimate extrinsics, poses and the corners of all groups together.
 
     Args:
-        sightings: The table of sightings.
-        association: Groups to estimate.
-        usable: Which corners (S, 4), in the sightings' own order, may be used.
-        rig: Extrinsics to start from; the poses are always the recorded ones.
-        cameras: Cameras by name, for the priors on their centres.
-        model: Noise and what is estimated.
+        sightings: the table of sightings.
+        association: groups to estimate.
+        usable: corners (S, 4), in the sightings' own order, that may be used.
+        rig: extrinsics to start from; the poses are always the recorded ones.
+        cameras: by name, for the priors on their centres.
+        model: noise and what is estimated.
         solve: takes the place of :func:`v2hdm.adjust.solve`.
 
     Raises:
-        MappingError: No corner was seen twice.
+        MappingError: no corner was seen twice.
     """
     row, group, corner, corner_index = _observed_corners(association, usable)
     if not len(row):
@@ -300,10 +290,7 @@ def _known(
     corner_index: IntArray,
     model: Model,
 ) -> tuple[KnownLengths | None, ControlPoints | None]:
-    """What sizes of classes and a survey say about the corners.
-
-    ``rig`` is good enough to tell length from width, and one corner from the next.
-    """
+    """The constraints by stated sizes and a survey; ``rig`` must tell one corner from the next."""
     if not model.sizes.by_class_m and not model.survey.control:
         return None, None
     located = locate(sightings, rig)

@@ -20,10 +20,10 @@ from v2hdm.site.options import AcceptanceOptions
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the verdict on the markings rests on.
+    """The solves that the classification of the candidates rests on.
 
-    ``final`` is the bundle solved over the accepted observations only, ``ungated`` the one before
-    it over all, of which ``inlier`` (K,) were accepted; ``usable`` (S, 4) says the same per corner.
+    ``final`` is solved over the accepted observations only, ``ungated`` over all, of which ``inlier`` (K,)
+    were accepted; ``usable`` (S, 4) says the same per corner.
     """
 
     sightings: Sightings
@@ -70,10 +70,10 @@ class Optimised:
 def conclude(
     evidence: Evidence, initial_rig: Rig, jitter_rad: float, options: AcceptanceOptions
 ) -> Optimised:
-    """Judge the candidates and put the outcome together.
+    """Classify the candidates and put the outcome together.
 
     Raises:
-        MappingError: No candidate is accepted.
+        MappingError: no candidate is accepted.
     """
     final, ungated = evidence.final, evidence.ungated
     seen = Support(
@@ -115,8 +115,8 @@ def conclude(
 def solved_candidates(bundle: Bundle) -> Candidates:
     """The corners of every group of ``bundle``.
 
-    Covariances are scaled by chi^2 per degree of freedom where that exceeds one: residuals larger
-    than their stated noise make the map less certain than the noise model claims.
+    Covariances are scaled by chi^2 per degree of freedom where that exceeds one: residuals larger than stated
+    make the map less certain than the noise model claims.
     """
     known = bundle.corner_index >= 0
     covariance = np.full((len(known), 8, 8), np.nan)

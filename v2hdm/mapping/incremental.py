@@ -62,10 +62,9 @@ class Grown:
 
 @dataclass
 class _Place:
-    """A marking of the map: the number of each of its corners (4,) there, -1 if it has none.
+    """A mapped marking: the number of each corner (4,) there, -1 for none.
 
-    ``images`` are those that showed it, ``point`` (4,) the corners that they showed as points; ``preview``
-    (4, 2) is where these lay before the marking was solved.
+    ``images`` showed it, ``point`` (4,) corners as points, at ``preview`` (4, 2) before it was solved.
     """
 
     corner: IntArray
@@ -77,9 +76,8 @@ class _Place:
 
 @dataclass(frozen=True)
 class _Track:
-    """The sightings ``rows`` of one track, what they say of the corners 0 to 3, and where these lie alone.
-
-    Corners that none of them shows as a point are nan.
+    """The ``rows`` of one track, its observations of corners 0 to 3, and where these lie; nan for no
+    point.
     """
 
     rows: IntArray
@@ -105,14 +103,14 @@ class IncrementalMapper:
         """Begin with an empty map.
 
         Args:
-            sightings: The table of sightings.
-            rig: Extrinsics to start from, and the recorded poses.
-            cameras: The rig's cameras by name.
-            position_sigma_m: How far the recorded positions are off.
-            options: Settings of the mapping.
-            link: Finds the tracks.
-            solve: Solves for all markings together.
-            model: What each marking is solved for under; of the poses it estimates nothing.
+            sightings: the table of sightings.
+            rig: extrinsics to start from, and the recorded poses.
+            cameras: the rig's cameras by name.
+            position_sigma_m: how far the recorded positions are off.
+            options: settings of the mapping.
+            link: finds the tracks.
+            solve: solves for all markings together.
+            model: of the solve for each marking, which estimates no pose.
         """
         self._sightings, self._link, self._solve, self._options = sightings, link, solve, options
         self._floor_m, self._model, self._first_rig = position_sigma_m, model, rig
@@ -136,13 +134,11 @@ class IncrementalMapper:
         self._record_at = int(np.ceil(_RECORD_GROWTH * len(self._places)))
 
     def run(self, progress: Callable[[str], None]) -> Grown:
-        """Take up all tracks in the order in which they end.
-
-        Args:
-            progress: Told in words how large the map is whenever the drive is linked anew.
+        """Take up all tracks in the order in which they end; ``progress`` gets the map's size at each new
+        linking.
 
         Raises:
-            MappingError: Nothing can be solved for.
+            MappingError: nothing can be solved for.
         """
         tracks, usable = self._link(self._rig, True)
         due, ended = _FIRST_LINK_MARKINGS, False
@@ -157,10 +153,7 @@ class IncrementalMapper:
         return Grown(association, usable, self._present_rig())
 
     def _begin(self, rig: Rig, known: int) -> None:
-        """An empty map with a rig to start from, of a drive that showed ``known`` markings.
-
-        So many need not be up to date one by one again: they are solved together.
-        """
+        """Begin an empty map from ``rig``, of which the first ``known`` markings are solved together."""
         self._rig, self._known = rig, known
         # Only the IPM that the first map starts from may be far off, and all that is located by it.
         self._coarse = rig is self._first_rig
@@ -180,9 +173,8 @@ class IncrementalMapper:
             return self._take_up(tracks, usable, most)
 
     def _take_up(self, tracks: Association, usable: BoolArray, most: int) -> tuple[Association, bool]:
-        """Take tracks into the map until it has ``most`` markings or the drive ends; and whether it did.
-
-        Returns which marking (S,) of the map each sighting became part of, and its corners' order.
+        """Map tracks up to ``most`` markings; the marking (S,) of each sighting, and whether the drive
+        ended.
         """
         number = np.full(len(self._sightings), -1, dtype=np.int64)
         shift = tracks.shift.copy()
@@ -290,10 +282,7 @@ class IncrementalMapper:
         return _Track(rows, kind, replace(seen, corner=corner), corners)
 
     def _same_as(self, track: _Track) -> tuple[int | None, int]:
-        """The marking of the map that lies where a track does, None if none; and how to turn the track.
-
-        Corner c of the marking is corner (c + turn) mod 4. Two things seen in one image are two markings.
-        """
+        """The mapped marking where a track lies, if any: its corner c is the track's (c + turn) mod 4."""
         corners = track.corners_map
         valid = np.asarray(np.isfinite(corners).all(axis=1))
         images = set(self._sightings.image[track.rows].tolist())

@@ -1,9 +1,7 @@
-"""What an optimisation leaves besides map and mountings: poses, clocks, residuals, joint covariances.
+"""The four methods of the paper, side by side on one set of cameras.
 
-The four methods of the paper, side by side on one set of cameras.
-
-CNI and ENI are the naive strategy under a calibrated and an estimated IPM; Opt is the joint
-optimisation; ONI is the naive strategy under the IPM that the optimisation found.
+CNI and ENI are the naive strategy under a calibrated and an estimated IPM; Opt is the joint optimisation; ONI
+is the naive strategy under the IPM that the optimisation found.
 """
 
 from __future__ import annotations
@@ -185,21 +183,21 @@ def run_methods(
     """Map a drive with every method that its IPMs allow.
 
     Args:
-        drive: The drive; its truth is not looked at.
-        detections: What was found in its images.
-        cameras: Which cameras to map with, together.
-        options: Settings of the mapping.
-        progress: Called with the name of each step as it begins.
-        base: An earlier map that ``Opt`` brings up to date; None where there is none.
-        grey: Reads the grey values (H, W) of an image, to look where ``base`` has paint; None does without.
-        crew: Who does what belongs to one visit of several.
+        drive: the drive; its truth is not looked at.
+        detections: of its images.
+        cameras: to map with, together.
+        options: settings of the mapping.
+        progress: gets the name of each step as it begins.
+        base: an earlier map that ``Opt`` brings up to date.
+        grey: reads the grey values (H, W) of an image, to look where ``base`` has paint.
+        crew: does what belongs to one visit of several.
 
     Returns:
         Results by method: ``CNI`` and ``ENI`` where every camera has such an IPM, ``Opt``, ``ONI``.
 
     Raises:
-        MappingError: There is nothing to map.
-        ConfigError: An option is out of range.
+        MappingError: there is nothing to map.
+        ConfigError: an option is out of range.
     """
     options = options or MappingOptions()
     check_options(options)

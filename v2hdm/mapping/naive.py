@@ -29,15 +29,12 @@ def naive_markings(
     ipm: Mapping[str, FloatArray],
     options: MappingOptions,
 ) -> tuple[list[Marking], list[Exclusion]]:
-    """Map the markings of ``tracks`` by one IPM ``vehicle_from_pinhole_px`` per camera.
+    """Map ``tracks`` by one IPM ``vehicle_from_pinhole_px`` per camera; also returns what was seen too
+    seldom.
 
-    Only sightings whose four valid corners lie inside the camera's region of interest count.
-    Tracks are merged where their averages under these very IPMs lie within
-    ``options.association.naive_merge_m``, so two cameras whose IPMs disagree by more yield two
-    markings where there is one: that is the method's own failure.
-
-    Returns:
-        The markings, and what was seen too seldom to be one.
+    Only sightings with four valid corners inside the region of interest count. Tracks merge where their
+    averages lie within ``naive_merge_m``: two cameras whose IPMs disagree by more yield two markings where
+    there is one, which is the method's own failure.
     """
     corners_map = ipm_corners(sightings, cameras, ipm)
     usable = (tracks.group >= 0) & _inside_roi(sightings, cameras, corners_map[1])

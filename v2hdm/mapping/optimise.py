@@ -236,10 +236,8 @@ class Optimiser:
         return adjust(problem, options, self._options.adjustment, self._crew.team)
 
     def _reweigh(self, bundle: Bundle) -> None:
-        """Take the observations for as good as their residuals under ``bundle`` say.
-
-        How well the poses are known is on the receiver's data sheet; how well corners are found in this
-        light, on this paint, under what is left of the lens's distortion, only the drive itself can report.
+        """Scale the observations' variances as their residuals say: no data sheet knows this light and
+        paint.
         """
         if len(bundle.row) >= LEAST_OBSERVATIONS:
             factor = self._variance_factor * bundle.solution.observation_factor

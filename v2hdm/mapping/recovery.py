@@ -1,8 +1,8 @@
 """Optimise, and where the drive contradicts an input that it can do without, drop that and optimise again.
 
-A survey, a known size or a clock is held against what everything else says before the result is solved. What
-is contradicted is dropped (clocks: put right) and told, never obeyed in silence; what the drive cannot do
-without, such as the focal length, stays and is told.
+A survey, a known size or a clock is held against everything else before the result is solved. If contradicted
+it is dropped (clocks: corrected) and reported, never obeyed in silence; what the drive cannot do without,
+such as the focal length, stays and is reported.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def optimise(inputs: Inputs, report: Callable[[str], None]) -> tuple[Outcome, Op
     """Optimise a drive, as often as inputs have to be dropped.
 
     Raises:
-        MappingError: There is nothing to map.
+        MappingError: there is nothing to map.
     """
     corrected: list[Contradiction] = []
     survey = inputs.options.survey
@@ -186,10 +186,7 @@ def _is_stated(one: Suspect, bundle: Bundle, drive: Drive) -> bool:
 
 
 def _is_of_the_map(one: Contradiction, survey: SurveyOptions, optimised: Optimised) -> bool:
-    """False of a surveyed point that was held to a candidate which did not enter the map.
-
-    A worn marking, or half of one, contradicts the survey of its corner; that it is none is told already.
-    """
+    """False of a surveyed point held to a candidate that did not enter the map, such as a worn marking."""
     if one.fault is not Fault.CONTROL:
         return True
     point_map = next(point.position_map for point in survey.control if point.id == one.about)

@@ -28,15 +28,10 @@ CELLS = (4, 6)
 class Contradiction:
     """One input that would have to be wrong, as far as the residuals say.
 
-    Attributes:
-        fault: what would be wrong.
-        cameras: of which cameras.
-        axis: along which axis, 0 to 2, of the vehicle (survey, lever) or the map (slope, datum).
-        about: the class of a known size and its length, a surveyed point, or the visit of a clock; empty for
-            others.
-        value: by how much, true minus stated: s, m, rad or a share.
-        sigma: how well this drive tells, inf where it cannot.
-        sigmas: the value in sigmas, by its chi-square: of one degree of freedom, of two for a surveyed point.
+    ``fault`` of ``cameras``, along ``axis`` 0 to 2 of the vehicle (survey, lever) or the map (slope, datum),
+    ``about`` the class of a known size and its length, a surveyed point, or the visit of a clock. ``value``
+    is true minus stated, in s, m, rad or a share, with the ``sigma`` of this drive, inf where it is
+    unobservable; ``sigmas`` is the value in sigmas, by its chi-square.
     """
 
     fault: Fault
@@ -50,13 +45,11 @@ class Contradiction:
 
 @dataclass(frozen=True)
 class CameraFit:
-    """How well one camera's observations fit.
+    """How well one camera's ``observations`` fit.
 
-    Attributes:
-        observations: how many there are.
-        variance_factor: how many times as large as stated by the detector their variances are, by the median.
-        rejected_share: share of them that the rest contradicts.
-        bias_px: longest median residual of the cells of its image (see :data:`CELLS`), px.
+    ``variance_factor`` is how many times as large as stated by the detector their variances are, by the
+    median; ``rejected_share`` of them the rest contradicts; ``bias_px`` is the longest median residual of the
+    cells of its image (see :data:`CELLS`).
     """
 
     observations: int
@@ -67,22 +60,17 @@ class CameraFit:
 
 @dataclass(frozen=True)
 class SolveEvidence:
-    """What the joint optimisation of one set of cameras leaves to judge.
+    """The evidence that the joint optimisation of one set of cameras leaves for the checks.
 
-    Attributes:
-        suspects: every input that was tested, as it stands in the result, the largest contradiction first.
-        corrected: inputs that were contradicted, and dropped or put right before the result was solved.
-        pose_model: what was estimated of the poses, of :data:`v2hdm.adjust.MODELS`.
-        held_out: mean robust loss of held-out observations by pose model; a little below 2 without errors.
-        fits: by camera.
-        variance_factor: as in :class:`CameraFit`, of all cameras.
-        along_route: (W,) the same of windows of :data:`WINDOW_OBSERVATIONS` in driving order.
-        window_s: (W,) when each window begins, s.
-        pose_pulls: root mean square by state of a pose, of what was taken off it, in the stated sigmas; at
-            most 1 where these are right.
-        worst_pull: the largest of them all, in sigmas.
-        worst_pull_s: when, s.
-        clock_s: of each visit, by camera its estimated clock offset and sigma, where the pose model has one.
+    Attributes: suspects: every input that was tested, as it stands in the result, the largest contradiction
+    first. corrected: inputs that were contradicted, and dropped or corrected before the result was solved.
+    pose_model: what was estimated of the poses, of :data:`v2hdm.adjust.MODELS`. held_out: mean robust loss of
+    held-out observations by pose model; a little below 2 without errors. fits: by camera. variance_factor: as
+    in :class:`CameraFit`, of all cameras. along_route: (W,) the same of windows of
+    :data:`WINDOW_OBSERVATIONS` in driving order. window_s: (W,) when each window begins, s. pose_pulls: root
+    mean square normalised innovation by state of a pose; at most 1 for right sigmas. worst_pull: the largest
+    of them all, in sigmas. worst_pull_s: when, s. clock_s: by visit and camera the estimated clock offset and
+    sigma, where the pose model has one.
     """
 
     suspects: tuple[Contradiction, ...]
@@ -108,15 +96,11 @@ class SolveEvidence:
 class AdjustedPoses:
     """The vehicle's poses at the images' times, as a solve has adjusted them.
 
-    Attributes:
-        stamp_s: (F,) when images were taken, on the clock of the poses, rising within each visit.
-        before: (F, 4, 4) ``map_from_vehicle`` as it went into the solve.
-        map_from_vehicle: (F, 4, 4) adjusted; as before where no marking was seen.
-        sigma: (F, 6) standard deviations along and about the vehicle's axes, m and rad; those stated by the
-            drive where no marking was seen.
-        seen: (F,) whether a marking was seen then.
-        frame: which of them each image is of, by its path.
-        visit: (F,) of which visit each is.
+    Attributes: stamp_s: (F,) when images were taken, on the clock of the poses, rising within each visit.
+    before: (F, 4, 4) ``map_from_vehicle`` as it went into the solve. map_from_vehicle: (F, 4, 4) adjusted; as
+    before where no marking was seen. sigma: (F, 6) along and about the vehicle's axes, m and rad; as stated
+    where no marking was seen. seen: (F,) whether a marking was seen then. frame: which of them each image is
+    of, by its path. visit: (F,) of which visit each is.
     """
 
     stamp_s: FloatArray
@@ -152,16 +136,15 @@ class Corners(Protocol):
 class MethodResult:
     """The outcome of one method on one set of cameras.
 
-    ``calibrations`` are per camera, empty where the method only has an IPM. ``reprojection_rmse_px``
-    (and ``initial_reprojection_rmse_px``, under the extrinsic the optimisation started from) are
-    over the same accepted corner observations; None for methods that do not reproject.
-    ``growth`` are the maps after the first markings, in the incremental mode, the whole map last;
-    ``diagnostics`` are named figures for the log and the report; ``certainty`` says of each camera
-    in a sentence what the drive determined and what rests on the survey; ``evidence`` is what the checks
-    after the solve rest on, ``poses`` the vehicle's poses as the solve has adjusted them, ``clocks`` of
-    each visit the offsets of the cameras' clocks, corrections before the solve included; ``corners`` how the
-    errors of the map's corners hang together, None where nothing tells; ``residuals`` are those of the corner
-    observations that it accepted; ``changes`` what became of an earlier map that was brought up to date.
+    Attributes: calibrations: by camera, empty where the method only has an IPM. reprojection_rmse_px: over
+    the accepted corner observations; None for methods that do not reproject. initial_reprojection_rmse_px:
+    the same under the extrinsic that the optimisation started from. growth: the maps after the first
+    markings, in the incremental mode, the whole map last. diagnostics: named figures for the log and the
+    report. certainty: by camera, a sentence on what the drive determined and what rests on the survey.
+    evidence: for the checks after the solve. poses: as the solve has adjusted them. clocks: by visit the
+    offsets of the cameras' clocks, corrections before the solve included. corners: how the errors of the
+    map's corners hang together, None where unknown. residuals: of the accepted corner observations. changes:
+    of an earlier map that was brought up to date.
     """
 
     name: str

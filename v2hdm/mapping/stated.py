@@ -1,7 +1,4 @@
-"""Sizes that a user states for classes of markings, as distances between their corners.
-
-Corners that the user has surveyed, found among those of the map.
-"""
+"""Sizes that a user states for classes and corners that a survey has measured, as constraints on corners."""
 
 from __future__ import annotations
 
@@ -23,15 +20,15 @@ _SIDES = (((0, 1), (3, 2)), ((1, 2), (0, 3)))
 def known_lengths(
     sizes: SizeOptions, kind: Sequence[str], corners_map: FloatArray, corner_index: IntArray
 ) -> KnownLengths | None:
-    """The distances between corners that sizes imply, None if there are none.
+    """The distances between corners that stated sizes imply, None if there are none.
 
     Of a diamond the size is that of its diagonals, of all others that of its sides. A marking that is not of
     its class's size is another thing, or cut off; nothing is known of it.
 
     Args:
-        sizes: What the user says.
+        sizes: as stated.
         kind: (G,) class of every group.
-        corners_map: (G, 4, 2) about where the corners lie, nan where nobody knows.
+        corners_map: (G, 4, 2) rough positions, nan where unknown.
         corner_index: (G, 4) the corners' numbers in the adjustment, -1 for none.
     """
     first, second, length_m = [], [], []
@@ -60,15 +57,13 @@ def known_lengths(
 def control_points(
     survey: SurveyOptions, corners_map: FloatArray, corner_index: IntArray, poses: PoseSigma
 ) -> ControlPoints | None:
-    """The corners that surveyed points are of, None if there are none.
-
-    Points without a corner within reach are left out: not every camera sees every one.
+    """The corners that surveyed points belong to, None if there are none; points out of reach are left out.
 
     Args:
-        survey: What the user says.
-        corners_map: (G, 4, 2) about where the corners lie, nan where nobody knows.
+        survey: as stated.
+        corners_map: (G, 4, 2) rough positions, nan where unknown.
         corner_index: (G, 4) the corners' numbers in the adjustment, -1 for none.
-        poses: How far the recorded poses are off; neighbouring corners share their drift.
+        poses: how far the recorded poses are off; neighbouring corners share their drift.
     """
     points, sigma_m = _arrays(survey.control)
     known = (corner_index >= 0) & np.isfinite(corners_map).all(axis=-1)

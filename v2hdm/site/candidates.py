@@ -33,7 +33,7 @@ class Candidates:
 
     @classmethod
     def seen(cls, corners_map: FloatArray, covariance_m2: FloatArray) -> Candidates:
-        """Candidates of corners (G, 4, 2) and covariances (G, 8, 8) that are nan where a corner was not seen."""
+        """Candidates of corners (G, 4, 2) and covariances (G, 8, 8) that are nan where one was not seen."""
         unseen = np.asarray(np.isnan(corners_map).any(axis=2))
         count = np.maximum((~unseen).sum(axis=1), 1)
         centre = np.where(unseen[..., None], 0.0, corners_map).sum(axis=1) / count[:, None]
@@ -64,10 +64,9 @@ class Candidates:
 class Counts:
     """How often G candidates were seen, each (G,).
 
-    ``images`` with accepted observations of it; ``observations`` of its corners, of which so many are
-    ``agreeing`` with the joint solution; ``easy_views``, images that had the whole candidate in easy view, and
-    ``found``, those among them that it was found in; ``as_symbol``, images in which a symbol
-    lies on it.
+    ``images`` with accepted observations; ``observations`` of corners, and how many are ``agreeing`` with the
+    solution; ``easy_views``, images with the whole candidate in easy view, and those where it was ``found``;
+    ``as_symbol``, images in which a symbol lies on it.
     """
 
     images: IntArray
@@ -93,15 +92,11 @@ class Exclusion:
 
 
 def with_shared_errors(candidates: Candidates, fused: FusedGroups) -> Candidates:
-    """The candidates, with the errors that all images of a corner share.
+    """The solved candidates (G,), with the errors that all images of a corner share.
 
     A worn end, the edge of a shadow and that of other paint stay where they are on the ground. Of errors that
     are correlated by r, n images have a mean of the variance (1 + (n - 1) r) / n (Kish, Survey Sampling,
-    1965): about r times that of a single image beside what the adjustment says.
-
-    Args:
-        candidates: (G,) as solved.
-        fused: the same corners by their images' own covariances.
+    1965): about r times that of a single image, as in ``fused``, beside what the adjustment says.
     """
     single = np.maximum(fused.seen, 1)[..., None, None] * fused.covariance_m2
     unseen = np.asarray(np.isnan(fused.corners_map).any(axis=2))[..., None, None]

@@ -1,10 +1,9 @@
-"""One map of two: corners that both have are estimated anew from both, with what the errors of each share.
+"""An earlier map brought up to date by a new drive: ids stay, what changed is listed with its evidence.
 
-The errors are those of :mod:`v2hdm.site.map_errors`. Given the shared ones, each marking is a mean of
-two by its own errors alone; what both maps have in common tells the shared ones. So a drift of one map counts
-once, however many markings it moved, and what only one map has is shifted along with its surroundings.
-
-An earlier map brought up to date by a new drive: ids stay, what changed is listed with its evidence.
+Corners that both maps have are estimated anew from both. Given the errors that markings share
+(:mod:`v2hdm.site.map_errors`), each is a mean of two by its own errors alone; what both maps have in common
+tells the shared ones. So a drift of one map counts once, however many markings it moved, and what only one
+map has is shifted along with its surroundings.
 """
 
 from __future__ import annotations
@@ -146,7 +145,7 @@ def update_map(
     Args:
         base: the earlier map.
         made: the new drive's own map, in the same frame.
-        observer: what the drive has seen.
+        observer: the new drive.
         mapped: (S,) which sightings are of the markings of ``made``.
         drift_over_m: distance over which the error of the drive's poses fades, m.
 
@@ -222,10 +221,7 @@ class _Numbers:
 
 
 def _looks_of(base: Base, places: Sequence[Marking], observer: Observer) -> Looks:
-    """How often the earlier drive looked at ``places``: as often as the new one's cameras at its poses had.
-
-    A candidate that the earlier map left out has found what is there.
-    """
+    """How often the earlier drive looked at ``places``, as often as the new one's cameras at its poses."""
     poses, count = base.poses, len(observer.cameras)
     views = Views(
         image=np.arange(count * len(poses)),

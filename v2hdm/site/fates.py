@@ -55,10 +55,9 @@ STAYED, MOVED = range(2)
 
 @dataclass(frozen=True)
 class Watched:
-    """How often places of N markings were looked at, in log likelihoods (N,).
+    """Log likelihoods (N,) of the images of N places where the drive's map has nothing.
 
-    ``there`` is that of what the images show if the marking is there, and yet is not in the map of the drive;
-    ``bare`` if it is not there.
+    ``there`` if the marking is there, ``bare`` if it is not.
     """
 
     there: FloatArray
@@ -101,8 +100,8 @@ class Decision:
 class _Candidates:
     """P pairs of markings that may be one: their numbers, the new one's turn, and how its corners are off.
 
-    ``off`` (P, 8), m; ``noise`` (P, 8, 8), m^2, is that of both; ``basis`` (P, 8, 8) has rows for two shifts,
-    the turn and five deformations; ``arm_m`` (P,) is what a turn is multiplied by in it.
+    ``off`` (P, 8), m, has the ``noise`` (P, 8, 8), m^2, of both; ``basis`` (P, 8, 8) has rows for two shifts,
+    the turn, in which it counts ``arm_m`` (P,) times, and five deformations.
     """
 
     old: IntArray
@@ -137,15 +136,10 @@ def decide(
     watched_now: Watched,
     watched_before: Watched,
 ) -> Decision:
-    """Tell what became of the ``old`` markings, and what the ``new`` ones are.
+    """Decide what became of ``old`` markings of an earlier map, and what the ``new`` ones of a drive are.
 
-    Args:
-        old: of the earlier map.
-        new: of the new drive's own map.
-        of_old: errors of the former.
-        of_new: errors of the latter.
-        watched_now: how often the new drive looked at the old markings that it has not mapped.
-        watched_before: how often the earlier drive looked at the places of the new ones.
+    ``of_old`` and ``of_new`` are their errors; ``watched_now`` is how often the new drive looked at the old
+    markings that it has not mapped, ``watched_before`` the earlier drive at the places of the new ones.
     """
     candidates = _candidates(old, new, of_old, of_new)
     shift = _shift(of_old, of_new, candidates, np.zeros(0, dtype=np.int64))
@@ -269,10 +263,8 @@ def _normal(off: FloatArray, covariance: FloatArray) -> float:
 
 
 def _alone(candidates: _Candidates, density: FloatArray) -> FloatArray:
-    """Log density (P,) of each candidate's new marking, in its pair's basis, if it is none of the old ones.
-
-    It lies anywhere, ``density`` (P,) per m^2, turned by any angle of half a circle, and its shape is another
-    one of its class's.
+    """Log density (P,) of each pair's new marking, in its basis, if it is another one: anywhere, any
+    angle.
     """
     off = (candidates.basis @ candidates.off[..., None])[..., 0]
     noise = candidates.basis @ candidates.noise @ np.swapaxes(candidates.basis, 1, 2)

@@ -1,10 +1,8 @@
-"""Detected lane paint as one cloud of directed points on the ground of the map.
+"""Detected lane paint as a cloud of directed points on the ground, and the nodes on its ridges.
 
-The centre lines of a cloud of lane points: nodes on its ridges, half a metre apart.
-
-Seeds spread over the cloud are moved across their line onto the local regression line of the points
-around them, a mean shift that is one-dimensional because every point carries its direction; points
-of a crossing or a parallel line take no part. What is left is thinned to single nodes.
+Seeds spread over the cloud are moved across their line onto the local regression line of the points around
+them, a mean shift that is one-dimensional because every point carries its direction; points of a crossing or
+a parallel line take no part. The rest is thinned to single nodes, half a metre apart.
 """
 
 from __future__ import annotations
@@ -69,10 +67,9 @@ class LaneCloud:
 
 @dataclass(frozen=True)
 class ImageGround:
-    """How each image of a drive maps to the ground.
+    """How each image of a drive maps to the ground; nan for images of cameras that are not used.
 
-    ``map_from_pinhole_px`` (I, 3, 3) and ``centre_map`` (I, 3), the camera's position; nan for
-    images of cameras that are not used.
+    ``map_from_pinhole_px`` (I, 3, 3) and the camera's position ``centre_map`` (I, 3).
     """
 
     map_from_pinhole_px: FloatArray
@@ -110,10 +107,9 @@ def collect_lane_points(
     max_range_m: float,
     jitter_rad: float,
 ) -> LaneCloud:
-    """Back-project all lane detections of the images that ``ground`` covers.
+    """Back-project all lane detections of the images that ``ground`` covers, up to ``max_range_m``.
 
-    Points farther than ``max_range_m`` from their camera are left out; ``jitter_rad`` of viewing
-    direction goes into the weights, so that near points count for more.
+    ``jitter_rad`` of viewing direction goes into the weights, so that near points count for more.
     """
     guides = _guides(drive, detections, ground, _GUIDE_RANGE * max_range_m)
     covered = np.isfinite(ground.centre_map[:, 0])
@@ -328,11 +324,7 @@ def _support(
 
 
 def _thin(points: FloatArray, tangent: FloatArray, images: IntArray, options: LaneOptions) -> IntArray:
-    """Indices of nodes such that no two of one line are closer than 0.7 of the spacing.
-
-    The best supported node stays and suppresses those around it along its line, and those beside it
-    within half the neighbourhood's width, which are the same line.
-    """
+    """Indices of the best supported nodes, no two closer than .7 of the spacing along or beside a line."""
     if not len(points):
         return np.zeros(0, dtype=np.int64)
     reach_m = 0.7 * options.node_spacing_m

@@ -1,12 +1,8 @@
-"""Nodes on lane paint strung into polylines, and polylines of one line joined across its gaps.
+"""Lanes: nodes on lane paint strung into polylines, and pieces of one line joined across its gaps.
 
-Gaps in mapped lanes that are bridged because images saw one line run across them.
-
-Paint under trees or worn away leaves pieces too far apart to be joined by their directions alone. Where
-the detector saw, in several images, one whole line pass the end of one piece and the start of the next, they
-are one lane, and those lines say where it runs between them.
-
-Lanes: the centre lines of lane paint, fused from all images into polylines.
+Pieces are joined by their directions; paint under trees or worn away leaves gaps too long for that. Where the
+detector saw, in several images, one whole line pass the end of one piece and the start of the next, they are
+one lane, and those lines say where it runs between them.
 """
 
 from __future__ import annotations
@@ -48,10 +44,8 @@ class Path:
 
 
 def string_nodes(nodes: Nodes, options: LaneOptions) -> list[Path]:
-    """String nodes into paths, each node linked with at most one ahead and one behind.
-
-    Two nodes are linked when each is the other's nearest on that side along its direction, so a
-    path never forks, and a neighbouring line, which lies to the side, is never a candidate.
+    """String nodes into paths that never fork: each links with one that is mutually nearest ahead or
+    behind.
     """
     if not len(nodes.points_map):
         return []
@@ -66,8 +60,7 @@ def string_nodes(nodes: Nodes, options: LaneOptions) -> list[Path]:
 def join_paths(paths: list[Path], options: LaneOptions) -> list[Path]:
     """Join paths end to end where both ends lie on one arc, shortest gaps first.
 
-    Gaps up to ``max_dash_gap_m`` are bridged between dashed pieces and up to ``max_break_m``
-    otherwise.
+    Gaps up to ``max_dash_gap_m`` are bridged between dashed pieces, up to ``max_break_m`` otherwise.
     """
     joints = _joints(paths, options)
     chain = _Chains(len(paths))
@@ -145,10 +138,7 @@ def _joints(paths: list[Path], options: LaneOptions) -> list[tuple[int, int, int
 
 
 def _on_one_arc(leaving_rad: FloatArray, arriving_rad: FloatArray, gap_m: FloatArray) -> BoolArray:
-    """Whether a gap's chord meets both ends' tangents at the same angle, as that of an arc does.
-
-    Short gaps say little about angles: half a node's lateral error of 5 cm is allowed for.
-    """
+    """Whether a gap's chord meets both tangents at one angle, lateral errors of 5 cm allowed for."""
     slack = np.arctan2(0.05, np.maximum(gap_m, 1e-6))
     return np.asarray(
         (np.abs(leaving_rad) <= _MAX_BEND_RAD + slack)
@@ -273,10 +263,7 @@ def _shortest_bridge(
 
 
 def _gaps(ends: FloatArray) -> NDArray[np.int64]:
-    """Path, end, path, end (G, 4) of all gaps whose way is roughly that of both paths, the shortest first.
-
-    ``ends`` (P, 2, 2, 2) are position and outward direction of both ends of every path.
-    """
+    """Path, end, path, end (G, 4) of all gaps whose way is roughly that of both paths, the shortest first."""
     place, outward = ends.reshape(-1, 2, 2).swapaxes(0, 1)
     gap = place[None] - place[:, None]
     gap_m = np.linalg.norm(gap, axis=2)

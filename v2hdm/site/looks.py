@@ -1,10 +1,8 @@
-"""Whether images show paint, bare ground or something before it where a marking should be.
+"""How often images looked at places of a map, and whether they show paint or bare ground there.
 
 A marking that was found in no image may be gone, or it may be worn, or a parked truck may hide it. The
-contrast of its outline's inside to the ground around it tells: bare ground has next to none. What contrast
-paint has in this light, and bare ground between the markings, the drive's own markings say.
-
-How often the images of a drive looked at places of a map, and what they showed there.
+contrast of its outline's inside to the ground around it decides: bare ground has next to none. The drive's
+own markings show what contrast paint has in this light, and bare ground between them.
 """
 
 from __future__ import annotations
@@ -157,7 +155,7 @@ def learn_paint(
     paint_map: FloatArray,
     near_views: Callable[[FloatArray], tuple[IntArray, IntArray]],
 ) -> Mapping[str, Paint]:
-    """By class what contrast paint and bare ground have in a drive; classes of too few markings are left out.
+    """By class the contrast of paint and of bare ground in a drive; classes of too few markings are left out.
 
     Args:
         pictures: its images.

@@ -1,4 +1,4 @@
-r"""What the markings of a map have in common by their errors, and how two maps therefore lie to each other.
+r"""The errors that markings of a map share, how two maps therefore lie to each other, and lines carried over.
 
 A corner of a map is off by an error of its own and by one that it shares with its surroundings: the drift of
 the receiver, which fades along the route, and a survey's. The shared error is a Gaussian process over the
@@ -6,9 +6,7 @@ ground with the covariance :math:`\sigma_a \sigma_b \exp(-d / l)` for two markin
 markings that two maps have in common tell how the maps are shifted against each other, everywhere near to
 them; and averaging many markings does not average away what they share.
 
-Lane lines and symbols of an earlier map, brought up to date by those of a new drive.
-
-Nothing is said of lane lines or symbols that have vanished: where the new drive has none, the earlier stay.
+Lane lines and symbols of an earlier map stay where the new drive has none.
 """
 
 from __future__ import annotations
@@ -194,11 +192,7 @@ def updated_lanes(
 ) -> tuple[Lane, ...]:
     """The lines of both maps: an earlier one keeps its id, and its course where the new drive has none of it.
 
-    Args:
-        old: of the earlier map.
-        new: of the new drive's own map.
-        shift: how the maps lie to each other.
-        number: gives a fresh id.
+    ``shift`` is how the maps lie to each other; ``number`` gives a fresh id.
     """
     before = [replace(one, points_map=_moved(one.points_map, shift, of_old=True)) for one in old]
     pieces: list[list[_Piece]] = [[] for _ in before]

@@ -38,11 +38,10 @@ _MAX_OVERLAP = 0.2
 
 @dataclass(frozen=True, kw_only=True)
 class Support:
-    """What was seen of G candidates, and under which rig.
+    """The sightings of G candidates and the rig that they were seen by.
 
-    ``kind`` (G,) is the class of each as an index into ``sightings.kinds``. Observation k
-    is one of row ``row`` (K,) of the sightings and of candidate ``group`` (K,), and has been ``accepted`` (K,) or
-    not. ``cameras`` are in the rig's order.
+    ``kind`` (G,) indexes ``sightings.kinds``. Observation k is of row ``row`` (K,) of the sightings and
+    candidate ``group`` (K,), and ``accepted`` (K,) or not. ``cameras`` are in the rig's order.
     """
 
     kind: IntArray
@@ -93,7 +92,7 @@ class Classified:
         """The markings of the map, one for each accepted candidate.
 
         Raises:
-            MappingError: There is none.
+            MappingError: there is none.
         """
         if not len(self.accepted):
             raise MappingError(_no_marking_message(self.exclusions()))
@@ -202,15 +201,11 @@ _CENTRES = np.kron(np.array([[0.5, 0.5, -0.5, -0.5]]), np.eye(2))
 def with_relative_sigma(
     markings: Sequence[Marking], corner_index: IntArray, joint: JointCovariance
 ) -> tuple[Marking, ...]:
-    """The markings with what each contributes to the error of the distance to one about 10 m away.
+    """The markings (M,) with what each contributes to the error of the distance to one about 10 m away.
 
     To the errors of the adjustment comes what the marking's own covariance has beyond it: an error of its
-    paint, which it shares with no other.
-
-    Args:
-        markings: (M,) of the map.
-        corner_index: (M, 4) the number of their corners in the solution, -1 where a corner was not seen.
-        joint: of corners of the solution.
+    paint, which it shares with no other. ``corner_index`` (M, 4) numbers their corners in the solution, -1
+    for one that was not seen; ``joint`` is of corners of the solution.
     """
     seen = np.flatnonzero((corner_index >= 0).sum(axis=1) >= 3)
     if not len(seen):

@@ -94,10 +94,10 @@ _OWN_SIZE = _SIZE_SIGMA_M**2 * np.kron(np.outer(_FIRST, _FIRST) + np.outer(_SECO
 
 @dataclass(frozen=True)
 class Posterior:
-    """What is known of G candidates.
+    """The posterior of G candidates.
 
-    ``probability`` (G, 7) of each kind; ``log_odds`` (G,) of being a marking; ``candidates`` are the corners of
-    what is one. ``evidence`` (G, 4) speaks for a marking and against clutter, in nats: the shape, how many
+    ``probability`` (G, 7) of each kind; ``log_odds`` (G,) of being a marking; ``candidates`` have the corners
+    of a marking. ``evidence`` (G, 4) speaks for a marking and against clutter, in nats: the shape, how many
     images show it, how many of its easy views, and how well they agree.
     """
 
@@ -200,8 +200,8 @@ class _Hypothesis:
     """One hypothesis on N ``candidates``.
 
     In the ``directions`` (N, 5, 8) the solved corners deviate by ``residual`` (N, 5) from where a shape was
-    laid, the painted ones by ``scatter`` (..., 8, 8); all images may misplace these by ``misplaced``
-    (..., 8, 8), if a ``one_way`` (N, 8) is given only that way: paint wears inwards, and runs on outwards.
+    laid, the painted ones by ``scatter`` (..., 8, 8); all images may misplace these by ``misplaced`` (..., 8,
+    8), only along ``one_way`` (N, 8) if given: paint wears inwards, and runs on outwards.
     """
 
     kind: int
@@ -319,9 +319,8 @@ def _as_seen(candidates: Candidates) -> Laid:
 
 
 def _inwards(corners: FloatArray, elongated: bool) -> list[tuple[FloatArray, FloatArray]]:
-    """How corners (N, 8) move as a side of (N, 4, 2) moves inwards by 1 m, and how far (N, 1) it can, m.
-
-    Of what is ``elongated`` these are the two ends, of others all four sides.
+    """Motions (N, 8) of corners as a side moves inwards by 1 m, and how far (N, 1) it can; ends if
+    elongated.
     """
     ways = []
     for along, side in ((corners[:, 1] - corners[:, 0], _FIRST), (corners[:, 2] - corners[:, 1], _SECOND)):
@@ -335,10 +334,7 @@ def _inwards(corners: FloatArray, elongated: bool) -> list[tuple[FloatArray, Flo
 
 
 def _slanted(corners: FloatArray, end: FloatArray) -> FloatArray:
-    """Covariance (N, 8, 8), m^2, of an ``end`` that wear, or the edge of other paint, cuts off at any angle.
-
-    At 45 degrees its two corners lie half the breadth of the paint before and behind its middle.
-    """
+    """Covariance (N, 8, 8), m^2, of an ``end`` cut off at any angle: by half the breadth at 45 degrees."""
     breadth_m = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).min(axis=1)
     each = (end.reshape(-1, 4, 1, 2) * np.eye(4)[:, :, None]).reshape(-1, 4, 8)
     return np.asarray((breadth_m / 2)[:, None, None] ** 2 * (np.swapaxes(each, 1, 2) @ each))

@@ -1,18 +1,16 @@
-"""The shapes that the markings of a class have in common, learned from the drive.
+"""The shapes that the markings of a class share, and how far painted edges are from where images put them.
 
 The diamonds of a yard are painted with one stencil, the dashes of a road with one roller. A hundred markings
 that were seen well say how large the next one is, which was seen four times, one corner under a puddle
 (empirical Bayes: Efron and Morris, Stein's estimation rule and its competitors, JASA 1973). All classes are
 parallelograms: half the diagonals say all of a shape.
 
-How far painted edges are from where all images agree that they are.
-
-An edge that is worn or dirty is measured in the same wrong place by every image. The error does not average
-out, and the residuals of the adjustment do not show it. The shape that the markings of a class share does:
-each marking deviates from it by its own error. Most deviate by a millimetre, some by centimetres. A normal
-variance per marking with an inverse-gamma prior describes both, so that deviations follow Student's t
-distribution (Lange, Little and Taylor, Robust statistical modeling using the t distribution, JASA 1989). The
-class teaches the prior; the posterior of a marking is added to the covariance of its corners.
+An edge that is worn or dirty is measured in the same wrong place by every image. That error does not average
+out, and no residual shows it, but each marking deviates from the shape of its class by its own error: most by
+a millimetre, some by centimetres. A normal variance per marking with an inverse-gamma prior describes both,
+so that deviations follow Student's t distribution (Lange, Little and Taylor, Robust statistical modeling
+using the t distribution, JASA 1989). The class teaches the prior; the posterior of a marking is added to the
+covariance of its corners.
 """
 
 from __future__ import annotations
@@ -104,8 +102,8 @@ def parallelograms(corners: FloatArray) -> FloatArray:
 def lay(shape: FloatArray, sigma_m: float, candidates: Candidates) -> tuple[Laid, Laid]:
     """Move and turn a parallelogram (4, 2) onto ``candidates``, corners weighted by their full covariances.
 
-    A parallelogram looks the same from both ends, so that one shift by a corner is all there is to try: the
-    better of the two ways comes first.
+    It looks the same from both ends, so that one shift by a corner is all there is to try: the better way
+    first.
     """
     information = np.asarray(np.linalg.inv(candidates.covariance_m2 + sigma_m**2 * np.eye(8)), np.float64)
     ways = [_lay(np.roll(shape, -shift, axis=0), candidates, information) for shift in (0, 1)]
@@ -206,11 +204,7 @@ def _lengths(corners: FloatArray) -> FloatArray:
 
 
 def _spread_m(shape: FloatArray, candidates: Candidates) -> float:
-    """How far the corners of members lie from their shape beyond their own covariances.
-
-    The standard deviation under which the median marking is as far from the shape as that of a chi-square
-    variable, but no less than what paint allows.
-    """
+    """How far members' corners lie from their shape beyond their covariances, by the median."""
     laid = lay(shape, SHAPE_SIGMA_M, candidates)[0]
     directions = laid.directions
     off = directions @ (candidates.corners_map - laid.corners_map).reshape(-1, 8, 1)
@@ -250,9 +244,8 @@ class PaintError:
     def variance_m2(self, deviation: FloatArray, formal: FloatArray) -> float:
         """The variance, m^2, of a marking's errors of measurement, given how it deviates from its class.
 
-        Args:
-            deviation: (m,) m, in orthonormal directions.
-            formal: (m, m) its covariance without paint errors.
+        ``deviation`` (m,) m is in orthonormal directions, ``formal`` (m, m) its covariance without paint
+        errors.
         """
         count = len(deviation)
         beyond = max(float(deviation @ deviation) - float(np.trace(formal)), 0.0)

@@ -44,7 +44,7 @@ def map_symbols(
         symbols: all sightings.
         rig: cameras and poses.
         jitter_rad: standard deviation of the viewing direction: far outlines are less certain.
-        markings: those of the map; paint that is one of them is no symbol.
+        markings: of the map; paint that is one of them is no symbol.
     """
     grounds = outlines_on_ground(symbols, rig)
     rows = [row for row, ground in enumerate(grounds) if ground is not None]
