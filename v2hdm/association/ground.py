@@ -83,8 +83,7 @@ def ground_points_with_jacobian(
 
 def _ipms(rig: Rig, camera: IntArray, frame: IntArray) -> FloatArray:
     """The IPMs (N, 3, 3), map from pinhole pixels, of cameras (N,) at frames (N,)."""
-    cam_from_map = rig.cam_from_vehicle[camera] @ np.linalg.inv(rig.map_from_vehicle[frame])
-    return ground_from_pinhole_px(rig.intrinsic[camera], cam_from_map)
+    return ground_from_pinhole_px(rig.intrinsic[camera], rig.cam_from_map(camera, frame))
 
 
 def locate(sightings: Sightings, rig: Rig) -> Located:

@@ -160,9 +160,7 @@ def in_view(
     where its corner lies behind the camera the line cannot be had by projecting the corner.
     """
     fused = fuse_groups(association, located, jitter_rad)
-    cam_from_map = rig.cam_from_vehicle[sightings.camera] @ np.linalg.inv(
-        rig.map_from_vehicle[sightings.frame]
-    )
+    cam_from_map = rig.cam_from_map(sightings.camera, sightings.frame)
     group = np.maximum(association.group, 0)
     corners = fused.corners_map[group] if association.count else np.full(located.corners_map.shape, np.nan)
     _, depth_m = project_ground(rig.intrinsic[sightings.camera], cam_from_map, corners)
@@ -312,11 +310,8 @@ def attach(
     whole = np.flatnonzero(fused.valid.all(axis=1))
     if not len(rows) or not len(whole):
         return association
-    informs = located.informs[rows][..., None]
-    middle = np.where(informs, located.corners_map[rows], 0.0).sum(axis=1) / informs.sum(axis=1)
-    near = cKDTree(fused.corners_map[whole].mean(axis=1)).query_ball_point(middle, _REACH_M)
-    row = np.repeat(rows, [len(groups) for groups in near])
-    group = whole[np.concatenate([np.asarray(groups, dtype=np.int64) for groups in near])]
+    row, near = near_pairs(located, rows, fused.corners_map[whole].mean(axis=1), _REACH_M)
+    group = whole[near]
     alike = group_kinds(association, sightings)[group] == sightings.kind[row]
     row, group = row[alike], group[alike]
     squared = squared_distances(sightings, located, rig, row, fused.corners_map[group], jitter_rad)
@@ -334,6 +329,17 @@ def attach(
     return Association(out_group, out_shift, association.count)
 
 
+def near_pairs(
+    located: Located, rows: IntArray, centres_map: FloatArray, reach_m: float
+) -> tuple[IntArray, IntArray]:
+    """Pairs (P,), (P,) of sightings, out of ``rows``, and places (G, 2) within reach of their middles."""
+    informs = located.informs[rows][..., None]
+    middle = np.where(informs, located.corners_map[rows], 0.0).sum(axis=1) / informs.sum(axis=1)
+    near = cKDTree(centres_map).query_ball_point(middle, reach_m)
+    row = np.repeat(rows, [len(places) for places in near])
+    return row, np.concatenate([np.asarray(places, dtype=np.int64) for places in near])
+
+
 def squared_distances(
     sightings: Sightings,
     located: Located,
@@ -344,7 +350,7 @@ def squared_distances(
 ) -> FloatArray:
     """Squared distances (P, 4), in sigmas, of sightings ``row`` (P,) from markings (P, 4, 2), by shift."""
     camera = sightings.camera[row]
-    cam_from_map = rig.cam_from_vehicle[camera] @ np.linalg.inv(rig.map_from_vehicle[sightings.frame[row]])
+    cam_from_map = rig.cam_from_map(camera, sightings.frame[row])
     expected, depth_m = project_ground(rig.intrinsic[camera], cam_from_map, corners_map)
     jitter_px = rig.intrinsic[camera, 0, 0] * jitter_rad
     noise = sightings.covariance_px[row] + jitter_px[:, None, None, None] ** 2 * np.eye(2)

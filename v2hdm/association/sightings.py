@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +23,10 @@ class Rig:
     intrinsic: FloatArray
     cam_from_vehicle: FloatArray
     map_from_vehicle: FloatArray
+
+    def cam_from_map(self, camera: IntArray, frame: IntArray) -> FloatArray:
+        """The poses (N, 4, 4) of cameras (N,) at frames (N,)."""
+        return np.asarray(self.cam_from_vehicle[camera] @ np.linalg.inv(self.map_from_vehicle[frame]))
 
     @property
     def height_m(self) -> FloatArray:
@@ -116,21 +120,8 @@ class Sightings:
 
     def subset(self, rows: IntArray | BoolArray) -> Sightings:
         """The sightings at ``rows`` (indices or a mask), over the same cameras and frames."""
-        return Sightings(
-            cameras=self.cameras,
-            stamp_s=self.stamp_s,
-            map_from_vehicle=self.map_from_vehicle,
-            image=self.image[rows],
-            camera=self.camera[rows],
-            frame=self.frame[rows],
-            kind=self.kind[rows],
-            corners_pinhole_px=self.corners_pinhole_px[rows],
-            covariance_px=self.covariance_px[rows],
-            valid=self.valid[rows],
-            kinds=self.kinds,
-            visit=self.visit,
-            symbols=self.symbols,
-        )
+        of_rows = ("image", "camera", "frame", "kind", "corners_pinhole_px", "covariance_px", "valid")
+        return replace(self, **{name: getattr(self, name)[rows] for name in of_rows})
 
 
 @dataclass(frozen=True)

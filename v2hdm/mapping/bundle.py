@@ -123,6 +123,11 @@ class Bundle:
         return out
 
     @property
+    def own_corner(self) -> IntArray:
+        """Which corner (K,) of its sighting each observation is."""
+        return np.asarray(self.association.corner_order()[self.row, self.corner])
+
+    @property
     def inliers(self) -> BoolArray:
         """Which observations (K,) nothing contradicts."""
         return np.isin(self.solution.verdict, (Verdict.ACCEPTED, Verdict.UNCONFIRMED))
@@ -156,9 +161,7 @@ def pose_sigma_of(pose_noise: PoseNoise) -> PoseSigma:
 
 
 def coarse_model(rig: Rig, pose_noise: Sequence[PoseNoise], options: MappingOptions) -> Model:
-    """The recorded poses are exact, their errors noise in the image: fast, and enough to tell markings
-    apart.
-    """
+    """The recorded poses are exact, their errors noise in the image: enough to tell markings apart."""
     focal_px = float(np.mean(rig.intrinsic[:, 0, 0]))
     jitter_px = focal_px * max(float(np.hypot(one.roll_pitch_rad, one.heading_rad)) for one in pose_noise)
     solver = SolveOptions(

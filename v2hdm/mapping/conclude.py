@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from v2hdm.association.ground import Views, locate
-from v2hdm.association.groups import Association, fuse_groups, group_kinds
+from v2hdm.association.groups import fuse_groups, group_kinds
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.mapping.bundle import Bundle
@@ -33,19 +33,6 @@ class Evidence:
     ungated: Bundle
     inlier: BoolArray
     usable: BoolArray
-
-
-@dataclass(frozen=True)
-class Observed:
-    """K observations: the row (K,) of the sightings, the candidate ``group`` (K,) and its corner (K,)."""
-
-    row: IntArray
-    group: IntArray
-    corner: IntArray
-
-    def only(self, chosen: BoolArray) -> Observed:
-        """Those that are ``chosen`` (K,)."""
-        return Observed(self.row[chosen], self.group[chosen], self.corner[chosen])
 
 
 @dataclass(frozen=True)
@@ -96,10 +83,8 @@ def conclude(
         final.corner_index[classified.accepted],
         lambda pairs: scale * final.solution.corner_covariance(pairs),
     )
-    own_corner = final.association.corner_order()[final.row, final.corner]
-    used = np.isin(final.group, classified.accepted) & evidence.sightings.valid[final.row, own_corner]
-    observed = Observed(final.row, final.group, final.corner)
-    at_start = residuals_under(initial_rig, evidence.sightings, final.association, observed, jitter_rad)
+    used = np.isin(final.group, classified.accepted) & evidence.sightings.valid[final.row, final.own_corner]
+    at_start = _residuals_under(initial_rig, evidence.sightings, final, jitter_rad)
     return Optimised(
         bundle=final,
         usable=evidence.usable,
@@ -107,8 +92,8 @@ def conclude(
         markings=markings,
         excluded=classified.exclusions(),
         calibrations=_calibrations(final, evidence.sightings.cameras, evidence.cameras),
-        reprojection_rmse_px=root_mean_square(final.solution.residual_px[used]),
-        initial_reprojection_rmse_px=root_mean_square(at_start[used]),
+        reprojection_rmse_px=_root_mean_square(final.solution.residual_px[used]),
+        initial_reprojection_rmse_px=_root_mean_square(at_start[used]),
     )
 
 
@@ -148,33 +133,16 @@ def _calibrations(
     }
 
 
-def residuals_under(
-    rig: Rig, sightings: Sightings, association: Association, observed: Observed, jitter_rad: float
-) -> FloatArray:
-    """Residuals (K, 2), px, of the observations when ``rig`` and its own best corners hold."""
-    fused = fuse_groups(association, locate(sightings, rig), jitter_rad)
-    poses = rig.map_from_vehicle[sightings.frame[observed.row]]
-    return reprojected(rig, poses, sightings, association, observed, fused.corners_map)
+def _residuals_under(rig: Rig, sightings: Sightings, bundle: Bundle, jitter_rad: float) -> FloatArray:
+    """Residuals (K, 2), px, of the bundle's observations when ``rig`` and its own best corners hold."""
+    fused = fuse_groups(bundle.association, locate(sightings, rig), jitter_rad)
+    camera, frame = sightings.camera[bundle.row], sightings.frame[bundle.row]
+    points = fused.corners_map[bundle.group, bundle.corner]
+    pixel, _ = project_ground(rig.intrinsic[camera], rig.cam_from_map(camera, frame), points[:, None])
+    return np.asarray(pixel[:, 0] - sightings.corners_pinhole_px[bundle.row, bundle.own_corner])
 
 
-def reprojected(
-    rig: Rig,
-    map_from_vehicle: FloatArray,
-    sightings: Sightings,
-    association: Association,
-    observed: Observed,
-    corners_map: FloatArray,
-) -> FloatArray:
-    """Residuals (K, 2), px, of the observations of corners (G, 4, 2) from poses (K, 4, 4)."""
-    camera = sightings.camera[observed.row]
-    cam_from_map = rig.cam_from_vehicle[camera] @ np.linalg.inv(map_from_vehicle)
-    points = corners_map[observed.group, observed.corner]
-    pixel, _ = project_ground(rig.intrinsic[camera], cam_from_map, points[:, None])
-    own_corner = association.corner_order()[observed.row, observed.corner]
-    return np.asarray(pixel[:, 0] - sightings.corners_pinhole_px[observed.row, own_corner])
-
-
-def root_mean_square(residual_px: FloatArray) -> float:
+def _root_mean_square(residual_px: FloatArray) -> float:
     """Root mean square length of residuals (K, 2); those that cannot be projected are left out."""
     squared = np.sum(residual_px**2, axis=1)
     finite = squared[np.isfinite(squared)]

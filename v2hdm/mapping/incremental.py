@@ -76,9 +76,7 @@ class _Place:
 
 @dataclass(frozen=True)
 class _Track:
-    """The ``rows`` of one track, its observations of corners 0 to 3, and where these lie; nan for no
-    point.
-    """
+    """The ``rows`` of one track, its observations, and its corners (4, 2), nan where none is a point."""
 
     rows: IntArray
     kind: int
@@ -134,8 +132,7 @@ class IncrementalMapper:
         self._record_at = int(np.ceil(_RECORD_GROWTH * len(self._places)))
 
     def run(self, progress: Callable[[str], None]) -> Grown:
-        """Take up all tracks in the order in which they end; ``progress`` gets the map's size at each new
-        linking.
+        """Take up all tracks in the order in which they end; ``progress`` gets the map's size.
 
         Raises:
             MappingError: nothing can be solved for.
@@ -153,7 +150,7 @@ class IncrementalMapper:
         return Grown(association, usable, self._present_rig())
 
     def _begin(self, rig: Rig, known: int) -> None:
-        """Begin an empty map from ``rig``, of which the first ``known`` markings are solved together."""
+        """Begin an empty map from ``rig``, whose first ``known`` markings are solved together."""
         self._rig, self._known = rig, known
         # Only the IPM that the first map starts from may be far off, and all that is located by it.
         self._coarse = rig is self._first_rig
@@ -173,9 +170,7 @@ class IncrementalMapper:
             return self._take_up(tracks, usable, most)
 
     def _take_up(self, tracks: Association, usable: BoolArray, most: int) -> tuple[Association, bool]:
-        """Map tracks up to ``most`` markings; the marking (S,) of each sighting, and whether the drive
-        ended.
-        """
+        """Map tracks up to ``most`` markings; returns them as groups, and whether the drive ended."""
         number = np.full(len(self._sightings), -1, dtype=np.int64)
         shift = tracks.shift.copy()
         rows = np.flatnonzero(tracks.group >= 0)

@@ -98,19 +98,10 @@ class JointCorners:
         """
         optimised, bundle = self.optimised, self.optimised.bundle
         index = bundle.corner_index[optimised.groups[marking]]
-        number = np.where(
-            index[np.arange(len(corner)), corner] >= 0,
-            index[np.arange(len(corner)), corner],
-            index.max(axis=1),
-        )
+        own = index[np.arange(len(corner)), corner]
+        number = np.where(own >= 0, own, index.max(axis=1))
         out = max(1.0, bundle.solution.chi2_per_dof) * bundle.solution.corner_covariance(number)
-        rows = 2 * corner[:, None] + np.arange(2)
-        for k in range(len(marking)):
-            stated = optimised.markings[marking[k]].covariance_m2
-            assert stated is not None
-            for other in np.flatnonzero(marking == marking[k]):
-                block = stated[np.ix_(rows[k], rows[other])]
-                out[2 * k : 2 * k + 2, 2 * other : 2 * other + 2] = block
+        _state(out, optimised.markings, marking, corner)
         # Put together from two sources, it may be negative along some direction, by a millimetre squared.
         values, vectors = np.linalg.eigh(out)
         return out if values[0] >= 0 else np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
@@ -125,13 +116,18 @@ class StatedCorners:
     def covariance(self, marking: IntArray, corner: IntArray) -> FloatArray:
         """As :meth:`JointCorners.covariance`, but that nothing is shared from one marking to another."""
         out = np.zeros((2 * len(marking), 2 * len(marking)))
-        rows = 2 * corner[:, None] + np.arange(2)
-        for k, own in enumerate(marking.tolist()):
-            stated = self.markings[own].covariance_m2
-            assert stated is not None
-            for other in np.flatnonzero(marking == own):
-                out[2 * k : 2 * k + 2, 2 * other : 2 * other + 2] = stated[np.ix_(rows[k], rows[other])]
+        _state(out, self.markings, marking, corner)
         return out
+
+
+def _state(out: FloatArray, markings: Sequence[Marking], marking: IntArray, corner: IntArray) -> None:
+    """Set the blocks of ``out`` within each marking to its own covariance."""
+    rows = 2 * corner[:, None] + np.arange(2)
+    for k, own in enumerate(marking.tolist()):
+        stated = markings[own].covariance_m2
+        assert stated is not None
+        for other in np.flatnonzero(marking == own):
+            out[2 * k : 2 * k + 2, 2 * other : 2 * other + 2] = stated[np.ix_(rows[k], rows[other])]
 
 
 def residuals_of(outcome: Outcome, optimised: Optimised) -> Residuals:
@@ -141,7 +137,6 @@ def residuals_of(outcome: Outcome, optimised: Optimised) -> Residuals:
     marking = np.zeros(bundle.association.count, dtype=np.int64)
     # The ids of a map whose markings have none yet: by their order, as its files number them.
     marking[optimised.groups] = np.arange(1, len(optimised.groups) + 1)
-    own_corner = bundle.association.corner_order()[bundle.row, bundle.corner]
     images = [drive.images[i] for i in seen.tolist()]
     return Residuals(
         image=tuple(_below(image.path, drive.root) for image in images),
@@ -150,8 +145,8 @@ def residuals_of(outcome: Outcome, optimised: Optimised) -> Residuals:
         row_image=row_image.astype(np.int64),
         marking=marking[bundle.group],
         corner=bundle.corner,
-        is_point=np.asarray(sightings.valid[bundle.row, own_corner]),
-        observed_px=sightings.corners_pinhole_px[bundle.row, own_corner],
+        is_point=np.asarray(sightings.valid[bundle.row, bundle.own_corner]),
+        observed_px=sightings.corners_pinhole_px[bundle.row, bundle.own_corner],
         residual_px=bundle.solution.residual_px,
         distance_sigma=np.sqrt(bundle.solution.mahalanobis2),
     )

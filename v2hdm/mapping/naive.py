@@ -29,8 +29,7 @@ def naive_markings(
     ipm: Mapping[str, FloatArray],
     options: MappingOptions,
 ) -> tuple[list[Marking], list[Exclusion]]:
-    """Map ``tracks`` by one IPM ``vehicle_from_pinhole_px`` per camera; also returns what was seen too
-    seldom.
+    """Map ``tracks`` by one IPM ``vehicle_from_pinhole_px`` per camera; returns exclusions, too.
 
     Only sightings with four valid corners inside the region of interest count. Tracks merge where their
     averages lie within ``naive_merge_m``: two cameras whose IPMs disagree by more yield two markings where

@@ -49,6 +49,10 @@ LOOSE_CLOCK_SIGMA_S = 0.3
 """How far clocks may be apart, s, once the drive has said that they are: half a period of a slow receiver."""
 
 
+def _silent(step: str) -> None:
+    """Ignore progress."""
+
+
 class Optimiser:
     """Takes one set of cameras through association and solving."""
 
@@ -89,17 +93,16 @@ class Optimiser:
         located = self._locate(self.initial_rig)
         return self._track(self.initial_rig, located, self._options.association.ipm_sigma_rad)
 
-    def run(self, tracks: Association, progress: Callable[[str], None] | None = None) -> Optimised:
+    def run(self, tracks: Association, progress: Callable[[str], None] = _silent) -> Optimised:
         """Optimise from ``tracks`` (see :meth:`initial_tracks`); ``progress`` gets each step's name."""
         return self.finish(self.settle(tracks, progress), progress)
 
-    def settle(self, tracks: Association, progress: Callable[[str], None] | None = None) -> Bundle:
+    def settle(self, tracks: Association, progress: Callable[[str], None] = _silent) -> Bundle:
         """Associate and solve by turns, until it is settled which sightings are of one marking."""
-        report = progress or _silent
-        report("coarse solve")
+        progress("coarse solve")
         bundle = self._solve_steep(tracks)
         for number in range(1, self._options.rounds + 1):
-            report(f"joint solve {number}")
+            progress(f"joint solve {number}")
             association = self._associate(bundle.rig)
             # The coarse solve takes the poses at their word, which no test of the inputs may rest on.
             if number > 1 and same_groups(association, bundle.association):
@@ -108,13 +111,12 @@ class Optimiser:
             self._reweigh(bundle)
         return bundle
 
-    def finish(self, bundle: Bundle, progress: Callable[[str], None] | None = None) -> Optimised:
+    def finish(self, bundle: Bundle, progress: Callable[[str], None] = _silent) -> Optimised:
         """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude."""
-        report = progress or _silent
         if self._options.pose_model == AUTO:
-            report("choice of the pose model")
+            progress("choice of the pose model")
             self._pose_model = self._choose_pose_model(bundle)
-        report("final solve")
+        progress("final solve")
         usable, inlier = self._gate(bundle)
         final = self._solve(bundle.association, usable, bundle.rig)
         return conclude(
@@ -137,7 +139,7 @@ class Optimiser:
             for offset_s in solved.clock_offset_s.T
         ]
 
-    def grow(self, progress: Callable[[str], None] | None = None) -> Bundle:
+    def grow(self, progress: Callable[[str], None] = _silent) -> Bundle:
         """Map one track after the other, as the vehicle would, and solve for all that the map rests on.
 
         ``progress`` is told how large the map is. In place of :meth:`settle`.
@@ -164,7 +166,7 @@ class Optimiser:
             solve,
             coarse_model(self.initial_rig, self._noise_of_visits, self._options),
         )
-        grown = mapper.run(progress or _silent)
+        grown = mapper.run(progress)
         self.growth = tuple(mapper.growth)
         bundle = self._solve(grown.association, grown.usable, grown.rig)
         self._reweigh(bundle)
@@ -236,9 +238,7 @@ class Optimiser:
         return adjust(problem, options, self._options.adjustment, self._crew.team)
 
     def _reweigh(self, bundle: Bundle) -> None:
-        """Scale the observations' variances as their residuals say: no data sheet knows this light and
-        paint.
-        """
+        """Scale the observations' variances as their residuals under ``bundle`` say."""
         if len(bundle.row) >= LEAST_OBSERVATIONS:
             factor = self._variance_factor * bundle.solution.observation_factor
             self._variance_factor = float(np.clip(factor, *VARIANCE_FACTORS))
@@ -258,10 +258,8 @@ class Optimiser:
     def _gate(self, bundle: Bundle) -> tuple[BoolArray, BoolArray]:
         """Corners (S, 4) of accepted observations, and the verdict on each observation (K,)."""
         inlier = bundle.inliers
-        order = bundle.association.corner_order()
         usable = np.zeros_like(self._sightings.valid)
-        row, corner = bundle.row[inlier], bundle.corner[inlier]
-        usable[row, order[row, corner]] = True
+        usable[bundle.row[inlier], bundle.own_corner[inlier]] = True
         return usable, inlier
 
 
@@ -271,7 +269,3 @@ def initial_rig(cameras: Mapping[str, Camera], map_from_vehicle: FloatArray) -> 
     ipm = np.stack([camera.ipm[camera.initial_ipm] for camera in cameras.values()])
     start = extrinsic_from_ipm(torch.tensor(intrinsic), torch.tensor(ipm)).numpy()
     return Rig(intrinsic, start, map_from_vehicle)
-
-
-def _silent(step: str) -> None:
-    """Ignore progress."""

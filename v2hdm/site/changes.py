@@ -18,7 +18,7 @@ from v2hdm.association.sightings import Rig
 from v2hdm.errors import MappingError
 from v2hdm.geometry.quadrilateral import SHIFTS
 from v2hdm.records import BoolArray, Change, Changes, Fate, FloatArray, HdMap, IntArray, Marking
-from v2hdm.site.fates import Decision, Pair, Watched, decide
+from v2hdm.site.fates import Decision, Watched, decide
 from v2hdm.site.looks import Looks, Observer, find_rates, with_paint
 from v2hdm.site.map_errors import SHIFT, Errors, Shift, updated_lanes, updated_symbols
 
@@ -260,69 +260,49 @@ def _check_site(decision: Decision, now: Looks, count: int) -> None:
 def _moves(
     decision: Decision, old: Sequence[Marking], by_old: Mapping[int, Marking], now: Looks
 ) -> list[Change]:
-    return [
-        _move(decision, pair, old[pair.old], by_old[pair.old], now)
-        for pair in decision.pairs
-        if pair.moved > LIKELY
-    ]
-
-
-def _move(decision: Decision, pair: Pair, before: Marking, after: Marking, now: Looks) -> Change:
-    shift = decision.shift
-    mean, spread = shift.of_old_at(shift.of_old.centres_map[[pair.old]], shift.of_old.shared_m2[[pair.old]])
-    own = shift.of_old.own_m2[pair.old] + shift.of_new.own_m2[pair.new]
-    sigma = np.sqrt(np.diag(own.reshape(4, 2, 4, 2).mean(axis=(0, 2)) + spread[0]))
-    placed = before.corners_map - mean[0]
-    return Change(
-        id=before.id or 0,
-        kind=before.kind,
-        fate=Fate.MOVED,
-        before=placed,
-        after=after.corners_map,
-        shift_m=after.corners_map.mean(axis=0) - placed.mean(axis=0),
-        shift_sigma_m=sigma,
-        probability=pair.moved,
-        views=int(now.views[pair.old]),
-        found=int(now.found[pair.old]),
-        sightings=after.sightings,
-    )
+    shift, out = decision.shift, []
+    for pair in decision.pairs:
+        if pair.moved <= LIKELY:
+            continue
+        k, after = pair.old, by_old[pair.old]
+        mean, spread = shift.of_old_at(shift.of_old.centres_map[[k]], shift.of_old.shared_m2[[k]])
+        own = shift.of_old.own_m2[k] + shift.of_new.own_m2[pair.new]
+        sigma = np.sqrt(np.diag(own.reshape(4, 2, 4, 2).mean(axis=(0, 2)) + spread[0]))
+        placed = old[k].corners_map - mean[0]
+        moved = after.corners_map.mean(axis=0) - placed.mean(axis=0)
+        numbers = pair.moved, int(now.views[k]), int(now.found[k]), after.sightings
+        change = _change(old[k], Fate.MOVED, placed, after.corners_map, numbers)
+        out.append(replace(change, shift_m=moved, shift_sigma_m=sigma))
+    return out
 
 
 def _missing(
     decision: Decision, old: Sequence[Marking], by_old: Mapping[int, Marking], now: Looks
 ) -> list[Change]:
-    return [
-        Change(
-            id=old[k].id or 0,
-            kind=old[k].kind,
-            fate=Fate.VANISHED if gone > LIKELY else Fate.NOT_SEEN,
-            before=by_old[k].corners_map,
-            after=None if gone > LIKELY else by_old[k].corners_map,
-            shift_m=None,
-            shift_sigma_m=None,
-            probability=gone if gone > LIKELY else 1 - gone,
-            views=int(now.views[k]),
-            found=int(now.found[k]),
-            sightings=old[k].sightings,
-        )
-        for k, gone in decision.gone.items()
-    ]
+    out = []
+    for k, gone in decision.gone.items():
+        fate, corners = Fate.VANISHED if gone > LIKELY else Fate.NOT_SEEN, by_old[k].corners_map
+        numbers = max(gone, 1 - gone), int(now.views[k]), int(now.found[k]), old[k].sightings
+        out.append(_change(old[k], fate, corners, None if gone > LIKELY else corners, numbers))
+    return out
 
 
 def _additions(decision: Decision, fresh: Mapping[int, Marking], before: Looks) -> list[Change]:
-    return [
-        Change(
-            id=one.id or 0,
-            kind=one.kind,
-            fate=Fate.NEW if decision.fresh[k] > LIKELY else Fate.FIRST_SEEN,
-            before=None,
-            after=one.corners_map,
-            shift_m=None,
-            shift_sigma_m=None,
-            probability=max(decision.fresh[k], 1 - decision.fresh[k]),
-            views=int(before.views[k]),
-            found=int(before.found[k]),
-            sightings=one.sightings,
-        )
-        for k, one in fresh.items()
-    ]
+    out = []
+    for k, one in fresh.items():
+        new = decision.fresh[k]
+        fate = Fate.NEW if new > LIKELY else Fate.FIRST_SEEN
+        numbers = max(new, 1 - new), int(before.views[k]), int(before.found[k]), one.sightings
+        out.append(_change(one, fate, None, one.corners_map, numbers))
+    return out
+
+
+def _change(
+    marking: Marking,
+    fate: Fate,
+    before: FloatArray | None,
+    after: FloatArray | None,
+    numbers: tuple[float, int, int, int],
+) -> Change:
+    """A change without a shift; ``numbers`` are probability, views, found and sightings."""
+    return Change(marking.id or 0, marking.kind, fate, before, after, None, None, *numbers)

@@ -263,9 +263,7 @@ def _normal(off: FloatArray, covariance: FloatArray) -> float:
 
 
 def _alone(candidates: _Candidates, density: FloatArray) -> FloatArray:
-    """Log density (P,) of each pair's new marking, in its basis, if it is another one: anywhere, any
-    angle.
-    """
+    """Log density (P,) of each pair's new marking, in its basis, if it is another one anywhere."""
     off = (candidates.basis @ candidates.off[..., None])[..., 0]
     noise = candidates.basis @ candidates.noise @ np.swapaxes(candidates.basis, 1, 2)
     shape = [

@@ -8,6 +8,7 @@ one lane, and those lines say where it runs between them.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,9 +45,7 @@ class Path:
 
 
 def string_nodes(nodes: Nodes, options: LaneOptions) -> list[Path]:
-    """String nodes into paths that never fork: each links with one that is mutually nearest ahead or
-    behind.
-    """
+    """String nodes into paths that never fork: linked are mutually nearest ones ahead and behind."""
     if not len(nodes.points_map):
         return []
     links = _mutual_links(nodes, _MAX_LINK_SPACINGS * options.node_spacing_m)
@@ -205,10 +204,14 @@ def _concatenate(paths: list[Path], options: LaneOptions) -> Path:
     pieces = [paths[0].points_map]
     for before, after in itertools.pairwise(paths):
         pieces += [_bridge(before.points_map, after.points_map, options.node_spacing_m), after.points_map]
-    length = np.array([max(path.length_m, 1e-9) for path in paths])
-    dash = float(np.average([path.dash for path in paths], weights=length))
-    images = float(np.average([path.images for path in paths], weights=length))
-    return Path(np.concatenate(pieces), dash, images)
+    return _merged(np.concatenate(pieces), paths)
+
+
+def _merged(points_map: FloatArray, paths: Sequence[Path]) -> Path:
+    """A path along ``points_map``, with the means of what it was made of."""
+    length_m = [max(path.length_m, 1e-9) for path in paths]
+    dash = float(np.average([path.dash for path in paths], weights=length_m))
+    return Path(points_map, dash, float(np.average([path.images for path in paths], weights=length_m)))
 
 
 def _bridge(before: FloatArray, after: FloatArray, spacing_m: float) -> FloatArray:
@@ -258,7 +261,8 @@ def _shortest_bridge(
         after = ended[b][0].turned(end_b == _LAST)
         between = _course_between(before.points_map[-1], after.points_map[0], guides, tree, options)
         if between is not None:
-            return a, b, _joined(before, between, after)
+            joined = np.concatenate([before.points_map, between, after.points_map])
+            return a, b, _merged(joined, [before, after])
     return None
 
 
@@ -316,13 +320,6 @@ def _course_between(
     course -= np.interp(at, [0.0, gap_m], [course[0], course[-1]])
     points = start + at[:, None] * ahead + course[:, None] * np.array([-ahead[1], ahead[0]])
     return np.asarray(points[1:-1])
-
-
-def _joined(before: Path, between: FloatArray, after: Path) -> Path:
-    lengths = [max(before.length_m, 1e-9), max(after.length_m, 1e-9)]
-    dash = float(np.average([before.dash, after.dash], weights=lengths))
-    images = float(np.average([before.images, after.images], weights=lengths))
-    return Path(np.concatenate([before.points_map, between, after.points_map]), dash, images)
 
 
 _LEAST_LENGTH_M = 6.0

@@ -18,7 +18,7 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 from v2hdm.association.ground import Views, easy_views, locate
-from v2hdm.association.groups import squared_distances
+from v2hdm.association.groups import near_pairs, squared_distances
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.geometry.ipm import project_ground
 from v2hdm.geometry.lens import distort_points
@@ -270,11 +270,7 @@ class Observer:
         rows = np.flatnonzero(free & (located.informs.sum(axis=1) >= 2))
         if not len(rows):
             return set()
-        informs = located.informs[rows][..., None]
-        middle = np.where(informs, located.corners_map[rows], 0.0).sum(axis=1) / informs.sum(axis=1)
-        near = cKDTree(corners.mean(axis=1)).query_ball_point(middle, _REACH_M)
-        row = np.repeat(rows, [len(places) for places in near])
-        place = np.concatenate([np.asarray(places, dtype=np.int64) for places in near])
+        row, place = near_pairs(located, rows, corners.mean(axis=1), _REACH_M)
         kinds = [one.kind for one in markings]
         alike = [
             kinds[p] == self.sightings.kinds[k] for p, k in zip(place, self.sightings.kind[row], strict=True)

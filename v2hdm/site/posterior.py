@@ -319,9 +319,7 @@ def _as_seen(candidates: Candidates) -> Laid:
 
 
 def _inwards(corners: FloatArray, elongated: bool) -> list[tuple[FloatArray, FloatArray]]:
-    """Motions (N, 8) of corners as a side moves inwards by 1 m, and how far (N, 1) it can; ends if
-    elongated.
-    """
+    """Motions (N, 8) of corners as a side moves inwards by 1 m, and how far (N, 1) it can, m."""
     ways = []
     for along, side in ((corners[:, 1] - corners[:, 0], _FIRST), (corners[:, 2] - corners[:, 1], _SECOND)):
         extent_m = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
