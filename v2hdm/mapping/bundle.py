@@ -53,15 +53,13 @@ def vehicle_twists(
 
 
 UNSURVEYED_CENTRE_SIGMA_M = 0.3
-"""How well a camera centre is known that nobody has surveyed, but a coarse IPM implies."""
+"""How well, m, a camera centre is known that nobody has surveyed, but a coarse IPM implies."""
 
 HEAVE_SIGMA_M = 0.01
-"""How far a vehicle's body moves up and down on its suspension on paved ground."""
-
+"""How far, m, a vehicle's body moves up and down on its suspension on paved ground."""
 
 CLOCK_SIGMA_S = 0.01
-"""How far the clocks of camera and receiver may be apart where nobody says that they are synchronised."""
-
+"""How far, s, clocks of camera and receiver may be apart where nobody says that they are synchronised."""
 
 Solve = Callable[[Problem, SolveOptions], Solution]
 
@@ -137,14 +135,9 @@ def full_model(
     pose_noise: Sequence[PoseNoise], options: MappingOptions, poses: str, variance_factor: float = 1.0
 ) -> Model:
     """Every frame deviates from its recorded pose by the states of the pose model ``poses``."""
-    solver = SolveOptions(
-        loss=options.loss, loss_scale=options.loss_scale, coarse=False, device=options.device
-    )
-    solver = with_model(solver, MODELS[poses])
-    pose_sigma = tuple(pose_sigma_of(one) for one in pose_noise)
-    return Model(
-        pose_sigma, options.model_floor_px, solver, variance_factor, options.known_sizes, options.survey
-    )
+    solver = with_model(replace(_solver(options), coarse=False), MODELS[poses])
+    sigma, floor_px = tuple(pose_sigma_of(one) for one in pose_noise), options.model_floor_px
+    return Model(sigma, floor_px, solver, variance_factor, options.known_sizes, options.survey)
 
 
 def pose_sigma_of(pose_noise: PoseNoise) -> PoseSigma:
@@ -164,10 +157,12 @@ def coarse_model(rig: Rig, pose_noise: Sequence[PoseNoise], options: MappingOpti
     """The recorded poses are exact, their errors noise in the image: enough to tell markings apart."""
     focal_px = float(np.mean(rig.intrinsic[:, 0, 0]))
     jitter_px = focal_px * max(float(np.hypot(one.roll_pitch_rad, one.heading_rad)) for one in pose_noise)
-    solver = SolveOptions(
-        pose_states=(), loss=options.loss, loss_scale=options.loss_scale, device=options.device
-    )
-    return Model(len(pose_noise) * (PoseSigma(),), float(np.hypot(options.model_floor_px, jitter_px)), solver)
+    floor_px = float(np.hypot(options.model_floor_px, jitter_px))
+    return Model(len(pose_noise) * (PoseSigma(),), floor_px, replace(_solver(options), pose_states=()))
+
+
+def _solver(options: MappingOptions) -> SolveOptions:
+    return SolveOptions(loss=options.loss, loss_scale=options.loss_scale, device=options.device)
 
 
 def solve_bundle(
@@ -207,34 +202,20 @@ def solve_bundle(
     covariance_px = sightings.covariance_px[row, own_corner]
     on_line = known_elsewhere(association, sightings.valid & usable, usable)[row, own_corner]
     covariance_px[on_line] = line_only(covariance_px[on_line], OPEN_END_PX)
-    covariance_px = covariance_px + model.floor_px**2 * np.eye(2)
     observations = Observations(
         camera=used.camera.astype(np.int64),
         frame=used.frame.astype(np.int64),
         corner=corner_index[group, corner],
         pinhole_px=sightings.corners_pinhole_px[row, own_corner],
-        covariance_px=model.variance_factor * covariance_px,
+        covariance_px=model.variance_factor * (covariance_px + model.floor_px**2 * np.eye(2)),
     )
     names = [sightings.cameras[c] for c in used.cameras]
-    lengths, control = _known(sightings, association, usable, rig, corner_index, model)
-    problem = replace(
-        _problem(sightings, rig, used, [cameras[name] for name in names], observations, model),
-        lengths=lengths,
-        control=control,
-    )
+    lengths, control = _constraints(sightings, association, usable, rig, corner_index, model)
+    problem = _problem(sightings, rig, used, [cameras[name] for name in names], observations, model)
+    problem = replace(problem, lengths=lengths, control=control)
     solution = solve(problem, model.solver)
-    return Bundle(
-        rig=_adjusted_rig(rig, sightings, used, solution),
-        model=model,
-        problem=problem,
-        solution=solution,
-        association=association,
-        row=row,
-        group=group,
-        corner=corner,
-        corner_index=corner_index,
-        camera_index={name: c for c, name in enumerate(names)},
-    )
+    adjusted, index = _adjusted_rig(rig, sightings, used, solution), {name: c for c, name in enumerate(names)}
+    return Bundle(adjusted, model, problem, solution, association, row, group, corner, corner_index, index)
 
 
 @dataclass(frozen=True)
@@ -258,6 +239,7 @@ def _problem(
     """The adjustment of ``observations``, whose ``cameras`` are those of ``used``."""
     centre, sigma = centre_priors(cameras, rig.cam_from_vehicle[used.cameras])
     intrinsic = rig.intrinsic[used.cameras]
+    twists = vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s, sightings.visit)
     return Problem(
         intrinsic=np.column_stack([intrinsic[:, 0, 0], intrinsic[:, 1, 1], intrinsic[:, :2, 2]]),
         cam_from_vehicle=rig.cam_from_vehicle[used.cameras],
@@ -267,14 +249,10 @@ def _problem(
         centre_vehicle=centre,
         centre_sigma_m=sigma,
         pose_sigma=model.pose_sigma,
-        twist_vehicle=_twists(sightings)[used.frames],
+        twist_vehicle=twists[used.frames],
         visit=sightings.visit[used.frames],
         clock_sigma_s=model.clock_sigma_s,
     )
-
-
-def _twists(sightings: Sightings) -> FloatArray:
-    return vehicle_twists(sightings.map_from_vehicle, sightings.stamp_s, sightings.visit)
 
 
 def drive_problem(sightings: Sightings, rig: Rig, cameras: Mapping[str, Camera], model: Model) -> Problem:
@@ -285,7 +263,7 @@ def drive_problem(sightings: Sightings, rig: Rig, cameras: Mapping[str, Camera],
     return _problem(sightings, rig, used, [cameras[name] for name in sightings.cameras], nothing, model)
 
 
-def _known(
+def _constraints(
     sightings: Sightings,
     association: Association,
     usable: BoolArray,

@@ -249,50 +249,38 @@ def run_naive(name: str, inputs: Inputs, ipm: Mapping[str, FloatArray]) -> Metho
 
 def _optimised_result(outcome: Outcome, optimised: Optimised, begin_s: float) -> MethodResult:
     inputs = outcome.inputs
-    options, drive, cameras = inputs.options, inputs.drive, inputs.cameras
-    growth = inputs.optimiser.growth
-    solution = optimised.bundle.solution
+    options, drive, cameras, bundle = inputs.options, inputs.drive, inputs.cameras, optimised.bundle
+    solution, growth, noise = bundle.solution, inputs.optimiser.growth, drive.pose_noise
     if solution.status is not Status.CONVERGED:
         _log.warning(
             "the joint optimisation ended early (%s): %s", solution.status.value, solution.status.advice
         )
-    lost = without_corner(options.survey, optimised.bundle.problem.control)
+    lost = without_corner(options.survey, bundle.problem.control)
     if len(lost):
         _log.warning(
             "%d of %d surveyed points are of no use, no corner of the map is nearest to them within %g m: %s",
-            len(lost),
-            len(options.survey.control),
-            options.survey.reach_m,
-            ", ".join(lost),
-        )
-    ground = ground_by_rig(drive, cameras, optimised.bundle.rig)
-    lanes = _lanes(inputs, ground)
-    symbols = map_symbols(
-        inputs.sightings.symbols,
-        optimised.bundle.rig,
-        drive.pose_noise.roll_pitch_rad,
-        optimised.markings,
-    )
+            len(lost), len(options.survey.control), options.survey.reach_m, ", ".join(lost),
+        )  # fmt: skip
+    lanes = _lanes(inputs, ground_by_rig(drive, cameras, bundle.rig))
+    symbols = map_symbols(inputs.sightings.symbols, bundle.rig, noise.roll_pitch_rad, optimised.markings)
     return MethodResult(
         name="Opt",
         cameras=tuple(cameras),
-        hd_map=HdMap(
-            optimised.markings, lanes, drive.origin, symbols, drive.pose_noise.position_drift_over_m
-        ),
+        hd_map=HdMap(optimised.markings, lanes, drive.origin, symbols, noise.position_drift_over_m),
         calibrations=optimised.calibrations,
         excluded=optimised.excluded,
         reprojection_rmse_px=optimised.reprojection_rmse_px,
         initial_reprojection_rmse_px=optimised.initial_reprojection_rmse_px,
         growth=(*growth, optimised.markings) if growth else (),
         diagnostics={
-            "observations": float(len(optimised.bundle.row)),
-            "candidates": float(optimised.bundle.association.count),
+            "observations": float(len(bundle.row)),
+            "candidates": float(bundle.association.count),
             "evaluations": float(solution.evaluations),
             "gap": solution.gap,
             "chi2_per_dof": solution.chi2_per_dof,
             "time_s": time.perf_counter() - begin_s,
         },
-        certainty=_certainty(optimised.bundle),
+        certainty=_certainty(bundle),
         evidence=outcome.evidence,
         poses=adjusted_poses(outcome),
         clocks=clock_offsets(outcome),
