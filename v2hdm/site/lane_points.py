@@ -23,11 +23,23 @@ from v2hdm.geometry.ipm import (
 )
 from v2hdm.geometry.lens import undistort_points
 from v2hdm.geometry.rigid import camera_centre
-from v2hdm.records import LANE_BOUNDARY, LANE_DASH, BoolArray, Drive, FloatArray, ImageDetections, IntArray
+from v2hdm.records import (
+    LANE_BOUNDARY,
+    LANE_DASH,
+    BoolArray,
+    Drive,
+    FloatArray,
+    ImageDetections,
+    IntArray,
+    LaneDetection,
+)
 from v2hdm.site.options import LaneOptions
 
 _CENTRE_SIGMA_PX = 1.0
 """Noise of a detected centre point across its line: about a cell of the network's output."""
+
+_OWN_SIGMA_M = 0.01
+"""Sigma of a point beyond its pixel's, m, which keeps the nearest image from outvoting all others."""
 
 _TANGENT_REACH = 2
 """Points to either side whose difference gives a point's direction."""
@@ -112,25 +124,15 @@ def collect_lane_points(
     ``jitter_rad`` of viewing direction goes into the weights, so that near points count for more.
     """
     guides = _guides(drive, detections, ground, _GUIDE_RANGE * max_range_m)
-    covered = np.isfinite(ground.centre_map[:, 0])
-    pieces = [
-        (found.image, lane.kind == LANE_DASH, lane.points_px)
-        for found in detections
-        if covered[found.image]
-        for lane in found.lanes
-        if lane.kind != LANE_BOUNDARY and len(lane.points_px) >= 2
-    ]
-    if not pieces:
+    lanes = _lanes(detections, ground, whole=False)
+    if not lanes:
         empty = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, int), np.zeros(0, bool)
         return LaneCloud(*empty, guides)
-    length = np.array([len(points) for _, _, points in pieces])
-    piece = np.repeat(np.arange(len(pieces)), length)
-    image = np.array([i for i, _, _ in pieces])[piece]
-    points_px = _undistort(drive, image, np.concatenate([points for _, _, points in pieces]))
+    piece, image, points_px = _points(drive, lanes)
     homographies = ground.map_from_pinhole_px[image]
     points_map, jacobian = ground_points_with_jacobian(homographies, points_px[:, None])
     points_map, jacobian = points_map[:, 0], jacobian[:, 0]
-    tangent = _tangents(points_map, piece, length)
+    tangent = _tangents(points_map, piece)
     centre = ground.centre_map[image]
     ray = points_map - centre[:, :2]
     covariance = _CENTRE_SIGMA_PX**2 * jacobian @ np.swapaxes(jacobian, 1, 2)
@@ -140,36 +142,51 @@ def collect_lane_points(
     with np.errstate(invalid="ignore"):
         keep = (np.linalg.norm(ray, axis=1) <= max_range_m) & np.isfinite(tangent).all(axis=1)
         keep &= np.isfinite(variance)
-    dash = np.array([is_dash for _, is_dash, _ in pieces])[piece]
-    # A centimetre of its own keeps the nearest image from outvoting all others.
-    weight = 1.0 / (variance[keep] + 0.01**2)
-    return LaneCloud(
-        points_map[keep], tangent[keep], weight, image[keep].astype(np.int64), dash[keep], guides
-    )
+    dash = np.array([lane.kind == LANE_DASH for _, lane in lanes])[piece]
+    weight = 1.0 / (variance[keep] + _OWN_SIGMA_M**2)
+    return LaneCloud(points_map[keep], tangent[keep], weight, image[keep], dash[keep], guides)
+
+
+def _lanes(
+    detections: Sequence[ImageDetections], ground: ImageGround, whole: bool
+) -> list[tuple[int, LaneDetection]]:
+    """The images and lane detections, ``whole`` lines or pieces, of the images that ``ground`` covers."""
+    covered = np.isfinite(ground.centre_map[:, 0])
+    return [
+        (found.image, lane)
+        for found in detections
+        if covered[found.image]
+        for lane in found.lanes
+        if (lane.kind == LANE_BOUNDARY) == whole and (whole or len(lane.points_px) >= 2)
+    ]
+
+
+def _points(
+    drive: Drive, lanes: Sequence[tuple[int, LaneDetection]]
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Of all points of ``lanes`` their lane (P,), their image (P,) and their pinhole pixels (P, 2)."""
+    of_lane = np.repeat(np.arange(len(lanes)), [len(lane.points_px) for _, lane in lanes])
+    image = np.array([i for i, _ in lanes], dtype=np.int64)[of_lane]
+    camera = np.array([one.camera for one in drive.images])[image]
+    points_px = np.concatenate([lane.points_px for _, lane in lanes]).astype(np.float64)
+    for name in np.unique(camera):
+        own = camera == name
+        points_px[own] = undistort_points(drive.cameras[str(name)].info, points_px[own])
+    return of_lane, image, points_px
 
 
 def _guides(
     drive: Drive, detections: Sequence[ImageDetections], ground: ImageGround, max_range_m: float
 ) -> Guides:
     """The whole lines of the images that ``ground`` covers, as far as ``max_range_m``."""
-    covered = np.isfinite(ground.centre_map[:, 0])
-    lines = [
-        (found.image, lane.points_px)
-        for found in detections
-        if covered[found.image]
-        for lane in found.lanes
-        if lane.kind == LANE_BOUNDARY
-    ]
-    if not lines:
+    lanes = _lanes(detections, ground, whole=True)
+    if not lanes:
         return Guides()
-    image_of_line = np.array([image for image, _ in lines], dtype=np.int64)
-    line = np.repeat(np.arange(len(lines)), [len(points_px) for _, points_px in lines])
-    image = image_of_line[line]
-    points_px = _undistort(drive, image, np.concatenate([points_px for _, points_px in lines]))
+    line, image, points_px = _points(drive, lanes)
     points_map = ground_points(ground.map_from_pinhole_px[image], points_px[:, None])[:, 0]
     with np.errstate(invalid="ignore"):
         near = np.linalg.norm(points_map - ground.centre_map[image, :2], axis=1) <= max_range_m
-    return Guides(points_map[near], line[near].astype(np.int64), image_of_line)
+    return Guides(points_map[near], line[near], np.array([i for i, _ in lanes], dtype=np.int64))
 
 
 def _rows(drive: Drive, cameras: Sequence[str]) -> tuple[IntArray, list[str], FloatArray]:
@@ -189,18 +206,9 @@ def _image_ground(
     return ImageGround(all_homographies, all_centres)
 
 
-def _undistort(drive: Drive, image: IntArray, points_px: FloatArray) -> FloatArray:
-    """Recorded pixels (P, 2) of images (P,) to pinhole pixels."""
-    camera = np.array([one.camera for one in drive.images])[image]
-    out = np.empty_like(points_px, dtype=np.float64)
-    for name in np.unique(camera):
-        own = camera == name
-        out[own] = undistort_points(drive.cameras[str(name)].info, points_px[own])
-    return out
-
-
-def _tangents(points: FloatArray, piece: IntArray, length: IntArray) -> FloatArray:
+def _tangents(points: FloatArray, piece: IntArray) -> FloatArray:
     """Unit direction (P, 2) at each point of its piece, from the points up to two places away."""
+    length = np.bincount(piece)
     first = (np.cumsum(length) - length)[piece]
     last = first + length[piece] - 1
     here = np.arange(len(points))
@@ -212,7 +220,11 @@ def _tangents(points: FloatArray, piece: IntArray, length: IntArray) -> FloatArr
 
 
 _SEED_CELL_M = 0.25
+"""Cells of which each gives a seed, m: half of the nodes' spacing."""
+
 _DIRECTION_BINS = 8
+"""Directions told apart within a cell, of half a circle."""
+
 _SAME_DIRECTION = np.cos(np.deg2rad(20.0))
 _ITERATIONS = 4
 

@@ -240,14 +240,10 @@ def _moved(points_map: FloatArray, shift: Shift, of_old: bool) -> FloatArray:
 
 def _owner(lane: Lane, lanes: Sequence[Lane]) -> int | None:
     """The earlier line of the same class that most of a new line lies on."""
-    shares = [
-        float((_apart(lane.points_map, one.points_map) <= _SAME_LINE_M).mean())
-        if one.kind == lane.kind
-        else 0.0
-        for one in lanes
-    ]
+    alike = [k for k, one in enumerate(lanes) if one.kind == lane.kind]
+    shares = [(_apart(lane.points_map, lanes[k].points_map) <= _SAME_LINE_M).mean() for k in alike]
     best = int(np.argmax(shares)) if shares else 0
-    return best if shares and shares[best] >= _LEAST_SHARED else None
+    return alike[best] if shares and shares[best] >= _LEAST_SHARED else None
 
 
 def _apart(points: FloatArray, line: FloatArray) -> FloatArray:
@@ -291,8 +287,7 @@ def _renewed(lane: Lane, pieces: Sequence[_Piece]) -> Lane:
     """The earlier line with its course replaced where new lines lie on it."""
     if not pieces:
         return lane
-    along = _along(lane.points_map)
-    heights = None if lane.heights_m is None else lane.heights_m
+    along, heights = _along(lane.points_map), lane.heights_m
     points: list[FloatArray] = []
     up: list[FloatArray] = []
     reached = -1.0
@@ -306,12 +301,7 @@ def _renewed(lane: Lane, pieces: Sequence[_Piece]) -> Lane:
             up += [heights[old], np.interp(station[own], along, heights)]
         reached = max(reached, piece.end)
     left = along > reached
-    points.append(lane.points_map[left])
-    if heights is not None:
-        up.append(heights[left])
-    return replace(
-        lane,
-        points_map=np.concatenate(points),
-        heights_m=np.concatenate(up) if heights is not None else None,
-        sightings=lane.sightings + max(piece.lane.sightings for piece in pieces),
-    )
+    sightings = lane.sightings + max(piece.lane.sightings for piece in pieces)
+    course = np.concatenate([*points, lane.points_map[left]])
+    heights = None if heights is None else np.concatenate([*up, heights[left]])
+    return replace(lane, points_map=course, heights_m=heights, sightings=sightings)
