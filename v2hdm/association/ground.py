@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from v2hdm.association.sightings import Rig, Sightings, Symbols, frames_of
+from v2hdm.association.sightings import LEAST_HEIGHT_M, Rig, Sightings, Symbols, frames_of
 from v2hdm.geometry.ipm import (
     apply_homography,
     direction_covariance,
@@ -102,7 +102,7 @@ def locate(sightings: Sightings, rig: Rig) -> Located:
         corners_map=corners_map,
         covariance_m2=covariance,
         ray_map=corners_map - centre_map[:, None, :2],
-        height_m=np.maximum(centre_map[:, 2], 0.1),
+        height_m=np.maximum(centre_map[:, 2], LEAST_HEIGHT_M),
         valid=sightings.valid & informs,
         informs=informs,
     )

@@ -26,6 +26,15 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 _LEAST_DEPTH_M = 1.0
 """Depth, m, from which a corner on a line may be projected: nearer, the line leaves the image steeply."""
 
+LEAST_TOLERANCE_M = 0.05
+"""How far corners of one shape may deviate, m, however small the marking is."""
+
+_CORNER_FLOOR_M = 0.001
+"""Floor of a corner's sigma where groups are fused, m."""
+
+_HUBER_SIGMAS = 2.0
+"""Residual in sigmas from which a sighting's weight in its group falls."""
+
 OPEN_END_M = 10.0
 """Sigma, m, of where along its side a corner lies that is no point: markings are up to so long."""
 
@@ -124,7 +133,7 @@ def fuse_groups(association: Association, located: Located, jitter_rad: float) -
     noise = located.covariance_m2 + located.direction_covariance_m2(jitter_rad)
     on_line = known_elsewhere(association, located.valid, located.informs)
     noise[on_line] = line_only(noise[on_line], OPEN_END_M)
-    covariance = association.in_group_order(noise) + 1e-6 * np.eye(2)
+    covariance = association.in_group_order(noise) + _CORNER_FLOOR_M**2 * np.eye(2)
     information = np.linalg.inv(np.where(informs[..., None, None], covariance, np.eye(2)))
     corner = np.where(informs, association.group[:, None] * 4 + np.arange(4), association.count * 4)
     points = np.where(informs[..., None], corners, 0.0)
@@ -141,7 +150,7 @@ def fuse_groups(association: Association, located: Located, jitter_rad: float) -
         mean = (spread @ vector[..., None])[..., 0]
         miss = points - mean[corner]
         distance = np.sqrt(np.maximum(np.einsum("sci,scij,scj->sc", miss, information, miss), 1e-12))
-        weight = informs * np.minimum(1.0, 2.0 / distance)
+        weight = informs * np.minimum(1.0, _HUBER_SIGMAS / distance)
     seen = np.bincount(corner[point], minlength=size)[:-1]
     mean[~solvable] = np.nan
     return FusedGroups(
@@ -255,7 +264,7 @@ def _coinciding_pairs(
     covariance = _mean_covariance(fused, a) + _mean_covariance(fused, b) + 2 * floor_m**2 * np.eye(2)
     solved = np.linalg.solve(covariance, found.offset[..., None])[..., 0]
     distance = np.sqrt(np.sum(found.offset * solved, axis=-1))
-    tolerance_m = np.maximum(shape_tolerance * np.maximum(size_m[a], size_m[b]), 0.05)
+    tolerance_m = np.maximum(shape_tolerance * np.maximum(size_m[a], size_m[b]), LEAST_TOLERANCE_M)
     accepted = (
         (kind[a] == kind[b])
         & (distance <= gate_sigmas)

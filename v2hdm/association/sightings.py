@@ -12,6 +12,9 @@ from v2hdm.geometry.lens import has_distortion, undistort_points
 from v2hdm.geometry.rigid import camera_centre
 from v2hdm.records import BoolArray, Camera, CameraInfo, Drive, FloatArray, ImageDetections, IntArray
 
+LEAST_HEIGHT_M = 0.1
+"""Least height of a camera, m, for what divides by it."""
+
 
 @dataclass(frozen=True)
 class Rig:
@@ -31,7 +34,7 @@ class Rig:
     @property
     def height_m(self) -> FloatArray:
         """Heights (C,) of the camera centres above the ground of the vehicle."""
-        return np.asarray(np.maximum(camera_centre(self.cam_from_vehicle)[:, 2], 0.1))
+        return np.asarray(np.maximum(camera_centre(self.cam_from_vehicle)[:, 2], LEAST_HEIGHT_M))
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from v2hdm.association.ground import Located
-from v2hdm.association.groups import Association
+from v2hdm.association.groups import LEAST_TOLERANCE_M, Association
 from v2hdm.association.options import AssociationOptions
 from v2hdm.association.sightings import NO_SYMBOLS, Rig, Sightings
 from v2hdm.geometry.quadrilateral import SHIFTS, align, diameters, mean_corners
@@ -24,9 +24,10 @@ from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.records import BoolArray, FloatArray, IntArray
 
 _REFUSED = 1e9
+"""Cost of a pair that the assignment must not make."""
 
-_LEAST_TOLERANCE_M = 0.05
-"""How far corners of one shape may deviate, m, however small the marking is."""
+_POSITION_FLOOR_M = 0.02
+"""Floor of a sighting's sigma, m, which keeps the gate from collapsing where the stated noise is nil."""
 
 
 @dataclass(frozen=True)
@@ -191,7 +192,7 @@ class _Linker:
         own = rows[d]
         found = align(corners[t], valid[t], self._located.corners_map[own], self._located.valid[own])
         cost = self._mahalanobis2(found.offset, last[t], own)
-        tolerance_m = np.maximum(self._options.shape_tolerance * size_m[t], _LEAST_TOLERANCE_M)
+        tolerance_m = np.maximum(self._options.shape_tolerance * size_m[t], LEAST_TOLERANCE_M)
         shape = found.deformation_m / tolerance_m
         accepted = (
             (cost <= self._options.gate_sigmas**2)
@@ -254,8 +255,8 @@ def _noise_covariances(located: Located, uncertainty: Uncertainty) -> FloatArray
         np.where(located.valid[..., None, None], located.covariance_m2, 0.0) * weight[..., None, None], axis=1
     )
     spread = _ray_covariance(ray, jitter_m, uncertainty.jitter_rad * range_m)
-    # A floor of 2 cm keeps the gate from collapsing where the stated noise is nil.
-    return np.asarray(pixels + spread + (uncertainty.position_m**2 + 0.02**2) * np.eye(2))
+    position_m2 = uncertainty.position_m**2 + _POSITION_FLOOR_M**2
+    return np.asarray(pixels + spread + position_m2 * np.eye(2))
 
 
 def _ray_covariance(ray: FloatArray, along_m: FloatArray, across_m: FloatArray) -> FloatArray:

@@ -18,7 +18,7 @@ import numpy as np
 
 from v2hdm.adjust import Observations, PoseSigma
 from v2hdm.adjust.incremental import IncrementalMap, Sighted
-from v2hdm.association.groups import Association, group_kinds
+from v2hdm.association.groups import LEAST_TOLERANCE_M, Association, group_kinds
 from v2hdm.association.options import LEAST_SIGHTINGS
 from v2hdm.association.sightings import Rig, Sightings
 from v2hdm.errors import AdjustError
@@ -282,7 +282,7 @@ class IncrementalMapper:
         valid = np.asarray(np.isfinite(corners).all(axis=1))
         images = set(self._sightings.image[track.rows].tolist())
         size_m = float(diameters(np.nan_to_num(corners), valid))
-        tolerance_m = max(self._options.association.shape_tolerance * size_m, 0.05)
+        tolerance_m = max(self._options.association.shape_tolerance * size_m, LEAST_TOLERANCE_M)
         best: tuple[float, int | None, int] = (self._gate_m(track.rows), None, 0)
         near = np.linalg.norm(self._centres - np.nanmean(corners, axis=0), axis=1) < best[0] + size_m
         for marking in np.flatnonzero(near).tolist():

@@ -41,34 +41,24 @@ CONTRADICTED_SIGMAS = 5.0
 """From so many sigmas an input is contradicted: clean drives stay below 3 (docs/verdict.md), and one in two
 million would exceed it by chance."""
 
-LEAST_VALUE: Mapping[Fault, float] = {
-    Fault.CLOCK: 0.005,
-    Fault.FOCAL: 0.003,
-    Fault.DISTORTION: 0.002,
-    Fault.PRINCIPAL: 5.0,
-    Fault.SLOPE: 0.002,
-    Fault.SURVEY: 0.03,
-    Fault.LEVER: 0.03,
-    Fault.SIZE: 0.01,
-    Fault.CONTROL: 0.02,
-    Fault.DATUM: 0.02,
+_LIMITS: Mapping[Fault, tuple[float, float]] = {
+    Fault.CLOCK: (0.005, 0.02),
+    Fault.FOCAL: (0.003, 0.01),
+    Fault.DISTORTION: (0.002, 0.02),
+    Fault.PRINCIPAL: (5.0, 10.0),
+    Fault.SLOPE: (0.002, 0.003),
+    Fault.SURVEY: (0.03, 1.0),
+    Fault.LEVER: (0.03, 1.0),
+    Fault.SIZE: (0.01, 0.05),
+    Fault.CONTROL: (0.02, 0.05),
+    Fault.DATUM: (0.02, 0.05),
 }
-"""Below this, in the fault's unit, an input is as good as a drive needs it, however sure the drive is."""
+"""In the fault's unit: the value below which an input is as good as a drive needs it, however sure the drive
+is, and the sigma up to which a drive observes it. A less observable fault is nearly what something else can
+be, and takes up what is left of other errors: of k1 on a straight street (.04), say."""
 
-OBSERVABLE_SIGMA: Mapping[Fault, float] = {
-    Fault.CLOCK: 0.02,
-    Fault.FOCAL: 0.01,
-    Fault.DISTORTION: 0.02,
-    Fault.PRINCIPAL: 10.0,
-    Fault.SLOPE: 0.003,
-    Fault.SURVEY: 1.0,
-    Fault.LEVER: 1.0,
-    Fault.SIZE: 0.05,
-    Fault.CONTROL: 0.05,
-    Fault.DATUM: 0.05,
-}
-"""Sigma, in the fault's unit, up to which a drive tells it. A fault that it tells less well is nearly what
-something else can be, and takes up what is left of other errors: of k1 on a straight street (.04), say."""
+OBSERVABLE_SIGMA = {fault: sigma for fault, (_, sigma) in _LIMITS.items()}
+"""Sigma, in the fault's unit, up to which a drive observes it."""
 
 LOOSE_CENTRE_SIGMA_M = 10.0
 """Sigma of a surveyed axis that was contradicted: it no longer says where on the vehicle the camera is."""
@@ -250,8 +240,8 @@ def _is_ambiguous(worst: Suspect, found: Sequence[Suspect]) -> bool:
 
 def is_contradicted(one: Suspect | Contradiction) -> bool:
     """Whether an input is off by more than chance and by more than matters, and this drive can report."""
-    told = one.sigma <= OBSERVABLE_SIGMA[one.fault]
-    return told and one.sigmas > CONTRADICTED_SIGMAS and abs(one.value) > LEAST_VALUE[one.fault]
+    least, sigma = _LIMITS[one.fault]
+    return one.sigma <= sigma and one.sigmas > CONTRADICTED_SIGMAS and abs(one.value) > least
 
 
 def _clocks(bundle: Bundle) -> tuple[dict[str, tuple[float, float]], ...]:

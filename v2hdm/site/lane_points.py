@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from v2hdm.association.ground import ground_points, ground_points_with_jacobian
-from v2hdm.association.sightings import Rig, frames_of
+from v2hdm.association.sightings import LEAST_HEIGHT_M, Rig, frames_of
 from v2hdm.geometry.ipm import (
     direction_covariance,
     facing_ipm,
@@ -136,7 +136,7 @@ def collect_lane_points(
     centre = ground.centre_map[image]
     ray = points_map - centre[:, :2]
     covariance = _CENTRE_SIGMA_PX**2 * jacobian @ np.swapaxes(jacobian, 1, 2)
-    covariance += direction_covariance(ray, np.maximum(centre[:, 2], 0.1), jitter_rad)
+    covariance += direction_covariance(ray, np.maximum(centre[:, 2], LEAST_HEIGHT_M), jitter_rad)
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     variance = np.einsum("pi,pij,pj->p", normal, covariance, normal)
     with np.errstate(invalid="ignore"):
@@ -220,13 +220,19 @@ def _tangents(points: FloatArray, piece: IntArray) -> FloatArray:
 
 
 _SEED_CELL_M = 0.25
-"""Cells of which each gives a seed, m: half of the nodes' spacing."""
+"""Side of the cells that each give a seed, m."""
 
 _DIRECTION_BINS = 8
 """Directions told apart within a cell, of half a circle."""
 
 _SAME_DIRECTION = np.cos(np.deg2rad(20.0))
+"""Cosine from which points are of one line: a crossing one is not."""
+
 _ITERATIONS = 4
+"""Mean shifts of each seed."""
+
+_THIN_SPACINGS = 0.7
+"""Spacings of nodes within which the best supported one suppresses others of its line."""
 
 
 @dataclass(frozen=True)
@@ -339,7 +345,7 @@ def _thin(points: FloatArray, tangent: FloatArray, images: IntArray, options: La
     """Indices of the best supported nodes, no two closer than .7 of the spacing along or beside a line."""
     if not len(points):
         return np.zeros(0, dtype=np.int64)
-    reach_m = 0.7 * options.node_spacing_m
+    reach_m = _THIN_SPACINGS * options.node_spacing_m
     near = cKDTree(points).query_ball_point(points, reach_m)
     alive = np.ones(len(points), dtype=bool)
     kept = []

@@ -20,10 +20,19 @@ from v2hdm.site.lane_points import Guides, LaneCloud, Nodes, find_nodes
 from v2hdm.site.options import LaneOptions
 
 _SAME_DIRECTION = np.cos(np.deg2rad(25.0))
+"""Cosine from which two nodes are of one line."""
+
 _MAX_LINK_SPACINGS = 2.5
-_MAX_BEND_RAD = np.deg2rad(25.0)
-_MAX_ARC_MISMATCH_RAD = np.deg2rad(8.0)
+"""Longest link of two nodes, in spacings of nodes."""
+
+_MAX_BEND_RAD, _MAX_ARC_MISMATCH_RAD = np.deg2rad([25.0, 8.0])
+"""Largest angle of a gap's chord and an end's tangent, and difference of the angles at both ends, rad."""
+
+_END_SIGMA_M = 0.05
+"""Lateral error of an end, m, which short gaps must allow for in angles."""
+
 _END_LENGTH_M = 2.0
+"""Length, m, over which an end's direction is taken."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +147,7 @@ def _joints(paths: list[Path], options: LaneOptions) -> list[tuple[int, int, int
 
 def _on_one_arc(leaving_rad: FloatArray, arriving_rad: FloatArray, gap_m: FloatArray) -> BoolArray:
     """Whether a gap's chord meets both tangents at one angle, lateral errors of 5 cm allowed for."""
-    slack = np.arctan2(0.05, np.maximum(gap_m, 1e-6))
+    slack = np.arctan2(_END_SIGMA_M, np.maximum(gap_m, 1e-6))
     return np.asarray(
         (np.abs(leaving_rad) <= _MAX_BEND_RAD + slack)
         & (np.abs(arriving_rad) <= _MAX_BEND_RAD + slack)
@@ -229,10 +238,14 @@ def _bridge(before: FloatArray, after: FloatArray, spacing_m: float) -> FloatArr
 
 
 _MAX_BRIDGE_M = 25.0
+"""Longest gap that images' whole lines bridge, m."""
+
 _PASSES_M = 0.4
 """A line that comes so near the end of a piece passes it."""
 
 _LEAST_COSINE = np.cos(np.deg2rad(30.0))
+"""Cosine of a gap's way and the directions of its ends at least."""
+
 _FIRST, _LAST = 0, 1
 _DIRECTION_LENGTH_M = 5.0
 """A bridge leaves a piece in about the direction of so much of its end."""

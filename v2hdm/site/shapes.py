@@ -46,6 +46,7 @@ _ELONGATED = 2.0
 """Paint this many times as long as wide is rolled by the metre: its width is common, its length its own."""
 
 _GAUSS_NEWTON_STEPS = 3
+"""Steps that refine a laid shape."""
 
 
 @dataclass(frozen=True)
