@@ -25,6 +25,7 @@ from v2hdm.mapping.bundle import Bundle
 from v2hdm.mapping.conclude import Optimised
 from v2hdm.mapping.crew import ALONE, Crew
 from v2hdm.mapping.naive import naive_markings
+from v2hdm.mapping.optimise import silent
 from v2hdm.mapping.options import MappingOptions, check_options
 from v2hdm.mapping.recovery import Inputs, Outcome, optimise
 from v2hdm.mapping.results import AdjustedPoses, ClockOffset, MethodResult
@@ -170,7 +171,7 @@ def run_methods(
     detections: Sequence[ImageDetections],
     cameras: Sequence[str],
     options: MappingOptions | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     base: Base | None = None,
     grey: Callable[[Image], NDArray[np.float32]] | None = None,
     crew: Crew = ALONE,
@@ -198,21 +199,20 @@ def run_methods(
     check_options(options)
     if options.survey.file is not None:
         raise ConfigError(f"mapping.survey.file is {options.survey.file!r}: read it first, give its points")
-    report = progress or _silent
-    report("linking sightings")
+    progress("linking sightings")
     given = Inputs(drive, detections, cameras, options, crew)
     results: dict[str, MethodResult] = {}
     for name, ipm in _given_ipms(drive, cameras).items():
-        report(name)
+        progress(name)
         results[name] = run_naive(name, given, ipm)
     begin_s = time.perf_counter()
-    outcome, optimised = optimise(given, report)
+    outcome, optimised = optimise(given, progress)
     optimal = _optimised_result(outcome, optimised, begin_s)
     if base is not None:
-        report("the earlier map")
+        progress("the earlier map")
         optimal = _brought_up_to_date(base, optimal, outcome, optimised, grey)
     results["Opt"] = optimal
-    report("ONI")
+    progress("ONI")
     found = optimal.calibrations
     ipm_found = {c: ipm_from_extrinsic(found[c].info, found[c].cam_from_vehicle) for c in cameras}
     results["ONI"] = replace(run_naive("ONI", outcome.inputs, ipm_found), calibrations=found)
@@ -329,7 +329,3 @@ def _lanes(inputs: Inputs, ground: ImageGround) -> tuple[Lane, ...]:
         jitter_rad=inputs.drive.pose_noise.roll_pitch_rad,
     )
     return map_lanes(cloud, options)
-
-
-def _silent(step: str) -> None:
-    """Ignore progress."""

@@ -49,7 +49,7 @@ LOOSE_CLOCK_SIGMA_S = 0.3
 """How far clocks may be apart, s, once the drive has said that they are: half a period of a slow receiver."""
 
 
-def _silent(step: str) -> None:
+def silent(step: str) -> None:
     """Ignore progress."""
 
 
@@ -93,11 +93,11 @@ class Optimiser:
         located = self._locate(self.initial_rig)
         return self._track(self.initial_rig, located, self._options.association.ipm_sigma_rad)
 
-    def run(self, tracks: Association, progress: Callable[[str], None] = _silent) -> Optimised:
+    def run(self, tracks: Association, progress: Callable[[str], None] = silent) -> Optimised:
         """Optimise from ``tracks`` (see :meth:`initial_tracks`); ``progress`` gets each step's name."""
         return self.finish(self.settle(tracks, progress), progress)
 
-    def settle(self, tracks: Association, progress: Callable[[str], None] = _silent) -> Bundle:
+    def settle(self, tracks: Association, progress: Callable[[str], None] = silent) -> Bundle:
         """Associate and solve by turns, until it is settled which sightings are of one marking."""
         progress("coarse solve")
         bundle = self._solve_steep(tracks)
@@ -111,7 +111,7 @@ class Optimiser:
             self._reweigh(bundle)
         return bundle
 
-    def finish(self, bundle: Bundle, progress: Callable[[str], None] = _silent) -> Optimised:
+    def finish(self, bundle: Bundle, progress: Callable[[str], None] = silent) -> Optimised:
         """Choose the pose model, leave out what contradicts ``bundle`` (see :meth:`settle`), and conclude."""
         if self._options.pose_model == AUTO:
             progress("choice of the pose model")
@@ -139,7 +139,7 @@ class Optimiser:
             for offset_s in solved.clock_offset_s.T
         ]
 
-    def grow(self, progress: Callable[[str], None] = _silent) -> Bundle:
+    def grow(self, progress: Callable[[str], None] = silent) -> Bundle:
         """Map one track after the other, as the vehicle would, and solve for all that the map rests on.
 
         ``progress`` is told how large the map is. In place of :meth:`settle`.

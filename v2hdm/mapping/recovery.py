@@ -117,7 +117,7 @@ class Outcome:
     evidence: SolveEvidence
 
 
-def optimise(inputs: Inputs, report: Callable[[str], None]) -> tuple[Outcome, Optimised]:
+def optimise(inputs: Inputs, progress: Callable[[str], None]) -> tuple[Outcome, Optimised]:
     """Optimise a drive, as often as inputs have to be dropped.
 
     Raises:
@@ -126,33 +126,40 @@ def optimise(inputs: Inputs, report: Callable[[str], None]) -> tuple[Outcome, Op
     corrected: list[Contradiction] = []
     survey = inputs.options.survey
     while True:
+        # 1. Associate and solve, all at once or marking by marking.
         optimiser, drive = inputs.optimiser, inputs.drive
         if inputs.options.mode == INCREMENTAL:
-            settled = optimiser.grow(report)
+            settled = optimiser.grow(progress)
         else:
-            settled = optimiser.settle(inputs.tracks, report)
-        report("tests of the inputs")
+            settled = optimiser.settle(inputs.tracks, progress)
+        # 2. Test the inputs against what everything else says.
+        progress("tests of the inputs")
         found = _suspects(settled, drive)
         worst = next((one for one in found if is_contradicted(one)), None)
-        corrected_inputs = None
+        # 3. Begin anew without the input that is contradicted most, if the drive can do without.
+        left = None
         if worst is not None and len(corrected) < MOST_CORRECTIONS and not _is_ambiguous(worst, found):
-            corrected_inputs = _recovered(inputs, worst, settled)
-        if worst is None or corrected_inputs is None:
+            left = _recovered(inputs, worst, settled)
+        if worst is None or left is None:
             break
-        told = contradictions(settled, (worst,), visit_names(drive))[0]
-        whose, about = " and ".join(told.cameras), f" {told.about}" if told.about else ""
-        _log.warning(
-            "%s: mapped again, for the drive contradicts the %s%s of %s by %.0f sigmas (%+.3g %s)",
-            ", ".join(inputs.cameras), told.fault.value, about, whose, told.sigmas, told.value,
-            told.fault.unit,
-        )  # fmt: skip
-        corrected.append(told)
-        inputs = corrected_inputs
-    optimised = optimiser.finish(settled, report)
+        corrected.append(contradictions(settled, (worst,), visit_names(drive))[0])
+        _warn(inputs, corrected[-1])
+        inputs = left
+    # 4. Choose the pose model, solve without outliers and conclude.
+    optimised = optimiser.finish(settled, progress)
     corrected = [_as_solved(one, settled) for one in corrected if _is_of_the_map(one, survey, optimised)]
     suspected = contradictions(settled, found, visit_names(drive))
     evidence = _evidence(settled, suspected, corrected, optimiser, optimised.bundle, inputs.sightings)
     return Outcome(inputs, optimised.bundle, evidence), optimised
+
+
+def _warn(inputs: Inputs, one: Contradiction) -> None:
+    about = f" {one.about}" if one.about else ""
+    _log.warning(
+        "%s: mapped again, for the drive contradicts the %s%s of %s by %.0f sigmas (%+.3g %s)",
+        ", ".join(inputs.cameras), one.fault.value, about, " and ".join(one.cameras), one.sigmas, one.value,
+        one.fault.unit,
+    )  # fmt: skip
 
 
 def visit_names(drive: Drive) -> tuple[str, ...]:
@@ -239,7 +246,7 @@ def _is_ambiguous(worst: Suspect, found: Sequence[Suspect]) -> bool:
 
 
 def is_contradicted(one: Suspect | Contradiction) -> bool:
-    """Whether an input is off by more than chance and by more than matters, and this drive can report."""
+    """Whether an input is off by more than chance and by more than matters, and this drive observes it."""
     least, sigma = _LIMITS[one.fault]
     return one.sigma <= sigma and one.sigmas > CONTRADICTED_SIGMAS and abs(one.value) > least
 
@@ -270,15 +277,12 @@ def _recovered(inputs: Inputs, worst: Suspect, settled: Bundle) -> Inputs | None
     if worst.fault is Fault.SIZE:
         # One wrong size says that the paint is of another standard; the others' corners may only look like
         # outliers, which a robust loss hides from the tests.
-        return replace(
-            inputs, options=replace(options, known_sizes=replace(options.known_sizes, by_class_m={}))
-        )
+        sizes = replace(options.known_sizes, by_class_m={})
+        return replace(inputs, options=replace(options, known_sizes=sizes))
     if worst.fault in (Fault.CONTROL, Fault.DATUM):
-        survey = options.survey
-        left = (
-            survey.without(point_of(settled, worst.item)) if worst.fault is Fault.CONTROL else survey.only([])
-        )
-        return replace(inputs, options=replace(options, survey=left))
+        point = point_of(settled, worst.item) if worst.fault is Fault.CONTROL else None
+        survey = options.survey.only([]) if point is None else options.survey.without(point)
+        return replace(inputs, options=replace(options, survey=survey))
     return None
 
 

@@ -62,15 +62,19 @@ class CameraFit:
 class SolveEvidence:
     """The evidence that the joint optimisation of one set of cameras leaves for the checks.
 
-    Attributes: suspects: every input that was tested, as it stands in the result, the largest contradiction
-    first. corrected: inputs that were contradicted, and dropped or corrected before the result was solved.
-    pose_model: what was estimated of the poses, of :data:`v2hdm.adjust.MODELS`. held_out: mean robust loss of
-    held-out observations by pose model; a little below 2 without errors. fits: by camera. variance_factor: as
-    in :class:`CameraFit`, of all cameras. along_route: (W,) the same of windows of
-    :data:`WINDOW_OBSERVATIONS` in driving order. window_s: (W,) when each window begins, s. pose_pulls: root
-    mean square normalised innovation by state of a pose; at most 1 for right sigmas. worst_pull: the largest
-    of them all, in sigmas. worst_pull_s: when, s. clock_s: by visit and camera the estimated clock offset and
-    sigma, where the pose model has one.
+    Attributes:
+        suspects: every input that was tested, as it stands in the result, the largest contradiction first.
+        corrected: inputs that were contradicted, and dropped or corrected before the result was solved.
+        pose_model: what was estimated of the poses, of :data:`v2hdm.adjust.MODELS`.
+        held_out: mean robust loss of held-out observations by pose model; a little below 2 without errors.
+        fits: by camera.
+        variance_factor: as in :class:`CameraFit`, of all cameras.
+        along_route: (W,) the same of windows of :data:`WINDOW_OBSERVATIONS` in driving order.
+        window_s: (W,) when each window begins, s.
+        pose_pulls: root mean square normalised innovation by state of a pose; at most 1 for right sigmas.
+        worst_pull: the largest of them all, in sigmas.
+        worst_pull_s: when, s.
+        clock_s: by visit and camera the estimated clock offset and sigma, where the pose model has one.
     """
 
     suspects: tuple[Contradiction, ...]
@@ -96,11 +100,14 @@ class SolveEvidence:
 class AdjustedPoses:
     """The vehicle's poses at the images' times, as a solve has adjusted them.
 
-    Attributes: stamp_s: (F,) when images were taken, on the clock of the poses, rising within each visit.
-    before: (F, 4, 4) ``map_from_vehicle`` as it went into the solve. map_from_vehicle: (F, 4, 4) adjusted; as
-    before where no marking was seen. sigma: (F, 6) along and about the vehicle's axes, m and rad; as stated
-    where no marking was seen. seen: (F,) whether a marking was seen then. frame: which of them each image is
-    of, by its path. visit: (F,) of which visit each is.
+    Attributes:
+        stamp_s: (F,) when images were taken, on the clock of the poses, rising within each visit.
+        before: (F, 4, 4) ``map_from_vehicle`` as it went into the solve.
+        map_from_vehicle: (F, 4, 4) adjusted; as before where no marking was seen.
+        sigma: (F, 6) along and about the vehicle's axes, m and rad; as stated where no marking was seen.
+        seen: (F,) whether a marking was seen then.
+        frame: which of them each image is of, by its path.
+        visit: (F,) of which visit each is.
     """
 
     stamp_s: FloatArray
@@ -136,15 +143,19 @@ class Corners(Protocol):
 class MethodResult:
     """The outcome of one method on one set of cameras.
 
-    Attributes: calibrations: by camera, empty where the method only has an IPM. reprojection_rmse_px: over
-    the accepted corner observations; None for methods that do not reproject. initial_reprojection_rmse_px:
-    the same under the extrinsic that the optimisation started from. growth: the maps after the first
-    markings, in the incremental mode, the whole map last. diagnostics: named figures for the log and the
-    report. certainty: by camera, a sentence on what the drive determined and what rests on the survey.
-    evidence: for the checks after the solve. poses: as the solve has adjusted them. clocks: by visit the
-    offsets of the cameras' clocks, corrections before the solve included. corners: how the errors of the
-    map's corners hang together, None where unknown. residuals: of the accepted corner observations. changes:
-    of an earlier map that was brought up to date.
+    Attributes:
+        calibrations: by camera, empty where the method only has an IPM.
+        reprojection_rmse_px: over the accepted corner observations; None for methods that do not reproject.
+        initial_reprojection_rmse_px: the same under the extrinsic that the optimisation started from.
+        growth: the maps after the first markings, in the incremental mode, the whole map last.
+        diagnostics: named figures for the log and the report.
+        certainty: by camera, a sentence on what the drive determined and what rests on the survey.
+        evidence: for the checks after the solve.
+        poses: as the solve has adjusted them.
+        clocks: by visit the offsets of the cameras' clocks, corrections before the solve included.
+        corners: how the errors of the map's corners hang together, None where unknown.
+        residuals: of the accepted corner observations.
+        changes: of an earlier map that was brought up to date.
     """
 
     name: str
