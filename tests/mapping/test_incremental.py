@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.mapping.scene import SceneOptions, make_scene
-from tests.mapping.test_methods import MATCH_M, match, rotation_error_deg
+from tests.mapping.scene import MATCH_M, SceneOptions, make_scene, match, rotation_error_deg
 from v2hdm.errors import ConfigError
 from v2hdm.mapping.methods import run_methods
 from v2hdm.mapping.options import MappingOptions

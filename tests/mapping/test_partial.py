@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.mapping.scene import Scene, SceneOptions, make_scene
-from tests.mapping.test_methods import MATCH_M, match
+from tests.mapping.scene import MATCH_M, Scene, SceneOptions, make_scene, match
 from v2hdm.association.ground import locate, views_of
 from v2hdm.association.groups import attach, fuse_groups, in_view
 from v2hdm.association.sightings import Sightings, collect_sightings
