@@ -158,10 +158,11 @@ def check_options(options: MappingOptions, kinds: Sequence[str] | None = None) -
     from v2hdm.adjust.problem import LOSSES  # brings torch, which settings as such do without
 
     choices = {"mode": MODES, "pose_model": POSE_MODELS, "adjustment": ADJUSTMENTS, "loss": LOSSES}
-    for key, (*others, last) in choices.items():
+    for key, allowed in choices.items():
         value = getattr(options, key)
-        if value not in (*others, last):
-            raise ConfigError(f"mapping.{key} is '{value}'; choose {', '.join(others)} or {last}.")
+        if value not in allowed:
+            which = " or ".join(allowed) if len(allowed) == 2 else f"from {', '.join(allowed)}"
+            raise ConfigError(f"mapping.{key} is '{value}'; choose {which}.")
     if options.adjustment == "parts" and options.device != "cpu":
         raise ConfigError("mapping.adjustment=parts works on the CPU; set device=cpu or adjustment=auto.")
     check_settings(options, _RANGES, "mapping.")
